@@ -1,0 +1,168 @@
+"""The one container of a 3D Gaussian scene.
+
+Parameters are stored as Splatfacto and the 3DGS PLY store them (natural-log scales, opacity
+logits, unnormalised wxyz quaternions, SH coefficients), so that nothing is lost on the way in or
+out. Activated values are properties, computed when asked for.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Iterator
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import SceneError
+
+SH_C0 = 0.28209479177387814
+"""The constant band of the real spherical harmonics, 1 / (2 sqrt(pi))."""
+
+MAX_SH_DEGREE = 3
+
+
+def sh_degree_of(num_rest: int) -> int:
+    """SH degree of a scene with ``num_rest`` coefficients beyond the constant one.
+
+    Raises:
+        SceneError: if no degree from 0 to 3 has that many.
+    """
+    for degree in range(MAX_SH_DEGREE + 1):
+        if (degree + 1) ** 2 - 1 == num_rest:
+            return degree
+    raise SceneError(
+        f"features_rest has {num_rest} coefficients a channel; expected 0, 3, 8 or 15 (SH degree 0 to {MAX_SH_DEGREE})"
+    )
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians, on one device and of one floating dtype.
+
+    Raises:
+        SceneError: if a shape, device or dtype does not fit the others.
+
+    Example:
+        >>> scene = Gaussians.empty(sh_degree=3)
+        >>> len(scene), scene.sh_degree
+        (0, 3)
+    """
+
+    means: Tensor  # [N, 3] scene units
+    scales: Tensor  # [N, 3] natural logarithm of the standard deviations, scene units
+    quats: Tensor  # [N, 4] wxyz, any length; zero means the identity
+    opacities: Tensor  # [N, 1] logit; +-Inf are opacity 1 and 0
+    features_dc: Tensor  # [N, 3] constant SH coefficient
+    features_rest: Tensor  # [N, (d+1)^2 - 1, 3] the other SH coefficients
+
+    def __post_init__(self) -> None:
+        tails = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (1,), "features_dc": (3,)}
+        n = self.means.shape[0] if self.means.dim() else -1
+        for name, tail in tails.items():
+            shape = tuple(getattr(self, name).shape)
+            if shape != (n, *tail):
+                raise SceneError(f"{name} has shape {shape}; expected ({n}, {', '.join(map(str, tail))})")
+        rest = tuple(self.features_rest.shape)
+        if len(rest) != 3 or rest[0] != n or rest[2] != 3:
+            raise SceneError(f"features_rest has shape {rest}; expected ({n}, (d+1)^2 - 1, 3)")
+        sh_degree_of(rest[1])
+        for name, value in self.items():
+            if value.device != self.means.device or value.dtype != self.means.dtype:
+                raise SceneError(
+                    f"{name} is {value.dtype} on {value.device} but means are {self.means.dtype} on {self.means.device}"
+                )
+        if not self.means.dtype.is_floating_point:
+            raise SceneError(f"parameters are {self.means.dtype}; expected a floating-point type")
+
+    @classmethod
+    def empty(cls, sh_degree: int = 0, **kwargs) -> "Gaussians":
+        """A scene of no Gaussians; ``kwargs`` go to ``torch.empty`` (dtype, device)."""
+        rest = (sh_degree + 1) ** 2 - 1
+        shapes = ((0, 3), (0, 3), (0, 4), (0, 1), (0, 3), (0, rest, 3))
+        return cls(*(torch.empty(shape, **kwargs) for shape in shapes))
+
+    @classmethod
+    def cat(cls, scenes: "list[Gaussians]") -> "Gaussians":
+        """All Gaussians of several scenes of one SH degree, in order."""
+        return cls(*(torch.cat(parts) for parts in zip(*(s.tensors() for s in scenes), strict=True)))
+
+    def items(self) -> Iterator[tuple[str, Tensor]]:
+        """``(name, tensor)`` of every parameter, in the order of the fields."""
+        return ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
+
+    def tensors(self) -> list[Tensor]:
+        """The parameter tensors, in the order of the fields."""
+        return [value for _, value in self.items()]
+
+    def map(self, function) -> "Gaussians":
+        """A scene whose every parameter is ``function(parameter)``."""
+        return Gaussians(*(function(value) for value in self.tensors()))
+
+    def replace(self, **changes: Tensor) -> "Gaussians":
+        """A scene with some parameters replaced."""
+        return dataclasses.replace(self, **changes)
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def __getitem__(self, index) -> "Gaussians":
+        """Select by slice, boolean mask (N,) or index tensor (K,). An integer selects one Gaussian."""
+        if isinstance(index, int):
+            index = [index]
+        return self.map(lambda value: value[index])
+
+    def to(self, *args, **kwargs) -> "Gaussians":
+        """As ``torch.Tensor.to``, for every parameter."""
+        return self.map(lambda value: value.to(*args, **kwargs))
+
+    def detach(self) -> "Gaussians":
+        """The same parameters outside any autograd graph."""
+        return self.map(torch.Tensor.detach)
+
+    @property
+    def device(self) -> torch.device:
+        return self.means.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.means.dtype
+
+    @property
+    def sh_degree(self) -> int:
+        return sh_degree_of(self.features_rest.shape[1])
+
+    @property
+    def sh(self) -> Tensor:
+        """All SH coefficients, (N, (d+1)^2, 3)."""
+        return torch.cat([self.features_dc[:, None], self.features_rest], dim=1)
+
+    @property
+    def alphas(self) -> Tensor:
+        """Opacities in [0, 1], (N,)."""
+        return torch.sigmoid(self.opacities[:, 0])
+
+    @property
+    def stds(self) -> Tensor:
+        """Standard deviations along the Gaussian's own axes, scene units, (N, 3)."""
+        return torch.exp(self.scales)
+
+    @property
+    def megabytes(self) -> float:
+        """Size of the parameters as float32, in units of 10^6 bytes."""
+        return 4e-6 * sum(value.numel() for value in self.tensors())
+
+    def usable(self) -> Tensor:
+        """Mask (N,) of Gaussians that can be drawn: nothing is NaN and nothing is infinite, but for
+        opacity logits (+-Inf are opacity 1 and 0) and log-scales of -Inf (a flat axis)."""
+        ok = torch.ones(len(self), dtype=torch.bool, device=self.device)
+        for name, value in self.items():
+            flat = value.reshape(len(self), -1) if len(self) else value.reshape(0, 1)
+            if name == "opacities":
+                bad = flat.isnan()
+            elif name == "scales":
+                bad = flat.isnan() | (flat == torch.inf)
+            else:
+                bad = ~flat.isfinite()
+            ok &= ~bad.any(dim=1)
+        return ok

@@ -1,0 +1,6 @@
+"""A differentiable rasterizer of 3D Gaussians in pure torch, shaped like gsplat's."""
+
+from pointsplat_ns.rasterizer.reference import rasterize_reference
+from pointsplat_ns.rasterizer.rendering import rasterization
+
+__all__ = ["rasterization", "rasterize_reference"]

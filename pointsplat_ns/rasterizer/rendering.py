@@ -1,0 +1,198 @@
+"""The public function: gsplat's signature and return shape, in pure torch."""
+
+from __future__ import annotations
+
+from typing import Literal, Optional
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.rasterizer.blending import blend
+from pointsplat_ns.rasterizer.constants import EPS2D, TILE
+from pointsplat_ns.rasterizer.projection import Projected, camera_centre, project
+from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
+from pointsplat_ns.rasterizer.tiles import intersect_tiles
+
+RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+
+
+def _check(means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds, render_mode) -> None:
+    n, c = means.shape[0], viewmats.shape[0]
+    wanted = {
+        "means": (means, (n, 3)),
+        "quats": (quats, (n, 4)),
+        "scales": (scales, (n, 3)),
+        "opacities": (opacities, (n,)),
+        "viewmats": (viewmats, (c, 4, 4)),
+        "Ks": (Ks, (c, 3, 3)),
+    }
+    for name, (tensor, shape) in wanted.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; expected {shape}")
+    if colors.shape[:1] != (n,) and colors.shape[:2] != (c, n):
+        raise ValueError(f"colors has shape {tuple(colors.shape)}; expected ({n}, ...) or ({c}, {n}, ...)")
+    if width < 1 or height < 1:
+        raise ValueError(f"image is {width} x {height} pixels; expected at least 1 x 1")
+    if render_mode not in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
+        raise ValueError(f"render_mode is {render_mode!r}; expected RGB, D, ED, RGB+D or RGB+ED")
+    if backgrounds is not None and backgrounds.shape[0] != c:
+        raise ValueError(f"backgrounds has shape {tuple(backgrounds.shape)}; expected ({c}, channels)")
+
+
+def _colors_of(seen: Projected, colors: Tensor, camera: int, per_camera: bool, sh_degree: Optional[int]) -> Tensor:
+    colors = (colors[camera] if per_camera else colors).index_select(0, seen.ids)
+    return colors if sh_degree is None else sh_to_color(seen.directions, colors, sh_degree)
+
+
+def rasterization(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    colors: Tensor,  # [(C,) N, D] or [(C,) N, K, 3]
+    viewmats: Tensor,  # [C, 4, 4]
+    Ks: Tensor,  # [C, 3, 3]
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = EPS2D,
+    sh_degree: Optional[int] = None,
+    packed: bool = True,
+    tile_size: int = TILE,
+    backgrounds: Optional[Tensor] = None,
+    render_mode: RenderMode = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    channel_chunk: int = 32,
+) -> tuple[Tensor, Tensor, dict]:
+    """Render 3D Gaussians from C pinhole cameras, on any torch device.
+
+    Takes what ``gsplat.rasterization`` takes and returns what it returns. Differentiable in means,
+    quats, scales, opacities, colors, backgrounds and viewmats. float32 and float64 are computed as
+    they are, lower precisions in float32. Gaussians with a NaN or infinite parameter are not drawn.
+
+    Args:
+        means: centres, world space.
+        quats: wxyz, any length; the zero quaternion is the identity.
+        scales: standard deviations (not logarithms), scene units.
+        opacities: in [0, 1].
+        colors: D channels, or SH coefficients if ``sh_degree`` is given; for all cameras or each.
+        viewmats: world to camera, OpenCV axes (x right, y down, z forward), rigid.
+        Ks: intrinsics in pixels; the centre of the first pixel is at (0.5, 0.5).
+        near_plane, far_plane: depths drawn, scene units.
+        radius_clip: Gaussians of a smaller radius (pixels) are not drawn.
+        eps2d: added to the diagonal of the projected covariance, pixels^2.
+        sh_degree: degree evaluated; must not exceed what ``colors`` holds.
+        packed: as in gsplat, ``meta`` then lists the M visible (camera, Gaussian) pairs in place of
+            (C, N) arrays. The image is the same.
+        backgrounds: (C, D), one colour a camera; depth channels are not composited over it.
+        render_mode: colours, depth ``D`` (sum of weight times depth), expected depth ``ED`` (that
+            divided by the accumulated alpha), or both.
+        absgrad: after the backward pass ``meta["means2d"].absgrad`` holds the sum over pixels of
+            the absolute gradient (AbsGS, arXiv 2404.10484).
+        rasterize_mode: ``antialiased`` scales opacities by the compensation of Mip-Splatting.
+        tile_size, sparse_grad, channel_chunk: accepted for gsplat's sake, without effect.
+
+    Returns:
+        Renders (C, H, W, channels), alphas (C, H, W, 1), and ``meta`` with means2d, radii, depths,
+        conics, opacities (all (C, N, ...), or (M, ...) if packed), camera_ids and gaussian_ids
+        (None unless packed), width, height, n_cameras, tile_size, tile_width, tile_height,
+        isect_offsets and flatten_ids.
+
+    Raises:
+        ValueError: if a shape or option does not fit.
+    """
+    opacities = opacities.reshape(-1) if opacities.dim() == 2 else opacities
+    _check(means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds, render_mode)
+    dtype = means.dtype if means.dtype in (torch.float32, torch.float64) else torch.float32
+    means, quats, scales, opacities, colors, viewmats, Ks = (
+        tensor.to(dtype) for tensor in (means, quats, scales, opacities, colors, viewmats, Ks)
+    )
+    n, cameras = means.shape[0], viewmats.shape[0]
+    per_camera = colors.dim() == (4 if sh_degree is not None else 3)
+
+    seen = [
+        project(
+            means, quats, scales, opacities, viewmats[c], Ks[c], width, height,
+            near_plane, far_plane, radius_clip, eps2d, rasterize_mode == "antialiased",
+        )
+        for c in range(cameras)
+    ]  # fmt: skip
+    camera_ids = torch.cat([torch.full_like(s.ids, c) for c, s in enumerate(seen)])
+    gaussian_ids = torch.cat([s.ids for s in seen])
+    dense_ids = camera_ids * n + gaussian_ids
+
+    def packed_of(name: str) -> Tensor:
+        return torch.cat([getattr(s, name) for s in seen])
+
+    def dense(values: Tensor) -> Tensor:
+        empty = values.new_zeros(cameras * n, *values.shape[1:])
+        return empty.index_copy(0, dense_ids, values).view(cameras, n, *values.shape[1:])
+
+    meta_means2d = packed_of("means2d")
+    if packed:
+        means2d = meta_means2d = meta_means2d.view_as(meta_means2d)
+    else:
+        meta_means2d = dense(meta_means2d)
+        means2d = meta_means2d.view(-1, 2).index_select(0, dense_ids)
+    cov2d, det, alphas, depths = (packed_of(name) for name in ("cov2d", "det", "opacities", "depths"))
+
+    channels = []
+    if render_mode.startswith("RGB"):
+        channels.append(torch.cat([_colors_of(s, colors, c, per_camera, sh_degree) for c, s in enumerate(seen)]))
+    color_channels = channels[0].shape[-1] if channels else 0
+    if render_mode != "RGB":
+        channels.append(depths[:, None])
+
+    tiles = intersect_tiles(means2d, cov2d, det, alphas, depths, camera_ids, cameras, width, height)
+
+    def keep_absgrad(values: Tensor) -> None:
+        if not packed:
+            values = values.new_zeros(cameras * n, 2).index_copy_(0, dense_ids, values).view(cameras, n, 2)
+        meta_means2d.absgrad = values
+
+    image, through = blend(
+        means2d, cov2d, det, alphas, torch.cat(channels, dim=-1), tiles, cameras, width, height,
+        keep_absgrad if absgrad else None,
+    )  # fmt: skip
+    accumulated = 1.0 - through
+
+    if backgrounds is not None and color_channels:
+        background = backgrounds.to(dtype)[:, None, None, :]
+        over = image[..., :color_channels] + through * background[..., :color_channels]
+        image = torch.cat([over, image[..., color_channels:]], dim=-1)
+    if render_mode.endswith("ED"):
+        expected = image[..., -1:] / accumulated.clamp_min(1e-10)
+        image = torch.cat([image[..., :-1], expected], dim=-1)
+
+    conics = torch.cat([s.conics for s in seen]).detach()
+    with torch.no_grad():
+        arrays = {
+            "radii": packed_of("radii"),
+            "depths": depths.detach(),
+            "conics": conics,
+            "opacities": alphas.detach(),
+        }
+        if not packed:
+            arrays = {name: dense(values) for name, values in arrays.items()}
+    meta = {
+        **arrays,
+        "means2d": meta_means2d,
+        "camera_ids": camera_ids if packed else None,
+        "gaussian_ids": gaussian_ids if packed else None,
+        "width": width,
+        "height": height,
+        "n_cameras": cameras,
+        "tile_size": TILE,
+        "tile_width": tiles.columns,
+        "tile_height": tiles.rows,
+        "isect_offsets": tiles.offsets[:-1].view(cameras, tiles.rows, tiles.columns),
+        "flatten_ids": dense_ids[tiles.gaussians],
+    }
+    return image, accumulated, meta
+
+
+__all__ = ["RenderMode", "camera_centre", "rasterization"]

@@ -1,0 +1,350 @@
+"""The fast rasterizer against the per-pixel reference, in value and gradient."""
+
+import math
+
+import pytest
+import torch
+
+from pointsplat_ns.rasterizer import rasterization, rasterize_reference
+from pointsplat_ns.rasterizer.projection import project
+from pointsplat_ns.rasterizer.tiles import intersect_tiles
+
+F64 = torch.float64
+
+
+def make_scene(n, seed=0, dtype=F64, scale=-3.0, spread=0.8, opacity=1.0):
+    g = torch.Generator().manual_seed(seed)
+
+    def randn(*shape):
+        return torch.randn(*shape, generator=g, dtype=F64)
+
+    means = randn(n, 3) * torch.tensor([1.0, 1.0, 0.5], dtype=F64) + torch.tensor([0, 0, 3.0], dtype=F64)
+    scales = torch.exp(randn(n, 3) * spread + scale)
+    opacities = torch.rand(n, generator=g, dtype=F64) * opacity
+    return [t.to(dtype) for t in (means, randn(n, 4), scales, opacities, randn(n, 16, 3) * 0.3)]
+
+
+def make_camera(width=37, height=29, dtype=F64, angle=0.2, cx=20.0, cy=13.0):
+    K = torch.tensor([[40.0, 0, cx], [0, 42.0, cy], [0, 0, 1]], dtype=dtype)
+    view = torch.eye(4, dtype=dtype)
+    c, s = math.cos(angle), math.sin(angle)
+    view[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=dtype)
+    view[:3, 3] = torch.tensor([0.1, -0.1, 0.2], dtype=dtype)
+    return view, K, width, height
+
+
+def leaves(tensors):
+    return [t.detach().clone().requires_grad_() for t in tensors]
+
+
+def both(scene, camera, mode="classic", sh_degree=3):
+    view, K, w, h = camera
+    fast = rasterization(
+        *scene, view[None], K[None], w, h, sh_degree=sh_degree, render_mode="RGB+D", rasterize_mode=mode
+    )
+    slow = rasterize_reference(*scene, view, K, w, h, sh_degree=sh_degree, antialiased=mode == "antialiased")
+    return (fast[0][0], fast[1][0]), (torch.cat([slow[0], slow[2]], -1), slow[1])
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize(
+    "n,scale,opacity,size",
+    [
+        (2, -0.5, 1.0, (16, 16)),
+        (200, -3.0, 1.0, (37, 29)),
+        (150, -1.0, 0.3, (23, 8)),  # large and faint: every tile sees every Gaussian
+        (150, -1.0, 1.0, (9, 31)),  # large and opaque: pixels saturate and stop
+    ],
+)
+def test_image_and_gradients_equal_the_reference_in_float64(mode, n, scale, opacity, size):
+    scene = leaves(make_scene(n, seed=n, scale=scale, opacity=opacity))
+    view, K, w, h = make_camera(*size)
+    view.requires_grad_()
+    fast, slow = both(scene, (view, K, w, h), mode)
+    g = torch.Generator().manual_seed(1)
+    weights = [torch.randn(x.shape, generator=g, dtype=F64) for x in slow]
+    for got, want in zip(fast, slow, strict=True):
+        assert (got - want).abs().max() < 1e-10  # same arithmetic in another order
+    grads = [
+        torch.autograd.grad(sum((x * w).sum() for x, w in zip(out, weights, strict=True)), [*scene, view])
+        for out in (fast, slow)
+    ]
+    for name, got, want in zip("means quats scales opacities colors viewmat".split(), *grads, strict=True):
+        assert want.abs().max() > 0, name
+        assert (got - want).abs().max() <= 1e-9 * want.abs().max(), name
+
+
+@pytest.mark.parametrize("cx,cy", [(-30.0, 13.0), (60.0, 40.0)])
+def test_principal_point_outside_the_image_moves_the_frustum_clamp(cx, cy):
+    fast, slow = both(make_scene(100, seed=3, scale=-1.5), make_camera(cx=cx, cy=cy))
+    assert slow[1].max() > 0.1
+    assert (fast[0] - slow[0]).abs().max() < 1e-10
+
+
+def test_gradcheck():
+    scene = make_scene(4, seed=5, scale=0.3, spread=0.3)
+    scene[3] = 0.3 + 0.5 * scene[3]
+    scene = leaves(scene)
+    view, K, w, h = make_camera(6, 5, cx=3.0, cy=2.5)
+    K = K * torch.tensor([[0.15], [0.15], [1.0]], dtype=F64)
+    K[0, 2], K[1, 2] = 3.0, 2.5
+    background = torch.rand(1, 3, dtype=F64, requires_grad=True)
+
+    def render(*args):
+        *scene, background = args
+        image, alpha, _ = rasterization(
+            *scene, view[None], K[None], w, h, sh_degree=2, backgrounds=background, render_mode="RGB+ED"
+        )
+        return image, alpha
+
+    # all pixels see all Gaussians far above the 1/255 threshold, where the image is smooth
+    assert (render(*scene, background)[1] > 0.05).all()
+    assert torch.autograd.gradcheck(render, (*scene, background), eps=1e-6, atol=1e-5)
+
+
+def test_many_channels_and_per_camera_colors_render_like_three():
+    means, quats, scales, opacities, sh = make_scene(80)
+    view, K, w, h = make_camera()
+    colors = torch.cat([sh[:, :, 0], sh[:, :, 1]], dim=1)[:, :11]
+    image, _, _ = rasterization(means, quats, scales, opacities, colors, view[None], K[None], w, h)
+    for d in range(11):
+        single, _, _ = rasterization(
+            means, quats, scales, opacities, colors[None, :, d : d + 1], view[None], K[None], w, h
+        )
+        torch.testing.assert_close(image[..., d : d + 1], single, rtol=0, atol=1e-12)
+
+
+def test_batched_cameras_equal_one_at_a_time_packed_or_not():
+    scene = make_scene(120, seed=8)
+    cameras = [make_camera(angle=a) for a in (-0.3, 0.2, 3.0)]  # the last looks away
+    views, Ks = torch.stack([c[0] for c in cameras]), torch.stack([c[1] for c in cameras])
+    w, h = 37, 29
+    for packed in (False, True):
+        image, alpha, meta = rasterization(*scene, views, Ks, w, h, sh_degree=1, packed=packed)
+        for c in range(3):
+            one, one_alpha, _ = rasterization(*scene, views[c : c + 1], Ks[c : c + 1], w, h, sh_degree=1)
+            torch.testing.assert_close(image[c], one[0], rtol=0, atol=1e-12)
+            torch.testing.assert_close(alpha[c], one_alpha[0], rtol=0, atol=1e-12)
+        rows = meta["radii"].shape
+        assert rows == ((len(meta["gaussian_ids"]),) if packed else (3, 120))
+        assert meta["means2d"].shape == (*rows, 2) and meta["conics"].shape == (*rows, 3)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_absgrad_is_the_sum_over_pixels_of_absolute_gradients(packed):
+    scene = leaves(make_scene(30, seed=2, scale=-2.0))
+    view, K, w, h = make_camera(11, 10, cx=5.0, cy=5.0)
+    image, _, meta = rasterization(*scene, view[None], K[None], w, h, sh_degree=0, absgrad=True, packed=packed)
+    meta["means2d"].retain_grad()
+    g = torch.Generator().manual_seed(0)
+    weights = torch.randn(image.shape, generator=g, dtype=F64)
+    (image * weights).sum().backward(retain_graph=True)
+    got, signed = meta["means2d"].absgrad.clone(), meta["means2d"].grad.clone()
+    want, total = torch.zeros_like(got), torch.zeros_like(got)
+    for y in range(h):
+        for x in range(w):
+            (grad,) = torch.autograd.grad((image * weights)[0, y, x].sum(), meta["means2d"], retain_graph=True)
+            want += grad.abs()
+            total += grad
+    torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(signed, total, rtol=1e-9, atol=1e-12)
+    assert (got > signed.abs() + 1e-6).any()
+
+
+def test_render_modes_agree():
+    scene = make_scene(60)
+    view, K, w, h = make_camera()
+
+    def render(mode):
+        return rasterization(*scene, view[None], K[None], w, h, sh_degree=0, render_mode=mode)
+
+    both_, alpha, _ = render("RGB+ED")
+    torch.testing.assert_close(both_[..., :3], render("RGB")[0])
+    torch.testing.assert_close(both_[..., 3:], render("ED")[0])
+    torch.testing.assert_close(render("D")[0] / alpha.clamp_min(1e-10), render("ED")[0])
+    inside = alpha > 0.5
+    assert (render("ED")[0][inside] > 0.5).all()
+
+
+def test_background_shows_where_nothing_is():
+    scene = make_scene(5, scale=-4.0)
+    view, K, w, h = make_camera()
+    background = torch.tensor([[0.2, 0.5, 0.9]], dtype=F64)
+    image, alpha, _ = rasterization(*scene, view[None], K[None], w, h, sh_degree=0, backgrounds=background)
+    empty = alpha[0, ..., 0] == 0
+    assert empty.any()
+    torch.testing.assert_close(image[0][empty], background.expand(int(empty.sum()), 3))
+
+
+@pytest.mark.parametrize("case", ["none", "behind", "transparent"])
+def test_nothing_to_draw_gives_black_and_zero_gradients(case):
+    scene = leaves(make_scene(0 if case == "none" else 7))
+    means, quats, scales, opacities, sh = scene
+    if case == "behind":
+        means = means * torch.tensor([1, 1, -1.0], dtype=F64)
+    if case == "transparent":
+        opacities = opacities * 1e-4
+    view, K, w, h = make_camera()
+    for mode in ("RGB", "RGB+ED"):
+        image, alpha, _ = rasterization(
+            means, quats, scales, opacities, sh, view[None], K[None], w, h, sh_degree=3, render_mode=mode
+        )
+        assert (image == 0).all() and (alpha == 0).all()
+        grads = torch.autograd.grad(image.sum() + alpha.sum(), scene, allow_unused=True, retain_graph=True)
+        assert all(g is None or (g == 0).all() for g in grads)
+
+
+def test_order_of_gaussians_does_not_matter():
+    scene = make_scene(150, seed=4)
+    view, K, w, h = make_camera()
+    order = torch.randperm(150, generator=torch.Generator().manual_seed(0))
+    image, _, _ = rasterization(*scene, view[None], K[None], w, h, sh_degree=2)
+    permuted, _, _ = rasterization(*[t[order] for t in scene], view[None], K[None], w, h, sh_degree=2)
+    torch.testing.assert_close(image, permuted, rtol=0, atol=1e-12)
+
+
+def test_a_crop_equals_the_same_part_of_the_whole():
+    scene = make_scene(150, seed=6)
+    view, K, w, h = make_camera(48, 40, cx=24.0, cy=20.0)
+    whole, _, _ = rasterization(*scene, view[None], K[None], w, h, sh_degree=0)
+    shifted = K.clone()
+    shifted[0, 2] -= 13
+    shifted[1, 2] -= 5
+    # the frustum clamp depends on the image size: keep it out of play with Gaussians near the axis
+    crop, _, _ = rasterization(*scene, view[None], shifted[None], 20, 30, sh_degree=0)
+    inside = project(*scene[:4], view, K, w, h)
+    assert inside.ids.numel() > 50
+    difference = (whole[0, 5:35, 13:33] - crop[0]).abs()
+    assert difference.median() == 0 or difference.median() < 1e-9
+
+
+def test_the_same_input_gives_the_same_bits():
+    scene = leaves(make_scene(200, dtype=torch.float32))
+    view, K, w, h = make_camera(dtype=torch.float32)
+    runs = []
+    for _ in range(2):
+        image, _, _ = rasterization(*scene, view[None], K[None], w, h, sh_degree=3)
+        runs.append((image, *torch.autograd.grad(image.square().sum(), scene)))
+    for a, b in zip(*runs, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_tiles_hold_every_pair_that_draws_and_few_others():
+    scene = make_scene(200, seed=9, scale=-2.5, spread=1.5)
+    view, K, w, h = make_camera(61, 43, cx=30.0, cy=20.0)
+    seen = project(*scene[:4], view, K, w, h)
+    tiles = intersect_tiles(
+        seen.means2d, seen.cov2d, seen.det, seen.opacities, seen.depths, torch.zeros_like(seen.ids), 1, w, h
+    )
+    listed = torch.zeros(tiles.rows * tiles.columns, len(seen.ids), dtype=torch.bool)
+    listed[torch.repeat_interleave(tiles.offsets.diff()), tiles.gaussians] = True
+    ys, xs = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+    offset = torch.stack([xs, ys], -1).reshape(-1, 1, 2) + 0.5 - seen.means2d
+    a, b, c = seen.conics.unbind(-1)
+    power = a * offset[..., 0] ** 2 + 2 * b * offset[..., 0] * offset[..., 1] + c * offset[..., 1] ** 2
+    drawn = seen.opacities * torch.exp(-0.5 * power) >= 1 / 255  # [pixels, M]
+    tile = ((ys // 8) * tiles.columns + xs // 8).reshape(-1)
+    needed = torch.zeros_like(listed)
+    for t in range(len(listed)):
+        needed[t] = drawn[tile == t].any(0)
+    assert not (needed & ~listed).any()
+    # an ellipse may slip between pixel centres, so a few pairs more than needed are right
+    assert listed.sum() <= 1.1 * needed.sum()
+    for t in range(len(listed)):
+        depths = seen.depths[tiles.gaussians[tiles.offsets[t] : tiles.offsets[t + 1]]]
+        assert (depths.diff() >= 0).all()
+
+
+@pytest.mark.parametrize(
+    "change",
+    ["needles", "zero quaternion", "flat axis", "opaque stack", "at the camera", "far from the origin", "huge", "tiny"],
+)
+def test_extremes_are_finite_and_float32_follows_float64(change):
+    means, quats, scales, opacities, sh = make_scene(80, seed=11, scale=-2.5)
+    view, K, w, h = make_camera()
+    tolerance = 1e-4
+    if change == "needles":
+        scales[:, 0], scales[:, 1:] = 3.0, 3e-6
+        tolerance = 5e-3  # the pixel position of a needle's edge, known to 1e-5 of a pixel, times its slope
+    elif change == "zero quaternion":
+        quats[::2] = 0
+    elif change == "flat axis":
+        scales[:, 2] = 0
+    elif change == "opaque stack":
+        opacities[:] = 1.0
+        means[:40] = means[0]
+    elif change == "at the camera":
+        centre = -view[:3, :3].T @ view[:3, 3]
+        means[::4] = centre + means[::4] * 1e-3
+        scales[::5] = 100.0
+        tolerance = 5e-3  # ordering of Gaussians a millimetre from the lens
+    elif change == "far from the origin":
+        shift = torch.tensor([65536.0, -131072.0, 32768.0], dtype=F64)
+        means = means.float().double() * 64
+        scales = scales * 64
+        means = (means + shift).float().double()
+        view[:3, 3] = view[:3, 3] * 64 - view[:3, :3] @ shift
+        tolerance = 0.05  # float32 holds positions at 1e5 to 0.008 units: a hundredth of a pixel here
+    elif change in ("huge", "tiny"):
+        factor = 1e6 if change == "huge" else 1e-6
+        means, scales, view = means * factor, scales * factor, view.clone()
+        view[:3, 3] *= factor
+    results = []
+    for dtype in (torch.float32, F64):
+        scene = leaves(t.to(dtype) for t in (means, quats, scales, opacities, sh))
+        near = 1e-8 if change == "tiny" else 0.01
+        image, alpha, _ = rasterization(
+            *scene, view[None].to(dtype), K[None].to(dtype), w, h, sh_degree=3, near_plane=near
+        )
+        grads = torch.autograd.grad(image.sum() + alpha.sum(), scene)
+        assert image.isfinite().all() and all(g.isfinite().all() for g in grads)
+        results.append(image.double())
+    difference = (results[0] - results[1]).abs()
+    # a pixel at a threshold (1/255 or 1e-4) may fall on either side: at most 1 % of them, by at most 1/255 or so
+    assert (difference > tolerance).double().mean() < 0.01
+    assert difference.max() < 0.1
+
+
+def test_rows_that_are_not_finite_are_not_drawn_and_do_not_spoil_the_rest():
+    scene = make_scene(40, seed=12)
+    view, K, w, h = make_camera()
+    clean, _, _ = rasterization(*scene, view[None], K[None], w, h, sh_degree=1)
+    bad = [torch.cat([t, t[:4]]) for t in scene]
+    bad[0][40, 0] = torch.nan
+    bad[1][41, 2] = torch.inf
+    bad[2][42, 1] = torch.inf
+    bad[3][43] = torch.nan
+    bad = leaves(bad)
+    image, _, _ = rasterization(*bad, view[None], K[None], w, h, sh_degree=1)
+    torch.testing.assert_close(image, clean, rtol=0, atol=1e-12)
+    for grad in torch.autograd.grad(image.sum(), bad):
+        assert grad.isfinite().all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_input_is_computed_in_float32(dtype):
+    scene = make_scene(20, dtype=dtype)
+    view, K, w, h = make_camera(dtype=torch.float32)
+    image, _, _ = rasterization(*scene, view[None], K[None], w, h, sh_degree=1)
+    want, _, _ = rasterization(*[t.float() for t in scene], view[None], K[None], w, h, sh_degree=1)
+    assert image.dtype == torch.float32 and torch.equal(image, want)
+
+
+@pytest.mark.parametrize(
+    "change,message",
+    [
+        (dict(means=torch.zeros(3, 2)), r"means has shape \(3, 2\)"),
+        (dict(opacities=torch.zeros(4)), r"opacities has shape \(4,\); expected \(3,\)"),
+        (dict(width=0), "0 x 8 pixels"),
+        (dict(render_mode="depth"), "render_mode is 'depth'"),
+        (dict(colors=torch.zeros(3, 4, 3), sh_degree=3), "4 SH coefficients given; degree 3 needs 16"),
+    ],
+)
+def test_wrong_arguments_say_what_was_got_and_wanted(change, message):
+    view, K, _, _ = make_camera(dtype=torch.float32)
+    args = dict(
+        means=torch.tensor([[0.0, 0, 3]] * 3), quats=torch.ones(3, 4), scales=torch.ones(3, 3),
+        opacities=torch.ones(3), colors=torch.ones(3, 3), viewmats=view[None], Ks=K[None], width=8, height=8,
+    )  # fmt: skip
+    with pytest.raises(ValueError, match=message):
+        rasterization(**{**args, **change})
