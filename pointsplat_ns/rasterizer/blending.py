@@ -63,7 +63,7 @@ class _Shape(NamedTuple):
     log_opacity: Tensor
 
     @classmethod
-    def of(cls, means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> "_Shape":
+    def of(cls, means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> _Shape:
         xx, xy, yy = cov2d.unbind(-1)
         return cls(means2d[:, 0], means2d[:, 1], yy / det, xy / yy, 1.0 / yy, opacities.log())
 

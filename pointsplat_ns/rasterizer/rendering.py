@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Optional
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -39,7 +39,7 @@ def _check(means, quats, scales, opacities, colors, viewmats, Ks, width, height,
         raise ValueError(f"backgrounds has shape {tuple(backgrounds.shape)}; expected ({c}, channels)")
 
 
-def _colors_of(seen: Projected, colors: Tensor, camera: int, per_camera: bool, sh_degree: Optional[int]) -> Tensor:
+def _colors_of(seen: Projected, colors: Tensor, camera: int, per_camera: bool, sh_degree: int | None) -> Tensor:
     colors = (colors[camera] if per_camera else colors).index_select(0, seen.ids)
     return colors if sh_degree is None else sh_to_color(seen.directions, colors, sh_degree)
 
@@ -58,10 +58,10 @@ def rasterization(
     far_plane: float = 1e10,
     radius_clip: float = 0.0,
     eps2d: float = EPS2D,
-    sh_degree: Optional[int] = None,
+    sh_degree: int | None = None,
     packed: bool = True,
     tile_size: int = TILE,
-    backgrounds: Optional[Tensor] = None,
+    backgrounds: Tensor | None = None,
     render_mode: RenderMode = "RGB",
     sparse_grad: bool = False,
     absgrad: bool = False,

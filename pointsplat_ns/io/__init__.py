@@ -1,0 +1,25 @@
+"""Readers and writers of Gaussian scenes, one file per format.
+
+Every reader returns a :class:`~pointsplat_ns.gaussians.Gaussians` and raises
+:class:`~pointsplat_ns.errors.SceneError` with one line that names the file and the fault.
+"""
+
+from pointsplat_ns.io.ply import read_ply, write_ply
+from pointsplat_ns.io.runs import Run, find_runs, open_run, scene_name, scene_names
+from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
+from pointsplat_ns.io.scene import read_scene, write_scene
+from pointsplat_ns.io.splatfacto import read_checkpoint
+
+__all__ = [
+    "Run",
+    "allow_splatfacto_checkpoints",
+    "find_runs",
+    "open_run",
+    "read_checkpoint",
+    "read_ply",
+    "read_scene",
+    "scene_name",
+    "scene_names",
+    "write_ply",
+    "write_scene",
+]

@@ -1,0 +1,77 @@
+"""What every reader and writer does with a path."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import Gaussians
+
+logger = logging.getLogger("pointsplat_ns")
+
+
+def require_file(path: Path | str, what: str) -> Path:
+    """``path`` as a Path, if it names a regular file.
+
+    Args:
+        path: the file.
+        what: what it should be, for the error ("a 3DGS PLY file").
+
+    Raises:
+        SceneError: if there is nothing, or a folder or a pipe, at ``path``.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise SceneError(f"{path}: no such file; expected {what}")
+    if not path.is_file():
+        raise SceneError(f"{path}: not a regular file; expected {what}")
+    return path
+
+
+def one_line(error: BaseException, limit: int = 160) -> str:
+    """The first line of an exception's text, at most ``limit`` characters; its type where it has none."""
+    lines = str(error).strip().splitlines()
+    text = lines[0].strip() if lines else type(error).__name__
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+@contextmanager
+def replacing(path: Path | str) -> Iterator[Path]:
+    """A path beside ``path`` to write to; it becomes ``path`` when the block ends well, else it is removed.
+
+    Missing parent folders are created.
+
+    Raises:
+        SceneError: if ``path`` is a folder or cannot be written.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise SceneError(f"{path}: is a folder; expected the name of a file to write")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+        os.replace(part, path)
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be written ({error.strerror or one_line(error)})") from error
+    finally:
+        if part.parent.is_dir():
+            part.unlink(missing_ok=True)
+
+
+def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:
+    """``scene`` without the Gaussians that cannot be drawn; says on the log how many those were.
+
+    Opacity logits of +-Inf and log-scales of -Inf have a meaning and stay
+    (see :meth:`~pointsplat_ns.gaussians.Gaussians.usable`).
+    """
+    usable = scene.usable()
+    dropped = len(scene) - int(usable.sum())
+    if not dropped:
+        return scene
+    logger.warning("%s: dropped %d of %d Gaussians with NaN or infinite values", path, dropped, len(scene))
+    return scene[usable]

@@ -1,0 +1,106 @@
+"""Reads nerfstudio's ``config.yml`` without running it.
+
+nerfstudio saves its configuration as a YAML of pickled Python objects; the ordinary way to load one
+imports and calls whatever the file names. Here a tag such as ``!!python/object:pkg.Class`` becomes an
+inert :class:`Tagged` value, paths become :class:`pathlib.Path` and tuples become tuples. Nothing is
+imported, nothing is called.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path, PureWindowsPath
+from typing import Any
+
+import yaml
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.io.files import one_line, require_file
+
+MAX_BYTES = 1 << 20
+"""A nerfstudio configuration has about 10 kB."""
+
+
+@dataclass(frozen=True)
+class Tagged:
+    """A value that the file says to build with Python code, left unbuilt."""
+
+    tag: str
+    """What would have been built: the dotted name of a class or function."""
+    value: Any
+    """The plain fields or arguments; None for a bare name."""
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The value as a dictionary of fields; empty where it is something else."""
+        return self.value if isinstance(self.value, dict) else {}
+
+
+class _Loader(yaml.SafeLoader):
+    """``SafeLoader`` that also knows YAML's Python tags, as inert values."""
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Refuse merge keys: nested ones grow exponentially, and nerfstudio writes none."""
+        if any(key.tag == "tag:yaml.org,2002:merge" for key, _ in node.value):
+            raise yaml.constructor.ConstructorError(None, None, "merge keys are not supported", node.start_mark)
+
+
+def read_config(path: Path | str) -> Tagged:
+    """Read a ``config.yml``.
+
+    Aliases share one value and so cannot be used to fill the memory.
+
+    Returns:
+        The configuration object at the root of the file.
+
+    Raises:
+        SceneError: if it is not YAML, too big, too deep, or has no Python object at its root.
+    """
+    path = require_file(path, "nerfstudio's config.yml")
+    size = path.stat().st_size
+    if size > MAX_BYTES:
+        raise SceneError(f"{path}: {size} bytes; expected a nerfstudio config.yml of at most {MAX_BYTES}")
+    try:
+        root = yaml.load(path.read_text("utf-8"), Loader=_Loader)
+    except yaml.MarkedYAMLError as error:
+        line = f" at line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise SceneError(f"{path}: not a nerfstudio config.yml ({error.problem or 'not YAML'}{line})") from error
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError, OSError) as error:
+        raise SceneError(f"{path}: not a nerfstudio config.yml ({one_line(error, 100)})") from error
+    if not isinstance(root, Tagged) or not root.fields:
+        raise SceneError(f"{path}: not a nerfstudio config.yml; expected a saved trainer configuration")
+    return root
+
+
+def _python(loader: _Loader, suffix: str, node: yaml.Node) -> Any:
+    """The inert value of a tag ``!!python/<suffix>``."""
+    kind, _, name = suffix.partition(":")
+    if kind in ("str", "unicode") and isinstance(node, yaml.ScalarNode):
+        return node.value
+    value = _plain(loader, node)
+    if kind == "tuple" and isinstance(value, list):
+        return tuple(value)
+    if kind in ("list", "dict", "none", "bool", "int", "long", "float") and not name:
+        return value
+    if kind.startswith("object/") and name.startswith("pathlib") and _all_text(value):
+        parts = [PureWindowsPath(part).as_posix() for part in value] if "Windows" in name else value
+        return Path(*parts)
+    return Tagged(name or kind, None if kind == "name" else value)
+
+
+def _plain(loader: _Loader, node: yaml.Node) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        return loader.construct_mapping(node, deep=True)
+    if isinstance(node, yaml.SequenceNode):
+        return loader.construct_sequence(node, deep=True)
+    return loader.construct_object(
+        yaml.ScalarNode(loader.resolve(yaml.ScalarNode, node.value, (True, False)), node.value)
+    )
+
+
+def _all_text(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(part, str) for part in value)
+
+
+_Loader.add_multi_constructor("tag:yaml.org,2002:python/", _python)
+_Loader.add_multi_constructor("!", lambda loader, suffix, node: Tagged(f"!{suffix}", _plain(loader, node)))

@@ -1,0 +1,211 @@
+"""3DGS PLY files: the format that viewers of Gaussian scenes exchange.
+
+One ``vertex`` per Gaussian with the properties ``x y z nx ny nz f_dc_0..2 f_rest_0..(3K-1) opacity
+scale_0..2 rot_0..3``, in Splatfacto's own parametrisation. ``f_rest`` is channel-major: all K
+coefficients of red, then green, then blue. Normals carry nothing and are written as zeros.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
+from pointsplat_ns.io.files import keep_usable, one_line, replacing, require_file
+from pointsplat_ns.io.ply_header import Element, Header, read_header
+
+CHUNK_ROWS = 16384
+"""Rows read at a time, about 4 MB: columns are then gathered out of the processor's cache."""
+
+_MEANS = ["x", "y", "z"]
+_NORMALS = ["nx", "ny", "nz"]
+_DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
+_OPACITY = ["opacity"]
+_SCALES = ["scale_0", "scale_1", "scale_2"]
+_QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
+
+
+def read_ply(path: Path | str) -> Gaussians:
+    """Read a 3DGS PLY: binary of either byte order, or ASCII; properties in any order and of any type.
+
+    The SH degree follows from the number of ``f_rest`` properties. Other properties and elements are
+    ignored. Gaussians with NaN, or with Inf where it has no meaning, are dropped and counted on the
+    log; all-zero rows stay (a zero quaternion is the identity).
+
+    Args:
+        path: the file.
+
+    Returns:
+        The scene, float32 on the CPU.
+
+    Raises:
+        SceneError: if the file is not a PLY, is truncated, or lacks a property.
+    """
+    path = require_file(path, "a 3DGS PLY file")
+    try:
+        with path.open("rb") as stream:
+            header = read_header(stream, path)
+            vertex = _gaussian_element(header, path)
+            names = _wanted(vertex, path)
+            blocks = (_binary if header.order else _ascii)(stream, header, vertex, names, path)
+            table = np.empty((vertex.count, len(names)), np.float32)
+            row = 0
+            for block in blocks:
+                table[row : row + len(block)] = block
+                row += len(block)
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
+    return keep_usable(_scene(torch.from_numpy(table)), path)
+
+
+def write_ply(scene: Gaussians, path: Path | str) -> None:
+    """Write ``scene`` as a 3DGS PLY: binary little endian, float32, the reference's property order.
+
+    A float32 scene that :func:`read_ply` reads back is the same to the bit. Gaussians with NaN, or
+    with Inf where it has no meaning, are left out and counted on the log. The file appears whole
+    or not at all.
+
+    Raises:
+        SceneError: if ``path`` cannot be written.
+    """
+    from plyfile import PlyData, PlyElement
+
+    scene = keep_usable(scene.detach().to("cpu", torch.float32), path)
+    rest = scene.features_rest.transpose(1, 2).reshape(len(scene), 3 * scene.features_rest.shape[1])
+    columns: list[tuple[list[str], Tensor]] = [
+        (_MEANS, scene.means),
+        (_NORMALS, torch.zeros_like(scene.means)),
+        (_DC, scene.features_dc),
+        (_rest_names(rest.shape[1]), rest),
+        (_OPACITY, scene.opacities),
+        (_SCALES, scene.scales),
+        (_QUATS, scene.quats),
+    ]
+    names = [name for group, _ in columns for name in group]
+    table = torch.cat([values for _, values in columns], dim=1).numpy().astype("<f4", copy=False)
+    rows = np.ascontiguousarray(table).view([(name, "<f4") for name in names]).reshape(len(scene))
+    with replacing(path) as part:
+        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(part))
+
+
+def _rest_names(count: int) -> list[str]:
+    return [f"f_rest_{i}" for i in range(count)]
+
+
+def _gaussian_element(header: Header, path: Path) -> Element:
+    """The element that holds the Gaussians, its declared count checked against the bytes in the file."""
+    found = {element.name: element for element in header.elements}
+    vertex = found.get("vertex")
+    if vertex is None:
+        raise SceneError(f"{path}: PLY has no element 'vertex' (found {', '.join(found) or 'none'})")
+    if vertex.has_list:
+        bad = next(name for name, kind in vertex.properties if kind == "list")
+        raise SceneError(f"{path}: vertex property {bad!r} is a list; expected a number per Gaussian")
+    before = header.before("vertex")
+    listed = next((element.name for element in before if element.has_list), None)
+    if listed is not None and header.order:
+        raise SceneError(f"{path}: element {listed!r} of lists stands before 'vertex'; expected 'vertex' first")
+    available = path.stat().st_size - header.size - sum(_least_bytes(element, header) for element in before)
+    row = _least_bytes(Element("vertex", 1, vertex.properties), header)
+    if vertex.properties and vertex.count * row > available:
+        whole = max(available, 0) // row
+        held = f"at most {whole}" if not header.order else f"{whole}"
+        raise SceneError(
+            f"{path}: truncated; the header declares {vertex.count} Gaussians of {row} bytes, the file holds {held}"
+        )
+    return vertex
+
+
+def _least_bytes(element: Element, header: Header) -> int:
+    """Bytes that an element takes at least: exact in binary; a digit and a separator a number in ASCII."""
+    if header.order:
+        return element.count * element.dtype(header.order).itemsize
+    # The last line of a file needs no newline.
+    return max(element.count * 2 * len(element.properties) - 1, 0)
+
+
+def _wanted(vertex: Element, path: Path) -> list[str]:
+    """Names of the properties of a Gaussian in the order x, dc, rest, opacity, scale, rot."""
+    present = {name for name, _ in vertex.properties}
+    if "packed_position" in present:
+        raise SceneError(f"{path}: a compressed PLY (property 'packed_position'); export it uncompressed")
+    rest = sorted(int(name[7:]) for name in present if re.fullmatch(r"f_rest_(0|[1-9]\d{0,5})", name))
+    required = [*_MEANS, *_DC, *_OPACITY, *_SCALES, *_QUATS]
+    counts = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1)]
+    if rest and rest[-1] + 1 in counts:
+        required += _rest_names(rest[-1] + 1)
+    missing = [name for name in required if name not in present]
+    if missing:
+        others = f" and {len(missing) - 1} more ({', '.join(missing[1:4])}...)" if len(missing) > 1 else ""
+        raise SceneError(f"{path}: lacks the vertex property {missing[0]!r}{others}; expected a 3DGS PLY")
+    if len(rest) not in counts:
+        raise SceneError(
+            f"{path}: has {len(rest)} f_rest properties; expected {', '.join(map(str, counts[:-1]))} or {counts[-1]} "
+            f"(SH degree 0 to {MAX_SH_DEGREE})"
+        )
+    return [*_MEANS, *_DC, *_rest_names(len(rest)), *_OPACITY, *_SCALES, *_QUATS]
+
+
+def _binary(stream: BinaryIO, header: Header, vertex: Element, names: list[str], path: Path) -> Iterator[np.ndarray]:
+    """Blocks of rows (R, len(names)) float32 of a binary file."""
+    dtype = vertex.dtype(header.order)
+    order = [name for name, _ in vertex.properties]
+    columns = [order.index(name) for name in names]
+    uniform = all(kind == "f4" for _, kind in vertex.properties)
+    stream.seek(
+        header.size + sum(element.count * element.dtype(header.order).itemsize for element in header.before("vertex"))
+    )
+    for start in range(0, vertex.count, CHUNK_ROWS):
+        want = min(CHUNK_ROWS, vertex.count - start)
+        data = stream.read(want * dtype.itemsize)
+        if len(data) < want * dtype.itemsize:
+            raise SceneError(f"{path}: truncated while it was read, at Gaussian {start + len(data) // dtype.itemsize}")
+        if uniform:
+            yield np.frombuffer(data, header.order + "f4").reshape(want, len(order))[:, columns]
+            continue
+        rows = np.frombuffer(data, dtype)
+        with np.errstate(over="ignore"):  # a double beyond float32 becomes Inf and is dropped with the others
+            yield np.stack([rows[name].astype(np.float32) for name in names], axis=1)
+
+
+def _ascii(stream: BinaryIO, header: Header, vertex: Element, names: list[str], path: Path) -> Iterator[np.ndarray]:
+    """Blocks of rows (R, len(names)) float32 of an ASCII file."""
+    order = [name for name, _ in vertex.properties]
+    columns = [order.index(name) for name in names]
+    stream.seek(header.size)
+    for element in header.before("vertex"):
+        for _ in range(element.count):
+            if not stream.readline():
+                raise SceneError(f"{path}: truncated in element {element.name!r}, before the Gaussians")
+    for start in range(0, vertex.count, CHUNK_ROWS):
+        block = []
+        for number in range(start, min(start + CHUNK_ROWS, vertex.count)):
+            line = stream.readline()
+            if not line:
+                raise SceneError(
+                    f"{path}: truncated; the header declares {vertex.count} Gaussians, the file holds {number}"
+                )
+            words = line.split()
+            if len(words) != len(order):
+                raise SceneError(f"{path}: Gaussian {number} has {len(words)} numbers; expected {len(order)}")
+            try:
+                block.append([float(words[column]) for column in columns])
+            except ValueError as error:
+                raise SceneError(f"{path}: Gaussian {number} is not all numbers ({one_line(error, 80)})") from error
+        with np.errstate(over="ignore"):
+            yield np.array(block, np.float64).astype(np.float32)
+
+
+def _scene(table: Tensor) -> Gaussians:
+    """A scene from columns x, dc, rest, opacity, scale, rot: (N, 14 + 3K) to Gaussians of K coefficients."""
+    n, k = table.shape[0], (table.shape[1] - 14) // 3
+    means, dc, rest, opacities, scales, quats = table.split([3, 3, 3 * k, 1, 3, 4], dim=1)
+    rest = rest.reshape(n, 3, k).transpose(1, 2)
+    return Gaussians(*(value.contiguous() for value in (means, scales, quats, opacities, dc, rest)))

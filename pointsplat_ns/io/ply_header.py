@@ -1,0 +1,117 @@
+"""The header of a PLY file, read with bounds and checked against the file's size.
+
+A header is a promise about what follows. Here it is parsed before anything is allocated for it, so
+that a damaged or hostile one (a count of 10^15, a header without an end) costs nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from pointsplat_ns.errors import SceneError
+
+MAX_HEADER_BYTES = 1 << 20
+"""A 3DGS header has about 1.5 kB; comments may make it longer, but not by a thousandfold."""
+
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
+    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(frozen=True)
+class Element:
+    """One element of a PLY file."""
+
+    name: str
+    count: int
+    properties: tuple[tuple[str, str], ...]
+    """``(name, numpy type)`` in the file's order; the type of a list is ``"list"``."""
+
+    @property
+    def has_list(self) -> bool:
+        return any(kind == "list" for _, kind in self.properties)
+
+    def dtype(self, order: str) -> np.dtype:
+        """Layout of one binary row; ``order`` is ``"<"`` or ``">"``. Only without list properties."""
+        return np.dtype([(name, order + kind) for name, kind in self.properties])
+
+
+@dataclass(frozen=True)
+class Header:
+    """A parsed PLY header."""
+
+    order: str
+    """``"<"``, ``">"`` or, for an ASCII file, the empty string."""
+    elements: tuple[Element, ...]
+    size: int
+    """Bytes of the header: where the data starts."""
+
+    def before(self, name: str) -> tuple[Element, ...]:
+        """The elements that precede the one called ``name``."""
+        return self.elements[: [element.name for element in self.elements].index(name)]
+
+
+def read_header(stream: BinaryIO, path: Path) -> Header:
+    """Parse the header at the start of ``stream``, which is left at an unspecified position.
+
+    Raises:
+        SceneError: if it is no PLY header, has no end, or declares something that PLY does not know.
+    """
+    text, size = _header_text(stream, path)
+    order: str | None = None
+    elements: list[tuple[str, int, list[tuple[str, str]]]] = []
+    for number, line in enumerate(text[1:], start=2):
+        words = line.split()
+        keyword = words[0] if words else ""
+        if keyword in ("", "comment", "obj_info"):
+            continue
+        if keyword == "format" and len(words) == 3 and words[1] in _ORDERS and words[2] == "1.0":
+            order = _ORDERS[words[1]]
+        elif keyword == "element" and len(words) == 3 and words[2].isascii() and words[2].isdigit():
+            # A number of over 18 digits exceeds every file; cut short, it still does.
+            elements.append((words[1], int(words[2][:19]), []))
+        elif keyword == "property" and elements and len(words) == 3 and words[1] in _TYPES:
+            elements[-1][2].append((words[2], _TYPES[words[1]]))
+        elif keyword == "property" and elements and len(words) == 5 and words[1] == "list":
+            elements[-1][2].append((words[4], "list"))
+        else:
+            raise SceneError(f"{path}: PLY header line {number} is not understood: {line[:80]!r}")
+    if order is None:
+        raise SceneError(f"{path}: PLY header names no format; expected ascii, binary_little_endian or _big_endian")
+    _reject_duplicates([name for name, _, _ in elements], "element", path)
+    for name, _, properties in elements:
+        _reject_duplicates([prop for prop, _ in properties], f"{name} property", path)
+    return Header(order, tuple(Element(name, count, tuple(props)) for name, count, props in elements), size)
+
+
+def _header_text(stream: BinaryIO, path: Path) -> tuple[list[str], int]:
+    """Lines of the header up to ``end_header``, and the number of bytes they take."""
+    start = stream.read(MAX_HEADER_BYTES)
+    if start[:4] not in (b"ply\n", b"ply\r"):
+        raise SceneError(f"{path}: not a PLY file (starts with {start[:4]!r}); expected the line 'ply'")
+    newline = b"\n" if start[3:4] == b"\n" else b"\r\n" if start[4:5] == b"\n" else b"\r"
+    end = start.find(newline + b"end_header" + newline)
+    if end < 0:
+        # The newline after end_header may be missing where nothing follows.
+        if not start.endswith(newline + b"end_header"):
+            why = "is truncated" if len(start) < MAX_HEADER_BYTES else f"is longer than {MAX_HEADER_BYTES} bytes"
+            raise SceneError(f"{path}: PLY header {why}; no line 'end_header' found")
+        end = len(start) - len(newline) - len(b"end_header")
+    size = min(end + 2 * len(newline) + len(b"end_header"), len(start))
+    return start[:end].decode("latin-1").split(newline.decode()), size
+
+
+def _reject_duplicates(names: list[str], what: str, path: Path) -> None:
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise SceneError(f"{path}: PLY header declares {what} {name!r} twice")
+        seen.add(name)

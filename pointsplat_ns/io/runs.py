@@ -1,0 +1,286 @@
+"""Trained nerfstudio runs: where the scene, its photos and its frame are.
+
+nerfstudio lays a run out as ``outputs/EXPERIMENT/METHOD/TIMESTAMP`` with ``config.yml``,
+``dataparser_transforms.json`` and ``nerfstudio_models/step-*.ckpt``. Everything is read without
+importing nerfstudio and without running what ``config.yml`` names.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.io.files import logger, one_line
+from pointsplat_ns.io.inert_yaml import Tagged, read_config
+from pointsplat_ns.io.splatfacto import is_complete
+
+CONFIG_NAME = "config.yml"
+TRANSFORMS_NAME = "dataparser_transforms.json"
+CHECKPOINT_FOLDER = "nerfstudio_models"
+
+_SPLATFACTO_FIELDS = {"sh_degree", "densify_grad_thresh", "rasterize_mode"}
+"""Model settings that only Splatfacto and what derives from it have."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A trained nerfstudio run. Settings are as ``config.yml`` has them; nested objects in them are
+    :class:`~pointsplat_ns.io.inert_yaml.Tagged`."""
+
+    folder: Path
+    config_path: Path
+    checkpoint: Path
+    """The newest complete checkpoint, or the one that was asked for."""
+    step: int
+    method_name: str
+    experiment_name: str
+    """As configured; empty or "unnamed" where the user gave none."""
+    timestamp: str
+    data: Path
+    """What the run was trained on: found on this machine if :func:`open_run` was asked to find it,
+    as configured otherwise."""
+    dataparser_class: str
+    """Dotted name of the dataparser's configuration class."""
+    dataparser_fields: dict[str, Any]
+    datamanager_fields: dict[str, Any]
+    model_class: str
+    """Dotted name of the model's configuration class."""
+    model_fields: dict[str, Any]
+    transform: Tensor  # [3, 4] float32, data world to scene, before the scale
+    scale: float
+    """Scene units per unit of the transformed data."""
+
+    @property
+    def is_gaussian_scene(self) -> bool:
+        """Whether the checkpoint holds one Gaussian scene: Splatfacto or a method derived from it."""
+        if self.method_name == "pointsplat":  # a refiner for many scenes, whatever its settings are called
+            return False
+        return self.method_name.startswith("splatfacto") or self.model_fields.keys() >= _SPLATFACTO_FIELDS
+
+
+def open_run(path: Path | str, need_data: bool = True) -> Run:
+    """The run at ``path``.
+
+    Args:
+        path: the run's folder, its ``config.yml``, or one of its checkpoints (which is then the one used).
+        need_data: look for the data the run was trained on. A relative path is tried from the current
+            folder, then from the run's folder and every folder above it.
+
+    Raises:
+        SceneError: if it is no run, has no complete checkpoint, or its data is needed and not found.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise SceneError(f"{path}: no such file or folder; expected a nerfstudio run")
+    chosen = path if path.suffix == ".ckpt" else None
+    folder = path if path.is_dir() else path.parent
+    if chosen is not None and not (folder / CONFIG_NAME).is_file():
+        folder = folder.parent
+    config_path = path if path.is_file() and chosen is None else folder / CONFIG_NAME
+    if not config_path.is_file():
+        raise SceneError(f"{path}: not a nerfstudio run; expected a folder with {CONFIG_NAME} (no {config_path})")
+    root = read_config(config_path)
+    pipeline = _tagged(root, "pipeline", config_path)
+    datamanager = _tagged(pipeline, "datamanager", config_path)
+    model = _tagged(pipeline, "model", config_path)
+    # Some methods keep their data elsewhere than in a dataparser; they are runs, if not Gaussian scenes.
+    dataparser = datamanager.fields.get("dataparser")
+    dataparser = dataparser if isinstance(dataparser, Tagged) else Tagged("", {})
+    checkpoint, step = _checkpoint(folder, root.fields.get("relative_model_dir"), chosen)
+    candidates = (datamanager.fields.get("data"), dataparser.fields.get("data"), root.fields.get("data"))
+    data = next((Path(value) for value in candidates if isinstance(value, (str, Path)) and str(value) != "."), None)
+    if data is None:
+        if need_data:
+            raise SceneError(f"{config_path}: names no data folder; expected the photos that the run was trained on")
+        data = Path()
+    transform, scale = _transforms(folder / TRANSFORMS_NAME)
+    return Run(
+        folder=folder,
+        config_path=config_path,
+        checkpoint=checkpoint,
+        step=step,
+        method_name=str(root.fields.get("method_name") or ""),
+        experiment_name=str(root.fields.get("experiment_name") or ""),
+        timestamp=str(root.fields.get("timestamp") or ""),
+        data=_find_data(data, folder, config_path) if need_data else data,
+        dataparser_class=dataparser.tag,
+        dataparser_fields=_settings(dataparser, "data"),
+        datamanager_fields=_settings(datamanager, "data", "dataparser"),
+        model_class=model.tag,
+        model_fields=_settings(model),
+        transform=transform,
+        scale=scale,
+    )
+
+
+def find_runs(folder: Path | str, need_data: bool = True) -> list[Run]:
+    """Every Gaussian scene trained below ``folder``: the newest run of each experiment that has a
+    complete checkpoint, sorted by experiment name.
+
+    Runs of other methods, and runs without a complete checkpoint, are passed over.
+
+    Args:
+        folder: a run, or any folder above some.
+        need_data: as for :func:`open_run`.
+
+    Raises:
+        SceneError: if there is none, or if the data of one is needed and not found.
+    """
+    folder = Path(folder)
+    if not folder.exists():
+        raise SceneError(f"{folder}: no such folder; expected one with trained nerfstudio runs in it")
+    if not folder.is_dir() or (folder / CONFIG_NAME).is_file():
+        return [open_run(folder, need_data)]
+    newest: dict[Path, Run] = {}
+    passed: list[str] = []
+    for place in _run_folders(folder):
+        try:
+            run = open_run(place, need_data=False)
+        except SceneError as error:
+            passed.append(str(error))
+            logger.warning("passed over: %s", error)
+            continue
+        if not run.is_gaussian_scene:
+            passed.append(f"{run.folder}: method {run.method_name or 'unknown'}")
+            continue
+        key = _experiment_folder(run)
+        if key not in newest or _when(run) > _when(newest[key]):
+            newest[key] = run
+    if not newest:
+        seen = f"; passed over {len(passed)}, such as {passed[0]}" if passed else ""
+        raise SceneError(
+            f"{folder}: no trained Splatfacto run below it; expected EXPERIMENT/METHOD/TIME/{CONFIG_NAME}{seen}"
+        )
+    runs = sorted(newest.values(), key=lambda run: (scene_name(run), str(run.folder)))
+    return [open_run(run.folder, need_data) for run in runs] if need_data else runs
+
+
+def scene_name(run: Run) -> str:
+    """A short name for the scene, fit for a file: the experiment's, or its data's if it has none."""
+    name = run.experiment_name if run.experiment_name not in ("", "unnamed") else ""
+    data = run.data.parent if run.data.suffix else run.data
+    name = name or data.name or run.folder.name
+    return re.sub(r"[^\w.+-]+", "-", name).strip("-.") or "scene"
+
+
+def scene_names(runs: list[Run]) -> list[str]:
+    """:func:`scene_name` of each run, with ``-2``, ``-3``... added where two would be the same."""
+    names: list[str] = []
+    for run in runs:
+        base = name = scene_name(run)
+        count = 1
+        while name in names:
+            count += 1
+            name = f"{base}-{count}"
+        names.append(name)
+    return names
+
+
+def _run_folders(folder: Path) -> list[Path]:
+    """Folders below ``folder`` that hold a ``config.yml``, sorted; nothing is looked for inside one."""
+    found = []
+    for place, inner, files in os.walk(folder):
+        if CONFIG_NAME in files:
+            found.append(Path(place))
+            inner.clear()
+        inner[:] = sorted(name for name in inner if not name.startswith("."))
+    return found
+
+
+def _experiment_folder(run: Run) -> Path:
+    """What runs of one experiment have in common: the folder EXPERIMENT of EXPERIMENT/METHOD/TIMESTAMP.
+    A run that was moved out of that layout stands for itself."""
+    place = run.folder.resolve()
+    as_laid_out = (place.parent.name, place.name) == (run.method_name, run.timestamp)
+    return place.parents[1] if as_laid_out else place
+
+
+def _when(run: Run) -> tuple[float, int]:
+    """Sorts runs by age: nerfstudio's own timestamp, the checkpoint's where the user chose another name."""
+    try:
+        return datetime.strptime(run.timestamp, "%Y-%m-%d_%H%M%S").timestamp(), run.step
+    except ValueError:
+        return run.checkpoint.stat().st_mtime, run.step
+
+
+def _tagged(parent: Tagged, name: str, path: Path) -> Tagged:
+    value = parent.fields.get(name)
+    if not isinstance(value, Tagged):
+        raise SceneError(f"{path}: not a trainer configuration; lacks the object {name!r}")
+    return value
+
+
+def _settings(config: Tagged, *without: str) -> dict[str, Any]:
+    """Fields of a configuration object but for its ``_target`` and those named."""
+    return {key: value for key, value in config.fields.items() if not str(key).startswith("_") and key not in without}
+
+
+def _checkpoint(folder: Path, configured: Any, chosen: Path | None) -> tuple[Path, int]:
+    """The checkpoint to use and its step."""
+    if chosen is not None:
+        match = re.fullmatch(r"step-(\d{1,18})", chosen.stem)
+        return chosen, int(match[1]) if match else 0
+    inside = folder / configured if isinstance(configured, Path) and not configured.is_absolute() else None
+    place = inside if inside is not None and inside.is_dir() else folder / CHECKPOINT_FOLDER
+    steps = {}
+    for file in place.glob("step-*.ckpt"):
+        match = re.fullmatch(r"step-(\d{1,18})\.ckpt", file.name)
+        if match:
+            steps[int(match[1])] = file
+    for step in sorted(steps, reverse=True):
+        if is_complete(steps[step]):
+            return steps[step], step
+        logger.warning("%s: not a complete checkpoint; trying an older one", steps[step])
+    found = f"{len(steps)} incomplete" if steps else "none"
+    raise SceneError(
+        f"{folder}: no complete checkpoint in {place.name} ({found}); let the training reach its first save"
+    )
+
+
+def _find_data(data: Path, folder: Path, config_path: Path) -> Path:
+    """Where the configured data is on this machine."""
+    data = data.expanduser()
+    if data.is_absolute():
+        tried = [data]
+    else:
+        home = folder.resolve()
+        tried = list(dict.fromkeys([Path.cwd() / data, *(above / data for above in (home, *home.parents))]))
+    for candidate in tried:
+        if candidate.exists():
+            return candidate
+    places = ", ".join(map(str, tried[:3])) + (f" and {len(tried) - 3} more above" if len(tried) > 3 else "")
+    raise SceneError(
+        f"{config_path}: its data {data} is not there; tried {places}; "
+        "start from the folder where the run was trained, or put the data back"
+    )
+
+
+def _transforms(path: Path) -> tuple[Tensor, float]:
+    """The dataparser's transform (3, 4) and scale; the identity and 1 where the run saved none."""
+    if not path.is_file():
+        return torch.eye(4)[:3], 1.0
+    try:
+        content = json.loads(path.read_text("utf-8"))
+        transform = torch.tensor(content["transform"], dtype=torch.float32)
+        scale = float(content["scale"])
+    except (OSError, ValueError, TypeError, KeyError, RecursionError, RuntimeError) as error:
+        why = f"lacks {error}" if isinstance(error, KeyError) else one_line(error, 80)
+        raise SceneError(
+            f"{path}: not a dataparser transform ({why}); expected 'transform' (3 x 4) and 'scale'"
+        ) from error
+    if transform.shape != (3, 4) or not transform.isfinite().all() or not (math.isfinite(scale) and scale > 0):
+        raise SceneError(
+            f"{path}: transform of shape {tuple(transform.shape)}, scale {scale}; "
+            "expected 3 x 4 finite numbers and a positive scale"
+        )
+    return transform, scale

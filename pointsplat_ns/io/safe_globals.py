@@ -1,0 +1,39 @@
+"""Lets torch load Splatfacto checkpoints with ``weights_only=True``.
+
+torch 2.6 and later unpickle nothing but tensors and plain values unless told otherwise, while every
+Splatfacto checkpoint holds a numpy float64 scalar in the state of its schedulers. What is registered
+here rebuilds such a scalar from its bytes; none of it can run code from the file.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+
+def allow_splatfacto_checkpoints() -> None:
+    """Register numpy's float64 scalar with torch's ``weights_only`` loader.
+
+    Calling it again changes nothing. Where torch has no such register (before 2.4), it does nothing:
+    ``torch.load`` there defaults to ``weights_only=False``.
+    """
+    add = getattr(torch.serialization, "add_safe_globals", None)
+    if add is None:
+        return
+    try:
+        from numpy._core.multiarray import scalar  # numpy 2
+    except ImportError:
+        from numpy.core.multiarray import scalar  # numpy 1
+    allowed: list = [np.dtype, type(np.dtype(np.float64))]
+    if _torch_version() >= (2, 6):
+        # A checkpoint may come from the other major version of numpy, so both names stand for this function.
+        allowed += [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
+    else:
+        allowed.append(scalar)
+    present = torch.serialization.get_safe_globals()
+    add([entry for entry in allowed if entry not in present])
+
+
+def _torch_version() -> tuple[int, int]:
+    major, minor = torch.__version__.split(".")[:2]
+    return int(major), int("".join(c for c in minor if c.isdigit()) or 0)

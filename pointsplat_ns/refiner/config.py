@@ -1,0 +1,224 @@
+"""Sizes and switches of the refiner.
+
+One dataclass says everything that shapes the network, and three presets name the sizes in use:
+``full`` (the published one, for a GPU), ``small`` and ``tiny`` (for a CPU). All share all code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.gaussians import MAX_SH_DEGREE
+
+CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
+"""Space-filling curves that a stage may serialize its points along."""
+
+FINE_BITS = 16
+"""Bits per axis of the finest position code; every grid of the network is a coarsening of it."""
+
+
+class RefinerConfigError(PointSplatError, ValueError):
+    """A refiner configuration that describes no network."""
+
+
+@dataclass
+class RefinerConfig:
+    """Everything that shapes a refiner.
+
+    The defaults are the sizes of the preset ``full``. Tuples of the encoder have one entry per
+    stage; ``strides`` and the tuples of the decoder have one entry fewer, finest first.
+
+    Raises:
+        RefinerConfigError: if the fields contradict one another.
+    """
+
+    sh_degree: int = MAX_SH_DEGREE
+    """Highest SH degree that the network reads and repairs; scenes of a lower one are padded with zeros."""
+    encoder: Literal["dual", "concat"] = "dual"
+    """``dual`` gates geometry by appearance (paper eq. 4 to 6); ``concat`` is one concatenated vector (SplatFormer)."""
+    use_appearance: bool = True
+    """Gate the geometry by the appearance branch (Table 4, column f^(a)); dual encoder only."""
+    use_position: bool = True
+    """Add the position encoding to both branches (Table 4, column delta); dual encoder only."""
+    feature_dim: int = 32
+    """Channels of each encoder branch."""
+    unit_gate: bool = False
+    """Multiply the softmax gate by its number of channels, so that gates average 1 and not 1/32. The next layer could
+    learn the same factor; starting with it trains visibly faster."""
+    color_hidden: int = 32
+    """Hidden channels of the MLP that reduces the SH coefficients beyond the constant one."""
+    color_dim: int = 8
+    """Channels that those coefficients are reduced to."""
+    grid: int | None = 384
+    """Cells along the unit cube at the finest level (at most 512); None adapts the cell to the spacing of the scene."""
+    strides: tuple[int, ...] = (1, 2, 2, 2)
+    """Cell growth from stage to stage, powers of two; 1 only merges what shares a cell."""
+    enc_channels: tuple[int, ...] = (64, 96, 128, 256, 512)
+    """Channels of each encoder stage."""
+    enc_depths: tuple[int, ...] = (2, 2, 2, 4, 2)
+    """Blocks in each encoder stage."""
+    enc_heads: tuple[int, ...] = (2, 4, 8, 16, 32)
+    """Attention heads in each encoder stage."""
+    dec_channels: tuple[int, ...] = (96, 96, 128, 256)
+    """Channels of each decoder stage, finest first."""
+    dec_depths: tuple[int, ...] = (2, 2, 2, 2)
+    """Blocks in each decoder stage, finest first."""
+    dec_heads: tuple[int, ...] = (4, 4, 4, 4)
+    """Attention heads in each decoder stage, finest first."""
+    patch: int = 1024
+    """Points that attend to one another."""
+    mlp_ratio: int = 4
+    """Hidden width of a block's MLP over its channels."""
+    drop_path: float = 0.3
+    """Chance that the deepest block's branch is dropped for a point in training; shallower blocks drop less."""
+    curves: tuple[str, ...] = ("hilbert", "hilbert-trans", "z", "z-trans")
+    """Serialization curves; block i of a stage uses curve i (shuffled in training). Memory is laid out by the first."""
+    norm: Literal["batch", "layer"] = "batch"
+    """Normalisation outside the attention blocks. ``batch`` is the published one and learns faster; ``layer`` acts
+    alike in training and evaluation, where batch statistics of one scene and running ones differ a little."""
+    head_width: int = 128
+    """Hidden width of the output heads."""
+    head_depth: int = 4
+    """Linear layers of each output head."""
+    means_reach: float = 0.05
+    """Farthest that a mean may move along an axis, as a share of the scene's extent (1.0 in the published code)."""
+    scales_gain: float = 1.0
+    """Factor on the residual of the log-scales."""
+    quats_gain: float = 1.0
+    """Factor on the residual of the unit quaternions."""
+    opacities_gain: float = 1.0
+    """Factor on the residual of the opacity logits."""
+    features_dc_gain: float = 1.0
+    """Factor on the residual of the constant SH coefficient."""
+    features_rest_gain: float = 1.0
+    """Factor on the residual of the other SH coefficients."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, list):
+                setattr(self, field.name, tuple(value))
+        self._validate()
+
+    def _validate(self) -> None:
+        stages = len(self.enc_channels)
+        sizes = {"enc_depths": stages, "enc_heads": stages, "strides": stages - 1}
+        sizes.update({"dec_channels": stages - 1, "dec_depths": stages - 1, "dec_heads": stages - 1})
+        _require(stages >= 1, "enc_channels is empty; expected one entry per stage")
+        for name, size in sizes.items():
+            found = len(getattr(self, name))
+            _require(found == size, f"{name} has {found} entries; expected {size} for {stages} encoder stages")
+        for part in ("enc", "dec"):
+            channels, heads = getattr(self, f"{part}_channels"), getattr(self, f"{part}_heads")
+            for c, h in zip(channels, heads, strict=True):
+                _require(h > 0 and c > 0 and c % h == 0, f"{part}: {c} channels do not divide into {h} heads")
+        for s in self.strides:
+            _require(s > 0 and s & (s - 1) == 0, f"strides holds {s}; expected powers of two")
+        unknown = [c for c in self.curves if c not in CURVES]
+        _require(
+            bool(self.curves) and not unknown, f"curves is {self.curves}; expected names out of {', '.join(CURVES)}"
+        )
+        _require(0 <= self.sh_degree <= MAX_SH_DEGREE, f"sh_degree is {self.sh_degree}; expected 0 to {MAX_SH_DEGREE}")
+        _require(self.encoder in ("dual", "concat"), f"encoder is {self.encoder!r}; expected 'dual' or 'concat'")
+        _require(self.norm in ("batch", "layer"), f"norm is {self.norm!r}; expected 'batch' or 'layer'")
+        _require(self.grid is None or 1 <= self.grid <= 512, f"grid is {self.grid}; expected 1 to 512, or None")
+        _require(self.head_depth >= 2, f"head_depth is {self.head_depth}; expected at least 2")
+        _require(self.patch >= 1, f"patch is {self.patch}; expected at least 1")
+        _require(0 <= self.drop_path < 1, f"drop_path is {self.drop_path}; expected 0 to 1")
+
+    @property
+    def num_rest(self) -> int:
+        """SH coefficients a channel beyond the constant one."""
+        return (self.sh_degree + 1) ** 2 - 1
+
+    @property
+    def encoded_dim(self) -> int:
+        """Channels per Gaussian that leave the encoder."""
+        return 14 + 3 * self.num_rest if self.encoder == "concat" else self.feature_dim
+
+    @property
+    def backbone_dim(self) -> int:
+        """Channels per Gaussian that leave the backbone."""
+        return self.dec_channels[0] if self.dec_channels else self.enc_channels[0]
+
+    def to_dict(self) -> dict[str, Any]:
+        """All fields, JSON-ready."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> RefinerConfig:
+        """The inverse of :meth:`to_dict`.
+
+        Raises:
+            RefinerConfigError: if a field is unknown or the fields contradict one another.
+        """
+        known = {field.name for field in dataclasses.fields(cls)}
+        unknown = sorted(set(values) - known)
+        _require(not unknown, f"unknown refiner settings {', '.join(unknown)}; a newer version may have written them")
+        try:
+            return cls(**values)
+        except TypeError as error:
+            raise RefinerConfigError(f"refiner settings of the wrong type: {error}") from error
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise RefinerConfigError(message)
+
+
+def preset(name: str, **changes: Any) -> RefinerConfig:
+    """The configuration of a named size, with ``changes`` applied.
+
+    ``full``: the published sizes, 42,762,819 parameters.
+    ``small``: 2,414,339 parameters, grid adapted to the scene.
+    ``tiny``: 664,563 parameters, grid adapted to the scene.
+
+    Raises:
+        RefinerConfigError: if there is no such preset, or the changes do not fit it.
+
+    Example:
+        >>> preset("tiny", patch=64).patch
+        64
+    """
+    if name not in PRESETS:
+        raise RefinerConfigError(f"no refiner size {name!r}; expected one of {', '.join(PRESETS)}")
+    return RefinerConfig(**{**PRESETS[name], **changes})
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "full": {},
+    "small": {
+        "grid": None,
+        "strides": (2, 2, 2),
+        "enc_channels": (32, 64, 96, 96),
+        "enc_depths": (2, 2, 2, 2),
+        "enc_heads": (2, 4, 6, 6),
+        "dec_channels": (48, 64, 80),
+        "dec_depths": (1, 1, 1),
+        "dec_heads": (3, 4, 5),
+        "patch": 256,
+        "mlp_ratio": 2,
+        "drop_path": 0.0,
+        "unit_gate": True,
+        "head_width": 96,
+    },
+    "tiny": {
+        "grid": None,
+        "strides": (2, 2),
+        "enc_channels": (32, 48, 64),
+        "enc_depths": (1, 1, 2),
+        "enc_heads": (2, 3, 4),
+        "dec_channels": (32, 48),
+        "dec_depths": (1, 1),
+        "dec_heads": (2, 3),
+        "patch": 128,
+        "mlp_ratio": 2,
+        "drop_path": 0.0,
+        "unit_gate": True,
+        "head_width": 64,
+    },
+}
+"""What each size changes of the defaults of :class:`RefinerConfig`."""

@@ -1,0 +1,96 @@
+"""The dual-branch encoder (paper eq. 4 to 6), its ablations, and the concatenating baseline."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from pointsplat_ns.refiner.config import RefinerConfig
+from pointsplat_ns.refiner.normalize import Features
+
+
+class BatchNorm(nn.BatchNorm1d):
+    """Batch norm over points: ``[N, C] -> [N, C]``.
+
+    Differs from torch's in two ways. A single point has no variance, so the running statistics
+    serve. And the running statistics are plain averages until enough steps have passed for the
+    momentum to take over: otherwise a short training is evaluated with what they started from.
+    """
+
+    def __init__(self, channels: int):
+        super().__init__(channels, eps=1e-3, momentum=0.01)
+
+    def forward(self, x: Tensor) -> Tensor:
+        use_batch = self.training and x.shape[0] > 1
+        momentum = self.momentum
+        if use_batch:
+            self.num_batches_tracked.add_(1)
+            momentum = max(momentum, 1.0 / float(self.num_batches_tracked))
+        return nn.functional.batch_norm(
+            x, self.running_mean, self.running_var, self.weight, self.bias, use_batch, momentum, self.eps
+        )
+
+
+def make_norm(kind: str, channels: int) -> nn.Module:
+    """The normalisation named in a :class:`RefinerConfig`: ``batch`` or ``layer``."""
+    return BatchNorm(channels) if kind == "batch" else nn.LayerNorm(channels)
+
+
+class DualBranchEncoder(nn.Module):
+    """Geometry gated by appearance.
+
+    ``f = softmax(phi_a(f_a) + delta) * (phi_p(f_p) + delta)`` over channels, with
+    ``f_p = (means, quats, scales)``, ``f_a = (opacity, dc, reduced rest)`` and ``delta = psi(means)``
+    (paper eq. 4 to 6). Without appearance the gate is 1, without position ``delta`` is 0 (Table 4).
+    With ``unit_gate`` the result is multiplied by the number of channels.
+    """
+
+    def __init__(self, config: RefinerConfig):
+        super().__init__()
+        dim = config.feature_dim
+        self.gate_gain = dim if config.unit_gate else 1
+        self.geometry = nn.Sequential(
+            nn.Linear(10, dim), make_norm(config.norm, dim), nn.ReLU(inplace=True), nn.Linear(dim, dim)
+        )
+        self.position = None
+        if config.use_position:
+            self.position = nn.Sequential(nn.Linear(3, dim), nn.ReLU(inplace=True), nn.Linear(dim, dim))
+        self.color = self.appearance = None
+        if config.use_appearance:
+            reduced = 0
+            if config.num_rest:
+                reduced = config.color_dim
+                self.color = nn.Sequential(
+                    nn.Linear(3 * config.num_rest, config.color_hidden),
+                    nn.ReLU(inplace=True),
+                    nn.Linear(config.color_hidden, reduced),
+                )
+            self.appearance = nn.Sequential(
+                nn.Linear(4 + reduced, dim), make_norm(config.norm, dim), nn.ReLU(inplace=True), nn.Linear(dim, dim)
+            )
+
+    def forward(self, features: Features) -> Tensor:
+        """Encoded Gaussians. # [N, feature_dim]"""
+        geometry = self.geometry(torch.cat([features.positions, features.quats, features.scales], dim=1))
+        delta = 0.0 if self.position is None else self.position(features.positions)
+        if self.appearance is None:
+            return geometry + delta
+        parts = [features.opacities, features.features_dc]
+        if self.color is not None:
+            parts.append(self.color(features.features_rest))
+        gate = torch.softmax(self.appearance(torch.cat(parts, dim=1)) + delta, dim=1)
+        return self.gate_gain * gate * (geometry + delta)
+
+
+class ConcatEncoder(nn.Module):
+    """All attributes side by side, as SplatFormer feeds them: 59 numbers at SH degree 3. No parameters."""
+
+    def forward(self, features: Features) -> Tensor:
+        """Concatenated Gaussians. # [N, 14 + 3 * num_rest]"""
+        f = features
+        return torch.cat([f.positions, f.scales, f.quats, f.opacities, f.features_dc, f.features_rest], dim=1)
+
+
+def make_encoder(config: RefinerConfig) -> nn.Module:
+    """The encoder that a configuration asks for."""
+    return DualBranchEncoder(config) if config.encoder == "dual" else ConcatEncoder()

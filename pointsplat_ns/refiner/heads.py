@@ -1,0 +1,54 @@
+"""Output heads: one MLP per attribute, from a point's features to the residual of that attribute."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from pointsplat_ns.refiner.config import RefinerConfig
+
+CPU_ROWS = 4096
+"""Rows that a CPU takes through all heads at a time, so that hidden layers stay in its cache (a quarter faster)."""
+
+
+class ResidualHeads(nn.Module):
+    """One ReLU MLP per attribute, whose last layer starts at zero.
+
+    Residuals are in the network's own units: the means' in unit cubes, bounded by tanh to
+    ``means_reach``; the quaternions' per unit length; the others as the container stores them.
+    """
+
+    def __init__(self, in_channels: int, config: RefinerConfig):
+        super().__init__()
+        self.means_reach = config.means_reach
+        sizes = {"means": 3, "scales": 3, "quats": 4, "opacities": 1, "features_dc": 3}
+        if config.num_rest:
+            sizes["features_rest"] = 3 * config.num_rest
+        self.gains = {name: getattr(config, f"{name}_gain") for name in sizes if name != "means"}
+        self.mlps = nn.ModuleDict({name: _head(in_channels, config, size) for name, size in sizes.items()})
+
+    def forward(self, x: Tensor) -> dict[str, Tensor]:
+        """Residuals by attribute: ``[N, Cin] -> {name: [N, size]}``."""
+        if x.device.type != "cpu" or len(x) <= CPU_ROWS:
+            return self._forward(x)
+        parts = [self._forward(rows) for rows in x.split(CPU_ROWS)]
+        return {name: torch.cat([part[name] for part in parts]) for name in self.mlps}
+
+    def _forward(self, x: Tensor) -> dict[str, Tensor]:
+        out = {}
+        for name, mlp in self.mlps.items():
+            residual = mlp(x)
+            out[name] = residual.tanh() * self.means_reach if name == "means" else residual * self.gains[name]
+        return out
+
+
+def _head(in_channels: int, config: RefinerConfig, out_channels: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    width = in_channels
+    for _ in range(config.head_depth - 1):
+        layers += [nn.Linear(width, config.head_width), nn.ReLU(inplace=True)]
+        width = config.head_width
+    last = nn.Linear(width, out_channels)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    return nn.Sequential(*layers, last)

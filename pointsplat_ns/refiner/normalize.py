@@ -1,0 +1,154 @@
+"""The unit cube that every scene is brought into, and the features that the network reads there.
+
+Positions are centred and divided by one extent, so that the aspect is kept; log-scales are shifted
+by the logarithm of that extent. The network therefore sees the same numbers whatever the unit and
+the place of a scene. What is clamped here is clamped for the network's eyes only: residuals are
+added to the untouched parameters.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.refiner.sparse_ops import permute
+
+TRIM = 0.01
+"""Share of the positions set aside at either end of each axis when the core of a scene is measured."""
+
+TRIM_FROM = 8
+"""Fewest Gaussians of which any is set aside: below, an outlier cannot be told from a scene."""
+
+MARGIN = 0.5
+"""How far the box may reach beyond the core, as a share of the core's longest side."""
+
+LOGIT_LIMIT = 12.0
+"""Opacity logits are clamped to this either way: beyond, opacity is 0 or 1 within 1e-5."""
+
+LOGIT_UNIT = 4.0
+"""Opacity logits are divided by this, which brings their usual range to about 1."""
+
+LOG_SCALE_CENTRE = -5.0
+"""Typical log of a standard deviation in the unit cube: 4 cm in a room of 6 m."""
+
+LOG_SCALE_UNIT = 2.0
+"""Log-scales, centred, are divided by this and clamped to :data:`LOG_SCALE_LIMIT` either way."""
+
+LOG_SCALE_LIMIT = 6.0
+
+SH_LIMIT = 8.0
+"""SH coefficients are clamped to this either way; displayable colours need no more than 1.8."""
+
+
+@dataclass(frozen=True)
+class UnitCube:
+    """A cube in scene units; all fields in float64."""
+
+    centre: Tensor  # [3] scene units
+    extent: Tensor  # [] side of the cube, scene units, above 0
+
+    def positions(self, means: Tensor) -> Tensor:
+        """Positions within [-0.5, 0.5], in float64; what lies outside is put on the nearest face. # [N, 3]"""
+        return ((means.double() - self.centre) / self.extent).clamp(-0.5, 0.5)
+
+    def log_scales(self, scales: Tensor) -> Tensor:
+        """Log-scales in units of the cube, in float64. # [N, 3]"""
+        return scales.double() - self.extent.log()
+
+    def to(self, device: torch.device) -> UnitCube:
+        return UnitCube(self.centre.to(device), self.extent.to(device))
+
+
+def unit_cube(means: Tensor) -> UnitCube:
+    """The cube that a scene is normalised by.
+
+    The core of the scene is the box of its positions without the outermost 1 % at either end of
+    each axis (at least one position, from 8 positions on). The box may reach beyond the core by half
+    of the core's longest side, but not beyond the positions. A scene without outliers keeps its full
+    extent; an outlier, however far, at most doubles it, so that it cannot squeeze the rest into one
+    cell. The cube shares the box's centre and has its longest side, or 1 where that is zero.
+
+    Args:
+        means: finite positions, at least one.  # [N, 3] scene units
+    """
+    ordered = means.detach().double().sort(dim=0).values
+    n = ordered.shape[0]
+    trim = max(1, math.ceil(TRIM * n)) if n >= TRIM_FROM else 0
+    low, high = ordered[0], ordered[-1]
+    core_low, core_high = ordered[trim], ordered[n - 1 - trim]
+    reach = MARGIN * (core_high - core_low).max()
+    if reach > 0:
+        low, high = torch.maximum(low, core_low - reach), torch.minimum(high, core_high + reach)
+    extent = (high - low).max()
+    return UnitCube(low + (high - low) / 2, torch.where(extent > 0, extent, torch.ones_like(extent)))
+
+
+@dataclass(frozen=True)
+class Features:
+    """What the network reads of N Gaussians: finite, of order 1, the same for q and -q."""
+
+    positions: Tensor  # [N, 3] unit cube, centred at 0
+    quats: Tensor  # [N, 4] unit wxyz, first non-zero component positive
+    scales: Tensor  # [N, 3] log-scale in the unit cube, centred and scaled
+    opacities: Tensor  # [N, 1] logit, scaled
+    features_dc: Tensor  # [N, 3]
+    features_rest: Tensor  # [N, 3 * num_rest] zero beyond the scene's degree
+    quat_scale: Tensor  # [N, 1] signed length: the scene's quaternion is this times ``quats``
+
+    def permute(self, order: Tensor, inverse: Tensor) -> Features:
+        """Rows in another order, given with its inverse. # [N], [N] int64"""
+        return Features(**{f.name: permute(getattr(self, f.name), order, inverse) for f in dataclasses.fields(self)})
+
+
+def gaussian_features(scene: Gaussians, cube: UnitCube, num_rest: int, dtype: torch.dtype) -> Features:
+    """Network input of a scene.
+
+    Args:
+        scene: usable Gaussians (``scene.usable()`` holds for all), N of them.
+        cube: the scene's unit cube, on the scene's device.
+        num_rest: coefficients a channel that the network reads beyond the constant one.
+        dtype: floating type of the network.
+    """
+    log_scales = (cube.log_scales(scene.scales) - LOG_SCALE_CENTRE) / LOG_SCALE_UNIT
+    quats, quat_scale = canonical_quats(scene.quats)
+    rest = scene.features_rest.flatten(1).clamp(-SH_LIMIT, SH_LIMIT).to(dtype)
+    return Features(
+        positions=cube.positions(scene.means).to(dtype),
+        quats=quats.to(dtype),
+        scales=log_scales.clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).to(dtype),
+        opacities=(scene.opacities.clamp(-LOGIT_LIMIT, LOGIT_LIMIT) / LOGIT_UNIT).to(dtype),
+        features_dc=scene.features_dc.clamp(-SH_LIMIT, SH_LIMIT).to(dtype),
+        features_rest=torch.nn.functional.pad(rest, (0, 3 * num_rest - rest.shape[1])),
+        quat_scale=quat_scale,
+    )
+
+
+def canonical_quats(quats: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit quaternions of one sign, and what they were divided by.
+
+    A quaternion and its negative are one rotation; the one whose first non-zero component is
+    positive stands for both. Zero stands for the identity, with a divisor of 1. Components are
+    scaled by the largest before they are squared, so that neither 1e-30 nor 1e30 is lost.
+
+    Args:
+        quats: finite wxyz of any length.  # [N, 4]
+
+    Returns:
+        unit quaternions [N, 4] and signed lengths [N, 1], with ``quats = unit * length`` but for zero.
+    """
+    largest = quats.abs().amax(dim=1, keepdim=True).detach()
+    zero = largest == 0
+    identity = torch.zeros_like(quats)
+    identity[:, 0] = 1
+    scaled = torch.where(zero, identity, quats / torch.where(zero, torch.ones_like(largest), largest))
+    length = scaled.norm(dim=1, keepdim=True)
+    first = (scaled != 0).to(torch.uint8).argmax(dim=1, keepdim=True)
+    sign = torch.where(scaled.gather(1, first) < 0, -1.0, 1.0).to(quats.dtype)
+    top = torch.finfo(quats.dtype).max
+    signed = (sign * length * torch.where(zero, torch.ones_like(largest), largest)).clamp(-top, top)
+    return scaled * sign / length, signed

@@ -1,0 +1,115 @@
+"""The three sparse operations of the network, each with its own backward.
+
+Autograd's own backward of a gather accumulates row by row; where the indices are a permutation or
+the targets are distinct, that is a gather too. Nothing here allocates more than a few times [N, C].
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+Pairs = list[tuple[Tensor, Tensor]]
+
+
+class _Permute(Function):
+    @staticmethod
+    def forward(ctx, x: Tensor, order: Tensor, inverse: Tensor) -> Tensor:
+        ctx.inverse = inverse
+        return x.index_select(0, order)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor):
+        return grad.index_select(0, ctx.inverse), None, None
+
+
+def permute(
+    x: Tensor,  # [N, C]
+    order: Tensor,  # [N] int64, a permutation
+    inverse: Tensor,  # [N] int64, its inverse
+) -> Tensor:
+    """``x[order]``. # [N, C]"""
+    return _Permute.apply(x, order, inverse)
+
+
+class _SegmentMax(Function):
+    @staticmethod
+    def forward(ctx, x: Tensor, cluster: Tensor, size: int) -> Tensor:
+        index = cluster[:, None].expand_as(x)
+        top = x.new_empty(size, x.shape[1]).scatter_reduce_(0, index, x, "amax", include_self=False)
+        ctx.save_for_backward(x, cluster, top)
+        return top
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor):
+        x, cluster, top = ctx.saved_tensors
+        is_top = (x == top.index_select(0, cluster)).to(x.dtype)
+        ties = torch.zeros_like(top).index_add_(0, cluster, is_top)
+        return is_top * (grad / ties.clamp_min_(1)).index_select(0, cluster), None, None
+
+
+def segment_max(
+    x: Tensor,  # [N, C]
+    cluster: Tensor,  # [N] int64 in [0, size), each value at least once
+    size: int,
+) -> Tensor:
+    """Maximum over the rows of each cluster; the gradient of a tie is shared out evenly. # [size, C]"""
+    return _SegmentMax.apply(x, cluster, size)
+
+
+class _SubmanifoldConv(Function):
+    @staticmethod
+    def forward(ctx, x: Tensor, weight: Tensor, pairs: Pairs) -> Tensor:
+        ctx.save_for_backward(x, weight)
+        ctx.pairs = pairs
+        out = x @ weight[13]
+        for k, (i, j) in enumerate(pairs):
+            if len(i):
+                out.index_add_(0, i, x.index_select(0, j) @ weight[14 + k])
+                out.index_add_(0, j, x.index_select(0, i) @ weight[12 - k])
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor):
+        x, weight = ctx.saved_tensors
+        need_x, need_weight = ctx.needs_input_grad[:2]
+        grad_x = grad @ weight[13].T if need_x else None
+        grad_weight = torch.zeros_like(weight) if need_weight else None
+        if need_weight:
+            torch.mm(x.T, grad, out=grad_weight[13])
+        for k, (i, j) in enumerate(ctx.pairs):
+            if not len(i):
+                continue
+            grad_i, grad_j = grad.index_select(0, i), grad.index_select(0, j)
+            if need_weight:
+                torch.mm(x.index_select(0, j).T, grad_i, out=grad_weight[14 + k])
+                torch.mm(x.index_select(0, i).T, grad_j, out=grad_weight[12 - k])
+            if need_x:
+                grad_x.index_add_(0, j, grad_i @ weight[14 + k].T)
+                grad_x.index_add_(0, i, grad_j @ weight[12 - k].T)
+        return grad_x, grad_weight, None
+
+
+def submanifold_conv(
+    x: Tensor,  # [M, Cin] one row per occupied cell
+    weight: Tensor,  # [27, Cin, Cout] taps in the order of (dx, dy, dz) from (-1, -1, -1), dz fastest
+    pairs: Pairs,  # from structure.neighbour_pairs
+) -> Tensor:
+    """3x3x3 convolution on the occupied cells alone: ``out[p] = sum_d x[p + d] @ weight[d]`` over
+    existing ``p + d``. Only those are multiplied; each tap holds one [P, C] gather at a time. # [M, Cout]"""
+    return _SubmanifoldConv.apply(x, weight, pairs)
+
+
+def segment_mean(
+    x: Tensor,  # [N, C]
+    cluster: Tensor,  # [N] int64 in [0, size), each value at least once
+    size: int,
+) -> Tensor:
+    """Mean over the rows of each cluster. # [size, C]"""
+    count = torch.bincount(cluster, minlength=size).to(x.dtype)
+    return x.new_zeros(size, x.shape[1]).index_add(0, cluster, x) / count[:, None]

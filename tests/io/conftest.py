@@ -1,0 +1,110 @@
+"""A trained run as nerfstudio itself writes one, shared by the tests of this folder."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pointsplat_ns.gaussians import Gaussians
+
+_MAKE_CONFIG = """
+import sys, yaml
+from pathlib import Path
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.models.base_model import ModelConfig
+from nerfstudio.models.splatfacto import SplatfactoModelConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+data = Path("data/kitchen")
+for method, model in (("splatfacto", SplatfactoModelConfig()), ("nerfacto", ModelConfig())):
+    datamanager = FullImageDatamanagerConfig(data=data, dataparser=NerfstudioDataParserConfig(load_3D_points=True))
+    optimizer = {"optimizer": AdamOptimizerConfig(lr=1e-3), "scheduler": ExponentialDecaySchedulerConfig()}
+    config = TrainerConfig(
+        method_name=method, data=data, output_dir=Path("outputs"), timestamp="2024-05-06_070809",
+        pipeline=VanillaPipelineConfig(datamanager=datamanager, model=model), optimizers={"means": optimizer},
+    )
+    config.set_experiment_name()
+    Path(sys.argv[1], f"{method}.yml").write_text(yaml.dump(config), "utf8")
+"""
+
+
+def _make_scene(n=5, degree=3, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    shapes = [(n, 3), (n, 3), (n, 4), (n, 1), (n, 3), (n, (degree + 1) ** 2 - 1, 3)]
+    return Gaussians(*(torch.randn(shape, generator=generator) for shape in shapes))
+
+
+def _checkpoint_of(scene, step=29999, prefix="_model.gauss_params."):
+    """The content of a checkpoint with all that nerfstudio's trainer puts in one."""
+    parameters = {name: torch.nn.Parameter(value.clone()) for name, value in scene.items()}
+    optimizers, schedulers = {}, {}
+    for name, value in parameters.items():
+        optimizer = torch.optim.Adam([value], lr=1e-3, eps=1e-15)
+        value.grad = torch.ones_like(value)
+        optimizer.step()
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: np.float64(0.5))
+        optimizers[name], schedulers[name] = optimizer.state_dict(), scheduler.state_dict()
+    pipeline = {prefix + name: value for name, value in scene.items()}
+    return {
+        "step": step,
+        "pipeline": {**pipeline, "_model.lpips.net.weight": torch.zeros(3)},
+        "optimizers": optimizers,
+        "schedulers": schedulers,
+        "scalers": {},
+    }
+
+
+@pytest.fixture
+def make_scene():
+    """``make_scene(n, degree, seed)``: a random scene."""
+    return _make_scene
+
+
+@pytest.fixture
+def checkpoint_of():
+    """``checkpoint_of(scene, step, prefix)``: what nerfstudio's trainer saves of it."""
+    return _checkpoint_of
+
+
+@pytest.fixture(scope="session")
+def config_texts(tmp_path_factory):
+    """``config.yml`` of splatfacto and of nerfacto, as the installed nerfstudio dumps them."""
+    pytest.importorskip("nerfstudio", reason="nerfstudio writes the configurations that are read here")
+    folder = tmp_path_factory.mktemp("configs")
+    # In a process of its own, so that the tests can prove that the readers import none of it.
+    subprocess.run([sys.executable, "-W", "ignore", "-c", _MAKE_CONFIG, str(folder)], check=True, capture_output=True)
+    return {path.stem: path.read_text("utf8") for path in folder.glob("*.yml")}
+
+
+@pytest.fixture
+def make_run(tmp_path, config_texts):
+    """A function that lays out a run below ``tmp_path`` and returns its folder."""
+
+    def make(
+        experiment="kitchen",
+        method="splatfacto",
+        time="2024-05-06_070809",
+        steps=(1999,),
+        scene=None,
+        outputs="outputs",
+    ):
+        folder = tmp_path / outputs / experiment / method / time
+        (folder / "nerfstudio_models").mkdir(parents=True)
+        text = config_texts.get(method, config_texts["splatfacto"])
+        text = text.replace("experiment_name: kitchen", f"experiment_name: {experiment}")
+        text = text.replace("method_name: splatfacto", f"method_name: {method}")
+        text = text.replace("timestamp: 2024-05-06_070809", f"timestamp: {time}")
+        (folder / "config.yml").write_text(text)
+        for step in steps:
+            content = _checkpoint_of(_make_scene(seed=step) if scene is None else scene, step)
+            torch.save(content, folder / "nerfstudio_models" / f"step-{step:09d}.ckpt")
+        (tmp_path / "data" / "kitchen").mkdir(parents=True, exist_ok=True)
+        return Path(folder)
+
+    return make

@@ -1,0 +1,343 @@
+"""3DGS PLY files: exact to the bit on the way out and back, and clear about damage."""
+
+import logging
+import math
+
+import numpy as np
+import numpy.lib.recfunctions
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from plyfile import PlyData, PlyElement, PlyListProperty
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io import ply, read_ply, write_ply
+
+
+def make(n=7, degree=3, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    shapes = [(n, 3), (n, 3), (n, 4), (n, 1), (n, 3), (n, (degree + 1) ** 2 - 1, 3)]
+    return Gaussians(*(torch.randn(shape, generator=generator) for shape in shapes))
+
+
+def same_bits(a, b):
+    return all(
+        torch.equal(x.view(torch.int32), y.view(torch.int32)) for x, y in zip(a.tensors(), b.tensors(), strict=True)
+    )
+
+
+def rows_of(path):
+    return np.array(PlyData.read(str(path), mmap=False)["vertex"].data)
+
+
+def rewrite(path, rows, **kwargs):
+    """The file again, by plyfile itself."""
+    PlyData([PlyElement.describe(rows, "vertex")], **kwargs).write(str(path))
+
+
+def column_names(degree):
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    return (
+        ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+        + [f"f_rest_{i}" for i in range(rest)]
+        + ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    )
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("n", [0, 1, 7])
+def test_round_trip_is_exact_to_the_bit(tmp_path, n, degree):
+    scene = make(n, degree)
+    write_ply(scene, tmp_path / "a.ply")
+    back = read_ply(tmp_path / "a.ply")
+    assert back.sh_degree == degree and same_bits(scene, back)
+    assert all(value.is_contiguous() for value in back.tensors())
+
+
+finite = st.floats(width=32, allow_nan=False, allow_infinity=False)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    hnp.arrays(np.float32, (3, 19), elements=finite),
+    hnp.arrays(np.float32, (3, 1), elements=st.floats(width=32, allow_nan=False)),
+    hnp.arrays(np.float32, (3, 3), elements=finite | st.just(-math.inf)),
+)
+def test_round_trip_holds_for_any_value_with_a_meaning(tmp_path_factory, table, opacities, scales):
+    means, quats, dc, rest = (torch.from_numpy(part.copy()) for part in np.split(table, [3, 7, 10], axis=1))
+    scene = Gaussians(means, torch.from_numpy(scales), quats, torch.from_numpy(opacities), dc, rest.reshape(3, 3, 3))
+    path = tmp_path_factory.mktemp("ply") / "any.ply"
+    write_ply(scene, path)
+    assert same_bits(scene, read_ply(path))
+
+
+def test_round_trip_crosses_the_boundaries_of_chunks(tmp_path, monkeypatch):
+    monkeypatch.setattr(ply, "CHUNK_ROWS", 3)
+    scene = make(10, 1)
+    write_ply(scene, tmp_path / "a.ply")
+    assert same_bits(scene, read_ply(tmp_path / "a.ply"))
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_written_header_is_the_references_to_the_letter(tmp_path, degree):
+    write_ply(make(7, degree), tmp_path / "a.ply")
+    header = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0].decode()
+    expected = ["ply", "format binary_little_endian 1.0", "element vertex 7"]
+    assert header.splitlines() == expected + [f"property float {name}" for name in column_names(degree)]
+
+
+def test_written_columns_hold_what_their_names_say(tmp_path):
+    scene = make(4, 3)
+    write_ply(scene, tmp_path / "a.ply")
+    rows = rows_of(tmp_path / "a.ply")
+    assert rows["z"].tolist() == scene.means[:, 2].tolist()
+    assert rows["rot_0"].tolist() == scene.quats[:, 0].tolist()
+    assert rows["scale_1"].tolist() == scene.scales[:, 1].tolist()
+    assert rows["opacity"].tolist() == scene.opacities[:, 0].tolist()
+    assert not rows["nx"].any() and not rows["ny"].any() and not rows["nz"].any()
+    for channel in range(3):  # channel-major: 15 of red, then 15 of green, then 15 of blue
+        assert rows[f"f_dc_{channel}"].tolist() == scene.features_dc[:, channel].tolist()
+        for k in (0, 6, 14):
+            assert rows[f"f_rest_{15 * channel + k}"].tolist() == scene.features_rest[:, k, channel].tolist()
+
+
+@pytest.mark.parametrize("options", [{"byte_order": ">"}, {"text": True}, {"byte_order": "<", "comments": ["by hand"]}])
+def test_other_encodings_read_the_same(tmp_path, options):
+    scene = make(5, 2).replace(opacities=torch.tensor([[math.inf], [-math.inf], [0.0], [1.0], [-4.0]]))
+    write_ply(scene, tmp_path / "a.ply")
+    rewrite(tmp_path / "b.ply", rows_of(tmp_path / "a.ply"), **options)
+    assert same_bits(scene, read_ply(tmp_path / "b.ply"))
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_properties_in_any_order_and_unknown_ones_are_fine(tmp_path, text):
+    scene = make(5, 1)
+    write_ply(scene, tmp_path / "a.ply")
+    rows = rows_of(tmp_path / "a.ply")
+    order = [*reversed(rows.dtype.names), "red", "weight"]
+    mixed = np.zeros(
+        5, [(name, "u1" if name == "red" else "f8" if name in ("weight", "x") else "f4") for name in order]
+    )
+    for name in rows.dtype.names:
+        mixed[name] = rows[name]
+    before = PlyElement.describe(np.zeros(3, [("a", "i4"), ("b", "u1")]), "camera")
+    after = PlyElement.describe(np.array([([1, 2, 3],)], [("vertex_indices", "O")]), "face")
+    PlyData([before, PlyElement.describe(mixed, "vertex"), after], text=text, byte_order="<").write(
+        str(tmp_path / "b.ply")
+    )
+    assert same_bits(scene, read_ply(tmp_path / "b.ply"))
+
+
+def test_crlf_header_is_read(tmp_path):
+    scene = make(5, 0)
+    write_ply(scene, tmp_path / "a.ply")
+    header, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    (tmp_path / "b.ply").write_bytes((header + b"end_header\n").replace(b"\n", b"\r\n") + data)
+    assert same_bits(scene, read_ply(tmp_path / "b.ply"))
+
+
+def test_all_zero_rows_stay(tmp_path, caplog):
+    scene = make(3, 0).map(torch.zeros_like)
+    write_ply(scene, tmp_path / "a.ply")
+    assert same_bits(scene, read_ply(tmp_path / "a.ply")) and not caplog.records
+
+
+def test_rows_without_meaning_are_dropped_counted_and_said(tmp_path, caplog):
+    scene = make(6, 1)
+    path = tmp_path / "a.ply"
+    write_ply(scene, path)
+    rows = rows_of(path)
+    rows["x"][1], rows["f_rest_4"][3], rows["scale_2"][4] = math.nan, math.inf, math.inf
+    rewrite(path, rows, byte_order="<")
+    with caplog.at_level(logging.WARNING, "pointsplat_ns"):
+        back = read_ply(path)
+    assert same_bits(scene[[0, 2, 5]], back)
+    assert [r.getMessage() for r in caplog.records] == [f"{path}: dropped 3 of 6 Gaussians with NaN or infinite values"]
+
+
+def test_a_double_beyond_float32_is_dropped_not_read_as_infinite(tmp_path):
+    write_ply(make(3, 0), tmp_path / "a.ply")
+    rows = rows_of(tmp_path / "a.ply")
+    wide = rows.astype([(name, "f8") for name in rows.dtype.names])
+    wide["y"][1] = 1e300
+    rewrite(tmp_path / "b.ply", wide, byte_order="<")
+    assert len(read_ply(tmp_path / "b.ply")) == 2
+
+
+def test_writing_leaves_out_rows_without_meaning_too(tmp_path, caplog):
+    means = torch.zeros(4, 3)
+    means[2] = math.nan
+    write_ply(make(4, 0).replace(means=means), tmp_path / "a.ply")
+    assert len(rows_of(tmp_path / "a.ply")) == 3
+    assert "dropped 1 of 4" in caplog.text
+
+
+def test_double_scenes_and_scenes_in_a_graph_can_be_written(tmp_path):
+    scene = make(3, 1)
+    write_ply(scene.map(lambda value: value.double().requires_grad_()), tmp_path / "a.ply")
+    assert same_bits(scene, read_ply(tmp_path / "a.ply"))
+
+
+# What can be wrong with a file
+
+
+def fails(path, *fragments):
+    with pytest.raises(SceneError) as caught:
+        read_ply(path)
+    text = str(caught.value)
+    assert text.startswith(str(path)) and "\n" not in text
+    for fragment in fragments:
+        assert fragment in text, text
+
+
+@pytest.fixture
+def good(tmp_path):
+    write_ply(make(7, 3), tmp_path / "scene.ply")
+    return tmp_path / "scene.ply"
+
+
+@pytest.mark.parametrize("cut", [1, 247, 248, 1000])
+def test_truncated_data_is_said_with_both_counts(good, cut):
+    good.write_bytes(good.read_bytes()[:-cut])
+    fails(good, "truncated", "declares 7 Gaussians", f"holds {7 - math.ceil(cut / 248)}")
+
+
+@pytest.mark.parametrize("size", [0, 2, 4, 40, 500])
+def test_truncated_header_is_said(good, size):
+    good.write_bytes(good.read_bytes()[:size])
+    fails(good, "not a PLY file" if size < 4 else "header is truncated")
+
+
+@pytest.mark.parametrize("name", ["x", "z", "f_dc_1", "f_rest_0", "f_rest_7", "opacity", "scale_2", "rot_0", "rot_3"])
+def test_a_missing_property_is_named(good, name):
+    rows = rows_of(good)
+    rewrite(good, np.lib.recfunctions.drop_fields(rows, name), byte_order="<")
+    fails(good, f"lacks the vertex property '{name}'")
+
+
+def test_a_wrong_number_of_sh_coefficients_is_said(good):
+    rows = np.lib.recfunctions.drop_fields(rows_of(good), ["f_rest_44", "f_rest_43"])
+    rewrite(good, rows, byte_order="<")
+    fails(good, "has 43 f_rest properties", "0, 9, 24 or 45")
+
+
+def test_a_plain_point_cloud_is_refused_by_what_it_lacks(tmp_path):
+    rewrite(tmp_path / "points.ply", np.zeros(4, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1")]))
+    fails(tmp_path / "points.ply", "lacks the vertex property 'f_dc_0' and 10 more")
+
+
+def test_a_compressed_ply_is_recognised(tmp_path):
+    rewrite(tmp_path / "c.ply", np.zeros(4, [("packed_position", "u4"), ("packed_rotation", "u4")]))
+    fails(tmp_path / "c.ply", "compressed PLY", "export it uncompressed")
+
+
+def test_a_file_without_vertices_is_said(tmp_path):
+    PlyData([PlyElement.describe(np.zeros(4, [("x", "f4")]), "point")]).write(str(tmp_path / "p.ply"))
+    fails(tmp_path / "p.ply", "no element 'vertex' (found point)")
+
+
+@pytest.mark.parametrize("count", ["1000000000000000", "9" * 400])
+@pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
+def test_an_absurd_count_is_refused_before_memory_is_taken(tmp_path, count, form):
+    header = f"ply\nformat {form} 1.0\nelement vertex {count}\n"
+    header += "".join(f"property float {name}\n" for name in column_names(0)) + "end_header\n"
+    (tmp_path / "a.ply").write_bytes(header.encode() + bytes(100))
+    fails(tmp_path / "a.ply", "truncated", "holds")
+
+
+def test_an_absurd_element_before_the_vertices_is_refused(tmp_path):
+    header = (
+        "ply\nformat binary_little_endian 1.0\nelement junk 1000000000000000\nproperty double a\nelement vertex 0\n"
+    )
+    header += "".join(f"property float {name}\n" for name in column_names(0)) + "end_header\n"
+    (tmp_path / "a.ply").write_bytes(header.replace("vertex 0", "vertex 1").encode() + bytes(100))
+    fails(tmp_path / "a.ply", "truncated")
+
+
+def test_list_properties_of_vertices_are_refused(tmp_path):
+    rows = np.zeros(2, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("lists", "O")])
+    for row in rows:
+        row["lists"] = np.zeros(3, "i4")
+    element = PlyElement.describe(rows, "vertex")
+    assert any(isinstance(prop, PlyListProperty) for prop in element.properties)
+    PlyData([element], byte_order="<").write(str(tmp_path / "a.ply"))
+    fails(tmp_path / "a.ply", "vertex property 'lists' is a list")
+
+
+@pytest.mark.parametrize(
+    ("line", "fragment"),
+    [
+        ("element vertex -5", "line 3 is not understood: 'element vertex -5'"),
+        ("element vertex 1_0", "line 3 is not understood"),
+        ("element vertex", "line 3 is not understood"),
+        ("element vertex 1\nproperty quad x", "line 4 is not understood: 'property quad x'"),
+        ("property float x", "line 3 is not understood"),
+        ("element vertex 1\nproperty float x\nproperty float x", "declares vertex property 'x' twice"),
+        ("element vertex 1\nelement vertex 1", "declares element 'vertex' twice"),
+        ("rubbish", "line 3 is not understood: 'rubbish'"),
+    ],
+)
+def test_a_damaged_header_line_is_quoted(tmp_path, line, fragment):
+    (tmp_path / "a.ply").write_text(f"ply\nformat binary_little_endian 1.0\n{line}\nend_header\n")
+    fails(tmp_path / "a.ply", fragment)
+
+
+def test_a_header_without_end_is_refused_after_a_bounded_read(tmp_path):
+    (tmp_path / "a.ply").write_bytes(b"ply\nformat ascii 1.0\n" + b"comment x\n" * 200_000)
+    fails(tmp_path / "a.ply", "longer than 1048576 bytes")
+
+
+def test_no_format_is_said(tmp_path):
+    (tmp_path / "a.ply").write_text("ply\nelement vertex 0\nend_header\n")
+    fails(tmp_path / "a.ply", "names no format")
+
+
+@pytest.mark.parametrize(
+    ("damage", "fragment"),
+    [
+        (lambda lines: [*lines[:-1], lines[-1].rsplit(" ", 1)[0] + "\n"], "Gaussian 2 has 16 numbers; expected 17"),
+        (
+            lambda lines: [*lines[:-1], lines[-1].replace(lines[-1].split()[0], "what", 1)],
+            "Gaussian 2 is not all numbers",
+        ),
+        (lambda lines: lines[:-1], "holds 2"),
+    ],
+)
+def test_damaged_ascii_is_said_with_its_row(tmp_path, damage, fragment):
+    write_ply(make(3, 0), tmp_path / "a.ply")
+    rewrite(tmp_path / "b.ply", rows_of(tmp_path / "a.ply"), text=True)
+    lines = (tmp_path / "b.ply").read_text().splitlines(keepends=True)
+    (tmp_path / "b.ply").write_text("".join(damage(lines)))
+    fails(tmp_path / "b.ply", fragment)
+
+
+def test_no_file_and_a_folder_are_said(tmp_path):
+    fails(tmp_path / "none.ply", "no such file")
+    fails(tmp_path, "not a regular file")
+
+
+# What can be wrong with writing
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "a.ply"
+    write_ply(make(2, 0), path)
+    old = path.read_bytes()
+
+    def fail(self, stream):
+        with open(stream, "wb") as file:
+            file.write(b"ply\nhalf")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(PlyData, "write", fail)
+    with pytest.raises(SceneError, match=r"a\.ply: cannot be written \(No space left on device\)"):
+        write_ply(make(5, 0), path)
+    assert path.read_bytes() == old and [p.name for p in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_writing_to_a_folder_is_said(tmp_path):
+    with pytest.raises(SceneError, match="is a folder"):
+        write_ply(make(1, 0), tmp_path)

@@ -1,0 +1,232 @@
+"""Trained runs: everything needed from a run comes from its folder alone."""
+
+import json
+import logging
+import os
+import re
+import shutil
+
+import pytest
+import torch
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.io import find_runs, open_run, read_scene, scene_name, scene_names, write_scene
+from pointsplat_ns.io.inert_yaml import Tagged
+
+
+def fails(call, *fragments):
+    with pytest.raises(SceneError) as caught:
+        call()
+    text = str(caught.value)
+    assert "\n" not in text
+    for fragment in fragments:
+        assert str(fragment) in text, text
+
+
+def test_a_run_of_nerfstudio_is_read_whole(make_run, tmp_path):
+    folder = make_run(steps=(1999, 9999, 29999))
+    transform = {"transform": [[1, 0, 0, 0.25], [0, 0, 1, -2], [0, -1, 0, 0]], "scale": 0.125}
+    (folder / "dataparser_transforms.json").write_text(json.dumps(transform))
+    run = open_run(folder)
+    assert run.folder == folder and run.config_path == folder / "config.yml"
+    assert run.checkpoint == folder / "nerfstudio_models" / "step-000029999.ckpt" and run.step == 29999
+    assert (run.method_name, run.experiment_name, run.timestamp) == ("splatfacto", "kitchen", "2024-05-06_070809")
+    assert run.data == tmp_path / "data" / "kitchen"
+    assert run.dataparser_class == "nerfstudio.data.dataparsers.nerfstudio_dataparser.NerfstudioDataParserConfig"
+    assert run.dataparser_fields["eval_mode"] == "fraction" and run.dataparser_fields["train_split_fraction"] == 0.9
+    assert not {"_target", "data"} & run.dataparser_fields.keys()
+    assert run.datamanager_fields["camera_res_scale_factor"] == 1.0 and "dataparser" not in run.datamanager_fields
+    assert run.model_class == "nerfstudio.models.splatfacto.SplatfactoModelConfig"
+    settings = [run.model_fields[name] for name in ("sh_degree", "rasterize_mode", "background_color")]
+    assert settings == [3, "classic", "random"]
+    assert isinstance(run.model_fields["camera_optimizer"], Tagged)
+    assert run.transform.tolist() == transform["transform"] and run.scale == 0.125
+    assert run.is_gaussian_scene
+
+
+def test_dataparser_fields_rebuild_the_dataparser_that_was_saved(make_run):
+    nerfstudio_dataparser = pytest.importorskip("nerfstudio.data.dataparsers.nerfstudio_dataparser")
+    run = open_run(make_run())
+    config = nerfstudio_dataparser.NerfstudioDataParserConfig
+    assert run.dataparser_class == f"{config.__module__}.{config.__qualname__}"
+    assert config(data=run.data, **run.dataparser_fields) == config(data=run.data, load_3D_points=True)
+
+
+@pytest.mark.parametrize("within", ["", "config.yml", "nerfstudio_models/step-000001999.ckpt"])
+def test_a_run_opens_by_any_of_its_names(make_run, within):
+    folder = make_run(steps=(1999, 9999))
+    run = open_run(folder / within)
+    assert run.folder == folder
+    assert run.step == (1999 if "ckpt" in within else 9999)
+
+
+def test_without_transforms_the_frame_is_the_datas_own(make_run):
+    run = open_run(make_run())
+    assert torch.equal(run.transform, torch.eye(4)[:3]) and run.scale == 1.0
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["{", "[]", '{"scale": 1}', '{"transform": [[1, 0], [0, 1]], "scale": 1}', '{"transform": "no", "scale": 1}',
+     json.dumps({"transform": torch.eye(4)[:3].tolist(), "scale": 0}),
+     json.dumps({"transform": [[float("nan")] * 4] * 3, "scale": 1})],
+)  # fmt: skip
+def test_damaged_transforms_are_said(make_run, content):
+    folder = make_run()
+    (folder / "dataparser_transforms.json").write_text(content)
+    fails(lambda: open_run(folder), folder / "dataparser_transforms.json", "transform", "scale")
+
+
+def test_an_incomplete_newest_checkpoint_gives_way_to_the_one_before(make_run, caplog):
+    folder = make_run(steps=(1999, 9999))
+    newest = folder / "nerfstudio_models" / "step-000009999.ckpt"
+    newest.write_bytes(newest.read_bytes()[:-100])
+    with caplog.at_level(logging.WARNING, "pointsplat_ns"):
+        assert open_run(folder).step == 1999
+    assert f"{newest}: not a complete checkpoint" in caplog.text
+
+
+def test_steps_are_compared_as_numbers_and_other_files_ignored(make_run):
+    folder = make_run(steps=(999999999, 1000000000))
+    (folder / "nerfstudio_models" / "step-last.ckpt").write_bytes(b"")
+    (folder / "nerfstudio_models" / "notes.txt").write_text("")
+    assert open_run(folder).step == 1000000000
+
+
+def test_a_run_without_checkpoint_is_said(make_run):
+    folder = make_run(steps=())
+    fails(lambda: open_run(folder), folder, "no complete checkpoint in nerfstudio_models (none)")
+    (folder / "nerfstudio_models" / "step-000000001.ckpt").write_bytes(b"PK")
+    fails(lambda: open_run(folder), "(1 incomplete)")
+
+
+def test_what_is_no_run_is_said(tmp_path):
+    fails(lambda: open_run(tmp_path / "none"), "no such file or folder")
+    fails(lambda: open_run(tmp_path), tmp_path, "not a nerfstudio run", "config.yml")
+    (tmp_path / "config.yml").write_text("!!python/object:a.B {x: 1}")
+    fails(lambda: open_run(tmp_path), tmp_path / "config.yml", "lacks the object 'pipeline'")
+
+
+# Where the data is
+
+
+def test_relative_data_is_found_from_the_current_folder_first(make_run, tmp_path, monkeypatch):
+    folder = make_run()
+    (tmp_path / "here" / "data" / "kitchen").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here")
+    assert open_run(folder).data == tmp_path / "here" / "data" / "kitchen"
+
+
+def test_a_relative_run_finds_its_data_above_itself(make_run, tmp_path, monkeypatch):
+    folder = make_run()
+    monkeypatch.chdir(folder.parent)
+    assert open_run(folder.name).data == tmp_path / "data" / "kitchen"
+
+
+def test_missing_data_is_said_with_what_was_tried_and_only_where_needed(make_run, tmp_path):
+    folder = make_run()
+    shutil.rmtree(tmp_path / "data")
+    fails(
+        lambda: open_run(folder), folder / "config.yml", "data/kitchen is not there", "tried", os.getcwd(), "more above"
+    )
+    assert str(open_run(folder, need_data=False).data) == "data/kitchen"
+    assert len(read_scene(folder)) == 5
+
+
+def test_absolute_data_is_tried_as_it_is(make_run, tmp_path):
+    folder = make_run()
+    text = (folder / "config.yml").read_text().replace("- data\n", f"- {tmp_path}/gone\n")
+    (folder / "config.yml").write_text(text)
+    fails(lambda: open_run(folder), f"{tmp_path}/gone/kitchen is not there; tried {tmp_path}/gone/kitchen;")
+
+
+def test_the_dataparsers_data_counts_where_the_datamanager_has_none(make_run, tmp_path):
+    folder = make_run()
+    text, count = re.subn(
+        r"(?m)^    data: .*\n    - data\n    - kitchen\n", "    data: null\n", (folder / "config.yml").read_text()
+    )
+    if not count:  # an alias of the path that the trainer's own alias holds
+        text, count = re.subn(r"(?m)^    data: \*id\d+\n", "    data: null\n", text)
+    assert count == 1
+    text = text.replace("      data: !!python/object/apply:pathlib.PosixPath []", "      data: other/room")
+    (folder / "config.yml").write_text(text)
+    assert str(open_run(folder, need_data=False).data) == "other/room"
+
+
+# Many runs
+
+
+def test_the_newest_finished_run_of_each_experiment_is_found(make_run, tmp_path):
+    make_run("room", time="2024-05-06_070809")
+    newest = make_run("room", method="splatfacto-cpu", time="2024-06-01_000000")
+    make_run("room", time="2024-07-01_000000", steps=())
+    kitchen = make_run("kitchen", method="splatfacto-big")
+    make_run("kitchen", method="pointsplat", time="2025-01-01_000000")
+    runs = find_runs(tmp_path)
+    assert [run.folder for run in runs] == [kitchen, newest]
+    assert [scene_name(run) for run in runs] == ["kitchen", "room"]
+    assert find_runs(newest)[0].folder == newest
+
+
+def test_a_descendant_of_splatfacto_is_known_by_its_settings_but_pointsplat_is_not(make_run):
+    folder = make_run(method="my-splats")
+    assert open_run(folder).is_gaussian_scene
+    assert not open_run(make_run(method="pointsplat")).is_gaussian_scene
+
+
+def test_other_methods_are_passed_over_and_said_where_nothing_is_left(make_run, tmp_path):
+    folder = make_run(method="nerfacto")
+    assert not open_run(folder).is_gaussian_scene
+    fails(lambda: find_runs(tmp_path), tmp_path, "no trained Splatfacto run below it", f"{folder}: method nerfacto")
+    (tmp_path / "empty").mkdir()
+    fails(lambda: find_runs(tmp_path / "empty"), "EXPERIMENT/METHOD/TIME/config.yml")
+    fails(lambda: find_runs(tmp_path / "none"), "no such folder")
+
+
+def test_flat_copies_of_runs_are_all_found_and_named_apart(make_run, tmp_path):
+    for name in ("one", "two"):
+        shutil.copytree(make_run(outputs=f"outputs-{name}"), tmp_path / "flat" / name / "copy")
+    runs = find_runs(tmp_path / "flat")
+    assert len(runs) == 2 and scene_names(runs) == ["kitchen", "kitchen-2"]
+
+
+def test_missing_data_of_one_run_among_many_is_an_error(make_run, tmp_path):
+    make_run("a")
+    broken = make_run("b")
+    text = (broken / "config.yml").read_text().replace("- kitchen\n", "- lost\n")
+    (broken / "config.yml").write_text(text)
+    fails(lambda: find_runs(tmp_path), broken / "config.yml", "data/lost is not there")
+    assert len(find_runs(tmp_path, need_data=False)) == 2
+
+
+@pytest.mark.parametrize(
+    ("experiment", "name"), [("unnamed", "kitchen"), ("''", "kitchen"), ("a/b c", "a-b-c"), ("../..", "scene")]
+)
+def test_scene_names_fit_for_files(make_run, experiment, name):
+    folder = make_run()
+    text = (folder / "config.yml").read_text().replace("experiment_name: kitchen", f"experiment_name: {experiment}")
+    (folder / "config.yml").write_text(text)
+    assert scene_name(open_run(folder)) == name
+
+
+# One way in and out
+
+
+def test_every_kind_of_path_reads_the_same_scene(make_run, make_scene, tmp_path):
+    scene = make_scene(6, 2)
+    folder = make_run(scene=scene)
+    write_scene(scene, tmp_path / "deep" / "er" / "scene.PLY")
+    paths = [folder, folder / "config.yml", open_run(folder).checkpoint, tmp_path / "deep" / "er" / "scene.PLY"]
+    for path in paths:
+        for found, expected in zip(read_scene(path).tensors(), scene.tensors(), strict=True):
+            assert torch.equal(found, expected), path
+
+
+def test_anything_else_is_refused_with_what_is_accepted(make_scene, tmp_path):
+    accepted = "a 3DGS .ply, a Splatfacto .ckpt, or a Splatfacto run"
+    (tmp_path / "scene.splat").write_bytes(b"")
+    fails(lambda: read_scene(tmp_path / "scene.splat"), tmp_path / "scene.splat", "a .splat file", accepted)
+    fails(lambda: read_scene(tmp_path), "a folder without config.yml", accepted)
+    fails(lambda: read_scene(tmp_path / "none.ply"), "no such file", accepted)
+    fails(lambda: write_scene(make_scene(), tmp_path / "a.spz"), "cannot write a .spz file")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.splat"]

@@ -1,0 +1,238 @@
+"""Splatfacto checkpoints: every key layout, colour logits, weights_only, and clear about damage."""
+
+import logging
+import math
+import subprocess
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import SH_C0
+from pointsplat_ns.io import allow_splatfacto_checkpoints, read_checkpoint
+from pointsplat_ns.io.splatfacto import PREFIXES
+
+
+def same_bits(a, b):
+    return all(
+        torch.equal(x.view(torch.int32), y.view(torch.int32)) for x, y in zip(a.tensors(), b.tensors(), strict=True)
+    )
+
+
+def fails(path, *fragments):
+    with pytest.raises(SceneError) as caught:
+        read_checkpoint(path)
+    text = str(caught.value)
+    assert text.startswith(str(path)) and "\n" not in text and len(text) < len(str(path)) + 400
+    for fragment in fragments:
+        assert fragment in text, text
+
+
+@pytest.mark.parametrize("prefix", PREFIXES)
+@pytest.mark.parametrize("degree", [1, 3])
+def test_parameters_come_back_to_the_bit(tmp_path, checkpoint_of, make_scene, prefix, degree):
+    scene = make_scene(6, degree)
+    torch.save(checkpoint_of(scene, prefix=prefix), tmp_path / "step-000000001.ckpt")
+    assert same_bits(scene, read_checkpoint(tmp_path / "step-000000001.ckpt"))
+
+
+def test_the_scene_outlives_its_file(tmp_path, checkpoint_of, make_scene):
+    scene = make_scene(1000, 3)
+    path = tmp_path / "a.ckpt"
+    torch.save(checkpoint_of(scene), path)
+    back = read_checkpoint(path)
+    with path.open("r+b") as file:  # in place, as an overwriting copy does
+        file.write(bytes(path.stat().st_size))
+    assert same_bits(scene, back)
+
+
+def test_colour_logits_of_degree_0_become_sh_of_the_same_colour(tmp_path, checkpoint_of, make_scene):
+    # Splatfacto seeds white and black points with infinite logits in float32.
+    logits = torch.tensor([[0.0, math.inf, -math.inf], [2.0, -3.0, 88.0]])
+    torch.save(checkpoint_of(make_scene(2, 0).replace(features_dc=logits)), tmp_path / "a.ckpt")
+    scene = read_checkpoint(tmp_path / "a.ckpt")
+    colours = 0.5 + SH_C0 * scene.features_dc
+    # 2e-7: two roundings of float32 around values of at most 1
+    assert torch.allclose(colours, torch.sigmoid(logits), atol=2e-7, rtol=0) and len(scene) == 2
+
+
+def test_half_precision_parameters_are_read_as_float32(tmp_path, checkpoint_of, make_scene):
+    content = checkpoint_of(make_scene(3, 1))
+    content["pipeline"] = {key: value.half() for key, value in content["pipeline"].items()}
+    torch.save(content, tmp_path / "a.ckpt")
+    scene = read_checkpoint(tmp_path / "a.ckpt")
+    assert scene.dtype == torch.float32 and torch.equal(scene.means, make_scene(3, 1).means.half().float())
+
+
+def test_the_old_file_format_of_torch_is_read(tmp_path, checkpoint_of, make_scene):
+    torch.save(checkpoint_of(make_scene(4, 2)), tmp_path / "a.ckpt", _use_new_zipfile_serialization=False)
+    assert same_bits(make_scene(4, 2), read_checkpoint(tmp_path / "a.ckpt"))
+
+
+def test_rows_without_meaning_are_dropped_counted_and_said(tmp_path, checkpoint_of, make_scene, caplog):
+    scene = make_scene(5, 1)
+    scene.means[3, 1] = math.nan
+    scene.opacities[0] = math.inf
+    torch.save(checkpoint_of(scene), tmp_path / "a.ckpt")
+    with caplog.at_level(logging.WARNING, "pointsplat_ns"):
+        assert same_bits(scene[[0, 1, 2, 4]], read_checkpoint(tmp_path / "a.ckpt"))
+    assert caplog.messages == [f"{tmp_path / 'a.ckpt'}: dropped 1 of 5 Gaussians with NaN or infinite values"]
+
+
+# weights_only
+
+NUMPY_CORE = np.float64.__reduce__(np.float64(1))[0].__module__.split(".")[1]
+
+
+def in_fresh_python(code, *arguments):
+    return subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code, *map(str, arguments)], capture_output=True, text=True
+    )
+
+
+def test_stock_loading_fails_before_the_registration_and_works_after_it(tmp_path, checkpoint_of, make_scene):
+    torch.save(checkpoint_of(make_scene()), tmp_path / "a.ckpt")
+    code = """
+import sys, torch
+try:
+    torch.load(sys.argv[1], map_location="cpu", weights_only=True)
+    print("loads at once")
+except Exception as error:
+    print("refused", "multiarray.scalar" in str(error))
+from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
+count = len(torch.serialization.get_safe_globals())
+allow_splatfacto_checkpoints()
+once = torch.serialization.get_safe_globals()
+allow_splatfacto_checkpoints()
+print(torch.serialization.get_safe_globals() == once, len(once) - count)
+print(torch.load(sys.argv[1], map_location="cpu", weights_only=True)["schedulers"]["means"]["_last_lr"][0])
+print("nerfstudio" in sys.modules)
+"""
+    done = in_fresh_python(code, tmp_path / "a.ckpt")
+    assert done.stdout.split("\n")[:4] == ["refused True", "True 4", "0.0005", "False"], done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("core", ["core", "_core"])
+def test_a_checkpoint_written_with_either_numpy_loads(tmp_path, checkpoint_of, make_scene, core):
+    path = tmp_path / "a.ckpt"
+    torch.save(checkpoint_of(make_scene()), path)
+    with zipfile.ZipFile(path) as archive:
+        entries = {info.filename: archive.read(info) for info in archive.infolist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in entries.items():
+            data = data.replace(f"cnumpy.{NUMPY_CORE}.multiarray\n".encode(), f"cnumpy.{core}.multiarray\n".encode())
+            archive.writestr(name, data)
+    assert any(f"cnumpy.{core}.multiarray\nscalar".encode() in data for data in zipfile_data(path))
+    assert same_bits(make_scene(), read_checkpoint(path))
+
+
+def zipfile_data(path):
+    with zipfile.ZipFile(path) as archive:
+        return [archive.read(info) for info in archive.infolist()]
+
+
+def test_registration_is_a_no_op_where_torch_has_no_register(monkeypatch):
+    monkeypatch.delattr(torch.serialization, "add_safe_globals")
+    allow_splatfacto_checkpoints()
+
+
+class Bomb:
+    def __reduce__(self):
+        return (print, ("this must never be printed",))
+
+
+def test_a_checkpoint_that_would_run_code_is_refused_and_runs_none(tmp_path, checkpoint_of, make_scene, capsys):
+    content = checkpoint_of(make_scene())
+    content["extra"] = Bomb()
+    torch.save(content, tmp_path / "a.ckpt")
+    fails(tmp_path / "a.ckpt", "holds an object of type", "print")
+    assert "never" not in capsys.readouterr().out
+
+
+def test_object_arrays_do_not_pass_as_numpy_scalars(tmp_path, checkpoint_of, make_scene):
+    content = checkpoint_of(make_scene())
+    content["extra"] = np.array([1, "a"], dtype=object)
+    torch.save(content, tmp_path / "a.ckpt")
+    fails(tmp_path / "a.ckpt", "holds an object of type numpy")
+
+
+# Damage
+
+
+@pytest.mark.parametrize("share", [0.01, 0.5, 0.99, 0.9999])
+def test_a_truncated_checkpoint_is_said(tmp_path, checkpoint_of, make_scene, share):
+    path = tmp_path / "a.ckpt"
+    torch.save(checkpoint_of(make_scene(50)), path)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+    fails(path, "truncated")
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"PK", bytes(5000), b"\x80\x02}q\x00."])
+def test_garbage_is_said(tmp_path, content):
+    (tmp_path / "a.ckpt").write_bytes(content)
+    fails(tmp_path / "a.ckpt", "expected a checkpoint that Splatfacto saved")
+
+
+def test_damage_inside_a_whole_archive_is_said(tmp_path, checkpoint_of, make_scene):
+    path = tmp_path / "a.ckpt"
+    torch.save(checkpoint_of(make_scene()), path)
+    with zipfile.ZipFile(path) as archive:
+        entries = {info.filename: archive.read(info) for info in archive.infolist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in entries.items():
+            archive.writestr(name, data[:-20] if name.endswith("data.pkl") else data)
+    fails(path, "truncated or not a checkpoint")
+
+
+def test_a_compressed_archive_is_not_unpacked(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.ckpt", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", bytes(1_000_000))
+    fails(tmp_path / "a.ckpt", "compressed archive")
+
+
+def test_a_checkpoint_of_another_method_is_said_with_the_keys_found(tmp_path):
+    state = {f"_model.field.mlp.{i}.weight": torch.zeros(2) for i in range(6)}
+    torch.save({"step": 1, "pipeline": state}, tmp_path / "a.ckpt")
+    fails(tmp_path / "a.ckpt", "another method", "_model.field.mlp.0.weight", "and 2 more", "_model.gauss_params.means")
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [({"state_dict": {}, "epoch": 3}, "found state_dict, epoch"), ([1], "found list"), ({}, "no keys")],
+)
+def test_a_file_that_is_no_nerfstudio_checkpoint_is_said(tmp_path, content, found):
+    torch.save(content, tmp_path / "a.ckpt")
+    fails(tmp_path / "a.ckpt", "not a nerfstudio checkpoint", found)
+
+
+@pytest.mark.parametrize("name", ["scales", "quats", "opacities", "features_dc", "features_rest"])
+def test_a_missing_parameter_is_named(tmp_path, checkpoint_of, make_scene, name):
+    content = checkpoint_of(make_scene())
+    del content["pipeline"]["_model.gauss_params." + name]
+    torch.save(content, tmp_path / "a.ckpt")
+    fails(tmp_path / "a.ckpt", f"lacks the key '_model.gauss_params.{name}'")
+
+
+@pytest.mark.parametrize(
+    ("value", "fragment"),
+    [
+        (torch.zeros(4, 3), "quats has shape (4, 3); expected (5, 4)"),
+        (torch.zeros(5, 4, dtype=torch.int64), "torch.int64"),
+        (torch.zeros(5, 4).to_sparse(), "expected a dense floating-point tensor"),
+        ([1.0], "is list"),
+        (torch.zeros(1).expand(10**12, 4), "more than the file can hold"),
+    ],
+)
+def test_a_parameter_that_cannot_be_one_is_named(tmp_path, checkpoint_of, make_scene, value, fragment):
+    content = checkpoint_of(make_scene())
+    content["pipeline"]["_model.gauss_params.quats"] = value
+    torch.save(content, tmp_path / "a.ckpt")
+    fails(tmp_path / "a.ckpt", fragment, "quats")
+
+
+def test_no_file_is_said(tmp_path):
+    fails(tmp_path / "none.ckpt", "no such file")

@@ -1,0 +1,60 @@
+import pytest
+import torch
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.refiner.config import preset
+from pointsplat_ns.refiner.encoder import ConcatEncoder, DualBranchEncoder
+from pointsplat_ns.refiner.normalize import gaussian_features, unit_cube
+
+
+def features(n: int = 30):
+    g = torch.Generator().manual_seed(0)
+    scene = Gaussians(*(torch.randn(n, *t, generator=g) for t in ((3,), (3,), (4,), (1,), (3,), (15, 3))))
+    return gaussian_features(scene, unit_cube(scene.means), 15, torch.float32)
+
+
+@pytest.mark.parametrize("unit_gate", [False, True])
+def test_the_encoder_is_equations_4_to_6_written_out(unit_gate):
+    torch.manual_seed(0)
+    encoder = DualBranchEncoder(preset("full", unit_gate=unit_gate)).eval()
+    f = features()
+    f_p = torch.cat([f.positions, f.quats, f.scales], dim=1)
+    f_a = torch.cat([f.opacities, f.features_dc, encoder.color(f.features_rest)], dim=1)
+    assert (f_p.shape[1], f_a.shape[1]) == (10, 12)
+    delta = encoder.position(f.positions)
+    weight = (encoder.appearance(f_a) + delta).exp()
+    weight = weight / weight.sum(dim=1, keepdim=True) * (32 if unit_gate else 1)
+    expected = weight * (encoder.geometry(f_p) + delta)
+    assert torch.allclose(encoder(f), expected, atol=1e-6)  # float32 softmax, values of order 1
+
+
+def test_without_appearance_and_position_only_geometry_is_left():
+    torch.manual_seed(0)
+    f = features()
+    f_p = torch.cat([f.positions, f.quats, f.scales], dim=1)
+    plain = DualBranchEncoder(preset("tiny", use_appearance=False, use_position=False))
+    assert torch.equal(plain(f), plain.geometry(f_p))
+    placed = DualBranchEncoder(preset("tiny", use_appearance=False))
+    assert torch.equal(placed(f), placed.geometry(f_p) + placed.position(f.positions))
+
+
+def test_layers_have_the_published_widths():
+    shapes = {name: tuple(p.shape) for name, p in DualBranchEncoder(preset("full")).named_parameters() if p.dim() == 2}
+    assert shapes == {
+        "geometry.0.weight": (32, 10),
+        "geometry.3.weight": (32, 32),
+        "position.0.weight": (32, 3),
+        "position.2.weight": (32, 32),
+        "color.0.weight": (32, 45),
+        "color.2.weight": (8, 32),
+        "appearance.0.weight": (32, 12),
+        "appearance.3.weight": (32, 32),
+    }
+
+
+def test_the_concatenating_baseline_holds_every_number_once():
+    f = features()
+    out = ConcatEncoder()(f)
+    assert out.shape == (30, 59)
+    parts = [f.positions, f.scales, f.quats, f.opacities, f.features_dc, f.features_rest]
+    assert torch.equal(out, torch.cat(parts, dim=1))

@@ -1,0 +1,138 @@
+import pytest
+import torch
+import torch.nn.functional as F
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.refiner.config import preset
+from pointsplat_ns.refiner.encoder import BatchNorm
+from pointsplat_ns.refiner.point_transformer import Block, PatchAttention, PointTransformer, SubmanifoldConv
+from pointsplat_ns.refiner.structure import build_structure
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def structure_of(means: torch.Tensor, config):
+    n = len(means)
+    tails = ((3,), (4,), (1,), (3,), (0, 3))
+    return build_structure(Gaussians(means, *(torch.zeros(n, *tail) for tail in tails)), config)
+
+
+def plain_attention(module: PatchAttention, x: torch.Tensor) -> torch.Tensor:
+    """Softmax attention written out, over all rows."""
+    m, c = x.shape
+    q, k, v = module.qkv(x).view(m, 3, module.heads, c // module.heads).permute(1, 2, 0, 3)
+    weight = torch.softmax(q @ k.transpose(1, 2) / (c // module.heads) ** 0.5, dim=-1)
+    return module.proj((weight @ v).transpose(0, 1).reshape(m, c))
+
+
+@pytest.mark.parametrize("patch", [20, 64])
+def test_attention_with_one_patch_is_plain_attention_whatever_the_order(patch):
+    torch.manual_seed(0)
+    module = PatchAttention(12, 3, patch).double()
+    x = torch.randn(20, 12, dtype=torch.float64)
+    order = torch.randperm(20)
+    expected = plain_attention(module, x)
+    assert torch.allclose(module(x, None), expected, atol=1e-12)
+    assert torch.allclose(module(x, (order, order.argsort())), expected, atol=1e-12)
+
+
+def test_patches_attend_within_themselves_and_the_last_borrows_from_before():
+    torch.manual_seed(0)
+    module = PatchAttention(8, 2, 6).double()
+    x = torch.randn(15, 8, dtype=torch.float64)
+    order = torch.randperm(15)
+    along = x[order]
+    expected = torch.cat(
+        [
+            plain_attention(module, along[:6]),
+            plain_attention(module, along[6:12]),
+            plain_attention(module, along[9:])[3:],
+        ]
+    )
+    assert torch.allclose(module(x, (order, order.argsort()))[order], expected, atol=1e-12)
+
+
+def test_attention_of_one_point_is_its_own_value():
+    torch.manual_seed(0)
+    module = PatchAttention(8, 2, 6)
+    x = torch.randn(1, 8)
+    assert torch.allclose(module(x, None), module.proj(module.qkv(x)[:, 16:]), atol=1e-6)
+
+
+def test_convolution_gives_points_of_one_cell_the_convolution_of_their_mean():
+    config = preset("full", grid=4)
+    means = torch.rand(40, 3, generator=seeded())
+    structure = structure_of(means, config)
+    level = structure.levels[0]
+    assert level.cell_of is not None
+    torch.manual_seed(0)
+    conv = SubmanifoldConv(3, 5).double()
+    with torch.no_grad():
+        conv.bias.normal_()
+    x = torch.randn(40, 3, dtype=torch.float64)
+    cells = ((structure.cube.positions(means)[structure.order] + 0.5) * 4).floor().clamp(max=3).long()
+    total, count = torch.zeros(3, 4, 4, 4, dtype=torch.float64), torch.zeros(4, 4, 4, dtype=torch.float64)
+    for row, (i, j, k) in zip(x, cells.tolist(), strict=True):
+        total[:, i, j, k] += row
+        count[i, j, k] += 1
+    kernel = conv.weight.reshape(3, 3, 3, 3, 5).permute(4, 3, 0, 1, 2)
+    dense = F.conv3d((total / count.clamp(min=1))[None], kernel, conv.bias, padding=1)[0]
+    assert torch.allclose(conv(x, level), dense[:, cells[:, 0], cells[:, 1], cells[:, 2]].T, atol=1e-12)
+
+
+def test_drop_path_acts_in_training_only_and_keeps_the_mean():
+    torch.manual_seed(0)
+    block = Block(8, 2, preset("tiny"), drop_path=0.4)
+    x = torch.ones(20000, 1)
+    dropped = block.train()._drop(x)
+    assert set(dropped.unique().tolist()) == {0.0, torch.tensor(1 / 0.6).item()}
+    assert abs(dropped.mean() - 1) < 0.03  # five standard errors of 0.006
+    assert block.eval()._drop(x) is x
+
+
+def test_batch_norm_equals_torch_in_training_and_takes_a_single_point():
+    ours, theirs = BatchNorm(4), torch.nn.BatchNorm1d(4, eps=1e-3)
+    x = torch.randn(30, 4, generator=seeded()) * 3 + 2
+    assert torch.equal(ours(x), theirs(x))
+    one = ours.train()(x[:1])
+    assert torch.equal(one, ours.eval()(x[:1])) and one.isfinite().all()
+
+
+def test_batch_norm_statistics_are_averages_at_first_so_that_short_trainings_evaluate_well():
+    norm = BatchNorm(2)
+    batches = [torch.randn(50, 2, generator=seeded(i)) + 10 for i in range(5)]
+    for batch in batches:
+        norm(batch)
+    assert torch.allclose(norm.running_mean, torch.stack([b.mean(0) for b in batches]).mean(0), rtol=1e-5)
+    assert torch.allclose(norm.running_var, torch.stack([b.var(0) for b in batches]).mean(0), rtol=1e-5)
+
+
+def test_full_preset_has_the_published_stages():
+    backbone = PointTransformer(32, preset("full"))
+    assert [len(stage.blocks) for stage in backbone.encoder] == [2, 2, 2, 4, 2]
+    assert [len(stage.blocks) for stage in backbone.decoder] == [2, 2, 2, 2]
+    assert [stage.blocks[0].attention.heads for stage in backbone.encoder] == [2, 4, 8, 16, 32]
+    assert [stage.blocks[0].norm1.normalized_shape[0] for stage in backbone.decoder] == [96, 96, 128, 256]
+    assert backbone.encoder[-1].blocks[-1].drop_path == pytest.approx(0.3)
+    assert backbone.encoder[0].blocks[0].drop_path == 0
+    assert backbone.embed.weight.shape == (27, 32, 64)
+
+
+def test_training_shuffles_the_curves_and_evaluation_does_not():
+    torch.manual_seed(0)
+    backbone = PointTransformer(32, preset("tiny"))
+    assert len({tuple(backbone.train()._curves()) for _ in range(20)}) > 3
+    assert all(backbone.eval()._curves() == [0, 1, 2, 3] for _ in range(3))
+
+
+def test_information_passes_between_distant_points_through_the_coarse_levels():
+    torch.manual_seed(0)
+    config = preset("tiny", patch=16)
+    means = torch.stack([torch.linspace(0, 1, 200), torch.zeros(200), torch.zeros(200)], dim=1)
+    structure = structure_of(means, config)
+    backbone = PointTransformer(4, config).eval()
+    x = torch.randn(200, 4, requires_grad=True)
+    backbone(x, structure)[0].sum().backward()
+    assert (x.grad.abs().sum(dim=1) > 0).sum() > 48  # three patches of the finest level

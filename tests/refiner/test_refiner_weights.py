@@ -1,0 +1,100 @@
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.refiner import Refiner, WeightsError, load_refiner, preset, read_metadata, save_refiner
+from pointsplat_ns.refiner.weights import FORMAT
+
+
+def trained(**changes) -> Refiner:
+    torch.manual_seed(0)
+    refiner = Refiner(preset("tiny", enc_depths=(1, 1, 1), **changes))
+    with torch.no_grad():
+        for mlp in refiner.heads.mlps.values():
+            mlp[-1].weight.normal_(std=0.1)
+    return refiner
+
+
+def scene(n: int = 50) -> Gaussians:
+    g = torch.Generator().manual_seed(0)
+    return Gaussians(*(torch.randn(n, *t, generator=g) for t in ((3,), (3,), (4,), (1,), (3,), (15, 3))))
+
+
+@pytest.mark.parametrize("norm", ["batch", "layer"])
+def test_a_refiner_survives_a_round_trip_to_the_bit(tmp_path, norm):
+    refiner = trained(norm=norm).train()
+    refiner(scene())  # moves running statistics
+    path = tmp_path / "new folder" / "refiner.safetensors"
+    metadata = {"steps": 10, "command": "train --x 'y'", "psnr": [1.5, None]}
+    save_refiner(refiner, path, metadata)
+    loaded = load_refiner(path)
+    assert loaded.config == refiner.config and not loaded.training
+    assert read_metadata(path) == metadata
+    for a, b in zip(refiner.eval()(scene()).tensors(), loaded(scene()).tensors(), strict=True):
+        assert torch.equal(a, b)
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+def test_a_failed_save_leaves_the_old_file_and_no_rest(tmp_path, monkeypatch):
+    path = tmp_path / "refiner.safetensors"
+    save_refiner(trained(), path)
+    before = path.read_bytes()
+    monkeypatch.setattr("os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(OSError, match="disk full"):
+        save_refiner(trained(), path)
+    assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
+def test_missing_foreign_and_truncated_files_are_named(tmp_path):
+    path = tmp_path / "refiner.safetensors"
+    with pytest.raises(WeightsError, match="refiner.safetensors: no such file"):
+        load_refiner(path)
+    path.write_bytes(b"not a safetensors file at all")
+    with pytest.raises(WeightsError, match="refiner.safetensors: not a readable safetensors file"):
+        load_refiner(path)
+    save_file({"x": torch.zeros(2)}, path)
+    with pytest.raises(WeightsError, match="format None; expected 'pointsplat-refiner/1'"):
+        load_refiner(path)
+    save_refiner(trained(), path)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(WeightsError, match="not a readable safetensors file"):
+        load_refiner(path)
+
+
+def rewrite(path, config=None, **tensors):
+    """The file with another configuration or other tensors; a tensor of None is left out."""
+    import json
+
+    from safetensors import safe_open
+
+    with safe_open(path, framework="pt") as file:
+        header = file.metadata()
+    state = {k: v for k, v in {**load_file(path), **tensors}.items() if v is not None}
+    save_file(state, path, metadata={**header, **({"config": json.dumps(config)} if config is not None else {})})
+
+
+def test_files_whose_contents_do_not_fit_are_refused(tmp_path):
+    path = tmp_path / "refiner.safetensors"
+    name = "heads.mlps.means.6.bias"
+
+    def check(message, **changes):
+        save_refiner(trained(), path)
+        rewrite(path, **changes)
+        with pytest.raises(WeightsError, match=message):
+            load_refiner(path)
+
+    check(f"1 tensors do not fit, first {name}: found nothing, expected \\(3,\\)", **{name: None})
+    check(f"{name}: found \\(4,\\), expected \\(3,\\)", **{name: torch.zeros(4)})
+    check("first extra: found \\(1,\\), expected nothing", extra=torch.zeros(1))
+    check(f"{name} holds NaN or Inf", **{name: torch.tensor([0.0, torch.nan, 0])})
+    check("unknown refiner settings flavour", config={"flavour": 1})
+    check("configuration not understood", config=[1])
+    check("configuration not understood", config={"enc_channels": 3})
+
+
+def test_a_file_without_configuration_is_refused(tmp_path):
+    path = tmp_path / "refiner.safetensors"
+    save_file({"x": torch.zeros(2)}, path, metadata={"format": FORMAT})
+    with pytest.raises(WeightsError, match="configuration not understood"):
+        load_refiner(path)

@@ -1,0 +1,75 @@
+import itertools
+
+import pytest
+import torch
+
+from pointsplat_ns.refiner.config import CURVES
+from pointsplat_ns.refiner.serialization import curve_codes, hilbert, z_order
+
+
+def full_grid(side: int) -> torch.Tensor:
+    return torch.tensor(list(itertools.product(range(side), repeat=3)))
+
+
+@pytest.mark.parametrize("curve", CURVES)
+@pytest.mark.parametrize("bits", [1, 2, 3, 4])
+def test_every_curve_visits_each_cell_of_a_full_grid_once(curve, bits):
+    codes = curve_codes(full_grid(2**bits), bits, curve)
+    assert codes.sort().values.tolist() == list(range(8**bits))
+
+
+@pytest.mark.parametrize("curve", ["hilbert", "hilbert-trans"])
+@pytest.mark.parametrize("bits", [1, 2, 3, 4])
+def test_consecutive_cells_of_the_hilbert_curve_share_a_face(curve, bits):
+    cells = full_grid(2**bits)
+    walk = cells[curve_codes(cells, bits, curve).argsort()]
+    assert ((walk[1:] - walk[:-1]).abs().sum(dim=1) == 1).all()
+
+
+def test_z_order_interleaves_bits_with_x_first():
+    assert z_order(torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [3, 3, 3]]), 2).tolist() == [
+        4,
+        2,
+        1,
+        32,
+        63,
+    ]
+
+
+@pytest.mark.parametrize("bits", [16, 20])
+def test_z_order_equals_python_interleaving_at_full_width(bits):
+    generator = torch.Generator().manual_seed(0)
+    coords = torch.randint(0, 2**bits, (50, 3), generator=generator)
+    expected = [
+        sum(((int(c) >> b) & 1) << (3 * b + 2 - a) for b in range(bits) for a, c in enumerate(row)) for row in coords
+    ]
+    assert z_order(coords, bits).tolist() == expected
+
+
+@pytest.mark.parametrize("curve", CURVES)
+@pytest.mark.parametrize("drop", [1, 5, 15])
+def test_coarse_cells_are_prefixes_so_that_one_sort_serves_all_grids(curve, drop):
+    generator = torch.Generator().manual_seed(1)
+    coords = torch.randint(0, 2**16, (4000, 3), generator=generator)
+    coarse = curve_codes(coords, 16, curve) >> 3 * drop
+    # Equal cells must have equal prefixes and different cells different ones.
+    cells = torch.unique(coords >> drop, dim=0, return_inverse=True)[1]
+    pairs = torch.unique(torch.stack([coarse, cells], dim=1), dim=0)
+    assert len(pairs) == len(pairs[:, 0].unique()) == len(pairs[:, 1].unique())
+
+
+def test_trans_exchanges_x_and_y():
+    coords = full_grid(8)
+    assert torch.equal(curve_codes(coords, 3, "hilbert-trans"), hilbert(coords[:, [1, 0, 2]], 3))
+    assert not torch.equal(curve_codes(coords, 3, "hilbert-trans"), hilbert(coords, 3))
+
+
+def test_unknown_curves_and_widths_are_refused():
+    with pytest.raises(ValueError, match="no curve 'peano'"):
+        curve_codes(full_grid(2), 1, "peano")
+    with pytest.raises(ValueError, match="21 bits"):
+        curve_codes(full_grid(2), 21, "z")
+
+
+def test_empty_input_gives_no_codes():
+    assert hilbert(torch.empty(0, 3, dtype=torch.long), 16).shape == (0,)

@@ -1,0 +1,114 @@
+import itertools
+
+import pytest
+import torch
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.refiner.config import FINE_BITS, preset
+from pointsplat_ns.refiner.structure import ADAPTIVE_OCCUPANCY, build_structure, neighbour_pairs
+
+
+def scene_at(means: torch.Tensor, seed: int = 0) -> Gaussians:
+    g = torch.Generator().manual_seed(seed)
+    n = len(means)
+    shapes = ((n, 3), (n, 4), (n, 1), (n, 3), (n, 3, 3))
+    return Gaussians(means, *(torch.randn(shape, generator=g) for shape in shapes))
+
+
+def surface(n: int, seed: int = 0) -> torch.Tensor:
+    g = torch.Generator().manual_seed(seed)
+    means = torch.rand(n, 3, generator=g)
+    means[torch.arange(n), torch.randint(0, 3, (n,), generator=g)] = 0.0
+    return means
+
+
+@pytest.mark.parametrize("size", ["full", "small", "tiny"])
+def test_orders_are_permutations_and_clusters_are_runs_without_gaps(size):
+    structure = build_structure(scene_at(surface(500)), preset(size))
+    assert structure.order.sort().values.tolist() == list(range(500))
+    assert torch.equal(structure.order[structure.inverse], torch.arange(500))
+    for level, coarser in itertools.zip_longest(structure.levels, structure.levels[1:]):
+        for order, inverse in level.orders[1:]:
+            assert torch.equal(order[inverse], torch.arange(level.size))
+        if coarser is None:
+            assert level.cluster is None
+        else:
+            steps = level.cluster[1:] - level.cluster[:-1]
+            assert level.cluster[0] == 0 and level.cluster[-1] == coarser.size - 1
+            assert ((steps == 0) | (steps == 1)).all()
+            assert level.cell_of is None or coarser.size <= level.num_cells
+
+
+def test_clusters_hold_exactly_the_points_of_a_cell():
+    means = surface(800)
+    config = preset("full", grid=64)
+    structure = build_structure(scene_at(means), config)
+    position = structure.cube.positions(means)[structure.order] + 0.5
+    cluster = torch.arange(800)
+    for level, stride in zip(structure.levels, (1, 2, 4, 8), strict=False):
+        cluster = level.cluster[cluster]
+        cells = (position * 64 / stride).floor().clamp(max=64 // stride - 1).long()
+        expected = torch.unique(cells, dim=0, return_inverse=True)[1]
+        joint = torch.unique(torch.stack([cluster, expected], dim=1), dim=0)
+        assert len(joint) == len(cluster.unique()) == len(expected.unique())
+
+
+def test_neighbours_are_those_that_brute_force_finds():
+    cells = torch.unique(torch.randint(0, 6, (80, 3), generator=torch.Generator().manual_seed(0)), dim=0)
+    cells = cells[torch.randperm(len(cells), generator=torch.Generator().manual_seed(1))]
+    found = {(int(a), int(b)) for i, j in neighbour_pairs(cells) for a, b in zip(i, j, strict=True)}
+    touch = (cells[:, None] - cells[None]).abs().amax(-1) == 1
+    assert found | {(b, a) for a, b in found} == {(int(a), int(b)) for a, b in touch.nonzero()}
+    assert len(found) == touch.sum() // 2
+
+
+@pytest.mark.parametrize("n", [50, 500, 5000])
+def test_an_adapted_grid_is_the_coarsest_that_keeps_most_points_apart(n):
+    means = surface(n)
+    structure = build_structure(scene_at(means), preset("tiny"))
+    position = structure.cube.positions(means) + 0.5
+
+    def occupied(side):
+        return len(torch.unique((position * side).floor().clamp(max=side - 1), dim=0))
+
+    side = round(structure.cells_per_side)
+    assert occupied(side) >= ADAPTIVE_OCCUPANCY * n > occupied(side // 2)
+
+
+def test_the_layout_depends_on_the_set_of_gaussians_and_not_on_their_order():
+    means = surface(300)
+    means[100:200] = means[:100]  # coincident pairs, told apart by their other parameters
+    scene = scene_at(means)
+    mix = torch.randperm(300, generator=torch.Generator().manual_seed(3))
+    a, b = build_structure(scene, preset("tiny")), build_structure(scene[mix], preset("tiny"))
+    assert torch.equal(a.order, mix[b.order])
+
+
+def test_all_coincident_points_make_one_cell_at_every_level():
+    structure = build_structure(scene_at(torch.full((40, 3), 2.5)), preset("small"))
+    assert [level.num_cells for level in structure.levels] == [1, 1, 1, 1]
+    assert [level.size for level in structure.levels] == [40, 1, 1, 1]
+
+
+def test_strides_beyond_the_finest_code_end_in_one_cell():
+    config = preset("tiny", strides=(2**10, 2**10), grid=512)
+    structure = build_structure(scene_at(surface(100)), config)
+    assert structure.levels[-1].size == 1
+    assert 2**10 * 2**10 > 2**FINE_BITS
+
+
+def test_a_far_outlier_does_not_squeeze_the_rest_into_one_cell():
+    means = surface(1000)
+    alone = build_structure(scene_at(means), preset("full"))
+    means[0] = 1e7
+    with_outlier = build_structure(scene_at(means), preset("full"))
+    assert with_outlier.levels[0].num_cells > 0.9 * alone.levels[0].num_cells
+
+
+def test_moving_to_a_device_keeps_everything():
+    structure = build_structure(scene_at(surface(60)), preset("tiny"))
+    moved = structure.to("cpu")
+    assert torch.equal(moved.order, structure.order)
+    assert moved.levels[0].orders[0] is None
+    assert torch.equal(moved.levels[1].neighbours[0][0], structure.levels[1].neighbours[0][0])
+    assert moved.built_for == structure.built_for
