@@ -1,0 +1,37 @@
+# Each target sets up what it needs: an environment in $(VENV), made once and renewed when pyproject.toml changes.
+#   make test    run the test suite
+#   make lint    check style
+#   make demo    the whole method on built-in rooms: train, prune, refine, evaluate, export
+# Use an environment of your own with `make test VENV=/path/to/env`.
+
+VENV ?= .venv
+# open3d below 0.20, which nerfstudio's exporter needs, has no wheels for Python 3.13 and later.
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.10 python3; do \
+	"$$p" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 13))' >/dev/null 2>&1 && { echo "$$p"; break; }; \
+	done)
+STAMP := $(VENV)/.pointsplat-installed
+
+.PHONY: setup test lint demo clean
+
+setup: $(STAMP)
+
+$(VENV)/bin/python:
+	@test -n "$(PYTHON)" || { echo "no Python 3.10, 3.11 or 3.12 found; install one or pass PYTHON=/path/to/python" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(STAMP): pyproject.toml | $(VENV)/bin/python
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $@
+
+test: $(STAMP)
+	$(VENV)/bin/python -m pytest
+
+lint: $(STAMP)
+	$(VENV)/bin/python -m ruff check .
+	$(VENV)/bin/python -m ruff format --check .
+
+demo: $(STAMP)
+	$(VENV)/bin/pointsplat demo
+
+clean:
+	rm -rf build *.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,22 @@
+"""Dataparsers that this plugin adds to nerfstudio.
+
+Apart from the methods: nerfstudio loads dataparsers while the modules that methods need are half imported.
+"""
+
+from __future__ import annotations
+
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+
+from pointsplat_ns.plugin import load_specification
+
+
+def _replica() -> DataParserSpecification:
+    from pointsplat_ns.data.replica import ReplicaDataParserConfig
+
+    return DataParserSpecification(
+        config=ReplicaDataParserConfig(),
+        description="Posed RGB-D frames in the layout that NICE-SLAM gave to Replica.",
+    )
+
+
+replica = load_specification("replica-data", _replica)

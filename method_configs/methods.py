@@ -1,0 +1,35 @@
+"""Methods that this plugin adds to nerfstudio."""
+
+from __future__ import annotations
+
+from nerfstudio.plugins.types import MethodSpecification
+
+from pointsplat_ns.patches import errors_in_one_line
+from pointsplat_ns.plugin import load_specification
+
+
+def _splatfacto_cpu() -> MethodSpecification:
+    from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
+    from pointsplat_ns.splatfacto_cpu_method import splatfacto_cpu_config
+
+    allow_splatfacto_checkpoints()
+    errors_in_one_line()
+    return MethodSpecification(
+        config=splatfacto_cpu_config(),
+        description="Splatfacto with a rasterizer in plain torch: trains on a CPU, and on CUDA where there is one.",
+    )
+
+
+splatfacto_cpu = load_specification("splatfacto-cpu", _splatfacto_cpu)
+
+
+def _pointsplat() -> MethodSpecification:
+    from pointsplat_ns.pointsplat_method import pointsplat_config
+
+    return MethodSpecification(
+        config=pointsplat_config(),
+        description="Prunes trained Splatfacto scenes and repairs them with one network trained across scenes.",
+    )
+
+
+pointsplat = load_specification("pointsplat", _pointsplat)

@@ -1,0 +1,34 @@
+"""The ``pointsplat`` command."""
+
+from __future__ import annotations
+
+import logging
+import sys
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run one subcommand; input that cannot be used ends it with one line and exit status 1."""
+    import tyro
+
+    from pointsplat_ns.cli.demo import demo
+    from pointsplat_ns.cli.scenes import export, prune, refine
+    from pointsplat_ns.cli.view import compare, rooms
+    from pointsplat_ns.errors import PointSplatError
+
+    logging.basicConfig(format="%(message)s", level=logging.INFO)
+    commands = {
+        "prune": prune,
+        "refine": refine,
+        "export": export,
+        "compare": compare,
+        "rooms": rooms,
+        "demo": demo,
+    }
+    try:
+        tyro.extras.subcommand_cli_from_dict(commands, prog="pointsplat", args=args)
+    except PointSplatError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)

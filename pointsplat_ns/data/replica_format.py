@@ -1,0 +1,362 @@
+"""The NICE-SLAM Replica layout: what is on disk, read and checked.
+
+A scene folder holds ``traj.txt`` (one camera-to-world per line, 16 numbers, row by row, OpenCV
+axes: x right, y down, z forward), ``results/frame*.jpg|png`` and, optionally,
+``results/depth*.png`` (16 bit; depth along the optical axis = value / ``scale``; 0 unknown). The
+intrinsics are in ``cam_params.json``, in the scene folder or in the one above it. Poses belong to
+frames by order: line k is the pose of the k-th frame by number.
+
+Needs numpy and Pillow only.
+"""
+
+import json
+import logging
+import math
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pointsplat_ns.errors import DataError
+
+logger = logging.getLogger(__name__)
+
+MAX_ROTATION_DRIFT = 1e-2
+"""Largest accepted entry of |R^T R - 1|. Real files print few digits (1e-7 to 1e-4 of drift, which is
+removed); beyond one percent the matrix holds a scale or a shear and is not a camera pose."""
+
+UNKNOWN_DEPTH = (0, 65535)
+"""Raw 16-bit depths that say "nothing measured": empty and saturated."""
+
+PixelCenters = Literal["auto", "integer", "half"]
+
+_PHOTO = re.compile(r"^frame(\d+)\.(jpg|jpeg|png)$", re.IGNORECASE)
+_DEPTH = re.compile(r"^depth(\d+)\.png$", re.IGNORECASE)
+_LAYOUT_HINT = "a scene folder holds traj.txt and results/frame*.jpg"
+
+
+@dataclass(frozen=True)
+class PinholeParams:
+    """Intrinsics as ``cam_params.json`` states them (no pixel-centre correction applied).
+
+    Attributes:
+        width, height: Image size in pixels.
+        fx, fy, cx, cy: Focal lengths and principal point in pixels.
+        scale: Raw depth counts per scene unit.
+        path: The file they come from.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    scale: float
+    path: Path
+
+    def principal_point(self, centers: PixelCenters = "auto") -> tuple[float, float]:
+        """Principal point with the centre of the top left pixel at (0.5, 0.5), as rasterizers draw.
+
+        The layout's own tools shoot rays through integer coordinates: the centre of the first
+        pixel is 0, and the middle of a picture 1200 wide is 599.5, which is what Replica's file says
+        (``integer``: half a pixel is added). Files whose principal point is exactly half the size
+        (320 of 640) count from the corner, where the middle of the picture is w / 2 (``half``: taken
+        as it is). ``auto`` tells the two apart by that: exactly (w / 2, h / 2) is ``half``, anything
+        else, a calibration's 318.7 included, is ``integer``, OpenCV's convention.
+        """
+        if centers == "auto":
+            centers = "half" if (self.cx, self.cy) == (self.width / 2, self.height / 2) else "integer"
+        shift = 0.5 if centers == "integer" else 0.0
+        return self.cx + shift, self.cy + shift
+
+
+@dataclass(frozen=True)
+class ReplicaScene:
+    """A checked scene: paths and numbers, no pixels.
+
+    Attributes:
+        folder: The scene folder.
+        params: Intrinsics and depth scale.
+        numbers: Frame numbers from the file names, ascending.
+        photos: One photo per number.
+        depths: One depth image per number, or None where the scene has no depth at all.
+        poses: float64 (F, 4, 4) camera-to-world, OpenCV axes, rotations exactly orthonormal.
+    """
+
+    folder: Path
+    params: PinholeParams
+    numbers: tuple[int, ...]
+    photos: tuple[Path, ...]
+    depths: tuple[Path, ...] | None
+    poses: np.ndarray  # [F, 4, 4]
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def select(self, indices: list[int]) -> "ReplicaScene":
+        """The same scene with only the frames at these positions, in this order."""
+        return replace(
+            self,
+            numbers=tuple(self.numbers[i] for i in indices),
+            photos=tuple(self.photos[i] for i in indices),
+            depths=None if self.depths is None else tuple(self.depths[i] for i in indices),
+            poses=self.poses[indices],
+        )
+
+
+def load_replica(folder: Path, check_sizes: bool = True) -> ReplicaScene:
+    """Reads and checks a scene; opens picture headers, decodes no picture.
+
+    Frames whose pose is not finite (lost tracking) are dropped and reported by one warning.
+
+    Args:
+        folder: The scene folder.
+        check_sizes: Compare every photo's size, read from its header, with ``cam_params.json``.
+
+    Raises:
+        DataError: A file is missing, unreadable or inconsistent; the text names it.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DataError(f"{folder}: no such folder; {_LAYOUT_HINT}")
+    if not (folder / "traj.txt").is_file() and not (folder / "results").is_dir():
+        scenes = sorted(p.parent.name for p in folder.glob("*/traj.txt"))
+        hint = f"it contains the scenes {', '.join(scenes)}: name one of them" if scenes else _LAYOUT_HINT
+        raise DataError(f"{folder}: not a scene of the Replica layout; {hint}")
+    params = read_cam_params(folder)
+    photos = _numbered(folder / "results", _PHOTO, "frame*.jpg or frame*.png")
+    if not photos:
+        raise DataError(f"{folder / 'results'}: no photo found; expected frame000000.jpg (or .png) and so on")
+    depths = _numbered(folder / "results", _DEPTH, "depth*.png")
+    poses = read_trajectory(folder / "traj.txt")
+    numbers = sorted(photos)
+    if len(poses) != len(numbers):
+        raise DataError(
+            f"{folder / 'traj.txt'}: {len(poses)} poses for {len(numbers)} photos in {folder / 'results'}; "
+            f"expected one line per photo{_missing_hint(numbers, len(poses))}"
+        )
+    if depths:
+        missing = [n for n in numbers if n not in depths]
+        if missing:
+            names = _some([_sibling_name(photos[n], "depth", ".png") for n in missing])
+            raise DataError(
+                f"{folder / 'results'}: {len(missing)} of {len(numbers)} photos have no depth image ({names}); "
+                "restore them, or remove all depth*.png to go without depth"
+            )
+    finite = np.isfinite(poses).all(axis=(1, 2))
+    if not finite.all():
+        lines = [int(i) + 1 for i in np.flatnonzero(~finite)]
+        if not finite.any():
+            raise DataError(f"{folder / 'traj.txt'}: none of the {len(poses)} poses is finite; expected numbers")
+        logger.warning(
+            "%s: %d of %d poses hold NaN or Inf (line %s): their frames are left out",
+            folder / "traj.txt",
+            len(lines),
+            len(poses),
+            _some([str(i) for i in lines]),
+        )
+    keep = [int(i) for i in np.flatnonzero(finite)]
+    rigid = _rigid(poses[keep], [i + 1 for i in keep], folder / "traj.txt")
+    numbers = [numbers[i] for i in keep]
+    scene = ReplicaScene(
+        folder=folder,
+        params=params,
+        numbers=tuple(numbers),
+        photos=tuple(photos[n] for n in numbers),
+        depths=tuple(depths[n] for n in numbers) if depths else None,
+        poses=rigid,
+    )
+    if check_sizes:
+        for path in scene.photos:
+            _check_size(path, _open_image(path).size, params)
+    return scene
+
+
+def read_cam_params(folder: Path) -> PinholeParams:
+    """Reads ``cam_params.json`` from the scene folder, else from the folder above it.
+
+    Raises:
+        DataError: Not found in either place, not JSON, or a number missing or out of range.
+    """
+    candidates = [folder / "cam_params.json", folder.absolute().parent / "cam_params.json"]
+    path = next((p for p in candidates if p.is_file()), None)
+    if path is None:
+        raise DataError(
+            f"{candidates[0]}: not found, nor {candidates[1]}; expected intrinsics "
+            '{"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}} in one of them'
+        )
+    try:
+        camera = json.loads(path.read_text(encoding="utf-8"))["camera"]
+    except (ValueError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: not valid JSON ({error}); expected a camera's intrinsics") from None
+    except (KeyError, TypeError):
+        raise DataError(f'{path}: no "camera" entry; expected {{"camera": {{"w": ..., "h": ...}}}}') from None
+    values: dict[str, float] = {}
+    for key in ("w", "h", "fx", "fy", "cx", "cy", "scale"):
+        value = camera.get(key) if isinstance(camera, dict) else None
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise DataError(f'{path}: camera "{key}" is {value!r}; expected a number')
+        if not math.isfinite(value) or (value <= 0 and key not in ("cx", "cy")):
+            raise DataError(f'{path}: camera "{key}" is {value}; expected a positive number')
+        values[key] = float(value)
+    for key in ("w", "h"):
+        if values[key] != int(values[key]):
+            raise DataError(f'{path}: camera "{key}" is {values[key]}; expected a whole number of pixels')
+    return PinholeParams(
+        width=int(values["w"]),
+        height=int(values["h"]),
+        fx=values["fx"],
+        fy=values["fy"],
+        cx=values["cx"],
+        cy=values["cy"],
+        scale=values["scale"],
+        path=path,
+    )
+
+
+def read_trajectory(path: Path) -> np.ndarray:
+    """Reads ``traj.txt``: float64 (F, 4, 4), camera-to-world, not yet checked to be rigid or finite.
+
+    Blank lines are ignored.
+
+    Raises:
+        DataError: No such file, or a line that is not 16 numbers (its line number is given).
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise DataError(f"{path}: not found; expected one camera-to-world (16 numbers) per line") from None
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: not a text file; expected one camera-to-world (16 numbers) per line") from None
+    rows = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.replace(",", " ").split()
+        if not words:
+            continue
+        if len(words) != 16:
+            raise DataError(f"{path}: line {number} has {len(words)} values; expected 16 (a 4 x 4 matrix, row by row)")
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError as error:
+            raise DataError(f"{path}: line {number}: {error}; expected 16 numbers") from None
+    if not rows:
+        raise DataError(f"{path}: empty; expected one camera-to-world (16 numbers) per line")
+    return np.asarray(rows, dtype=np.float64).reshape(-1, 4, 4)
+
+
+def read_photo(path: Path, params: PinholeParams) -> np.ndarray:
+    """Decodes one photo: uint8 (H, W, 3), sRGB.
+
+    Raises:
+        DataError: Missing, broken, or of another size than ``params``.
+    """
+    image = _open_image(path)
+    _check_size(path, image.size, params)
+    return np.asarray(_decoded(path, image).convert("RGB"))
+
+
+def read_depth(path: Path, params: PinholeParams) -> np.ndarray:
+    """Decodes one depth image: float32 (H, W), scene units along the optical axis, 0 where unknown.
+
+    Raises:
+        DataError: Missing, broken, not 16 bit, or of another size than ``params``.
+    """
+    image = _open_image(path)
+    _check_size(path, image.size, params)
+    if image.mode not in ("I;16", "I;16B", "I"):
+        raise DataError(f"{path}: pixels of mode {image.mode}; expected a 16-bit grey depth image")
+    raw = np.asarray(_decoded(path, image)).astype(np.int64)
+    depth = raw.astype(np.float32) / np.float32(params.scale)
+    depth[np.isin(raw, UNKNOWN_DEPTH)] = 0.0
+    return depth
+
+
+def _open_image(path: Path):
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        return Image.open(path)
+    except FileNotFoundError:
+        raise DataError(f"{path}: not found") from None
+    except (UnidentifiedImageError, OSError) as error:
+        raise DataError(f"{path}: not a readable picture ({type(error).__name__}); restore the file") from None
+
+
+def _decoded(path: Path, image):
+    try:
+        image.load()
+    except (OSError, SyntaxError, ValueError) as error:
+        raise DataError(f"{path}: broken picture ({error}); restore the file") from None
+    return image
+
+
+def _check_size(path: Path, size: tuple[int, int], params: PinholeParams) -> None:
+    if size != (params.width, params.height):
+        raise DataError(
+            f"{path}: {size[0]} x {size[1]} pixels; expected {params.width} x {params.height} as in {params.path}"
+        )
+
+
+def _numbered(folder: Path, pattern: re.Pattern, wanted: str) -> dict[int, Path]:
+    """The files of a folder whose name matches, by the number in the name."""
+    if not folder.is_dir():
+        raise DataError(f"{folder}: no such folder; expected {wanted} in it")
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        match = pattern.match(path.name)
+        if match is None:
+            continue
+        number = int(match.group(1))
+        if number in found:
+            raise DataError(f"{folder}: {found[number].name} and {path.name} have the same number; keep one of them")
+        found[number] = path
+    return found
+
+
+def _sibling_name(path: Path, stem: str, suffix: str) -> str:
+    return stem + re.sub(r"\D", "", path.stem) + suffix
+
+
+def _missing_hint(numbers: list[int], poses: int) -> str:
+    """Names the photos that are missing from an otherwise gapless numbering, if that explains the count."""
+    last = max(numbers[0] + poses - 1, numbers[-1])
+    if len(numbers) >= poses or last - numbers[0] + 1 != poses:
+        return ""
+    present = set(numbers)
+    gaps = [f"frame{n:06d}" for n in range(numbers[0], last + 1) if n not in present]
+    return f"; missing: {_some(gaps)}"
+
+
+def _some(items: list[str], limit: int = 5) -> str:
+    return ", ".join(items[:limit]) + (f" and {len(items) - limit} more" if len(items) > limit else "")
+
+
+def _rigid(poses: np.ndarray, lines: list[int], path: Path) -> np.ndarray:
+    """Poses with the nearest rotation (polar factor, by SVD) in place of a slightly drifted one.
+
+    Raises:
+        DataError: The last row is not (0, 0, 0, 1), the drift is too large, or the axes are mirrored.
+    """
+    last = np.abs(poses[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1)
+    rotation = poses[:, :3, :3]
+    drift = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max(axis=(1, 2))
+    mirrored = np.linalg.det(rotation) < 0
+    for k, line in enumerate(lines):
+        if last[k] > 1e-6:
+            row = " ".join(f"{v:g}" for v in poses[k, 3])
+            raise DataError(f"{path}: line {line} ends in {row}; expected 0 0 0 1 (a matrix written row by row)")
+        if drift[k] > MAX_ROTATION_DRIFT:
+            raise DataError(
+                f"{path}: line {line} is not a rigid pose (R^T R is off by {drift[k]:.2g}); "
+                f"expected a rotation within {MAX_ROTATION_DRIFT:g}"
+            )
+        if mirrored[k]:
+            raise DataError(f"{path}: line {line} mirrors the axes (determinant -1); expected a rotation")
+    u, _, vt = np.linalg.svd(rotation)
+    rigid = np.tile(np.eye(4), (len(poses), 1, 1))
+    rigid[:, :3, :3] = u @ vt
+    rigid[:, :3, 3] = poses[:, :3, 3]
+    return rigid

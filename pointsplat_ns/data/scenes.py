@@ -1,0 +1,279 @@
+"""Trained scenes with their posed photos, one or many, as the refiner is trained and evaluated on.
+
+A trained run knows its data, its dataparser and its frame, so the run is all that a person names:
+``--data`` takes one run, or any folder above several.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.base_datamanager import DataManager, DataManagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.utils.colors import get_color
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from pointsplat_ns.data.frames import FrameCache, Frames, free_memory_share
+from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.inert_yaml import Tagged
+from pointsplat_ns.io.runs import Run, find_runs, scene_names
+from pointsplat_ns.io.splatfacto import read_checkpoint
+
+VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
+"""What Splatfacto evaluates over where it trained with random backgrounds."""
+
+_NO_SEEDS = ("load_seed_points", "load_3D_points")
+"""Settings of dataparsers that gather seed points, which a trained scene has no use for."""
+
+
+def dataparser_of(run: Run) -> DataParser:
+    """The dataparser that a run was trained with, set up as it was then.
+
+    Only classes that nerfstudio or an installed plugin registers are used; the run's file names one,
+    it does not get to import anything.
+
+    Raises:
+        SceneError: if the dataparser is not installed or does not know a setting.
+    """
+    from nerfstudio.configs.dataparser_configs import all_dataparsers
+
+    known = {f"{type(c).__module__}.{type(c).__qualname__}": type(c) for c in all_dataparsers.values()}
+    if run.dataparser_class not in known:
+        raise SceneError(
+            f"{run.config_path}: trained with the dataparser {run.dataparser_class or 'of another kind'}, which is not "
+            "installed here; install the plugin that provides it"
+        )
+    config = known[run.dataparser_class]()
+    fields = {f.name for f in dataclasses.fields(config)}
+    for name, value in run.dataparser_fields.items():
+        if name not in fields:
+            raise SceneError(f"{run.config_path}: its dataparser has no setting {name!r}; install the version it had")
+        if isinstance(value, Tagged):
+            continue  # an object: the default stands
+        setattr(config, name, False if name in _NO_SEEDS else value)
+    config.data = run.data
+    return config.setup()
+
+
+class TrainedScene:
+    """One trained run: its Gaussians and, when asked for, its posed photos.
+
+    Args:
+        name: unique among the scenes in use.
+        run: where everything is.
+        cache: for decoded photos, shared among scenes.
+    """
+
+    def __init__(self, name: str, run: Run, cache: FrameCache):
+        self.name = name
+        self.run = run
+        self._cache = cache
+
+    def read_dense(self) -> Gaussians:
+        """The Gaussians as trained, read anew each time: a dense scene is too big to keep many of."""
+        return read_checkpoint(self.run.checkpoint)
+
+    @property
+    def rasterize_mode(self) -> Literal["classic", "antialiased"]:
+        """How the run rendered, and how it is rendered from then on."""
+        mode = self.run.model_fields.get("rasterize_mode")
+        return mode if mode in ("classic", "antialiased") else "classic"
+
+    @property
+    def background(self) -> torch.Tensor:
+        """Colour (3,) that the run is evaluated over."""
+        color = self.run.model_fields.get("background_color")
+        return get_color(color) if color in ("black", "white") else torch.tensor(VIEWER_BACKGROUND)
+
+    @cached_property
+    def _dataparser(self) -> DataParser:
+        return dataparser_of(self.run)
+
+    @cached_property
+    def train_outputs(self) -> DataparserOutputs:
+        """What the dataparser says of the training photos.
+
+        Raises:
+            DataError: if their frame is not the one that the Gaussians are in.
+        """
+        outputs = self._dataparser.get_dataparser_outputs(split="train")
+        moved = (outputs.dataparser_transform[:3] - self.run.transform).abs().max()
+        if moved > 1e-4 or abs(outputs.dataparser_scale / self.run.scale - 1) > 1e-4:
+            raise DataError(
+                f"{self.run.data}: its poses are no longer in the frame that {self.run.folder} was trained in (the "
+                f"transform differs by {float(moved):.3g}, the scale is {outputs.dataparser_scale:.6g} and was "
+                f"{self.run.scale:.6g}); put back the data as it was, or train the scene again"
+            )
+        return outputs
+
+    def _frames(self, outputs: DataparserOutputs) -> Frames:
+        scale = self.run.datamanager_fields.get("camera_res_scale_factor", 1.0)
+        return Frames(InputDataset(outputs, scale if isinstance(scale, float) else 1.0), cache=self._cache)
+
+    @cached_property
+    def train_frames(self) -> Frames:
+        """Training photos at the resolution that the run was trained at."""
+        return self._frames(self.train_outputs)
+
+    @cached_property
+    def eval_frames(self) -> Frames:
+        """Held-out photos at the resolution that the run was trained at."""
+        return self._frames(self._dataparser.get_dataparser_outputs(split="test"))
+
+
+@dataclass
+class ScenesDataManagerConfig(DataManagerConfig):
+    """Trained scenes with their posed photos"""
+
+    _target: type = field(default_factory=lambda: ScenesDataManager)
+    data: Path | None = None
+    """A trained Splatfacto run, or a folder above several (the newest run of each experiment is taken)."""
+    eval_scenes: tuple[str, ...] = ()
+    """Names of scenes never to train on, to see how the refiner does on scenes that it does not know."""
+    images_per_step: int = 2
+    """Training photos of one scene rendered at each step (the paper: 2)."""
+    cache_gigabytes: float | None = None
+    """Memory for decoded photos; by default a quarter of what is free. What does not fit is read again."""
+    seed: int = 0
+    """Chooses the order of scenes and photos."""
+
+
+class ScenesDataManager(DataManager):
+    """Hands out, at each step, one scene and some of its training photos.
+
+    What a step gets depends on the seed and the step alone, so that a resumed training goes on as if
+    it had never stopped.
+
+    Raises:
+        SceneError: if ``data`` holds no trained run, or ``eval_scenes`` names one that is not there.
+    """
+
+    config: ScenesDataManagerConfig
+
+    def __init__(
+        self,
+        config: ScenesDataManagerConfig,
+        device: torch.device | str = "cpu",
+        test_mode: Literal["test", "val", "inference"] = "val",
+        world_size: int = 1,
+        local_rank: int = 0,
+        **kwargs: Any,
+    ):
+        self.config, self.device, self.test_mode = config, device, test_mode
+        self.world_size, self.local_rank = world_size, local_rank
+        if world_size > 1:
+            raise SceneError("--machine.num-devices: the refiner is trained by one process; expected 1")
+        if config.data is None:
+            raise SceneError("--data is missing: expected a trained Splatfacto run, or a folder above several")
+        runs = find_runs(config.data, need_data=test_mode != "inference")
+        gigabytes = config.cache_gigabytes
+        cache = FrameCache(free_memory_share() if gigabytes is None else int(gigabytes * 1e9))
+        self.scenes = [TrainedScene(name, run, cache) for name, run in zip(scene_names(runs), runs, strict=True)]
+        names = [scene.name for scene in self.scenes]
+        unknown = [name for name in config.eval_scenes if name not in names]
+        if unknown:
+            raise SceneError(
+                f"--eval-scenes {unknown[0]}: no such scene in {config.data}; there are {', '.join(names)}"
+            )
+        self.train_indices = [i for i, name in enumerate(names) if name not in config.eval_scenes]
+        self.eval_indices = [i for i, name in enumerate(names) if name in config.eval_scenes] or self.train_indices
+        if not self.train_indices:
+            raise SceneError(f"--eval-scenes names all {len(names)} scenes of {config.data}; none is left to train on")
+        if config.images_per_step < 1:
+            raise DataError(f"--images-per-step {config.images_per_step}: expected at least 1")
+        self.shown = self.eval_indices[0]
+        """The scene that the viewer and the exporter get."""
+        training = ", ".join(names[i] for i in self.train_indices)
+        held_out = ", ".join(config.eval_scenes) or "no scene (held-out photos of the training scenes serve)"
+        CONSOLE.log(f"training scenes: {training}; evaluation on: {held_out}")
+        super().__init__()
+
+    @property
+    def train_dataset(self) -> InputDataset | None:  # type: ignore[override]
+        """Training photos of the shown scene, for the viewer."""
+        return None if self.test_mode == "inference" else self.scenes[self.shown].train_frames.dataset
+
+    @property
+    def eval_dataset(self) -> InputDataset | None:  # type: ignore[override]
+        """Held-out photos of the shown scene, for the viewer."""
+        return None if self.test_mode == "inference" else self.scenes[self.shown].eval_frames.dataset
+
+    @property
+    def includes_time(self) -> bool:
+        """No scene moves."""
+        return False
+
+    def setup_train(self) -> None:
+        """Nothing to set up: photos are read when they are due."""
+
+    def setup_eval(self) -> None:
+        """Nothing to set up: photos are read when they are due."""
+
+    def _choice(self, step: int) -> tuple[int, list[int]]:
+        """Scene and photos of a step: each scene once before any twice, photos at random without repetition."""
+        epoch, place = divmod(step, len(self.train_indices))
+        order = random.Random(f"{self.config.seed} scenes {epoch}").sample(self.train_indices, len(self.train_indices))
+        scene = order[place]
+        count = len(self.scenes[scene].train_frames)
+        chosen = random.Random(f"{self.config.seed} photos {step}")
+        return scene, chosen.sample(range(count), min(self.config.images_per_step, count))
+
+    def next_train(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
+        """Index of a training scene, and some of its training photos with their cameras, on the device."""
+        scene, photos = self._choice(step)
+        frames = [self._to_device(self.scenes[scene].train_frames[i]) for i in photos]
+        next_scene, next_photos = self._choice(step + 1)
+        self.scenes[next_scene].train_frames.prefetch(next_photos)
+        return scene, frames
+
+    def next_eval(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
+        """Index of an evaluation scene, and one of its held-out photos."""
+        scene = self.eval_indices[step % len(self.eval_indices)]
+        frames = self.scenes[scene].eval_frames
+        if len(frames) == 0:
+            raise DataError(f"{self.scenes[scene].run.data}: no frame is held out; change the dataparser's split")
+        index = random.Random(f"{self.config.seed} eval {step}").randrange(len(frames))
+        return scene, [self._to_device(frames[index])]
+
+    def next_eval_image(self, step: int):  # type: ignore[override]
+        """As :meth:`next_eval`."""
+        return self.next_eval(step)
+
+    def held_out(self, scene: int) -> Iterator[tuple[Cameras, dict[str, Any]]]:
+        """Every held-out photo of a scene with its camera, on the device."""
+        return (self._to_device(frame) for frame in self.scenes[scene].eval_frames)
+
+    def _to_device(self, frame: tuple[Cameras, dict[str, Any]]) -> tuple[Cameras, dict[str, Any]]:
+        camera, data = frame
+        for name in ("image", "mask"):
+            if name in data:
+                data[name] = data[name].to(self.device)
+        return camera.to(self.device), data
+
+    def get_train_rays_per_batch(self) -> int:
+        """Pixels of a step, for nerfstudio's log."""
+        cameras = self.scenes[self.train_indices[0]].train_frames.dataset.cameras
+        return int(cameras.height[0]) * int(cameras.width[0]) * self.config.images_per_step
+
+    def get_eval_rays_per_batch(self) -> int:
+        """Pixels of a held-out photo, for nerfstudio's log."""
+        return self.get_train_rays_per_batch() // self.config.images_per_step
+
+    def get_datapath(self) -> Path:
+        """What ``--data`` named."""
+        assert self.config.data is not None
+        return self.config.data
+
+    def get_param_groups(self) -> dict:
+        """Nothing here is trained."""
+        return {}

@@ -1,0 +1,263 @@
+"""The PointSplat model: a dense scene is pruned once, refined by one network, and rendered.
+
+To nerfstudio it is a Splatfacto model whose Gaussians are the refined ones of one scene, so that the
+viewer and ``ns-export gaussian-splat`` work on it unchanged. Only the network is trained and saved.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.models.splatfacto import SH2RGB
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from pointsplat_ns.data.scenes import TrainedScene
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.lpips import Lpips, LpipsUnavailable, load_lpips
+from pointsplat_ns.metrics import psnr
+from pointsplat_ns.pruning import prune
+from pointsplat_ns.refined_run import prune_options
+from pointsplat_ns.refiner import Refiner, Structure, preset
+from pointsplat_ns.splatfacto_cpu import SplatfactoCpuModel, SplatfactoCpuModelConfig, viewmats_of
+
+
+@dataclass
+class PointSplatModelConfig(SplatfactoCpuModelConfig):
+    """Which Gaussians are kept, and the network that repairs them"""
+
+    _target: type = field(default_factory=lambda: PointSplatModel)
+    keep: float = 0.3
+    """Gaussians to keep: a ratio in (0, 1], or a count if above 1."""
+    score: str = "paper"
+    """Score that chooses them: paper (eq. 3), opacity, volume or random."""
+    opacity_weight: float = 0.3
+    """Lambda of the paper's score: the weight of opacity; that of volume is what is left of 1."""
+    size: Literal["tiny", "small", "full"] = "small"
+    """Size of the network: full is the paper's and wants a GPU; small and tiny are for a CPU."""
+    encoder: Literal["dual", "concat"] = "dual"
+    """dual is the paper's dual-branch encoder; concat feeds one concatenated vector, as SplatFormer does."""
+    lpips_weight: float = 0.1
+    """Weight of LPIPS in the loss, beside L1."""
+    lpips_net: Literal["auto", "alex", "vgg"] = "auto"
+    """Network of the training loss's LPIPS; auto is vgg on CUDA and alex, thirty times cheaper, elsewhere."""
+
+
+@dataclass
+class PrunedScene:
+    """What training and evaluation need of a scene, made once."""
+
+    scene: TrainedScene
+    dense_count: int
+    pruned: Gaussians
+    structure: Structure | None
+    seconds: float  # to choose and select, without reading
+
+    @property
+    def name(self) -> str:
+        return self.scene.name
+
+
+def options_of(config: PointSplatModelConfig) -> dict[str, Any]:
+    """Arguments of :func:`pointsplat_ns.pruning.prune` that a config asks for."""
+    return prune_options(config.keep, config.score, config.opacity_weight)
+
+
+class PointSplatModel(SplatfactoCpuModel):
+    """See the module. The pipeline hands over the scenes with :meth:`attach` before anything is drawn."""
+
+    config: PointSplatModelConfig
+
+    def populate_modules(self) -> None:
+        """Build the network; nothing of a scene is a parameter."""
+        self.refiner = Refiner(preset(self.config.size, encoder=self.config.encoder))
+        self.camera_optimizer = CameraOptimizerConfig(mode="off").setup(num_cameras=1, device="cpu")
+        self.crop_box = None
+        self.step = 0
+        self.scenes: list[TrainedScene] = []
+        self.shown = 0
+        self._pruned: dict[int, PrunedScene] = {}
+        self._refined: tuple[int, Gaussians] | None = None
+        self._lpips: dict[str, Lpips | None] = {}
+        self.lpips_reason: str | None = None
+        """Why there is no LPIPS, once that is known."""
+
+    def attach(self, scenes: list[TrainedScene], shown: int) -> None:
+        """Take the scenes to work on, and which of them is the model's own to the viewer and the exporter."""
+        self.scenes, self.shown = scenes, shown
+
+    def load_state_dict(self, dict, **kwargs):  # type: ignore[override]
+        """The network's weights; Splatfacto's own method would look for Gaussians."""
+        self._refined = None
+        return torch.nn.Module.load_state_dict(self, dict, **kwargs)
+
+    def get_training_callbacks(self, training_callback_attributes) -> list:
+        """None: there is no densification."""
+        return []
+
+    def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
+        """The network's parameters by part: encoder, backbone and one head per attribute."""
+        return self.refiner.parameter_groups()
+
+    def pruned_scene(self, index: int) -> PrunedScene:
+        """A scene, pruned and serialized; made at the first call and kept."""
+        if index not in self._pruned:
+            scene = self.scenes[index]
+            dense = scene.read_dense()
+            start = time.perf_counter()
+            try:
+                pruned = prune(dense, **options_of(self.config)).scene
+            except SceneError as error:
+                raise SceneError(f"{scene.run.checkpoint}: {error}") from error
+            seconds = time.perf_counter() - start
+            pruned = pruned.to(self.device)
+            structure = self.refiner.prepare(pruned)
+            self._pruned[index] = PrunedScene(scene, len(dense), pruned, structure, seconds)
+            CONSOLE.log(f"{scene.name}: kept {len(pruned):,} of {len(dense):,} Gaussians")
+        return self._pruned[index]
+
+    def refine(self, index: int) -> Gaussians:
+        """The refined scene; differentiable in training, computed once for the same weights in evaluation."""
+        made = self.pruned_scene(index)
+        if self.training:
+            self._refined = None
+            return self.refiner(made.pruned, made.structure)
+        if self._refined is None or self._refined[0] != index:
+            with torch.no_grad():
+                self._refined = (index, self.refiner(made.pruned, made.structure))
+        return self._refined[1]
+
+    def timed_refine(self, index: int) -> tuple[Gaussians, float]:
+        """As :meth:`refine` in evaluation, computed anew, and the seconds that it took."""
+        self.pruned_scene(index)
+        self._refined = None
+        start = time.perf_counter()
+        refined = self.refine(index)
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        return refined, time.perf_counter() - start
+
+    def draw(self, gaussians: Gaussians, scene: TrainedScene, camera: Cameras) -> dict[str, Tensor]:
+        """Render a scene as its run was rendered.
+
+        Args:
+            camera: of shape (1,), on the model's device.
+
+        Returns:
+            ``rgb`` (H, W, 3) in [0, 1], ``accumulation`` (H, W, 1), ``depth`` (H, W, 1) in scene units, ``background``.
+        """
+        width, height = int(camera.width.item()), int(camera.height.item())
+        image, alpha, _ = self._rasterization()(
+            means=gaussians.means,
+            quats=gaussians.quats,
+            scales=gaussians.stds,
+            opacities=gaussians.alphas,
+            colors=gaussians.sh,
+            viewmats=viewmats_of(camera.camera_to_worlds),
+            Ks=camera.get_intrinsics_matrices().to(self.device),
+            width=width,
+            height=height,
+            sh_degree=gaussians.sh_degree,
+            render_mode="RGB" if self.training else "RGB+ED",
+            rasterize_mode=scene.rasterize_mode,
+        )
+        background = scene.background.to(image)
+        outputs = {
+            "rgb": (image[0, ..., :3] + (1 - alpha[0]) * background).clamp(0, 1),
+            "accumulation": alpha[0],
+            "background": background.expand(height, width, 3),
+        }
+        if not self.training:
+            depth = image[0, ..., 3:]
+            outputs["depth"] = torch.where(alpha[0] > 0, depth, depth.max())
+        return outputs
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Any]:
+        """The shown scene, refined, from one camera; cropped where the viewer asks for it."""
+        if not isinstance(camera, Cameras):
+            return {}
+        gaussians = self.gaussians
+        if self.crop_box is not None and not self.training:
+            gaussians = gaussians[self.crop_box.within(gaussians.means).reshape(-1)]
+        return self.draw(gaussians, self.scenes[self.shown], camera)
+
+    def lpips_of(self, net: str) -> Lpips | None:
+        """LPIPS with a backbone, loaded once; None, with ``lpips_reason`` set, where it cannot be had."""
+        if net not in self._lpips:
+            try:
+                self._lpips[net] = load_lpips(net).to(self.device)  # type: ignore[arg-type]
+            except LpipsUnavailable as error:
+                self._lpips[net], self.lpips_reason = None, str(error)
+                CONSOLE.log(f"going on without LPIPS: {error}")
+        return self._lpips[net]
+
+    def losses(self, index: int, frames: list[tuple[Cameras, dict]]) -> tuple[dict, dict[str, Tensor], dict]:
+        """Refine a scene and compare its renders with photos.
+
+        Returns:
+            Outputs of the last photo's camera, the losses (L1 and weighted LPIPS, averaged over the photos), and
+            metrics to log.
+
+        Raises:
+            SceneError: if a loss is not finite.
+        """
+        refined, scene = self.refine(index), self.scenes[index]
+        net = self.config.lpips_net
+        net = ("vgg" if self.device.type == "cuda" else "alex") if net == "auto" else net
+        lpips = self.lpips_of(net) if self.config.lpips_weight > 0 else None
+        outputs: dict[str, Tensor] = {}
+        l1, perceptual, quality = [], [], []
+        for camera, data in frames:
+            outputs = self.draw(refined, scene, camera)
+            rgb, photo = outputs["rgb"], self.photo_of(data, outputs["background"])
+            if "mask" in data:
+                rgb, photo = rgb * data["mask"], photo * data["mask"]
+            l1.append((rgb - photo).abs().mean())
+            quality.append(psnr(rgb.detach(), photo))
+            if lpips is not None:
+                perceptual.append(lpips(rgb, photo))
+        losses = {"l1": torch.stack(l1).mean()}
+        if perceptual:
+            losses["lpips"] = self.config.lpips_weight * torch.stack(perceptual).mean()
+        for name, value in losses.items():
+            if not value.isfinite():
+                raise SceneError(
+                    f"{scene.name}: the {name} loss of the refined scene is {value.item()}; lower the rates"
+                )
+        return outputs, losses, {"psnr": torch.stack(quality).mean(), "gaussian_count": len(refined)}
+
+    def _get_downscale_factor(self) -> int:
+        """1: nothing is gained by starting coarse, as Splatfacto does."""
+        return 1
+
+    def photo_of(self, data: dict[str, Any], background: Tensor) -> Tensor:
+        """A photo (H, W, 3) in [0, 1], over ``background`` where it has an alpha channel."""
+        return self.composite_with_background(self.get_gt_img(data["image"]), background)
+
+    # What nerfstudio's viewer and exporter read of a Splatfacto model.
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The shown scene, refined."""
+        return self.refine(self.shown).detach()
+
+    @property
+    def gauss_params(self) -> dict[str, Tensor]:  # type: ignore[override]
+        """The shown scene's parameters by Splatfacto's names."""
+        return dict(self.gaussians.items())
+
+    @property
+    def colors(self) -> Tensor:
+        """Colours of the shown scene seen from nowhere in particular, (N, 3)."""
+        return SH2RGB(self.gaussians.features_dc)
+
+    @property
+    def shs_0(self) -> Tensor:
+        """Constant SH coefficients of the shown scene, (N, 3)."""
+        return self.gaussians.features_dc

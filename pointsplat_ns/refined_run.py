@@ -1,0 +1,85 @@
+"""A trained ``pointsplat`` run, opened without nerfstudio and without running its ``config.yml``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.runs import Run, find_runs, open_run, scene_names
+from pointsplat_ns.pruning import prune
+from pointsplat_ns.refiner import Refiner, preset
+
+METHOD = "pointsplat"
+_PREFIX = "_model.refiner."
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedRun:
+    """A trained refiner, how it expects scenes to be pruned, and the scenes of its run by name."""
+
+    run: Run
+    refiner: Refiner
+    prune_options: dict[str, Any]
+    scenes: dict[str, Run]
+    default_scene: str
+
+    @torch.no_grad()
+    def compact(self, dense: Gaussians, keep: float | int | None = None) -> Gaussians:
+        """Prune a scene as the refiner was trained to see it, and refine it.
+
+        Args:
+            dense: on the CPU.
+            keep: ratio (float) or count (int); by default the one of the training.
+
+        Raises:
+            BudgetError: if ``keep`` does not fit the scene.
+            SceneError: if the scene has a higher SH degree than the refiner.
+        """
+        options = self.prune_options if keep is None else {**self.prune_options, "keep": keep}
+        return self.refiner(prune(dense, **options).scene)
+
+
+def prune_options(keep: float, score: str, opacity_weight: float) -> dict[str, Any]:
+    """Arguments of :func:`pointsplat_ns.pruning.prune` for a model's settings; ``keep`` above 1 is a count."""
+    extra = {"opacity_weight": opacity_weight} if score == "paper" else {}
+    return {"keep": int(keep) if keep > 1 else float(keep), "by": score, **extra}
+
+
+def open_refined_run(path: Path | str, need_scenes: bool = True) -> RefinedRun:
+    """Open a trained ``pointsplat`` run.
+
+    Args:
+        path: its folder, ``config.yml`` or checkpoint.
+        need_scenes: find the Splatfacto runs that it was trained on.
+
+    Raises:
+        SceneError: if it is another kind of run, is damaged, or its scenes are needed and gone.
+    """
+    run = open_run(path, need_data=need_scenes)
+    if run.method_name != METHOD:
+        raise SceneError(f"{path}: a run of the method {run.method_name or 'unknown'}; expected a {METHOD} run")
+    settings = run.model_fields
+    try:
+        refiner = Refiner(preset(settings["size"], encoder=settings["encoder"]))
+        options = prune_options(float(settings["keep"]), settings["score"], float(settings["opacity_weight"]))
+        state = torch.load(run.checkpoint, map_location="cpu", weights_only=True, mmap=True)["pipeline"]
+        weights = {name[len(_PREFIX) :]: value for name, value in state.items() if name.startswith(_PREFIX)}
+        refiner.load_state_dict(weights)
+    except KeyError as error:
+        raise SceneError(f"{run.config_path}: lacks {error}; expected a {METHOD} run of this version") from error
+    except Exception as error:  # a damaged archive can raise nearly anything
+        text = " ".join(str(error).split())[:160]
+        raise SceneError(f"{run.checkpoint}: not a usable {METHOD} checkpoint ({text})") from error
+    scenes: dict[str, Run] = {}
+    default = ""
+    if need_scenes:
+        runs = find_runs(run.data, need_data=False)
+        scenes = dict(zip(scene_names(runs), runs, strict=True))
+        held_out = [name for name in run.datamanager_fields.get("eval_scenes") or () if name in scenes]
+        default = (held_out or list(scenes))[0]
+    return RefinedRun(run, refiner.eval(), options, scenes, default)
