@@ -12,7 +12,7 @@ def main(args: list[str] | None = None) -> None:
 
     from pointsplat_ns.cli.demo import demo
     from pointsplat_ns.cli.scenes import export, prune, refine
-    from pointsplat_ns.cli.view import compare, rooms
+    from pointsplat_ns.cli.view import report, rooms
     from pointsplat_ns.errors import PointSplatError
 
     logging.basicConfig(format="%(message)s", level=logging.INFO)
@@ -20,7 +20,7 @@ def main(args: list[str] | None = None) -> None:
         "prune": prune,
         "refine": refine,
         "export": export,
-        "compare": compare,
+        "report": report,
         "rooms": rooms,
         "demo": demo,
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -53,6 +53,10 @@ class ReplicaDataParser(DataParser):
 
     config: ReplicaDataParserConfig
 
+    def __init__(self, config: ReplicaDataParserConfig):
+        super().__init__(config)
+        self._scene: ReplicaScene | None = None
+
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         """See the base class.
 
@@ -64,9 +68,11 @@ class ReplicaDataParser(DataParser):
         """
         config = self.config
         self._check_config()
-        scene = load_replica(config.data)
+        if self._scene is None:  # once for both splits
+            self._scene = load_replica(config.data)
+        scene = self._scene
         if config.depth_unit_scale_factor is not None:
-            scene = _with_depth_unit(scene, config.depth_unit_scale_factor)
+            scene = replace(scene, params=replace(scene.params, scale=1.0 / config.depth_unit_scale_factor))
         train, held_out = self._split(scene)
         part = scene.select(train if split == "train" else held_out)
         params = scene.params
@@ -176,12 +182,6 @@ def read_eval_list(path: Path) -> list[int]:
     if not numbers:
         raise DataError(f"{path}: names no frame; expected a frame number or file name a line")
     return numbers
-
-
-def _with_depth_unit(scene: ReplicaScene, unit: float) -> ReplicaScene:
-    from dataclasses import replace
-
-    return replace(scene, params=replace(scene.params, scale=1.0 / unit))
 
 
 def _scene_box(scene: ReplicaScene, scale: float) -> SceneBox:

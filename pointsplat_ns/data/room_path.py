@@ -40,9 +40,9 @@ def capture_path(room: "Room", frames: int, seed: int) -> Tensor:
     heights = (_LOWEST + top) / 2 + (top - _LOWEST) / 2 * np.sin(2 * math.pi * (3 * share + rng.random()))
     middle = np.array([xs[free.any(0)].mean(), ys[free.any(1)].mean()])
     # Across the room on the first round; swinging to both sides on the second, to see into the corners.
-    swing = 0.2 + 0.75 * _smoothstep((share - 0.4) / 0.2)
-    gaze = np.arctan2(middle[1] - route[:, 1], middle[0] - route[:, 0])
-    gaze = np.unwrap(gaze) + swing * np.sin(2 * math.pi * 5 * share)
+    swing = 0.2 + 0.7 * _smoothstep((share - 0.4) / 0.2)
+    gaze = np.unwrap(np.arctan2(middle[1] - route[:, 1], middle[0] - route[:, 0]))
+    gaze = _eased(gaze, frames / 40) + swing * np.sin(2 * math.pi * 4 * share)
     pitch = -0.22 + 0.24 * np.sin(2 * math.pi * (7 * share + rng.random()))
     positions = np.concatenate([route, heights[:, None]], axis=1)
     return torch.stack([_look(p, g, t) for p, g, t in zip(positions, gaze, pitch, strict=True)])
@@ -127,6 +127,13 @@ def _walk(cells: np.ndarray, stops: list[int]) -> np.ndarray:
             here = int(before[here])
             walk.append(here)
     return cells[walk]
+
+
+def _eased(values: np.ndarray, sigma: float) -> np.ndarray:
+    """Gaussian smoothing over ``sigma`` frames: no sudden turn where the way passes the middle closely."""
+    from scipy.ndimage import gaussian_filter1d
+
+    return gaussian_filter1d(values, sigma, mode="nearest")
 
 
 def _smoothstep(t: np.ndarray) -> np.ndarray:

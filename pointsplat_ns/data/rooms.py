@@ -19,7 +19,7 @@ from torch import Tensor
 
 from pointsplat_ns.data.raycast import dot, surface, trace_camera, unit
 from pointsplat_ns.data.room_layout import Light, RoomSpec, sample_room
-from pointsplat_ns.data.room_light import BakedRoom, bake
+from pointsplat_ns.data.room_light import BakedRoom, bake, one_thread
 from pointsplat_ns.data.room_path import capture_path
 from pointsplat_ns.errors import DataError
 
@@ -83,10 +83,11 @@ def render_room(
     c2w, K = c2w.float(), K.float()
     step = max(_BAND // (width * SUBPIXELS**2), 1)
     bands = []
-    for first in range(0, height, step):
-        band = K.clone()
-        band[1, 2] -= first
-        bands.append(_render_band(room, c2w, band, width, min(step, height - first), highlights))
+    with one_thread(), torch.no_grad():
+        for first in range(0, height, step):
+            band = K.clone()
+            band[1, 2] -= first
+            bands.append(_render_band(room, c2w, band, width, min(step, height - first), highlights))
     rgb, depth = zip(*bands, strict=True)
     return torch.cat(rgb), torch.cat(depth)
 

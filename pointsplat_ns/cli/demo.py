@@ -1,0 +1,141 @@
+"""``pointsplat demo``: the whole method, end to end, on rooms that the package makes itself."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+UNSEEN = "room2"
+"""The room that the refiner is not trained on."""
+
+
+def demo(
+    output: Path = Path("outputs/demo"),
+    keep: float = 0.1,
+    scene_steps: int = 900,
+    refiner_steps: int = 400,
+    fresh: bool = False,
+) -> None:
+    """Train small scenes, prune them, train the refiner, evaluate it on a room that it never saw, export.
+
+    Runs the same commands that a person would type, and prints them. What an interrupted demo has
+    finished is not done again.
+
+    Args:
+        output: folder for everything that is made.
+        keep: share of the Gaussians to keep.
+        scene_steps: training steps of each room.
+        refiner_steps: training steps of the refiner.
+        fresh: start over.
+    """
+    from rich.console import Console
+
+    from pointsplat_ns.cli.view import read_evaluation, report_table, rooms
+    from pointsplat_ns.data.rooms import write_room  # noqa: F401  (fails early where a library is missing)
+
+    console = Console()
+    start = time.perf_counter()
+    if fresh and output.exists():
+        shutil.rmtree(output)
+    names = ["room0", "room1", UNSEEN]
+    missing = [name for name in names if not (output / "rooms" / name).is_dir()]
+    if missing:
+        rooms(output / "rooms", tuple(int(name[4:]) for name in missing), frames=60, width=256, height=192)
+
+    scenes = output / "scenes"
+    for name in names:
+        if not _finished(scenes / name / "splatfacto-cpu" / "demo", scene_steps):
+            _run(
+                "ns-train splatfacto-cpu --vis tensorboard --timestamp demo "
+                f"--output-dir {scenes} --experiment-name {name} --max-num-iterations {scene_steps} "
+                f"--data {output / 'rooms' / name} replica-data"
+            )
+    run = output / "refiner" / "rooms" / "pointsplat" / "demo"
+    if not _finished(run, refiner_steps):
+        _run(
+            "ns-train pointsplat --vis tensorboard --timestamp demo "
+            f"--output-dir {output / 'refiner'} --experiment-name rooms --max-num-iterations {refiner_steps} "
+            f"--data {scenes} --pipeline.datamanager.eval-scenes {UNSEEN} "
+            f"--pipeline.model.keep {keep} --pipeline.model.size tiny"
+        )
+    evaluation, pictures = output / "evaluation.json", output / "pictures"
+    _run(f"ns-eval --load-config {run / 'config.yml'} --output-path {evaluation} --render-output-path {pictures}")
+    splat = output / f"{UNSEEN}_refined.ply"
+    _run(f"pointsplat export {run} -o {splat}")
+
+    results = read_evaluation(evaluation)
+    picture = output / "before_after.png"
+    before_after(sorted(pictures.glob(f"{UNSEEN}_*.png")), results["scenes"][UNSEEN], picture)
+    console.print(report_table(results))
+    console.print(f"{splat}: open it in any 3DGS viewer, or run ns-viewer --load-config {run / 'config.yml'}")
+    console.print(f"{picture}: photo, dense, pruned and refined side by side, of a room that the refiner never saw")
+    console.print(f"done in {(time.perf_counter() - start) / 60:.1f} minutes")
+
+
+def before_after(views: list[Path], scene: dict, path: Path, rows: int = 3) -> None:
+    """A captioned picture of some views, each photo, dense, pruned and refined side by side.
+
+    Args:
+        views: pictures of ``ns-eval``, four images wide.
+        scene: that scene's part of the evaluation.
+        path: the PNG to write.
+        rows: how many views to show, spread over all.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.image import imread
+
+    titles = ["photo, held out"]
+    for variant in ("dense", "pruned", "refined"):
+        values = scene[variant]
+        titles.append(f"{variant}: {values['gaussians']:,} Gaussians, {values['megabytes']:.1f} MB, {values['psnr']:.1f} dB")
+    shown = views[:: max(1, len(views) // rows)][:rows]
+    images = [imread(view) for view in shown]
+    height, width = images[0].shape[0], images[0].shape[1] // 4
+    figure = Figure(figsize=(16, 4 * len(shown) * height / width + 0.4), layout="constrained")
+    axes = figure.subplots(len(shown), 4, squeeze=False)
+    for row, image in zip(axes, images, strict=True):
+        for column, axis in enumerate(row):
+            axis.imshow(image[:, column * width : (column + 1) * width])
+            axis.set_axis_off()
+    for axis, title in zip(axes[0], titles, strict=True):
+        axis.set_title(title, fontsize=11)
+    beside = path.with_name(f".{path.name}.part")
+    figure.savefig(beside, dpi=100, format="png")
+    os.replace(beside, path)
+
+
+def _finished(run: Path, steps: int) -> bool:
+    """Whether a run's training reached its last step; what an interrupted one left is removed."""
+    from pointsplat_ns.errors import SceneError
+    from pointsplat_ns.io.runs import open_run
+
+    try:
+        if open_run(run, need_data=False).step == steps - 1:
+            return True
+    except SceneError:
+        pass
+    shutil.rmtree(run, ignore_errors=True)
+    return False
+
+
+def _run(command: str) -> None:
+    """Run a command of this Python's environment, shown as one would type it.
+
+    Raises:
+        PointSplatError: if it fails.
+    """
+    from pointsplat_ns.errors import PointSplatError
+
+    print(f"\n$ {command}", flush=True)
+    program, *arguments = shlex.split(command)
+    beside = Path(sys.executable).parent / program
+    # Threads that sleep rather than spin while they wait lose far less on a busy machine.
+    environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}
+    status = subprocess.run([str(beside) if beside.exists() else program, *arguments], env=environment).returncode
+    if status != 0:
+        raise PointSplatError(f"{command}: ended with exit status {status}; its own words are above")

@@ -1,0 +1,102 @@
+"""Subcommands that make data or show results: rooms, report."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+ROWS = ("dense", "pruned", "refined")
+
+
+def rooms(
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    seeds: tuple[int, ...] = (0, 1, 2),
+    frames: int = 80,
+    width: int = 320,
+    height: int = 240,
+) -> None:
+    """Make furnished rooms with photos, depth images and poses, in the Replica layout.
+
+    Args:
+        output: folder to make the scenes room0, room1... in, named by their seeds.
+        seeds: one room each; the same seed is the same room.
+        frames: photos a room.
+        width: of a photo, pixels.
+        height: of a photo, pixels.
+    """
+    from pointsplat_ns.data.rooms import write_room
+
+    for seed in seeds:
+        print(write_room(output / f"room{seed}", seed, frames, width, height))
+
+
+def report(evaluation: tyro.conf.Positional[Path]) -> None:
+    """Show what ns-eval wrote of a pointsplat run as a table.
+
+    Args:
+        evaluation: the JSON file.
+    """
+    from rich.console import Console
+
+    Console().print(report_table(read_evaluation(evaluation)))
+
+
+def read_evaluation(path: Path) -> dict[str, Any]:
+    """The results in a file that ``ns-eval`` wrote of a pointsplat run.
+
+    Raises:
+        DataError: if it is something else.
+    """
+    from pointsplat_ns.errors import DataError
+
+    try:
+        results = json.loads(path.read_text("utf-8"))["results"]
+        assert set(ROWS) <= set(next(iter(results["scenes"].values())))
+        return results
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); expected what ns-eval wrote") from error
+    except (ValueError, KeyError, TypeError, AttributeError, AssertionError, StopIteration) as error:
+        raise DataError(f"{path}: not an evaluation of a pointsplat run; expected what ns-eval wrote") from error
+
+
+def report_table(results: dict[str, Any]):
+    """A rich table: one row for each scene and variant, then the averages."""
+    from rich.table import Table
+
+    settings = results.get("settings", {})
+    caption = results.get("lpips_note")
+    table = Table(
+        title=f"keep {settings.get('keep')}, score {settings.get('by')}, refiner {settings.get('size')}", caption=caption
+    )
+    table.add_column("scene")
+    table.add_column("variant")
+    for name in ("PSNR dB", "SSIM", "LPIPS", "Gaussians", "MB", "fps"):
+        table.add_column(name, justify="right")
+    blocks = [
+        (f"{name}{'' if scene['seen_in_training'] else ' (never seen)'}", scene)
+        for name, scene in results["scenes"].items()
+    ]
+    averages = (("average", "average"), ("average, never seen", "average_unseen"))
+    blocks += [(title, results[key]) for title, key in averages if len(blocks) > 1 and key in results]
+    for title, block in blocks:
+        for i, row in enumerate(ROWS):
+            values = block[row]
+            table.add_row(
+                title if i == 0 else "",
+                row,
+                _number(values["psnr"], 2),
+                _number(values["ssim"], 3),
+                _number(values["lpips"], 3),
+                _number(values["gaussians"], 0),
+                _number(values["megabytes"], 2),
+                _number(values["fps"], 1),
+                end_section=i == len(ROWS) - 1,
+            )
+    return table
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:,.{digits}f}"
