@@ -97,7 +97,9 @@ def evaluate_scene(
         raise DataError(f"{scene.run.data}: no frame is held out, so there is nothing to evaluate on; change the split")
     rows = {}
     for name, gaussians in variants.items():
-        rows[name] = {metric: _mean(values[name][metric]) for metric in METRICS}
+        # LPIPS that failed at one view is not known for all, and no mean of the others is comparable.
+        complete = {metric: per_view if len(per_view) == views else [] for metric, per_view in values[name].items()}
+        rows[name] = {metric: _mean(complete[metric]) for metric in METRICS}
         rows[name] |= {"gaussians": len(gaussians), "megabytes": gaussians.megabytes}
         rows[name]["fps"] = 1.0 / statistics.median(seconds[name])
     return SceneReport(scene.name, views, rows, values, last_picture=picture)

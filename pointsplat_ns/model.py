@@ -18,11 +18,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from pointsplat_ns.data.scenes import TrainedScene
-from pointsplat_ns.errors import SceneError
+from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.metrics import psnr
-from pointsplat_ns.pruning import prune
+from pointsplat_ns.pruning import SCORES, prune
 from pointsplat_ns.refined_run import prune_options
 from pointsplat_ns.refiner import Refiner, Structure, preset
 from pointsplat_ns.splatfacto_cpu import SplatfactoCpuModel, SplatfactoCpuModelConfig, viewmats_of
@@ -75,7 +75,14 @@ class PointSplatModel(SplatfactoCpuModel):
     config: PointSplatModelConfig
 
     def populate_modules(self) -> None:
-        """Build the network; nothing of a scene is a parameter."""
+        """Build the network; nothing of a scene is a parameter.
+
+        Raises:
+            PointSplatError: if no scene could be pruned as the config asks.
+        """
+        options_of(self.config)
+        if self.config.score not in SCORES:
+            raise PointSplatError(f"no score is called {self.config.score!r}; expected one of {', '.join(SCORES)}")
         self.refiner = Refiner(preset(self.config.size, encoder=self.config.encoder))
         self.camera_optimizer = CameraOptimizerConfig(mode="off").setup(num_cameras=1, device="cpu")
         self.crop_box = None
@@ -93,9 +100,19 @@ class PointSplatModel(SplatfactoCpuModel):
         self.scenes, self.shown = scenes, shown
 
     def load_state_dict(self, dict, **kwargs):  # type: ignore[override]
-        """The network's weights; Splatfacto's own method would look for Gaussians."""
+        """The network's weights; Splatfacto's own method would look for Gaussians.
+
+        Raises:
+            SceneError: if they are those of another network. nerfstudio would go on with the part that fits.
+        """
         self._refined = None
-        return torch.nn.Module.load_state_dict(self, dict, **kwargs)
+        try:
+            return torch.nn.Module.load_state_dict(self, dict, **{**kwargs, "strict": True})
+        except RuntimeError as error:
+            raise SceneError(
+                f"the checkpoint does not hold a network of size {self.config.size} with the {self.config.encoder} "
+                "encoder; expected the settings that it was trained with"
+            ) from error
 
     def get_training_callbacks(self, training_callback_attributes) -> list:
         """None: there is no densification."""
@@ -113,8 +130,8 @@ class PointSplatModel(SplatfactoCpuModel):
             start = time.perf_counter()
             try:
                 pruned = prune(dense, **options_of(self.config)).scene
-            except SceneError as error:
-                raise SceneError(f"{scene.run.checkpoint}: {error}") from error
+            except PointSplatError as error:
+                raise type(error)(f"{scene.run.checkpoint}: {error}") from error
             seconds = time.perf_counter() - start
             pruned = pruned.to(self.device)
             structure = self.refiner.prepare(pruned)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import re
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
@@ -12,6 +14,7 @@ from nerfstudio.engine.schedulers import CosineDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
 from pointsplat_ns.pipeline import PointSplatPipelineConfig
+from pointsplat_ns.splatfacto_cpu_method import SplatfactoCpuTrainer
 
 RATES = {
     "encoder": 1e-3,
@@ -34,17 +37,37 @@ WARM_UP = 0.05
 class PointSplatTrainerConfig(TrainerConfig):
     """nerfstudio's trainer, with the learning-rate schedules fitted to the length of the run"""
 
-    _target: type = field(default_factory=lambda: Trainer)
+    _target: type = field(default_factory=lambda: SplatfactoCpuTrainer)
 
     def setup(self, **kwargs) -> Trainer:
-        """The trainer, for a copy of this config whose cosine schedules end with the run."""
+        """The trainer, for a copy of this config whose cosine schedules end with the run.
+
+        A resumed run ends ``max_num_iterations`` after the step that it resumes from, and its schedules with it: what
+        was stopped at 500 of 2,000 steps and is resumed for 1,500 goes on exactly as it would have.
+        """
         config = copy.deepcopy(self)
+        steps = _steps_done(config) + config.max_num_iterations
         for group in config.optimizers.values():
             schedule = group["scheduler"]
             if isinstance(schedule, CosineDecaySchedulerConfig) and schedule.max_steps == 0:
-                schedule.max_steps = config.max_num_iterations
-                schedule.warm_up_end = max(1, round(WARM_UP * config.max_num_iterations))
+                schedule.warm_up_end = max(1, round(WARM_UP * steps))
+                schedule.max_steps = max(steps, schedule.warm_up_end + 1)  # the cosine divides by what is between
         return self._target(config, **kwargs)
+
+
+def _steps_done(config: TrainerConfig) -> int:
+    """Steps behind the checkpoint that a run is to resume from, by its name; 0 for a new run."""
+    step = config.load_step
+    if config.load_dir is not None and step is None:
+        step = max((_step_of(path) for path in config.load_dir.glob("step-*.ckpt")), default=-1)
+    elif config.load_dir is None:
+        step = -1 if config.load_checkpoint is None else _step_of(config.load_checkpoint)
+    return step + 1
+
+
+def _step_of(checkpoint: Path) -> int:
+    match = re.fullmatch(r"step-(\d{1,18})", checkpoint.stem)
+    return int(match[1]) if match else -1
 
 
 def pointsplat_config() -> TrainerConfig:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from pointsplat_ns.errors import SceneError
+from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import Run, find_runs, open_run, scene_names
+from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.refiner import Refiner, preset
 
@@ -45,7 +47,16 @@ class RefinedRun:
 
 
 def prune_options(keep: float, score: str, opacity_weight: float) -> dict[str, Any]:
-    """Arguments of :func:`pointsplat_ns.pruning.prune` for a model's settings; ``keep`` above 1 is a count."""
+    """Arguments of :func:`pointsplat_ns.pruning.prune` for a model's settings; ``keep`` above 1 is a count.
+
+    Raises:
+        BudgetError: if ``keep`` is neither a ratio nor a whole number.
+    """
+    if not 0 < keep < math.inf or (keep > 1 and keep != int(keep)):  # NaN fails too
+        raise BudgetError(
+            f"keep is {keep:g}; expected a ratio above 0 and up to 1 (such as 0.3) or a whole number of Gaussians "
+            "(such as 50000)"
+        )
     extra = {"opacity_weight": opacity_weight} if score == "paper" else {}
     return {"keep": int(keep) if keep > 1 else float(keep), "by": score, **extra}
 
@@ -67,11 +78,14 @@ def open_refined_run(path: Path | str, need_scenes: bool = True) -> RefinedRun:
     try:
         refiner = Refiner(preset(settings["size"], encoder=settings["encoder"]))
         options = prune_options(float(settings["keep"]), settings["score"], float(settings["opacity_weight"]))
+        allow_splatfacto_checkpoints()  # for the numbers in the schedulers' state
         state = torch.load(run.checkpoint, map_location="cpu", weights_only=True, mmap=True)["pipeline"]
         weights = {name[len(_PREFIX) :]: value for name, value in state.items() if name.startswith(_PREFIX)}
         refiner.load_state_dict(weights)
     except KeyError as error:
         raise SceneError(f"{run.config_path}: lacks {error}; expected a {METHOD} run of this version") from error
+    except PointSplatError as error:
+        raise SceneError(f"{run.config_path}: {error}") from error
     except Exception as error:  # a damaged archive can raise nearly anything
         text = " ".join(str(error).split())[:160]
         raise SceneError(f"{run.checkpoint}: not a usable {METHOD} checkpoint ({text})") from error
@@ -80,6 +94,7 @@ def open_refined_run(path: Path | str, need_scenes: bool = True) -> RefinedRun:
     if need_scenes:
         runs = find_runs(run.data, need_data=False)
         scenes = dict(zip(scene_names(runs), runs, strict=True))
-        held_out = [name for name in run.datamanager_fields.get("eval_scenes") or () if name in scenes]
+        named = run.datamanager_fields.get("eval_scenes") or ()
+        held_out = [name for name in scenes if name in named]  # in the order of the viewer and ns-export
         default = (held_out or list(scenes))[0]
     return RefinedRun(run, refiner.eval(), options, scenes, default)

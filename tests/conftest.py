@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 WALL_DISTANCE = 2.0
@@ -55,3 +58,93 @@ def write_wall(scene: Path, num_frames: int = NUM_FRAMES, width: int = WIDTH, he
 def wall_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of the painted wall; shared by all tests, so do not write to it."""
     return write_wall(tmp_path_factory.mktemp("replica") / "wall")
+
+
+SEED = 20
+LPIPS_WEIGHTS = Path(__file__).resolve().parents[1] / "../shared/data/weights"
+
+
+@pytest.fixture(scope="session")
+def wall_config() -> Callable:
+    """A function (scene, output_dir, steps) that gives the config of a short splatfacto-cpu training."""
+    from pointsplat_ns.data.replica import ReplicaDataParserConfig
+    from pointsplat_ns.splatfacto_cpu_method import splatfacto_cpu_config
+
+    def config_of(scene: Path, output_dir: Path, steps: int):
+        config = splatfacto_cpu_config()
+        config.machine.device_type = "cpu"
+        config.output_dir, config.max_num_iterations = output_dir, steps
+        config.pipeline.datamanager.dataparser = ReplicaDataParserConfig(num_seed_points=300)
+        config.pipeline.datamanager.data = config.data = scene
+        config.pipeline.model.refine_every = 10
+        config.pipeline.model.densify_grad_thresh = 1e-4
+        config.set_timestamp()
+        return config
+
+    return config_of
+
+
+@pytest.fixture(scope="session")
+def run_training() -> Callable:
+    """A function that trains a config with nerfstudio's trainer and gives the trainer and the loss of every step."""
+
+    def run(config):
+        torch.manual_seed(SEED)
+        config.save_config()
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        losses, iteration = [], trainer.train_iteration
+
+        def recorded(step):
+            result = iteration(step)
+            losses.append(result[0].item())
+            return result
+
+        trainer.train_iteration = recorded
+        with warnings.catch_warnings():
+            # torch: "lr_scheduler.step() before optimizer.step()", because it does not see the gradient scaler's step
+            warnings.filterwarnings("ignore", category=UserWarning, module="torch.optim.*")
+            trainer.train()
+        return trainer, losses
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def trained_walls(wall_scene, wall_config, run_training, tmp_path_factory) -> Path:
+    """Folder with two short splatfacto-cpu runs: ``wall-a``, and ``wall-b`` of SH degree 1, antialiased, over white.
+
+    Shared by all tests, so do not write to it.
+    """
+    folder = tmp_path_factory.mktemp("trained")
+    for name in ("wall-a", "wall-b"):
+        config = wall_config(wall_scene, folder, steps=30)
+        config.experiment_name = name
+        if name == "wall-b":
+            config.pipeline.model.sh_degree = 1
+            config.pipeline.model.rasterize_mode = "antialiased"
+            config.pipeline.model.background_color = "white"
+        run_training(config)
+    return folder
+
+
+@pytest.fixture()
+def no_lpips(tmp_path, monkeypatch):
+    """A machine with no LPIPS weights and no network."""
+    monkeypatch.setenv("POINTSPLAT_LPIPS_WEIGHTS", str(tmp_path))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+
+    def no_network(*args, **kwargs):
+        raise OSError("no network")
+
+    monkeypatch.setattr(torch.hub, "download_url_to_file", no_network)
+
+
+@pytest.fixture()
+def some_lpips(request, monkeypatch) -> bool:
+    """LPIPS from the weights at hand; without them, none and no attempt at a download. Says which."""
+    if LPIPS_WEIGHTS.exists():
+        monkeypatch.setenv("POINTSPLAT_LPIPS_WEIGHTS", str(LPIPS_WEIGHTS))
+    else:
+        request.getfixturevalue("no_lpips")
+    return LPIPS_WEIGHTS.exists()

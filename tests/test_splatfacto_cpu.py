@@ -16,7 +16,6 @@ from nerfstudio.models import splatfacto as stock
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
-from pointsplat_ns.data.replica import ReplicaDataParserConfig
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.splatfacto_cpu import LONE_POINT_SCALE, SplatfactoCpuModelConfig, viewmats_of
@@ -227,50 +226,20 @@ def test_schedules_follow_the_length_of_the_run_and_spare_what_was_set_by_hand()
     assert fitted_schedules(config).optimizers["means"]["scheduler"].max_steps == 30_000
 
 
-def wall_config(scene: Path, output_dir: Path, steps: int):
-    config = splatfacto_cpu_config()
-    config.machine.device_type = "cpu"
-    config.output_dir, config.max_num_iterations = output_dir, steps
-    config.pipeline.datamanager.dataparser = ReplicaDataParserConfig(num_seed_points=300)
-    config.pipeline.datamanager.data = config.data = scene
-    config.pipeline.model.refine_every = 10
-    config.pipeline.model.densify_grad_thresh = 1e-4
-    config.set_timestamp()
-    return config
-
-
-def run(config):
-    """Train; returns the trainer and the loss of every step."""
-    torch.manual_seed(SEED)
-    config.save_config()
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    losses, iteration = [], trainer.train_iteration
-
-    def recorded(step):
-        result = iteration(step)
-        losses.append(result[0].item())
-        return result
-
-    trainer.train_iteration = recorded
-    trainer.train()
-    return trainer, losses
-
-
-def test_a_run_that_cannot_start_leaves_no_folder(tmp_path):
+def test_a_run_that_cannot_start_leaves_no_folder(tmp_path, wall_config, run_training):
     config = wall_config(tmp_path / "no_such_scene", tmp_path / "outputs", steps=5)
     (tmp_path / "outputs").mkdir()
     (tmp_path / "outputs" / "of another run").mkdir()
     with pytest.raises(DataError, match="no_such_scene"):
-        run(config)
+        run_training(config)
     assert [path.name for path in (tmp_path / "outputs").iterdir()] == ["of another run"]
 
 
 @pytest.fixture(scope="module")
-def trained(wall_scene, tmp_path_factory):
+def trained(wall_scene, wall_config, run_training, tmp_path_factory):
     """A short run on the painted wall: its config, its trainer and its losses."""
     config = wall_config(wall_scene, tmp_path_factory.mktemp("outputs"), steps=50)
-    return config, *run(config)
+    return config, *run_training(config)
 
 
 def checkpoint_of(config) -> Path:
@@ -296,12 +265,14 @@ def test_checkpoint_has_splatfactos_layout_and_loads_weights_only(trained):
     assert set(state["optimizers"]) == set(theirs.get_param_groups())
 
 
-def test_resuming_goes_on_from_the_checkpoint_and_still_learns(trained, wall_scene, tmp_path):
+def test_resuming_goes_on_from_the_checkpoint_and_still_learns(
+    trained, wall_scene, wall_config, run_training, tmp_path
+):
     config, first, before = trained
     again = wall_config(wall_scene, tmp_path, steps=10)
     again.load_dir = config.get_checkpoint_dir()
     saved = first.pipeline.model.means.detach().clone()
-    trainer, losses = run(again)
+    trainer, losses = run_training(again)
     model = trainer.pipeline.model
     assert trainer._start_step == 50 and trainer.step == 59
     assert losses[0] < 0.5 * before[0], "resumed from scratch"
@@ -309,24 +280,6 @@ def test_resuming_goes_on_from_the_checkpoint_and_still_learns(trained, wall_sce
     for name, parameter in model.gauss_params.items():
         assert trainer.optimizers.optimizers[name].param_groups[0]["params"] == [parameter]
         assert trainer.optimizers.optimizers[name].state[parameter]["exp_avg"].shape == parameter.shape
-
-
-@pytest.fixture()
-def no_lpips(tmp_path, monkeypatch):
-    """A machine with no LPIPS weights and no network."""
-    monkeypatch.setenv("POINTSPLAT_LPIPS_WEIGHTS", str(tmp_path))
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    with mock.patch("torch.hub.download_url_to_file", side_effect=OSError("no network")):
-        yield
-
-
-@pytest.fixture()
-def some_lpips(request, monkeypatch):
-    """LPIPS from the weights at hand; without them, none and no attempt at a download."""
-    if WEIGHTS.exists():
-        monkeypatch.setenv("POINTSPLAT_LPIPS_WEIGHTS", str(WEIGHTS))
-    else:
-        request.getfixturevalue("no_lpips")
 
 
 def test_ns_eval_writes_valid_json(trained, tmp_path, some_lpips):

@@ -19,6 +19,9 @@ def demo(
     keep: float = 0.1,
     scene_steps: int = 900,
     refiner_steps: int = 400,
+    frames: int = 60,
+    width: int = 256,
+    height: int = 192,
     fresh: bool = False,
 ) -> None:
     """Train small scenes, prune them, train the refiner, evaluate it on a room that it never saw, export.
@@ -31,21 +34,22 @@ def demo(
         keep: share of the Gaussians to keep.
         scene_steps: training steps of each room.
         refiner_steps: training steps of the refiner.
+        frames: photos of each room.
+        width: of a photo, pixels.
+        height: of a photo, pixels.
         fresh: start over.
     """
     from rich.console import Console
 
     from pointsplat_ns.cli.view import read_evaluation, report_table, rooms
-    from pointsplat_ns.data.rooms import write_room  # noqa: F401  (fails early where a library is missing)
 
-    console = Console()
     start = time.perf_counter()
     if fresh and output.exists():
         shutil.rmtree(output)
     names = ["room0", "room1", UNSEEN]
     missing = [name for name in names if not (output / "rooms" / name).is_dir()]
     if missing:
-        rooms(output / "rooms", tuple(int(name[4:]) for name in missing), frames=60, width=256, height=192)
+        rooms(output / "rooms", tuple(int(name[4:]) for name in missing), frames, width, height)
 
     scenes = output / "scenes"
     for name in names:
@@ -71,10 +75,10 @@ def demo(
     results = read_evaluation(evaluation)
     picture = output / "before_after.png"
     before_after(sorted(pictures.glob(f"{UNSEEN}_*.png")), results["scenes"][UNSEEN], picture)
-    console.print(report_table(results))
-    console.print(f"{splat}: open it in any 3DGS viewer, or run ns-viewer --load-config {run / 'config.yml'}")
-    console.print(f"{picture}: photo, dense, pruned and refined side by side, of a room that the refiner never saw")
-    console.print(f"done in {(time.perf_counter() - start) / 60:.1f} minutes")
+    Console().print(report_table(results))
+    print(f"{splat}: open it in any 3DGS viewer, or run ns-viewer --load-config {run / 'config.yml'}")
+    print(f"{picture}: photo, dense, pruned and refined side by side, of a room that the refiner never saw")
+    print(f"done in {(time.perf_counter() - start) / 60:.1f} minutes")
 
 
 def before_after(views: list[Path], scene: dict, path: Path, rows: int = 3) -> None:
@@ -92,7 +96,8 @@ def before_after(views: list[Path], scene: dict, path: Path, rows: int = 3) -> N
     titles = ["photo, held out"]
     for variant in ("dense", "pruned", "refined"):
         values = scene[variant]
-        titles.append(f"{variant}: {values['gaussians']:,} Gaussians, {values['megabytes']:.1f} MB, {values['psnr']:.1f} dB")
+        size = f"{values['gaussians']:,} Gaussians, {values['megabytes']:.1f} MB"
+        titles.append(f"{variant}: {size}, {values['psnr']:.1f} dB")
     shown = views[:: max(1, len(views) // rows)][:rows]
     images = [imread(view) for view in shown]
     height, width = images[0].shape[0], images[0].shape[1] // 4

@@ -82,7 +82,11 @@ def export(run: Scene, output: Output, scene: str | None = None) -> None:
     from pointsplat_ns.refined_run import METHOD, open_refined_run
 
     start = time.perf_counter()
-    if run.suffix.lower() != ".ply" and open_run(run, need_data=False).method_name == METHOD:
+    try:
+        method = open_run(run, need_data=False).method_name
+    except SceneError:
+        method = ""  # a scene that stands alone, or nothing that can be read: read_scene says which
+    if method == METHOD:
         trained = open_refined_run(run)
         chosen = scene or trained.default_scene
         if chosen not in trained.scenes:

@@ -63,7 +63,7 @@ def read_evaluation(path: Path) -> dict[str, Any]:
 
 
 def report_table(results: dict[str, Any]):
-    """A rich table: one row for each scene and variant, then the averages."""
+    """A rich table: one row for each scene and variant, then the averages; "seen" is whether it was trained on."""
     from rich.table import Table
 
     settings = results.get("settings", {})
@@ -72,20 +72,22 @@ def report_table(results: dict[str, Any]):
         title=f"keep {settings.get('keep')}, score {settings.get('by')}, refiner {settings.get('size')}", caption=caption
     )
     table.add_column("scene")
+    table.add_column("seen")
     table.add_column("variant")
-    for name in ("PSNR dB", "SSIM", "LPIPS", "Gaussians", "MB", "fps"):
+    for name in ("PSNR dB", "SSIM", "LPIPS", "splats", "MB", "fps"):
         table.add_column(name, justify="right")
     blocks = [
-        (f"{name}{'' if scene['seen_in_training'] else ' (never seen)'}", scene)
-        for name, scene in results["scenes"].items()
+        (name, "yes" if scene["seen_in_training"] else "never", scene) for name, scene in results["scenes"].items()
     ]
-    averages = (("average", "average"), ("average, never seen", "average_unseen"))
-    blocks += [(title, results[key]) for title, key in averages if len(blocks) > 1 and key in results]
-    for title, block in blocks:
+    if len(blocks) > 1:
+        averages = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
+        blocks += [("average", seen, results[key]) for seen, key in averages if key in results]
+    for title, seen, block in blocks:
         for i, row in enumerate(ROWS):
             values = block[row]
             table.add_row(
                 title if i == 0 else "",
+                seen if i == 0 else "",
                 row,
                 _number(values["psnr"], 2),
                 _number(values["ssim"], 3),

@@ -1,7 +1,6 @@
 """Sampled rooms: which furniture stands where, of what material, under which lights."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -190,9 +189,6 @@ class Palette:
             motif = tuple(float(m) for m in 0.5 * np.asarray(self.wall) + 0.5 * np.asarray(self.accent()))
             return Material(tex.wallpaper(self.wall, motif, float(self.rng.uniform(0.25, 0.4))))
         return Material(tex.plain(self.wall, 0.07, 0.4))
-
-
-Furniture = Callable[[Builder, Frame, Palette, Vec], None]
 
 
 def sample_room(seed: int) -> RoomSpec:

@@ -7,6 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pointsplat_ns.errors import DataError
+
 if TYPE_CHECKING:
     from pointsplat_ns.data.rooms import Room
 
@@ -42,8 +44,8 @@ def capture_path(room: "Room", frames: int, seed: int) -> Tensor:
     # Across the room on the first round; swinging to both sides on the second, to see into the corners.
     swing = 0.2 + 0.7 * _smoothstep((share - 0.4) / 0.2)
     gaze = np.unwrap(np.arctan2(middle[1] - route[:, 1], middle[0] - route[:, 0]))
-    gaze = _eased(gaze, frames / 40) + swing * np.sin(2 * math.pi * 4 * share)
-    pitch = -0.22 + 0.24 * np.sin(2 * math.pi * (7 * share + rng.random()))
+    gaze = _eased(gaze, frames / 40) + swing * np.sin(2 * math.pi * 3 * share)
+    pitch = -0.22 + 0.24 * np.sin(2 * math.pi * (5 * share + rng.random()))
     positions = np.concatenate([route, heights[:, None]], axis=1)
     return torch.stack([_look(p, g, t) for p, g, t in zip(positions, gaze, pitch, strict=True)])
 
@@ -64,13 +66,13 @@ def _free_cells(room: "Room", top: float) -> tuple[np.ndarray, np.ndarray, np.nd
     ys = np.arange(-depth / 2 + CELL / 2, depth / 2, CELL)
     grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
     free = np.ones(len(grid), dtype=bool)
-    # Furniture in between two heights is caught: boxes are thicker than the steps' clearance.
+    # The 6 cm on top of the clearance pay for heights between those tried and places between cells.
     for z in np.arange(_LOWEST, top + 0.099, 0.1):
         points = torch.tensor(np.concatenate([grid, np.full((len(grid), 1), z)], axis=1), dtype=torch.float32)
         free &= (clearance(room, points) > CLEARANCE + 0.06).numpy()
     labels, count = ndimage.label(free.reshape(len(ys), len(xs)))
     if count == 0:
-        raise RuntimeError(f"room {room.spec.seed} has no free space for a camera")
+        raise DataError(f"room seed {room.spec.seed}: furniture leaves no free space for a camera; choose another seed")
     sizes = ndimage.sum_labels(np.ones_like(labels), labels, np.arange(1, count + 1))
     return labels == 1 + int(np.argmax(sizes)), xs, ys
 

@@ -99,14 +99,13 @@ class TrainedScene:
     def _dataparser(self) -> DataParser:
         return dataparser_of(self.run)
 
-    @cached_property
-    def train_outputs(self) -> DataparserOutputs:
-        """What the dataparser says of the training photos.
+    def _outputs(self, split: str) -> DataparserOutputs:
+        """What the dataparser says of the photos of a split.
 
         Raises:
             DataError: if their frame is not the one that the Gaussians are in.
         """
-        outputs = self._dataparser.get_dataparser_outputs(split="train")
+        outputs = self._dataparser.get_dataparser_outputs(split=split)
         moved = (outputs.dataparser_transform[:3] - self.run.transform).abs().max()
         if moved > 1e-4 or abs(outputs.dataparser_scale / self.run.scale - 1) > 1e-4:
             raise DataError(
@@ -116,19 +115,20 @@ class TrainedScene:
             )
         return outputs
 
-    def _frames(self, outputs: DataparserOutputs) -> Frames:
+    def _frames(self, split: str) -> Frames:
         scale = self.run.datamanager_fields.get("camera_res_scale_factor", 1.0)
-        return Frames(InputDataset(outputs, scale if isinstance(scale, float) else 1.0), cache=self._cache)
+        scale = float(scale) if isinstance(scale, (int, float)) else 1.0
+        return Frames(InputDataset(self._outputs(split), scale), cache=self._cache)
 
     @cached_property
     def train_frames(self) -> Frames:
         """Training photos at the resolution that the run was trained at."""
-        return self._frames(self.train_outputs)
+        return self._frames("train")
 
     @cached_property
     def eval_frames(self) -> Frames:
         """Held-out photos at the resolution that the run was trained at."""
-        return self._frames(self._dataparser.get_dataparser_outputs(split="test"))
+        return self._frames("test")
 
 
 @dataclass
@@ -175,7 +175,15 @@ class ScenesDataManager(DataManager):
             raise SceneError("--machine.num-devices: the refiner is trained by one process; expected 1")
         if config.data is None:
             raise SceneError("--data is missing: expected a trained Splatfacto run, or a folder above several")
+        if config.images_per_step < 1:
+            raise DataError(f"--images-per-step {config.images_per_step}: expected at least 1")
         runs = find_runs(config.data, need_data=test_mode != "inference")
+        for run in runs:
+            if not run.is_gaussian_scene:  # find_runs passes over those below a folder, not one that is named
+                raise SceneError(
+                    f"{run.folder}: a run of the method {run.method_name or 'unknown'}; "
+                    "expected a trained Splatfacto run"
+                )
         gigabytes = config.cache_gigabytes
         cache = FrameCache(free_memory_share() if gigabytes is None else int(gigabytes * 1e9))
         self.scenes = [TrainedScene(name, run, cache) for name, run in zip(scene_names(runs), runs, strict=True)]
@@ -189,8 +197,6 @@ class ScenesDataManager(DataManager):
         self.eval_indices = [i for i, name in enumerate(names) if name in config.eval_scenes] or self.train_indices
         if not self.train_indices:
             raise SceneError(f"--eval-scenes names all {len(names)} scenes of {config.data}; none is left to train on")
-        if config.images_per_step < 1:
-            raise DataError(f"--images-per-step {config.images_per_step}: expected at least 1")
         self.shown = self.eval_indices[0]
         """The scene that the viewer and the exporter get."""
         training = ", ".join(names[i] for i in self.train_indices)

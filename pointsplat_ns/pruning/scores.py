@@ -12,10 +12,15 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 
 DEFAULT_OPACITY_WEIGHT = 0.3
 """Lambda of the paper's eq. 3, the same for every data set."""
+
+
+class ScoreError(PointSplatError, ValueError):
+    """An option that a score cannot work with."""
 
 
 def zscore(values: Tensor) -> Tensor:
@@ -51,10 +56,10 @@ def paper_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIGHT
         Scores (N,), float64.
 
     Raises:
-        ValueError: if ``opacity_weight`` is not in [0, 1].
+        ScoreError: if ``opacity_weight`` is not in [0, 1].
     """
     if not 0 <= opacity_weight <= 1:
-        raise ValueError(f"opacity_weight is {opacity_weight}; expected 0 to 1")
+        raise ScoreError(f"opacity_weight is {opacity_weight}; expected 0 to 1")
     usable = scene.usable()
     scores = torch.full((len(scene),), math.nan, dtype=torch.float64, device=scene.device)
     part = scene if bool(usable.all()) else scene[usable]

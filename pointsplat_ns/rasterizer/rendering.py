@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer.blending import blend
 from pointsplat_ns.rasterizer.constants import EPS2D, TILE
-from pointsplat_ns.rasterizer.projection import Projected, camera_centre, project
+from pointsplat_ns.rasterizer.projection import Projected, project
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.rasterizer.tiles import intersect_tiles
 
@@ -194,5 +194,3 @@ def rasterization(
     }
     return image, accumulated, meta
 
-
-__all__ = ["RenderMode", "camera_centre", "rasterization"]

@@ -204,18 +204,17 @@ def test_order_of_gaussians_does_not_matter():
 
 
 def test_a_crop_equals_the_same_part_of_the_whole():
-    scene = make_scene(150, seed=6)
+    # The frustum clamp follows the image, and reaches 0.15 x 20 = 3 pixels beyond the crop: Gaussians
+    # this small do not reach the crop from where they are clamped.
+    scene = make_scene(400, seed=6, scale=-5.0, spread=0.3)
     view, K, w, h = make_camera(48, 40, cx=24.0, cy=20.0)
     whole, _, _ = rasterization(*scene, view[None], K[None], w, h, sh_degree=0)
     shifted = K.clone()
     shifted[0, 2] -= 13
     shifted[1, 2] -= 5
-    # the frustum clamp depends on the image size: keep it out of play with Gaussians near the axis
-    crop, _, _ = rasterization(*scene, view[None], shifted[None], 20, 30, sh_degree=0)
-    inside = project(*scene[:4], view, K, w, h)
-    assert inside.ids.numel() > 50
-    difference = (whole[0, 5:35, 13:33] - crop[0]).abs()
-    assert difference.median() == 0 or difference.median() < 1e-9
+    crop, alpha, _ = rasterization(*scene, view[None], shifted[None], 20, 30, sh_degree=0)
+    assert (alpha > 0.1).sum() > 20
+    assert (whole[0, 5:35, 13:33] - crop[0]).abs().max() < 1e-12
 
 
 def test_the_same_input_gives_the_same_bits():

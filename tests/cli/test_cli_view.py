@@ -1,0 +1,94 @@
+"""The commands that make data and show results, and the demo in small."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pointsplat_ns.cli import main
+from pointsplat_ns.io.ply import read_ply
+
+
+def evaluation(lpips: float | None = 0.25) -> dict:
+    def row(psnr: float, count: int) -> dict:
+        return {"psnr": psnr, "ssim": 0.9, "lpips": lpips, "gaussians": count, "megabytes": count * 236e-6, "fps": 12.0}
+
+    rows = {"dense": row(30.0, 1000), "pruned": row(20.0, 100), "refined": row(25.0, 100)}
+    return {
+        "results": {
+            "settings": {"keep": 0.1, "by": "paper", "size": "tiny"},
+            "average": rows,
+            "average_unseen": rows,
+            "average_seen": rows,
+            "scenes": {
+                "a": {"seen_in_training": True, "views": 3, **rows},
+                "b": {"seen_in_training": False, "views": 3, **rows},
+            },
+        }
+    }
+
+
+def test_report_shows_every_scene_and_variant(tmp_path, capsys):
+    path = tmp_path / "eval.json"
+    path.write_text(json.dumps(evaluation()))
+    main(["report", str(path)])
+    shown = capsys.readouterr().out
+    rows = [line.replace("│", " ").split() for line in shown.splitlines() if "dense" in line]
+    assert [row[:2] for row in rows[:2]] == [["a", "yes"], ["b", "never"]]
+    assert shown.count("refined") == 5 and "25.00" in shown and "1,000" in shown and "0.250" in shown
+
+
+def test_report_shows_a_dash_where_lpips_is_unknown(tmp_path, capsys):
+    path = tmp_path / "eval.json"
+    path.write_text(json.dumps(evaluation(lpips=None)))
+    main(["report", str(path)])
+    assert " - " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"results": {"psnr": 3.0}}', '{"results": {"scenes": {}}}'])
+def test_report_of_something_else_is_one_line_and_status_1(tmp_path, capsys, content):
+    path = tmp_path / "eval.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(SystemExit) as end:
+        main(["report", str(path)])
+    error = capsys.readouterr().err
+    assert end.value.code == 1 and str(path) in error and error.count("\n") == 1
+
+
+def test_rooms_are_named_by_their_seeds(tmp_path):
+    main(["rooms", "-o", str(tmp_path / "r"), "--seeds", "3", "--frames", "2", "--width", "32", "--height", "24"])
+    assert sorted(p.name for p in (tmp_path / "r").iterdir()) == ["room3"]
+    assert len(list((tmp_path / "r" / "room3" / "results").glob("frame*"))) == 2
+
+
+def test_the_demo_runs_end_to_end_and_does_nothing_twice(tmp_path, capfd, monkeypatch):
+    monkeypatch.setenv("POINTSPLAT_LPIPS_WEIGHTS", str(tmp_path))  # no weights there, and no download
+    output = tmp_path / "demo"
+    small = "--scene-steps 12 --refiner-steps 3 --frames 11 --width 64 --height 48 --keep 0.5".split()
+    main(["demo", "--output", str(output), *small])
+    shown = capfd.readouterr().out
+    assert "room2   │ never │ dense" in shown and "refined" in shown
+    assert (output / "before_after.png").stat().st_size > 10_000
+    results = json.loads((output / "evaluation.json").read_text())["results"]
+    assert results["scenes"]["room2"]["seen_in_training"] is False
+    assert results["scenes"]["room0"]["seen_in_training"] is True
+    kept = results["scenes"]["room2"]["refined"]["gaussians"]
+    assert len(read_ply(output / "room2_refined.ply")) == kept
+    assert abs(kept - results["scenes"]["room2"]["dense"]["gaussians"] / 2) <= 1
+    before = {p: p.stat().st_mtime_ns for p in output.rglob("*.ckpt")}
+    main(["demo", "--output", str(output), *small])
+    assert before == {p: p.stat().st_mtime_ns for p in output.rglob("*.ckpt")}
+    assert "ns-train" not in capfd.readouterr().out
+
+
+def test_the_demo_says_which_command_failed(tmp_path, capfd):
+    output = tmp_path / "demo"
+    for seed in range(3):
+        Path(output / "rooms" / f"room{seed}").mkdir(parents=True)  # rooms without a photo
+    with pytest.raises(SystemExit) as end:
+        main(["demo", "--output", str(output)])
+    error = capfd.readouterr().err
+    assert end.value.code == 1 and "ns-train splatfacto-cpu" in error.splitlines()[-1]
