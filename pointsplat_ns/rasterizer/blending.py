@@ -69,7 +69,7 @@ class _Shape(NamedTuple):
 
 
 def _coefficients(shape: _Shape, tile_x: Tensor, tile_y: Tensor) -> Tensor:
-    """Log alpha as coefficients of the basis, (..., 6)."""
+    """Log alpha as coefficients of the basis, (6, S, B)."""
     ex, ey = tile_x - shape.x, tile_y - shape.y
     a, r, d = shape.a, shape.r, shape.d
     s = ex - r * ey
@@ -82,8 +82,7 @@ def _coefficients(shape: _Shape, tile_x: Tensor, tile_y: Tensor) -> Tensor:
             -0.5 * a,
             a_r,
             -0.5 * (a_r * r + d),
-        ],
-        dim=-1,
+        ]
     )
 
 
@@ -104,7 +103,7 @@ def _coefficients_backward(shape: _Shape, tile_x: Tensor, tile_y: Tensor, grad: 
 class _Frame:
     """Index arithmetic that forward and backward share."""
 
-    def __init__(self, tiles: TileList, width: int, height: int, dtype: torch.dtype):
+    def __init__(self, tiles: TileList, count: int, width: int, height: int, dtype: torch.dtype):
         lengths = tiles.offsets[1:] - tiles.offsets[:-1]
         self.lengths, self.order = torch.sort(lengths, descending=True, stable=True)
         self.starts = tiles.offsets[:-1][self.order]
@@ -113,34 +112,36 @@ class _Frame:
         self.x = (column * TILE + TILE // 2).to(dtype)  # tile centres, pixels
         self.y = (row * TILE + TILE // 2).to(dtype)
         self.gaussians = tiles.gaussians
+        self.padded_gaussians = torch.cat([tiles.gaussians, tiles.gaussians.new_full((1,), count)])
         self.occupied = int((lengths > 0).sum())
         axis = torch.arange(TILE, device=lengths.device)
         inside_x = column[:, None] * TILE + axis < width
         inside_y = row[:, None] * TILE + axis < height
         self.inside = (inside_y[:, :, None] & inside_x[:, None, :]).reshape(-1, PIXELS)  # [tiles, 64]
 
-    def pairs(self, tiles: Tensor, first: int, padding: int) -> tuple[Tensor, Tensor, Tensor]:
-        """For tiles [B]: places in the pair list [S, B], which of them exist, and their Gaussians."""
-        step = first + torch.arange(CHUNK, device=tiles.device)[:, None]
-        place = self.starts[tiles] + step
-        real = step < self.lengths[tiles]
-        place = torch.where(real, place, torch.zeros_like(place))
-        ids = self.gaussians[place]
-        return place, real, torch.where(real, ids, torch.full_like(ids, padding))
+    def pairs(self, tiles: Tensor, first: int) -> tuple[Tensor, Tensor]:
+        """For tiles [B]: places in the pair list, and the Gaussians there, both [S * B].
+
+        Where a tile's list has ended the place is one past all pairs and the Gaussian is the table's padding.
+        """
+        step = torch.arange(first, first + CHUNK, device=tiles.device)[:, None]
+        ended = step >= self.lengths[tiles]
+        place = (self.starts[tiles] + step).masked_fill_(ended, self.gaussians.numel()).view(-1)
+        ids = self.padded_gaussians.index_select(0, place)
+        return place, ids
 
 
-def _table(shape: _Shape, colors: Tensor) -> Tensor:
-    """Everything a pair gathers, (M + 1, 6 + D); the last row is the padding, which is never seen."""
-    table = torch.cat([torch.stack(shape, dim=-1), colors], dim=-1)
-    padding = table.new_zeros(1, table.shape[1])
-    padding[0, 5] = _NEVER
-    return torch.cat([table, padding])
+def _table(shape: _Shape, colors: Tensor) -> tuple[Tensor, Tensor]:
+    """What a pair gathers: shapes (6, M + 1) and colours (M + 1, D); the last is the padding, which is never seen."""
+    rows = torch.nn.functional.pad(torch.stack(shape), (0, 1))
+    rows[5, -1] = _NEVER
+    return rows, torch.nn.functional.pad(colors, (0, 0, 0, 1))
 
 
 def _alphas(coefficients: Tensor, basis: Tensor, work: Tensor) -> Tensor:
-    """Alphas (S, B, 64) from coefficients (S, B, 6), written into ``work``."""
-    s, b, _ = coefficients.shape
-    alpha = torch.mm(coefficients.view(s * b, 6), basis, out=work[: s * b])
+    """Alphas (S, B, 64) from coefficients (6, S, B), written into ``work``."""
+    _, s, b = coefficients.shape
+    alpha = torch.mm(coefficients.view(6, s * b).T, basis, out=work[: s * b])
     alpha.clamp_(LOG_ALPHA_MIN - 1.0, LOG_ALPHA_MAX).exp_()  # the floor keeps denormals away
     F.threshold_(alpha, ALPHA_MIN, 0.0)
     return alpha.view(s, b, PIXELS)
@@ -168,10 +169,10 @@ class Blend(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, means2d, cov2d, det, opacities, colors, tiles, width, height, absgrad_of):
-        frame = _Frame(tiles, width, height, means2d.dtype)
-        shape = _Shape.of(means2d, cov2d, det, opacities)
-        table, basis = _table(shape, colors), _basis(means2d)
         count, channels = colors.shape
+        frame = _Frame(tiles, count, width, height, means2d.dtype)
+        shapes, shades = _table(_Shape.of(means2d, cov2d, det, opacities), colors)
+        basis = _basis(means2d)
         image = colors.new_zeros(frame.order.numel(), PIXELS, channels)
         final = colors.new_ones(frame.order.numel(), PIXELS)
         keep_tape = any(ctx.needs_input_grad)
@@ -188,9 +189,9 @@ class Blend(torch.autograd.Function):
             for first in range(0, longest, CHUNK):
                 if keep_tape:
                     chunks.append(_Chunk(rows, first, through))
-                _, _, ids = frame.pairs(rows, first, count)
-                gathered = table.index_select(0, ids.reshape(-1)).view(CHUNK, rows.numel(), -1)
-                pair = _Shape(*gathered[..., :6].unbind(-1))
+                _, ids = frame.pairs(rows, first)
+                pair = _Shape(*shapes.index_select(1, ids).view(6, CHUNK, -1))
+                shade = shades.index_select(0, ids).view(CHUNK, -1, channels)
                 alpha = _alphas(_coefficients(pair, frame.x[rows], frame.y[rows]), basis, work)
                 steps, _ = _transmittances(alpha, through, work_t)
                 weight = alpha * steps[:-1]
@@ -204,7 +205,7 @@ class Blend(torch.autograd.Function):
                     through.mul_(open_[-1])
                 else:
                     last = torch.minimum(last, through)
-                blended += torch.bmm(weight.permute(1, 2, 0), gathered[..., 6:].permute(1, 0, 2))
+                blended += torch.bmm(weight.permute(1, 2, 0), shade.permute(1, 0, 2))
                 if first + CHUNK >= longest:
                     break
                 alive = frame.lengths[rows] > first + CHUNK
@@ -233,10 +234,11 @@ class Blend(torch.autograd.Function):
         frame, absgrad_of = ctx.frame, ctx.absgrad_of
         grad_image, grad_final = grad_image[frame.order], grad_final[frame.order]
         shape = _Shape.of(means2d, cov2d, det, opacities)
-        table, basis = _table(shape, colors), _basis(means2d)
-        count, channels = colors.shape
-        width_out = 6 + channels + (2 if absgrad_of is not None else 0)
-        pair_grads = colors.new_zeros(frame.gaussians.numel(), width_out)
+        shapes, shades = _table(shape, colors)
+        basis = _basis(means2d)
+        channels = colors.shape[1]
+        columns = 6 + channels + (2 if absgrad_of is not None else 0)
+        pair_grads = colors.new_zeros(frame.padded_gaussians.numel(), columns)
         _, work, work_t = _work(frame, means2d)
         # alpha was clamped only where an opacity exceeds the clamp
         clamped = bool((opacities > ALPHA_MAX).any())
@@ -249,9 +251,9 @@ class Blend(torch.autograd.Function):
             behind = (grad_final * final)[begin : begin + size].clone()
             for tiles, first, before in reversed(chunks):
                 b = tiles.numel()
-                place, real, ids = frame.pairs(tiles, first, count)
-                gathered = table.index_select(0, ids.reshape(-1)).view(CHUNK, b, -1)
-                pair = _Shape(*gathered[..., :6].unbind(-1))
+                place, ids = frame.pairs(tiles, first)
+                pair = _Shape(*shapes.index_select(1, ids).view(6, CHUNK, b))
+                color = shades.index_select(0, ids).view(CHUNK, b, channels)
                 tile_x, tile_y = frame.x[tiles], frame.y[tiles]
                 coefficients = _coefficients(pair, tile_x, tile_y)
                 alpha = _alphas(coefficients, basis, work)
@@ -262,7 +264,7 @@ class Blend(torch.autograd.Function):
 
                 grad_pixels = grad_image[tiles]  # [B, 64, D]
                 grad_colors = torch.bmm(weight.permute(1, 0, 2), grad_pixels).permute(1, 0, 2)
-                shade = torch.bmm(gathered[..., 6:].permute(1, 0, 2), grad_pixels.transpose(1, 2))
+                shade = torch.bmm(color.permute(1, 0, 2), grad_pixels.transpose(1, 2))
                 weight.mul_(shade.permute(1, 0, 2))  # weight * (color . grad), [S, B, 64]
 
                 suffix = steps  # the transmittances are no longer needed
@@ -276,28 +278,30 @@ class Blend(torch.autograd.Function):
                     grad_log.masked_fill_(at_clamp, 0.0)
 
                 flat = grad_log.view(CHUNK * b, PIXELS)
-                parts = [(flat @ basis.T).view(CHUNK, b, 6), grad_colors]
+                packed = flat.new_empty(CHUNK * b, columns)
+                packed[:, :6] = flat @ basis.T
+                packed[:, 6 : 6 + channels] = grad_colors.reshape(CHUNK * b, channels)
                 if absgrad_of is not None:
-                    slopes = _mean_slopes(coefficients, pair.r).view(2, CHUNK * b, 3) @ basis[:3]
-                    parts.append((slopes * flat).abs_().sum(-1).view(2, CHUNK, b).permute(1, 2, 0))
-                packed = torch.cat(parts, dim=-1)
-                pair_grads[place[real]] = packed[real]
+                    for column, slope in enumerate(_mean_slopes(coefficients)):
+                        slope = torch.mm(slope.view(3, -1).T, basis[:3], out=work[: CHUNK * b])
+                        packed[:, 6 + channels + column] = slope.mul_(flat).abs_().sum(-1)
+                pair_grads.index_copy_(0, place, packed)
 
-        return _gather_gradients(ctx, frame, shape, pair_grads, means2d, cov2d, det, opacities, absgrad_of)
+        return _gather_gradients(frame, shape, pair_grads[:-1], cov2d, det, opacities, channels, absgrad_of)
 
 
-def _mean_slopes(coefficients: Tensor, r: Tensor) -> Tensor:
-    """d log alpha / d mean as linear functions of (1, u, v): (2, ..., 3), from the coefficients.
+def _mean_slopes(coefficients: Tensor) -> tuple[Tensor, Tensor]:
+    """d log alpha / d mean x and y as linear functions of (1, u, v), (3, S, B) each, from (6, S, B).
 
     The gradient of log alpha by the mean is minus its gradient by the pixel.
     """
-    _, cu, cv, cuu, cuv, cvv = coefficients.unbind(-1)
-    return torch.stack([torch.stack([-cu, -2 * cuu, -cuv], -1), torch.stack([-cv, -cuv, -2 * cvv], -1)])
+    _, cu, cv, cuu, cuv, cvv = coefficients
+    return torch.stack([-cu, -2 * cuu, -cuv]), torch.stack([-cv, -cuv, -2 * cvv])
 
 
-def _gather_gradients(ctx, frame, shape, pair_grads, means2d, cov2d, det, opacities, absgrad_of):
+def _gather_gradients(frame, shape, pair_grads, cov2d, det, opacities, channels, absgrad_of):
     """Turn gradients of pairs into gradients of the Gaussians (the inputs of ``forward``)."""
-    count, channels = means2d.shape[0], pair_grads.shape[1] - 6 - (2 if absgrad_of is not None else 0)
+    count = det.shape[0]
     tile = torch.repeat_interleave(frame.lengths)  # in order of length: bring it to the order of the list
     place = torch.arange(tile.numel(), device=tile.device)
     place = place - (torch.cumsum(frame.lengths, 0) - frame.lengths)[tile] + frame.starts[tile]
