@@ -80,15 +80,17 @@ class PointSplatPipeline(VanillaPipeline):
     @torch.no_grad()
     def get_eval_loss_dict(self, step: int) -> tuple[Any, dict, dict]:
         """Losses at one held-out photo."""
+        training = self.training
         self.eval()
         index, frames = self.datamanager.next_eval(step)
         result = self.model.losses(index, frames)
-        self.train()
+        self.train(training)
         return result
 
     @torch.no_grad()
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict, dict]:
         """One held-out photo: metrics, and a picture of photo, pruned and refined side by side."""
+        training = self.training
         self.eval()
         index, frames = self.datamanager.next_eval_image(step)
         made = self.model.pruned_scene(index)
@@ -101,7 +103,7 @@ class PointSplatPipeline(VanillaPipeline):
             metrics |= {
                 f"{name}_{variant}": v for name, v in values.items() if isinstance(v, float) and math.isfinite(v)
             }
-        self.train()
+        self.train(training)
         return metrics, {"photo_pruned_refined": report.last_picture}
 
     @torch.no_grad()
@@ -120,6 +122,7 @@ class PointSplatPipeline(VanillaPipeline):
             ``average``, ``average_unseen`` and ``average_seen`` (over scenes, by variant), and ``scenes``. What
             cannot be computed is None, and ``lpips_note`` says why LPIPS is missing.
         """
+        training = self.training
         self.eval()
         manager, model = self.datamanager, self.model
         reports: list[SceneReport] = []
@@ -131,7 +134,7 @@ class PointSplatPipeline(VanillaPipeline):
             report.seen_in_training = index in manager.train_indices
             report.seconds = {"prune": made.seconds, "refine": seconds}
             reports.append(report)
-        self.train()
+        self.train(training)
         summary = summarize(reports, get_std)
         summary["settings"] = {"size": self.config.model.size, **options_of(self.config.model)}
         if model.lpips_reason is not None:

@@ -148,3 +148,36 @@ def some_lpips(request, monkeypatch) -> bool:
     else:
         request.getfixturevalue("no_lpips")
     return LPIPS_WEIGHTS.exists()
+
+
+@pytest.fixture(scope="session")
+def make_refined_run() -> Callable:
+    """A function that writes a pointsplat run as nerfstudio saves it, whose network adds ``moved`` to every opacity
+    logit and nothing else, and gives its folder."""
+    from pointsplat_ns.pointsplat_method import pointsplat_config
+    from pointsplat_ns.refiner import Refiner, preset
+
+    def make(folder: Path, data: Path, eval_scenes: tuple[str, ...] = (), moved: float = 0.0, **model) -> Path:
+        config = pointsplat_config()
+        config.output_dir, config.experiment_name = folder, "refiner"
+        config.pipeline.datamanager.data = config.data = data
+        config.pipeline.datamanager.eval_scenes = eval_scenes
+        for name, value in {"size": "tiny", "keep": 0.5, **model}.items():
+            setattr(config.pipeline.model, name, value)
+        config.set_timestamp()
+        config.save_config()
+        torch.manual_seed(SEED)
+        refiner = Refiner(preset("tiny"))
+        with torch.no_grad():
+            [*refiner.heads.mlps["opacities"].modules()][-1].bias.fill_(moved)
+        state = {f"_model.refiner.{name}": value for name, value in refiner.state_dict().items()}
+        # The rate of a cosine schedule is a numpy number, which torch refuses to load unless it is told otherwise.
+        schedules = {"encoder": {"_last_lr": [np.float64(0.1)]}}
+        config.get_checkpoint_dir().mkdir()
+        torch.save(
+            {"step": 9, "pipeline": state, "optimizers": {}, "schedulers": schedules, "scalers": {}},
+            config.get_checkpoint_dir() / "step-000000009.ckpt",
+        )
+        return config.get_base_dir()
+
+    return make

@@ -1,0 +1,177 @@
+"""pointsplat prune, refine and export: what they write, and what they say of input that cannot be used."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
+from pointsplat_ns.cli import main
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io import read_ply, read_scene, write_ply
+from pointsplat_ns.pruning import prune
+
+SEED = 5
+
+
+def same(a: Gaussians, b: Gaussians) -> bool:
+    return all(torch.equal(x, y) for (_, x), (_, y) in zip(a.items(), b.items(), strict=True))
+
+
+def random_scene(n: int = 80, degree: int = 3) -> Gaussians:
+    generator = torch.Generator().manual_seed(SEED)
+    sizes = {"means": 3, "scales": 3, "quats": 4, "opacities": 1, "features_dc": 3}
+    values = {name: torch.randn((n, size), generator=generator) for name, size in sizes.items()}
+    return Gaussians(**values, features_rest=torch.randn((n, (degree + 1) ** 2 - 1, 3), generator=generator))
+
+
+@pytest.fixture()
+def ply(tmp_path) -> Path:
+    write_ply(random_scene(), tmp_path / "scene.ply")
+    return tmp_path / "scene.ply"
+
+
+@pytest.fixture()
+def splatfacto_run(trained_walls) -> Path:
+    (run,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
+    return run
+
+
+@pytest.fixture(scope="module")
+def refined_run(make_refined_run, trained_walls, tmp_path_factory) -> Path:
+    return make_refined_run(tmp_path_factory.mktemp("refined"), trained_walls, ("wall-b",), moved=0.5)
+
+
+def run(*args) -> None:
+    main([str(a) for a in args])
+
+
+def refusal(capsys, output: Path, *args) -> str:
+    """The one line on stderr with which a command refuses; it prints nothing else and writes nothing."""
+    before = sorted(output.parent.rglob("*")) if output.parent.is_dir() else None
+    with pytest.raises(SystemExit) as caught:
+        run(*args, "-o", output)
+    said = capsys.readouterr()
+    assert caught.value.code == 1 and said.out == ""
+    assert said.err.startswith("error: ") and said.err.count("\n") == 1
+    assert (sorted(output.parent.rglob("*")) if output.parent.is_dir() else None) == before, "partial output"
+    return said.err
+
+
+@pytest.mark.parametrize("kind", ["ply", "folder", "config", "ckpt", "bare ckpt"])
+def test_prune_takes_every_kind_of_scene(kind, ply, splatfacto_run, tmp_path, capsys):
+    (checkpoint,) = (splatfacto_run / "nerfstudio_models").iterdir()
+    shutil.copy(checkpoint, tmp_path / "alone.ckpt")
+    scene = {
+        "ply": ply,
+        "folder": splatfacto_run,
+        "config": splatfacto_run / "config.yml",
+        "ckpt": checkpoint,
+        "bare ckpt": tmp_path / "alone.ckpt",
+    }[kind]
+    output = tmp_path / "new" / "out.ply"
+    run("prune", scene, "--keep", "0.5", "-o", output)
+    dense = read_scene(scene)
+    assert same(read_ply(output), prune(dense, 0.5).scene)
+    said = capsys.readouterr().out
+    assert str(output) in said and f"of {len(dense):,} Gaussians" in said and "MB" in said
+    assert [p.name for p in output.parent.iterdir()] == ["out.ply"]
+
+
+@pytest.mark.parametrize(("keep", "kept"), [("0.25", 20), ("25%", 20), ("7", 7), ("1.0", 80), ("1", 1)])
+def test_keep_is_a_ratio_a_percentage_or_a_count(ply, tmp_path, keep, kept):
+    run("prune", ply, "--keep", keep, "-o", tmp_path / "out.ply")
+    assert same(read_ply(tmp_path / "out.ply"), prune(read_ply(ply), kept).scene)
+
+
+def test_prune_scores_as_it_is_told(ply, tmp_path):
+    run("prune", ply, "--keep", "9", "--by", "volume", "-o", tmp_path / "volume.ply")
+    run("prune", ply, "--keep", "9", "--opacity-weight", "1.0", "-o", tmp_path / "opacity.ply")
+    dense = read_ply(ply)
+    assert same(read_ply(tmp_path / "volume.ply"), prune(dense, 9, "volume").scene)
+    assert same(read_ply(tmp_path / "opacity.ply"), prune(dense, 9, "opacity").scene)
+
+
+@pytest.mark.parametrize("keep", ["0", "1.5", "nan", "inf", "-3", "81", "half", "", "0%", "101%"])
+@pytest.mark.parametrize("command", ["prune", "refine"])
+def test_a_keep_that_no_scene_can_satisfy_is_refused(command, keep, ply, refined_run, tmp_path, capsys):
+    using = ("--using", refined_run) if command == "refine" else ()
+    assert "keep is" in refusal(capsys, tmp_path / "out.ply", command, ply, *using, f"--keep={keep}")
+
+
+def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
+    output = tmp_path / "out.ply"
+    assert "gone.ply: no such file" in refusal(capsys, output, "prune", tmp_path / "gone.ply")
+    assert "without config.yml" in refusal(capsys, output, "prune", tmp_path)
+    assert "another method" in refusal(capsys, output, "prune", refined_run)
+    half = tmp_path / "half.ply"
+    half.write_bytes(ply.read_bytes()[:-100])
+    assert "half.ply" in refusal(capsys, output, "prune", half)
+    assert "opacity_weight is 2.0; expected 0 to 1" in refusal(capsys, output, "prune", ply, "--opacity-weight", "2")
+
+
+def test_an_output_that_cannot_be_written_is_refused(ply, tmp_path, capsys):
+    assert "ends in .ply" in refusal(capsys, tmp_path / "out.splat", "prune", ply)
+    (tmp_path / "folder.ply").mkdir()
+    assert "is a folder" in refusal(capsys, tmp_path / "folder.ply", "prune", ply)
+    assert "cannot be written" in refusal(capsys, ply / "below_a_file.ply", "prune", ply)
+
+
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_refine_takes_a_scene_that_the_run_never_saw(degree, refined_run, tmp_path, capsys):
+    dense = random_scene(50, degree)
+    write_ply(dense, tmp_path / "scene.ply")
+    run("refine", tmp_path / "scene.ply", "--using", refined_run, "-o", tmp_path / "out.ply")
+    refined, kept = read_ply(tmp_path / "out.ply"), prune(dense, 0.5).scene
+    assert same(refined, kept.replace(opacities=kept.opacities + 0.5)) and len(refined) == 25
+    assert re.search(r"refined 25 of 50 Gaussians \(50.0 %\)", capsys.readouterr().out)
+    run("refine", tmp_path / "scene.ply", "--using", refined_run, "--keep", "11", "-o", tmp_path / "out.ply")
+    assert len(read_ply(tmp_path / "out.ply")) == 11
+
+
+def test_refine_refuses_what_is_no_refiner(ply, splatfacto_run, tmp_path, capsys):
+    output = tmp_path / "out.ply"
+    said = refusal(capsys, output, "refine", ply, "--using", splatfacto_run)
+    assert "splatfacto-cpu; expected a pointsplat run" in said
+    assert "not a nerfstudio run" in refusal(capsys, output, "refine", ply, "--using", tmp_path)
+    assert "no such file" in refusal(capsys, output, "refine", ply, "--using", tmp_path / "gone")
+
+
+def test_export_writes_the_scene_of_a_splatfacto_run_as_it_is(splatfacto_run, tmp_path):
+    (checkpoint,) = (splatfacto_run / "nerfstudio_models").iterdir()
+    shutil.copy(checkpoint, tmp_path / "alone.ckpt")
+    for i, path in enumerate((splatfacto_run, splatfacto_run / "config.yml", checkpoint, tmp_path / "alone.ckpt")):
+        run("export", path, "-o", tmp_path / f"{i}.ply")
+        assert same(read_ply(tmp_path / f"{i}.ply"), read_scene(checkpoint))
+
+
+def test_export_writes_the_refined_scene_of_a_pointsplat_run(refined_run, trained_walls, tmp_path, capsys):
+    for name, options in (("wall-b", ()), ("wall-a", ("--scene", "wall-a"))):
+        run("export", refined_run, *options, "-o", tmp_path / "out.ply")
+        (source,) = (trained_walls / name / "splatfacto-cpu").iterdir()
+        kept = prune(read_scene(source), 0.5).scene
+        assert same(read_ply(tmp_path / "out.ply"), kept.replace(opacities=kept.opacities + 0.5))
+        assert name in capsys.readouterr().out
+
+
+def test_export_refuses_a_scene_that_is_not_there(refined_run, splatfacto_run, ply, tmp_path, capsys):
+    output = tmp_path / "out.ply"
+    assert "wall-a, wall-b" in refusal(capsys, output, "export", refined_run, "--scene", "attic")
+    assert "holds one scene" in refusal(capsys, output, "export", splatfacto_run, "--scene", "wall-a")
+    assert "gone: no such file" in refusal(capsys, output, "export", tmp_path / "gone")
+    assert "without config.yml" in refusal(capsys, output, "export", tmp_path)
+
+
+def test_the_command_as_installed_refuses_with_status_1_and_one_line(tmp_path):
+    code = "from pointsplat_ns.cli import main; main()"
+    arguments = ["refine", "gone.ply", "--using", "gone", "-o", str(tmp_path / "out.ply")]
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 1 and done.stdout == ""
+    assert done.stderr.startswith("error: gone: no such file") and done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
