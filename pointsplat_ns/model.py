@@ -21,7 +21,7 @@ from pointsplat_ns.data.scenes import TrainedScene
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.lpips import Lpips, LpipsUnavailable, load_lpips
-from pointsplat_ns.metrics import psnr
+from pointsplat_ns.metrics import ImageError, psnr
 from pointsplat_ns.pruning import SCORES, prune
 from pointsplat_ns.refined_run import prune_options
 from pointsplat_ns.refiner import Refiner, Structure, preset
@@ -238,7 +238,11 @@ class PointSplatModel(SplatfactoCpuModel):
             l1.append((rgb - photo).abs().mean())
             quality.append(psnr(rgb.detach(), photo))
             if lpips is not None:
-                perceptual.append(lpips(rgb, photo))
+                try:
+                    perceptual.append(lpips(rgb, photo))
+                except ImageError as error:  # too small for the network
+                    self._lpips[net] = lpips = None
+                    CONSOLE.log(f"going on without LPIPS in the loss: {error}")
         losses = {"l1": torch.stack(l1).mean()}
         if perceptual:
             losses["lpips"] = self.config.lpips_weight * torch.stack(perceptual).mean()

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from pointsplat_ns.data.scenes import ScenesDataManager, ScenesDataManagerConfig
@@ -59,6 +60,21 @@ class PointSplatPipeline(VanillaPipeline):
         self._model = config.model.setup(scene_box=None, num_train_data=0, device=device, grad_scaler=grad_scaler)
         self.model.to(device)
         self.model.attach(self.datamanager.scenes, self.datamanager.shown)
+        scenes, indices = self.datamanager.scenes, self.datamanager.train_indices
+        self.trained_on: set[str] = {scenes[i].identity for i in indices} if test_mode == "val" else set()
+        """Identities of the scenes that the network has been trained on, resumed trainings included."""
+
+    def get_extra_state(self) -> dict[str, list[str]]:
+        """What a checkpoint says beside the weights: which scenes they were trained on."""
+        return {"trained_on": sorted(self.trained_on)}
+
+    def set_extra_state(self, state: dict[str, list[str]]) -> None:
+        """Remember what a checkpoint was trained on, and say so if scenes have come or gone since."""
+        known = set(state["trained_on"])
+        gone = known - {scene.identity for scene in self.datamanager.scenes}
+        if gone:
+            CONSOLE.log(f"trained on {', '.join(sorted(gone))}, which {self.datamanager.get_datapath()} no longer has")
+        self.trained_on |= known
 
     @property
     def model(self) -> PointSplatModel:
@@ -100,9 +116,7 @@ class PointSplatPipeline(VanillaPipeline):
         pixels = int(frames[0][0].height) * int(frames[0][0].width)
         metrics: dict[str, Any] = {"num_rays": pixels}
         for variant, values in report.variants.items():
-            metrics |= {
-                f"{name}_{variant}": v for name, v in values.items() if isinstance(v, float) and math.isfinite(v)
-            }
+            metrics |= _finite({f"{name}_{variant}": value for name, value in values.items()})
         self.train(training)
         return metrics, {"photo_pruned_refined": report.last_picture}
 
@@ -131,7 +145,7 @@ class PointSplatPipeline(VanillaPipeline):
             refined, seconds = model.timed_refine(index)
             variants = {"dense": scene.read_dense().to(model.device), "pruned": made.pruned, "refined": refined}
             report = evaluate_scene(model, scene, variants, manager.held_out(index), True, output_path)
-            report.seen_in_training = index in manager.train_indices
+            report.seen_in_training = scene.identity in self.trained_on
             report.seconds = {"prune": made.seconds, "refine": seconds}
             reports.append(report)
         self.train(training)

@@ -164,7 +164,8 @@ def test_the_checkpoint_holds_the_network_and_nothing_else(trained):
     state = torch.load(path, map_location="cpu", weights_only=True)
     refiner = trainer.pipeline.model.refiner
     names = {f"_model.refiner.{name}" for name in refiner.state_dict()}
-    assert set(state["pipeline"]) == names | {"_model.device_indicator_param"}
+    assert set(state["pipeline"]) == names | {"_model.device_indicator_param", "_extra_state"}
+    assert [name.split("/")[0] for name in state["pipeline"]["_extra_state"]["trained_on"]] == ["wall-a"]
     assert all(torch.equal(state["pipeline"][f"_model.refiner.{n}"], v) for n, v in refiner.state_dict().items())
     parameters = sum(p.numel() for p in refiner.parameters())
     assert path.stat().st_size < 4 * 3 * parameters + 500_000, "three floats a parameter: itself and Adam's two"
@@ -306,6 +307,37 @@ def evaluated(trained):
     """The pipeline as ns-eval opens it."""
     config, _, _ = trained
     return eval_setup(config.get_base_dir() / "config.yml")[1]
+
+
+def test_a_scene_trained_again_since_is_not_the_one_that_the_network_has_seen(trained, trained_walls, tmp_path):
+    config, _, _ = trained
+    moved = tmp_path / "moved"
+    shutil.copytree(trained_walls, moved)
+    (again,) = (moved / "wall-a" / "splatfacto-cpu").iterdir()
+    text = (again / "config.yml").read_text()
+    other = copy.deepcopy(config)
+    other.pipeline.datamanager.data = moved
+    pipeline = other.pipeline.setup(device="cpu", test_mode="test")
+    state = torch.load(next(config.get_checkpoint_dir().iterdir()), weights_only=True)
+    pipeline.load_pipeline(state["pipeline"], state["step"])
+    seen = [scene.identity in pipeline.trained_on for scene in pipeline.datamanager.scenes]
+    assert seen == [True, False], "a run is the same wherever its folder is"
+    timestamp = pipeline.datamanager.scenes[0].run.timestamp
+    (again / "config.yml").write_text(text.replace(timestamp, "2031-01-01_000000"))
+    pipeline = other.pipeline.setup(device="cpu", test_mode="test")
+    pipeline.load_pipeline(state["pipeline"], state["step"])
+    assert not any(scene.identity in pipeline.trained_on for scene in pipeline.datamanager.scenes)
+
+
+def test_photos_too_small_for_lpips_are_trained_on_with_l1_alone(evaluated):
+    def too_small(*_):
+        raise ImageError("images of 8 x 8 pixels are too small")
+
+    index, frames = evaluated.datamanager.next_eval(0)
+    config = evaluated.model.config
+    nets = mock.patch.object(evaluated.model, "_lpips", {"alex": too_small, "vgg": too_small})
+    with nets, mock.patch.object(config, "lpips_weight", 0.1):
+        assert set(evaluated.model.losses(index, frames)[1]) == {"l1"}
 
 
 def test_the_evaluation_compares_dense_pruned_and_refined(evaluated, some_lpips, tmp_path):

@@ -68,9 +68,8 @@ def report_table(results: dict[str, Any]):
 
     settings = results.get("settings", {})
     caption = results.get("lpips_note")
-    table = Table(
-        title=f"keep {settings.get('keep')}, score {settings.get('by')}, refiner {settings.get('size')}", caption=caption
-    )
+    title = f"keep {settings.get('keep')}, score {settings.get('by')}, refiner {settings.get('size')}"
+    table = Table(title=title, caption=caption)
     table.add_column("scene")
     table.add_column("seen")
     table.add_column("variant")

@@ -79,6 +79,12 @@ class TrainedScene:
         self.run = run
         self._cache = cache
 
+    @property
+    def identity(self) -> str:
+        """Tells this trained scene from any other, wherever its folder is moved: EXPERIMENT/METHOD/TIME, step."""
+        run = self.run
+        return f"{self.name}/{run.method_name}/{run.timestamp} step {run.step}"
+
     def read_dense(self) -> Gaussians:
         """The Gaussians as trained, read anew each time: a dense scene is too big to keep many of."""
         return read_checkpoint(self.run.checkpoint)

@@ -193,4 +193,3 @@ def rasterization(
         "flatten_ids": dense_ids[tiles.gaussians],
     }
     return image, accumulated, meta
-
