@@ -76,9 +76,11 @@ class RefinerConfig:
     """Chance that the deepest block's branch is dropped for a point in training; shallower blocks drop less."""
     curves: tuple[str, ...] = ("hilbert", "hilbert-trans", "z", "z-trans")
     """Serialization curves; block i of a stage uses curve i (shuffled in training). Memory is laid out by the first."""
-    norm: Literal["batch", "layer"] = "batch"
-    """Normalisation outside the attention blocks. ``batch`` is the published one and learns faster; ``layer`` acts
-    alike in training and evaluation, where batch statistics of one scene and running ones differ a little."""
+    norm: Literal["scene", "batch", "layer"] = "scene"
+    """Normalisation outside the attention blocks. ``scene`` takes each channel's mean and variance over the points of
+    the scene at hand, in training and in evaluation. In training that is what the published ``batch`` does, as a step
+    sees one scene; but ``batch`` evaluates with running averages over scenes, which fit none of them. ``layer``
+    normalises each point by itself."""
     head_width: int = 128
     """Hidden width of the output heads."""
     head_depth: int = 4
@@ -123,7 +125,8 @@ class RefinerConfig:
         )
         _require(0 <= self.sh_degree <= MAX_SH_DEGREE, f"sh_degree is {self.sh_degree}; expected 0 to {MAX_SH_DEGREE}")
         _require(self.encoder in ("dual", "concat"), f"encoder is {self.encoder!r}; expected 'dual' or 'concat'")
-        _require(self.norm in ("batch", "layer"), f"norm is {self.norm!r}; expected 'batch' or 'layer'")
+        norms = ("scene", "batch", "layer")
+        _require(self.norm in norms, f"norm is {self.norm!r}; expected one of {', '.join(norms)}")
         _require(self.grid is None or 1 <= self.grid <= 512, f"grid is {self.grid}; expected 1 to 512, or None")
         _require(self.head_depth >= 2, f"head_depth is {self.head_depth}; expected at least 2")
         _require(self.patch >= 1, f"patch is {self.patch}; expected at least 1")

@@ -31,9 +31,28 @@ class BatchNorm(nn.BatchNorm1d):
         )
 
 
+class SceneNorm(nn.Module):
+    """Normalises each channel over the points of the scene at hand: ``[N, C] -> [N, C]``.
+
+    Batch norm as it trains, with no running statistics to evaluate with. A single point, which has
+    no variance, is its own mean.
+    """
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(channels))
+        self.bias = nn.Parameter(torch.zeros(channels))
+        self.eps = 1e-3
+
+    def forward(self, x: Tensor) -> Tensor:
+        if x.shape[0] < 2:
+            return (x - x) * self.weight + self.bias
+        return nn.functional.batch_norm(x, None, None, self.weight, self.bias, True, 0.0, self.eps)
+
+
 def make_norm(kind: str, channels: int) -> nn.Module:
-    """The normalisation named in a :class:`RefinerConfig`: ``batch`` or ``layer``."""
-    return BatchNorm(channels) if kind == "batch" else nn.LayerNorm(channels)
+    """The normalisation named in a :class:`RefinerConfig`: ``scene``, ``batch`` or ``layer``."""
+    return {"scene": SceneNorm, "batch": BatchNorm, "layer": nn.LayerNorm}[kind](channels)
 
 
 class DualBranchEncoder(nn.Module):

@@ -4,7 +4,7 @@ import torch.nn.functional as F
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.refiner.config import preset
-from pointsplat_ns.refiner.encoder import BatchNorm
+from pointsplat_ns.refiner.encoder import BatchNorm, SceneNorm
 from pointsplat_ns.refiner.point_transformer import Block, PatchAttention, PointTransformer, SubmanifoldConv
 from pointsplat_ns.refiner.structure import build_structure
 
@@ -98,6 +98,31 @@ def test_batch_norm_equals_torch_in_training_and_takes_a_single_point():
     assert torch.equal(ours(x), theirs(x))
     one = ours.train()(x[:1])
     assert torch.equal(one, ours.eval()(x[:1])) and one.isfinite().all()
+
+
+def test_scene_norm_is_batch_norm_as_it_trains_and_evaluates_the_same():
+    ours, theirs = SceneNorm(4), torch.nn.BatchNorm1d(4, eps=1e-3)
+    x = torch.randn(30, 4, generator=seeded()) * 3 + 2
+    assert torch.equal(ours(x), theirs(x))
+    assert torch.equal(ours.eval()(x), ours.train()(x))
+    assert set(ours.state_dict()) == {"weight", "bias"}
+    one = ours(x[:1].requires_grad_())
+    assert torch.equal(one, ours.bias[None])
+
+
+@pytest.mark.parametrize("offset,spread", [(0.0, 1e-12), (1e4, 1.0), (0.0, 1e15)])
+def test_scene_norm_at_extremes_follows_float64(offset, spread):
+    x = torch.randn(500, 3, generator=seeded(), dtype=torch.float64) * spread + offset
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        norm = SceneNorm(3).to(dtype)
+        leaf = x.to(dtype).requires_grad_()
+        out = norm(leaf)
+        out.square().sum().backward()
+        assert out.isfinite().all() and leaf.grad.isfinite().all()
+        results.append(out.double())
+    # at 1e4 float32 steps are a thousandth of the spread, and the mean is known to a few of them
+    assert (results[0] - results[1]).abs().max() < 2e-2
 
 
 def test_batch_norm_statistics_are_averages_at_first_so_that_short_trainings_evaluate_well():

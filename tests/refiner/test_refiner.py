@@ -92,7 +92,7 @@ def test_an_untrained_refiner_returns_hard_scenes_to_the_bit_but_zero_quaternion
     assert same(refined, scene.replace(quats=torch.where(zero[:, None], identity, scene.quats)))
 
 
-@pytest.mark.parametrize("norm", ["batch", "layer"])
+@pytest.mark.parametrize("norm", ["scene", "batch", "layer"])
 @pytest.mark.parametrize("training", [False, True])
 @pytest.mark.parametrize("name", hard_scenes())
 def test_output_and_gradients_of_hard_scenes_are_finite(name, training, norm):
@@ -246,7 +246,7 @@ def test_at_the_start_only_the_last_layers_have_gradients_and_one_step_wakes_the
         optimizer.step()
 
 
-@pytest.mark.parametrize("norm", ["batch", "layer"])
+@pytest.mark.parametrize("norm", ["scene", "batch", "layer"])
 def test_a_few_steps_fit_a_target_that_depends_on_neighbours_and_evaluation_agrees(norm):
     scene = make_scene(300, sh_degree=1)
     near = torch.cdist(scene.means, scene.means).topk(4, largest=False).indices

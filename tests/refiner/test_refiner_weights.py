@@ -21,7 +21,7 @@ def scene(n: int = 50) -> Gaussians:
     return Gaussians(*(torch.randn(n, *t, generator=g) for t in ((3,), (3,), (4,), (1,), (3,), (15, 3))))
 
 
-@pytest.mark.parametrize("norm", ["batch", "layer"])
+@pytest.mark.parametrize("norm", ["scene", "batch", "layer"])
 def test_a_refiner_survives_a_round_trip_to_the_bit(tmp_path, norm):
     refiner = trained(norm=norm).train()
     refiner(scene())  # moves running statistics
