@@ -87,7 +87,9 @@ def _load(path: Path) -> Any:
             raise SceneError(
                 f"{path}: holds an object of type {foreign[1]}, which only running its code could load; {expected}"
             ) from error
-        raise SceneError(f"{path}: truncated or not a checkpoint ({one_line(error, 100)}); {expected}") from error
+        raise SceneError(
+            f"{path}: truncated or not a checkpoint ({type(error).__name__}: {one_line(error, 100)}); {expected}"
+        ) from error
 
 
 def _pipeline_state(content: Any, path: Path) -> dict[str, Any]:
