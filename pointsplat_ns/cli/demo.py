@@ -10,6 +10,10 @@ import sys
 import time
 from pathlib import Path
 
+SHORT_SPIN = {"GOMP_SPINCOUNT": "20000"}
+"""OpenMP threads that wait spin for some microseconds, then sleep. By default they spin on, which on a busy machine
+holds up the thread that they wait for; threads that sleep at once (OMP_WAIT_POLICY=PASSIVE) wake too late."""
+
 UNSEEN = "room2"
 """The room that the refiner is not trained on."""
 
@@ -57,7 +61,7 @@ def demo(
             _run(
                 "ns-train splatfacto-cpu --vis tensorboard --timestamp demo "
                 f"--output-dir {scenes} --experiment-name {name} --max-num-iterations {scene_steps} "
-                f"--data {output / 'rooms' / name} replica-data"
+                f"--data {output / 'rooms' / name} replica-data --num-seed-points 20000"
             )
     run = output / "refiner" / "rooms" / "pointsplat" / "demo"
     if not _finished(run, refiner_steps):
@@ -139,8 +143,7 @@ def _run(command: str) -> None:
     print(f"\n$ {command}", flush=True)
     program, *arguments = shlex.split(command)
     beside = Path(sys.executable).parent / program
-    # Threads that sleep rather than spin while they wait lose far less on a busy machine.
-    environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}
+    environment = {**SHORT_SPIN, **os.environ}
     status = subprocess.run([str(beside) if beside.exists() else program, *arguments], env=environment).returncode
     if status != 0:
         raise PointSplatError(f"{command}: ended with exit status {status}; its own words are above")
