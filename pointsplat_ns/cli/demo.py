@@ -43,9 +43,7 @@ def demo(
         height: of a photo, pixels.
         fresh: start over.
     """
-    from rich.console import Console
-
-    from pointsplat_ns.cli.view import read_evaluation, report_table, rooms
+    from pointsplat_ns.cli.view import read_evaluation, rooms, show_report
 
     start = time.perf_counter()
     if fresh and output.exists():
@@ -79,7 +77,7 @@ def demo(
     results = read_evaluation(evaluation)
     picture = output / "before_after.png"
     before_after(sorted(pictures.glob(f"{UNSEEN}_*.png")), results["scenes"][UNSEEN], picture)
-    Console().print(report_table(results))
+    show_report(results)
     print(f"{splat}: open it in any 3DGS viewer, or run ns-viewer --load-config {run / 'config.yml'}")
     print(f"{picture}: photo, dense, pruned and refined side by side, of a room that the refiner never saw")
     print(f"done in {(time.perf_counter() - start) / 60:.1f} minutes")

@@ -39,9 +39,16 @@ def report(evaluation: tyro.conf.Positional[Path]) -> None:
     Args:
         evaluation: the JSON file.
     """
+    show_report(read_evaluation(evaluation))
+
+
+def show_report(results: dict[str, Any]) -> None:
+    """Print an evaluation as a table, and why LPIPS is missing if it is."""
     from rich.console import Console
 
-    Console().print(report_table(read_evaluation(evaluation)))
+    Console().print(report_table(results))
+    if "lpips_note" in results:
+        print(f"no LPIPS: {results['lpips_note']}")
 
 
 def read_evaluation(path: Path) -> dict[str, Any]:
@@ -67,9 +74,8 @@ def report_table(results: dict[str, Any]):
     from rich.table import Table
 
     settings = results.get("settings", {})
-    caption = results.get("lpips_note")
     title = f"keep {settings.get('keep')}, score {settings.get('by')}, refiner {settings.get('size')}"
-    table = Table(title=title, caption=caption)
+    table = Table(title=title)
     table.add_column("scene")
     table.add_column("seen")
     table.add_column("variant")
