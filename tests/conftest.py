@@ -129,10 +129,11 @@ def trained_walls(wall_scene, wall_config, run_training, tmp_path_factory) -> Pa
 
 
 @pytest.fixture()
-def no_lpips(tmp_path, monkeypatch):
+def no_lpips(tmp_path_factory, monkeypatch):
     """A machine with no LPIPS weights and no network."""
-    monkeypatch.setenv("POINTSPLAT_LPIPS_WEIGHTS", str(tmp_path))
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    nothing = tmp_path_factory.mktemp("no_weights")
+    monkeypatch.setenv("POINTSPLAT_LPIPS_WEIGHTS", str(nothing))
+    monkeypatch.setenv("TORCH_HOME", str(nothing))
 
     def no_network(*args, **kwargs):
         raise OSError("no network")

@@ -53,13 +53,13 @@ def _basis(like: Tensor) -> Tensor:
 
 
 class _Shape(NamedTuple):
-    """The parameters of Gaussians as pairs see them, each (...,)."""
+    """The parameters of Gaussians as pairs see them, each (...,); a, r and d as the module says."""
 
-    x: Tensor  # mean minus nothing: pixels in the image
+    x: Tensor  # mean, pixels
     y: Tensor
-    a: Tensor
+    a: Tensor  # 1 / pixels^2
     r: Tensor
-    d: Tensor
+    d: Tensor  # 1 / pixels^2
     log_opacity: Tensor
 
     @classmethod
