@@ -59,10 +59,6 @@ class PrunedScene:
     structure: Structure | None
     seconds: float  # to choose and select, without reading
 
-    @property
-    def name(self) -> str:
-        return self.scene.name
-
 
 def options_of(config: PointSplatModelConfig) -> dict[str, Any]:
     """Arguments of :func:`pointsplat_ns.pruning.prune` that a config asks for."""
@@ -122,11 +118,11 @@ class PointSplatModel(SplatfactoCpuModel):
         """The network's parameters by part: encoder, backbone and one head per attribute."""
         return self.refiner.parameter_groups()
 
-    def pruned_scene(self, index: int) -> PrunedScene:
-        """A scene, pruned and serialized; made at the first call and kept."""
+    def pruned_scene(self, index: int, dense: Gaussians | None = None) -> PrunedScene:
+        """A scene, pruned and serialized; made at the first call and kept. Who has read the dense scene may give it."""
         if index not in self._pruned:
             scene = self.scenes[index]
-            dense = scene.read_dense()
+            dense = scene.read_dense() if dense is None else dense
             start = time.perf_counter()
             try:
                 pruned = prune(dense, **options_of(self.config)).scene

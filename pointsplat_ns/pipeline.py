@@ -141,9 +141,10 @@ class PointSplatPipeline(VanillaPipeline):
         manager, model = self.datamanager, self.model
         reports: list[SceneReport] = []
         for index, scene in enumerate(manager.scenes):
-            made = model.pruned_scene(index)
+            dense = scene.read_dense()
+            made = model.pruned_scene(index, dense)
             refined, seconds = model.timed_refine(index)
-            variants = {"dense": scene.read_dense().to(model.device), "pruned": made.pruned, "refined": refined}
+            variants = {"dense": dense.to(model.device), "pruned": made.pruned, "refined": refined}
             report = evaluate_scene(model, scene, variants, manager.held_out(index), True, output_path)
             report.seen_in_training = scene.identity in self.trained_on
             report.seconds = {"prune": made.seconds, "refine": seconds}

@@ -11,7 +11,7 @@ import torch
 
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.runs import Run, find_runs, open_run, scene_names
+from pointsplat_ns.io.runs import Run, find_runs, open_run, scene_names, shown_scene
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.refiner import Refiner, preset
@@ -94,7 +94,5 @@ def open_refined_run(path: Path | str, need_scenes: bool = True) -> RefinedRun:
     if need_scenes:
         runs = find_runs(run.data, need_data=False)
         scenes = dict(zip(scene_names(runs), runs, strict=True))
-        named = run.datamanager_fields.get("eval_scenes") or ()
-        held_out = [name for name in scenes if name in named]  # in the order of the viewer and ns-export
-        default = (held_out or list(scenes))[0]
+        default = shown_scene(list(scenes), run.datamanager_fields.get("eval_scenes") or ())
     return RefinedRun(run, refiner.eval(), options, scenes, default)

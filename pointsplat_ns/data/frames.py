@@ -81,10 +81,10 @@ class FrameCache:
         with self._lock:
             if key in self._entries:
                 self.num_bytes -= self._entries.pop(key)[1]
+            while self.num_bytes + size > self.max_bytes:  # make room first: the bound holds at every moment
+                self.num_bytes -= self._entries.popitem(last=False)[1][1]
             self._entries[key] = (frame, size)
             self.num_bytes += size
-            while self.num_bytes > self.max_bytes:
-                self.num_bytes -= self._entries.popitem(last=False)[1][1]
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -243,10 +243,11 @@ class _EvalLoader:
         return len(self._frames)
 
     def __iter__(self) -> Iterator[tuple[Cameras, dict[str, Any]]]:
-        return (_to_device(frame, self._device) for frame in self._frames)
+        return (to_device(frame, self._device) for frame in self._frames)
 
 
-def _to_device(frame: tuple[Cameras, dict[str, Any]], device: torch.device | str) -> tuple[Cameras, dict[str, Any]]:
+def to_device(frame: tuple[Cameras, dict[str, Any]], device: torch.device | str) -> tuple[Cameras, dict[str, Any]]:
+    """A camera and its photo on a device."""
     camera, data = frame
     for name in ("image", "mask"):
         if name in data:
@@ -324,7 +325,7 @@ class LazyImageDatamanager(FullImageDatamanager):
             self.train_unseen_cameras = self.sample_train_cameras()
         frame = self.train_frames[index]
         self.train_frames.prefetch(self.train_unseen_cameras[:LOOK_AHEAD])
-        camera, data = _to_device(frame, self.device)
+        camera, data = to_device(frame, self.device)
         camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
         return camera, data
 
@@ -333,4 +334,4 @@ class LazyImageDatamanager(FullImageDatamanager):
         index = self.eval_unseen_cameras.pop(random.randint(0, len(self.eval_unseen_cameras) - 1))
         if not self.eval_unseen_cameras:
             self.eval_unseen_cameras = list(range(len(self.eval_dataset)))
-        return _to_device(self.eval_frames[index], self.device)
+        return to_device(self.eval_frames[index], self.device)

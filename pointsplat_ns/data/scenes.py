@@ -22,11 +22,11 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from pointsplat_ns.data.frames import FrameCache, Frames, free_memory_share
+from pointsplat_ns.data.frames import FrameCache, Frames, free_memory_share, to_device
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.inert_yaml import Tagged
-from pointsplat_ns.io.runs import Run, find_runs, scene_names
+from pointsplat_ns.io.runs import Run, find_runs, scene_names, shown_scene
 from pointsplat_ns.io.splatfacto import read_checkpoint
 
 VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
@@ -184,12 +184,6 @@ class ScenesDataManager(DataManager):
         if config.images_per_step < 1:
             raise DataError(f"--images-per-step {config.images_per_step}: expected at least 1")
         runs = find_runs(config.data, need_data=test_mode != "inference")
-        for run in runs:
-            if not run.is_gaussian_scene:  # find_runs passes over those below a folder, not one that is named
-                raise SceneError(
-                    f"{run.folder}: a run of the method {run.method_name or 'unknown'}; "
-                    "expected a trained Splatfacto run"
-                )
         gigabytes = config.cache_gigabytes
         cache = FrameCache(free_memory_share() if gigabytes is None else int(gigabytes * 1e9))
         self.scenes = [TrainedScene(name, run, cache) for name, run in zip(scene_names(runs), runs, strict=True)]
@@ -203,7 +197,7 @@ class ScenesDataManager(DataManager):
         self.eval_indices = [i for i, name in enumerate(names) if name in config.eval_scenes] or self.train_indices
         if not self.train_indices:
             raise SceneError(f"--eval-scenes names all {len(names)} scenes of {config.data}; none is left to train on")
-        self.shown = self.eval_indices[0]
+        self.shown = names.index(shown_scene(names, config.eval_scenes))
         """The scene that the viewer and the exporter get."""
         training = ", ".join(names[i] for i in self.train_indices)
         held_out = ", ".join(config.eval_scenes) or "no scene (held-out photos of the training scenes serve)"
@@ -243,7 +237,7 @@ class ScenesDataManager(DataManager):
     def next_train(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
         """Index of a training scene, and some of its training photos with their cameras, on the device."""
         scene, photos = self._choice(step)
-        frames = [self._to_device(self.scenes[scene].train_frames[i]) for i in photos]
+        frames = [to_device(self.scenes[scene].train_frames[i], self.device) for i in photos]
         next_scene, next_photos = self._choice(step + 1)
         self.scenes[next_scene].train_frames.prefetch(next_photos)
         return scene, frames
@@ -255,7 +249,7 @@ class ScenesDataManager(DataManager):
         if len(frames) == 0:
             raise DataError(f"{self.scenes[scene].run.data}: no frame is held out; change the dataparser's split")
         index = random.Random(f"{self.config.seed} eval {step}").randrange(len(frames))
-        return scene, [self._to_device(frames[index])]
+        return scene, [to_device(frames[index], self.device)]
 
     def next_eval_image(self, step: int):  # type: ignore[override]
         """As :meth:`next_eval`."""
@@ -263,14 +257,7 @@ class ScenesDataManager(DataManager):
 
     def held_out(self, scene: int) -> Iterator[tuple[Cameras, dict[str, Any]]]:
         """Every held-out photo of a scene with its camera, on the device."""
-        return (self._to_device(frame) for frame in self.scenes[scene].eval_frames)
-
-    def _to_device(self, frame: tuple[Cameras, dict[str, Any]]) -> tuple[Cameras, dict[str, Any]]:
-        camera, data = frame
-        for name in ("image", "mask"):
-            if name in data:
-                data[name] = data[name].to(self.device)
-        return camera.to(self.device), data
+        return (to_device(frame, self.device) for frame in self.scenes[scene].eval_frames)
 
     def get_train_rays_per_batch(self) -> int:
         """Pixels of a step, for nerfstudio's log."""

@@ -11,6 +11,7 @@ import json
 import math
 import os
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -127,20 +128,26 @@ def find_runs(folder: Path | str, need_data: bool = True) -> list[Run]:
     """Every Gaussian scene trained below ``folder``: the newest run of each experiment that has a
     complete checkpoint, sorted by experiment name.
 
-    Runs of other methods, and runs without a complete checkpoint, are passed over.
+    Below a folder, runs of other methods and runs without a complete checkpoint are passed over.
 
     Args:
         folder: a run, or any folder above some.
         need_data: as for :func:`open_run`.
 
     Raises:
-        SceneError: if there is none, or if the data of one is needed and not found.
+        SceneError: if there is none, if ``folder`` is itself a run of another method, or if the data of one is
+            needed and not found.
     """
     folder = Path(folder)
     if not folder.exists():
         raise SceneError(f"{folder}: no such folder; expected one with trained nerfstudio runs in it")
     if not folder.is_dir() or (folder / CONFIG_NAME).is_file():
-        return [open_run(folder, need_data)]
+        run = open_run(folder, need_data)
+        if not run.is_gaussian_scene:
+            raise SceneError(
+                f"{run.folder}: a run of the method {run.method_name or 'unknown'}; expected a trained Splatfacto run"
+            )
+        return [run]
     newest: dict[Path, Run] = {}
     passed: list[str] = []
     for place in _run_folders(folder):
@@ -184,6 +191,13 @@ def scene_names(runs: list[Run]) -> list[str]:
             name = f"{base}-{count}"
         names.append(name)
     return names
+
+
+def shown_scene(names: list[str], eval_scenes: Iterable[str]) -> str:
+    """Which of several scenes the viewer and the exporters get: the first that is held out of training, or the
+    first."""
+    held_out = set(eval_scenes)
+    return next((name for name in names if name in held_out), names[0])
 
 
 def _run_folders(folder: Path) -> list[Path]:

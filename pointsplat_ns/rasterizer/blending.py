@@ -244,11 +244,9 @@ class Blend(torch.autograd.Function):
         clamped = bool((opacities > ALPHA_MAX).any())
 
         for chunks in reversed(ctx.tape):
-            if not chunks:
-                continue
             begin, size = int(chunks[0].tiles[0]), chunks[0].tiles.numel()
             # what lies behind: sum over later Gaussians of weight * (color . grad), and the background
-            behind = (grad_final * final)[begin : begin + size].clone()
+            behind = grad_final[begin : begin + size] * final[begin : begin + size]
             for tiles, first, before in reversed(chunks):
                 b = tiles.numel()
                 place, ids = frame.pairs(tiles, first)
