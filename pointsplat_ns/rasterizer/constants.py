@@ -1,6 +1,7 @@
 """The thresholds of 3D Gaussian rasterization, as the field uses them (3DGS, gsplat)."""
 
 import math
+from dataclasses import dataclass
 
 ALPHA_MIN = 1.0 / 255.0
 """A Gaussian is not drawn on a pixel where its alpha is lower: it could not change an 8-bit image."""
@@ -29,3 +30,16 @@ CHUNK = 16
 
 LOG_ALPHA_MIN = math.log(ALPHA_MIN)
 LOG_ALPHA_MAX = math.log(ALPHA_MAX)
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What is given up for speed."""
+
+    alpha_min: float = ALPHA_MIN
+    """A Gaussian is not drawn on a pixel where its alpha is lower."""
+    transmittance_min: float = TRANSMITTANCE_MIN
+    """A pixel is finished before the Gaussian that would bring its transmittance to this or less."""
+
+
+EXACT = Quality()

@@ -30,6 +30,10 @@ def _rotation(quat: Tensor) -> Tensor:
     return (w * w - q @ q) * torch.eye(3, dtype=quat.dtype) + 2 * torch.outer(q, q) + 2 * w * cross
 
 
+def _det(m: Tensor) -> Tensor:
+    return m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
+
+
 def rasterize_reference(
     means: Tensor,  # [N, 3]
     quats: Tensor,  # [N, 4]
@@ -59,7 +63,8 @@ def rasterize_reference(
 
     for i in torch.argsort(points[:, 2].detach(), stable=True).tolist():
         x, y, z = points[i]
-        if not near_plane < z < far_plane:
+        parameters = torch.cat([points[i], quats[i], scales[i], opacities[i, None]])
+        if not parameters.isfinite().all() or (scales[i] < 0).any() or not near_plane < z < far_plane:
             continue
         # Jacobian of the projection, evaluated inside the enlarged field of view
         half_x, half_y = 0.5 * width / fx, 0.5 * height / fy
@@ -73,7 +78,7 @@ def rasterize_reference(
         blurred = cov2d + eps2d * torch.eye(2, dtype=means.dtype)
         opacity = opacities[i]
         if antialiased:
-            ratio = torch.linalg.det(cov2d) / torch.linalg.det(blurred)
+            ratio = _det(cov2d) / _det(blurred)
             opacity = opacity * ratio.clamp_min(COMPENSATION_MIN**2).sqrt()
         offset = pixels - torch.stack([fx * x / z + cx, fy * y / z + cy])
         sigma = 0.5 * torch.einsum("hwi,ij,hwj->hw", offset, torch.linalg.inv(blurred), offset)

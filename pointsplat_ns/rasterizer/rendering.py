@@ -9,9 +9,9 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer.blending import blend
 from pointsplat_ns.rasterizer.constants import EPS2D, TILE
-from pointsplat_ns.rasterizer.projection import Projected, project
+from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, project
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
-from pointsplat_ns.rasterizer.tiles import intersect_tiles
+from pointsplat_ns.rasterizer.tiles import Footprints
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 
@@ -39,9 +39,29 @@ def _check(means, quats, scales, opacities, colors, viewmats, Ks, width, height,
         raise ValueError(f"backgrounds has shape {tuple(backgrounds.shape)}; expected ({c}, channels)")
 
 
+def _cat(tensors: list[Tensor]) -> Tensor:
+    return tensors[0] if len(tensors) == 1 else torch.cat(tensors)
+
+
+def _finite_colors(seen: Projected, *rest) -> tuple[Projected, Tensor, Tensor]:
+    """What a camera sees without the Gaussians whose colour is NaN or infinite, the colours, and the ids dropped."""
+    colors = _colors_of(seen, *rest)
+    dropped = seen.ids[:0]
+    if not bool(colors.detach().sum().isfinite()):  # one bad value spoils the sum
+        finite = colors.detach().isfinite().all(-1)
+        dropped = seen.ids[~finite]
+        if dropped.numel():
+            # evaluated again, and not selected, so that the gradient never multiplies 0 by infinity
+            seen = seen.select(finite.nonzero()[:, 0])
+            colors = _colors_of(seen, *rest)
+    return seen, colors, dropped
+
+
 def _colors_of(seen: Projected, colors: Tensor, camera: int, per_camera: bool, sh_degree: int | None) -> Tensor:
-    colors = (colors[camera] if per_camera else colors).index_select(0, seen.ids)
-    return colors if sh_degree is None else sh_to_color(seen.directions, colors, sh_degree)
+    colors = colors[camera] if per_camera else colors
+    if sh_degree is None:
+        return colors.index_select(0, seen.ids)
+    return sh_to_color(seen.directions, colors, sh_degree, seen.ids)
 
 
 def rasterization(
@@ -72,7 +92,12 @@ def rasterization(
 
     Takes what ``gsplat.rasterization`` takes and returns what it returns. Differentiable in means,
     quats, scales, opacities, colors, backgrounds and viewmats. float32 and float64 are computed as
-    they are, lower precisions in float32. Gaussians with a NaN or infinite parameter are not drawn.
+    they are, lower precisions in float32. float64 viewmats beside float32 Gaussians place the camera
+    exactly, however far from the origin.
+
+    Degenerate input that has a meaning keeps it: the zero quaternion is the identity, a scale of 0 a
+    flat Gaussian, an opacity of 1 opaque. What has none (NaN, infinities, a negative scale or opacity)
+    is not drawn, gets a zero gradient and is counted in ``meta["skipped"]``.
 
     Args:
         means: centres, world space.
@@ -99,8 +124,8 @@ def rasterization(
     Returns:
         Renders (C, H, W, channels), alphas (C, H, W, 1), and ``meta`` with means2d, radii, depths,
         conics, opacities (all (C, N, ...), or (M, ...) if packed), camera_ids and gaussian_ids
-        (None unless packed), width, height, n_cameras, tile_size, tile_width, tile_height,
-        isect_offsets and flatten_ids.
+        (None unless packed), skipped (the number of Gaussians without meaning; colours are looked at only where
+        they would be seen), width, height, n_cameras, tile_size, tile_width and tile_height.
 
     Raises:
         ValueError: if a shape or option does not fit.
@@ -108,9 +133,7 @@ def rasterization(
     opacities = opacities.reshape(-1) if opacities.dim() == 2 else opacities
     _check(means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds, render_mode)
     dtype = means.dtype if means.dtype in (torch.float32, torch.float64) else torch.float32
-    means, quats, scales, opacities, colors, viewmats, Ks = (
-        tensor.to(dtype) for tensor in (means, quats, scales, opacities, colors, viewmats, Ks)
-    )
+    means, quats, scales, opacities, colors = (tensor.to(dtype) for tensor in (means, quats, scales, opacities, colors))
     n, cameras = means.shape[0], viewmats.shape[0]
     per_camera = colors.dim() == (4 if sh_degree is not None else 3)
 
@@ -121,12 +144,19 @@ def rasterization(
         )
         for c in range(cameras)
     ]  # fmt: skip
+    skipped = count_meaningless(means, quats, scales, opacities)
+    channels = []
+    if render_mode.startswith("RGB"):
+        looks = [_finite_colors(s, colors, c, per_camera, sh_degree) for c, s in enumerate(seen)]
+        seen = [look[0] for look in looks]
+        channels.append(_cat([look[1] for look in looks]))
+        skipped += torch.cat([look[2] for look in looks]).unique().numel()
     camera_ids = torch.cat([torch.full_like(s.ids, c) for c, s in enumerate(seen)])
     gaussian_ids = torch.cat([s.ids for s in seen])
     dense_ids = camera_ids * n + gaussian_ids
 
     def packed_of(name: str) -> Tensor:
-        return torch.cat([getattr(s, name) for s in seen])
+        return _cat([getattr(s, name) for s in seen])
 
     def dense(values: Tensor) -> Tensor:
         empty = values.new_zeros(cameras * n, *values.shape[1:])
@@ -140,14 +170,11 @@ def rasterization(
         means2d = meta_means2d.view(-1, 2).index_select(0, dense_ids)
     cov2d, det, alphas, depths = (packed_of(name) for name in ("cov2d", "det", "opacities", "depths"))
 
-    channels = []
-    if render_mode.startswith("RGB"):
-        channels.append(torch.cat([_colors_of(s, colors, c, per_camera, sh_degree) for c, s in enumerate(seen)]))
     color_channels = channels[0].shape[-1] if channels else 0
     if render_mode != "RGB":
         channels.append(depths[:, None])
 
-    tiles = intersect_tiles(means2d, cov2d, det, alphas, depths, camera_ids, cameras, width, height)
+    footprints = Footprints(means2d, cov2d, det, alphas, depths, camera_ids, cameras, width, height)
 
     def keep_absgrad(values: Tensor) -> None:
         if not packed:
@@ -155,8 +182,8 @@ def rasterization(
         meta_means2d.absgrad = values
 
     image, through = blend(
-        means2d, cov2d, det, alphas, torch.cat(channels, dim=-1), tiles, cameras, width, height,
-        keep_absgrad if absgrad else None,
+        means2d, cov2d, det, alphas, torch.cat(channels, dim=-1), footprints,
+        absgrad_of=keep_absgrad if absgrad else None,
     )  # fmt: skip
     accumulated = 1.0 - through
 
@@ -183,13 +210,12 @@ def rasterization(
         "means2d": meta_means2d,
         "camera_ids": camera_ids if packed else None,
         "gaussian_ids": gaussian_ids if packed else None,
+        "skipped": skipped,
         "width": width,
         "height": height,
         "n_cameras": cameras,
         "tile_size": TILE,
-        "tile_width": tiles.columns,
-        "tile_height": tiles.rows,
-        "isect_offsets": tiles.offsets[:-1].view(cameras, tiles.rows, tiles.columns),
-        "flatten_ids": dense_ids[tiles.gaussians],
+        "tile_width": footprints.columns,
+        "tile_height": footprints.rows,
     }
     return image, accumulated, meta

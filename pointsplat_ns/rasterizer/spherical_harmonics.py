@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 # Normalisation constants of the real spherical harmonics (Sloan, "Efficient Spherical Harmonic
 # Evaluation", 2013), with the signs that 3DGS files use.
@@ -11,6 +12,153 @@ C0 = 0.28209479177387814
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+
+_BLOCK = 4096  # Gaussians whose coefficients are read at once on a CPU: 0.8 MB at degree 3
+
+
+def _check_degree(degree: int) -> None:
+    if not 0 <= degree <= 3:
+        raise ValueError(f"SH degree is {degree}; expected 0 to 3")
+
+
+def _basis_rows(x: Tensor, y: Tensor, z: Tensor, degree: int) -> list[Tensor]:
+    rows = [torch.full_like(x, C0)]
+    if degree >= 1:
+        rows += [-C1 * y, C1 * z, -C1 * x]
+    if degree >= 2:
+        xx, yy, zz, xy = x * x, y * y, z * z, x * y
+        rows += [
+            C2[0] * xy,
+            -C2[0] * (y * z),
+            C2[1] * (2.0 * zz - xx - yy),
+            -C2[0] * (x * z),
+            C2[2] * (xx - yy),
+        ]
+    if degree >= 3:
+        around = 4.0 * zz - xx - yy
+        rows += [
+            -C3[0] * y * (3.0 * xx - yy),
+            C3[1] * xy * z,
+            -C3[2] * y * around,
+            C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+            -C3[2] * x * around,
+            C3[4] * z * (xx - yy),
+            -C3[0] * x * (xx - 3.0 * yy),
+        ]
+    return rows
+
+
+def _basis_backward(x: Tensor, y: Tensor, z: Tensor, grad: Tensor, degree: int) -> Tensor:
+    """Gradient (3, M) by the unit direction, from the gradients ((degree + 1)^2, M) of the basis."""
+    gx, gy, gz = -C1 * grad[3], -C1 * grad[1], C1 * grad[2]
+    if degree >= 2:
+        a, b, c, d, e = C2[0] * grad[4], C2[0] * grad[5], 2 * C2[1] * grad[6], C2[0] * grad[7], 2 * C2[2] * grad[8]
+        gx += a * y - c * x - d * z + e * x
+        gy += a * x - b * z - c * y - e * y
+        gz += 2 * c * z - b * y - d * x
+    if degree >= 3:
+        xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+        h0, h6 = C3[0] * grad[9], C3[0] * grad[15]
+        h1, h3, h5 = C3[1] * grad[10], C3[3] * grad[12], C3[4] * grad[14]
+        h2, h4 = C3[2] * grad[11], C3[2] * grad[13]
+        around, across = 4.0 * zz - xx - yy, 3.0 * (xx - yy)
+        gx += h1 * yz - 6 * h0 * xy + 2 * h2 * xy - 6 * h3 * xz - h4 * (around - 2 * xx) + 2 * h5 * xz - h6 * across
+        gy += h1 * xz - h0 * across - h2 * (around - 2 * yy) - 6 * h3 * yz + 2 * h4 * xy - 2 * h5 * yz + 6 * h6 * xy
+        gz += h1 * xy - 8 * h2 * yz + h3 * (6.0 * zz - 3.0 * xx - 3.0 * yy) - 8 * h4 * xz + h5 * (xx - yy)
+    return torch.stack([gx, gy, gz])
+
+
+def unit_rows(vectors: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit vectors (D, M) of the columns of (D, M), and the inverse of their lengths (M).
+
+    A zero vector stays zero, and so does its inverse length: it has no gradient. The length is taken after
+    division by the largest component, so that neither 1e-30 nor 1e30 under- or overflows.
+    """
+    largest = vectors.abs().amax(dim=0)
+    zero = largest < torch.finfo(vectors.dtype).tiny
+    inverse = largest.masked_fill(zero, torch.inf).reciprocal_()
+    scaled = vectors * inverse
+    length = (scaled * scaled).sum(dim=0).masked_fill_(zero, 1.0).rsqrt_()
+    return scaled.mul_(length), inverse.mul_(length)
+
+
+def _blocks(count: int, on_cpu: bool) -> list[slice]:
+    """Pieces of the work: on a CPU the coefficients of one piece stay in the cache, and no copy of all is made."""
+    step = _BLOCK if on_cpu else max(count, 1)
+    return [slice(start, min(start + step, count)) for start in range(0, count, step)]
+
+
+def _offset(color: Tensor) -> Tensor:
+    """Add the 1/2 of 3DGS, and turn infinities to NaN: a lower bound of 0 would hide that one has no meaning."""
+    return (color - color) + (color + 0.5)
+
+
+class _Color(torch.autograd.Function):
+    """Colours of some rows of SH coefficients; see :func:`sh_to_color`."""
+
+    @staticmethod
+    def forward(ctx, directions, coefficients, ids, degree):
+        used = (degree + 1) ** 2
+        unit, inverse_length = unit_rows(directions.T.contiguous())
+        basis = torch.stack(_basis_rows(*unit, degree)).T.contiguous()
+        color = directions.new_empty(directions.shape[0], 3)
+        for part in _blocks(color.shape[0], color.device.type == "cpu"):
+            chosen = coefficients.index_select(0, ids[part])[:, :used]
+            torch.bmm(basis[part].unsqueeze(1), chosen, out=color[part].unsqueeze(1))
+        color = _offset(color)
+        ctx.degree = degree
+        ctx.save_for_backward(coefficients, unit, inverse_length, basis, color > 0, ids)
+        return color.clamp_min_(0.0)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):
+        coefficients, unit, inverse_length, basis, positive, ids = ctx.saved_tensors
+        grad = grad * positive
+        used = basis.shape[1]
+        grad_basis = torch.empty_like(basis) if ctx.needs_input_grad[0] else None
+        grad_coefficients = torch.zeros_like(coefficients) if ctx.needs_input_grad[1] else None
+        for part in _blocks(basis.shape[0], basis.device.type == "cpu"):
+            if grad_basis is not None:
+                chosen = coefficients.index_select(0, ids[part])[:, :used]
+                torch.bmm(chosen, grad[part].unsqueeze(-1), out=grad_basis[part].unsqueeze(-1))
+            if grad_coefficients is not None:
+                rows = basis[part].unsqueeze(-1) * grad[part].unsqueeze(1)
+                grad_coefficients[:, :used].index_copy_(0, ids[part], rows)
+        grad_directions = None
+        if grad_basis is not None:
+            grad_unit = _basis_backward(*unit, grad_basis.T.contiguous(), ctx.degree)
+            across = grad_unit - unit * (unit * grad_unit).sum(0)
+            grad_directions = (across * inverse_length).T.contiguous()
+        return grad_directions, grad_coefficients, None, None
+
+
+def sh_to_color(directions: Tensor, coefficients: Tensor, degree: int, ids: Tensor | None = None) -> Tensor:
+    """Colours seen along directions, as 3DGS defines them: ``max(SH + 1/2, 0)``.
+
+    Args:
+        directions: (M, 3) from the camera centre to the Gaussian, world space, any length; a zero direction sees
+            the basis at zero.
+        coefficients: (M, K, 3), or (N, K, 3) with ``ids``; K >= (degree + 1)^2, the rest is ignored.
+        degree: 0 to 3.
+        ids: (M,) int64, each at most once: the row of ``coefficients`` that each direction belongs to.
+
+    Returns:
+        (M, 3), not below 0; NaN where a coefficient is not finite.
+
+    Raises:
+        ValueError: if the degree is not 0 to 3, or there are too few coefficients.
+    """
+    _check_degree(degree)
+    used = (degree + 1) ** 2
+    if coefficients.shape[-2] < used:
+        raise ValueError(f"{coefficients.shape[-2]} SH coefficients given; degree {degree} needs {used}")
+    if degree == 0:
+        constant = coefficients[..., 0, :]
+        return _offset(C0 * (constant if ids is None else constant.index_select(0, ids))).clamp_min(0.0)
+    if ids is None:
+        ids = torch.arange(coefficients.shape[0], device=coefficients.device)
+    return _Color.apply(directions, coefficients, ids, degree)
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
@@ -26,65 +174,5 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     Raises:
         ValueError: if the degree is not 0 to 3.
     """
-    if not 0 <= degree <= 3:
-        raise ValueError(f"SH degree is {degree}; expected 0 to 3")
-    x, y, z = directions.unbind(-1)
-    basis = [torch.full_like(x, C0)]
-    if degree >= 1:
-        basis += [-C1 * y, C1 * z, -C1 * x]
-    if degree >= 2:
-        xx, yy, zz = x * x, y * y, z * z
-        basis += [
-            C2[0] * (x * y),
-            -C2[0] * (y * z),
-            C2[1] * (2.0 * zz - xx - yy),
-            -C2[0] * (x * z),
-            C2[2] * (xx - yy),
-        ]
-    if degree >= 3:
-        basis += [
-            -C3[0] * y * (3.0 * xx - yy),
-            C3[1] * (x * y) * z,
-            -C3[2] * y * (4.0 * zz - xx - yy),
-            C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
-            -C3[2] * x * (4.0 * zz - xx - yy),
-            C3[4] * z * (xx - yy),
-            -C3[0] * x * (xx - 3.0 * yy),
-        ]
-    return torch.stack(basis, dim=-1)
-
-
-def safe_normalize(vectors: Tensor) -> Tensor:
-    """Unit vectors (..., D); a zero vector stays zero, with a zero gradient.
-
-    The length is taken after division by the largest component, so that neither 1e-30 nor 1e30
-    under- or overflows.
-    """
-    largest = vectors.detach().abs().amax(dim=-1, keepdim=True)
-    zero = largest == 0
-    scaled = vectors / torch.where(zero, torch.ones_like(largest), largest)
-    length = (scaled * scaled).sum(dim=-1, keepdim=True)
-    length = torch.where(zero, torch.ones_like(length), length).sqrt()
-    return scaled / length
-
-
-def sh_to_color(directions: Tensor, coefficients: Tensor, degree: int) -> Tensor:
-    """Colours seen along directions, as 3DGS defines them: ``max(SH + 1/2, 0)``.
-
-    Args:
-        directions: (M, 3) from the camera centre to the Gaussian, world space, any length.
-        coefficients: (M, K, 3) with K >= (degree + 1)^2; the rest is ignored.
-        degree: 0 to 3.
-
-    Returns:
-        (M, 3), not below 0.
-    """
-    used = (degree + 1) ** 2
-    if coefficients.shape[-2] < used:
-        raise ValueError(f"{coefficients.shape[-2]} SH coefficients given; degree {degree} needs {used}")
-    if degree == 0:
-        color = C0 * coefficients[..., 0, :]
-    else:
-        basis = sh_basis(safe_normalize(directions), degree)
-        color = torch.matmul(basis.unsqueeze(-2), coefficients[..., :used, :]).squeeze(-2)
-    return (color + 0.5).clamp_min(0.0)
+    _check_degree(degree)
+    return torch.stack(_basis_rows(*directions.unbind(-1), degree), dim=-1)

@@ -1,0 +1,421 @@
+"""Degenerate and extreme scenes: finite, the same in float32 as in float64, and in float64 as the reference says.
+
+Input is rounded to float32 first, so that what is compared is the arithmetic, not what float32 can hold.
+"""
+
+import math
+
+import pytest
+import torch
+
+from pointsplat_ns.rasterizer import rasterization, rasterize_reference
+
+F64 = torch.float64
+NAMES = ("means", "quats", "scales", "opacities", "colors")
+
+
+def make_scene(n=50, seed=11):
+    g = torch.Generator().manual_seed(seed)
+
+    def randn(*shape):
+        return torch.randn(*shape, generator=g, dtype=F64)
+
+    means = randn(n, 3) * torch.tensor([1.0, 1.0, 0.5], dtype=F64) + torch.tensor([0, 0, 3.0], dtype=F64)
+    scales = torch.exp(0.8 * randn(n, 3) - 2.5)
+    opacities = torch.rand(n, generator=g, dtype=F64)
+    return [means, randn(n, 4), scales, opacities, randn(n, 16, 3) * 0.3]
+
+
+def make_camera(cx=20.0, cy=13.0, focal=40.0):
+    K = torch.tensor([[focal, 0, cx], [0, 1.05 * focal, cy], [0, 0, 1]], dtype=F64)
+    c, s = math.cos(0.2), math.sin(0.2)
+    view = torch.eye(4, dtype=F64)
+    view[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=F64)
+    view[:3, 3] = torch.tensor([0.1, -0.1, 0.2], dtype=F64)
+    return view, K
+
+
+def draw(scene, view, K, size, dtype, near=0.01, mode="classic", sh_degree=3, slow=False):
+    """Image with depth, alpha, and the gradients of a fixed random sum of them, in float64."""
+    leaves = [t.detach().to(dtype, copy=True).requires_grad_() for t in scene]
+    w, h = size
+    if slow:
+        image, alpha, depth = rasterize_reference(
+            *leaves, view.to(dtype), K.to(dtype), w, h, near, sh_degree=sh_degree, antialiased=mode == "antialiased"
+        )
+        image = torch.cat([image, depth], -1)
+    else:
+        image, alpha, meta = rasterization(
+            *leaves, view[None].to(dtype), K[None].to(dtype), w, h, near_plane=near,
+            sh_degree=sh_degree, rasterize_mode=mode, render_mode="RGB+D",
+        )  # fmt: skip
+        image, alpha = image[0], alpha[0]
+    g = torch.Generator().manual_seed(1)
+    pixels = torch.cat([image[..., :3], alpha, image[..., 3:] / scene[0].abs().max()], -1)
+    weights = torch.rand(pixels.shape, generator=g, dtype=F64).to(dtype)
+    total = (pixels * weights).sum()
+    if total.requires_grad:
+        grads = torch.autograd.grad(total, leaves, allow_unused=True)
+    else:
+        grads = [None] * 5
+    grads = [torch.zeros_like(leaf) if g is None else g for g, leaf in zip(grads, leaves, strict=True)]
+    assert pixels.isfinite().all()
+    for name, grad in zip(NAMES, grads, strict=True):
+        assert grad.isfinite().all(), name
+    return pixels.detach().double(), [g.double() for g in grads]
+
+
+def relative_change(scene, grads):
+    """Gradients by log scale and by the direction of the quaternion, whose size means something at any scale."""
+    means, quats, scales, opacities, colors = grads
+    size = scene[0].std().clamp_min(1e-30)
+    return [means * size, quats * scene[1].norm(dim=-1, keepdim=True), scales * scene[2], opacities, colors]
+
+
+def check(scene, camera, size=(37, 29), tolerance=1e-4, grad_tolerance=1e-3, flips=0.005, reference=True, **options):
+    """float32 against float64, and float64 against the reference."""
+    view, K = (t.float().double() for t in camera)
+    scene = [t.float().double() for t in scene]
+    single, single_grads = draw(scene, view, K, size, torch.float32, **options)
+    double, double_grads = draw(scene, view, K, size, F64, **options)
+    difference = (single - double).abs().amax(-1)
+    assert double[..., 3].max() > 0.05, "the scene shows nothing"
+    # a pixel whose alpha is at 1/255, or whose transmittance is at 1e-4, may fall on either side
+    flipped = difference > tolerance
+    assert flipped.double().mean() <= flips, difference.max()
+    assert difference.max() < 0.02
+    pairs = list(zip(NAMES, relative_change(scene, single_grads), relative_change(scene, double_grads), strict=True))
+    for name, got, want in pairs:
+        assert (got - want).norm() <= grad_tolerance * want.norm() + 1e-7, (name, (got - want).norm() / want.norm())
+    if reference:
+        truth, truth_grads = draw(scene, view, K, size, F64, slow=True, **options)
+        assert (double - truth).abs().max() < 1e-8  # the same in another order
+        for name, got, want in zip(
+            NAMES, relative_change(scene, double_grads), relative_change(scene, truth_grads), strict=True
+        ):
+            assert (got - want).norm() <= 1e-6 * want.norm() + 1e-12, name
+    return single, single_grads
+
+
+def _log_scales(scene):
+    scene[2] = torch.linspace(-80, 20, 150, dtype=F64)[torch.randperm(150, generator=torch.manual_seed(0))].view(50, 3)
+    scene[2] = scene[2].exp()
+    scene[3] = 0.3 * scene[3]
+
+
+def _needles(aspect):
+    def change(scene):
+        scene[2][:, 0], scene[2][:, 1:] = 3.0, 3.0 / aspect
+
+    return change
+
+
+def _stacked(scene):
+    scene[3][:] = 1.0
+    scene[0][:30] = scene[0][0]
+
+
+def _any_length(scene):
+    scene[1] = scene[1] * 10.0 ** torch.linspace(-18, 18, 50, dtype=F64)[:, None]
+
+
+CASES = {
+    "zero quaternions": lambda s: s[1][::2].zero_(),
+    "quaternions of any length": _any_length,
+    "one flat axis": lambda s: s[2][:, 2].zero_(),
+    "lines": lambda s: s[2][:, 1:].zero_(),
+    "points": lambda s: s[2].zero_(),
+    "opacity exactly 1, stacked": _stacked,
+    "opacity exactly 0": lambda s: s[3][::2].zero_(),
+    "opacity above 1": lambda s: s[3].mul_(3),
+    "coincident": lambda s: s[0].copy_(s[0][:1].expand_as(s[0]).clone() * torch.tensor([0.1, 0.1, 1])),
+    "log-scales from -80 to 20": _log_scales,
+    "needles of aspect 1e4": _needles(1e4),
+    "needles of aspect 1e6": _needles(1e6),
+    "covering the image a hundred times": lambda s: (s[2].fill_(37 * 100 * 3.0 / 40), s[3].mul_(0.3)),
+}
+# Where float32 itself cannot do better, (image, gradient):
+LOOSER = {
+    # the edge of a needle is as sharp as eps2d allows, its far end turned by 1e-7 of its length
+    "needles of aspect 1e4": (1e-3, 1e-2),
+    "needles of aspect 1e6": (1e-3, 1e-2),
+}
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("case", CASES)
+def test_degenerate_gaussians(case, mode):
+    scene = make_scene()
+    CASES[case](scene)
+    if mode == "antialiased" and any(word in case for word in ("lines", "points", "needles")):
+        scene[3][:] = 40.0  # the compensation is at or near its lower bound of 0.005
+    tolerance, grad_tolerance = LOOSER.get(case, (1e-4, 1e-3))
+    check(
+        scene,
+        make_camera(),
+        tolerance=tolerance,
+        grad_tolerance=grad_tolerance,
+        mode=mode,
+        reference=case != "log-scales from -80 to 20",
+    )
+    # (with axes of 1e20 pixels the reference's xx yy - xy^2 cancels to 0 even in float64)
+
+
+def test_gaussians_at_and_across_the_camera_plane():
+    scene = make_scene()
+    view, K = make_camera()
+    centre = torch.linalg.solve(view[:3, :3], -view[:3, 3])
+    scene[0][0] = centre  # depth and view vector exactly zero
+    scene[0][1:9] = centre + (scene[0][1:9] - centre) * 1e-3
+    scene[0][9:18, 2] *= -1
+    scene[2][:18] *= 30  # wide enough to reach from behind the camera, or to hold it inside
+    single, grads = check(scene, (view, K), tolerance=1e-3, grad_tolerance=1e-2, flips=0.02)
+    assert all((g[0] == 0).all() for g in grads)
+
+
+def test_camera_inside_gaussians():
+    scene = make_scene()
+    view, K = make_camera()
+    scene[2][:] = scene[2] / scene[2].amax(-1, keepdim=True) * 20.0
+    scene[3][:] = 0.2
+    check(scene, (view, K))
+
+
+@pytest.mark.parametrize("logit", [-40.0, 40.0, -math.inf, math.inf])
+def test_extreme_opacity_logits_through_the_sigmoid(logit):
+    scene = make_scene()
+    logits = torch.logit(scene[3])
+    logits[::3] = logit
+    scene[3] = torch.sigmoid(logits)
+    if logit > 0:
+        assert (scene[3][::3] == 1).all()
+    check(scene, make_camera())
+    single = logits.float().requires_grad_()
+    view, K = make_camera()
+    rest = [t.float() for t in scene]
+    image, _, _ = rasterization(
+        *rest[:3], torch.sigmoid(single), rest[4], view[None].float(), K[None].float(), 37, 29, sh_degree=1
+    )
+    (grad,) = torch.autograd.grad(image.sum(), single)
+    assert grad.isfinite().all() and (grad[::3] == 0).all() and grad.any()
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+def test_scenes_of_any_size(factor):
+    scene = make_scene()
+    view, K = make_camera()
+    plain, plain_grads = draw(scene, view, K, (37, 29), F64)
+    view[:3, 3] *= factor
+    scaled = [scene[0] * factor, scene[1], scene[2] * factor, *scene[3:]]
+    single, grads = check(scaled, (view, K), near=0.01 * factor)
+    # the same picture and the same relative gradients as at the usual size, but for the rounding of the input
+    assert ((single - plain)[..., :4].abs() > 1e-4).double().mean() < 0.01
+    for got, want in zip(relative_change(scaled, grads), relative_change(scene, plain_grads), strict=True):
+        assert (got - want).norm() <= 1e-3 * want.norm()
+
+
+def test_a_scene_a_million_units_from_the_origin():
+    scene = make_scene()
+    view, K = make_camera()
+    shift = torch.tensor([1e6, -7e5, 4e5], dtype=F64)
+    scene[0] = scene[0] * 64 + shift
+    scene[2] = scene[2] * 64
+    view[:3, 3] = view[:3, 3] * 64 - view[:3, :3] @ shift
+    # check() rounds means and view to float32 before anything is drawn: they move by 0.03 units, the arithmetic does
+    # not; gradients differ where the float32 rotation is no exact rotation
+    check(scene, (view, K), tolerance=1e-3, grad_tolerance=1e-2, flips=0.01)
+
+
+def test_float64_cameras_beside_float32_gaussians_place_the_camera_exactly():
+    scene = make_scene()
+    view, K = make_camera()
+    shift = torch.tensor([1e6, -7e5, 4e5], dtype=F64)
+    scene[0] = (scene[0] * 64 + shift).float().double()
+    scene[2] = scene[2] * 64
+    view[:3, 3] = view[:3, 3] * 64 - view[:3, :3] @ shift
+    want, _, _ = rasterization(*scene, view[None], K[None], 37, 29, sh_degree=0)
+    single = [t.float() for t in scene]
+    got, _, _ = rasterization(*single, view[None], K[None], 37, 29, sh_degree=0)
+    rounded, _, _ = rasterization(*single, view[None].float(), K[None], 37, 29, sh_degree=0)
+    assert got.dtype == torch.float32
+    assert ((got - want).abs() > 1e-4).double().mean() < 0.01
+    assert ((rounded - want).abs() > 1e-4).double().mean() > 0.1
+
+
+@pytest.mark.parametrize("focal", [1.0, 1e5])
+def test_extreme_focal_lengths(focal):
+    scene = make_scene()
+    view, K = make_camera(focal=focal)
+    if focal == 1.0:
+        scene[2] *= 10  # a degree and more per pixel: smaller is below a pixel
+        check(scene, (view, K))
+    else:
+        # the whole image sees 4e-4 rad: draw in there what is a few pixels large. One ulp of a coordinate of 3 units
+        # is 2e-7 units, so 0.01 pixels.
+        centre = torch.linalg.solve(view[:3, :3], -view[:3, 3])
+        rays = torch.rand(50, 2, generator=torch.Generator().manual_seed(2), dtype=F64) * 30 - 15
+        local = torch.cat([rays / focal, torch.ones(50, 1, dtype=F64)], -1) * scene[0][:, 2:].abs()
+        scene[0] = centre + local @ view[:3, :3]
+        scene[2] = scene[2] * 1e-3
+        check(scene, (view, K), tolerance=1e-2, grad_tolerance=2e-2, flips=0.01)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 4000), (4000, 1), (61, 53)])
+def test_any_image_size(size):
+    scene = make_scene(30)
+    w, h = size
+    scene[2] *= 4
+    view, K = make_camera(cx=w / 2, cy=h / 2, focal=max(20.0, 0.6 * max(size)))
+    check(scene, (view, K), size, flips=0.01)
+
+
+@pytest.mark.parametrize("cx,cy", [(-60.0, 13.0), (90.0, 80.0), (20.0, -500.0)])
+def test_principal_point_outside_the_image(cx, cy):
+    scene = make_scene()
+    scene[2] *= 3
+    scene[0][:, :2] -= (torch.tensor([cx, cy], dtype=F64) - torch.tensor([18.0, 14.0])) / 40.0 * 3.0
+    check(scene, make_camera(cx, cy), tolerance=1e-3, grad_tolerance=1e-2)
+
+
+@pytest.mark.parametrize("n,culled", [(0, False), (1, False), (1, True), (20, True)])
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_few_or_no_gaussians(n, culled, dtype):
+    scene = make_scene(max(n, 1))
+    scene = [t[:n] for t in scene]
+    scene[3] = 0.5 + 0.5 * scene[3]
+    if n:
+        scene[0][0] = torch.tensor([0, 0, 3.0], dtype=F64)
+    if culled:
+        scene[0][:, 2] = -scene[0][:, 2].abs() - 1
+    view, K = make_camera()
+    leaves = [t.to(dtype).requires_grad_() for t in scene]
+    for mode in ("RGB", "RGB+ED"):
+        for packed in (False, True):
+            image, alpha, meta = rasterization(
+                *leaves, view[None].to(dtype), K[None].to(dtype), 37, 29,
+                sh_degree=2, render_mode=mode, packed=packed, absgrad=True,
+            )  # fmt: skip
+            assert image.isfinite().all() and meta["skipped"] == 0
+            assert bool(alpha.any()) == (n > 0 and not culled)
+            grads = torch.autograd.grad(image.sum() + alpha.sum(), leaves, allow_unused=True)
+            for grad in grads:
+                assert grad is None or grad.isfinite().all()
+                assert not culled or grad is None or not grad.any()
+
+
+BAD = [
+    ("means", math.nan), ("means", math.inf), ("means", -math.inf), ("quats", math.nan), ("quats", math.inf),
+    ("scales", math.nan), ("scales", math.inf), ("scales", -0.1), ("opacities", math.nan), ("opacities", math.inf),
+    ("opacities", -0.5), ("colors", math.nan), ("colors", math.inf), ("colors", -math.inf),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("sh_degree", [None, 0, 3])
+def test_what_has_no_meaning_is_skipped_and_counted_with_a_zero_gradient(dtype, sh_degree):
+    scene = [t.to(dtype) for t in make_scene()]
+    if sh_degree is None:
+        scene[4] = scene[4][:, :5, 0]
+    view, K = (t.to(dtype)[None] for t in make_camera())
+    scene[3] = scene[3].clamp_min(0.1)
+    scene[0][:, :2] *= 0.2  # all in sight
+    clean, clean_alpha, meta = rasterization(*[t[len(BAD) :] for t in scene], view, K, 37, 29, sh_degree=sh_degree)
+    assert meta["skipped"] == 0
+    for row, (name, value) in enumerate(BAD):
+        scene[NAMES.index(name)][row].view(-1)[0] = value
+    leaves = [t.clone().requires_grad_() for t in scene]
+    image, alpha, meta = rasterization(*leaves, view, K, 37, 29, sh_degree=sh_degree, render_mode="RGB+ED")
+    assert meta["skipped"] == len(BAD)
+    tolerance = 1e-12 if dtype == F64 else 1e-5  # another order of the same sums
+    assert (image[..., :-1] - clean).abs().max() < tolerance and (alpha - clean_alpha).abs().max() < tolerance
+    for name, grad in zip(NAMES, torch.autograd.grad(image.sum() + alpha.sum(), leaves), strict=True):
+        assert grad.isfinite().all(), name
+        assert not grad[: len(BAD)].any(), name
+        assert grad[len(BAD) :].any() or (sh_degree in (None, 0) and name == "quats"), name
+
+
+def test_a_bad_colour_out_of_sight_is_not_looked_at():
+    scene = make_scene()
+    scene[0][0, 2], scene[4][0] = -5.0, math.nan
+    view, K = make_camera()
+    image, _, meta = rasterization(*scene, view[None], K[None], 37, 29, sh_degree=3)
+    assert image.isfinite().all() and meta["skipped"] == 0
+
+
+@pytest.mark.parametrize("dtype,tolerance", [(torch.float16, 0.02), (torch.bfloat16, 0.15)])
+def test_half_precision_input_gives_a_picture_close_to_float32(dtype, tolerance):
+    # A position is held to 2^-11 (float16) or 2^-8 (bfloat16) of itself: at x / z = 0.5 that is 0.02 and 0.15 of the
+    # 20 pixels from the centre; an edge of a Gaussian a few pixels wide changes by a share of that.
+    scene = make_scene()
+    scene[2][::2, 1] = 1e-9  # float16 holds this as zero: the axis is lost, a flat Gaussian is left
+    view, K = (t.float()[None] for t in make_camera())
+    want, _, _ = rasterization(*[t.float() for t in scene], view, K, 37, 29, sh_degree=3)
+    half = [t.to(dtype).requires_grad_() for t in scene]
+    got, _, meta = rasterization(*half, view.to(dtype).float(), K, 37, 29, sh_degree=3)
+    assert got.dtype == torch.float32 and meta["skipped"] == 0
+    assert (got - want).abs().mean() < tolerance
+    exact, _, _ = rasterization(*[t.detach().float() for t in half], view.to(dtype).float(), K, 37, 29, sh_degree=3)
+    assert torch.equal(got, exact)  # nothing is computed in half precision
+    for grad, leaf in zip(torch.autograd.grad(got.mean(), half), half, strict=True):
+        assert grad.dtype == leaf.dtype == dtype and grad.isfinite().all() and grad.any()
+
+
+def test_non_contiguous_and_expanded_tensors():
+    scene = [t.float() for t in make_scene()]
+    scene[1][:], scene[3][:] = scene[1][0], 0.7
+    view, K = (t.float()[None] for t in make_camera())
+
+    def run(tensors):
+        leaves = [t.requires_grad_() for t in tensors]
+        image, _, _ = rasterization(*leaves, view, K, 37, 29, sh_degree=2)
+        return image, torch.autograd.grad(image.sum(), leaves)
+
+    strided = [
+        scene[0].T.contiguous().T, scene[1][:1].expand(50, 4), scene[2].repeat(1, 2)[:, ::2],
+        scene[3][:1].expand(50), scene[4].permute(2, 1, 0).contiguous().permute(2, 1, 0),
+    ]  # fmt: skip
+    strided[2] = torch.stack([scene[2], scene[2]], -1)[..., 0]
+    assert not any(t.is_contiguous() for t in strided)
+    image, grads = run([t.clone() for t in scene])
+    got, got_grads = run([t.detach() for t in strided])
+    assert (image - got).abs().max() < 1e-6  # a matrix product may sum strided rows in another order
+    for want, grad in zip(grads, got_grads, strict=True):
+        assert (want - grad).norm() <= 1e-4 * want.norm()
+
+
+def test_twenty_thousand_coincident_gaussians():
+    # all at one place, each 10 pixels large: the picture of the first few, the rest is behind them
+    scene = [t[:1].expand(20_000, *t.shape[1:]).float() for t in make_scene()]
+    scene[0] = torch.tensor([0, 0, 3.0]).expand(20_000, 3)
+    scene[3] = torch.full((20_000,), 0.5)
+    view, K = (t.float()[None] for t in make_camera())
+
+    def run(n):
+        leaves = [t[:n].clone().requires_grad_() for t in scene]
+        image, alpha, _ = rasterization(*leaves, view, K, 37, 29, sh_degree=3)
+        return image, alpha, torch.autograd.grad(image.sum(), leaves)
+
+    image, alpha, grads = run(20_000)
+    assert image.isfinite().all() and alpha.max() > 0.999
+    assert all(g.isfinite().all() for g in grads)
+    middle = (slice(None), slice(11, 15), slice(18, 22))
+    few, _, _ = run(30)
+    assert (image[middle] - few[middle]).abs().max() < 1e-6  # half of the light stops at each: 13 suffice for 1e-4
+    assert not grads[0][15_000:].sum(0).isnan().any()
+
+
+@pytest.mark.parametrize(
+    "change,message",
+    [
+        (dict(K=(0, 0, 0.0)), "fx 0.0.*focal lengths not 0"),
+        (dict(K=(1, 2, math.nan)), "cy nan"),
+        (dict(view=(0, 3, math.inf)), "viewmat is .*inf.*expected finite"),
+        (dict(view=(slice(0, 3), slice(0, 3), 0.0)), "viewmat is .*a rotation"),
+    ],
+)
+def test_a_camera_without_meaning_says_so(change, message):
+    view, K = make_camera()
+    for name, (row, column, value) in change.items():
+        dict(K=K, view=view)[name][row, column] = value
+    with pytest.raises(ValueError, match=message):
+        rasterization(*make_scene(), view[None], K[None], 37, 29, sh_degree=0)

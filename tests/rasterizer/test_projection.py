@@ -1,0 +1,180 @@
+"""Projection and colours against gsplat's own plain-torch formulas, in float64, with gradients."""
+
+import math
+
+import pytest
+import torch
+
+from pointsplat_ns.rasterizer.ewa import rotation_rows
+from pointsplat_ns.rasterizer.projection import project
+from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color, unit_rows
+
+F64 = torch.float64
+
+
+def make_scene(n=60, seed=3, scale=-2.5):
+    g = torch.Generator().manual_seed(seed)
+
+    def randn(*shape):
+        return torch.randn(*shape, generator=g, dtype=F64)
+
+    means = randn(n, 3) * torch.tensor([1.5, 1.2, 0.6], dtype=F64) + torch.tensor([0, 0, 3.0], dtype=F64)
+    return [
+        means,
+        3 * randn(n, 4),
+        torch.exp(0.8 * randn(n, 3) + scale),
+        0.1 + 0.9 * torch.rand(n, generator=g).to(F64),
+    ]
+
+
+def make_camera(cx=20.0, cy=13.0):
+    K = torch.tensor([[40.0, 0, cx], [0, 42.0, cy], [0, 0, 1]], dtype=F64)
+    c, s = math.cos(0.2), math.sin(0.2)
+    view = torch.eye(4, dtype=F64)
+    view[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=F64)
+    view[:3, 3] = torch.tensor([0.1, -0.1, 0.2], dtype=F64)
+    return view, K, 37, 29
+
+
+def gsplat_formulas():
+    return pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat is not installed")
+
+
+def random_like(tensors):
+    g = torch.Generator().manual_seed(1)
+    return [torch.randn(t.shape, generator=g, dtype=F64) for t in tensors]
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("cx,cy", [(20.0, 13.0), (-30.0, 13.0), (60.0, 45.0)])
+def test_projection_and_its_gradients_are_gsplats(antialiased, cx, cy):
+    """Means, depths, conics and compensation, with the frustum clamp that follows the principal point.
+
+    Two differences on purpose: gsplat's compensation has no lower bound (ours is 0.005), so that this scene stays
+    above it; and gsplat culls by a square of 3 standard deviations, ours by the ellipse at 1/255, so that what is
+    compared is what ours keeps.
+    """
+    theirs = gsplat_formulas()
+    scene = [t.requires_grad_() for t in make_scene(scale=-1.0)]
+    means, quats, scales, opacities = scene
+    view, K, w, h = make_camera(cx, cy)
+    view.requires_grad_()
+    seen = project(*scene, view, K, w, h, antialiased=antialiased)
+    assert len(seen.ids) > 15
+
+    covars, _ = theirs._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+    _, means2d, depths, conics, compensations = theirs._fully_fused_projection(
+        means, covars, view[None], K[None], w, h, calc_compensations=True
+    )
+    want = [means2d[0, seen.ids], depths[0, seen.ids], conics[0, seen.ids], opacities[seen.ids]]
+    if antialiased:
+        assert compensations[0, seen.ids].min() > 0.005
+        want[3] = want[3] * compensations[0, seen.ids]
+    got = [seen.means2d, seen.depths, seen.conics, seen.opacities]
+    x = (means2d[0, :, 0] - cx) / 40.0
+    low, high = -cx / 40 - 0.3 * 0.5 * w / 40, (w - cx) / 40 + 0.3 * 0.5 * w / 40
+    clamped = (x[seen.ids] < low) | (x[seen.ids] > high)
+    assert clamped.any() and not clamped.all()
+    for ours, gsplats in zip(got, want, strict=True):
+        assert (ours - gsplats).abs().max() <= 1e-11 * gsplats.abs().max()
+    weights = random_like(want)
+    grads = [
+        torch.autograd.grad(sum((o * x).sum() for o, x in zip(outputs, weights, strict=True)), [*scene, view])
+        for outputs in (got, want)
+    ]
+    for name, ours, gsplats in zip("means quats scales opacities viewmat".split(), *grads, strict=True):
+        assert gsplats.any(), name
+        assert (ours - gsplats).abs().max() <= 1e-9 * gsplats.abs().max(), name
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("stored", [1, 4, 9, 16])
+def test_colours_and_their_gradients_are_gsplats(degree, stored):
+    theirs = gsplat_formulas()
+    if stored < (degree + 1) ** 2:
+        with pytest.raises(ValueError, match=f"{stored} SH coefficients given"):
+            sh_to_color(torch.zeros(2, 3), torch.zeros(2, stored, 3), degree)
+        return
+    g = torch.Generator().manual_seed(degree)
+    directions = (4 * torch.randn(5000, 3, generator=g, dtype=F64)).requires_grad_()
+    coefficients = torch.randn(6000, stored, 3, generator=g, dtype=F64).requires_grad_()
+    ids = torch.randperm(6000, generator=g)[:5000].sort().values
+    got = sh_to_color(directions, coefficients, degree, ids)
+    want = (theirs._spherical_harmonics(degree, directions, coefficients[ids]) + 0.5).clamp_min(0)
+    assert (got == 0).any() and (got - want).abs().max() < 1e-13
+    (weights,) = random_like([want])
+    grads = [
+        torch.autograd.grad((out * weights).sum(), [coefficients, directions], allow_unused=True) for out in (got, want)
+    ]
+    assert (grads[0][0] - grads[1][0]).abs().max() < 1e-12
+    if degree > 0:
+        assert (grads[0][1] - grads[1][1]).abs().max() < 1e-12
+    else:
+        assert grads[0][1] is None  # a constant has no direction
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_projection_gradcheck(antialiased):
+    scene = make_scene(5, scale=-1.5)
+    scene[0][:, :2] *= 0.2
+    scene[0][0, 0] = 3.0  # where the frustum clamp binds
+    scene[2][0] *= 8
+    view, K, w, h = make_camera()
+
+    def outputs(*inputs):
+        seen = project(*inputs, K, w, h, antialiased=antialiased)
+        assert len(seen.ids) == 5
+        # means2d as the offset from the image's centre: gradcheck compares absolute numbers
+        return seen.means2d - 15, seen.depths, seen.cov2d / 10, seen.det / 100, seen.opacities, seen.directions
+
+    inputs = [t.clone().requires_grad_() for t in (*scene, view)]
+    assert torch.autograd.gradcheck(outputs, inputs, eps=1e-6, atol=1e-5, rtol=1e-5)
+
+
+def test_colour_gradcheck():
+    g = torch.Generator().manual_seed(0)
+    directions = torch.randn(6, 3, generator=g, dtype=F64, requires_grad=True)
+    coefficients = (0.1 * torch.randn(9, 16, 3, generator=g, dtype=F64)).requires_grad_()
+    ids = torch.tensor([0, 2, 3, 5, 7, 8])
+    assert torch.autograd.gradcheck(lambda d, c: sh_to_color(d, c, 3, ids), (directions, coefficients))
+
+
+def test_compensation_stops_at_its_lower_bound_with_no_gradient_of_its_own():
+    means = torch.tensor([[0.0, 0, 3]], dtype=F64)
+    quats = torch.tensor([[1.0, 0, 0, 0]], dtype=F64)
+    view, K, w, h = make_camera()
+    for size, bound in ((1e-30, True), (1e-4, True), (0.1, False)):
+        for dtype in (torch.float32, F64):
+            scales = torch.full((1, 3), size, dtype=dtype, requires_grad=True)
+            opacities = torch.tensor([0.9], dtype=dtype)
+            args = [t.to(dtype) for t in (means, quats)]
+            seen = project(*args, scales, 2.0 * opacities, view.to(dtype), K.to(dtype), w, h, antialiased=True)
+            (grad,) = torch.autograd.grad(seen.opacities.sum(), scales)
+            if bound:
+                torch.testing.assert_close(seen.opacities, 2 * 0.9 * torch.full_like(opacities, 0.005))
+                assert not grad.any()
+            else:
+                assert seen.opacities > 0.1 and grad.isfinite().all() and grad.any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_unit_rows_neither_overflow_nor_lose_the_zero_vector(dtype):
+    vectors = torch.tensor([[0, 0, 0], [1e-30, 0, 2e-30], [1e30, 1e30, 0], [3, 4, 0], [1e-42, 0, 0]], dtype=dtype)
+    unit, inverse = unit_rows(vectors.T.contiguous())
+    assert unit.isfinite().all() and inverse.isfinite().all()
+    lengths = unit.norm(dim=0)
+    assert lengths[0] == 0 and inverse[0] == 0
+    torch.testing.assert_close(lengths[1:4], torch.ones(3, dtype=dtype))
+    torch.testing.assert_close(1 / inverse[1:4], torch.tensor([5**0.5 * 1e-30, 2**0.5 * 1e30, 5], dtype=dtype))
+    assert (rotation_rows(torch.zeros(4, 1, dtype=dtype))[..., 0] == torch.eye(3, dtype=dtype)).all()
+
+
+def test_a_mirroring_focal_length_mirrors_the_image():
+    scene = make_scene(scale=-1.0)
+    view, K, w, h = make_camera(cx=18.5)
+    mirrored = torch.diag(torch.tensor([-1.0, 1, 1], dtype=F64)) @ K
+    mirrored[0, 2] = w - K[0, 2]
+    one, other = project(*scene, view, K, w, h), project(*scene, view, mirrored, w, h)
+    assert torch.equal(one.ids, other.ids) and len(one.ids) > 15
+    torch.testing.assert_close(one.means2d[:, 0], w - other.means2d[:, 0])
+    torch.testing.assert_close(one.det, other.det)
