@@ -16,9 +16,20 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from pointsplat_ns.rasterizer.compiled import SMALLEST, Kernels, kernels
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, CHUNK, EXACT, TILE, Quality
-from pointsplat_ns.rasterizer.pairs import MOMENTS, PIXELS, basis_of, chain, gather, mean_slopes, moments, table_of
-from pointsplat_ns.rasterizer.tiles import Footprints, TileList
+from pointsplat_ns.rasterizer.pairs import (
+    MOMENTS,
+    PIXELS,
+    Pairs,
+    basis_of,
+    chain,
+    gather,
+    mean_slopes,
+    moments,
+    table_of,
+)
+from pointsplat_ns.rasterizer.tiles import Footprints, Region
 
 _BLOCK_PAIRS = 2**11  # pairs evaluated at once by each thread of a CPU: 0.5 MB a work array in float32
 _BLOCK_PAIRS_GPU = 2**18
@@ -27,6 +38,15 @@ _BYTES_PER_PAIR = 160  # of the lists, the tape and the gradient sums, measured 
 
 MEMORY_BUDGET = 2**31
 """Bytes that the lists of pairs of one image may take before it is drawn in several regions."""
+
+
+class BlendOptions(NamedTuple):
+    """How to blend."""
+
+    quality: Quality = EXACT
+    compiled: bool = False
+    """Use compiled kernels where the machine can make them (float32, CPU)."""
+    memory_budget: int = MEMORY_BUDGET
 
 
 class _Tiles(NamedTuple):
@@ -50,22 +70,21 @@ class _Chunk(NamedTuple):
     first: int  # place in each tile's list
     size: int  # S
     before: Tensor  # [B, 64] transmittance before the chunk; 0 where the pixel is finished
-    saturates: bool  # a pixel is finished by this chunk
 
 
 class _Frame:
     """The tiles of one region, longest list first, and their pairs."""
 
-    def __init__(self, tiles: TileList, count: int, width: int, height: int, dtype: torch.dtype):
+    def __init__(self, footprints: Footprints, region: Region, dtype: torch.dtype):
+        tiles = self.list = footprints.tiles(region)
         lengths = tiles.offsets[1:] - tiles.offsets[:-1]
-        self.list = tiles
-        self.width, self.height, self.tiles = width, height, lengths.numel()
+        self.width, self.height, self.tiles = footprints.width, footprints.height, lengths.numel()
         self.occupied = int((lengths > 0).sum())
         ids = torch.sort(lengths, descending=True, stable=True).indices[: self.occupied]
         x, y = (centre.to(dtype) for centre in tiles.centres(ids))
         self.sorted = _Tiles(ids, x, y, tiles.offsets[ids], tiles.offsets[ids + 1])
         self.pairs_count = tiles.gaussians.numel()
-        self.gaussians = F.pad(tiles.gaussians, (0, 1), value=count)  # the last pair is padding
+        self.gaussians = F.pad(tiles.gaussians, (0, 1), value=tiles.order.numel())  # the last pair is padding
         pairs = _BLOCK_PAIRS_GPU if lengths.is_cuda else _BLOCK_PAIRS * max(2, torch.get_num_threads())
         self.block = max(1, min(pairs // CHUNK, self.occupied))  # tiles
         self.capacity = pairs
@@ -104,14 +123,36 @@ class _Work:
         return self._through[: b * (s + 1) * PIXELS].view(b, s + 1, PIXELS)
 
 
-def _alphas(coefficients: Tensor, basis: Tensor, quality: Quality, clamp: bool, out: Tensor) -> Tensor:
+class _Scene(NamedTuple):
+    """What is blended."""
+
+    table: Tensor  # [M + 1, 11 + D]
+    channels: int
+    clamp: bool  # some opacity exceeds ALPHA_MAX
+    quality: Quality
+    basis: Tensor  # [6, 64]
+    fused: Kernels | None  # the compiled chunk kernels
+    limits: tuple[Tensor, Tensor]  # the thresholds of ``quality``, as compiled kernels take them
+
+    @classmethod
+    def of(cls, means2d, cov2d, det, opacities, colors, options: BlendOptions) -> _Scene:
+        channels, quality = colors.shape[1], options.quality
+        fused = None
+        if options.compiled and colors.dtype == torch.float32 and colors.device.type == "cpu":
+            fused = kernels(channels)
+        limits = (colors.new_tensor(quality.alpha_min), colors.new_tensor(quality.transmittance_min))
+        table = table_of(means2d, cov2d, det, opacities, colors)
+        return cls(table, channels, bool((opacities > ALPHA_MAX).any()), quality, basis_of(means2d), fused, limits)
+
+
+def _alphas(coefficients: Tensor, scene: _Scene, out: Tensor) -> Tensor:
     """Alphas (B, S, 64) from coefficients (B * S, 6), written into ``out``."""
     flat = out.view(-1, PIXELS)
-    torch.mm(coefficients, basis, out=flat)
+    torch.mm(coefficients, scene.basis, out=flat)
     flat.exp2_()
-    if clamp:
+    if scene.clamp:
         flat.clamp_(max=ALPHA_MAX)
-    F.threshold_(flat, quality.alpha_min, 0.0)
+    F.threshold_(flat, scene.quality.alpha_min, 0.0)
     return out
 
 
@@ -144,21 +185,70 @@ def _sums_behind(terms: Tensor, behind: Tensor, out: Tensor) -> Tensor:
     return out
 
 
-class _Scene(NamedTuple):
-    """What is blended."""
+def _blend_chunk(
+    scene: _Scene, pairs: Pairs, before: Tensor, last: Tensor, blended: Tensor, work: _Work
+) -> tuple[Tensor, Tensor]:
+    """Blend S Gaussians into each tile of ``blended`` (B, D, 64), in place.
 
-    table: Tensor  # [M + 1, 11 + D]
-    channels: int
-    clamp: bool  # some opacity exceeds ALPHA_MAX
-    quality: Quality
-    basis: Tensor  # [6, 64]
+    Returns:
+        Transmittance after them, 0 where the pixel is finished, and the last one that was not, (B, 64) each.
+    """
+    b, s = pairs.rows.shape[:2]
+    stop_below = scene.quality.transmittance_min
+    alpha = _alphas(pairs.coefficients, scene, work.array(0, b, s))
+    passing = torch.sub(1.0, alpha, out=work.array(1, b, s))
+    through = _transmittances(passing, before, work.through(b, s))
+    weight = alpha.mul_(through[:, :-1])
+    after = through[:, -1].clone()
+    if bool(((after <= stop_below) & (before > 0)).any()):
+        drawn = torch.gt(through[:, 1:], stop_below, out=passing)
+        weight.mul_(drawn)
+        stop = through.gather(1, drawn.sum(1, keepdim=True).long())[:, 0]
+        last = torch.where(stop > 0, stop, last)
+        after.mul_(drawn[:, -1])
+    else:
+        last = torch.where(after > 0, after, last)
+    blended.baddbmm_(pairs.colors.transpose(1, 2), weight)
+    return after, last
+
+
+def _blend_chunk_backward(
+    scene: _Scene, pairs: Pairs, before: Tensor, behind: Tensor, pixels: Tensor, work: _Work
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The backward pass of one chunk.
+
+    Args:
+        behind: (B, 64) sum over later Gaussians of weight * (color . grad), and the background.
+        pixels: (B, D, 64) gradient of the image.
+
+    Returns:
+        Gradients of log alpha (B, S, 64) and of the colours (B, D, S), and ``behind`` for the chunk before.
+    """
+    b, s = pairs.rows.shape[:2]
+    stop_below = scene.quality.transmittance_min
+    alpha = _alphas(pairs.coefficients, scene, work.array(0, b, s))
+    passing = torch.sub(1.0, alpha, out=work.array(1, b, s))
+    through = _transmittances(passing, before, work.through(b, s))
+    weight = work.array(2, b, s)
+    if bool((through[:, -1] <= stop_below).any()):
+        alpha.mul_(torch.gt(through[:, 1:], stop_below, out=weight))
+    torch.mul(alpha, through[:, :-1], out=weight)
+    odds = torch.div(alpha, passing, out=passing)
+    at_clamp = alpha >= ALPHA_MAX * (1 - 1e-6) if scene.clamp else None
+    grad_colors = torch.bmm(pixels, weight.transpose(1, 2))
+    weight.mul_(torch.bmm(pairs.colors, pixels, out=alpha))  # weight * (color . grad)
+    sums_behind = _sums_behind(weight, behind, out=through)  # the transmittances are no longer needed
+    grad_log = weight.addcmul_(odds, sums_behind[:, 1:], value=-1.0)
+    if at_clamp is not None:
+        grad_log.masked_fill_(at_clamp, 0.0)
+    return grad_log, grad_colors, sums_behind[:, 0].clone()
 
 
 def _blend_region(frame: _Frame, scene: _Scene, image: Tensor, final: Tensor, keep_tape: bool) -> list[list[_Chunk]]:
     """Blend the tiles of one region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64)."""
     tape: list[list[_Chunk]] = []
     work = _Work(frame, image, 2)
-    stop_below = scene.quality.transmittance_min
+    fused = scene.fused
 
     for begin in range(0, frame.occupied, frame.block):
         left = _Tiles(*(values[begin : begin + frame.block] for values in frame.sorted))
@@ -171,33 +261,19 @@ def _blend_region(frame: _Frame, scene: _Scene, image: Tensor, final: Tensor, ke
         first = 0
         while True:
             b = before.shape[0]
-            s = frame.chunk_size(b, longest - first)
+            s = CHUNK if fused and b >= SMALLEST else frame.chunk_size(b, longest - first)
             ids = frame.gaussians.index_select(0, frame.pairs(left, first, s))
             pairs = gather(scene.table, ids, left.x, left.y)
-            alpha = _alphas(pairs.coefficients, scene.basis, scene.quality, scene.clamp, work.array(0, b, s))
-            passing = torch.sub(1.0, alpha, out=work.array(1, b, s))
-            through = _transmittances(passing, before, work.through(b, s))
-            weight = alpha.mul_(through[:, :-1])
-            after = through[:, -1].clone()
-            saturates = bool(((after <= stop_below) & (before > 0)).any())
             if keep_tape:
-                chunks.append(_Chunk(left, rows, first, s, before, saturates))
-            if saturates:
-                drawn = torch.gt(through[:, 1:], stop_below, out=passing)
-                weight.mul_(drawn)
-                stop = through.gather(1, drawn.sum(1, keepdim=True).long())[:, 0]
-                last = torch.where(stop > 0, stop, last)
-                after.mul_(drawn[:, -1])
+                chunks.append(_Chunk(left, rows, first, s, before))
+            if fused and b >= SMALLEST:
+                before, blended, last = fused.forward(pairs.rows, scene.basis, before, blended, last, *scene.limits)
             else:
-                last = torch.where(after > 0, after, last)
-            before = after
-            blended.baddbmm_(pairs.colors.transpose(1, 2), weight)
+                before, last = _blend_chunk(scene, pairs, before, last, blended, work)
             first += s
             if first >= longest:
                 break
-            alive = left.end - left.start > first
-            if saturates:
-                alive &= before.amax(-1) > 0
+            alive = (left.end - left.start > first) & (before.amax(-1) > 0)
             still = int(alive.sum())
             if still == 0:
                 break
@@ -239,42 +315,34 @@ def _blend_region_backward(
         block_pixels = grad_image.index_select(0, whole)  # [B, D, 64]
         # what lies behind: sum over later Gaussians of weight * (color . grad), and the background
         behind = grad_final.index_select(0, whole) * final.index_select(0, whole)
-        for tiles, rows, first, s, before, saturates in reversed(chunks):
+        for tiles, rows, first, s, before in reversed(chunks):
             b = before.shape[0]
             pixels = block_pixels if rows is None else block_pixels.index_select(0, rows)
             here = slice(done, done + b * s)
             done += b * s
             place[here] = frame.pairs(tiles, first, s)
             pairs = gather(scene.table, frame.gaussians.index_select(0, place[here]), tiles.x, tiles.y)
-            alpha = _alphas(pairs.coefficients, scene.basis, scene.quality, scene.clamp, work.array(0, b, s))
-            passing = torch.sub(1.0, alpha, out=work.array(1, b, s))
-            through = _transmittances(passing, before, work.through(b, s))
-            weight = work.array(2, b, s)
-            if saturates:
-                alpha.mul_(torch.gt(through[:, 1:], scene.quality.transmittance_min, out=weight))
-            torch.mul(alpha, through[:, :-1], out=weight)
-            odds = torch.div(alpha, passing, out=passing)
-            at_clamp = alpha >= ALPHA_MAX * (1 - 1e-6) if scene.clamp else None
+            behind_here = behind if rows is None else behind.index_select(0, rows)
+            if scene.fused and b >= SMALLEST:
+                grad_log, weight, behind_here = scene.fused.backward(
+                    pairs.rows, scene.basis, before, behind_here, pixels, *scene.limits
+                )
+                grad_colors = torch.bmm(pixels, weight.transpose(1, 2))  # [B, D, S]
+            else:
+                grad_log, grad_colors, behind_here = _blend_chunk_backward(
+                    scene, pairs, before, behind_here, pixels, work
+                )
+            if rows is None:
+                behind = behind_here
+            else:
+                behind.index_copy_(0, rows, behind_here)
 
             packed = sums[here]
-            grad_colors = torch.bmm(pixels, weight.transpose(1, 2))  # [B, D, S]
             packed[:, MOMENTS : MOMENTS + channels].view(b, s, channels).copy_(grad_colors.transpose(1, 2))
-            weight.mul_(torch.bmm(pairs.colors, pixels, out=alpha))  # weight * (color . grad)
-
-            behind_here = behind if rows is None else behind.index_select(0, rows)
-            sums_behind = _sums_behind(weight, behind_here, out=through)  # the transmittances are no longer needed
-            if rows is None:
-                behind.copy_(sums_behind[:, 0])
-            else:
-                behind.index_copy_(0, rows, sums_behind[:, 0])
-            grad_log = weight.addcmul_(odds, sums_behind[:, 1:], value=-1.0)
-            if at_clamp is not None:
-                grad_log.masked_fill_(at_clamp, 0.0)
-
             flat = grad_log.view(-1, PIXELS)
             if absgrad:
                 for column, slope in enumerate(mean_slopes(pairs.coefficients)):
-                    slope = torch.mm(slope, scene.basis[:3], out=alpha.view(-1, PIXELS))
+                    slope = torch.mm(slope, scene.basis[:3], out=work.array(0, b, s).view(-1, PIXELS))
                     packed[:, MOMENTS + channels + column] = slope.mul_(flat).abs_().sum(-1)
             moments(pairs, torch.mm(scene.basis, flat.T), packed)
 
@@ -292,45 +360,36 @@ class Blend(torch.autograd.Function):
     """Blend projected Gaussians into the tiles of one region; see :func:`blend`."""
 
     @staticmethod
-    def forward(
-        ctx, means2d, cov2d, det, opacities, colors, make_tiles, keep_tiles, width, height, quality, absgrad_of
-    ):
-        """``make_tiles`` makes the region's list; the tape is kept for the backward pass only if ``keep_tiles``."""
-        ctx.make_frame = lambda tiles: _Frame(tiles, colors.shape[0], width, height, means2d.dtype)
-        frame = ctx.make_frame(make_tiles())
+    def forward(ctx, means2d, cov2d, det, opacities, colors, footprints, region, keep_lists, options, absgrad_of):
+        """The lists are kept for the backward pass only if ``keep_lists``."""
+        frame = _Frame(footprints, region, means2d.dtype)
         image = colors.new_zeros(frame.tiles, colors.shape[1], PIXELS)
         final = colors.new_ones(frame.tiles, PIXELS)
         needs_grad = any(ctx.needs_input_grad)
-        scene = _scene(means2d, cov2d, det, opacities, colors, quality)
-        tape = _blend_region(frame, scene, image, final, needs_grad and keep_tiles)
+        scene = _Scene.of(means2d, cov2d, det, opacities, colors, options)
+        tape = _blend_region(frame, scene, image, final, needs_grad and keep_lists)
         if needs_grad:
             ctx.save_for_backward(means2d, cov2d, det, opacities, colors, final)
-            ctx.kept = (frame, tape) if keep_tiles else None
-            ctx.make_tiles, ctx.quality, ctx.absgrad_of = make_tiles, quality, absgrad_of
+            ctx.kept = (frame, tape) if keep_lists else None
+            ctx.arguments = footprints, region, options, absgrad_of
         return image, final
 
     @staticmethod
     def backward(ctx, grad_image, grad_final):
         means2d, cov2d, det, opacities, colors, final = ctx.saved_tensors
-        scene = _scene(means2d, cov2d, det, opacities, colors, ctx.quality)
+        footprints, region, options, absgrad_of = ctx.arguments
+        scene = _Scene.of(means2d, cov2d, det, opacities, colors, options)
         if ctx.kept:
             frame, tape = ctx.kept
         else:
-            frame = ctx.make_frame(ctx.make_tiles())
+            frame = _Frame(footprints, region, means2d.dtype)
             tape = _blend_region(frame, scene, torch.empty_like(grad_image), torch.empty_like(final), True)
-        absgrad = ctx.absgrad_of is not None
-        summed = _blend_region_backward(frame, scene, tape, final, grad_image, grad_final, absgrad)
-        channels = scene.channels
-        if absgrad:
-            ctx.absgrad_of(summed[:, MOMENTS + channels :])
-        grads = chain(summed[:, :MOMENTS], cov2d, det, opacities)
-        return *grads, summed[:, MOMENTS : MOMENTS + channels], None, None, None, None, None, None
-
-
-def _scene(means2d, cov2d, det, opacities, colors, quality) -> _Scene:
-    clamp = bool((opacities > ALPHA_MAX).any())
-    table = table_of(means2d, cov2d, det, opacities, colors)
-    return _Scene(table, colors.shape[1], clamp, quality, basis_of(means2d))
+        summed = _blend_region_backward(frame, scene, tape, final, grad_image, grad_final, absgrad_of is not None)
+        first, last = MOMENTS, MOMENTS + scene.channels
+        if absgrad_of is not None:
+            absgrad_of(summed[:, last:])
+        grads = chain(summed[:, :first], cov2d, det, opacities)
+        return *grads, summed[:, first:last], None, None, None, None, None
 
 
 def blend(
@@ -340,17 +399,16 @@ def blend(
     opacities: Tensor,  # [M] in (0, 1]
     colors: Tensor,  # [M, D]
     footprints: Footprints,
-    quality: Quality = EXACT,
-    memory_budget: int = MEMORY_BUDGET,
+    options: BlendOptions = BlendOptions(),  # noqa: B008 - immutable
     absgrad_of: Callable[[Tensor], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Blend Gaussians into images.
 
     Args:
         footprints: of the same Gaussians.
-        quality: thresholds.
-        memory_budget: bytes. An image whose lists of pairs would take more is drawn in several
-            regions, one after the other, and their lists are made again for the backward pass.
+        options: an image whose lists of pairs would take more than ``options.memory_budget`` bytes
+            is drawn in several regions, one after the other, and their lists are made again for the
+            backward pass.
         absgrad_of: called in the backward pass with the sums over pixels of the absolute gradients
             of means2d, (M, 2).
 
@@ -358,11 +416,11 @@ def blend(
         Colours (C, H, W, D) over black, and the remaining transmittance (C, H, W, 1).
     """
     cameras, width, height = footprints.cameras, footprints.width, footprints.height
-    regions = footprints.regions(max(1, memory_budget // _BYTES_PER_PAIR))
+    regions = footprints.regions(max(1, options.memory_budget // _BYTES_PER_PAIR))
     if absgrad_of is not None and len(regions) > 1:
         absgrad_of = _Summed(absgrad_of, len(regions))
 
-    def untile(values: Tensor, region) -> Tensor:
+    def untile(values: Tensor, region: Region) -> Tensor:
         rows, columns = region.bottom - region.top, region.right - region.left
         values = values.view(cameras, rows, columns, -1, TILE, TILE).permute(0, 1, 4, 2, 5, 3)
         return values.reshape(cameras, rows * TILE, columns * TILE, -1)
@@ -381,10 +439,8 @@ def blend(
     images, finals = [], []
     for region in regions:
         image, final = Blend.apply(
-            means2d, cov2d, det, opacities, colors,
-            lambda region=region: footprints.tiles(region), len(regions) == 1,
-            width, height, quality, absgrad_of,
-        )  # fmt: skip
+            means2d, cov2d, det, opacities, colors, footprints, region, len(regions) == 1, options, absgrad_of
+        )
         images.append(image)
         finals.append(final)
     return assemble(images), assemble(finals)

@@ -43,3 +43,5 @@ class Quality:
 
 
 EXACT = Quality()
+
+QUALITIES = {"exact": EXACT, "balanced": Quality(2 / 255, 1e-3), "fast": Quality(6 / 255, 1e-2)}

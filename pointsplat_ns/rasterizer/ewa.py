@@ -203,20 +203,21 @@ class Project(torch.autograd.Function):
         p1, p2 = shape.p1, shape.p2
         gxx, gxy, gyy = grad_cov2d.T.contiguous()
 
-        # det0, and det = det0 + eps2d (xx + yy) + eps2d^2
+        # det = det0 + blur, with blur = eps2d (|p1|^2 + |p2|^2 + eps2d)
+        cross = _cross(p1, p2)
         grad_det0 = grad_det
         if lens.antialiased:
-            compensation = ratio[0].clamp_min(COMPENSATION_MIN**2).sqrt()
+            ratio = ratio[0]
+            compensation = ratio.clamp_min(COMPENSATION_MIN**2).sqrt()
             grad_ratio = 0.5 * grad_alphas * opacities.index_select(0, ids) / compensation
-            grad_ratio = grad_ratio * (ratio[0] > COMPENSATION_MIN**2)
+            grad_ratio = grad_ratio * (ratio > COMPENSATION_MIN**2)
             grad_alphas = grad_alphas * compensation
-            cross = _cross(p1, p2)
             det0 = cross[0].square() + cross[1].square() + cross[2].square()
-            det = det0 + lens.eps2d * ((p1 * p1).sum(0) + (p2 * p2).sum(0)) + lens.eps2d * lens.eps2d
-            grad_det = grad_det - grad_ratio * ratio[0] / det
-            grad_det0 = grad_det + grad_ratio / det
-        else:
-            cross = _cross(p1, p2)
+            blur = lens.eps2d * ((p1 * p1).sum(0) + (p2 * p2).sum(0) + lens.eps2d)
+            det = det0 + blur
+            # 1 - det0 / det as blur / det: the difference has no digit left where the Gaussian is large
+            grad_det0 = grad_det + grad_ratio / det * (blur / det)
+            grad_det = grad_det - grad_ratio * ratio / det
         normal = torch.stack(cross) * (2 * grad_det0)
         gxx, gyy = 2 * (gxx + lens.eps2d * grad_det), 2 * (gyy + lens.eps2d * grad_det)
         grad_p1 = torch.addcmul(p1 * gxx, p2, gxy).add_(torch.stack(_cross(p2, normal)))

@@ -30,7 +30,9 @@ MOMENTS = 6
 
 _NEVER = -1e4  # log2 alpha of the padding
 _LOG2E, _LN2 = 1.0 / math.log(2.0), math.log(2.0)
-_X, _Y, _R, _A, _D, _QUADRATIC, _COLOR = 0, 1, 2, 3, 4, 5, 11  # columns of the table
+_X, _Y, _R, _A, _D = range(5)  # columns of the table
+QUADRATIC, COLOR = 5, 11
+"""First columns of the coefficients and of the colours."""
 
 
 def basis_of(like: Tensor) -> Tensor:
@@ -52,7 +54,7 @@ def table_of(means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, col
     zero = torch.zeros_like(a)
     columns = [*means2d.unbind(-1), r, a, d, opacities.log2(), zero, zero, -0.5 * a, ar, -0.5 * (ar * r + d)]
     table = F.pad(torch.cat([torch.stack(columns, dim=-1), colors], dim=-1), (0, 0, 0, 1))
-    table[-1, _QUADRATIC] = _NEVER
+    table[-1, QUADRATIC] = _NEVER
     return table
 
 
@@ -64,6 +66,7 @@ class Pairs(NamedTuple):
     r: Tensor  # [B * S]
     coefficients: Tensor  # [B * S, 6] of log2 alpha, on the basis
     colors: Tensor  # [B, S, D]
+    rows: Tensor  # [B, S, 11 + D] what the last two are views of
 
 
 def gather(table: Tensor, ids: Tensor, x: Tensor, y: Tensor) -> Pairs:
@@ -74,11 +77,12 @@ def gather(table: Tensor, ids: Tensor, x: Tensor, y: Tensor) -> Pairs:
     ey = (y[:, None] - my.view(-1, size)).view(-1)
     s = (x[:, None] - mx.view(-1, size)).view(-1).addcmul_(r, ey, value=-1.0)
     a_s, d_ey = a * s, d * ey
-    quadratic = rows[:, _QUADRATIC:_COLOR]
+    quadratic = rows[:, QUADRATIC:COLOR]
     quadratic[:, 0].addcmul_(a_s, s, value=-0.5).addcmul_(d_ey, ey, value=-0.5)
     torch.neg(a_s, out=quadratic[:, 1])
     torch.sub(a_s.mul_(r), d_ey, out=quadratic[:, 2])
-    return Pairs(s, ey, r, quadratic, rows[:, _COLOR:].view(-1, size, rows.shape[1] - _COLOR))
+    rows = rows.view(-1, size, rows.shape[1])
+    return Pairs(s, ey, r, quadratic, rows[..., COLOR:], rows)
 
 
 def moments(pairs: Pairs, sums: Tensor, out: Tensor) -> None:

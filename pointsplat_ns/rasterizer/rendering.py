@@ -7,13 +7,14 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.blending import blend
-from pointsplat_ns.rasterizer.constants import EPS2D, TILE
+from pointsplat_ns.rasterizer.blending import MEMORY_BUDGET, BlendOptions, blend
+from pointsplat_ns.rasterizer.constants import EPS2D, QUALITIES, TILE, Quality
 from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, project
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.rasterizer.tiles import Footprints
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+QualityName = Literal["exact", "balanced", "fast"]
 
 
 def _check(means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds, render_mode) -> None:
@@ -87,6 +88,9 @@ def rasterization(
     absgrad: bool = False,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     channel_chunk: int = 32,
+    quality: QualityName | Quality = "exact",
+    compiled: bool = False,
+    memory_budget: int = MEMORY_BUDGET,
 ) -> tuple[Tensor, Tensor, dict]:
     """Render 3D Gaussians from C pinhole cameras, on any torch device.
 
@@ -98,6 +102,10 @@ def rasterization(
     Degenerate input that has a meaning keeps it: the zero quaternion is the identity, a scale of 0 a
     flat Gaussian, an opacity of 1 opaque. What has none (NaN, infinities, a negative scale or opacity)
     is not drawn, gets a zero gradient and is counted in ``meta["skipped"]``.
+
+    The same input gives the same bits, forward and backward, on the same machine with the same number of
+    threads. Another number of threads sums gradients in another order (1 and 2 were seen to give the same
+    image and gradients 6e-7 apart); so may another machine, device or version of torch.
 
     Args:
         means: centres, world space.
@@ -119,6 +127,12 @@ def rasterization(
         absgrad: after the backward pass ``meta["means2d"].absgrad`` holds the sum over pixels of
             the absolute gradient (AbsGS, arXiv 2404.10484).
         rasterize_mode: ``antialiased`` scales opacities by the compensation of Mip-Splatting.
+        quality: what to give up for speed, by name or as thresholds; see ``QUALITIES``.
+        compiled: blend with kernels made by ``torch.compile`` where there is a C++ compiler (CPU,
+            float32). Making them takes a minute once; without a compiler a warning says why and the
+            eager path is used.
+        memory_budget: bytes that lists of pairs may take before the image is drawn in several
+            regions, one after the other; the image is the same to rounding.
         tile_size, sparse_grad, channel_chunk: accepted for gsplat's sake, without effect.
 
     Returns:
@@ -174,7 +188,8 @@ def rasterization(
     if render_mode != "RGB":
         channels.append(depths[:, None])
 
-    footprints = Footprints(means2d, cov2d, det, alphas, depths, camera_ids, cameras, width, height)
+    level = quality if isinstance(quality, Quality) else QUALITIES[quality]
+    footprints = Footprints(means2d, cov2d, det, alphas, depths, camera_ids, cameras, width, height, level.alpha_min)
 
     def keep_absgrad(values: Tensor) -> None:
         if not packed:
@@ -183,7 +198,7 @@ def rasterization(
 
     image, through = blend(
         means2d, cov2d, det, alphas, torch.cat(channels, dim=-1), footprints,
-        absgrad_of=keep_absgrad if absgrad else None,
+        BlendOptions(level, compiled, memory_budget), keep_absgrad if absgrad else None,
     )  # fmt: skip
     accumulated = 1.0 - through
 

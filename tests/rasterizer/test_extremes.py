@@ -72,8 +72,12 @@ def relative_change(scene, grads):
     return [means * size, quats * scene[1].norm(dim=-1, keepdim=True), scales * scene[2], opacities, colors]
 
 
-def check(scene, camera, size=(37, 29), tolerance=1e-4, grad_tolerance=1e-3, flips=0.005, reference=True, **options):
-    """float32 against float64, and float64 against the reference."""
+def check(scene, camera, size=(37, 29), tolerance=1e-5, grad_tolerance=5e-5, flips=0.005, reference=True, **options):
+    """float32 against float64, and float64 against the reference.
+
+    The tolerances are ten times what float32's 1e-7 was seen to become over 50 layers: 1e-6 in a pixel, 5e-6 in
+    the norm of a gradient.
+    """
     view, K = (t.float().double() for t in camera)
     scene = [t.float().double() for t in scene]
     single, single_grads = draw(scene, view, K, size, torch.float32, **options)
@@ -99,6 +103,7 @@ def check(scene, camera, size=(37, 29), tolerance=1e-4, grad_tolerance=1e-3, fli
 
 def _log_scales(scene):
     scene[2] = torch.linspace(-80, 20, 150, dtype=F64)[torch.randperm(150, generator=torch.manual_seed(0))].view(50, 3)
+    scene[2][0], scene[2][1] = 20, -80  # the first is flat over the image, and its determinant 1e39
     scene[2] = scene[2].exp()
     scene[3] = 0.3 * scene[3]
 
@@ -134,12 +139,6 @@ CASES = {
     "needles of aspect 1e6": _needles(1e6),
     "covering the image a hundred times": lambda s: (s[2].fill_(37 * 100 * 3.0 / 40), s[3].mul_(0.3)),
 }
-# Where float32 itself cannot do better, (image, gradient):
-LOOSER = {
-    # the edge of a needle is as sharp as eps2d allows, its far end turned by 1e-7 of its length
-    "needles of aspect 1e4": (1e-3, 1e-2),
-    "needles of aspect 1e6": (1e-3, 1e-2),
-}
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
@@ -149,12 +148,9 @@ def test_degenerate_gaussians(case, mode):
     CASES[case](scene)
     if mode == "antialiased" and any(word in case for word in ("lines", "points", "needles")):
         scene[3][:] = 40.0  # the compensation is at or near its lower bound of 0.005
-    tolerance, grad_tolerance = LOOSER.get(case, (1e-4, 1e-3))
     check(
         scene,
         make_camera(),
-        tolerance=tolerance,
-        grad_tolerance=grad_tolerance,
         mode=mode,
         reference=case != "log-scales from -80 to 20",
     )
@@ -169,7 +165,7 @@ def test_gaussians_at_and_across_the_camera_plane():
     scene[0][1:9] = centre + (scene[0][1:9] - centre) * 1e-3
     scene[0][9:18, 2] *= -1
     scene[2][:18] *= 30  # wide enough to reach from behind the camera, or to hold it inside
-    single, grads = check(scene, (view, K), tolerance=1e-3, grad_tolerance=1e-2, flips=0.02)
+    single, grads = check(scene, (view, K))
     assert all((g[0] == 0).all() for g in grads)
 
 
@@ -222,8 +218,8 @@ def test_a_scene_a_million_units_from_the_origin():
     scene[2] = scene[2] * 64
     view[:3, 3] = view[:3, 3] * 64 - view[:3, :3] @ shift
     # check() rounds means and view to float32 before anything is drawn: they move by 0.03 units, the arithmetic does
-    # not; gradients differ where the float32 rotation is no exact rotation
-    check(scene, (view, K), tolerance=1e-3, grad_tolerance=1e-2, flips=0.01)
+    # not
+    check(scene, (view, K))
 
 
 def test_float64_cameras_beside_float32_gaussians_place_the_camera_exactly():
@@ -257,7 +253,7 @@ def test_extreme_focal_lengths(focal):
         local = torch.cat([rays / focal, torch.ones(50, 1, dtype=F64)], -1) * scene[0][:, 2:].abs()
         scene[0] = centre + local @ view[:3, :3]
         scene[2] = scene[2] * 1e-3
-        check(scene, (view, K), tolerance=1e-2, grad_tolerance=2e-2, flips=0.01)
+        check(scene, (view, K), tolerance=5e-3, grad_tolerance=2e-3)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 4000), (4000, 1), (61, 53)])
@@ -266,7 +262,7 @@ def test_any_image_size(size):
     w, h = size
     scene[2] *= 4
     view, K = make_camera(cx=w / 2, cy=h / 2, focal=max(20.0, 0.6 * max(size)))
-    check(scene, (view, K), size, flips=0.01)
+    check(scene, (view, K), size)
 
 
 @pytest.mark.parametrize("cx,cy", [(-60.0, 13.0), (90.0, 80.0), (20.0, -500.0)])
@@ -274,7 +270,7 @@ def test_principal_point_outside_the_image(cx, cy):
     scene = make_scene()
     scene[2] *= 3
     scene[0][:, :2] -= (torch.tensor([cx, cy], dtype=F64) - torch.tensor([18.0, 14.0])) / 40.0 * 3.0
-    check(scene, make_camera(cx, cy), tolerance=1e-3, grad_tolerance=1e-2)
+    check(scene, make_camera(cx, cy))
 
 
 @pytest.mark.parametrize("n,culled", [(0, False), (1, False), (1, True), (20, True)])
@@ -323,12 +319,14 @@ def test_what_has_no_meaning_is_skipped_and_counted_with_a_zero_gradient(dtype, 
     assert meta["skipped"] == 0
     for row, (name, value) in enumerate(BAD):
         scene[NAMES.index(name)][row].view(-1)[0] = value
-    leaves = [t.clone().requires_grad_() for t in scene]
-    image, alpha, meta = rasterization(*leaves, view, K, 37, 29, sh_degree=sh_degree, render_mode="RGB+ED")
+    leaves = [t.clone().requires_grad_() for t in (*scene, view)]
+    image, alpha, meta = rasterization(*leaves, K, 37, 29, sh_degree=sh_degree, render_mode="RGB+ED")
     assert meta["skipped"] == len(BAD)
     tolerance = 1e-12 if dtype == F64 else 1e-5  # another order of the same sums
     assert (image[..., :-1] - clean).abs().max() < tolerance and (alpha - clean_alpha).abs().max() < tolerance
-    for name, grad in zip(NAMES, torch.autograd.grad(image.sum() + alpha.sum(), leaves), strict=True):
+    *grads, grad_view = torch.autograd.grad(image.sum() + alpha.sum(), leaves)
+    assert grad_view.isfinite().all() and grad_view.any()
+    for name, grad in zip(NAMES, grads, strict=True):
         assert grad.isfinite().all(), name
         assert not grad[: len(BAD)].any(), name
         assert grad[len(BAD) :].any() or (sh_degree in (None, 0) and name == "quats"), name
@@ -401,7 +399,8 @@ def test_twenty_thousand_coincident_gaussians():
     middle = (slice(None), slice(11, 15), slice(18, 22))
     few, _, _ = run(30)
     assert (image[middle] - few[middle]).abs().max() < 1e-6  # half of the light stops at each: 13 suffice for 1e-4
-    assert not grads[0][15_000:].sum(0).isnan().any()
+    # at the rim each stops 1/255: ln(1e4) x 255 = 2349 of them end the pixel, and the rest is seen nowhere
+    assert not any(g[2400:].any() for g in grads) and grads[3][1000:].any()
 
 
 @pytest.mark.parametrize(
