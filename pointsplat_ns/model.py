@@ -166,7 +166,7 @@ class PointSplatModel(SplatfactoCpuModel):
             ``rgb`` (H, W, 3) in [0, 1], ``accumulation`` (H, W, 1), ``depth`` (H, W, 1) in scene units, ``background``.
         """
         width, height = int(camera.width.item()), int(camera.height.item())
-        image, alpha, _ = self._rasterization()(
+        image, alpha, _ = self._rasterization(
             means=gaussians.means,
             quats=gaussians.quats,
             scales=gaussians.stds,

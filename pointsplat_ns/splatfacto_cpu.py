@@ -8,7 +8,6 @@ the same in fewer operations.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -26,28 +25,17 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from pointsplat_ns.errors import DataError, PointSplatError
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.fast_ssim import fast_ssim
 from pointsplat_ns.lpips import LpipsUnavailable, load_lpips
 from pointsplat_ns.metrics import ImageError
+from pointsplat_ns.rasterizer import rasterization
 
 LONE_POINT_SCALE = 0.01
 """Standard deviation, in scene units, of a seed that has no other point to take its size from."""
 
 HALF_LEVEL = 0.5 / 255
 """Half a step of an 8-bit colour: the nearest to 0 and 1 that a seed's colour logit goes, so that it stays finite."""
-
-
-@functools.cache
-def gsplat_works() -> bool:
-    """Whether gsplat's CUDA kernels are there. The first call may compile them, as Splatfacto's first step does."""
-    if not torch.cuda.is_available():
-        return False
-    try:
-        from gsplat.cuda._backend import _C
-    except Exception:  # a failed compilation raises what the compiler's wrapper likes
-        return False
-    return _C is not None
 
 
 def viewmats_of(camera_to_worlds: Tensor) -> Tensor:
@@ -90,6 +78,11 @@ class SplatfactoCpuModelConfig(SplatfactoModelConfig):
     _target: type = field(default_factory=lambda: SplatfactoCpuModel)
     backend: Literal["auto", "torch", "gsplat"] = "auto"
     """What draws: torch runs everywhere; gsplat needs CUDA; auto takes gsplat where its kernels are there."""
+    compiled: bool = False
+    """Blend with kernels made by torch.compile: faster on a CPU with a C++ compiler, after a minute of compiling at the
+    first step (once; the result is kept on disk). Where that fails a warning says why, and training goes on without."""
+    quality: Literal["exact", "balanced", "fast"] = "exact"
+    """What training may give up for speed (see the README for how much); evaluation is always exact."""
 
 
 class SplatfactoCpuModel(SplatfactoModel):
@@ -260,7 +253,7 @@ class SplatfactoCpuModel(SplatfactoModel):
             degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
         else:
             colors, degree = torch.sigmoid(params["features_dc"]), None
-        return self._rasterization()(
+        return self._rasterization(
             means=params["means"],
             quats=params["quats"],
             scales=torch.exp(params["scales"]),
@@ -277,20 +270,15 @@ class SplatfactoCpuModel(SplatfactoModel):
             rasterize_mode=self.config.rasterize_mode,
         )
 
-    def _rasterization(self):
-        """gsplat's rasterization or ours, as the config and the device have it."""
-        backend = self.config.backend
-        on_cuda = self.device.type == "cuda"
-        if backend == "gsplat" and not (on_cuda and gsplat_works()):
-            raise PointSplatError(
-                f"--pipeline.model.backend gsplat: the model is on {self.device.type} and gsplat's CUDA kernels are "
-                f"{'there' if gsplat_works() else 'not there'}; expected both on CUDA; use auto or torch"
-            )
-        if backend != "torch" and on_cuda and gsplat_works():
-            from gsplat.rendering import rasterization
-        else:
-            from pointsplat_ns.rasterizer import rasterization
-        return rasterization
+    def _rasterization(self, **arguments):
+        """Rasterize as the config has it."""
+        config = self.config
+        return rasterization(**arguments, backend=config.backend, compiled=config.compiled, quality=self._quality)
+
+    @property
+    def _quality(self) -> str:
+        """Evaluation is always exact."""
+        return self.config.quality if self.training else "exact"
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]

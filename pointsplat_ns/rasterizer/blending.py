@@ -31,7 +31,8 @@ from pointsplat_ns.rasterizer.pairs import (
 )
 from pointsplat_ns.rasterizer.tiles import Footprints, Region
 
-_BLOCK_PAIRS = 2**11  # pairs evaluated at once by each thread of a CPU: 0.5 MB a work array in float32
+_BLOCK_PAIRS = 2**12  # pairs evaluated at once, for each thread of a CPU: 1 MB a work array in float32
+_BLOCK_PAIRS_COMPILED = 2**11  # compiled kernels have no calls to save, and fit the cache better
 _BLOCK_PAIRS_GPU = 2**18
 _LONGEST_CHUNK = 1024
 _BYTES_PER_PAIR = 160  # of the lists, the tape and the gradient sums, measured in float32 with three channels
@@ -75,7 +76,7 @@ class _Chunk(NamedTuple):
 class _Frame:
     """The tiles of one region, longest list first, and their pairs."""
 
-    def __init__(self, footprints: Footprints, region: Region, dtype: torch.dtype):
+    def __init__(self, footprints: Footprints, region: Region, dtype: torch.dtype, compiled: bool):
         tiles = self.list = footprints.tiles(region)
         lengths = tiles.offsets[1:] - tiles.offsets[:-1]
         self.width, self.height, self.tiles = footprints.width, footprints.height, lengths.numel()
@@ -85,7 +86,8 @@ class _Frame:
         self.sorted = _Tiles(ids, x, y, tiles.offsets[ids], tiles.offsets[ids + 1])
         self.pairs_count = tiles.gaussians.numel()
         self.gaussians = F.pad(tiles.gaussians, (0, 1), value=tiles.order.numel())  # the last pair is padding
-        pairs = _BLOCK_PAIRS_GPU if lengths.is_cuda else _BLOCK_PAIRS * max(2, torch.get_num_threads())
+        pairs = _BLOCK_PAIRS_COMPILED if compiled else _BLOCK_PAIRS
+        pairs = _BLOCK_PAIRS_GPU if lengths.is_cuda else pairs * torch.get_num_threads()
         self.block = max(1, min(pairs // CHUNK, self.occupied))  # tiles
         self.capacity = pairs
 
@@ -110,8 +112,8 @@ class _Frame:
 class _Work:
     """The work arrays of a block, allocated once."""
 
-    def __init__(self, frame: _Frame, like: Tensor, arrays: int):
-        self._arrays = [like.new_empty(frame.capacity * PIXELS) for _ in range(arrays)]
+    def __init__(self, frame: _Frame, like: Tensor):
+        self._arrays = [like.new_empty(frame.capacity * PIXELS) for _ in range(3)]
         self._through = like.new_empty((frame.capacity + frame.block) * PIXELS)
 
     def array(self, which: int, b: int, s: int) -> Tensor:
@@ -244,51 +246,103 @@ def _blend_chunk_backward(
     return grad_log, grad_colors, sums_behind[:, 0].clone()
 
 
-def _blend_region(frame: _Frame, scene: _Scene, image: Tensor, final: Tensor, keep_tape: bool) -> list[list[_Chunk]]:
-    """Blend the tiles of one region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64)."""
-    tape: list[list[_Chunk]] = []
-    work = _Work(frame, image, 2)
-    fused = scene.fused
+def _blend_block(
+    frame: _Frame, scene: _Scene, work: _Work, image: Tensor, final: Tensor, keep_tape: bool, begin: int
+) -> list[_Chunk]:
+    """Blend the tiles from ``begin`` on into their rows of ``image`` (tiles, D, 64) and ``final`` (tiles, 64)."""
+    left = _Tiles(*(values[begin : begin + frame.block] for values in frame.sorted))
+    rows = None
+    longest = int(left.end[0] - left.start[0])
+    before = frame.inside(left)
+    blended = image.new_zeros(before.shape[0], scene.channels, PIXELS)
+    last = torch.ones_like(before)
+    chunks: list[_Chunk] = []
+    first = 0
+    while True:
+        b = before.shape[0]
+        fused = scene.fused if b >= SMALLEST else None
+        s = CHUNK if fused else frame.chunk_size(b, longest - first)
+        ids = frame.gaussians.index_select(0, frame.pairs(left, first, s))
+        pairs = gather(scene.table, ids, left.x, left.y)
+        if keep_tape:
+            chunks.append(_Chunk(left, rows, first, s, before))
+        if fused:
+            before, blended, last = fused.forward(pairs.rows, scene.basis, before, blended, last, *scene.limits)
+        else:
+            before, last = _blend_chunk(scene, pairs, before, last, blended, work)
+        first += s
+        if first >= longest:
+            break
+        alive = (left.end - left.start > first) & (before.amax(-1) > 0)
+        still = int(alive.sum())
+        if still == 0:
+            break
+        if still <= 0.9 * b:
+            done, alive = (~alive).nonzero()[:, 0], alive.nonzero()[:, 0]
+            finished = left.ids.index_select(0, done)
+            image.index_copy_(0, finished, blended.index_select(0, done))
+            final.index_copy_(0, finished, last.index_select(0, done))
+            left, rows = left.take(alive), alive if rows is None else rows.index_select(0, alive)
+            before, blended, last = (values.index_select(0, alive) for values in (before, blended, last))
+            longest = int((left.end - left.start).max())
+    image.index_copy_(0, left.ids, blended)
+    final.index_copy_(0, left.ids, last)
+    return chunks
 
-    for begin in range(0, frame.occupied, frame.block):
-        left = _Tiles(*(values[begin : begin + frame.block] for values in frame.sorted))
-        rows = None
-        longest = int(left.end[0] - left.start[0])
-        before = frame.inside(left)
-        blended = image.new_zeros(before.shape[0], scene.channels, PIXELS)
-        last = torch.ones_like(before)
-        chunks: list[_Chunk] = []
-        first = 0
-        while True:
-            b = before.shape[0]
-            s = CHUNK if fused and b >= SMALLEST else frame.chunk_size(b, longest - first)
-            ids = frame.gaussians.index_select(0, frame.pairs(left, first, s))
-            pairs = gather(scene.table, ids, left.x, left.y)
-            if keep_tape:
-                chunks.append(_Chunk(left, rows, first, s, before))
-            if fused and b >= SMALLEST:
-                before, blended, last = fused.forward(pairs.rows, scene.basis, before, blended, last, *scene.limits)
-            else:
-                before, last = _blend_chunk(scene, pairs, before, last, blended, work)
-            first += s
-            if first >= longest:
-                break
-            alive = (left.end - left.start > first) & (before.amax(-1) > 0)
-            still = int(alive.sum())
-            if still == 0:
-                break
-            if still <= 0.9 * b:
-                done, alive = (~alive).nonzero()[:, 0], alive.nonzero()[:, 0]
-                finished = left.ids.index_select(0, done)
-                image.index_copy_(0, finished, blended.index_select(0, done))
-                final.index_copy_(0, finished, last.index_select(0, done))
-                left, rows = left.take(alive), alive if rows is None else rows.index_select(0, alive)
-                before, blended, last = (values.index_select(0, alive) for values in (before, blended, last))
-                longest = int((left.end - left.start).max())
-        image.index_copy_(0, left.ids, blended)
-        final.index_copy_(0, left.ids, last)
-        tape.append(chunks)
-    return tape
+
+def _blend_region(frame: _Frame, scene: _Scene, image: Tensor, final: Tensor, keep_tape: bool) -> list[list[_Chunk]]:
+    """Blend the tiles of one region, block by block."""
+    work = _Work(frame, image)
+    begins = range(0, frame.occupied, frame.block)
+    return [_blend_block(frame, scene, work, image, final, keep_tape, begin) for begin in begins]
+
+
+def _blend_block_backward(
+    frame: _Frame,
+    scene: _Scene,
+    work: _Work,
+    final: Tensor,  # [tiles, 64]
+    grad_image: Tensor,  # [tiles, D, 64]
+    grad_final: Tensor,  # [tiles, 64]
+    chunks: list[_Chunk],
+    place: Tensor,  # [pairs of the chunks] int64, written: places in the pair list
+    sums: Tensor,  # [pairs of the chunks, MOMENTS + D (+ 2)], written
+) -> None:
+    """The gradient sums of the pairs of one block, the last chunk first."""
+    channels = scene.channels
+    whole = chunks[0].tiles.ids
+    block_pixels = grad_image.index_select(0, whole)  # [B, D, 64]
+    # what lies behind: sum over later Gaussians of weight * (color . grad), and the background
+    behind = grad_final.index_select(0, whole) * final.index_select(0, whole)
+    done = 0
+    for tiles, rows, first, s, before in reversed(chunks):
+        b = before.shape[0]
+        pixels = block_pixels if rows is None else block_pixels.index_select(0, rows)
+        here = slice(done, done + b * s)
+        done += b * s
+        place[here] = frame.pairs(tiles, first, s)
+        pairs = gather(scene.table, frame.gaussians.index_select(0, place[here]), tiles.x, tiles.y)
+        behind_here = behind if rows is None else behind.index_select(0, rows)
+        if scene.fused and b >= SMALLEST:
+            grad_log, weight, behind_here = scene.fused.backward(
+                pairs.rows, scene.basis, before, behind_here, pixels, *scene.limits
+            )
+            grad_colors = torch.bmm(pixels, weight.transpose(1, 2))  # [B, D, S]
+        else:
+            grad_log, grad_colors, behind_here = _blend_chunk_backward(scene, pairs, before, behind_here, pixels, work)
+        if rows is None:
+            behind = behind_here
+        else:
+            behind.index_copy_(0, rows, behind_here)
+
+        packed = sums[here]
+        packed[:, MOMENTS : MOMENTS + channels].view(b, s, channels).copy_(grad_colors.transpose(1, 2))
+        flat = grad_log.view(-1, PIXELS)
+        if sums.shape[1] > MOMENTS + channels:  # absolute gradients of the means
+            for column, slope in enumerate(mean_slopes(pairs.coefficients)):
+                slope = torch.mm(slope, scene.basis[:3], out=work.array(0, b, s).view(-1, PIXELS))
+                packed[:, MOMENTS + channels + column] = slope.mul_(flat).abs_().sum(-1)
+        moments(pairs, torch.mm(scene.basis, flat.T), packed)
 
 
 def _blend_region_backward(
@@ -301,56 +355,19 @@ def _blend_region_backward(
     absgrad: bool,
 ) -> Tensor:
     """Moments, colour gradients and absolute gradients of the Gaussians from one region, (M, MOMENTS + D [+ 2])."""
-    channels = scene.channels
-    columns = MOMENTS + channels + (2 if absgrad else 0)
-    total = sum(chunk.before.shape[0] * chunk.size for chunks in tape for chunk in chunks)
-    sums = grad_image.new_empty(total + 1, columns)  # of pairs, in the order of the tape; the last is zero
+    sizes = [sum(chunk.before.shape[0] * chunk.size for chunk in chunks) for chunks in tape]
+    total = sum(sizes)
+    sums = grad_image.new_empty(total + 1, MOMENTS + scene.channels + (2 if absgrad else 0))  # in the tape's order
     sums[-1] = 0.0
     place = frame.gaussians.new_empty(total)  # in the pair list
-    done = 0
-    work = _Work(frame, grad_image, 3)
-
-    for chunks in tape:
-        whole = chunks[0].tiles.ids
-        block_pixels = grad_image.index_select(0, whole)  # [B, D, 64]
-        # what lies behind: sum over later Gaussians of weight * (color . grad), and the background
-        behind = grad_final.index_select(0, whole) * final.index_select(0, whole)
-        for tiles, rows, first, s, before in reversed(chunks):
-            b = before.shape[0]
-            pixels = block_pixels if rows is None else block_pixels.index_select(0, rows)
-            here = slice(done, done + b * s)
-            done += b * s
-            place[here] = frame.pairs(tiles, first, s)
-            pairs = gather(scene.table, frame.gaussians.index_select(0, place[here]), tiles.x, tiles.y)
-            behind_here = behind if rows is None else behind.index_select(0, rows)
-            if scene.fused and b >= SMALLEST:
-                grad_log, weight, behind_here = scene.fused.backward(
-                    pairs.rows, scene.basis, before, behind_here, pixels, *scene.limits
-                )
-                grad_colors = torch.bmm(pixels, weight.transpose(1, 2))  # [B, D, S]
-            else:
-                grad_log, grad_colors, behind_here = _blend_chunk_backward(
-                    scene, pairs, before, behind_here, pixels, work
-                )
-            if rows is None:
-                behind = behind_here
-            else:
-                behind.index_copy_(0, rows, behind_here)
-
-            packed = sums[here]
-            packed[:, MOMENTS : MOMENTS + channels].view(b, s, channels).copy_(grad_colors.transpose(1, 2))
-            flat = grad_log.view(-1, PIXELS)
-            if absgrad:
-                for column, slope in enumerate(mean_slopes(pairs.coefficients)):
-                    slope = torch.mm(slope, scene.basis[:3], out=work.array(0, b, s).view(-1, PIXELS))
-                    packed[:, MOMENTS + channels + column] = slope.mul_(flat).abs_().sum(-1)
-            moments(pairs, torch.mm(scene.basis, flat.T), packed)
+    work = _Work(frame, grad_image)
+    for block in zip(tape, place.split(sizes), sums[:-1].split(sizes), strict=True):
+        _blend_block_backward(frame, scene, work, final, grad_image, grad_final, *block)
 
     # group the sums of pairs by Gaussian; pairs behind a saturated tile have no sum
     by_place = place.new_full((frame.pairs_count + 1,), total)
-    by_place[place] = torch.arange(total, device=place.device)
-    by_gaussian = torch.empty_like(frame.list.places)
-    by_gaussian[frame.list.places] = by_place[:-1]
+    by_place.index_copy_(0, place, torch.arange(total, device=place.device))
+    by_gaussian = torch.empty_like(frame.list.places).index_copy_(0, frame.list.places, by_place[:-1])
     counts = frame.list.counts
     in_depth_order = F.embedding_bag(by_gaussian, sums, torch.cumsum(counts, 0) - counts, mode="sum")
     return torch.empty_like(in_depth_order).index_copy_(0, frame.list.order, in_depth_order)
@@ -362,9 +379,12 @@ class Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means2d, cov2d, det, opacities, colors, footprints, region, keep_lists, options, absgrad_of):
         """The lists are kept for the backward pass only if ``keep_lists``."""
-        frame = _Frame(footprints, region, means2d.dtype)
-        image = colors.new_zeros(frame.tiles, colors.shape[1], PIXELS)
-        final = colors.new_ones(frame.tiles, PIXELS)
+        frame = _Frame(footprints, region, means2d.dtype, options.compiled)
+        image = colors.new_empty(frame.tiles, colors.shape[1], PIXELS)
+        final = colors.new_empty(frame.tiles, PIXELS)
+        if frame.occupied < frame.tiles:
+            image.zero_()
+            final.fill_(1.0)
         needs_grad = any(ctx.needs_input_grad)
         scene = _Scene.of(means2d, cov2d, det, opacities, colors, options)
         tape = _blend_region(frame, scene, image, final, needs_grad and keep_lists)
@@ -382,7 +402,7 @@ class Blend(torch.autograd.Function):
         if ctx.kept:
             frame, tape = ctx.kept
         else:
-            frame = _Frame(footprints, region, means2d.dtype)
+            frame = _Frame(footprints, region, means2d.dtype, options.compiled)
             tape = _blend_region(frame, scene, torch.empty_like(grad_image), torch.empty_like(final), True)
         summed = _blend_region_backward(frame, scene, tape, final, grad_image, grad_final, absgrad_of is not None)
         first, last = MOMENTS, MOMENTS + scene.channels

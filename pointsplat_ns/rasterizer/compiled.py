@@ -100,7 +100,7 @@ def blend_chunk_backward(
 
 @functools.cache
 def kernels(channels: int) -> Kernels | None:
-    """Kernels for float32 on a CPU and so many channels, compiled at the first call; if that fails, None and a warning."""
+    """Kernels for float32 on a CPU and so many channels, made at the first call; if that fails, None and a warning."""
     try:
         made = Kernels(
             torch.compile(blend_chunk, dynamic=True, fullgraph=True),

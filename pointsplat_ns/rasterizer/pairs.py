@@ -95,14 +95,13 @@ def moments(pairs: Pairs, sums: Tensor, out: Tensor) -> None:
     q = torch.addcmul(gu, r, gv, value=-1.0)
     h = torch.addcmul(guv, r, gvv, value=-1.0)
     guu.addcmul_(r, guv.add_(h), value=-1.0)
-    first = torch.addcmul(q, s, g)
-    dv = torch.addcmul(gv, ey, g)
-    out[:, 0] = first
-    out[:, 1] = guu.addcmul_(s, first.add_(q))
-    out[:, 2] = dv
-    out[:, 4] = h.addcmul_(s, dv).addcmul_(ey, q)
-    out[:, 3] = gvv.addcmul_(ey, dv.add_(gv))
-    out[:, 5] = g
+    w, ww, v, vv, wv, one = out.unbind(1)[:MOMENTS]
+    one.copy_(g)
+    torch.addcmul(q, s, g, out=w)
+    torch.addcmul(gv, ey, g, out=v)
+    torch.addcmul(guu, s, w + q, out=ww)
+    torch.addcmul(gvv, ey, gv.add_(v), out=vv)
+    torch.addcmul(h.addcmul_(ey, q), s, v, out=wv)
 
 
 def mean_slopes(coefficients: Tensor) -> tuple[Tensor, Tensor]:

@@ -7,6 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from pointsplat_ns.rasterizer.backends import use_gsplat
 from pointsplat_ns.rasterizer.blending import MEMORY_BUDGET, BlendOptions, blend
 from pointsplat_ns.rasterizer.constants import EPS2D, QUALITIES, TILE, Quality
 from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, project
@@ -88,6 +89,7 @@ def rasterization(
     absgrad: bool = False,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     channel_chunk: int = 32,
+    backend: Literal["torch", "gsplat", "auto"] = "torch",
     quality: QualityName | Quality = "exact",
     compiled: bool = False,
     memory_budget: int = MEMORY_BUDGET,
@@ -127,6 +129,8 @@ def rasterization(
         absgrad: after the backward pass ``meta["means2d"].absgrad`` holds the sum over pixels of
             the absolute gradient (AbsGS, arXiv 2404.10484).
         rasterize_mode: ``antialiased`` scales opacities by the compensation of Mip-Splatting.
+        backend: what draws. "gsplat" hands everything to gsplat itself, which needs CUDA; "auto" does so
+            where it can. What follows has no effect on gsplat.
         quality: what to give up for speed, by name or as thresholds; see ``QUALITIES``.
         compiled: blend with kernels made by ``torch.compile`` where there is a C++ compiler (CPU,
             float32). Making them takes a minute once; without a compiler a warning says why and the
@@ -143,7 +147,15 @@ def rasterization(
 
     Raises:
         ValueError: if a shape or option does not fit.
+        PointSplatError: if gsplat is asked for and cannot be used.
     """
+    if backend != "torch" and use_gsplat(backend, means.device):
+        from gsplat.rendering import rasterization as gsplat_rasterization
+
+        return gsplat_rasterization(
+            means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane, radius_clip,
+            eps2d, sh_degree, packed, 16, backgrounds, render_mode, sparse_grad, absgrad, rasterize_mode, channel_chunk,
+        )  # fmt: skip
     opacities = opacities.reshape(-1) if opacities.dim() == 2 else opacities
     _check(means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds, render_mode)
     dtype = means.dtype if means.dtype in (torch.float32, torch.float64) else torch.float32

@@ -101,10 +101,13 @@ class Footprints:
         shapes = torch.stack([*means2d.unbind(-1), level, 1.0 / yy, peak, slope, variance], dim=-1)
         self.shapes = shapes.index_select(0, self.order)  # [M, 7]
         self.camera_ids = camera_ids.index_select(0, self.order)
-        my = self.shapes[:, 1]
-        half_y = (level * yy).sqrt_().index_select(0, self.order).add_(_SLACK)
+        mx, my = self.shapes[:, 0], self.shapes[:, 1]
+        half_x, half_y = ((level * v).sqrt_().index_select(0, self.order).add_(_SLACK) for v in (xx, yy))
+        # the box around the ellipse, in tiles
         self.row0 = _tile_of(my - half_y, up=True, tiles=self.rows)
         self.row1 = _tile_of(my + half_y, up=False, tiles=self.rows)
+        self.column0 = _tile_of(mx - half_x, up=True, tiles=self.columns)
+        self.widths = (_tile_of(mx + half_x, up=False, tiles=self.columns) - self.column0 + 1).clamp_min_(0)
 
     @property
     def whole(self) -> Region:
@@ -118,37 +121,19 @@ class Footprints:
         """
         if self.order.numel() * self.rows * self.columns <= most_pairs:
             return [self.whole]
-        # one row of tiles has at most `columns` pairs for each Gaussian that reaches it
-        reached = torch.zeros(self.rows + 1, dtype=torch.int64, device=self.row0.device)
-        touching = self.row1 >= self.row0
-        ones = touching.long()
-        reached.index_add_(0, self.row0.clamp_max(self.rows), ones)
-        reached.index_add_(0, (self.row1 + 1).clamp(0, self.rows), -ones)
-        bound = [count * self.columns for count in torch.cumsum(reached, 0)[:-1].tolist()]
-        if sum(bound) > most_pairs:
-            bound = self._row_pairs().tolist()
-        regions, top, total = [], 0, 0
-        for row, pairs in enumerate(bound):
-            if total + pairs > most_pairs and row > top:
-                regions.append(Region(top, row, 0, self.columns))
-                top, total = row, 0
-            total += pairs
-            if pairs > most_pairs:  # even one row is too many
-                parts = min(-(-pairs // most_pairs), self.columns)
-                edges = [self.columns * part // parts for part in range(parts + 1)]
-                regions += [Region(row, row + 1, a, b) for a, b in zip(edges, edges[1:], strict=False)]
-                top, total = row + 1, 0
-        if top < self.rows:
-            regions.append(Region(top, self.rows, 0, self.columns))
+        heights = (self.row1 - self.row0 + 1).clamp_min_(0)
+        if int((heights * self.widths).sum()) <= most_pairs:  # boxes around the ellipses
+            return [self.whole]
+        widths = torch.where(heights > 0, self.widths, 0)
+        regions = []
+        for top, bottom, pairs in _intervals(_spread(self.row0, heights, widths, self.rows), most_pairs):
+            if pairs <= most_pairs:
+                regions.append(Region(top, bottom, 0, self.columns))
+                continue
+            reaching = (self.row0 <= top) & (self.row1 >= top)  # one row of tiles is too many
+            columns = _spread(self.column0[reaching], self.widths[reaching], 1, self.columns)
+            regions += [Region(top, bottom, left, right) for left, right, _ in _intervals(columns, most_pairs)]
         return regions
-
-    def _row_pairs(self) -> Tensor:
-        """Pairs of each row of tiles, (rows,) int64: exact, from one row at a time."""
-        counts = []
-        for row in range(self.rows):
-            _, column0, column1 = self._strips(Region(row, row + 1, 0, self.columns))[1:4]
-            counts.append((column1 - column0 + 1).clamp_min_(0).sum())
-        return torch.stack(counts)
 
     def _strips(self, region: Region) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Each row of tiles that each Gaussian reaches: the Gaussian (depth order), the row, first and last column."""
@@ -188,6 +173,26 @@ class Footprints:
         edges = torch.arange(tiles + 1, device=tile.device, dtype=tile.dtype if tiles < 2**15 - 1 else torch.int64)
         offsets = torch.searchsorted(tile.to(edges.dtype), edges)
         return TileList(gaussian.index_select(0, places), offsets, places, counts, self.order, region)
+
+
+def _spread(first: Tensor, lengths: Tensor, amounts: Tensor | int, bins: int) -> list[int]:
+    """What each bin gets when each item gives its amount to ``lengths`` bins from ``first`` on."""
+    amounts = torch.where(lengths > 0, amounts, 0)  # a negative length is none
+    steps = torch.zeros(bins + 1, dtype=torch.int64, device=first.device)
+    steps.index_add_(0, first.clamp(0, bins), amounts)
+    steps.index_add_(0, (first + lengths).clamp(0, bins), -amounts)
+    return torch.cumsum(steps, 0)[:-1].tolist()
+
+
+def _intervals(amounts: list[int], most: int) -> list[tuple[int, int, int]]:
+    """Consecutive bins put together as long as their sum is at most ``most``: first, end and sum."""
+    intervals, first, total = [], 0, 0
+    for i, amount in enumerate(amounts):
+        if i > first and total + amount > most:
+            intervals.append((first, i, total))
+            first, total = i, 0
+        total += amount
+    return [*intervals, (first, len(amounts), total)]
 
 
 def intersect_tiles(

@@ -1,0 +1,184 @@
+"""Options of blending that must not change the image, or change it by what they say."""
+
+import os
+import shutil
+import subprocess
+import sys
+import warnings
+
+import pytest
+import torch
+
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.rasterizer import blending, rasterization
+from pointsplat_ns.rasterizer.compiled import kernels
+from pointsplat_ns.rasterizer.constants import CHUNK, QUALITIES
+from pointsplat_ns.rasterizer.tiles import Footprints
+
+WIDTH, HEIGHT = 70, 45  # neither is a multiple of the tile
+
+
+def make_scene(n=400, seed=0, size=-2.2, dtype=torch.float32):
+    g = torch.Generator().manual_seed(seed)
+    means = torch.randn(n, 3, generator=g, dtype=torch.float64) * torch.tensor([1.2, 1.0, 0.5]) + torch.tensor(
+        [0, 0, 3]
+    )
+    quats = torch.randn(n, 4, generator=g, dtype=torch.float64)
+    stds = torch.exp(torch.randn(n, 3, generator=g, dtype=torch.float64) * 0.7 + size)
+    opacities = torch.rand(n, generator=g, dtype=torch.float64)
+    sh = 0.3 * torch.randn(n, 16, 3, generator=g, dtype=torch.float64)
+    return [t.to(dtype).requires_grad_() for t in (means, quats, stds, opacities, sh)]
+
+
+def draw(scene, absgrad=False, **options):
+    """Image, alphas, gradients of the scene and, if asked for, the absolute gradients."""
+    dtype = scene[0].dtype
+    K = torch.tensor([[50.0, 0, 33], [0, 52, 21], [0, 0, 1]], dtype=dtype)
+    view = torch.eye(4, dtype=dtype)
+    for tensor in scene:
+        tensor.grad = None
+    image, alphas, meta = rasterization(
+        *scene, view[None], K[None], WIDTH, HEIGHT, sh_degree=3, absgrad=absgrad, **options
+    )
+    slope = torch.linspace(0.2, 1, WIDTH, dtype=dtype)[None, None, :, None]
+    ((image * slope).sum() + (alphas * slope).square().sum()).backward()
+    results = [image.detach(), alphas.detach(), *(t.grad.clone() for t in scene)]
+    return results + ([meta["means2d"].absgrad.clone()] if absgrad else [])
+
+
+def assert_same(results, wanted, tolerance):
+    for got, true in zip(results, wanted, strict=True):
+        assert (got - true).abs().max() <= tolerance * true.abs().max()
+
+
+@pytest.mark.parametrize("pairs", [1, 40, 300, 2000])
+def test_a_lower_memory_budget_changes_neither_image_nor_gradients(pairs):
+    scene = make_scene(dtype=torch.float64)
+    wanted = draw(scene, absgrad=True)
+    got = draw(scene, absgrad=True, memory_budget=pairs * blending._BYTES_PER_PAIR)
+    assert_same(got, wanted, 1e-12)  # sums over regions in another order
+
+
+def test_regions_cover_every_tile_once_and_keep_within_the_budget_where_tiles_allow():
+    g = torch.Generator().manual_seed(3)
+    n = 300
+    means2d = torch.rand(n, 2, generator=g) * torch.tensor([200.0, 120.0])
+    cov2d = torch.tensor([[30.0, 5.0, 20.0]]).repeat(n, 1)
+    det = cov2d[:, 0] * cov2d[:, 2] - cov2d[:, 1] ** 2
+    footprints = Footprints(
+        means2d, cov2d, det, torch.full((n,), 0.9), torch.rand(n, generator=g), torch.zeros(n, dtype=torch.int64),
+        1, 200, 120,
+    )  # fmt: skip
+    total = footprints.tiles(footprints.whole).gaussians.numel()
+    for most in (10, 200, 1000, total * 10):
+        regions = footprints.regions(most)
+        seen = torch.zeros(footprints.rows, footprints.columns)
+        pairs = 0
+        for region in regions:
+            seen[region.top : region.bottom, region.left : region.right] += 1
+            count = footprints.tiles(region).gaussians.numel()
+            pairs += count
+            one_tile = region.bottom - region.top == 1 and region.right - region.left == 1
+            if most >= 200:
+                assert count <= most or one_tile
+        assert bool((seen == 1).all())
+        assert pairs == total
+    assert len(footprints.regions(total * 10)) == 1
+
+
+@pytest.mark.parametrize("n,size", [(20, 0.5), (3000, -4.0)])
+def test_long_chunks_of_few_tiles_equal_short_ones(n, size, monkeypatch):
+    scene = make_scene(n=n, size=size, seed=n, dtype=torch.float64)
+    long = draw(scene)
+    monkeypatch.setattr(blending, "_LONGEST_CHUNK", CHUNK)
+    assert_same(long, draw(scene), 1e-12)  # products and sums in another order
+
+
+def test_a_million_to_one_stack_is_blended_front_to_back():
+    """2,000 Gaussians on one spot: one tile, long chunks; the closed form is 1 - (1 - a)^n until the pixel stops."""
+    n, alpha = 2000, 0.01
+    scene = [
+        torch.tensor([[0.0, 0.0, 2.0]]).repeat(n, 1), torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        torch.full((n, 3), 5.0), torch.full((n,), alpha), torch.ones(n, 3),
+    ]  # fmt: skip
+    K = torch.tensor([[50.0, 0, 3.5], [0, 50, 3.5], [0, 0, 1]])
+    image, alphas, _ = rasterization(*scene, torch.eye(4)[None], K[None], 8, 8)
+    drawn = 916  # the first n with 0.99^n <= 1e-4 is 917: that one is not drawn
+    wanted = 1 - (1 - alpha) ** drawn
+    assert abs(float(alphas[0, 3, 3, 0]) - wanted) < 1e-5  # float32 product of 916 factors
+    assert abs(float(image[0, 3, 3, 0]) - wanted) < 1e-5
+
+
+def test_lower_qualities_are_within_the_error_they_state_and_in_order():
+    scene = make_scene(n=2000, size=-3.0)
+    exact = draw(scene)[0]
+    errors = {name: float((draw(scene, quality=name)[0] - exact).square().mean()) for name in QUALITIES}
+    assert errors["exact"] == 0
+    assert 0 < errors["balanced"] < errors["fast"]
+    assert errors["balanced"] < 10 ** (-45 / 10)  # 53 dB and more on trained scenes; this one is all edges
+    with pytest.raises(KeyError):
+        draw(scene, quality="worst")
+
+
+def test_gradients_of_a_lower_quality_are_those_of_its_image():
+    scene = make_scene(n=30, size=-1.0, dtype=torch.float64)
+    grads = draw(scene, quality="fast")[2:]
+    step = 1e-6
+    for which, row in ((0, 3), (2, 11), (3, 7)):
+        values = []
+        for sign in (1, -1):
+            moved = [t.detach().clone().requires_grad_() for t in scene]
+            with torch.no_grad():
+                moved[which].view(len(moved[which]), -1)[row, 0] += sign * step
+            image, alphas = draw(moved, quality="fast")[:2]
+            slope = torch.linspace(0.2, 1, WIDTH, dtype=torch.float64)[None, None, :, None]
+            values.append(float((image * slope).sum() + (alphas * slope).square().sum()))
+        numeric = (values[0] - values[1]) / (2 * step)
+        analytic = float(grads[which].reshape(len(scene[which]), -1)[row, 0])
+        assert abs(numeric - analytic) <= 2e-3 * (1 + abs(analytic))  # a pixel may cross the threshold
+
+
+def test_gsplat_on_a_cpu_is_refused_in_one_line_and_auto_draws_with_torch():
+    scene = make_scene(n=20)
+    with pytest.raises(PointSplatError, match="backend gsplat: the Gaussians are on cpu .* use auto or torch"):
+        draw(scene, backend="gsplat")
+    with pytest.raises(ValueError, match="expected torch, gsplat or auto"):
+        draw(scene, backend="vulkan")
+    assert torch.equal(draw(scene, backend="auto")[0], draw(scene)[0])
+
+
+@pytest.mark.skipif(shutil.which(os.environ.get("CXX", "g++")) is None, reason="there is no C++ compiler")
+def test_compiled_kernels_equal_eager_ones():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        warnings.filterwarnings("ignore", module="torch")
+        assert kernels(3) is not None
+    scene = make_scene(n=3000, size=-2.5)
+    assert_same(draw(scene, absgrad=True, compiled=True), draw(scene, absgrad=True), 2e-5)  # float32, other order
+
+
+PROBE = """
+import torch, warnings, sys
+warnings.simplefilter("ignore")
+with warnings.catch_warnings(record=True) as told:
+    warnings.simplefilter("always")
+    from pointsplat_ns.rasterizer.compiled import kernels
+    made = kernels(3)
+ours = [str(w.message) for w in told if "stays eager" in str(w.message)]
+print("NONE" if made is None else "MADE", len(ours), ours[0] if ours else "", sep="|")
+"""
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [{"CXX": "/nonexistent/c++"}, {"TORCHINDUCTOR_CACHE_DIR": "/proc/nothing"}],
+    ids=["no compiler", "no cache"],
+)
+def test_without_a_compiler_or_a_cache_the_eager_path_is_used_and_one_line_says_why(broken, tmp_path):
+    environment = {**os.environ, "TORCHINDUCTOR_CACHE_DIR": str(tmp_path), **broken}
+    ran = subprocess.run([sys.executable, "-c", PROBE], env=environment, capture_output=True, text=True, timeout=300)
+    assert ran.returncode == 0, ran.stderr
+    made, count, message = ran.stdout.strip().splitlines()[-1].split("|", 2)
+    assert (made, count) == ("NONE", "1")
+    assert "stays eager" in message
+    assert len(message) < 300
