@@ -22,7 +22,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.metrics import ImageError, psnr
-from pointsplat_ns.pruning import SCORES, prune
+from pointsplat_ns.pruning import METHODS, compact
 from pointsplat_ns.refined_run import prune_options
 from pointsplat_ns.refiner import Refiner, Structure, preset
 from pointsplat_ns.splatfacto_cpu import SplatfactoCpuModel, SplatfactoCpuModelConfig, viewmats_of
@@ -35,10 +35,11 @@ class PointSplatModelConfig(SplatfactoCpuModelConfig):
     _target: type = field(default_factory=lambda: PointSplatModel)
     keep: float = 0.3
     """Gaussians to keep: a ratio in (0, 1], or a count if above 1."""
-    score: str = "paper"
-    """Score that chooses them: paper (eq. 3), opacity, volume or random."""
+    score: str = "merge"
+    """How they are chosen: merge puts one Gaussian in the place of neighbours; a score leaves Gaussians out: coverage,
+    paper (eq. 3), authors, opacity, volume, log-volume, area or random."""
     opacity_weight: float = 0.3
-    """Lambda of the paper's score: the weight of opacity; that of volume is what is left of 1."""
+    """Lambda of the scores that have one (paper, authors, log-volume): the weight of opacity against volume."""
     size: Literal["tiny", "small", "full"] = "small"
     """Size of the network: full is the paper's and wants a GPU; small and tiny are for a CPU."""
     encoder: Literal["dual", "concat"] = "dual"
@@ -61,7 +62,7 @@ class PrunedScene:
 
 
 def options_of(config: PointSplatModelConfig) -> dict[str, Any]:
-    """Arguments of :func:`pointsplat_ns.pruning.prune` that a config asks for."""
+    """Arguments of :func:`pointsplat_ns.pruning.compact` that a config asks for."""
     return prune_options(config.keep, config.score, config.opacity_weight)
 
 
@@ -77,8 +78,8 @@ class PointSplatModel(SplatfactoCpuModel):
             PointSplatError: if no scene could be pruned as the config asks.
         """
         options_of(self.config)
-        if self.config.score not in SCORES:
-            raise PointSplatError(f"no score is called {self.config.score!r}; expected one of {', '.join(SCORES)}")
+        if self.config.score not in METHODS:
+            raise PointSplatError(f"no score is called {self.config.score!r}; expected one of {', '.join(METHODS)}")
         self.refiner = Refiner(preset(self.config.size, encoder=self.config.encoder))
         self.camera_optimizer = CameraOptimizerConfig(mode="off").setup(num_cameras=1, device="cpu")
         self.crop_box = None
@@ -125,7 +126,7 @@ class PointSplatModel(SplatfactoCpuModel):
             dense = scene.read_dense() if dense is None else dense
             start = time.perf_counter()
             try:
-                pruned = prune(dense, **options_of(self.config)).scene
+                pruned = compact(dense, **options_of(self.config))
             except PointSplatError as error:
                 raise type(error)(f"{scene.run.checkpoint}: {error}") from error
             seconds = time.perf_counter() - start

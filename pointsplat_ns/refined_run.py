@@ -13,7 +13,7 @@ from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import Run, find_runs, open_run, scene_names, shown_scene
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
-from pointsplat_ns.pruning import prune
+from pointsplat_ns.pruning import WEIGHTED, compact
 from pointsplat_ns.refiner import Refiner, preset
 
 METHOD = "pointsplat"
@@ -43,11 +43,11 @@ class RefinedRun:
             SceneError: if the scene has a higher SH degree than the refiner.
         """
         options = self.prune_options if keep is None else {**self.prune_options, "keep": keep}
-        return self.refiner(prune(dense, **options).scene)
+        return self.refiner(compact(dense, **options))
 
 
 def prune_options(keep: float, score: str, opacity_weight: float) -> dict[str, Any]:
-    """Arguments of :func:`pointsplat_ns.pruning.prune` for a model's settings; ``keep`` above 1 is a count.
+    """Arguments of :func:`pointsplat_ns.pruning.compact` for a model's settings; ``keep`` above 1 is a count.
 
     Raises:
         BudgetError: if ``keep`` is neither a ratio nor a whole number.
@@ -57,7 +57,7 @@ def prune_options(keep: float, score: str, opacity_weight: float) -> dict[str, A
             f"keep is {keep:g}; expected a ratio above 0 and up to 1 (such as 0.3) or a whole number of Gaussians "
             "(such as 50000)"
         )
-    extra = {"opacity_weight": opacity_weight} if score == "paper" else {}
+    extra = {"opacity_weight": opacity_weight} if score in WEIGHTED else {}
     return {"keep": int(keep) if keep > 1 else float(keep), "by": score, **extra}
 
 

@@ -26,7 +26,7 @@ from pointsplat_ns.lpips import load_lpips
 from pointsplat_ns.metrics import ImageError
 from pointsplat_ns.pipeline import REFINER_NAME
 from pointsplat_ns.pointsplat_method import RATES, pointsplat_config
-from pointsplat_ns.pruning import prune
+from pointsplat_ns.pruning import compact, prune
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.refiner import load_refiner
 from pointsplat_ns.refiner.weights import read_metadata
@@ -40,7 +40,7 @@ def small_config(data: Path, output_dir: Path, steps: int = 10, **model):
     config.machine.device_type = "cpu"
     config.output_dir, config.max_num_iterations, config.experiment_name = output_dir, steps, "refiner"
     config.pipeline.datamanager.data = config.data = data
-    for name, value in {"size": "tiny", "keep": 0.5, "lpips_weight": 0.0, **model}.items():
+    for name, value in {"size": "tiny", "keep": 0.5, "score": "paper", "lpips_weight": 0.0, **model}.items():
         setattr(config.pipeline.model, name, value)
     config.set_timestamp()
     return config
@@ -84,6 +84,16 @@ def trained(trained_walls, run_training, tmp_path_factory):
 # pruning and the untrained network
 
 
+def test_by_default_scenes_are_merged(trained_walls):
+    assert pointsplat_config().pipeline.model.score == "merge"
+    pipeline = pipeline_of(trained_walls, score="merge", keep=0.25)
+    dense = read_scene(run_of(trained_walls, "wall-a"))
+    wanted = compact(dense, 0.25, "merge")
+    made = pipeline.model.pruned_scene(0).pruned
+    assert len(made) == len(dense) // 4
+    assert same(made, wanted)
+
+
 def test_untrained_the_refined_scene_is_the_pruned_one_to_the_bit(trained_walls):
     pipeline = pipeline_of(trained_walls)
     for index, scene in enumerate(pipeline.datamanager.scenes):
@@ -113,7 +123,7 @@ def test_what_one_scene_cannot_give_names_the_scene(trained_walls):
     pipeline = pipeline_of(trained_walls, keep=1e6)
     with pytest.raises(BudgetError, match=r"wall-a.*\.ckpt: keep is 1000000 Gaussians; expected 1 to"):
         pipeline.model.pruned_scene(0)
-    with pytest.raises(PointSplatError, match="no score is called 'beauty'; expected one of paper"):
+    with pytest.raises(PointSplatError, match="no score is called 'beauty'; expected one of merge"):
         pipeline_of(trained_walls, score="beauty")
     with pytest.raises(PointSplatError, match="opacity_weight is 1.5; expected 0 to 1"):
         pipeline_of(trained_walls, opacity_weight=1.5).model.pruned_scene(0)
@@ -127,7 +137,10 @@ def test_a_scene_is_drawn_as_it_was_trained(trained_walls):
         modes.append((arguments["rasterize_mode"], arguments["sh_degree"]))
         return rasterization(**arguments)
 
-    with mock.patch.object(type(pipeline.model), "_rasterization", lambda self: recorded), torch.no_grad():
+    with (
+        mock.patch.object(type(pipeline.model), "_rasterization", lambda self, **arguments: recorded(**arguments)),
+        torch.no_grad(),
+    ):
         for index in (0, 1):
             pipeline.model.losses(index, [next(pipeline.datamanager.held_out(index))])
     assert modes == [("classic", 3), ("antialiased", 1)]

@@ -2,33 +2,80 @@
 
 from __future__ import annotations
 
+import math
+import re
+from dataclasses import dataclass
 from numbers import Integral, Real
 
 from pointsplat_ns.errors import BudgetError
 
-WANTED = "expected a ratio above 0 and up to 1.0 (such as 0.3) or a whole number of Gaussians (such as 50000)"
+WANTED = (
+    "expected a ratio above 0 and up to 1.0 (such as 0.3), a percentage (30%), a whole number of Gaussians "
+    "(such as 50000) or a size (12MB)"
+)
+
+AUTO_PSNR = 35.0
+"""PSNR in dB, against the dense scene's own renders, that ``auto`` stands for. Of a scene that matches its photos at
+30 dB an unrelated error of this size takes 1.2 dB, of one that matches them at 25 dB, 0.4 dB."""
 
 
-def resolve_keep(n: int, keep: float | int) -> int:
+@dataclass(frozen=True)
+class Megabytes:
+    """A budget: the PLY written is at most this big, in units of 10^6 bytes."""
+
+    value: float
+
+
+@dataclass(frozen=True)
+class WithinPsnr:
+    """A budget: the smallest scene whose renders reach this PSNR (dB) against the dense scene's own."""
+
+    value: float
+
+
+Keep = float | int | Megabytes | WithinPsnr
+
+
+def ply_bytes(count: int, sh_degree: int) -> int:
+    """Size of the 3DGS PLY of ``count`` Gaussians, bytes: an ASCII header, then 17 numbers a Gaussian (normals
+    included) and three for each SH coefficient beyond the constant one, as float32."""
+    rest = 3 * ((sh_degree + 1) ** 2 - 1)
+    names = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest))]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property float {name}" for name in names] + ["end_header"]
+    return sum(len(line) + 1 for line in lines) + 4 * len(names) * count
+
+
+def resolve_keep(n: int, keep: Keep, sh_degree: int = 3) -> int:
     """The number of Gaussians that a budget means for a scene of ``n``.
 
     The type decides: a float is a ratio and an int is a count, so ``1.0`` keeps everything and ``1``
-    keeps one Gaussian. A ratio is rounded to the nearest count, a half up, and keeps at least one.
+    keeps one Gaussian. A ratio is rounded to the nearest count, a half up, and keeps at least one. A
+    size is a limit: it keeps as many as fit, and everything if everything fits.
 
     Args:
         n: number of Gaussians in the scene.
-        keep: float ratio in (0, 1] or int count in 1..n.
+        keep: float ratio in (0, 1], int count in 1..n, or :class:`Megabytes`.
+        sh_degree: of the scene that will be written; it matters to a size alone.
 
     Returns:
         The count, in 1..n.
 
     Raises:
-        BudgetError: if ``keep`` is out of its range, NaN or no number, or if the scene is empty.
+        BudgetError: if ``keep`` is out of its range, NaN or no number, if it needs renders to be resolved
+            (:class:`WithinPsnr`), or if the scene is empty.
 
     Example:
         >>> resolve_keep(1000, 0.3), resolve_keep(1000, 1), resolve_keep(1000, 1.0)
         (300, 1, 1000)
+        >>> resolve_keep(1000, Megabytes(0.1), sh_degree=0)
+        1000
     """
+    if isinstance(keep, WithinPsnr):
+        raise BudgetError("keep is auto, which is found by rendering; expected a ratio, a count or a size here")
+    if isinstance(keep, Megabytes):
+        return _that_fit(n, keep.value, sh_degree)
     if isinstance(keep, bool) or not isinstance(keep, Real):
         raise BudgetError(f"keep is {keep!r}; {WANTED}")
     if n < 1:
@@ -42,20 +89,50 @@ def resolve_keep(n: int, keep: float | int) -> int:
     return min(n, max(1, int(n * float(keep) + 0.5)))
 
 
-def parse_keep(text: str) -> float | int:
-    """A budget as a person types it: ``0.3`` and ``30%`` are ratios, ``50000`` is a count.
+def _that_fit(n: int, megabytes: float, sh_degree: int) -> int:
+    """How many of ``n`` Gaussians fit into a PLY of so many megabytes."""
+    if not 0 < megabytes < math.inf:
+        raise BudgetError(f"keep is {megabytes:g}MB; {WANTED}")
+    if n < 1:
+        raise BudgetError(f"keep is {megabytes:g}MB but the scene holds no Gaussians; expected at least one")
+    limit = math.floor(megabytes * 1e6)
+    each = ply_bytes(1, sh_degree) - ply_bytes(0, sh_degree)
+    count = min(n, max(0, (limit - ply_bytes(0, sh_degree)) // each))
+    while count > 0 and ply_bytes(count, sh_degree) > limit:  # the count's own digits in the header
+        count -= 1
+    if count < 1:
+        least = ply_bytes(1, sh_degree)
+        raise BudgetError(
+            f"keep is {megabytes:g}MB, too small for one Gaussian of SH degree {sh_degree}; expected at least "
+            f"{least / 1e6:g}MB"
+        )
+    return count
+
+
+def parse_keep(text: str) -> Keep:
+    """A budget as a person types it: ``0.3`` and ``30%`` are ratios, ``50000`` is a count, ``12MB`` is a size,
+    ``auto`` and ``auto:35`` the PSNR (dB) that renders must reach against the dense scene's own.
 
     Raises:
-        BudgetError: if it is neither. The range is for :func:`resolve_keep` to judge.
+        BudgetError: if it is none of these. The range of a ratio, count or size is for :func:`resolve_keep` to judge.
 
     Example:
-        >>> parse_keep("30%"), parse_keep("50000"), parse_keep("1"), parse_keep("1.0")
-        (0.3, 50000, 1, 1.0)
+        >>> parse_keep("30%"), parse_keep("50000"), parse_keep("1"), parse_keep("1.0"), parse_keep("12MB")
+        (0.3, 50000, 1, 1.0, Megabytes(value=12.0))
     """
     text = text.strip()
     try:
+        if text == "auto":
+            return WithinPsnr(AUTO_PSNR)
+        if text.startswith("auto:"):
+            psnr = float(text[5:].removesuffix("dB"))
+            if not 0 < psnr < math.inf:
+                raise ValueError
+            return WithinPsnr(psnr)
+        if re.fullmatch(r".*[mM][bB]", text):
+            return Megabytes(float(text[:-2]))
         if text.endswith("%"):
             return float(text[:-1]) / 100
         return int(text) if text.lstrip("+-").isdigit() else float(text)
     except ValueError as error:
-        raise BudgetError(f"keep is {text!r}; {WANTED}") from error
+        raise BudgetError(f"keep is {text!r}; {WANTED}, or auto or auto:DB (such as auto:35)") from error

@@ -1,7 +1,8 @@
-"""Scores of Gaussians: the higher, the more worth keeping.
+"""Scores of Gaussians by their own attributes: the higher, the more worth keeping.
 
 Every score is a function of the scene and options of its own, and gives (N,) float64 on the scene's
 device. Gaussians that cannot be drawn score NaN and take no part in the statistics of the others.
+Everything is computed from logarithms and logits in float64: nothing overflows, whatever the scene.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import math
 from collections.abc import Callable
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError
@@ -58,19 +60,41 @@ def paper_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIGHT
     Raises:
         ScoreError: if ``opacity_weight`` is not in [0, 1].
     """
-    if not 0 <= opacity_weight <= 1:
-        raise ScoreError(f"opacity_weight is {opacity_weight}; expected 0 to 1")
-    usable = scene.usable()
-    scores = torch.full((len(scene),), math.nan, dtype=torch.float64, device=scene.device)
-    part = scene if bool(usable.all()) else scene[usable]
-    if len(part) == 0:
-        return scores
-    alphas = torch.sigmoid(part.opacities[:, 0].double())
-    logs = log_volume(part)
-    largest = logs.max()
-    volumes = torch.exp(logs - largest) if largest > -math.inf else torch.zeros_like(logs)
-    scores[usable] = opacity_weight * zscore(alphas) + (1 - opacity_weight) * zscore(volumes)
-    return scores
+    return _weighted(scene, opacity_weight, lambda part: torch.sigmoid(part.opacities[:, 0].double()), _volumes)
+
+
+def authors_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIGHT) -> Tensor:
+    """The score of the paper's released code, which is another than eq. 3.
+
+    ``opacity_weight * z(logit) + (1 - opacity_weight) * z(4/3 pi product of (log-scale + 1e-6))``: the raw
+    logit in place of alpha, and a product of logarithms in place of the volume. An infinite value stands
+    where the largest (smallest) finite one does, so that it spoils neither mean nor deviation.
+
+    Raises:
+        ScoreError: if ``opacity_weight`` is not in [0, 1].
+    """
+    return _weighted(
+        scene,
+        opacity_weight,
+        lambda part: _within_finite(part.opacities[:, 0].double()),
+        lambda part: 4 / 3 * math.pi * (_within_finite(part.scales.double()) + 1e-6).prod(dim=1),
+    )
+
+
+def log_volume_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIGHT) -> Tensor:
+    """Eq. 3 with the logarithm of the volume in place of the volume: a few giants then no longer set the scale.
+
+    ``opacity_weight * z(alpha) + (1 - opacity_weight) * z(log(4/3 pi sx sy sz))``.
+
+    Raises:
+        ScoreError: if ``opacity_weight`` is not in [0, 1].
+    """
+    return _weighted(
+        scene,
+        opacity_weight,
+        lambda part: torch.sigmoid(part.opacities[:, 0].double()),
+        lambda part: _within_finite(log_volume(part)),
+    )
 
 
 def opacity_score(scene: Gaussians) -> Tensor:
@@ -83,6 +107,18 @@ def volume_score(scene: Gaussians) -> Tensor:
     return _only_usable(scene, log_volume(scene))
 
 
+def log_area(scene: Gaussians) -> Tensor:
+    """Natural logarithm of the product of the two largest standard deviations, square scene units, (N,) float64:
+    of what is seen of a Gaussian from its broad side, but for a factor."""
+    scales = scene.scales.double()
+    return scales.sum(dim=1) - scales.amin(dim=1) if bool(scales.isfinite().all()) else scales.topk(2).values.sum(1)
+
+
+def area_score(scene: Gaussians) -> Tensor:
+    """Opacity times what is seen: log(alpha * area of the two largest axes), (N,) float64."""
+    return _only_usable(scene, F.logsigmoid(scene.opacities[:, 0].double()) + log_area(scene))
+
+
 def random_score(scene: Gaussians, seed: int = 0) -> Tensor:
     """Uniform in [0, 1), the same for one seed on every device, (N,) float64: the baseline to beat."""
     generator = torch.Generator().manual_seed(seed)
@@ -93,10 +129,32 @@ def _only_usable(scene: Gaussians, scores: Tensor) -> Tensor:
     return torch.where(scene.usable(), scores, math.nan)
 
 
-SCORES: dict[str, Callable[..., Tensor]] = {
-    "paper": paper_score,
-    "opacity": opacity_score,
-    "volume": volume_score,
-    "random": random_score,
-}
-"""Scores by name; each takes the scene and keyword options of its own."""
+def _weighted(
+    scene: Gaussians,
+    opacity_weight: float,
+    opacity_of: Callable[[Gaussians], Tensor],
+    size_of: Callable[[Gaussians], Tensor],
+) -> Tensor:
+    """The weighted sum of the z-scores of an opacity and a size, over the Gaussians that can be drawn."""
+    if not 0 <= opacity_weight <= 1:  # NaN fails too
+        raise ScoreError(f"opacity_weight is {opacity_weight}; expected 0 to 1")
+    usable = scene.usable()
+    whole = bool(usable.all())
+    part = scene if whole else scene[usable]
+    scores = opacity_weight * zscore(opacity_of(part)) + (1 - opacity_weight) * zscore(size_of(part))
+    return scores if whole else torch.full_like(usable, math.nan, dtype=torch.float64).masked_scatter_(usable, scores)
+
+
+def _volumes(scene: Gaussians) -> Tensor:
+    """Volumes relative to the largest, in [0, 1], (N,) float64."""
+    logs = log_volume(scene)
+    largest = logs.max() if len(scene) else -math.inf
+    return torch.exp(logs - largest) if largest > -math.inf else torch.zeros_like(logs)
+
+
+def _within_finite(values: Tensor) -> Tensor:
+    """``values`` with each infinite one put where the largest (smallest) finite one is; +-1 where none is finite."""
+    finite = values[values.isfinite()]
+    if len(finite) == values.numel():
+        return values
+    return values.clamp(*finite.aminmax()) if len(finite) else values.clamp(-1.0, 1.0)

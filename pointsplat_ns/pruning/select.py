@@ -2,16 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.errors import BudgetError, PointSplatError
+from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.budget import resolve_keep
-from pointsplat_ns.pruning.scores import SCORES
+from pointsplat_ns.pruning.budget import Keep, resolve_keep
+from pointsplat_ns.pruning.coverage import coverage_score
+from pointsplat_ns.pruning.scores import (
+    area_score,
+    authors_score,
+    log_volume_score,
+    opacity_score,
+    paper_score,
+    random_score,
+    volume_score,
+)
+
+SCORES: dict[str, Callable[..., Tensor]] = {
+    "coverage": coverage_score,
+    "paper": paper_score,
+    "authors": authors_score,
+    "opacity": opacity_score,
+    "volume": volume_score,
+    "log-volume": log_volume_score,
+    "area": area_score,
+    "random": random_score,
+}
+"""Scores by name; each takes the scene and keyword options of its own."""
+
+WEIGHTED = ("paper", "authors", "log-volume")
+"""Those that take ``opacity_weight``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +81,13 @@ def select(scores: Tensor, k: int) -> Tensor:
     return chosen.nonzero()[:, 0]
 
 
-def prune(scene: Gaussians, keep: float | int, by: str = "paper", **options: Any) -> Pruned:
+def prune(scene: Gaussians, keep: Keep, by: str = "paper", **options: Any) -> Pruned:
     """Keep the best of a scene.
 
     Args:
         scene: N Gaussians.
-        keep: float ratio in (0, 1] or int count in 1..N (see :func:`~pointsplat_ns.pruning.budget.resolve_keep`).
-        by: name of a score in :data:`~pointsplat_ns.pruning.scores.SCORES`.
+        keep: ratio, count or size (see :func:`~pointsplat_ns.pruning.budget.resolve_keep`).
+        by: name of a score in :data:`SCORES`.
         **options: options of that score.
 
     Returns:
@@ -70,15 +95,27 @@ def prune(scene: Gaussians, keep: float | int, by: str = "paper", **options: Any
 
     Raises:
         BudgetError: if no such number can be kept.
+        SceneError: if no Gaussian of the scene can be drawn.
         PointSplatError: if there is no such score.
     """
     if by not in SCORES:
         raise PointSplatError(f"no score is called {by!r}; expected one of {', '.join(SCORES)}")
-    k = resolve_keep(len(scene), keep)
+    k = resolve_keep(len(scene), keep, scene.sh_degree)
+    need_usable(scene)
     with torch.no_grad():
         scores = SCORES[by](scene, **options)
         indices = select(scores, k)
     return Pruned(scene[indices], indices, scores)
+
+
+def need_usable(scene: Gaussians) -> None:
+    """Make sure that a scene has something to keep.
+
+    Raises:
+        SceneError: if no Gaussian of it can be drawn.
+    """
+    if not bool(scene.usable().any()):
+        raise SceneError(f"none of the {len(scene)} Gaussians can be drawn: all have NaN or infinite values")
 
 
 def _first(mask: Tensor, count: int) -> Tensor:

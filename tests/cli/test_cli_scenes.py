@@ -12,10 +12,13 @@ import pytest
 import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
+from pointsplat_ns.auto_budget import DenseReference
 from pointsplat_ns.cli import main
+from pointsplat_ns.compaction import COMPARED_VIEWS, IMAGE_SCORES
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, read_scene, write_ply
-from pointsplat_ns.pruning import prune
+from pointsplat_ns.pruning import SCORES, compact, prune, select
+from pointsplat_ns.views import views_of_run
 
 SEED = 5
 
@@ -76,7 +79,7 @@ def test_prune_takes_every_kind_of_scene(kind, ply, splatfacto_run, tmp_path, ca
         "bare ckpt": tmp_path / "alone.ckpt",
     }[kind]
     output = tmp_path / "new" / "out.ply"
-    run("prune", scene, "--keep", "0.5", "-o", output)
+    run("prune", scene, "--keep", "0.5", "--by", "paper", "-o", output)
     dense = read_scene(scene)
     assert same(read_ply(output), prune(dense, 0.5).scene)
     said = capsys.readouterr().out
@@ -86,19 +89,21 @@ def test_prune_takes_every_kind_of_scene(kind, ply, splatfacto_run, tmp_path, ca
 
 @pytest.mark.parametrize(("keep", "kept"), [("0.25", 20), ("25%", 20), ("7", 7), ("1.0", 80), ("1", 1)])
 def test_keep_is_a_ratio_a_percentage_or_a_count(ply, tmp_path, keep, kept):
-    run("prune", ply, "--keep", keep, "-o", tmp_path / "out.ply")
+    run("prune", ply, "--by", "paper", "--keep", keep, "-o", tmp_path / "out.ply")
     assert same(read_ply(tmp_path / "out.ply"), prune(read_ply(ply), kept).scene)
 
 
 def test_prune_scores_as_it_is_told(ply, tmp_path):
     run("prune", ply, "--keep", "9", "--by", "volume", "-o", tmp_path / "volume.ply")
-    run("prune", ply, "--keep", "9", "--opacity-weight", "1.0", "-o", tmp_path / "opacity.ply")
+    run("prune", ply, "--keep", "9", "--by", "paper", "--opacity-weight", "1.0", "-o", tmp_path / "opacity.ply")
     dense = read_ply(ply)
     assert same(read_ply(tmp_path / "volume.ply"), prune(dense, 9, "volume").scene)
     assert same(read_ply(tmp_path / "opacity.ply"), prune(dense, 9, "opacity").scene)
 
 
-@pytest.mark.parametrize("keep", ["0", "1.5", "nan", "inf", "-3", "81", "half", "", "0%", "101%"])
+@pytest.mark.parametrize(
+    "keep", ["0", "1.5", "nan", "inf", "-3", "81", "half", "", "0%", "101%", "0MB", "-1MB", "nanMB", "auto:0"]
+)
 @pytest.mark.parametrize("command", ["prune", "refine"])
 def test_a_keep_that_no_scene_can_satisfy_is_refused(command, keep, ply, refined_run, tmp_path, capsys):
     using = ("--using", refined_run) if command == "refine" else ()
@@ -113,7 +118,11 @@ def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
     half = tmp_path / "half.ply"
     half.write_bytes(ply.read_bytes()[:-100])
     assert "half.ply" in refusal(capsys, output, "prune", half)
-    assert "opacity_weight is 2.0; expected 0 to 1" in refusal(capsys, output, "prune", ply, "--opacity-weight", "2")
+    for by in ("paper", "authors", "log-volume"):
+        said = refusal(capsys, output, "prune", ply, "--by", by, "--opacity-weight", "2")
+        assert "opacity_weight is 2.0; expected 0 to 1" in said
+    write_ply(random_scene(3).map(lambda value: value * torch.nan), tmp_path / "nothing.ply")
+    assert "holds no Gaussians" in refusal(capsys, output, "prune", tmp_path / "nothing.ply")
 
 
 def test_an_output_that_cannot_be_written_is_refused(ply, tmp_path, capsys):
@@ -121,6 +130,74 @@ def test_an_output_that_cannot_be_written_is_refused(ply, tmp_path, capsys):
     (tmp_path / "folder.ply").mkdir()
     assert "is a folder" in refusal(capsys, tmp_path / "folder.ply", "prune", ply)
     assert "cannot be written" in refusal(capsys, ply / "below_a_file.ply", "prune", ply)
+
+
+def test_every_method_can_be_asked_for():
+    from typing import get_args, get_type_hints
+
+    from pointsplat_ns.cli import scenes
+    from pointsplat_ns.compaction import ALL_METHODS
+
+    assert get_args(get_type_hints(scenes.prune)["by"]) == ALL_METHODS
+
+
+@pytest.mark.parametrize("by", sorted(SCORES))
+def test_prune_by_a_score_keeps_gaussians_bit_for_bit(by, ply, tmp_path):
+    run("prune", ply, "--keep", "0.3", "--by", by, "-o", tmp_path / "out.ply")
+    assert same(read_ply(tmp_path / "out.ply"), prune(read_ply(ply), 0.3, by).scene)
+
+
+def test_prune_merges_if_not_told_otherwise(ply, tmp_path):
+    run("prune", ply, "--keep", "0.3", "-o", tmp_path / "out.ply")
+    assert same(read_ply(tmp_path / "out.ply"), compact(read_ply(ply), 0.3))
+
+
+@pytest.mark.parametrize("by", ["lightgaussian", "pup"])
+def test_prune_looks_from_the_poses_of_the_run(by, splatfacto_run, tmp_path, capsys):
+    run("prune", splatfacto_run, "--keep", "0.5", "--by", by, "-o", tmp_path / "out.ply")
+    dense, views = read_scene(splatfacto_run), views_of_run(splatfacto_run)
+    wanted = select(IMAGE_SCORES[by](dense, views), len(read_ply(tmp_path / "out.ply")))
+    assert same(read_ply(tmp_path / "out.ply"), dense[wanted])
+    assert "poses of the dataset" in capsys.readouterr().out
+
+
+def test_prune_keeps_what_fits_into_a_file(ply, tmp_path):
+    run("prune", ply, "--by", "opacity", "--keep", "0.005MB", "--sh", "1", "-o", tmp_path / "out.ply")
+    size, row = (tmp_path / "out.ply").stat().st_size, 4 * 26
+    assert size <= 5_000 < size + row and read_ply(tmp_path / "out.ply").sh_degree == 1
+
+
+def test_prune_finds_the_budget_of_a_run_by_rendering(splatfacto_run, tmp_path, capsys):
+    run("prune", splatfacto_run, "--by", "coverage", "--keep", "auto:30", "--sh", "auto", "-o", tmp_path / "out.ply")
+    said = capsys.readouterr().out
+    views = views_of_run(splatfacto_run).spread(COMPARED_VIEWS)
+    reached, _ = DenseReference(read_scene(splatfacto_run), views).psnr(read_ply(tmp_path / "out.ply"))
+    assert reached >= 30 and f"renders reach {reached:.1f} dB" in said and "poses of the dataset" in said
+
+
+def test_a_dry_run_says_all_and_writes_nothing(ply, tmp_path, capsys):
+    before = sorted(tmp_path.iterdir())
+    run("prune", ply, "--by", "coverage", "--keep", "0.25", "--sh", "0", "--dry-run")
+    said = capsys.readouterr().out
+    assert sorted(tmp_path.iterdir()) == before
+    assert "dry run, nothing is written: kept 20 of 80 Gaussians (25.0 %)" in said
+    assert "SH degree 3 cut to 0: 100 % of the directional energy lost" in said and "opacity" in said
+
+
+def test_prune_draws_the_distributions_when_it_is_asked_to(ply, tmp_path):
+    run("prune", ply, "--by", "paper", "-o", tmp_path / "out.ply")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out.ply", "scene.ply"]
+    run("prune", ply, "--by", "paper", "-o", tmp_path / "out.ply", "--plot", tmp_path / "out.png")
+    assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_prune_refuses_options_that_cannot_be_met_before_it_starts(ply, tmp_path, capsys):
+    output = tmp_path / "out.ply"
+    assert "ends in .png" in refusal(capsys, output, "prune", ply, "--plot", tmp_path / "out.jpg")
+    assert "--fine-tune -1" in refusal(capsys, output, "prune", ply, "--fine-tune", "-1")
+    with pytest.raises(SystemExit) as caught:
+        run("prune", ply)
+    assert caught.value.code == 1 and "--output is missing" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("degree", [0, 2, 3])

@@ -4,11 +4,14 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+import torch
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pointsplat_ns.errors import BudgetError
-from pointsplat_ns.pruning import parse_keep, resolve_keep
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io import write_ply
+from pointsplat_ns.pruning import Megabytes, WithinPsnr, parse_keep, ply_bytes, resolve_keep
 
 
 @pytest.mark.parametrize(
@@ -67,5 +70,64 @@ def test_a_typed_budget_keeps_its_kind(text, keep):
 
 @pytest.mark.parametrize("text", ["", "half", "%", "1,000", "0.3x"])
 def test_a_typed_budget_that_is_none_is_said(text):
+    with pytest.raises(BudgetError, match="expected a ratio"):
+        parse_keep(text)
+
+
+def scene_of(n, degree):
+    sizes = [(n, 3), (n, 3), (n, 4), (n, 1), (n, 3), (n, (degree + 1) ** 2 - 1, 3)]
+    return Gaussians(*(torch.zeros(size) for size in sizes))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("n", [0, 1, 9, 10, 1234])
+def test_the_size_is_that_of_the_file(degree, n, tmp_path):
+    write_ply(scene_of(n, degree), tmp_path / "scene.ply")
+    assert ply_bytes(n, degree) == (tmp_path / "scene.ply").stat().st_size
+
+
+@settings(max_examples=200)
+@given(st.integers(1, 10**7), st.integers(0, 3), st.floats(0.002, 3000))
+def test_a_size_keeps_as_many_as_fit_and_not_one_more(n, degree, megabytes):
+    k = resolve_keep(n, Megabytes(megabytes), degree)
+    limit = math.floor(megabytes * 1e6)
+    assert 1 <= k <= n and ply_bytes(k, degree) <= limit
+    assert k == n or ply_bytes(k + 1, degree) > limit
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, 1e-6])
+def test_what_is_no_size_is_said(value):
+    with pytest.raises(BudgetError, match="keep is .*MB"):
+        resolve_keep(1000, Megabytes(value))
+
+
+def test_a_size_of_an_empty_scene_is_refused():
+    with pytest.raises(BudgetError, match="holds no Gaussians"):
+        resolve_keep(0, Megabytes(1.0))
+
+
+def test_auto_is_no_count_before_something_was_rendered():
+    with pytest.raises(BudgetError, match="found by rendering"):
+        resolve_keep(1000, WithinPsnr(35.0))
+
+
+@pytest.mark.parametrize(
+    ("text", "keep"),
+    [
+        ("12MB", Megabytes(12.0)),
+        (" 0.5 mb ", Megabytes(0.5)),
+        ("auto", WithinPsnr(35.0)),
+        ("auto:40", WithinPsnr(40.0)),
+        ("auto:32.5dB", WithinPsnr(32.5)),
+    ],
+)
+def test_a_typed_size_or_quality_is_read(text, keep):
+    assert parse_keep(text) == keep
+
+
+@pytest.mark.parametrize(
+    "text", ["MB", "xMB", "12GB", "auto:", "auto:0", "auto:-3", "auto:nan", "auto:inf", "automatic"]
+)
+def test_a_typed_size_or_quality_that_is_none_is_said(text):
     with pytest.raises(BudgetError, match="expected a ratio"):
         parse_keep(text)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning import SCORES, paper_score
+from pointsplat_ns.pruning import SCORES, WEIGHTED, paper_score, prune
 
 
 def make(n=50, degree=1, seed=0, dtype=torch.float32):
@@ -95,7 +95,7 @@ def test_unusable_gaussians_score_nan_and_leave_the_others_alone(name):
     spoiled.means[1, 0], spoiled.scales[4, 2] = math.nan, math.inf
     score = SCORES[name](spoiled)
     assert score.isnan().tolist() == [False, True, False, False, True, False]
-    if name != "random":
+    if name not in ("random", "coverage"):  # their values depend on how many there are; test_coverage has the other's
         assert torch.equal(score[[0, 2, 3, 5]], SCORES[name](scene[[0, 2, 3, 5]]))
 
 
@@ -125,3 +125,100 @@ def test_random_is_the_same_for_one_seed_and_another_for_the_next():
 def test_a_weight_outside_its_range_is_said(weight):
     with pytest.raises(ValueError, match="expected 0 to 1"):
         paper_score(make(), weight)
+
+
+def z(x):
+    return (x - x.mean()) / x.std()
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.3, 1.0])
+def test_authors_is_the_formula_of_the_released_code(weight):
+    scene = make()
+    logits, scales = (x.double().numpy().astype(np.longdouble) for x in (scene.opacities[:, 0], scene.scales))
+    product = np.longdouble(4 / 3 * math.pi) * np.prod(scales + np.longdouble(1e-6), axis=1)
+    wanted = torch.from_numpy((weight * z(logits) + (1 - weight) * z(product)).astype(np.float64))
+    # 1e-12: float64 over 50 terms
+    assert torch.allclose(SCORES["authors"](scene, opacity_weight=weight), wanted, rtol=1e-12, atol=1e-12)
+
+
+def test_authors_ranks_a_pancake_above_a_ball_as_eq_3_does_not():
+    scales = torch.log(torch.tensor([[0.1, 0.1, 1e-5], [0.01, 0.01, 0.01]]))
+    scene = make(2).replace(scales=scales, opacities=torch.zeros(2, 1))
+    volume, product = SCORES["paper"](scene), SCORES["authors"](scene)
+    assert volume[1] > volume[0] and product[0] > product[1]
+
+
+def test_log_volume_is_eq_3_with_the_logarithm():
+    scene = make()
+    alphas = 1 / (1 + np.exp(-scene.opacities[:, 0].double().numpy()))
+    wanted = 0.3 * z(alphas) + 0.7 * z(scene.scales.double().sum(1).numpy())
+    assert np.allclose(SCORES["log-volume"](scene), wanted, rtol=1e-12, atol=1e-12)
+
+
+def test_area_is_alpha_times_the_two_largest_axes():
+    scene = make(dtype=torch.float64)
+    largest = scene.stds.sort(dim=1, descending=True).values
+    # 1e-12: a handful of roundings in float64
+    assert torch.allclose(SCORES["area"](scene).exp(), scene.alphas * largest[:, 0] * largest[:, 1], rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", sorted(SCORES))
+@pytest.mark.parametrize("case", ["huge", "tiny", "mixed", "infinite logits", "flat", "flat and clear", "far"])
+def test_no_score_of_what_can_be_drawn_is_nan(name, case):
+    scene = make(40)
+    infinite = torch.tensor([math.inf, -math.inf]).repeat(20)[:, None]
+    flat = scene.scales.clone()
+    flat[::3, 1] = -math.inf
+    scene = {
+        "huge": lambda: scene.replace(scales=torch.full((40, 3), 80.0)),
+        "tiny": lambda: scene.replace(scales=torch.full((40, 3), -80.0)),
+        "mixed": lambda: scene.replace(scales=80 * scene.scales.sign(), opacities=80 * scene.opacities.sign()),
+        "infinite logits": lambda: scene.replace(opacities=infinite),
+        "flat": lambda: scene.replace(scales=flat),
+        "flat and clear": lambda: scene.replace(scales=torch.full((40, 3), -math.inf), opacities=infinite),
+        "far": lambda: scene.replace(means=scene.means * 1e37),
+    }[case]()
+    score = SCORES[name](scene)
+    assert not score.isnan().any()
+    assert (score < math.inf).all() or name == "opacity"  # whose score is the logit
+    assert len(prune(scene, 7, name).indices) == 7
+
+
+@pytest.mark.parametrize("name", sorted(set(SCORES) - {"random"}))
+def test_float32_and_float64_rank_alike(name):
+    scene = make(300)
+    single, double = SCORES[name](scene), SCORES[name](scene.to(torch.float64))
+    # Both are computed in float64 from the same values, positions in a grid of 2^20 cells included.
+    assert torch.allclose(single, double, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["paper", "authors", "opacity", "area", "log-volume"])
+def test_infinite_logits_keep_their_rank(name):
+    scene = make(9)
+    logits = torch.linspace(-3, 3, 9)[:, None]
+    logits[0], logits[-1] = -math.inf, math.inf
+    score = SCORES[name](scene.replace(opacities=logits, scales=torch.zeros(9, 3)))
+    assert (score.diff() >= 0).all() and score[-1] > score[4] > score[0]
+
+
+@pytest.mark.parametrize("name", sorted(set(SCORES) - {"opacity", "random"}))
+def test_a_single_giant_is_found_and_leaves_the_others_apart(name):
+    scene = make(60)
+    scene = scene.replace(scales=scene.scales.clone(), opacities=torch.zeros(60, 1))
+    scene.scales[17] = 80.0
+    score = SCORES[name](scene)
+    assert score.isfinite().all() and score[17] == score.max()
+    if name not in ("paper", "authors"):  # whose z-scores the giant does flatten: that is their formula
+        assert len(score.unique()) > 30
+
+
+@pytest.mark.parametrize("name", sorted(set(SCORES) - {"random"}))
+def test_of_equal_gaussians_at_one_place_any_will_do(name):
+    scene = make(1)[[0] * 30]
+    assert SCORES[name](scene).isfinite().all() and len(prune(scene, 10, name).scene) == 10
+
+
+@pytest.mark.parametrize("name", WEIGHTED)
+def test_every_weighted_score_says_a_weight_outside_its_range(name):
+    with pytest.raises(ValueError, match="expected 0 to 1"):
+        SCORES[name](make(), opacity_weight=1.5)

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pointsplat_ns.errors import BudgetError, PointSplatError
+from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning import prune, select
+from pointsplat_ns.pruning import SCORES, Megabytes, ply_bytes, prune, select
 
 
 def make(n=50, degree=1, seed=0):
@@ -59,7 +59,7 @@ def bits(value):
     return value.contiguous().view(torch.int32)
 
 
-@pytest.mark.parametrize("by", ["paper", "opacity", "volume", "random"])
+@pytest.mark.parametrize("by", sorted(SCORES))
 @pytest.mark.parametrize(("keep", "k"), [(0.3, 15), (1, 1), (1.0, 50), (37, 37)])
 def test_prune_keeps_exactly_k_bit_for_bit_and_in_order(by, keep, k):
     scene = make()
@@ -100,7 +100,19 @@ def test_a_scene_in_a_graph_stays_in_it():
 
 
 def test_an_unknown_score_is_said_with_those_there_are():
-    with pytest.raises(
-        PointSplatError, match="no score is called 'best'; expected one of paper, opacity, volume, random"
-    ):
+    with pytest.raises(PointSplatError, match="no score is called 'best'; expected one of coverage, paper, authors"):
         prune(make(), 0.5, by="best")
+
+
+@pytest.mark.parametrize("by", sorted(SCORES))
+def test_a_scene_with_nothing_to_draw_is_refused(by):
+    with pytest.raises(SceneError, match="none of the 4 Gaussians can be drawn"):
+        prune(make(4).map(lambda value: value * math.nan), 0.5, by)
+    with pytest.raises(BudgetError, match="holds no Gaussians"):
+        prune(Gaussians.empty(), 0.5, by)
+
+
+def test_a_size_keeps_what_fits_at_the_degree_of_the_scene():
+    scene = make(50, degree=1)
+    kept = prune(scene, Megabytes(ply_bytes(20, 1) / 1e6)).scene
+    assert len(kept) == 20

@@ -1,0 +1,123 @@
+"""Sums over the pixels of a view, one row a Gaussian, of what a picture alone does not tell.
+
+The rasterizer's own gradients give sums over pixels that are linear in the picture. How many pixels a
+Gaussian is drawn on, or the sum of squares of the gradients of each pixel, are not. Here what a view
+sees, as the rasterizer projects it, is walked front to back tile by tile, by the rasterizer's rules, and
+every pair of Gaussian and pixel is handed to a function.
+
+Shapes: M Gaussians seen, B tiles of a block, L Gaussians in the longest list of the block, 64 pixels a tile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
+from pointsplat_ns.rasterizer.projection import Projected
+
+PIXELS = TILE * TILE
+_BLOCK_VALUES = 2**20
+"""Values of one (B, L, 64) array: 4 MB in float32, of which a walk holds a dozen."""
+
+
+class Pairs(NamedTuple):
+    """The pairs of a block of tiles, front to back along L. Nothing is drawn where ``alpha`` is zero."""
+
+    ids: Tensor  # [B, L] rows of the projected Gaussians
+    alpha: Tensor  # [B, L, 64]
+    before: Tensor  # [B, L, 64] transmittance in front of the Gaussian
+    final: Tensor  # [B, 64] transmittance behind all that are drawn
+    gx: Tensor  # [B, L, 64] d log alpha / d mean x, 1 / pixels
+    gy: Tensor  # [B, L, 64]
+    clamped: Tensor  # [B, L, 64] where alpha is held at its maximum
+
+
+def sum_over_pixels(
+    seen: Projected, width: int, height: int, columns: int, values: Callable[[Pairs], Tensor]
+) -> Tensor:
+    """Sum a function of every pair of Gaussian and pixel over the pixels of one view.
+
+    Args:
+        seen: what the view sees, M Gaussians.
+        width, height: pixels.
+        columns: F, numbers a Gaussian.
+        values: gives (B, L, F) of a block of pairs: sums over the 64 pixels of each tile.
+
+    Returns:
+        (M, F), in the dtype of ``seen``.
+    """
+    means2d, cov2d, det = seen.means2d.detach(), seen.cov2d.detach(), seen.det.detach()
+    total = means2d.new_zeros(len(seen.ids), columns)
+    gaussians, starts, across = _tile_lists(seen, width, height)
+    xx, xy, yy = cov2d.unbind(-1)
+    # As the rasterizer keeps it: extent in x given y, and extent in y; both terms are positive.
+    shapes = [*means2d.unbind(-1), yy / det, xy / yy, 1.0 / yy, seen.opacities.detach().log()]
+    table = torch.stack(shapes, dim=-1)  # (M, 6)
+    lengths, order = torch.sort(starts.diff(), descending=True)
+    occupied = int((lengths > 0).sum())
+    step = torch.arange(TILE, device=means2d.device)
+    place_y, place_x = (grid.reshape(-1) for grid in torch.meshgrid(step, step, indexing="ij"))
+    begin = 0
+    while begin < occupied:
+        longest = int(lengths[begin])
+        size = max(1, min(_BLOCK_VALUES // (longest * PIXELS), occupied - begin))
+        tiles = order[begin : begin + size]
+        place = torch.arange(longest, device=tiles.device)
+        listed = place < lengths[begin : begin + size, None]  # (B, L)
+        ids = gaussians[(starts[tiles, None] + place).clamp_max(gaussians.numel() - 1)]
+        pixel_x = (tiles % across * TILE)[:, None] + place_x  # (B, 64)
+        pixel_y = torch.div(tiles, across, rounding_mode="floor")[:, None] * TILE + place_y
+        inside = (pixel_x < width) & (pixel_y < height)
+        pairs = _pairs(table[ids], ids, pixel_x, pixel_y, listed, inside)
+        total.index_add_(0, ids[listed], values(pairs)[listed])
+        begin += size
+    return total
+
+
+@torch.no_grad()
+def _tile_lists(seen: Projected, width: int, height: int) -> tuple[Tensor, Tensor, int]:
+    """Gaussians by tile, front to back (P,), where each tile's begin (tiles + 1,), and the tiles across.
+
+    A Gaussian is listed for every tile that the box around its 1/255 ellipse touches.
+    """
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    order = torch.argsort(seen.depths, stable=True)
+    xx, _, yy = seen.cov2d[order].unbind(-1)
+    level = 2.0 * (seen.opacities[order] / ALPHA_MIN).log().clamp_min(0.0)
+    edges = []
+    for middle, variance, tiles in zip(seen.means2d[order].unbind(-1), (xx, yy), (columns, rows), strict=True):
+        half = (level * variance).sqrt() + 0.5
+        edges.append(((middle - half) / TILE).floor().clamp(0, tiles - 1).long())
+        edges.append(((middle + half) / TILE).floor().clamp(0, tiles - 1).long())
+    left, right, top, bottom = edges
+    wide = right - left + 1
+    counts = wide * (bottom - top + 1)
+    owner = torch.repeat_interleave(counts)
+    place = torch.arange(owner.numel(), device=owner.device) - (counts.cumsum(0) - counts)[owner]
+    down = torch.div(place, wide[owner], rounding_mode="floor")
+    tile = (top[owner] + down) * columns + left[owner] + place - down * wide[owner]
+    tile, by_tile = torch.sort(tile, stable=True)
+    starts = torch.searchsorted(tile, torch.arange(rows * columns + 1, device=tile.device))
+    return order[owner[by_tile]], starts, columns
+
+
+def _pairs(shape: Tensor, ids: Tensor, pixel_x: Tensor, pixel_y: Tensor, listed: Tensor, inside: Tensor) -> Pairs:
+    """Alphas and transmittances of a block; ``shape`` is (B, L, 6), pixels are (B, 64), ``listed`` is (B, L)."""
+    mx, my, a, r, d, log_opacity = (value[..., None] for value in shape.unbind(-1))
+    x, y = pixel_x[:, None] + 0.5 - mx, pixel_y[:, None] + 0.5 - my
+    across = x - r * y
+    gx = a * across
+    alpha = (log_opacity - 0.5 * (gx * across + d * y * y)).exp()
+    alpha = torch.where(listed[..., None] & inside[:, None] & (alpha >= ALPHA_MIN), alpha, 0.0)
+    clamped = alpha >= ALPHA_MAX
+    alpha = alpha.clamp_max(ALPHA_MAX)
+    after = torch.cumprod(1 - alpha, dim=1)
+    # A pixel is finished before the Gaussian that would bring its transmittance too low.
+    alpha = torch.where(after > TRANSMITTANCE_MIN, alpha, 0.0)
+    after = torch.cumprod(1 - alpha, dim=1)
+    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
+    return Pairs(ids, alpha, before, after[:, -1], gx, d * y - r * gx, clamped)
