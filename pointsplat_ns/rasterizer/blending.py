@@ -35,6 +35,7 @@ _BLOCK_PAIRS = 2**12  # pairs evaluated at once, for each thread of a CPU: 1 MB 
 _BLOCK_PAIRS_COMPILED = 2**11  # compiled kernels have no calls to save, and fit the cache better
 _BLOCK_PAIRS_GPU = 2**18
 _LONGEST_CHUNK = 1024
+_STEP_BY_STEP = 64  # longer chunks are scanned in fewer, larger operations
 _BYTES_PER_PAIR = 160  # of the lists, the tape and the gradient sums, measured in float32 with three channels
 
 MEMORY_BUDGET = 2**31
@@ -160,10 +161,10 @@ def _alphas(coefficients: Tensor, scene: _Scene, out: Tensor) -> Tensor:
 
 def _transmittances(passing: Tensor, before: Tensor, out: Tensor) -> Tensor:
     """Transmittance before each Gaussian and after the last, (B, S + 1, 64), from 1 - alpha (B, S, 64)."""
-    steps, factors = out.unbind(1), passing.unbind(1)
-    steps[0].copy_(before)
-    if len(factors) <= 4 * CHUNK:
-        for k, factor in enumerate(factors):
+    out[:, 0] = before
+    if passing.shape[1] <= _STEP_BY_STEP:
+        steps = out.unbind(1)
+        for k, factor in enumerate(passing.unbind(1)):
             torch.mul(steps[k], factor, out=steps[k + 1])
         return out
     groups = out[:, 1:].unflatten(1, (-1, CHUNK))  # products of each group at once, then group by group
@@ -179,11 +180,13 @@ def _transmittances(passing: Tensor, before: Tensor, out: Tensor) -> Tensor:
 
 def _sums_behind(terms: Tensor, behind: Tensor, out: Tensor) -> Tensor:
     """``behind`` (B, 64) plus the sum of the terms from each Gaussian on, (B, S + 1, 64), from terms (B, S, 64)."""
-    size = terms.shape[1]
-    sums, terms = out.unbind(1), terms.unbind(1)
-    sums[size].copy_(behind)
-    for k in range(size - 1, -1, -1):
-        torch.add(sums[k + 1], terms[k], out=sums[k])
+    out[:, -1] = behind
+    if terms.shape[1] > _STEP_BY_STEP:
+        torch.add(terms.flip(1).cumsum(1).flip(1), behind[:, None], out=out[:, :-1])
+        return out
+    sums = out.unbind(1)
+    for k, term in reversed(list(enumerate(terms.unbind(1)))):
+        torch.add(sums[k + 1], term, out=sums[k])
     return out
 
 

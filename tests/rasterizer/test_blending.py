@@ -94,7 +94,7 @@ def test_long_chunks_of_few_tiles_equal_short_ones(n, size, monkeypatch):
     assert_same(long, draw(scene), 1e-12)  # products and sums in another order
 
 
-def test_a_million_to_one_stack_is_blended_front_to_back():
+def test_a_tall_stack_is_blended_front_to_back():
     """2,000 Gaussians on one spot: one tile, long chunks; the closed form is 1 - (1 - a)^n until the pixel stops."""
     n, alpha = 2000, 0.01
     scene = [
