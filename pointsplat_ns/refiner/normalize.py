@@ -76,11 +76,11 @@ def unit_cube(means: Tensor) -> UnitCube:
     Args:
         means: finite positions, at least one.  # [N, 3] scene units
     """
-    ordered = means.detach().double().sort(dim=0).values
-    n = ordered.shape[0]
+    axes = means.detach().T.contiguous()  # [3, N]
+    n = axes.shape[1]
     trim = max(1, math.ceil(TRIM * n)) if n >= TRIM_FROM else 0
-    low, high = ordered[0], ordered[-1]
-    core_low, core_high = ordered[trim], ordered[n - 1 - trim]
+    low, high = (value.double() for value in axes.aminmax(dim=1))
+    core_low, core_high = (axes.kthvalue(k, dim=1).values.double() for k in (trim + 1, n - trim))
     reach = MARGIN * (core_high - core_low).max()
     if reach > 0:
         low, high = torch.maximum(low, core_low - reach), torch.minimum(high, core_high + reach)

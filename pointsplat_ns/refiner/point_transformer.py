@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from pointsplat_ns.refiner.config import RefinerConfig
 from pointsplat_ns.refiner.encoder import make_norm
+from pointsplat_ns.refiner.rows import by_rows, rows_at_a_time
 from pointsplat_ns.refiner.sparse_ops import permute, segment_max, segment_mean, submanifold_conv
 from pointsplat_ns.refiner.structure import Level, Structure
 
@@ -34,7 +35,7 @@ class SubmanifoldConv(nn.Module):
             x = segment_mean(x, level.cell_of, level.num_cells)
         x = submanifold_conv(x, self.weight, level.neighbours)
         if self.bias is not None:
-            x = x + self.bias
+            x = x.add_(self.bias)
         return x if level.cell_of is None else x.index_select(0, level.cell_of)
 
 
@@ -55,19 +56,20 @@ class PatchAttention(nn.Module):
         """``[M, C] -> [M, C]``; ``order`` is a curve's order and inverse, None for memory order."""
         if order is not None:
             x = permute(x, *order)
-        qkv = self.qkv(x)
-        m, size = len(x), min(self.patch, len(x))
-        rest = m % size
-        full = self._attend(qkv[: m - rest], size)
-        if rest:
-            last = self._attend(qkv[m - size :], size)
-            full = torch.cat([full, last[size - rest :]])
-        x = self.proj(full)
-        return x if order is None else permute(x, order[1], order[0])
+        size = min(self.patch, len(x))
+        full = len(x) // size * size
+        rows = rows_at_a_time(self.qkv.out_features, size)
+        out = by_rows(lambda part: self._attend(part, size), x[:full], rows)
+        if full < len(x):
+            last = self._attend(x[len(x) - size :], size)
+            out = torch.cat([out, last[full - len(x) :]])
+        return out if order is None else permute(out, order[1], order[0])
 
-    def _attend(self, qkv: Tensor, size: int) -> Tensor:
-        q, k, v = qkv.view(-1, size, 3, self.heads, qkv.shape[1] // (3 * self.heads)).permute(2, 0, 3, 1, 4)
-        return F.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(len(qkv), -1)  # (P, H, K, D) -> (M, C)
+    def _attend(self, x: Tensor, size: int) -> Tensor:
+        """``[P * size, C] -> [P * size, C]``: each run of ``size`` rows by itself."""
+        channels = x.shape[1]
+        q, k, v = self.qkv(x).view(-1, size, 3, self.heads, channels // self.heads).permute(2, 0, 3, 1, 4)
+        return self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(-1, channels))
 
 
 class Block(nn.Module):
@@ -86,9 +88,10 @@ class Block(nn.Module):
 
     def forward(self, x: Tensor, level: Level, order: tuple[Tensor, Tensor] | None) -> Tensor:
         """``[M, C] -> [M, C]``."""
-        x = x + self.conv_out(self.conv(x, level))
-        x = x + self._drop(self.attention(self.norm1(x), order))
-        return x + self._drop(self.mlp(self.norm2(x)))
+        x = by_rows(self.conv_out, self.conv(x, level), rows_at_a_time(x.shape[1])).add_(x)
+        x = self._drop(self.attention(self.norm1(x), order)).add_(x)
+        rows = rows_at_a_time(self.mlp[0].out_features)
+        return self._drop(by_rows(lambda part: self.mlp(self.norm2(part)), x, rows)).add_(x)
 
     def _drop(self, x: Tensor) -> Tensor:
         if not self.training or self.drop_path == 0:
@@ -135,7 +138,7 @@ class Unpool(nn.Module):
 
     def forward(self, x: Tensor, skip: Tensor, cluster: Tensor) -> Tensor:
         """``[size, Cin], [M, Cskip] -> [M, Cout]``."""
-        return self.skip(skip) + self.coarse(x).index_select(0, cluster)
+        return self.coarse(x).index_select(0, cluster).add_(self.skip(skip))
 
 
 class PointTransformer(nn.Module):

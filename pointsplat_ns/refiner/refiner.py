@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
 from torch import Tensor, nn
 
@@ -21,6 +23,11 @@ class Refiner(nn.Module):
 
     Untrained, all residuals are zero and the scene comes out as it went in, to the bit. The one
     exception is a zero quaternion, which comes out as the identity that it stands for.
+
+    Gaussians that cannot be drawn (``usable()`` of the container: NaN, or infinite where that means
+    nothing) come out as they went in, and the others as if those were not there. In evaluation a
+    Gaussian comes out as it went in, too, if the network's arithmetic would make it one of those;
+    in training such a value passes, so that the loss shows it.
 
     Residuals do not depend on the scene's unit and place, on the order of its Gaussians (in
     evaluation; exact duplicates are interchangeable) or on the signs of its quaternions.
@@ -43,27 +50,27 @@ class Refiner(nn.Module):
         """What the network needs to know of a scene's positions, on the scene's device.
 
         Build it once per scene and hand it to :meth:`forward` at every step. None for a scene of no
-        Gaussians.
+        Gaussians that can be drawn.
 
         Raises:
-            SceneError: if a Gaussian cannot be drawn, or the SH degree exceeds the network's.
+            SceneError: if the SH degree exceeds the network's.
         """
         if scene.sh_degree > self.config.sh_degree:
             raise SceneError(
                 f"the scene has SH degree {scene.sh_degree}; this refiner was built for at most {self.config.sh_degree}"
             )
-        bad = int((~scene.usable()).sum())
-        if bad:
-            raise SceneError(
-                f"{bad} of {len(scene)} Gaussians have NaN or infinite parameters; drop them with scene[scene.usable()]"
-            )
-        return build_structure(scene, self.config) if len(scene) else None
+        usable = scene.usable()
+        if usable.all():
+            return build_structure(scene, self.config) if len(scene) else None
+        if not usable.any():
+            return None
+        return dataclasses.replace(build_structure(scene[usable], self.config), usable=usable)
 
     def forward(self, scene: Gaussians, structure: Structure | None = None) -> Gaussians:
         """The refined scene, in the space, dtype and order of the given one.
 
         Args:
-            scene: N usable Gaussians of an SH degree up to the configuration's.
+            scene: Gaussians of an SH degree up to the configuration's.
             structure: of these positions, from :meth:`prepare`; built here if missing.
 
         Raises:
@@ -74,14 +81,22 @@ class Refiner(nn.Module):
             structure = self.prepare(scene)
         if structure is None:
             return scene
-        if len(structure.order) != len(scene) or structure.built_for != structure_key(self.config):
+        if structure.total != len(scene) or structure.built_for != structure_key(self.config):
             raise ValueError(
-                f"structure of {len(structure.order)} Gaussians and settings {structure.built_for} given for "
+                f"structure of {structure.total} Gaussians and settings {structure.built_for} given for "
                 f"{len(scene)} Gaussians and settings {structure_key(self.config)}; call prepare(scene) again"
             )
+        if structure.usable is None:
+            return self._refine(scene, structure)
+        return _put_back(self._refine(scene[structure.usable], structure), structure.usable, scene)
+
+    def _refine(self, scene: Gaussians, structure: Structure) -> Gaussians:
+        """The refined scene of usable Gaussians."""
         features = gaussian_features(scene, structure.cube, self.config.num_rest, self.dtype)
-        residuals = self.residuals(features, structure)
-        return self._add(scene, residuals, features, structure)
+        refined = self._add(scene, self.residuals(features, structure), features, structure)
+        if self.training or (sound := refined.usable()).all():
+            return refined
+        return _put_back(refined[sound], sound, scene)
 
     def residuals(self, features: Features, structure: Structure) -> dict[str, Tensor]:
         """The network proper: residuals by attribute, in network units and scene order. # {name: [N, size]}"""
@@ -120,3 +135,10 @@ class Refiner(nn.Module):
             features_dc=scene.features_dc + residuals["features_dc"].to(scene.dtype),
             features_rest=rest,
         )
+
+
+def _put_back(rows: Gaussians, mask: Tensor, scene: Gaussians) -> Gaussians:
+    """``scene`` with the Gaussians of ``mask`` replaced by ``rows``, in order."""
+    place = mask.nonzero()[:, 0]
+    values = zip(scene.items(), rows.tensors(), strict=True)
+    return Gaussians(**{name: before.index_copy(0, place, after) for (name, before), after in values})

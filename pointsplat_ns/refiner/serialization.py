@@ -7,6 +7,7 @@ points without the last three bits per halving. That makes one sort serve all gr
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 
@@ -37,22 +38,24 @@ def hilbert(coords: Tensor, bits: int) -> Tensor:
     Returns:
         codes in ``[0, 8**bits)``.  # [N] int64
     """
-    axes = [coords[:, axis].clone() for axis in range(3)]
+    # Half as wide, the integers take half as long; shifted to the top and back, a bit fills the word as a mask.
+    axes = [coords[:, axis].to(torch.int32, copy=True) for axis in range(3)]
     for bit in range(bits - 1, 0, -1):
         low = (1 << bit) - 1
         for axis in range(3):
-            is_set = (axes[axis] >> bit) & 1
             # Bit set: mirror the first axis below this bit. Bit clear: swap the first axis with this one there.
-            swapped = (axes[0] ^ axes[axis]) & low & (is_set - 1)
-            axes[0] = axes[0] ^ swapped ^ (low & -is_set)
+            mirrored = ((axes[axis] << (31 - bit)) >> 31) & low
             if axis:
-                axes[axis] = axes[axis] ^ swapped
-    axes[1] = axes[1] ^ axes[0]
-    axes[2] = axes[2] ^ axes[1]
-    parity = axes[2] * 0
-    for bit in range(bits - 1, 0, -1):
-        parity = parity ^ (((1 << bit) - 1) & -((axes[2] >> bit) & 1))
-    return _interleave([_spread(axis ^ parity) for axis in axes])
+                swapped = (axes[0] ^ axes[axis]) & (mirrored ^ low)
+                axes[axis] ^= swapped
+                axes[0] ^= swapped
+            axes[0] ^= mirrored
+    axes[1] ^= axes[0]
+    axes[2] ^= axes[1]
+    parity = axes[2] >> 1  # of the bits above each bit: doubled in reach five times
+    for reach in (1, 2, 4, 8, 16):
+        parity ^= parity >> reach
+    return _interleave([_spread((axis ^ parity).long()) for axis in axes])
 
 
 def curve_codes(coords: Tensor, bits: int, curve: str) -> Tensor:

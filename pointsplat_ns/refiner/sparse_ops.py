@@ -6,10 +6,14 @@ the targets are distinct, that is a gather too. Nothing here allocates more than
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
+
+from pointsplat_ns.refiner.rows import rows_at_a_time
 
 Pairs = list[tuple[Tensor, Tensor]]
 
@@ -67,10 +71,9 @@ class _SubmanifoldConv(Function):
         ctx.save_for_backward(x, weight)
         ctx.pairs = pairs
         out = x @ weight[13]
-        for k, (i, j) in enumerate(pairs):
-            if len(i):
-                out.index_add_(0, i, x.index_select(0, j) @ weight[14 + k])
-                out.index_add_(0, j, x.index_select(0, i) @ weight[12 - k])
+        for k, i, j in _parts(pairs, x):
+            out.index_add_(0, i, x.index_select(0, j) @ weight[14 + k])
+            out.index_add_(0, j, x.index_select(0, i) @ weight[12 - k])
         return out
 
     @staticmethod
@@ -82,17 +85,24 @@ class _SubmanifoldConv(Function):
         grad_weight = torch.zeros_like(weight) if need_weight else None
         if need_weight:
             torch.mm(x.T, grad, out=grad_weight[13])
-        for k, (i, j) in enumerate(ctx.pairs):
-            if not len(i):
-                continue
+        for k, i, j in _parts(ctx.pairs, x):
             grad_i, grad_j = grad.index_select(0, i), grad.index_select(0, j)
             if need_weight:
-                torch.mm(x.index_select(0, j).T, grad_i, out=grad_weight[14 + k])
-                torch.mm(x.index_select(0, i).T, grad_j, out=grad_weight[12 - k])
+                grad_weight[14 + k].addmm_(x.index_select(0, j).T, grad_i)
+                grad_weight[12 - k].addmm_(x.index_select(0, i).T, grad_j)
             if need_x:
                 grad_x.index_add_(0, j, grad_i @ weight[14 + k].T)
                 grad_x.index_add_(0, i, grad_j @ weight[12 - k].T)
         return grad_x, grad_weight, None
+
+
+def _parts(pairs: Pairs, x: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """Offset and indices of all pairs; on a CPU as many at a time as its cache holds rows of."""
+    for k, (i, j) in enumerate(pairs):
+        rows = rows_at_a_time(x.shape[1]) if x.device.type == "cpu" else max(1, len(i))
+        for part_i, part_j in zip(i.split(rows), j.split(rows), strict=True):
+            if len(part_i):
+                yield k, part_i, part_j
 
 
 def submanifold_conv(

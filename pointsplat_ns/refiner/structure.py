@@ -56,6 +56,12 @@ class Structure:
     levels: list[Level]
     cells_per_side: float  # of the first level, along the unit cube
     built_for: tuple  # the settings that it depends on
+    usable: Tensor | None = None  # [T] mask of the scene's Gaussians that it covers, N of them; None: it covers all
+
+    @property
+    def total(self) -> int:
+        """Gaussians of the scene, those that cannot be drawn included."""
+        return len(self.order if self.usable is None else self.usable)
 
     def to(self, device: torch.device | str) -> Structure:
         """The same structure on another device."""
@@ -134,14 +140,21 @@ def neighbour_pairs(cells: Tensor) -> list[tuple[Tensor, Tensor]]:
     bits = 20
     keys = ((cells[:, 0] + 1) << 2 * bits) | ((cells[:, 1] + 1) << bits) | (cells[:, 2] + 1)
     keys, index = keys.sort()
-    pairs = []
+    end = len(keys) - 1
+    matches = torch.empty_like(index)
+    pairs, column = [], None
     for dx, dy, dz in HALF_KERNEL:
         target = keys + ((dx << 2 * bits) + (dy << bits) + dz)
-        place = torch.searchsorted(keys, target).clamp_(max=len(keys) - 1)
-        found = (keys[place] == target).nonzero()[:, 0]
-        i, j = index[found], index[place[found]]
-        i, by_memory = i.sort()
-        pairs.append((i, j[by_memory]))
+        if (dx, dy) != column:  # the three cells of a column follow one another in the sorted keys
+            column = (dx, dy)
+            place = torch.searchsorted(keys, target).clamp_(max=end)
+        else:
+            place = (place + (keys.index_select(0, place) < target)).clamp_(max=end)
+        found = keys.index_select(0, place) == target
+        # Scattered into memory order, the pairs come out sorted by it.
+        matches.scatter_(0, index, torch.where(found, index.index_select(0, place), -1))
+        i = (matches >= 0).nonzero()[:, 0]
+        pairs.append((i, matches.index_select(0, i)))
     return pairs
 
 
@@ -185,9 +198,7 @@ def _argsort_pair(codes: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _invert(order: Tensor) -> Tensor:
-    inverse = torch.empty_like(order)
-    inverse[order] = torch.arange(len(order), device=order.device)
-    return inverse
+    return torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
 
 
 def _log2_product(strides: tuple[int, ...]) -> int:

@@ -92,12 +92,12 @@ def test_an_untrained_refiner_returns_hard_scenes_to_the_bit_but_zero_quaternion
     assert same(refined, scene.replace(quats=torch.where(zero[:, None], identity, scene.quats)))
 
 
-@pytest.mark.parametrize("norm", ["scene", "batch", "layer"])
+@pytest.mark.parametrize("changes", [{"norm": "scene"}, {"norm": "batch"}, {"norm": "layer"}, {"grid": 384}])
 @pytest.mark.parametrize("training", [False, True])
 @pytest.mark.parametrize("name", hard_scenes())
-def test_output_and_gradients_of_hard_scenes_are_finite(name, training, norm):
+def test_output_and_gradients_of_hard_scenes_are_finite(name, training, changes):
     scene = hard_scenes()[name].map(lambda value: value.clone().requires_grad_())
-    refiner = make_refiner(norm=norm).train(training)
+    refiner = make_refiner(**changes).train(training)
     refined = refiner(scene)
     assert refined.usable().all()
     total = 0
@@ -294,17 +294,72 @@ def test_parameter_groups_hold_every_parameter_once():
     assert "encoder" not in make_refiner(encoder="concat").parameter_groups()
 
 
-def test_unusable_scenes_are_refused_with_their_count_and_a_remedy():
-    scene = make_scene(10)
-    scene.means[3, 1] = torch.nan
-    scene.scales[5] = torch.inf
-    with pytest.raises(SceneError, match="2 of 10 Gaussians have NaN or infinite parameters; drop them with"):
-        make_refiner().prepare(scene)
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("name", ["means", "scales", "quats", "features_dc", "features_rest"])
+def test_unusable_gaussians_come_back_unchanged_and_the_others_as_if_those_were_not_there(name, bad):
+    scene = make_scene(60)
+    bad_rows = torch.tensor([0, 17, 59])
+    getattr(scene, name)[bad_rows] = bad
+    refiner = make_refiner()
+    refined = refiner(scene)
+    good = scene.usable()
+    # -Inf is a legal log-scale: such a Gaussian is flat, and refined
+    assert torch.equal((~good).nonzero()[:, 0], bad_rows[:0] if name == "scales" and bad < 0 else bad_rows)
+    for before, after in zip(scene[~good].tensors(), refined[~good].tensors(), strict=True):
+        assert torch.equal(before.nan_to_num(7.0), after.nan_to_num(7.0))
+    assert same(refined[good], refiner(scene[good]))
+    assert not torch.equal(refined.opacities[good], scene.opacities[good])
+
+
+def test_a_scene_of_unusable_gaussians_alone_comes_back():
+    scene = make_scene(5)
+    scene.opacities[:] = torch.nan
+    refined = make_refiner()(scene)
+    assert refined.opacities.isnan().all() and torch.equal(refined.means, scene.means)
+
+
+def test_unusable_gaussians_leave_all_gradients_finite():
+    scene = make_scene(60)
+    scene.means[3] = torch.nan
+    refiner = make_refiner().train()
+    refined = refiner(scene, refiner.prepare(scene))
+    sum(value[refined.usable()].square().sum() for value in refined.tensors()).backward()
+    for name, parameter in refiner.named_parameters():
+        assert parameter.grad is None or parameter.grad.isfinite().all(), name
+    assert refiner.heads.mlps["means"][-1].weight.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_what_a_broken_network_computes_never_leaves_it_in_evaluation_but_shows_in_training(bad):
+    scene = make_scene(60)
+    refiner = make_refiner()
+    with torch.no_grad():
+        refiner.heads.mlps["scales"][-1].bias[1] = bad
+    assert same(refiner(scene), scene)
+    assert not refiner.train()(scene).usable().any()
+
+
+def test_a_mean_at_the_end_of_the_number_range_does_not_overflow():
+    top = torch.finfo(torch.float32).max
+    scene = make_scene(4).replace(means=torch.tensor([[top, 0, 0], [-top, 0, 0], [0, 1.0, 0], [1.0, 0, 0]]))
+    assert make_refiner(means_reach=1.0)(scene).means.isfinite().all()
 
 
 def test_a_scene_of_a_higher_degree_than_the_network_is_refused():
     with pytest.raises(SceneError, match="SH degree 3; this refiner was built for at most 1"):
         make_refiner(sh_degree=1)(make_scene())
+
+
+def test_a_structure_counts_unusable_gaussians_and_moves_with_them():
+    scene = make_scene(50)
+    scene.quats[4, 0] = torch.nan
+    refiner = make_refiner()
+    structure = refiner.prepare(scene)
+    assert structure.total == 50 and len(structure.order) == 49
+    moved = refiner(scene, structure.to("cpu"))
+    assert torch.equal(moved.means, refiner(scene).means)
+    with pytest.raises(ValueError, match="structure of 50 Gaussians"):
+        refiner(scene[scene.usable()], structure)
 
 
 def test_a_structure_of_another_scene_or_configuration_is_refused():
