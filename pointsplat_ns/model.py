@@ -6,7 +6,9 @@ viewer and ``ns-export gaussian-splat`` work on it unchanged. Only the network i
 
 from __future__ import annotations
 
+import dataclasses
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -17,7 +19,8 @@ from nerfstudio.models.splatfacto import SH2RGB
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from pointsplat_ns.data.scenes import TrainedScene
+from pointsplat_ns.data.dense import DenseScene
+from pointsplat_ns.data.frames import FrameCache
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.lpips import Lpips, LpipsUnavailable, load_lpips
@@ -26,6 +29,9 @@ from pointsplat_ns.pruning import METHODS, compact
 from pointsplat_ns.refined_run import prune_options
 from pointsplat_ns.refiner import Refiner, Structure, preset
 from pointsplat_ns.splatfacto_cpu import SplatfactoCpuModel, SplatfactoCpuModelConfig, viewmats_of
+
+_PRUNED = "pruned"
+"""Names pruned scenes among what is kept in the cache."""
 
 
 @dataclass
@@ -54,11 +60,23 @@ class PointSplatModelConfig(SplatfactoCpuModelConfig):
 class PrunedScene:
     """What training and evaluation need of a scene, made once."""
 
-    scene: TrainedScene
+    scene: DenseScene
     dense_count: int
     pruned: Gaussians
     structure: Structure | None
     seconds: float  # to choose and select, without reading
+
+
+def tensors_in(value: Any) -> Iterator[Tensor]:
+    """Every tensor held by a dataclass, tuple or list, however deep."""
+    if isinstance(value, Tensor):
+        yield value
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        for entry in dataclasses.fields(value):
+            yield from tensors_in(getattr(value, entry.name))
+    elif isinstance(value, (tuple, list)):
+        for entry in value:
+            yield from tensors_in(entry)
 
 
 def options_of(config: PointSplatModelConfig) -> dict[str, Any]:
@@ -84,17 +102,19 @@ class PointSplatModel(SplatfactoCpuModel):
         self.camera_optimizer = CameraOptimizerConfig(mode="off").setup(num_cameras=1, device="cpu")
         self.crop_box = None
         self.step = 0
-        self.scenes: list[TrainedScene] = []
+        self.scenes: list[DenseScene] = []
         self.shown = 0
-        self._pruned: dict[int, PrunedScene] = {}
+        self._cache = FrameCache(0)
+        self._latest: tuple[int, PrunedScene] | None = None
         self._refined: tuple[int, Gaussians] | None = None
         self._lpips: dict[str, Lpips | None] = {}
         self.lpips_reason: str | None = None
         """Why there is no LPIPS, once that is known."""
 
-    def attach(self, scenes: list[TrainedScene], shown: int) -> None:
-        """Take the scenes to work on, and which of them is the model's own to the viewer and the exporter."""
-        self.scenes, self.shown = scenes, shown
+    def attach(self, scenes: list[DenseScene], shown: int, cache: FrameCache) -> None:
+        """Take the scenes to work on, which of them is the model's own to the viewer and the exporter, and where pruned
+        scenes are kept."""
+        self.scenes, self.shown, self._cache, self._latest = scenes, shown, cache, None
 
     def load_state_dict(self, dict, **kwargs):  # type: ignore[override]
         """The network's weights; Splatfacto's own method would look for Gaussians.
@@ -120,21 +140,28 @@ class PointSplatModel(SplatfactoCpuModel):
         return self.refiner.parameter_groups()
 
     def pruned_scene(self, index: int, dense: Gaussians | None = None) -> PrunedScene:
-        """A scene, pruned and serialized; made at the first call and kept. Who has read the dense scene may give it."""
-        if index not in self._pruned:
-            scene = self.scenes[index]
-            dense = scene.read_dense() if dense is None else dense
-            start = time.perf_counter()
-            try:
-                pruned = compact(dense, **options_of(self.config))
-            except PointSplatError as error:
-                raise type(error)(f"{scene.run.checkpoint}: {error}") from error
-            seconds = time.perf_counter() - start
-            pruned = pruned.to(self.device)
-            structure = self.refiner.prepare(pruned)
-            self._pruned[index] = PrunedScene(scene, len(dense), pruned, structure, seconds)
-            CONSOLE.log(f"{scene.name}: kept {len(pruned):,} of {len(dense):,} Gaussians")
-        return self._pruned[index]
+        """A scene, pruned and serialized; kept while the cache has room for it, the latest in any case. Who has read
+        the dense scene may give it."""
+        if self._latest is None or self._latest[0] != index:
+            known = self._cache.get((_PRUNED, index))
+            self._latest = (index, self._prune(index, dense) if known is None else known[0])  # type: ignore[arg-type]
+        return self._latest[1]
+
+    def _prune(self, index: int, dense: Gaussians | None) -> PrunedScene:
+        scene = self.scenes[index]
+        dense = scene.dense(keep=False) if dense is None else dense
+        start = time.perf_counter()
+        try:
+            pruned = compact(dense, **options_of(self.config))
+        except PointSplatError as error:
+            raise type(error)(f"{scene.source}: {error}") from error
+        seconds = time.perf_counter() - start
+        pruned = pruned.to(self.device)
+        structure = self.refiner.prepare(pruned)
+        made = PrunedScene(scene, len(dense), pruned, structure, seconds)
+        self._cache.put((_PRUNED, index), (made, dict(enumerate(tensors_in(made)))))  # type: ignore[arg-type]
+        CONSOLE.log(f"{scene.name}: kept {len(pruned):,} of {len(dense):,} Gaussians")
+        return made
 
     def refine(self, index: int) -> Gaussians:
         """The refined scene; differentiable in training, computed once for the same weights in evaluation."""
@@ -157,7 +184,7 @@ class PointSplatModel(SplatfactoCpuModel):
             torch.cuda.synchronize(self.device)
         return refined, time.perf_counter() - start
 
-    def draw(self, gaussians: Gaussians, scene: TrainedScene, camera: Cameras) -> dict[str, Tensor]:
+    def draw(self, gaussians: Gaussians, scene: DenseScene, camera: Cameras) -> dict[str, Tensor]:
         """Render a scene as its run was rendered.
 
         Args:

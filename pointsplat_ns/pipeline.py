@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -14,13 +16,18 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch.cuda.amp.grad_scaler import GradScaler
 
+from pointsplat_ns import parallel
 from pointsplat_ns.data.scenes import ScenesDataManager, ScenesDataManagerConfig
+from pointsplat_ns.errors import SceneError
 from pointsplat_ns.evaluation import SceneReport, evaluate_scene, summarize
 from pointsplat_ns.model import PointSplatModel, PointSplatModelConfig, options_of
 from pointsplat_ns.refiner import save_refiner
 
 REFINER_NAME = "refiner.safetensors"
 """The trained network, in the run's folder: what ``pointsplat refine --using RUN`` needs."""
+
+_REDUCED = ("l1", "lpips", "psnr")
+"""What is averaged over processes at each step."""
 
 
 @dataclass
@@ -36,7 +43,7 @@ class PointSplatPipeline(VanillaPipeline):
     """One step: one scene, pruned and refined, rendered from some of its training cameras.
 
     Raises:
-        SceneError: if ``--data`` holds no trained scene.
+        SceneError: if ``--data`` holds no scene, or ``world_size`` processes are not connected.
     """
 
     datamanager: ScenesDataManager
@@ -52,24 +59,52 @@ class PointSplatPipeline(VanillaPipeline):
         grad_scaler: GradScaler | None = None,
     ):
         super(VanillaPipeline, self).__init__()
+        if world_size != parallel.world_size():
+            raise SceneError(
+                f"{world_size} processes are asked for and {parallel.world_size()} are connected; start them with "
+                "ns-train --machine.num-devices, on GPUs, or join them with torch.distributed"
+            )
+        if world_size > 1 and torch.device(device).type == "cuda":
+            torch.cuda.set_device(local_rank)  # what is gathered travels by the current device
         self.config, self.test_mode, self.world_size = config, test_mode, world_size
         self.datamanager = config.datamanager.setup(
-            device=device, test_mode=test_mode, world_size=world_size, local_rank=local_rank
+            device=device, test_mode=test_mode, world_size=world_size, local_rank=parallel.rank()
         )
         torch.manual_seed(config.datamanager.seed)
         self._model = config.model.setup(scene_box=None, num_train_data=0, device=device, grad_scaler=grad_scaler)
         self.model.to(device)
-        self.model.attach(self.datamanager.scenes, self.datamanager.shown)
+        self.model.attach(self.datamanager.scenes, self.datamanager.shown, self.datamanager.cache)
+        parallel.share_state(self.model.refiner)
+        if world_size > 1:
+            parallel.synchronise_batch_norm(self.model.refiner)
+        self._saved_groups: list[str] = []
         scenes, indices = self.datamanager.scenes, self.datamanager.train_indices
         self.trained_on: set[str] = {scenes[i].identity for i in indices} if test_mode == "val" else set()
         """Identities of the scenes that the network has been trained on, resumed trainings included."""
 
-    def get_extra_state(self) -> dict[str, list[str]]:
-        """What a checkpoint says beside the weights: which scenes they were trained on."""
-        return {"trained_on": sorted(self.trained_on)}
+    def get_extra_state(self) -> dict[str, Any]:
+        """What a checkpoint says beside the weights: which scenes they were trained on, and gradients in waiting."""
+        state: dict[str, Any] = {"trained_on": sorted(self.trained_on)}
+        if self._saved_groups:
+            groups = self.get_param_groups()
+            state["gradients"] = {name: [p.grad for p in groups[name]] for name in self._saved_groups}
+        return state
 
-    def set_extra_state(self, state: dict[str, list[str]]) -> None:
-        """Remember what a checkpoint was trained on, and say so if scenes have come or gone since."""
+    @contextmanager
+    def saving_gradients(self, groups: list[str]) -> Iterator[None]:
+        """Within, a checkpoint holds the gradients of these parts of the network."""
+        self._saved_groups = groups
+        try:
+            yield
+        finally:
+            self._saved_groups = []
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Remember what a checkpoint was trained on, and say so if scenes have come or gone since; take up gradients
+        that were gathering when it was saved."""
+        for name, gradients in state.get("gradients", {}).items():
+            for p, gradient in zip(self.get_param_groups()[name], gradients, strict=True):
+                p.grad = None if gradient is None else gradient.to(p)
         known = set(state["trained_on"])
         gone = known - {scene.identity for scene in self.datamanager.scenes}
         if gone:
@@ -84,13 +119,19 @@ class PointSplatPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict, dict]:
         """Losses of one scene at some of its training photos.
 
-        Random numbers (the order of serialization curves, dropped paths) depend on the seed and the step
-        alone, as the choice of scene and photos does: a resumed training goes on as if it had never stopped.
+        Random numbers (the order of serialization curves, dropped paths) depend on the seed and the place of the
+        scene in the sequence alone, as the choice of scene and photos does: a resumed training goes on as if it had
+        never stopped. Several processes take turns in that sequence; the values of their losses and metrics are the
+        mean over processes, the gradients each process's own.
         """
-        torch.manual_seed(random.Random(f"{self.config.datamanager.seed} network {step}").getrandbits(63))
+        place = self.datamanager.place(step)
+        torch.manual_seed(random.Random(f"{self.config.datamanager.seed} network {place}").getrandbits(63))
         index, frames = self.datamanager.next_train(step)
         outputs, losses, metrics = self.model.losses(index, frames)
-        metrics["scene"] = index
+        means = parallel.means_over_ranks({**losses, "psnr": metrics["psnr"]}, _REDUCED)
+        if self.world_size > 1:
+            losses = {name: parallel.with_value(value, means[name]) for name, value in losses.items()}
+        metrics |= {"psnr": means["psnr"], "scene": index}
         return outputs, losses, metrics
 
     @torch.no_grad()
@@ -134,24 +175,33 @@ class PointSplatPipeline(VanillaPipeline):
         Returns:
             ``psnr``, ``ssim`` and ``lpips`` of the refined scenes (of those never trained on, if there are any),
             ``average``, ``average_unseen`` and ``average_seen`` (over scenes, by variant), and ``scenes``. What
-            cannot be computed is None, and ``lpips_note`` says why LPIPS is missing.
+            cannot be computed is None, and ``lpips_note`` says why LPIPS is missing. ``reference`` says what renders
+            were compared with, here and in each scene: ``photos``, or ``dense renders`` where a scene has no photos
+            (the dense scene is then the reference, and has no PSNR). Where there are both, the figures above are those
+            against photos, and ``against_dense_renders`` holds the others.
         """
         training = self.training
         self.eval()
         manager, model = self.datamanager, self.model
         reports: list[SceneReport] = []
-        for index, scene in enumerate(manager.scenes):
-            dense = scene.read_dense()
+        mine = range(parallel.rank(), len(manager.scenes), self.world_size)
+        for index in mine:
+            scene = manager.scenes[index]
+            dense = scene.dense(keep=False)
             made = model.pruned_scene(index, dense)
             refined, seconds = model.timed_refine(index)
             variants = {"dense": dense.to(model.device), "pruned": made.pruned, "refined": refined}
             report = evaluate_scene(model, scene, variants, manager.held_out(index), True, output_path)
             report.seen_in_training = scene.identity in self.trained_on
             report.seconds = {"prune": made.seconds, "refine": seconds}
+            report.last_picture = None
             reports.append(report)
         self.train(training)
-        summary = summarize(reports, get_std)
+        order = {scene.name: index for index, scene in enumerate(manager.scenes)}
+        reports = sorted(parallel.gathered(reports), key=lambda report: order[report.name])
+        summary = summarize_by_reference(reports, [scene.has_photos for scene in manager.scenes], get_std)
         summary["settings"] = {"size": self.config.model.size, **options_of(self.config.model)}
+        summary["supervision"] = manager.supervision
         if model.lpips_reason is not None:
             summary["lpips_note"] = model.lpips_reason
         if step is None:
@@ -163,7 +213,7 @@ class PointSplatPipeline(VanillaPipeline):
 
         def save(step: int) -> None:
             trainer = attributes.trainer
-            if trainer is not None:
+            if trainer is not None and parallel.rank() == 0:
                 names = [self.datamanager.scenes[i].name for i in self.datamanager.train_indices]
                 save_refiner(
                     self.model.refiner,
@@ -172,6 +222,27 @@ class PointSplatPipeline(VanillaPipeline):
                 )
 
         return [TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], save)]
+
+
+def summarize_by_reference(reports: list[SceneReport], has_photos: list[bool], with_std: bool) -> dict[str, Any]:
+    """:func:`~pointsplat_ns.evaluation.summarize`, where no mean mixes what was compared with photos and what was
+    compared with the dense scene's own renders."""
+    names = {True: "photos", False: "dense renders"}
+    parts = {
+        photos: summarize([r for r, kind in zip(reports, has_photos, strict=True) if kind == photos], with_std)
+        for photos in sorted(set(has_photos), reverse=True)
+    }
+    for photos, part in parts.items():
+        part["reference"] = names[photos]
+        for row in part["scenes"].values():
+            row["reference"] = names[photos]
+    summary = next(iter(parts.values()))
+    if len(parts) == 2:
+        other = parts[False]
+        rows = {**summary["scenes"], **other.pop("scenes")}
+        summary["scenes"] = {r.name: rows[r.name] for r in reports}
+        summary["against_dense_renders"] = other
+    return summary
 
 
 def _finite(values: dict[str, Any]) -> dict[str, float]:

@@ -6,15 +6,16 @@ import copy
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
-from nerfstudio.engine.schedulers import CosineDecaySchedulerConfig
+from nerfstudio.engine.schedulers import CosineDecaySchedulerConfig, MultiStepSchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
 from pointsplat_ns.pipeline import PointSplatPipelineConfig
-from pointsplat_ns.splatfacto_cpu_method import SplatfactoCpuTrainer
+from pointsplat_ns.training import PointSplatTrainer
 
 RATES = {
     "encoder": 1e-3,
@@ -29,6 +30,19 @@ RATES = {
 """Adam's peak learning rate for each part of the network. The published 1e-5 to 3e-5 suit a long training of the full
 network; the small ones learn in a few hundred steps at these."""
 
+PAPER_RATES = dict.fromkeys(RATES, 1e-5)
+"""The paper's: 1e-5 throughout, divided by 10 (``schedule="step"``) at :data:`STEP_AT` of the steps."""
+
+AUTHORS_RATES = {
+    **dict.fromkeys(RATES, 3e-5),
+    **dict.fromkeys(("means", "scales", "quats"), 1e-5),
+    "features_rest": 1e-6,
+}
+"""Those of the authors' released code, with its cosine."""
+
+STEP_AT, STEP_FACTOR = 0.6, 0.1
+"""Where the step schedule divides the rates by ten, as a share of the steps: 6,000 of 10,000 in the paper."""
+
 WARM_UP = 0.05
 """Share of the steps over which the rates rise to their peak, before the cosine."""
 
@@ -37,19 +51,35 @@ WARM_UP = 0.05
 class PointSplatTrainerConfig(TrainerConfig):
     """nerfstudio's trainer, with the learning-rate schedules fitted to the length of the run"""
 
-    _target: type = field(default_factory=lambda: SplatfactoCpuTrainer)
+    _target: type = field(default_factory=lambda: PointSplatTrainer)
+    rates: Literal["fast", "paper", "authors"] = "fast"
+    """Learning rates of the parts of the network: those that teach a small network in a few hundred steps, the paper's
+    (1e-5), or those of the authors' code (1e-6 to 3e-5). What was set by hand is left as it is."""
+    schedule: Literal["cosine", "step"] = "cosine"
+    """How the rates fall: along a cosine after a short warm-up, or to a tenth at 60 % of the steps."""
+    gradient_accumulation_steps: dict[str, int] = field(default_factory=dict)
+    """Steps, each on one scene, whose gradients are averaged before an update: ``all 4``, or by part of the network."""
 
     def setup(self, **kwargs) -> Trainer:
-        """The trainer, for a copy of this config whose cosine schedules end with the run.
+        """The trainer, for a copy of this config whose rates are those asked for and whose schedules end with the run.
 
         A resumed run ends ``max_num_iterations`` after the step that it resumes from, and its schedules with it: what
         was stopped at 500 of 2,000 steps and is resumed for 1,500 goes on exactly as it would have.
         """
         config = copy.deepcopy(self)
         steps = _steps_done(config) + config.max_num_iterations
-        for group in config.optimizers.values():
+        rates = {"fast": RATES, "paper": PAPER_RATES, "authors": AUTHORS_RATES}[self.rates]
+        for name, group in config.optimizers.items():
+            if group["optimizer"].lr == RATES.get(name):
+                group["optimizer"].lr = rates[name]
             schedule = group["scheduler"]
             if isinstance(schedule, CosineDecaySchedulerConfig) and schedule.max_steps == 0:
+                if self.schedule == "step":
+                    milestones = (max(1, round(STEP_AT * steps)),)
+                    group["scheduler"] = MultiStepSchedulerConfig(
+                        max_steps=steps, gamma=STEP_FACTOR, milestones=milestones
+                    )
+                    continue
                 schedule.warm_up_end = max(1, round(WARM_UP * steps))
                 schedule.max_steps = max(steps, schedule.warm_up_end + 1)  # the cosine divides by what is between
         return self._target(config, **kwargs)

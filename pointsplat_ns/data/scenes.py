@@ -1,7 +1,8 @@
 """Trained scenes with their posed photos, one or many, as the refiner is trained and evaluated on.
 
 A trained run knows its data, its dataparser and its frame, so the run is all that a person names:
-``--data`` takes one run, or any folder above several.
+``--data`` takes one run, or any folder above several. Photos are not needed where the dense scene's own
+renders are what the refiner learns from: ``--data`` may then name PLY files, too.
 """
 
 from __future__ import annotations
@@ -22,11 +23,12 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from pointsplat_ns.data.dense import DenseScene, PlyScene, SampledPoses, Split, find_plys
 from pointsplat_ns.data.frames import FrameCache, Frames, free_memory_share, to_device
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.inert_yaml import Tagged
-from pointsplat_ns.io.runs import Run, find_runs, scene_names, shown_scene
+from pointsplat_ns.io.runs import Run, find_runs, open_run, scene_names, shown_scene
 from pointsplat_ns.io.splatfacto import read_checkpoint
 
 VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
@@ -65,19 +67,30 @@ def dataparser_of(run: Run) -> DataParser:
     return config.setup()
 
 
-class TrainedScene:
+class TrainedScene(DenseScene):
     """One trained run: its Gaussians and, when asked for, its posed photos.
 
     Args:
         name: unique among the scenes in use.
         run: where everything is.
-        cache: for decoded photos, shared among scenes.
+        cache: for decoded photos, Gaussians and renders, shared among scenes.
+        poses: how to sample poses if the data is gone.
+        device: where the dense scene's own renders are drawn.
+        has_photos: whether the run's data is at hand.
     """
 
-    def __init__(self, name: str, run: Run, cache: FrameCache):
-        self.name = name
+    def __init__(
+        self,
+        name: str,
+        run: Run,
+        cache: FrameCache,
+        poses: SampledPoses | None = None,
+        device: torch.device | str = "cpu",
+        has_photos: bool = True,
+    ):
+        super().__init__(name, run.checkpoint, cache, poses, device)
         self.run = run
-        self._cache = cache
+        self.has_photos = has_photos
 
     @property
     def identity(self) -> str:
@@ -127,14 +140,71 @@ class TrainedScene:
         return Frames(InputDataset(self._outputs(split), scale), cache=self._cache)
 
     @cached_property
-    def train_frames(self) -> Frames:
-        """Training photos at the resolution that the run was trained at."""
-        return self._frames("train")
+    def train_frames(self) -> Any:
+        """Training photos at the resolution that the run was trained at; the scene's own renders without data."""
+        return self._frames("train") if self.has_photos else self.rendered_train
 
     @cached_property
-    def eval_frames(self) -> Frames:
-        """Held-out photos at the resolution that the run was trained at."""
-        return self._frames("test")
+    def eval_frames(self) -> Any:
+        """Held-out photos at the resolution that the run was trained at; the scene's own renders without data."""
+        return self._frames("test") if self.has_photos else self.rendered_eval
+
+    def cameras(self, split: Split) -> Cameras:
+        """The dataset's cameras, or sampled ones if the data is gone."""
+        if not self.has_photos:
+            return super().cameras(split)
+        return (self.train_frames if split == "train" else self.eval_frames).dataset.cameras
+
+
+def find_scenes(
+    folder: Path,
+    supervision: Literal["auto", "photos", "dense"],
+    cache: FrameCache,
+    poses: SampledPoses | None = None,
+    device: torch.device | str = "cpu",
+    need_data: bool = True,
+) -> tuple[Literal["photos", "dense"], list[DenseScene]]:
+    """The scenes that ``--data`` names, and what they are learned from.
+
+    Args:
+        folder: a run, a PLY file, or any folder above several.
+        supervision: ``photos`` takes the runs, whose data must be at hand; ``dense`` takes the runs, whose data may be
+            gone, and the PLY files; ``auto`` is ``photos`` if there is a run, ``dense`` otherwise.
+        cache, poses, device: for the scenes.
+        need_data: whether photos will be looked at.
+
+    Raises:
+        SceneError: if there is no scene, or a run's data is needed and not found.
+    """
+    runs: list[Run] = []
+    nothing: SceneError | None = None
+    try:
+        if folder.suffix.lower() != ".ply":
+            runs = find_runs(folder, need_data=False)
+    except SceneError as error:
+        nothing = error
+    plys = find_plys(folder) if supervision == "dense" or (supervision == "auto" and not runs) else []
+    if not runs and not plys:
+        if nothing is None:
+            raise SceneError(f"{folder}: no trained run; expected one, or --pipeline.datamanager.supervision dense")
+        hint = " (PLY files are trained on with --pipeline.datamanager.supervision dense)"
+        raise SceneError(f"{nothing}{hint if supervision == 'photos' else ', or 3DGS PLY files'}") from nothing
+    chosen: Literal["photos", "dense"] = "dense" if plys or supervision == "dense" else "photos"
+    scenes: list[DenseScene] = []
+    for name, run in zip(scene_names(runs), runs, strict=True):
+        has_photos = True
+        if need_data:
+            try:
+                run = dataclasses.replace(run, data=open_run(run.config_path).data)
+            except SceneError as error:
+                if chosen == "photos":
+                    raise SceneError(f"{error}, or take --pipeline.datamanager.supervision dense") from error
+                has_photos = False
+        scenes.append(TrainedScene(name, run, cache, poses, device, has_photos))
+    taken = {scene.name for scene in scenes}
+    for name, path in plys:
+        scenes.append(PlyScene(f"{name}.ply" if name in taken else name, path, cache, poses, device))
+    return chosen, scenes
 
 
 @dataclass
@@ -143,13 +213,22 @@ class ScenesDataManagerConfig(DataManagerConfig):
 
     _target: type = field(default_factory=lambda: ScenesDataManager)
     data: Path | None = None
-    """A trained Splatfacto run, or a folder above several (the newest run of each experiment is taken)."""
+    """A trained Splatfacto run, a 3DGS .ply, or a folder above several (the newest run of each experiment is taken)."""
+    supervision: Literal["auto", "photos", "dense"] = "auto"
+    """What renders of the refined scene are compared with in training: photos, or the dense scene's own renders, from
+    the dataset's poses or, where there is no dataset, from poses sampled in free space. auto is photos for trained
+    runs, and dense for PLY files."""
+    sampled_poses: int = 40
+    """Poses sampled to train on in a scene that has no dataset (a fifth as many again are held out)."""
+    sampled_size: tuple[int, int] = (320, 240)
+    """Width and height in pixels of pictures from sampled poses."""
     eval_scenes: tuple[str, ...] = ()
     """Names of scenes never to train on, to see how the refiner does on scenes that it does not know."""
     images_per_step: int = 2
     """Training photos of one scene rendered at each step (the paper: 2)."""
     cache_gigabytes: float | None = None
-    """Memory for decoded photos; by default a quarter of what is free. What does not fit is read again."""
+    """Memory for decoded photos, dense and pruned scenes and their renders; by default a quarter of what is free. What
+    does not fit is made again when it is due."""
     seed: int = 0
     """Chooses the order of scenes and photos."""
 
@@ -158,7 +237,8 @@ class ScenesDataManager(DataManager):
     """Hands out, at each step, one scene and some of its training photos.
 
     What a step gets depends on the seed and the step alone, so that a resumed training goes on as if
-    it had never stopped.
+    it had never stopped. Of W processes, process R takes the places R, W + R, 2 W + R... of one sequence:
+    together they see what one process sees in W times the steps.
 
     Raises:
         SceneError: if ``data`` holds no trained run, or ``eval_scenes`` names one that is not there.
@@ -177,16 +257,20 @@ class ScenesDataManager(DataManager):
     ):
         self.config, self.device, self.test_mode = config, device, test_mode
         self.world_size, self.local_rank = world_size, local_rank
-        if world_size > 1:
-            raise SceneError("--machine.num-devices: the refiner is trained by one process; expected 1")
         if config.data is None:
-            raise SceneError("--data is missing: expected a trained Splatfacto run, or a folder above several")
+            raise SceneError("--data is missing: expected a trained Splatfacto run, a .ply, or a folder above several")
         if config.images_per_step < 1:
             raise DataError(f"--images-per-step {config.images_per_step}: expected at least 1")
-        runs = find_runs(config.data, need_data=test_mode != "inference")
+        if config.sampled_poses < 1 or min(config.sampled_size) < 1:
+            size = "{} x {}".format(*config.sampled_size)
+            raise DataError(f"{config.sampled_poses} sampled poses of {size} pixels: expected at least 1 of 1 x 1")
         gigabytes = config.cache_gigabytes
-        cache = FrameCache(free_memory_share() if gigabytes is None else int(gigabytes * 1e9))
-        self.scenes = [TrainedScene(name, run, cache) for name, run in zip(scene_names(runs), runs, strict=True)]
+        self.cache = FrameCache(free_memory_share() if gigabytes is None else int(gigabytes * 1e9))
+        held_out_poses = max(1, config.sampled_poses // 5)
+        poses = SampledPoses(config.sampled_poses, held_out_poses, *config.sampled_size, seed=config.seed)
+        self.supervision, self.scenes = find_scenes(
+            Path(config.data), config.supervision, self.cache, poses, device, need_data=test_mode != "inference"
+        )
         names = [scene.name for scene in self.scenes]
         unknown = [name for name in config.eval_scenes if name not in names]
         if unknown:
@@ -201,13 +285,14 @@ class ScenesDataManager(DataManager):
         """The scene that the viewer and the exporter get."""
         training = ", ".join(names[i] for i in self.train_indices)
         held_out = ", ".join(config.eval_scenes) or "no scene (held-out photos of the training scenes serve)"
-        CONSOLE.log(f"training scenes: {training}; evaluation on: {held_out}")
+        targets = "photos" if self.supervision == "photos" else "renders of the dense scenes"
+        CONSOLE.log(f"training scenes: {training}; trained on: {targets}; evaluation on: {held_out}")
         super().__init__()
 
     @property
     def train_dataset(self) -> InputDataset | None:  # type: ignore[override]
         """Training photos of the shown scene, for the viewer."""
-        return None if self.test_mode == "inference" else self.scenes[self.shown].train_frames.dataset
+        return None if self.test_mode == "inference" else self.training_frames(self.shown).dataset
 
     @property
     def eval_dataset(self) -> InputDataset | None:  # type: ignore[override]
@@ -225,21 +310,32 @@ class ScenesDataManager(DataManager):
     def setup_eval(self) -> None:
         """Nothing to set up: photos are read when they are due."""
 
+    def training_frames(self, scene: int) -> Any:
+        """What a scene is learned from: its photos, or the dense scene's own renders."""
+        scene_at = self.scenes[scene]
+        return scene_at.train_frames if self.supervision == "photos" else scene_at.rendered_train
+
+    def place(self, step: int) -> int:
+        """Where this process is in the sequence of scenes at a step of its own."""
+        return step * self.world_size + self.local_rank
+
     def _choice(self, step: int) -> tuple[int, list[int]]:
         """Scene and photos of a step: each scene once before any twice, photos at random without repetition."""
+        step = self.place(step)
         epoch, place = divmod(step, len(self.train_indices))
         order = random.Random(f"{self.config.seed} scenes {epoch}").sample(self.train_indices, len(self.train_indices))
         scene = order[place]
-        count = len(self.scenes[scene].train_frames)
+        count = len(self.training_frames(scene))
         chosen = random.Random(f"{self.config.seed} photos {step}")
         return scene, chosen.sample(range(count), min(self.config.images_per_step, count))
 
     def next_train(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
         """Index of a training scene, and some of its training photos with their cameras, on the device."""
         scene, photos = self._choice(step)
-        frames = [to_device(self.scenes[scene].train_frames[i], self.device) for i in photos]
+        targets = self.training_frames(scene)
+        frames = [to_device(targets[i], self.device) for i in photos]
         next_scene, next_photos = self._choice(step + 1)
-        self.scenes[next_scene].train_frames.prefetch(next_photos)
+        self.training_frames(next_scene).prefetch(next_photos)
         return scene, frames
 
     def next_eval(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
@@ -247,7 +343,9 @@ class ScenesDataManager(DataManager):
         scene = self.eval_indices[step % len(self.eval_indices)]
         frames = self.scenes[scene].eval_frames
         if len(frames) == 0:
-            raise DataError(f"{self.scenes[scene].run.data}: no frame is held out; change the dataparser's split")
+            raise DataError(
+                f"{self.scenes[scene].source}: no frame of its data is held out; change the dataparser's split"
+            )
         index = random.Random(f"{self.config.seed} eval {step}").randrange(len(frames))
         return scene, [to_device(frames[index], self.device)]
 
@@ -261,7 +359,7 @@ class ScenesDataManager(DataManager):
 
     def get_train_rays_per_batch(self) -> int:
         """Pixels of a step, for nerfstudio's log."""
-        cameras = self.scenes[self.train_indices[0]].train_frames.dataset.cameras
+        cameras = self.training_frames(self.train_indices[0]).dataset.cameras
         return int(cameras.height[0]) * int(cameras.width[0]) * self.config.images_per_step
 
     def get_eval_rays_per_batch(self) -> int:

@@ -92,8 +92,6 @@ def test_what_cannot_be_a_scene_says_what_is_wrong(trained_walls, tmp_path):
         manager_of(trained_walls, eval_scenes=("wall-a", "wall-b"))
     with pytest.raises(DataError, match="--images-per-step 0"):
         manager_of(trained_walls, images_per_step=0)
-    with pytest.raises(SceneError, match="one process"):
-        ScenesDataManagerConfig(data=trained_walls).setup(world_size=2)
 
 
 def test_a_run_of_another_method_is_refused_when_it_is_named_itself(wall_config, wall_scene, tmp_path):
@@ -235,6 +233,15 @@ def test_each_epoch_has_each_scene_once_and_photos_differ(trained_walls):
     assert len({steps[i][0] for i in range(0, 40, 2)}) == 2, "the order of scenes varies"
     assert all(len(set(photos)) == 2 for _, photos in steps)
     assert {i for _, photos in steps for i in photos} == set(range(NUM_TRAIN)), "every training photo has its turn"
+
+
+def test_processes_share_out_what_one_would_see(trained_walls):
+    alone = [photos_of(manager_of(trained_walls), step) for step in range(12)]
+    config = ScenesDataManagerConfig(data=trained_walls, cache_gigabytes=0.01)
+    for size in (2, 3):
+        shares = [config.setup(test_mode="val", world_size=size, local_rank=rank) for rank in range(size)]
+        together = [photos_of(share, step) for step in range(12 // size) for share in shares]
+        assert together == alone
 
 
 def test_more_photos_a_step_than_there_are_means_all(trained_walls):

@@ -1,0 +1,253 @@
+"""Training across scenes without photos: dense supervision, exact resuming, accumulation, rates and schedules."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from pathlib import Path
+from unittest import mock
+
+import pytest
+import torch
+
+import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
+from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io import write_ply
+from pointsplat_ns.pointsplat_method import RATES, pointsplat_config
+
+
+def box_room(seed: int, count: int = 900) -> Gaussians:
+    """A closed box of coloured Gaussians, 4 x 3 x 2 scene units: free inside, covered all around."""
+    generator = torch.Generator().manual_seed(seed)
+    means = torch.rand(count, 3, generator=generator) * 2 - 1
+    rows, axis = torch.arange(count), torch.arange(count) % 3
+    means[rows, axis] = torch.sign(means[rows, axis])
+    return Gaussians(
+        means=means * torch.tensor([2.0, 1.5, 1.0]),
+        scales=torch.full((count, 3), 0.12).log(),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        opacities=torch.full((count, 1), 4.0),
+        features_dc=torch.sin(2 * means + torch.randn(3, generator=generator)),
+        features_rest=torch.zeros(count, 3, 3),
+    )
+
+
+def config_of(data: Path, output_dir: Path, steps: int):
+    """The method as registered, tiny, on tiny pictures, without LPIPS."""
+    config = pointsplat_config()
+    config.machine.device_type, config.experiment_name = "cpu", "refiner"
+    config.output_dir, config.max_num_iterations, config.steps_per_eval_image = output_dir, steps, 3
+    config.pipeline.datamanager.data = config.data = data
+    config.pipeline.datamanager.sampled_poses, config.pipeline.datamanager.sampled_size = 6, (48, 36)
+    model = config.pipeline.model
+    model.size, model.keep, model.score, model.lpips_weight = "tiny", 0.4, "paper", 0.0
+    config.set_timestamp()
+    return config
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory) -> Path:
+    """A folder of three PLY files and nothing else."""
+    folder = tmp_path_factory.mktemp("rooms")
+    for seed in range(3):
+        write_ply(box_room(seed), folder / f"room{seed}.ply")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(rooms, run_training, tmp_path_factory):
+    """A short training on two of the rooms: its config and trainer."""
+    config = config_of(rooms, tmp_path_factory.mktemp("refined"), steps=16)
+    config.pipeline.datamanager.eval_scenes = ("room2",)
+    trainer, _ = run_training(config)
+    return config, trainer
+
+
+# dense supervision
+
+
+def test_a_folder_of_ply_files_trains_the_refiner(trained, no_lpips):
+    config, trainer = trained
+    pipeline = trainer.pipeline
+    report = pipeline.get_average_eval_image_metrics()
+    assert json.loads(json.dumps(report, allow_nan=False)) == report
+    assert report["supervision"] == "dense" and report["reference"] == "dense renders"
+    for name, block in report["scenes"].items():
+        assert block["reference"] == "dense renders" and block["views"] == 1
+        assert block["seen_in_training"] == (name != "room2")
+        assert block["dense"]["psnr"] is None or block["dense"]["psnr"] > 100, "it is the reference: float32 noise"
+        # dB; 16 steps give the known scenes 1.5 or more
+        assert block["refined"]["psnr"] > block["pruned"]["psnr"] + (0.5 if name != "room2" else 0.0)
+
+
+def test_the_evaluation_of_the_saved_run_is_that_of_the_training(trained, no_lpips):
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    config, trainer = trained
+    opened = eval_setup(config.get_base_dir() / "config.yml")[1].get_average_eval_image_metrics()
+    assert opened["scenes"]["room2"]["seen_in_training"] is False
+    assert opened["psnr"] == trainer.pipeline.get_average_eval_image_metrics()["psnr"]
+
+
+def test_no_mean_mixes_photos_and_dense_renders(trained_walls, rooms, tmp_path, no_lpips):
+    shutil.copytree(trained_walls, tmp_path / "all")
+    shutil.copy(rooms / "room0.ply", tmp_path / "all")
+    config = config_of(tmp_path / "all", tmp_path, 1)
+    config.pipeline.datamanager.supervision = "dense"
+    report = config.pipeline.setup(device="cpu", test_mode="test").eval().get_average_eval_image_metrics(get_std=True)
+    json.dumps(report, allow_nan=False)
+    scenes, other = report["scenes"], report["against_dense_renders"]
+    references = {name: block["reference"] for name, block in scenes.items()}
+    assert references == {"wall-a": "photos", "wall-b": "photos", "room0": "dense renders"}
+    walls = [scenes[name]["refined"]["psnr"] for name in ("wall-a", "wall-b")]
+    assert report["reference"] == "photos" and report["psnr"] == pytest.approx(sum(walls) / 2)
+    assert other["reference"] == "dense renders" and other["psnr"] == scenes["room0"]["refined"]["psnr"]
+    assert report["average"]["refined"]["psnr"] == report["psnr"] and "scenes" not in other
+
+
+def test_the_loss_is_against_the_dense_scene_even_where_there_are_photos(trained_walls):
+    config = config_of(trained_walls, Path("unused"), 1)
+    config.pipeline.model.keep = 1.0
+    losses = {}
+    for supervision in ("photos", "dense"):
+        config.pipeline.datamanager.supervision = supervision
+        pipeline = config.pipeline.setup(device="cpu", test_mode="val")
+        losses[supervision] = float(pipeline.get_train_loss_dict(0)[1]["l1"].detach())
+    # an untrained refiner that keeps all is the dense scene, but for the rounding of its renders to 8 bits
+    assert losses["dense"] < 0.5 / 255 and losses["photos"] > 5 / 255
+
+
+def test_pruned_scenes_are_kept_within_the_bound_and_made_again_alike(rooms):
+    config = config_of(rooms, Path("unused"), 1)
+    config.pipeline.datamanager.cache_gigabytes = 0.0
+    none_kept = config.pipeline.setup(device="cpu", test_mode="test").model
+    config.pipeline.datamanager.cache_gigabytes = 0.05
+    kept = config.pipeline.setup(device="cpu", test_mode="test").model
+    made = [kept.pruned_scene(index) for index in range(3)]
+    again = [none_kept.pruned_scene(index) for index in (0, 1, 2, 0)]
+    assert all(kept.pruned_scene(index) is made[index] for index in range(3))
+    assert again[3] is not again[0] and none_kept.pruned_scene(0) is again[3], "the latest is there in any case"
+    for one, other in ((again[3], again[0]), (again[1], made[1])):
+        assert all(torch.equal(a, b) for (_, a), (_, b) in zip(one.pruned.items(), other.pruned.items(), strict=True))
+    structures = made[0].structure
+    smallest = structures.order.numel() * 8 + sum(v.numel() * 4 for _, v in made[0].pruned.items())
+    assert kept._cache.num_bytes > 3 * smallest, "neighbour tables count, too"
+
+
+# resuming
+
+
+@pytest.mark.parametrize(("stop", "accumulate", "schedule"), [(4, 3, "step"), (3, 1, "cosine")])
+def test_an_interrupted_training_has_the_losses_of_an_unbroken_one(
+    rooms, run_training, tmp_path, stop, accumulate, schedule
+):
+    def config(name, steps):
+        made = config_of(rooms, tmp_path / name, steps)
+        made.gradient_accumulation_steps, made.schedule = {"all": accumulate}, schedule
+        made.steps_per_save, made.save_only_latest_checkpoint = stop, False
+        return made
+
+    whole, losses = run_training(config("whole", 8))
+    assert len(set(losses)) == 8
+    rest = config("rest", 8 - stop - 1)
+    rest.load_dir, rest.load_step = whole.checkpoint_dir, stop
+    resumed, last_losses = run_training(rest)
+    assert last_losses == losses[stop + 1 :]
+    for name, value in whole.pipeline.model.refiner.state_dict().items():
+        assert torch.equal(resumed.pipeline.model.refiner.state_dict()[name], value), name
+    rates = [t.optimizers.optimizers["means"].param_groups[0]["lr"] for t in (whole, resumed)]
+    assert rates[0] == rates[1]
+    state = torch.load(whole.checkpoint_dir / f"step-{stop:09d}.ckpt", weights_only=True)["pipeline"]["_extra_state"]
+    assert ("gradients" in state) == (accumulate == 3), "only gradients that wait for their update are saved"
+
+
+def test_dropped_paths_and_shuffled_curves_are_those_of_an_unbroken_training(rooms):
+    pipeline = config_of(rooms, Path("unused"), 1).pipeline.setup(device="cpu", test_mode="val").train()
+    blocks = [m for m in pipeline.model.refiner.modules() if hasattr(m, "drop_path")]
+    for block in blocks:
+        block.drop_path = 0.5
+    for parameter in pipeline.model.refiner.heads.parameters():  # or residuals are zero, whatever is dropped
+        torch.nn.init.normal_(parameter, std=0.05)
+    first = [float(pipeline.get_train_loss_dict(step)[1]["l1"].detach()) for step in (0, 3, 6, 3)]
+    torch.manual_seed(99)
+    assert float(pipeline.get_train_loss_dict(3)[1]["l1"].detach()) == first[1] == first[3]
+    with mock.patch.object(pipeline.config.datamanager, "seed", 1), torch.random.fork_rng():
+        index, frames = pipeline.datamanager.next_train(3)
+        torch.manual_seed(5)
+        assert float(pipeline.model.losses(index, frames)[1]["l1"].detach()) != first[3], "proves too little"
+
+
+# accumulation, rates, schedules
+
+
+def test_accumulated_gradients_are_averaged_before_they_are_clipped(rooms, run_training, tmp_path):
+    pipeline = config_of(rooms, Path("unused"), 1).pipeline.setup(device="cpu", test_mode="val").train()
+    for step in range(2):
+        (0.5 * pipeline.get_train_loss_dict(step)[1]["l1"]).backward()
+    means = {n: [p.grad for p in group] for n, group in pipeline.get_param_groups().items() if n != "encoder"}
+    norms = {n: float(torch.cat([g.reshape(-1) for g in grads]).norm()) for n, grads in means.items()}
+    assert min(norms["means"], norms["scales"]) > 1e-5, "proves too little"
+    config = config_of(rooms, tmp_path, 2)
+    config.gradient_accumulation_steps = {"all": 2}
+    factors = dict.fromkeys(norms, 1.5) | {
+        "scales": 0.5
+    }  # of the mean's norm: above it, but below the sum's; and below
+    for name, factor in factors.items():
+        config.optimizers[name]["optimizer"].max_norm = factor * norms[name]
+    trainer, _ = run_training(config)
+    groups = trainer.pipeline.get_param_groups()
+    for name, grads in means.items():
+        for p, mean in zip(groups[name], grads, strict=True):
+            wanted = mean * min(1.0, factors[name])
+            # float32: a half taken before the sum, and after it; the norm itself is float32
+            torch.testing.assert_close(p.grad, wanted, rtol=1e-3, atol=1e-7)
+
+
+@pytest.mark.parametrize("steps", [{"hands": 2}, {"encoder": 0}])
+def test_an_accumulation_that_means_nothing_is_refused_and_leaves_no_folder(rooms, tmp_path, steps):
+    config = config_of(rooms, tmp_path / "outputs", 1)
+    config.gradient_accumulation_steps = steps
+    config.save_config()
+    with pytest.raises(PointSplatError, match="--gradient-accumulation-steps .*expected all or one of encoder"):
+        config.setup(local_rank=0, world_size=1).setup()
+    assert not (tmp_path / "outputs").exists()
+
+
+def fitted_of(config):
+    with mock.patch.object(config, "_target", lambda fitted, **_: fitted):
+        return config.setup().optimizers
+
+
+def test_published_rates_are_taken_but_for_what_was_set_by_hand():
+    config = config_of(Path("unused"), Path("unused"), 100)
+    assert {n: g["optimizer"].lr for n, g in fitted_of(config).items()} == RATES
+    config.optimizers["backbone"]["optimizer"].lr = 7e-4
+    expected = {"paper": dict.fromkeys(RATES, 1e-5), "authors": dict.fromkeys(RATES, 3e-5)}
+    expected["authors"] |= {"means": 1e-5, "scales": 1e-5, "quats": 1e-5, "features_rest": 1e-6}
+    for config.rates in ("paper", "authors"):
+        fitted = fitted_of(config)
+        assert {n: g["optimizer"].lr for n, g in fitted.items()} == expected[config.rates] | {"backbone": 7e-4}
+        assert all(g["optimizer"].eps == 1e-15 and g["optimizer"].max_norm == 2.0 for g in fitted.values())
+
+
+@pytest.mark.parametrize("steps", [1, 10, 10_000])
+def test_the_step_schedule_divides_by_ten_at_sixty_percent(steps):
+    config = config_of(Path("unused"), Path("unused"), steps)
+    config.schedule = "step"
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1e-5)
+    schedule = fitted_of(config)["encoder"]["scheduler"].setup().get_scheduler(optimizer, 1e-5)
+    rates = []
+    for _ in range(steps):
+        rates.append(optimizer.param_groups[0]["lr"])
+        optimizer.step(), schedule.step()
+    at = max(1, round(0.6 * steps))
+    assert rates[:at] == [1e-5] * at
+    assert all(math.isclose(rate, 1e-6, rel_tol=1e-9) for rate in rates[at:])
+
+
+def test_processes_that_are_not_connected_are_refused(rooms):
+    config = config_of(rooms, Path("unused"), 1)
+    with pytest.raises(SceneError, match="2 processes are asked for and 1 are connected"):
+        config.pipeline.setup(device="cpu", test_mode="val", world_size=2)
