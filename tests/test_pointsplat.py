@@ -42,6 +42,8 @@ def small_config(data: Path, output_dir: Path, steps: int = 10, **model):
     config.pipeline.datamanager.data = config.data = data
     for name, value in {"size": "tiny", "keep": 0.5, "score": "paper", "lpips_weight": 0.0, **model}.items():
         setattr(config.pipeline.model, name, value)
+    for group in config.optimizers.values():
+        group["optimizer"].lr *= 10  # tests take few steps
     config.set_timestamp()
     return config
 

@@ -60,6 +60,8 @@ def rooms(tmp_path_factory) -> Path:
 def trained(rooms, run_training, tmp_path_factory):
     """A short training on two of the rooms: its config and trainer."""
     config = config_of(rooms, tmp_path_factory.mktemp("refined"), steps=16)
+    for group in config.optimizers.values():
+        group["optimizer"].lr *= 10  # tests take few steps
     config.pipeline.datamanager.eval_scenes = ("room2",)
     trainer, _ = run_training(config)
     return config, trainer
@@ -89,6 +91,18 @@ def test_the_evaluation_of_the_saved_run_is_that_of_the_training(trained, no_lpi
     opened = eval_setup(config.get_base_dir() / "config.yml")[1].get_average_eval_image_metrics()
     assert opened["scenes"]["room2"]["seen_in_training"] is False
     assert opened["psnr"] == trainer.pipeline.get_average_eval_image_metrics()["psnr"]
+
+
+def test_ns_export_writes_the_refined_scene_of_a_ply(trained, tmp_path):
+    from nerfstudio.scripts.exporter import ExportGaussianSplat
+
+    from pointsplat_ns.io import read_ply
+
+    config, trainer = trained
+    ExportGaussianSplat(load_config=config.get_base_dir() / "config.yml", output_dir=tmp_path).main()
+    written, expected = read_ply(tmp_path / "splat.ply"), trainer.pipeline.eval().model.gaussians
+    assert len(written) == len(expected) and torch.equal(written.means, expected.means)
+    assert trainer.pipeline.datamanager.scenes[trainer.pipeline.model.shown].name == "room2"
 
 
 def test_no_mean_mixes_photos_and_dense_renders(trained_walls, rooms, tmp_path, no_lpips):
@@ -221,7 +235,7 @@ def fitted_of(config):
 
 
 def test_published_rates_are_taken_but_for_what_was_set_by_hand():
-    config = config_of(Path("unused"), Path("unused"), 100)
+    config = pointsplat_config()
     assert {n: g["optimizer"].lr for n, g in fitted_of(config).items()} == RATES
     config.optimizers["backbone"]["optimizer"].lr = 7e-4
     expected = {"paper": dict.fromkeys(RATES, 1e-5), "authors": dict.fromkeys(RATES, 3e-5)}

@@ -22,7 +22,7 @@ def demo(
     output: Path = Path("outputs/demo"),
     keep: float = 0.1,
     scene_steps: int = 900,
-    refiner_steps: int = 400,
+    refiner_steps: int = 300,
     frames: int = 60,
     width: int = 256,
     height: int = 192,

@@ -186,7 +186,10 @@ def find_scenes(
     plys = find_plys(folder) if supervision == "dense" or (supervision == "auto" and not runs) else []
     if not runs and not plys:
         if nothing is None:
-            raise SceneError(f"{folder}: no trained run; expected one, or --pipeline.datamanager.supervision dense")
+            found = "a PLY file, which has no photos" if supervision == "photos" else "no Gaussians in it"
+            found = found if folder.is_file() else "no such file"
+            wanted = "--pipeline.datamanager.supervision dense" if supervision == "photos" else "a 3DGS .ply"
+            raise SceneError(f"{folder}: {found}; expected {wanted}")
         hint = " (PLY files are trained on with --pipeline.datamanager.supervision dense)"
         raise SceneError(f"{nothing}{hint if supervision == 'photos' else ', or 3DGS PLY files'}") from nothing
     chosen: Literal["photos", "dense"] = "dense" if plys or supervision == "dense" else "photos"

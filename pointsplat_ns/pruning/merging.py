@@ -48,6 +48,10 @@ OPAQUE = 0.99
 GROWTH = 0.6
 """Power of the mass beyond :data:`OPAQUE` by which the area grows: 0 would open holes, 1 smears edges."""
 
+DEEPENING = 0.25
+"""Power of the number of its members by which the optical depth of a finished Gaussian grows. Pairs keep the mass of
+what they replace, but spread it beyond the members and with it the gaps between them: what lies behind shows through."""
+
 MOST_SURPLUS = 4.0
 """Bound of that mass over what the area holds. Two Gaussians seldom reach 2; points without area would be infinite."""
 
@@ -165,11 +169,12 @@ def merge(scene: Gaussians, k: int, progress: Callable[[float], None] | None = N
         owner = owner[owner]
     place = torch.full((len(part),), -1)
     place[alive] = torch.arange(len(alive))
+    sizes = torch.bincount(place[owner], minlength=k)
+    state.alphas = _deepened(state.alphas, sizes)
     made = _as_gaussians(state, part)
-    alone = torch.bincount(place[owner], minlength=k) == 1
     kept = part[alive]
     pairs = zip(kept.tensors(), made.tensors(), strict=True)
-    merged = Gaussians(*(torch.where(alone.view(-1, *[1] * (a.dim() - 1)), a, b) for a, b in pairs))
+    merged = Gaussians(*(torch.where((sizes == 1).view(-1, *[1] * (a.dim() - 1)), a, b) for a, b in pairs))
     assignment = torch.full((n,), -1, device=scene.device)
     assignment[members] = place[owner].to(scene.device)
     report(1.0)
@@ -355,6 +360,12 @@ def _replace(state: _State, first: Tensor, second: Tensor) -> None:
         for values in (state.colours, state.sh):
             weight = pairs.weight[:, None].to(values.dtype)
             values[i] = weight * values[i] + (1 - weight) * values[j]
+
+
+def _deepened(alphas: Tensor, sizes: Tensor) -> Tensor:
+    """Opacities (n,) of Gaussians with ``sizes`` (n,) members: 1 - (1 - alpha)^p, where p = sizes^:data:`DEEPENING`."""
+    depth = -torch.log1p(-alphas.clamp_max(OPAQUE)) * sizes.double() ** DEEPENING
+    return -torch.expm1(-depth).clamp_max(OPAQUE)
 
 
 def _as_gaussians(state: _State, like: Gaussians) -> Gaussians:

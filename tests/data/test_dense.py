@@ -93,8 +93,10 @@ def test_what_holds_no_scene_says_so(rooms, tmp_path):
     for data in (rooms, rooms / "one.ply"):
         with pytest.raises(SceneError, match="supervision dense"):
             manager_of(data, supervision="photos")
-    with pytest.raises(SceneError, match=r"cloud.ply: no .*run"):
+    with pytest.raises(SceneError, match="cloud.ply: no Gaussians in it; expected a 3DGS .ply"):
         manager_of(rooms / "cloud.ply")
+    with pytest.raises(SceneError, match="two.ply: no such file"):
+        manager_of(rooms / "two.ply")
     with pytest.raises(DataError, match="0 sampled poses of 32 x 24 pixels"):
         manager_of(rooms, sampled_poses=0)
 
