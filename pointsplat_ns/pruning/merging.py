@@ -43,14 +43,17 @@ INVISIBLE = 1 / 255
 """Opacity below which rasterizers draw nothing."""
 
 OPAQUE = 0.99
-"""Largest opacity of a merged Gaussian, the most that rasterizers draw."""
+"""Largest opacity that a merge gives; what mass is left over becomes area."""
+
+MOST_DRAWN = 0.999
+"""Largest opacity of a finished Gaussian; rasterizers draw no more."""
 
 GROWTH = 0.6
 """Power of the mass beyond :data:`OPAQUE` by which the area grows: 0 would open holes, 1 smears edges."""
 
 DEEPENING = 0.25
-"""Power of the number of its members by which the optical depth of a finished Gaussian grows. Pairs keep the mass of
-what they replace, but spread it beyond the members and with it the gaps between them: what lies behind shows through."""
+"""Power of the number of members by which the optical depth of a finished Gaussian grows. The mass of pairs is kept,
+but each merge spreads it further, and the more were merged, the more shows through. The power is measured."""
 
 MOST_SURPLUS = 4.0
 """Bound of that mass over what the area holds. Two Gaussians seldom reach 2; points without area would be infinite."""
@@ -365,7 +368,7 @@ def _replace(state: _State, first: Tensor, second: Tensor) -> None:
 def _deepened(alphas: Tensor, sizes: Tensor) -> Tensor:
     """Opacities (n,) of Gaussians with ``sizes`` (n,) members: 1 - (1 - alpha)^p, where p = sizes^:data:`DEEPENING`."""
     depth = -torch.log1p(-alphas.clamp_max(OPAQUE)) * sizes.double() ** DEEPENING
-    return -torch.expm1(-depth).clamp_max(OPAQUE)
+    return (-torch.expm1(-depth)).clamp_max(MOST_DRAWN)
 
 
 def _as_gaussians(state: _State, like: Gaussians) -> Gaussians:

@@ -99,6 +99,16 @@ def test_a_smooth_wall_at_a_quarter_looks_the_same_and_far_better_than_a_quarter
     assert merged > thinned + 6
 
 
+def test_deepening_brings_opaque_walls_closer_to_what_they_were(monkeypatch):
+    scene = wall()
+    dense = render(scene)
+    for share in (4, 10, 30):
+        monkeypatch.undo()
+        deepened = psnr(render(merge(scene, len(scene) // share).scene), dense)
+        monkeypatch.setattr(merging, "DEEPENING", 0.0)
+        assert deepened > psnr(render(merge(scene, len(scene) // share).scene), dense) + 0.1
+
+
 def test_an_edge_between_colours_stays_where_it_is():
     scene = wall()
     left = scene.means[:, 0] < 0
@@ -114,10 +124,21 @@ def test_two_coincident_halves_become_one_of_their_common_mass():
     one = cloud(1)
     pair = Gaussians.cat([one, one]).replace(opacities=torch.zeros(2, 1))
     merged = merge(pair, 1).scene
-    # Mass 0.5 + 0.5 less the integral of what is covered twice, 0.25 G^2: half of 0.25. In float32, 7 digits.
-    assert float(merged.alphas) == pytest.approx(1 - 0.125, rel=1e-5)
+    # Mass 0.5 + 0.5 less the integral of what is covered twice, 0.25 G^2: half of 0.25; then deepened for two members.
+    want = 1 - 0.125 ** (2**merging.DEEPENING)
+    assert float(merged.alphas) == pytest.approx(want, rel=1e-5)  # float32, 7 digits
     torch.testing.assert_close(merged.means, one.means)
     torch.testing.assert_close(merged.scales.sort().values, one.scales.sort().values, rtol=1e-4, atol=1e-4)
+
+
+def test_deepening_leaves_one_member_as_it_is_and_grows_with_their_number_up_to_opaque():
+    alphas = torch.tensor([0.0, 1e-12, 0.3, 0.3, 0.3, 0.9, 1.0], dtype=torch.float64)
+    sizes = torch.tensor([10**6, 16, 1, 2, 16, 10**6, 10**6])
+    most = merging.MOST_DRAWN
+    want = torch.tensor([0, 2e-12, 0.3, 1 - 0.7 ** (2**0.25), 1 - 0.7**2, most, most], dtype=torch.float64)
+    # rel: 1 - (1 - a)^p to all digits even where a is far below float64's spacing at 1
+    torch.testing.assert_close(merging._deepened(alphas, sizes), want, rtol=1e-11, atol=0)
+    assert float((merging._deepened(alphas.float(), sizes) - want).abs().max()) < 1e-6  # float32, 7 digits
 
 
 def test_colour_of_a_pair_is_the_mean_by_mass():
