@@ -11,6 +11,7 @@ trained at; a PLY is looked at from poses sampled in its free space. With Node a
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import resource
@@ -61,24 +62,34 @@ def load(path: Path, count: int) -> Scene:
     if path.suffix == ".ply":
         name, views = path.stem, sample_views(dense, count)
     else:
-        views = views_of_run(path, "test")
-        name, photos = _photos(path, len(views), count)
-        views = views.spread(count)
+        name, views, photos = _held_out(path, count)
     renders = [draw(dense, views, i) for i in range(len(views))]
     return Scene(name, dense, views, renders, photos)
 
 
-def _photos(path: Path, total: int, count: int) -> tuple[str, list[Tensor]]:
-    """The run's name and the held-out photos of the views that :meth:`Views.spread` takes."""
+def _held_out(path: Path, count: int) -> tuple[str, Views, list[Tensor]]:
+    """The run's name, and at most ``count`` of its held-out photos with the views that they show once undistorted."""
     from pointsplat_ns.data.frames import FrameCache
     from pointsplat_ns.data.scenes import TrainedScene
     from pointsplat_ns.io import scene_name
+    from pointsplat_ns.splatfacto_cpu import viewmats_of
 
     run = open_run(path)
     frames = TrainedScene(scene_name(run), run, FrameCache(0)).eval_frames
+    total = len(frames)
     taken = range(total) if count >= total else torch.linspace(0, total - 1, count).round().long().tolist()
-    images = [frames[i][1]["image"][..., :3] for i in taken]
-    return scene_name(run), [image.float() / 255 if image.dtype == torch.uint8 else image.float() for image in images]
+    shown = [frames[i] for i in taken]
+    photos = [data["image"][..., :3] for _, data in shown]
+    photos = [photo.float() / 255 if photo.dtype == torch.uint8 else photo.float() for photo in photos]
+    height, width = photos[0].shape[:2]
+    views = dataclasses.replace(
+        views_of_run(path, "test"),
+        viewmats=torch.cat([viewmats_of(camera.camera_to_worlds) for camera, _ in shown]),
+        Ks=torch.cat([camera.get_intrinsics_matrices() for camera, _ in shown]),
+        width=width,
+        height=height,
+    )
+    return scene_name(run), views, photos
 
 
 def compare(scene: Scene, made: Gaussians, lpips: Lpips | None) -> dict[str, float | None]:
