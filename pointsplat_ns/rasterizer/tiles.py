@@ -195,22 +195,6 @@ def _intervals(amounts: list[int], most: int) -> list[tuple[int, int, int]]:
     return [*intervals, (first, len(amounts), total)]
 
 
-def intersect_tiles(
-    means2d: Tensor,  # [M, 2] pixels
-    cov2d: Tensor,  # [M, 3] xx, xy, yy
-    det: Tensor,  # [M]
-    opacities: Tensor,  # [M]
-    depths: Tensor,  # [M]
-    camera_ids: Tensor,  # [M] int64
-    cameras: int,
-    width: int,
-    height: int,
-) -> TileList:
-    """The tile list of whole images; see :class:`Footprints`."""
-    footprints = Footprints(means2d, cov2d, det, opacities, depths, camera_ids, cameras, width, height)
-    return footprints.tiles(footprints.whole)
-
-
 def _tile_of(position: Tensor, up: bool, tiles: int) -> Tensor:
     """First tile with a pixel centre at or after ``position`` (up), or last with one at or before."""
     if up:

@@ -7,7 +7,7 @@ import torch
 
 from pointsplat_ns.rasterizer import rasterization, rasterize_reference
 from pointsplat_ns.rasterizer.projection import project
-from pointsplat_ns.rasterizer.tiles import intersect_tiles
+from pointsplat_ns.rasterizer.tiles import Footprints
 
 F64 = torch.float64
 
@@ -198,9 +198,10 @@ def test_tiles_hold_every_pair_that_draws_and_few_others():
     scene = make_scene(200, seed=9, scale=-2.5, spread=1.5)
     view, K, w, h = make_camera(61, 43, cx=30.0, cy=20.0)
     seen = project(*scene[:4], view, K, w, h)
-    tiles = intersect_tiles(
+    footprints = Footprints(
         seen.means2d, seen.cov2d, seen.det, seen.opacities, seen.depths, torch.zeros_like(seen.ids), 1, w, h
     )
+    tiles = footprints.tiles(footprints.whole)
     listed = torch.zeros(tiles.rows * tiles.columns, len(seen.ids), dtype=torch.bool)
     listed[torch.repeat_interleave(tiles.offsets.diff()), tiles.gaussians] = True
     ys, xs = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
