@@ -18,6 +18,7 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
 from pointsplat_ns.rasterizer.projection import Projected
+from pointsplat_ns.rasterizer.tiles import Footprints
 
 PIXELS = TILE * TILE
 _BLOCK_VALUES = 2**20
@@ -52,7 +53,10 @@ def sum_over_pixels(
     """
     means2d, cov2d, det = seen.means2d.detach(), seen.cov2d.detach(), seen.det.detach()
     total = means2d.new_zeros(len(seen.ids), columns)
-    gaussians, starts, across = _tile_lists(seen, width, height)
+    camera = torch.zeros_like(seen.ids)
+    footprints = Footprints(means2d, cov2d, det, seen.opacities, seen.depths, camera, 1, width, height)
+    lists = footprints.tiles(footprints.whole)
+    gaussians, starts, across = lists.gaussians, lists.offsets, footprints.columns
     xx, xy, yy = cov2d.unbind(-1)
     # As the rasterizer keeps it: extent in x given y, and extent in y; both terms are positive.
     shapes = [*means2d.unbind(-1), yy / det, xy / yy, 1.0 / yy, seen.opacities.detach().log()]
@@ -76,33 +80,6 @@ def sum_over_pixels(
         total.index_add_(0, ids[listed], values(pairs)[listed])
         begin += size
     return total
-
-
-@torch.no_grad()
-def _tile_lists(seen: Projected, width: int, height: int) -> tuple[Tensor, Tensor, int]:
-    """Gaussians by tile, front to back (P,), where each tile's begin (tiles + 1,), and the tiles across.
-
-    A Gaussian is listed for every tile that the box around its 1/255 ellipse touches.
-    """
-    columns, rows = -(-width // TILE), -(-height // TILE)
-    order = torch.argsort(seen.depths, stable=True)
-    xx, _, yy = seen.cov2d[order].unbind(-1)
-    level = 2.0 * (seen.opacities[order] / ALPHA_MIN).log().clamp_min(0.0)
-    edges = []
-    for middle, variance, tiles in zip(seen.means2d[order].unbind(-1), (xx, yy), (columns, rows), strict=True):
-        half = (level * variance).sqrt() + 0.5
-        edges.append(((middle - half) / TILE).floor().clamp(0, tiles - 1).long())
-        edges.append(((middle + half) / TILE).floor().clamp(0, tiles - 1).long())
-    left, right, top, bottom = edges
-    wide = right - left + 1
-    counts = wide * (bottom - top + 1)
-    owner = torch.repeat_interleave(counts)
-    place = torch.arange(owner.numel(), device=owner.device) - (counts.cumsum(0) - counts)[owner]
-    down = torch.div(place, wide[owner], rounding_mode="floor")
-    tile = (top[owner] + down) * columns + left[owner] + place - down * wide[owner]
-    tile, by_tile = torch.sort(tile, stable=True)
-    starts = torch.searchsorted(tile, torch.arange(rows * columns + 1, device=tile.device))
-    return order[owner[by_tile]], starts, columns
 
 
 def _pairs(shape: Tensor, ids: Tensor, pixel_x: Tensor, pixel_y: Tensor, listed: Tensor, inside: Tensor) -> Pairs:

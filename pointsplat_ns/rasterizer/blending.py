@@ -444,7 +444,7 @@ def blend(
         absgrad_of = _Summed(absgrad_of, len(regions))
 
     def untile(values: Tensor, region: Region) -> Tensor:
-        rows, columns = region.bottom - region.top, region.right - region.left
+        rows, columns = region.rows, region.columns
         values = values.view(cameras, rows, columns, -1, TILE, TILE).permute(0, 1, 4, 2, 5, 3)
         return values.reshape(cameras, rows * TILE, columns * TILE, -1)
 

@@ -29,6 +29,14 @@ class Region(NamedTuple):
     left: int
     right: int
 
+    @property
+    def rows(self) -> int:
+        return self.bottom - self.top
+
+    @property
+    def columns(self) -> int:
+        return self.right - self.left
+
 
 @dataclass
 class TileList:
@@ -41,19 +49,12 @@ class TileList:
     order: Tensor  # [M] int64, the Gaussians in depth order
     region: Region
 
-    @property
-    def rows(self) -> int:
-        return self.region.bottom - self.region.top
-
-    @property
-    def columns(self) -> int:
-        return self.region.right - self.region.left
-
     def centres(self, tiles: Tensor) -> tuple[Tensor, Tensor]:
         """Pixel coordinates (x, y) of the centres of tiles (B,) of the region, int64."""
-        within = tiles % (self.rows * self.columns)
-        row = torch.div(within, self.columns, rounding_mode="floor")
-        column = within - row * self.columns
+        columns = self.region.columns
+        within = tiles % (self.region.rows * columns)
+        row = torch.div(within, columns, rounding_mode="floor")
+        column = within - row * columns
         return (column + self.region.left) * TILE + TILE // 2, (row + self.region.top) * TILE + TILE // 2
 
 
@@ -157,7 +158,7 @@ class Footprints:
     @torch.no_grad()
     def tiles(self, region: Region) -> TileList:
         """Pair Gaussians with tiles and sort the pairs by tile, then depth, then row of the input."""
-        rows, columns = region.bottom - region.top, region.right - region.left
+        rows, columns = region.rows, region.columns
         owner, row, column0, column1 = self._strips(region)
         widths = (column1 - column0 + 1).clamp_min_(0)
         counts = torch.zeros_like(self.order).index_add_(0, owner, widths)

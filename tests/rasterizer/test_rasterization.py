@@ -202,14 +202,14 @@ def test_tiles_hold_every_pair_that_draws_and_few_others():
         seen.means2d, seen.cov2d, seen.det, seen.opacities, seen.depths, torch.zeros_like(seen.ids), 1, w, h
     )
     tiles = footprints.tiles(footprints.whole)
-    listed = torch.zeros(tiles.rows * tiles.columns, len(seen.ids), dtype=torch.bool)
+    listed = torch.zeros(footprints.rows * footprints.columns, len(seen.ids), dtype=torch.bool)
     listed[torch.repeat_interleave(tiles.offsets.diff()), tiles.gaussians] = True
     ys, xs = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
     offset = torch.stack([xs, ys], -1).reshape(-1, 1, 2) + 0.5 - seen.means2d
     a, b, c = seen.conics.unbind(-1)
     power = a * offset[..., 0] ** 2 + 2 * b * offset[..., 0] * offset[..., 1] + c * offset[..., 1] ** 2
     drawn = seen.opacities * torch.exp(-0.5 * power) >= 1 / 255  # [pixels, M]
-    tile = ((ys // 8) * tiles.columns + xs // 8).reshape(-1)
+    tile = ((ys // 8) * footprints.columns + xs // 8).reshape(-1)
     needed = torch.zeros_like(listed)
     for t in range(len(listed)):
         needed[t] = drawn[tile == t].any(0)
