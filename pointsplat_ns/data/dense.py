@@ -28,7 +28,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.ply import read_ply
 from pointsplat_ns.io.ply_header import read_header
-from pointsplat_ns.io.runs import CONFIG_NAME
+from pointsplat_ns.io.runs import CONFIG_NAME, distinct
 from pointsplat_ns.poses import BACKGROUND, sample_views
 from pointsplat_ns.views import Views, draw
 
@@ -257,19 +257,15 @@ def find_plys(folder: Path) -> list[tuple[str, Path]]:
                 continue
             inner[:] = sorted(name for name in inner if not name.startswith("."))
             paths += [Path(place) / name for name in files if name.lower().endswith(".ply")]
-    found: list[tuple[str, Path]] = []
+    found, names = [], []
     for path in sorted(paths):
         if not _holds_gaussians(path):
             CONSOLE.log(f"passed over {path}: no Gaussians in it")
             continue
         parts = path.relative_to(root).with_suffix("").parts
-        name = base = re.sub(r"[^\w.+-]+", "-", "-".join(parts)).strip("-.") or "scene"
-        for count in itertools.count(2):
-            if name not in (taken for taken, _ in found):
-                break
-            name = f"{base}-{count}"
-        found.append((name, path))
-    return found
+        names.append(re.sub(r"[^\w.+-]+", "-", "-".join(parts)).strip("-.") or "scene")
+        found.append(path)
+    return list(zip(distinct(names), found, strict=True))
 
 
 def _holds_gaussians(path: Path) -> bool:

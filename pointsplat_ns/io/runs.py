@@ -180,17 +180,21 @@ def scene_name(run: Run) -> str:
     return re.sub(r"[^\w.+-]+", "-", name).strip("-.") or "scene"
 
 
-def scene_names(runs: list[Run]) -> list[str]:
-    """:func:`scene_name` of each run, with ``-2``, ``-3``... added where two would be the same."""
-    names: list[str] = []
-    for run in runs:
-        base = name = scene_name(run)
-        count = 1
-        while name in names:
+def distinct(names: Iterable[str]) -> list[str]:
+    """The names, with ``-2``, ``-3``... added where two would be the same."""
+    found: list[str] = []
+    for base in names:
+        name, count = base, 1
+        while name in found:
             count += 1
             name = f"{base}-{count}"
-        names.append(name)
-    return names
+        found.append(name)
+    return found
+
+
+def scene_names(runs: list[Run]) -> list[str]:
+    """:func:`scene_name` of each run, made distinct."""
+    return distinct(scene_name(run) for run in runs)
 
 
 def shown_scene(names: list[str], eval_scenes: Iterable[str]) -> str:
