@@ -11,7 +11,6 @@ trained at; a PLY is looked at from poses sampled in its free space. With Node a
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import resource
@@ -20,91 +19,24 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 from typing import Annotated
 
 import torch
 import tyro
+from held_out import COLUMNS, Scene, compare, load, lpips_or_none
 from rich.console import Console
 from rich.table import Table
-from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import open_run, read_ply, read_scene, write_ply
-from pointsplat_ns.lpips import Lpips, LpipsUnavailable, load_lpips
-from pointsplat_ns.metrics import psnr, ssim
-from pointsplat_ns.poses import sample_views
+from pointsplat_ns.io import read_ply, write_ply
+from pointsplat_ns.lpips import Lpips
+from pointsplat_ns.metrics import psnr
 from pointsplat_ns.pruning import METHODS, SCORES, compact
-from pointsplat_ns.views import Views, draw, views_of_run
 
 RIVAL = "splat-transform"
-COLUMNS = ("psnr", "ssim", "lpips")
 SWEEP = tuple(round(0.1 * i, 1) for i in range(1, 10))
-
-
-@dataclass
-class Scene:
-    """A dense scene, the views it is judged in, and what they show."""
-
-    name: str
-    dense: Gaussians
-    views: Views
-    renders: list[Tensor]  # [H, W, 3] of the dense scene
-    photos: list[Tensor] | None  # [H, W, 3]
-
-
-def load(path: Path, count: int) -> Scene:
-    """A run with its held-out photos, or a PLY with sampled views."""
-    dense = read_scene(path)
-    photos = None
-    if path.suffix == ".ply":
-        name, views = path.stem, sample_views(dense, count)
-    else:
-        name, views, photos = _held_out(path, count)
-    renders = [draw(dense, views, i) for i in range(len(views))]
-    return Scene(name, dense, views, renders, photos)
-
-
-def _held_out(path: Path, count: int) -> tuple[str, Views, list[Tensor]]:
-    """The run's name, and at most ``count`` of its held-out photos with the views that they show once undistorted."""
-    from pointsplat_ns.data.frames import FrameCache
-    from pointsplat_ns.data.scenes import TrainedScene
-    from pointsplat_ns.io import scene_name
-    from pointsplat_ns.splatfacto_cpu import viewmats_of
-
-    run = open_run(path)
-    frames = TrainedScene(scene_name(run), run, FrameCache(0)).eval_frames
-    total = len(frames)
-    taken = range(total) if count >= total else torch.linspace(0, total - 1, count).round().long().tolist()
-    shown = [frames[i] for i in taken]
-    photos = [data["image"][..., :3] for _, data in shown]
-    photos = [photo.float() / 255 if photo.dtype == torch.uint8 else photo.float() for photo in photos]
-    height, width = photos[0].shape[:2]
-    views = dataclasses.replace(
-        views_of_run(path, "test"),
-        viewmats=torch.cat([viewmats_of(camera.camera_to_worlds) for camera, _ in shown]),
-        Ks=torch.cat([camera.get_intrinsics_matrices() for camera, _ in shown]),
-        width=width,
-        height=height,
-    )
-    return scene_name(run), views, photos
-
-
-def compare(scene: Scene, made: Gaussians, lpips: Lpips | None) -> dict[str, float | None]:
-    """Mean metrics over the views, against the dense scene's renders (``dense_*``) and the photos (``photo_*``)."""
-    values: dict[str, list[float]] = {}
-    for i, render in enumerate(scene.renders):
-        image = draw(made, scene.views, i)
-        targets = {"dense": render} | ({"photo": scene.photos[i]} if scene.photos else {})
-        for against, target in targets.items():
-            values.setdefault(f"{against}_psnr", []).append(min(float(psnr(image, target)), 100.0))
-            values.setdefault(f"{against}_ssim", []).append(float(ssim(image, target)))
-            if lpips is not None:
-                values.setdefault(f"{against}_lpips", []).append(float(lpips(image, target)))
-    names = [f"{against}_{column}" for against in ("dense", "photo") for column in COLUMNS]
-    return {name: fmean(values[name]) if name in values else None for name in names}
 
 
 class Rival:
@@ -281,7 +213,7 @@ def main(
         return
     if not scenes:
         raise SystemExit("no scene named; expected runs or PLY files, or --speed")
-    network = _lpips_or_none(lpips)
+    network = lpips_or_none(lpips)
     rival = Rival(splat_transform) if not sweep else None
     rows: list[dict] = []
     console = Console(width=None if sys.stdout.isatty() else 150)
@@ -308,16 +240,6 @@ def main(
 
 def _dense_psnr(scene: Scene) -> float:
     return fmean(float(psnr(a, b)) for a, b in zip(scene.renders, scene.photos or [], strict=True))
-
-
-def _lpips_or_none(wanted: bool) -> Lpips | None:
-    if not wanted:
-        return None
-    try:
-        return load_lpips("alex", download=False)
-    except LpipsUnavailable as error:
-        print(f"no LPIPS: {error}")
-        return None
 
 
 if __name__ == "__main__":

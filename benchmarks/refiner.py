@@ -44,7 +44,8 @@ PLAN = {"tiny": COUNTS, "small": COUNTS, "full": (1_000, 10_000, 30_000)}
 TRAIN_UP_TO = {"tiny": 100_000, "small": 59_000, "full": 1_000}
 """Most Gaussians of a training step in a default run."""
 SLOPE_FROM = 10_000
-"""Fewest Gaussians that count for the slope: below, fixed costs and half-filled patches show."""
+"""A second slope, next to that of all counts, leaves out fewer Gaussians than this: there, fixed costs and half-filled
+patches make the curve flatter."""
 MATRIX_KERNELS = ("aten::addmm", "aten::mm", "aten::bmm", "aten::baddbmm")
 PARTS = ("attention", "convolution", "heads", "structure", "rest")
 PART_OF: dict[type[nn.Module], str] = {
@@ -288,19 +289,20 @@ def print_tables(results: list[Result], args: Args) -> None:
         table.add_row(r.size, f"{r.gaussians:,}", *figures, *(f"{r.shares[name]:.0%}" for name in PARTS))
     console.print(table)
 
-    slopes = Table(title=f"Slopes of log time over log N from {SLOPE_FROM:,} Gaussians on (1: linear)")
-    for name in ("size", "inference", "training step", "structure"):
+    slopes = Table(title="Slopes of log time over log N (1: linear)")
+    for name in ("size", "from", "inference", "training step", "structure"):
         slopes.add_column(name)
     for size in dict.fromkeys(r.size for r in results):
-        rows = [r for r in results if r.size == size and r.gaussians >= SLOPE_FROM]
-        trained = [r for r in rows if r.step is not None]
-        counts = [r.gaussians for r in rows]
-        values = (
-            slope(counts, [r.inference for r in rows]),
-            slope([r.gaussians for r in trained], [r.step for r in trained]),
-            slope(counts, [r.prepare for r in rows]),
-        )
-        slopes.add_row(size, *("-" if value is None else f"{value:.2f}" for value in values))
+        for least in (min(r.gaussians for r in results if r.size == size), SLOPE_FROM):
+            rows = [r for r in results if r.size == size and r.gaussians >= least]
+            trained = [r for r in rows if r.step is not None]
+            counts = [r.gaussians for r in rows]
+            values = (
+                slope(counts, [r.inference for r in rows]),
+                slope([r.gaussians for r in trained], [r.step for r in trained]),
+                slope(counts, [r.prepare for r in rows]),
+            )
+            slopes.add_row(size, f"{least:,}", *("-" if value is None else f"{value:.2f}" for value in values))
     console.print(slopes)
 
     if any(r.bf16 for r in results):

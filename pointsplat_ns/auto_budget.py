@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.metrics import SSIM_WINDOW, ssim
 from pointsplat_ns.pruning.sh_bands import cut_sh
 from pointsplat_ns.views import Views, draw
 
@@ -35,6 +36,31 @@ class AutoBudget:
     """PSNR in dB by count, for every count tried."""
 
 
+@dataclass(frozen=True)
+class Closeness:
+    """How close a scene's renders come to those of the dense scene."""
+
+    errors: tuple[float, ...]
+    """Mean squared error of each view."""
+    ssim: float | None
+    """Mean over views; None where views are smaller than SSIM's window."""
+
+    @property
+    def error(self) -> float:
+        """Mean squared error over all pixels of all views."""
+        return sum(self.errors) / len(self.errors)
+
+    @property
+    def psnr(self) -> float:
+        """Over all pixels of all views, dB; inf where nothing differs."""
+        return _psnr(self.error)
+
+    @property
+    def worst(self) -> float:
+        """Of the worst view, dB."""
+        return _psnr(max(self.errors))
+
+
 class DenseReference:
     """Renders of the dense scene, and how close another scene comes to them.
 
@@ -51,15 +77,26 @@ class DenseReference:
     @torch.no_grad()
     def errors(self, scene: Gaussians) -> list[float]:
         """Mean squared error of each view."""
-        return [
-            float((draw(scene, self.views, index).double() - picture.double()).square().mean())
-            for index, picture in enumerate(self.pictures)
-        ]
+        return [_error(draw(scene, self.views, index), picture) for index, picture in enumerate(self.pictures)]
+
+    @torch.no_grad()
+    def closeness(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> Closeness:
+        """Errors and SSIM of a scene; ``progress`` is called with the share of the views done."""
+        large_enough = min(self.views.width, self.views.height) >= SSIM_WINDOW
+        errors, similarities = [], []
+        for index, picture in enumerate(self.pictures):
+            drawn = draw(scene, self.views, index)
+            errors.append(_error(drawn, picture))
+            if large_enough:
+                similarities.append(float(ssim(drawn, picture)))
+            if progress is not None:
+                progress((index + 1) / len(self.pictures))
+        return Closeness(tuple(errors), sum(similarities) / len(similarities) if similarities else None)
 
     def psnr(self, scene: Gaussians) -> tuple[float, float]:
         """PSNR over all pixels of all views, and of the worst view, dB."""
-        errors = self.errors(scene)
-        return _psnr(sum(errors) / len(errors)), _psnr(max(errors))
+        close = Closeness(tuple(self.errors(scene)), None)
+        return close.psnr, close.worst
 
 
 def smallest_within(
@@ -136,8 +173,14 @@ def _next_guess(low: int, high: int, tried: dict[int, float], psnr: float) -> in
     return min(high - 1, max(low + 1, round(math.exp(below + share * (above - below)))))
 
 
+def _error(drawn: Tensor, picture: Tensor) -> float:
+    """Mean squared error, float64."""
+    return float((drawn.double() - picture.double()).square().mean())
+
+
 def _psnr(mse: float) -> float:
-    return -10 * math.log10(mse) if mse > 0 else math.inf
+    """Of a mean squared error, dB: inf for none, NaN for NaN."""
+    return math.inf if mse == 0 else -10 * math.log10(mse) if mse > 0 else math.nan
 
 
 def needed_sh_degree(dense: Gaussians, views: Views, psnr: float = SH_PSNR) -> tuple[int, float]:

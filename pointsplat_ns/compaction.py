@@ -6,11 +6,13 @@ fine-tuning.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import torch
 
@@ -68,30 +70,36 @@ class Poses:
     def __init__(self, path: Path | str | None, dense: Gaussians):
         self._path, self._dense = path, dense
         self.origin = ""
-        """Where they came from, once they were asked for."""
+        """Where they came from, once there are some."""
+        self._missing = ""
+        self._rasterize_mode: Literal["classic", "antialiased"] = "classic"
 
     @cached_property
     def _of_dataset(self) -> Views | None:
         if self._path is None or Path(self._path).suffix.lower() == ".ply":
             return None
         try:
-            open_run(self._path, need_data=False)
+            self._rasterize_mode = open_run(self._path, need_data=False).rasterize_mode
         except SceneError:
             return None  # a checkpoint that stands alone
         try:
             return views_of_run(self._path)
         except (SceneError, DataError) as error:
-            self.origin = f" (no dataset: {error})"
+            self._missing = f" (no dataset: {error})"
             return None
 
     def __call__(self, count: int) -> Views:
-        """At most ``count`` of the dataset's training poses, or ``count`` sampled ones."""
+        """At most ``count`` of the dataset's training poses, or ``count`` sampled ones; drawn as the run rendered.
+
+        Raises:
+            DataError: if there is no dataset, and no free place to look from.
+        """
         if self._of_dataset is not None:
             self.origin = "poses of the dataset"
             return self._of_dataset.spread(count)
-        if not self.origin.startswith("poses"):
-            self.origin = f"poses sampled in free space{self.origin}"
-        return sample_views(self._dense, count)
+        views = sample_views(self._dense, count)
+        self.origin = f"poses sampled in free space{self._missing}"
+        return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
 
 
 def compact_scene(

@@ -10,6 +10,7 @@ import dataclasses
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -25,10 +26,12 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.metrics import ImageError, psnr
+from pointsplat_ns.pruned_files import read_pruned, stored_path, write_pruned
 from pointsplat_ns.pruning import METHODS, compact
-from pointsplat_ns.refined_run import prune_options
+from pointsplat_ns.refined_run import network_options, prune_options
 from pointsplat_ns.refiner import Refiner, Structure, preset
 from pointsplat_ns.splatfacto_cpu import SplatfactoCpuModel, SplatfactoCpuModelConfig, viewmats_of
+from pointsplat_ns.transforms import random_transform
 
 _PRUNED = "pruned"
 """Names pruned scenes among what is kept in the cache."""
@@ -41,6 +44,15 @@ class PointSplatModelConfig(SplatfactoCpuModelConfig):
     _target: type = field(default_factory=lambda: PointSplatModel)
     keep: float = 0.3
     """Gaussians to keep: a ratio in (0, 1], or a count if above 1."""
+    more_keeps: tuple[float, ...] = ()
+    """Further amounts to keep, as ``keep``: each training step draws one of them all, so that one network learns to
+    repair scenes of many budgets. Evaluation takes ``keep``."""
+    augment: bool = False
+    """Train on each scene turned, mirrored and repainted at random, so that the network learns neither which way is up
+    nor the colours of the training scenes. The pictures it is compared with stay as they are; the price is that
+    a scene's neighbour tables are computed at each step."""
+    pruned_folder: Path | None = None
+    """Folder for pruned scenes, which other trainings on the same scenes then need not make again."""
     score: str = "merge"
     """How they are chosen: merge puts one Gaussian in the place of neighbours; a score leaves Gaussians out: coverage,
     paper (eq. 3), authors, opacity, volume, log-volume, area or random."""
@@ -50,6 +62,13 @@ class PointSplatModelConfig(SplatfactoCpuModelConfig):
     """Size of the network: full is the paper's and wants a GPU; small and tiny are for a CPU."""
     encoder: Literal["dual", "concat"] = "dual"
     """dual is the paper's dual-branch encoder; concat feeds one concatenated vector, as SplatFormer does."""
+    use_appearance: bool = True
+    """Gate the geometry by what a Gaussian looks like (the paper's Table 4); dual encoder only."""
+    use_position: bool = True
+    """Add the positional term delta to both branches (the paper's Table 4); dual encoder only."""
+    norm: Literal["scene", "batch", "layer"] = "scene"
+    """Normalisation outside the attention blocks: scene takes statistics of the scene at hand, in evaluation too; batch
+    is the published one, which evaluates with running averages over the training scenes; layer is by Gaussian."""
     lpips_weight: float = 0.1
     """Weight of LPIPS in the loss, beside L1."""
     lpips_net: Literal["auto", "alex", "vgg"] = "auto"
@@ -93,19 +112,20 @@ class PointSplatModel(SplatfactoCpuModel):
         """Build the network; nothing of a scene is a parameter.
 
         Raises:
-            PointSplatError: if no scene could be pruned as the config asks.
+            PointSplatError: if no scene could be pruned as the config asks, or its settings describe no network.
         """
-        options_of(self.config)
+        for keep in (self.config.keep, *self.config.more_keeps):
+            prune_options(keep, self.config.score, self.config.opacity_weight)
         if self.config.score not in METHODS:
             raise PointSplatError(f"no score is called {self.config.score!r}; expected one of {', '.join(METHODS)}")
-        self.refiner = Refiner(preset(self.config.size, encoder=self.config.encoder))
+        self.refiner = Refiner(preset(self.config.size, **network_options(vars(self.config))))
         self.camera_optimizer = CameraOptimizerConfig(mode="off").setup(num_cameras=1, device="cpu")
         self.crop_box = None
         self.step = 0
         self.scenes: list[DenseScene] = []
         self.shown = 0
         self._cache = FrameCache(0)
-        self._latest: tuple[int, PrunedScene] | None = None
+        self._latest: tuple[tuple[int, float], PrunedScene] | None = None
         self._refined: tuple[int, Gaussians] | None = None
         self._lpips: dict[str, Lpips | None] = {}
         self.lpips_reason: str | None = None
@@ -126,9 +146,10 @@ class PointSplatModel(SplatfactoCpuModel):
         try:
             return torch.nn.Module.load_state_dict(self, dict, **{**kwargs, "strict": True})
         except RuntimeError as error:
+            options = ", ".join(f"{name} {value}" for name, value in network_options(vars(self.config)).items())
             raise SceneError(
-                f"the checkpoint does not hold a network of size {self.config.size} with the {self.config.encoder} "
-                "encoder; expected the settings that it was trained with"
+                f"the checkpoint does not hold a network of size {self.config.size} with {options}; expected the "
+                "settings that it was trained with"
             ) from error
 
     def get_training_callbacks(self, training_callback_attributes) -> list:
@@ -139,36 +160,49 @@ class PointSplatModel(SplatfactoCpuModel):
         """The network's parameters by part: encoder, backbone and one head per attribute."""
         return self.refiner.parameter_groups()
 
-    def pruned_scene(self, index: int, dense: Gaussians | None = None) -> PrunedScene:
+    def pruned_scene(self, index: int, dense: Gaussians | None = None, keep: float | None = None) -> PrunedScene:
         """A scene, pruned and serialized; kept while the cache has room for it, the latest in any case. Who has read
-        the dense scene may give it."""
-        if self._latest is None or self._latest[0] != index:
-            known = self._cache.get((_PRUNED, index))
-            self._latest = (index, self._prune(index, dense) if known is None else known[0])  # type: ignore[arg-type]
+        the dense scene may give it; ``keep`` is the config's by default."""
+        key = (index, self.config.keep if keep is None else keep)
+        if self._latest is None or self._latest[0] != key:
+            known = self._cache.get((_PRUNED, *key))
+            self._latest = (key, self._prune(*key, dense) if known is None else known[0])  # type: ignore[arg-type]
         return self._latest[1]
 
-    def _prune(self, index: int, dense: Gaussians | None) -> PrunedScene:
+    def _prune(self, index: int, keep: float, dense: Gaussians | None) -> PrunedScene:
         scene = self.scenes[index]
-        dense = scene.dense(keep=False) if dense is None else dense
-        start = time.perf_counter()
-        try:
-            pruned = compact(dense, **options_of(self.config))
-        except PointSplatError as error:
-            raise type(error)(f"{scene.source}: {error}") from error
-        seconds = time.perf_counter() - start
+        options = prune_options(keep, self.config.score, self.config.opacity_weight)
+        stored = stored_path(self.config.pruned_folder, scene.identity, options)
+        if stored is not None and stored.is_file():
+            pruned, dense_count, seconds = read_pruned(stored)
+        else:
+            dense = scene.dense(keep=False) if dense is None else dense
+            start = time.perf_counter()
+            try:
+                pruned = compact(dense, **options)
+            except PointSplatError as error:
+                raise type(error)(f"{scene.source}: {error}") from error
+            dense_count, seconds = len(dense), time.perf_counter() - start
+            if stored is not None:
+                write_pruned(stored, pruned, dense_count, seconds)
         pruned = pruned.to(self.device)
         structure = self.refiner.prepare(pruned)
-        made = PrunedScene(scene, len(dense), pruned, structure, seconds)
-        self._cache.put((_PRUNED, index), (made, dict(enumerate(tensors_in(made)))))  # type: ignore[arg-type]
-        CONSOLE.log(f"{scene.name}: kept {len(pruned):,} of {len(dense):,} Gaussians")
+        made = PrunedScene(scene, dense_count, pruned, structure, seconds)
+        self._cache.put((_PRUNED, index, keep), (made, dict(enumerate(tensors_in(made)))))  # type: ignore[arg-type]
+        CONSOLE.log(f"{scene.name}: kept {len(pruned):,} of {dense_count:,} Gaussians")
         return made
 
     def refine(self, index: int) -> Gaussians:
         """The refined scene; differentiable in training, computed once for the same weights in evaluation."""
-        made = self.pruned_scene(index)
         if self.training:
             self._refined = None
-            return self.refiner(made.pruned, made.structure)
+            keeps = (self.config.keep, *self.config.more_keeps)
+            made = self.pruned_scene(index, keep=keeps[int(torch.randint(len(keeps), ()))] if len(keeps) > 1 else None)
+            if not self.config.augment:
+                return self.refiner(made.pruned, made.structure)
+            transform = random_transform()
+            return transform.undo(self.refiner(transform.apply(made.pruned)))
+        made = self.pruned_scene(index)
         if self._refined is None or self._refined[0] != index:
             with torch.no_grad():
                 self._refined = (index, self.refiner(made.pruned, made.structure))
@@ -243,10 +277,7 @@ class PointSplatModel(SplatfactoCpuModel):
 
         Returns:
             Outputs of the last photo's camera, the losses (L1 and weighted LPIPS, averaged over the photos), and
-            metrics to log.
-
-        Raises:
-            SceneError: if a loss is not finite.
+            metrics to log. A loss may be NaN or infinite: the trainer then skips the step.
         """
         refined, scene = self.refine(index), self.scenes[index]
         net = self.config.lpips_net
@@ -270,11 +301,6 @@ class PointSplatModel(SplatfactoCpuModel):
         losses = {"l1": torch.stack(l1).mean()}
         if perceptual:
             losses["lpips"] = self.config.lpips_weight * torch.stack(perceptual).mean()
-        for name, value in losses.items():
-            if not value.isfinite():
-                raise SceneError(
-                    f"{scene.name}: the {name} loss of the refined scene is {value.item()}; lower the rates"
-                )
         return outputs, losses, {"psnr": torch.stack(quality).mean(), "gaussian_count": len(refined)}
 
     def _get_downscale_factor(self) -> int:

@@ -45,6 +45,15 @@ def means_over_ranks(values: dict[str, Tensor], names: Sequence[str]) -> dict[st
     return {name: (table[0, names.index(name)] / table[1, names.index(name)]).to(values[name].dtype) for name in known}
 
 
+def any_rank(flag: bool, device: torch.device | str) -> bool:
+    """Whether it is so in any process. All must ask, each with its own device."""
+    if world_size() == 1:
+        return flag
+    count = torch.tensor([float(flag)], device=device)
+    dist.all_reduce(count)
+    return bool(count > 0)
+
+
 def with_value(local: Tensor, value: Tensor) -> Tensor:
     """A scalar of the given value whose gradient is that of ``local``."""
     return local + (value - local).detach()

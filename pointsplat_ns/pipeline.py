@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from pointsplat_ns.data.scenes import ScenesDataManager, ScenesDataManagerConfig
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.evaluation import SceneReport, evaluate_scene, summarize
 from pointsplat_ns.model import PointSplatModel, PointSplatModelConfig, options_of
+from pointsplat_ns.refined_run import network_options
 from pointsplat_ns.refiner import save_refiner
 
 REFINER_NAME = "refiner.safetensors"
@@ -78,16 +80,24 @@ class PointSplatPipeline(VanillaPipeline):
         if world_size > 1:
             parallel.synchronise_batch_norm(self.model.refiner)
         self._saved_groups: list[str] = []
+        self.faults: list[str] = []
+        """Losses of the latest training step in this process that were not finite, in words."""
+        self.counted: dict[str, int] = {}
+        """Steps whose gradients are gathered, by part of the network."""
+        self.skipped: Counter[str] = Counter()
+        """Steps that were left out because a loss or a gradient was not finite, by scene, over all processes."""
         scenes, indices = self.datamanager.scenes, self.datamanager.train_indices
         self.trained_on: set[str] = {scenes[i].identity for i in indices} if test_mode == "val" else set()
         """Identities of the scenes that the network has been trained on, resumed trainings included."""
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What a checkpoint says beside the weights: which scenes they were trained on, and gradients in waiting."""
-        state: dict[str, Any] = {"trained_on": sorted(self.trained_on)}
+        """What a checkpoint says beside the weights: which scenes they were trained on, how many steps were skipped,
+        and gradients in waiting."""
+        state: dict[str, Any] = {"trained_on": sorted(self.trained_on), "skipped": dict(self.skipped)}
         if self._saved_groups:
             groups = self.get_param_groups()
             state["gradients"] = {name: [p.grad for p in groups[name]] for name in self._saved_groups}
+            state["counted"] = {name: self.counted[name] for name in self._saved_groups if name in self.counted}
         return state
 
     @contextmanager
@@ -100,11 +110,14 @@ class PointSplatPipeline(VanillaPipeline):
             self._saved_groups = []
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Remember what a checkpoint was trained on, and say so if scenes have come or gone since; take up gradients
-        that were gathering when it was saved."""
+        """Remember what a checkpoint was trained on, and say so if scenes have gone since; take up gradients that
+        were gathering when it was saved, and the count of skipped steps, but for those of scenes that are gone."""
         for name, gradients in state.get("gradients", {}).items():
             for p, gradient in zip(self.get_param_groups()[name], gradients, strict=True):
                 p.grad = None if gradient is None else gradient.to(p)
+        self.counted.update(state.get("counted", {}))
+        names = {scene.name for scene in self.datamanager.scenes}
+        self.skipped = Counter({name: count for name, count in state.get("skipped", {}).items() if name in names})
         known = set(state["trained_on"])
         gone = known - {scene.identity for scene in self.datamanager.scenes}
         if gone:
@@ -122,12 +135,13 @@ class PointSplatPipeline(VanillaPipeline):
         Random numbers (the order of serialization curves, dropped paths) depend on the seed and the place of the
         scene in the sequence alone, as the choice of scene and photos does: a resumed training goes on as if it had
         never stopped. Several processes take turns in that sequence; the values of their losses and metrics are the
-        mean over processes, the gradients each process's own.
+        mean over processes, the gradients each process's own. Losses that are not finite are in ``faults``.
         """
         place = self.datamanager.place(step)
         torch.manual_seed(random.Random(f"{self.config.datamanager.seed} network {place}").getrandbits(63))
         index, frames = self.datamanager.next_train(step)
         outputs, losses, metrics = self.model.losses(index, frames)
+        self.faults = [f"the {name} loss is {v.item()}" for name, v in losses.items() if not v.isfinite()]
         means = parallel.means_over_ranks({**losses, "psnr": metrics["psnr"]}, _REDUCED)
         if self.world_size > 1:
             losses = {name: parallel.with_value(value, means[name]) for name, value in losses.items()}
@@ -200,7 +214,11 @@ class PointSplatPipeline(VanillaPipeline):
         order = {scene.name: index for index, scene in enumerate(manager.scenes)}
         reports = sorted(parallel.gathered(reports), key=lambda report: order[report.name])
         summary = summarize_by_reference(reports, [scene.has_photos for scene in manager.scenes], get_std)
-        summary["settings"] = {"size": self.config.model.size, **options_of(self.config.model)}
+        summary["settings"] = {
+            "size": self.config.model.size,
+            **network_options(vars(self.config.model)),
+            **options_of(self.config.model),
+        }
         summary["supervision"] = manager.supervision
         if model.lpips_reason is not None:
             summary["lpips_note"] = model.lpips_reason

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.plys import find_plys
 from pointsplat_ns.io.runs import Run, find_runs, open_run, scene_names, shown_scene
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.pruning import WEIGHTED, compact
@@ -27,7 +29,8 @@ class RefinedRun:
     run: Run
     refiner: Refiner
     prune_options: dict[str, Any]
-    scenes: dict[str, Run]
+    scenes: dict[str, Path]
+    """The checkpoint or PLY that holds each dense scene."""
     default_scene: str
 
     @torch.no_grad()
@@ -61,12 +64,22 @@ def prune_options(keep: float, score: str, opacity_weight: float) -> dict[str, A
     return {"keep": int(keep) if keep > 1 else float(keep), "by": score, **extra}
 
 
+def network_options(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Changes to a size's preset that a model's settings ask for. A run from before a setting has its default.
+
+    Raises:
+        KeyError: if the encoder is not named.
+    """
+    defaults = {"use_appearance": True, "use_position": True, "norm": "scene"}
+    return {"encoder": settings["encoder"], **{name: settings.get(name, value) for name, value in defaults.items()}}
+
+
 def open_refined_run(path: Path | str, need_scenes: bool = True) -> RefinedRun:
     """Open a trained ``pointsplat`` run.
 
     Args:
         path: its folder, ``config.yml`` or checkpoint.
-        need_scenes: find the Splatfacto runs that it was trained on.
+        need_scenes: find the Splatfacto runs and PLY files that it was trained on.
 
     Raises:
         SceneError: if it is another kind of run, is damaged, or its scenes are needed and gone.
@@ -76,7 +89,7 @@ def open_refined_run(path: Path | str, need_scenes: bool = True) -> RefinedRun:
         raise SceneError(f"{path}: a run of the method {run.method_name or 'unknown'}; expected a {METHOD} run")
     settings = run.model_fields
     try:
-        refiner = Refiner(preset(settings["size"], encoder=settings["encoder"]))
+        refiner = Refiner(preset(settings["size"], **network_options(settings)))
         options = prune_options(float(settings["keep"]), settings["score"], float(settings["opacity_weight"]))
         allow_splatfacto_checkpoints()  # for the numbers in the schedulers' state
         state = torch.load(run.checkpoint, map_location="cpu", weights_only=True, mmap=True)["pipeline"]
@@ -89,10 +102,30 @@ def open_refined_run(path: Path | str, need_scenes: bool = True) -> RefinedRun:
     except Exception as error:  # a damaged archive can raise nearly anything
         text = " ".join(str(error).split())[:160]
         raise SceneError(f"{run.checkpoint}: not a usable {METHOD} checkpoint ({text})") from error
-    scenes: dict[str, Run] = {}
+    scenes: dict[str, Path] = {}
     default = ""
     if need_scenes:
-        runs = find_runs(run.data, need_data=False)
-        scenes = dict(zip(scene_names(runs), runs, strict=True))
+        scenes = _scenes_of(run)
         default = shown_scene(list(scenes), run.datamanager_fields.get("eval_scenes") or ())
     return RefinedRun(run, refiner.eval(), options, scenes, default)
+
+
+def _scenes_of(run: Run) -> dict[str, Path]:
+    """Where the scenes are that a run was trained on, by the names that the training gave them
+    (:func:`pointsplat_ns.data.scenes.find_scenes`, which a test compares with this)."""
+    supervision = run.datamanager_fields.get("supervision", "auto")
+    runs: list[Run] = []
+    nothing: SceneError | None = None
+    try:
+        if run.data.suffix.lower() != ".ply":
+            runs = find_runs(run.data, need_data=False)
+    except SceneError as error:
+        nothing = error
+    scenes = {name: found.checkpoint for name, found in zip(scene_names(runs), runs, strict=True)}
+    plys = find_plys(run.data) if supervision == "dense" or (supervision == "auto" and not runs) else []
+    names = set(scenes)
+    for name, path in plys:
+        scenes[f"{name}.ply" if name in names else name] = path
+    if not scenes:
+        raise SceneError(f"{run.config_path}: {nothing or f'{run.data}: no Gaussians in it'}; put its scenes back")
+    return scenes

@@ -5,10 +5,11 @@ import math
 import pytest
 import torch
 
-from pointsplat_ns.auto_budget import PRECISION, DenseReference, needed_sh_degree, smallest_within
+from pointsplat_ns.auto_budget import PRECISION, Closeness, DenseReference, needed_sh_degree, smallest_within
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.fine_tune import fine_tune
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.poses import content_box, look_at, sample_views
 from pointsplat_ns.pruning import coverage_score, cut_sh, select
 from pointsplat_ns.views import Views, draw
@@ -116,6 +117,28 @@ def test_the_scene_found_is_good_enough_and_a_little_smaller_one_is_not(scene, l
     assert below and count <= max(max(below) * PRECISION, max(below) + 1)
     assert all(found.tried[k] < wanted for k in below)
     assert len(calls) == len(set(calls)) <= 12 and all(0 <= share <= 1 for share in shares)
+
+
+def test_closeness_is_that_of_the_metrics_over_all_views(scene, looks):
+    reference, kept, shares = DenseReference(scene, looks), scene[:900], []
+    close = reference.closeness(kept, shares.append)
+    pictures = torch.stack([draw(kept, looks, i) for i in range(4)]).double()
+    wanted = torch.stack(reference.pictures).double()
+    each = psnr(pictures, wanted)
+    # 1e-6: float64 means, summed in another order
+    assert close.psnr == pytest.approx(float(-10 * torch.log10((pictures - wanted).square().mean())), abs=1e-6)
+    assert close.worst == pytest.approx(float(each.min()), abs=1e-6) and close.worst < close.psnr
+    assert close.ssim == pytest.approx(float(ssim(pictures, wanted).mean()), abs=1e-5)  # float32 there
+    assert reference.psnr(kept) == (close.psnr, close.worst) and shares == [0.25, 0.5, 0.75, 1.0]
+    itself = reference.closeness(scene)
+    assert itself.psnr == itself.worst == math.inf and itself.ssim == pytest.approx(1.0)
+    assert DenseReference(scene, looks.resized(10)).closeness(kept).ssim is None
+
+
+def test_an_error_that_is_no_number_is_no_perfect_score():
+    spoiled = Closeness((1e-3, math.nan), None)
+    assert math.isnan(spoiled.psnr) and not spoiled.psnr > Closeness((0.5,), None).psnr
+    assert Closeness((1e-300,), None).psnr == pytest.approx(3000) and Closeness((0.0,), None).psnr == math.inf
 
 
 def test_a_psnr_that_any_scene_reaches_keeps_one_gaussian(scene, looks):

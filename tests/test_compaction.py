@@ -8,7 +8,7 @@ import torch
 from pointsplat_ns.auto_budget import DenseReference
 from pointsplat_ns.compaction import ALL_METHODS, IMAGE_SCORES, Poses, compact_scene
 from pointsplat_ns.distributions import opacity_quantiles, plot_distributions, size_quantiles
-from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
+from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.poses import sample_views
@@ -121,15 +121,22 @@ def test_a_bare_scene_is_looked_at_from_sampled_poses_and_a_run_from_its_own(sce
 
 
 def test_a_run_whose_data_is_gone_is_looked_at_from_sampled_poses_and_it_is_said(trained_walls, tmp_path, monkeypatch):
-    (run,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
     import pointsplat_ns.compaction as compaction
 
     def gone(path):
         raise SceneError("its data is not there")
 
     monkeypatch.setattr(compaction, "views_of_run", gone)
-    poses = Poses(run, room())
-    assert len(poses(2)) == 2 and poses.origin == "poses sampled in free space (no dataset: its data is not there)"
+    for name, mode in (("wall-a", "classic"), ("wall-b", "antialiased")):  # as the run rendered
+        (run,) = (trained_walls / name / "splatfacto-cpu").iterdir()
+        poses = Poses(run, room())
+        views = poses(2)
+        assert len(views) == 2 and views.rasterize_mode == mode
+        assert poses.origin == "poses sampled in free space (no dataset: its data is not there)"
+    nothing = Poses(run, room()[:0])
+    with pytest.raises(DataError, match="nothing of the scene can be seen"):
+        nothing(2)
+    assert nothing.origin == ""
 
 
 @pytest.mark.parametrize("by", ALL_METHODS)

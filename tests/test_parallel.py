@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from unittest import mock
 
@@ -14,6 +17,8 @@ from torch import nn
 
 UPDATES = 3
 ROWS, CHANNELS = 10, 4
+BROKEN = {3}, {6}
+"""Places of a broken photo, which the second process meets, and of a broken gradient, which the first does."""
 
 
 def write_rooms(folder: Path) -> None:
@@ -73,9 +78,66 @@ def train(config, world_size: int = 1) -> dict:
         "psnr": quality,
         "gradients": {name: p.grad.clone() for name, p in refiner.named_parameters()},
         "weights": {name: p.detach().clone() for name, p in refiner.named_parameters()},
+        "statistics": {name: value.clone() for name, value in refiner.named_buffers()},
         "report": {name: block["refined"]["psnr"] for name, block in report["scenes"].items()},
+        "skipped": dict(trainer.pipeline.skipped),
         "files": sorted(p.name for p in config.get_base_dir().rglob("*") if p.is_file() and "events" not in p.name),
     }
+
+
+@contextmanager
+def broken(photos: set[int], gradients: set[int]) -> Iterator[None]:
+    """Within, photos of NaN, and finite losses with a gradient of NaN, at these places in the sequence of scenes."""
+    from pointsplat_ns.data.scenes import ScenesDataManager
+    from pointsplat_ns.pipeline import PointSplatPipeline
+
+    next_train, losses_of = ScenesDataManager.next_train, PointSplatPipeline.get_train_loss_dict
+
+    def targets(self, step):
+        scene, frames = next_train(self, step)
+        if self.place(step) in photos:
+            frames = [(camera, {**data, "image": torch.full((24, 32, 3), torch.nan)}) for camera, data in frames]
+        return scene, frames
+
+    def losses(self, step):
+        outputs, parts, metrics = losses_of(self, step)
+        if self.datamanager.place(step) in gradients:
+            weight = self.model.refiner.heads.mlps["scales"][-1].weight
+            parts["l1"] = parts["l1"] + 0 * (0 * weight.sum()).sqrt()  # a root's slope at 0, times 0
+        return outputs, parts, metrics
+
+    with (
+        mock.patch.object(ScenesDataManager, "next_train", targets),
+        mock.patch.object(PointSplatPipeline, "get_train_loss_dict", losses),
+    ):
+        yield
+
+
+def gathering(data: Path, output_dir: Path, steps: int, accumulate: int, norm: str = "scene"):
+    """The config of a training that updates once in some steps, and saves between two updates as well."""
+    config = config_of(data, output_dir, steps)
+    config.gradient_accumulation_steps = {"all": accumulate}
+    config.steps_per_save, config.save_only_latest_checkpoint, config.pipeline.model.norm = 2, False, norm
+    return config
+
+
+def resumed(rooms: Path, folder: Path, name: str, rank: int, norm: str) -> list[dict]:
+    """A training of two processes, and the end of it once more from a checkpoint between two updates."""
+    whole = train(gathering(rooms, folder / f"{name}{rank}", 4, 2, norm), world_size=2)
+    rest = gathering(rooms, folder / f"{name} on {rank}", 1, 2, norm)
+    rest.load_dir, rest.load_step = folder / f"{name}0" / "refiner" / "pointsplat" / "now" / "nerfstudio_models", 2
+    return [whole, train(rest, world_size=2)]
+
+
+def stopped(rooms: Path, output_dir: Path) -> str:
+    """What a training of two processes says when the second one's photos are all broken."""
+    from pointsplat_ns.errors import SceneError
+
+    config = config_of(rooms, output_dir, 20)
+    config.max_skipped_steps = 2
+    with broken(set(range(1, 40, 2)), set()), pytest.raises(SceneError) as caught:
+        train(config, world_size=2)
+    return str(caught.value)
 
 
 def normalise(norm: nn.Module, x: torch.Tensor, weights: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -104,6 +166,12 @@ def work(rank: int, folder: Path) -> None:
 
     dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=2)
     found = train(config_of(folder / "rooms", folder / f"out{rank}", UPDATES), world_size=2)
+    found["resumed"] = resumed(folder / "rooms", folder, "gathering", rank, "scene")
+    with broken(*BROKEN):
+        found["skipping"] = resumed(folder / "rooms", folder, "skipping", rank, "scene")
+    with broken({3}, set()):
+        found["batch norm"] = resumed(folder / "rooms", folder, "batch norm", rank, "batch")
+    found["stopped"] = stopped(folder / "rooms", folder / f"stopped{rank}")
     x, weights = rows()
     mine = slice(0, 3) if rank == 0 else slice(3, ROWS)
     norm = nn.Sequential(BatchNorm(CHANNELS).double())
@@ -131,7 +199,9 @@ def together(tmp_path_factory):
         alone = config_of(folder / "rooms", folder / "alone", 2 * UPDATES)
         alone.gradient_accumulation_steps = {"all": 2}
         alone = train(alone)
-        text = pair.communicate(timeout=120)[0].decode()
+        with broken(BROKEN[0] | {2}, BROKEN[1] | {7}):  # what either of two processes cannot use, both leave out
+            alone["skipping"] = train(gathering(folder / "rooms", folder / "skipping", 8, 4))
+        text = pair.communicate(timeout=600)[0].decode()
     finally:
         pair.kill()
     assert pair.returncode == 0, text
@@ -167,6 +237,40 @@ def test_the_first_process_alone_writes(together):
     found, alone = together
     assert {"refiner.safetensors", f"step-{UPDATES - 1:09d}.ckpt"} <= set(found[0]["files"])
     assert not {"refiner.safetensors"} & set(found[1]["files"]) and not [f for f in found[1]["files"] if "ckpt" in f]
+
+
+@pytest.mark.parametrize("name", ["resumed", "skipping", "batch norm"])
+def test_a_training_interrupted_between_two_updates_ends_as_an_unbroken_one(together, name):
+    for part in together[0]:
+        whole, rest = part[name]
+        assert f"step-{2:09d}.ckpt" in together[0][0][name][0]["files"], "it was saved with gradients in waiting"
+        assert str(rest["losses"]) == str(whole["losses"][3:]) and rest["skipped"] == whole["skipped"]
+        for key in ("weights", "statistics"):
+            for tensor, value in whole[key].items():
+                assert torch.equal(rest[key][tensor], value), (key, tensor)
+    ours, theirs = (part[name][0] for part in together[0])
+    assert all(torch.equal(ours["weights"][n], theirs["weights"][n]) for n in ours["weights"])
+    assert bool(ours["statistics"]) == (name == "batch norm")
+
+
+def test_what_one_process_cannot_use_all_leave_out(together):
+    found, alone = together
+    for part in found:
+        whole = part["skipping"][0]
+        assert [value != value for value in whole["losses"]] == [False, True, False, False], "the mean is NaN, too"
+        assert sum(whole["skipped"].values()) == 2, "the one broken scene of each such step"
+        for name, wanted in alone["skipping"]["weights"].items():
+            error = (whole["weights"][name] - wanted).abs().max() / wanted.abs().max().clamp_min(1e-6)
+            assert error < 1e-3, (name, float(error))  # as above
+    assert found[0]["skipping"][0]["skipped"] == found[1]["skipping"][0]["skipped"]
+    assert sum(alone["skipping"]["skipped"].values()) == 4
+
+
+def test_all_processes_stop_at_once_and_name_the_scenes_of_all(together):
+    texts = [part["stopped"] for part in together[0]]
+    assert all("training stopped at step 2: losses or gradients were not finite in 3 steps" in text for text in texts)
+    names = [re.findall(r"([abc]): (\d)", text) for text in texts]
+    assert names[0] == names[1] and sum(int(count) for _, count in names[0]) == 3
 
 
 def test_batch_norm_is_that_of_all_points(together):

@@ -50,6 +50,7 @@ def test_a_scene_of_any_size_and_degree_is_pruned_and_refined(make_refined_run, 
 def test_scenes_are_known_by_name_and_the_first_held_out_is_the_default(make_refined_run, trained_walls, tmp_path):
     opened = open_refined_run(make_refined_run(tmp_path / "1", trained_walls))
     assert list(opened.scenes) == ["wall-a", "wall-b"] and opened.default_scene == "wall-a"
+    assert all(path.suffix == ".ckpt" and path.is_file() for path in opened.scenes.values())
     opened = open_refined_run(make_refined_run(tmp_path / "2", trained_walls, ("wall-b",)))
     assert opened.default_scene == "wall-b"
     # The viewer and ns-export show the first held-out scene by name, whatever the order on the command line was.

@@ -10,18 +10,21 @@ def main(args: list[str] | None = None) -> None:
     """Run one subcommand; input that cannot be used ends it with one line and exit status 1."""
     import tyro
 
+    from pointsplat_ns.cli.compact import compact
     from pointsplat_ns.cli.demo import demo
-    from pointsplat_ns.cli.scenes import export, prune, refine
+    from pointsplat_ns.cli.make_refiner import make_refiner
+    from pointsplat_ns.cli.scenes import export, prune
     from pointsplat_ns.cli.view import report, rooms
     from pointsplat_ns.errors import PointSplatError
 
     logging.basicConfig(format="%(message)s", level=logging.INFO)
     commands = {
+        "compact": compact,
         "prune": prune,
-        "refine": refine,
         "export": export,
         "report": report,
         "rooms": rooms,
+        "make-refiner": make_refiner,
         "demo": demo,
     }
     try:

@@ -3,16 +3,9 @@
 from __future__ import annotations
 
 import os
-import shlex
 import shutil
-import subprocess
-import sys
 import time
 from pathlib import Path
-
-SHORT_SPIN = {"GOMP_SPINCOUNT": "20000"}
-"""OpenMP threads that wait spin for some microseconds, then sleep. By default they spin on, which on a busy machine
-holds up the thread that they wait for; threads that sleep at once (OMP_WAIT_POLICY=PASSIVE) wake too late."""
 
 UNSEEN = "room2"
 """The room that the refiner is not trained on."""
@@ -43,6 +36,7 @@ def demo(
         height: of a photo, pixels.
         fresh: start over.
     """
+    from pointsplat_ns.cli.running import finished, run
     from pointsplat_ns.cli.view import read_evaluation, rooms, show_report
 
     start = time.perf_counter()
@@ -55,30 +49,30 @@ def demo(
 
     scenes = output / "scenes"
     for name in names:
-        if not _finished(scenes / name / "splatfacto-cpu" / "demo", scene_steps):
-            _run(
+        if not finished(scenes / name / "splatfacto-cpu" / "demo", scene_steps):
+            run(
                 "ns-train splatfacto-cpu --vis tensorboard --timestamp demo "
                 f"--output-dir {scenes} --experiment-name {name} --max-num-iterations {scene_steps} "
                 f"--data {output / 'rooms' / name} replica-data --num-seed-points 20000"
             )
-    run = output / "refiner" / "rooms" / "pointsplat" / "demo"
-    if not _finished(run, refiner_steps):
-        _run(
+    trained = output / "refiner" / "rooms" / "pointsplat" / "demo"
+    if not finished(trained, refiner_steps):
+        run(
             "ns-train pointsplat --vis tensorboard --timestamp demo "
             f"--output-dir {output / 'refiner'} --experiment-name rooms --max-num-iterations {refiner_steps} "
             f"--data {scenes} --pipeline.datamanager.eval-scenes {UNSEEN} "
             f"--pipeline.model.keep {keep} --pipeline.model.size tiny"
         )
     evaluation, pictures = output / "evaluation.json", output / "pictures"
-    _run(f"ns-eval --load-config {run / 'config.yml'} --output-path {evaluation} --render-output-path {pictures}")
+    run(f"ns-eval --load-config {trained / 'config.yml'} --output-path {evaluation} --render-output-path {pictures}")
     splat = output / f"{UNSEEN}_refined.ply"
-    _run(f"pointsplat export {run} -o {splat}")
+    run(f"pointsplat export {trained} -o {splat}")
 
     results = read_evaluation(evaluation)
     picture = output / "before_after.png"
     before_after(sorted(pictures.glob(f"{UNSEEN}_*.png")), results["scenes"][UNSEEN], picture)
     show_report(results)
-    print(f"{splat}: open it in any 3DGS viewer, or run ns-viewer --load-config {run / 'config.yml'}")
+    print(f"{splat}: open it in any 3DGS viewer, or run ns-viewer --load-config {trained / 'config.yml'}")
     print(f"{picture}: photo, dense, pruned and refined side by side, of a room that the refiner never saw")
     print(f"done in {(time.perf_counter() - start) / 60:.1f} minutes")
 
@@ -114,34 +108,3 @@ def before_after(views: list[Path], scene: dict, path: Path, rows: int = 3) -> N
     beside = path.with_name(f".{path.name}.part")
     figure.savefig(beside, dpi=100, format="png")
     os.replace(beside, path)
-
-
-def _finished(run: Path, steps: int) -> bool:
-    """Whether a run's training reached its last step; what an interrupted one left is removed."""
-    from pointsplat_ns.errors import SceneError
-    from pointsplat_ns.io.runs import open_run
-
-    try:
-        if open_run(run, need_data=False).step == steps - 1:
-            return True
-    except SceneError:
-        pass
-    shutil.rmtree(run, ignore_errors=True)
-    return False
-
-
-def _run(command: str) -> None:
-    """Run a command of this Python's environment, shown as one would type it.
-
-    Raises:
-        PointSplatError: if it fails.
-    """
-    from pointsplat_ns.errors import PointSplatError
-
-    print(f"\n$ {command}", flush=True)
-    program, *arguments = shlex.split(command)
-    beside = Path(sys.executable).parent / program
-    environment = {**SHORT_SPIN, **os.environ}
-    status = subprocess.run([str(beside) if beside.exists() else program, *arguments], env=environment).returncode
-    if status != 0:
-        raise PointSplatError(f"{command}: ended with exit status {status}; its own words are above")

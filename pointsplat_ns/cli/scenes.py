@@ -1,4 +1,4 @@
-"""Subcommands that turn one scene into another: prune, refine, export."""
+"""Subcommands that turn one scene into another: prune, export; and what compact shares with them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,25 @@ from typing import Annotated, Literal
 import tyro
 
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+OptionalOutput = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
 Scene = tyro.conf.Positional[Path]
+Method = Literal[
+    "merge",
+    "coverage",
+    "paper",
+    "authors",
+    "opacity",
+    "volume",
+    "log-volume",
+    "area",
+    "random",
+    "lightgaussian",
+    "pup",
+]
+Bands = Literal["all", "auto", "0", "1", "2", "3"]
 
 
-def _say(what: str, dense: int, kept, seconds: float, path: Path | str) -> None:
+def say(what: str, dense: int, kept, seconds: float, path: Path | str) -> None:
     from pointsplat_ns.pruning import ply_bytes
 
     share = f" ({100 * len(kept) / dense:.1f} %)" if dense else ""
@@ -23,7 +38,7 @@ def _say(what: str, dense: int, kept, seconds: float, path: Path | str) -> None:
 
 
 @contextmanager
-def _progress() -> Iterator[Callable[[str, float], None]]:
+def progress_bar() -> Iterator[Callable[[str, float], None]]:
     """A bar that is told what is being done and the share done of it; it leaves nothing behind."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -43,7 +58,7 @@ def _progress() -> Iterator[Callable[[str, float], None]]:
         yield told
 
 
-def _show_distributions(dense, kept) -> None:
+def show_distributions(dense, kept) -> None:
     """A table of what there was and what there is."""
     from rich.console import Console
     from rich.table import Table
@@ -64,25 +79,42 @@ def _show_distributions(dense, kept) -> None:
     Console().print(table)
 
 
+def need_outputs(output: Path | None, picture: Path | None, dry_run: bool) -> None:
+    """Refuse, before anything takes minutes, what could not be written in the end.
+
+    Raises:
+        SceneError: if ``output`` is missing without a dry run, or is no .ply, or ``picture`` no .png.
+    """
+    from pointsplat_ns.errors import SceneError
+
+    if output is None and not dry_run:
+        raise SceneError("--output is missing; expected the name of the .ply to write, or --dry-run")
+    for path, kind in ((output, ".ply"), (picture, ".png")):
+        if path is not None and path.suffix.lower() != kind:
+            raise SceneError(
+                f"{path}: cannot write a {path.suffix or 'nameless'} file; expected a name that ends in {kind}"
+            )
+        if path is not None and path.is_dir():
+            raise SceneError(f"{path}: is a folder; expected the name of a file to write")
+
+
+def write_unless_dry(scene, output: Path | None, dry_run: bool) -> Path | str:
+    """Write a scene; says where it is."""
+    from pointsplat_ns.io.scene import write_scene
+
+    if output is None or dry_run:
+        return "dry run, nothing is written"
+    write_scene(scene, output)
+    return output
+
+
 def prune(
     scene: Scene,
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None,
+    output: OptionalOutput = None,
     keep: str = "0.3",
-    by: Literal[
-        "merge",
-        "coverage",
-        "paper",
-        "authors",
-        "opacity",
-        "volume",
-        "log-volume",
-        "area",
-        "random",
-        "lightgaussian",
-        "pup",
-    ] = "merge",
+    by: Method = "merge",
     opacity_weight: float = 0.3,
-    sh: Literal["all", "auto", "0", "1", "2", "3"] = "all",
+    sh: Bands = "all",
     fine_tune: int = 0,
     plot: Path | None = None,
     dry_run: bool = False,
@@ -110,60 +142,26 @@ def prune(
     from pointsplat_ns.compaction import Poses, compact_scene
     from pointsplat_ns.distributions import plot_distributions
     from pointsplat_ns.errors import SceneError
-    from pointsplat_ns.io.scene import read_scene, write_scene
+    from pointsplat_ns.io.scene import read_scene
     from pointsplat_ns.pruning import parse_keep
 
-    if output is None and not dry_run:
-        raise SceneError("--output is missing; expected the name of the .ply to write, or --dry-run")
-    for path, kind in ((output, ".ply"), (plot, ".png")):  # before what may take minutes
-        if path is not None and path.suffix.lower() != kind:
-            raise SceneError(
-                f"{path}: cannot write a {path.suffix or 'nameless'} file; expected a name that ends in {kind}"
-            )
-        if path is not None and path.is_dir():
-            raise SceneError(f"{path}: is a folder; expected the name of a file to write")
+    need_outputs(output, plot, dry_run)
     if fine_tune < 0:
         raise SceneError(f"--fine-tune {fine_tune}: expected a number of steps, 0 for none")
     budget = parse_keep(keep)
     dense = read_scene(scene)
     start = time.perf_counter()
-    with _progress() as told:
+    with progress_bar() as told:
         made = compact_scene(dense, budget, by, sh, opacity_weight, Poses(scene, dense), fine_tune, progress=told)
     seconds = time.perf_counter() - start
     if plot is not None:
         plot_distributions({"before": dense, "after": made.scene}, plot)
-    where: Path | str = "dry run, nothing is written"
-    if output is not None and not dry_run:
-        write_scene(made.scene, output)
-        where = output
-    _say("kept", len(dense), made.scene, seconds, where)
+    say("kept", len(dense), made.scene, seconds, write_unless_dry(made.scene, output, dry_run))
     for note in made.notes:
         print(note)
-    _show_distributions(dense, made.scene)
+    show_distributions(dense, made.scene)
     if plot is not None:
         print(f"{plot}: opacity and volume, before and after")
-
-
-def refine(scene: Scene, using: Path, output: Output, keep: str | None = None) -> None:
-    """Prune any scene and repair it with a trained refiner. No photos are needed.
-
-    Args:
-        scene: a 3DGS .ply, a Splatfacto checkpoint, or a Splatfacto run (its folder or config.yml).
-        using: a trained pointsplat run: its folder or config.yml.
-        output: the .ply to write.
-        keep: how many Gaussians, as for prune; by default what the refiner was trained with.
-    """
-    from pointsplat_ns.io.scene import read_scene, write_scene
-    from pointsplat_ns.pruning import parse_keep
-    from pointsplat_ns.refined_run import open_refined_run
-
-    trained = open_refined_run(using, need_scenes=False)
-    dense = read_scene(scene)
-    start = time.perf_counter()
-    refined = trained.compact(dense, None if keep is None else parse_keep(keep))
-    seconds = time.perf_counter() - start
-    write_scene(refined, output)
-    _say("refined", len(dense), refined, seconds, output)
 
 
 def export(run: Scene, output: Output, scene: str | None = None) -> None:
@@ -189,7 +187,7 @@ def export(run: Scene, output: Output, scene: str | None = None) -> None:
         chosen = scene or trained.default_scene
         if chosen not in trained.scenes:
             raise SceneError(f"--scene {chosen}: no such scene in {run}; there are {', '.join(trained.scenes)}")
-        dense = read_scene(trained.scenes[chosen].checkpoint)
+        dense = read_scene(trained.scenes[chosen])
         result, what = trained.compact(dense), f"{chosen}, refined:"
     else:
         if scene is not None:
@@ -197,4 +195,4 @@ def export(run: Scene, output: Output, scene: str | None = None) -> None:
         dense = result = read_scene(run)
         what = "wrote"
     write_scene(result, output)
-    _say(what, len(dense), result, time.perf_counter() - start, output)
+    say(what, len(dense), result, time.perf_counter() - start, output)

@@ -10,6 +10,12 @@ import tyro
 
 ROWS = ("dense", "pruned", "refined")
 
+PHOTOS = "photos"
+"""What an evaluation that does not say was compared with."""
+
+NAMES = {PHOTOS: "held-out photos", "dense renders": "the dense scenes' own renders"}
+"""What is compared with, in words."""
+
 
 def rooms(
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
@@ -43,10 +49,11 @@ def report(evaluation: tyro.conf.Positional[Path]) -> None:
 
 
 def show_report(results: dict[str, Any]) -> None:
-    """Print an evaluation as a table, and why LPIPS is missing if it is."""
+    """Print an evaluation: a table for each thing compared with, and why LPIPS is missing if it is."""
     from rich.console import Console
 
-    Console().print(report_table(results))
+    for table in report_tables(results):
+        Console().print(table)
     if "lpips_note" in results:
         print(f"no LPIPS: {results['lpips_note']}")
 
@@ -69,24 +76,35 @@ def read_evaluation(path: Path) -> dict[str, Any]:
         raise DataError(f"{path}: not an evaluation of a pointsplat run; expected what ns-eval wrote") from error
 
 
-def report_table(results: dict[str, Any]):
-    """A rich table: one row for each scene and variant, then the averages; "seen" is whether it was trained on."""
+def report_tables(results: dict[str, Any]) -> list:
+    """A rich table for what was compared with photos, and one for what was compared with dense renders; no average
+    mixes the two."""
+    other = results.get("against_dense_renders")
+    parts = [results] if other is None else [results, other]
+    return [_table(results, part) for part in parts]
+
+
+def _table(results: dict[str, Any], part: dict[str, Any]):
+    """One row for each scene and variant of a part, then its averages; "seen" is whether it was trained on."""
     from rich.table import Table
 
     settings = results.get("settings", {})
+    reference = part.get("reference", PHOTOS)
     title = f"keep {settings.get('keep')}, score {settings.get('by')}, refiner {settings.get('size')}"
-    table = Table(title=title)
+    table = Table(title=f"{title}; compared with {NAMES.get(reference, reference)}")
     table.add_column("scene")
     table.add_column("seen")
     table.add_column("variant")
     for name in ("PSNR dB", "SSIM", "LPIPS", "splats", "MB", "fps"):
         table.add_column(name, justify="right")
     blocks = [
-        (name, "yes" if scene["seen_in_training"] else "never", scene) for name, scene in results["scenes"].items()
+        (name, "yes" if scene["seen_in_training"] else "never", scene)
+        for name, scene in results["scenes"].items()
+        if scene.get("reference", PHOTOS) == reference
     ]
     if len(blocks) > 1:
         averages = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
-        blocks += [("average", seen, results[key]) for seen, key in averages if key in results]
+        blocks += [("average", seen, part[key]) for seen, key in averages if key in part]
     for title, seen, block in blocks:
         for i, row in enumerate(ROWS):
             values = block[row]

@@ -9,9 +9,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import itertools
-import os
 import random
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,15 +18,11 @@ from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from pointsplat_ns.data.frames import FrameCache
-from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.ply import read_ply
-from pointsplat_ns.io.ply_header import read_header
-from pointsplat_ns.io.runs import CONFIG_NAME, distinct
 from pointsplat_ns.poses import BACKGROUND, sample_views
 from pointsplat_ns.views import Views, draw
 
@@ -239,39 +233,3 @@ def cameras_of(views: Views) -> Cameras:
     poses = torch.cat([turned * turned.new_tensor([1.0, -1.0, -1.0]), places], dim=2).float()
     fx, fy, cx, cy = (Ks[:, i, j].float() for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     return Cameras(poses, fx, fy, cx, cy, views.width, views.height, camera_type=CameraType.PERSPECTIVE)
-
-
-def find_plys(folder: Path) -> list[tuple[str, Path]]:
-    """Name and path of every 3DGS PLY at or below ``folder``, sorted by path.
-
-    What lies in the folder of a nerfstudio run, and PLY files that hold no Gaussians, are passed over.
-    """
-    if folder.is_file():
-        paths = [folder] if folder.suffix.lower() == ".ply" else []
-        root = folder.parent
-    else:
-        paths, root = [], folder
-        for place, inner, files in os.walk(folder):
-            if CONFIG_NAME in files:
-                inner.clear()
-                continue
-            inner[:] = sorted(name for name in inner if not name.startswith("."))
-            paths += [Path(place) / name for name in files if name.lower().endswith(".ply")]
-    found, names = [], []
-    for path in sorted(paths):
-        if not _holds_gaussians(path):
-            CONSOLE.log(f"passed over {path}: no Gaussians in it")
-            continue
-        parts = path.relative_to(root).with_suffix("").parts
-        names.append(re.sub(r"[^\w.+-]+", "-", "-".join(parts)).strip("-.") or "scene")
-        found.append(path)
-    return list(zip(distinct(names), found, strict=True))
-
-
-def _holds_gaussians(path: Path) -> bool:
-    try:
-        with path.open("rb") as stream:
-            elements = read_header(stream, path).elements
-    except (SceneError, OSError):
-        return False
-    return any({"opacity", "scale_0", "rot_0"} <= {name for name, _ in element.properties} for element in elements)

@@ -17,20 +17,32 @@ CELL = 0.08  # metres, grid on which free space is searched
 _LOWEST, _HIGHEST = 1.05, 1.65  # metres, heights of the camera
 
 
-def capture_path(room: "Room", frames: int, seed: int) -> Tensor:
+STYLES = ("rounds", "outward", "stops")
+"""How people capture rooms: two rounds that look across the room, then to both sides; two rounds along the walls that
+look at them; or from a few places, turning on each."""
+
+_STOPS = 6  # places of the style "stops"
+
+
+def capture_path(room: "Room", frames: int, seed: int, style: str = "rounds") -> Tensor:
     """Poses along two rounds through a room.
 
-    The first round looks across the room, the second swings from side to side; height and pitch vary
-    on the way. Every position keeps at least :data:`CLEARANCE` from all surfaces.
+    Height and pitch vary on the way. Every position keeps at least :data:`CLEARANCE` from all surfaces.
 
     Args:
         room: The room.
         frames: Number of poses.
         seed: Start angle, direction and swing of the walk.
+        style: One of :data:`STYLES`.
 
     Returns:
         (F, 4, 4) float32 camera-to-world, OpenCV axes, z of the world up.
+
+    Raises:
+        DataError: No such style, or no free place in the room.
     """
+    if style not in STYLES:
+        raise DataError(f"no capture style is called {style!r}; expected one of {', '.join(STYLES)}")
     rng = np.random.default_rng([seed, 21])
     width, depth, height = room.spec.size
     top = min(_HIGHEST, height - 0.6)
@@ -45,6 +57,12 @@ def capture_path(room: "Room", frames: int, seed: int) -> Tensor:
     swing = 0.2 + 0.7 * _smoothstep((share - 0.4) / 0.2)
     gaze = np.unwrap(np.arctan2(middle[1] - route[:, 1], middle[0] - route[:, 0]))
     gaze = _eased(gaze, frames / 40) + swing * np.sin(2 * math.pi * 3 * share)
+    if style == "outward":
+        gaze = gaze + math.pi
+    elif style == "stops":
+        at = np.floor(share * _STOPS)
+        route = route[np.searchsorted(share, at / _STOPS)]
+        gaze = turn * 2 * math.pi * (share * _STOPS - at) + at
     pitch = -0.22 + 0.24 * np.sin(2 * math.pi * (5 * share + rng.random()))
     positions = np.concatenate([route, heights[:, None]], axis=1)
     return torch.stack([_look(p, g, t) for p, g, t in zip(positions, gaze, pitch, strict=True)])

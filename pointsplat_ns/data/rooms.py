@@ -111,6 +111,7 @@ def write_room(
     width: int = 320,
     height: int = 240,
     progress: bool = True,
+    style: str = "rounds",
 ) -> Path:
     """Writes a captured room in the Replica layout, beside ``folder`` first and then renamed to it.
 
@@ -120,6 +121,7 @@ def write_room(
         frames: Pictures to take.
         width, height: Pixels of a picture.
         progress: Show a progress bar.
+        style: How the camera is led, see :func:`capture_path`.
 
     Returns:
         ``folder``.
@@ -135,7 +137,7 @@ def write_room(
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DataError(f"{folder}: exists and is not an empty folder; remove it or name another")
     room = make_room(seed)
-    poses = capture_path(room, frames, seed)
+    poses = capture_path(room, frames, seed, style)
     K = default_intrinsics(width, height)
     partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
     try:

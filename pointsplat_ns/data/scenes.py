@@ -23,11 +23,12 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from pointsplat_ns.data.dense import DenseScene, PlyScene, SampledPoses, Split, find_plys
+from pointsplat_ns.data.dense import DenseScene, PlyScene, SampledPoses, Split
 from pointsplat_ns.data.frames import FrameCache, Frames, free_memory_share, to_device
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.inert_yaml import Tagged
+from pointsplat_ns.io.plys import find_plys
 from pointsplat_ns.io.runs import Run, find_runs, open_run, scene_names, shown_scene
 from pointsplat_ns.io.splatfacto import read_checkpoint
 

@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -67,6 +67,11 @@ class Run:
         if self.method_name == "pointsplat":  # a refiner for many scenes, whatever its settings are called
             return False
         return self.method_name.startswith("splatfacto") or self.model_fields.keys() >= _SPLATFACTO_FIELDS
+
+    @property
+    def rasterize_mode(self) -> Literal["classic", "antialiased"]:
+        """How the run rendered, and how its scene is to be drawn."""
+        return "antialiased" if self.model_fields.get("rasterize_mode") == "antialiased" else "classic"
 
 
 def open_run(path: Path | str, need_data: bool = True) -> Run:

@@ -125,6 +125,10 @@ class RefinerConfig:
         )
         _require(0 <= self.sh_degree <= MAX_SH_DEGREE, f"sh_degree is {self.sh_degree}; expected 0 to {MAX_SH_DEGREE}")
         _require(self.encoder in ("dual", "concat"), f"encoder is {self.encoder!r}; expected 'dual' or 'concat'")
+        _require(
+            self.encoder == "dual" or (self.use_appearance and self.use_position),
+            "use_appearance and use_position are switches of the encoder 'dual'; encoder 'concat' expects both on",
+        )
         norms = ("scene", "batch", "layer")
         _require(self.norm in norms, f"norm is {self.norm!r}; expected one of {', '.join(norms)}")
         _require(self.grid is None or 1 <= self.grid <= 512, f"grid is {self.grid}; expected 1 to 512, or None")

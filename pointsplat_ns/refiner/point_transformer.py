@@ -6,13 +6,15 @@ Source of the architecture: X. Wu et al., "Point Transformer V3: Simpler, Faster
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pointsplat_ns.refiner.config import RefinerConfig
 from pointsplat_ns.refiner.encoder import make_norm
-from pointsplat_ns.refiner.rows import by_rows, rows_at_a_time
+from pointsplat_ns.refiner.rows import add_by_rows, add_rows, by_rows, rows_at_a_time
 from pointsplat_ns.refiner.sparse_ops import permute, segment_max, segment_mean, submanifold_conv
 from pointsplat_ns.refiner.structure import Level, Structure
 
@@ -29,13 +31,15 @@ class SubmanifoldConv(nn.Module):
         self.weight = nn.Parameter(torch.empty(27, in_channels, out_channels).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
 
-    def forward(self, x: Tensor, level: Level) -> Tensor:
-        """``[M, Cin] -> [M, Cout]``."""
+    def forward(self, x: Tensor, level: Level, then: Callable[[Tensor], Tensor] | None = None) -> Tensor:
+        """``[M, Cin] -> [M, Cout]``; ``then`` is applied row by row, to the result of each cell once."""
         if level.cell_of is not None:
             x = segment_mean(x, level.cell_of, level.num_cells)
         x = submanifold_conv(x, self.weight, level.neighbours)
         if self.bias is not None:
             x = x.add_(self.bias)
+        if then is not None:
+            x = by_rows(then, x, rows_at_a_time(x.shape[1]))
         return x if level.cell_of is None else x.index_select(0, level.cell_of)
 
 
@@ -52,17 +56,38 @@ class PatchAttention(nn.Module):
         self.qkv = nn.Linear(channels, 3 * channels)
         self.proj = nn.Linear(channels, channels)
 
-    def forward(self, x: Tensor, order: tuple[Tensor, Tensor] | None) -> Tensor:
-        """``[M, C] -> [M, C]``; ``order`` is a curve's order and inverse, None for memory order."""
-        if order is not None:
-            x = permute(x, *order)
+    def forward(
+        self, x: Tensor, order: tuple[Tensor, Tensor] | None, norm: nn.Module | None = None, add: bool = False
+    ) -> Tensor:
+        """``[M, C] -> [M, C]``: attention among the rows of ``norm(x)``.
+
+        Args:
+            x: features.  # [M, C]
+            order: a curve's order and inverse, None for memory order.
+            norm: applied row by row before.
+            add: add the result to ``x`` in place, without gradients, and return that.
+        """
         size = min(self.patch, len(x))
         full = len(x) // size * size
         rows = rows_at_a_time(self.qkv.out_features, size)
-        out = by_rows(lambda part: self._attend(part, size), x[:full], rows)
+
+        def attend(part: Tensor) -> Tensor:
+            return self._attend(part if norm is None else norm(part), size)
+
+        if add:
+            along = None if order is None else order[0]
+            # Read before they change: the last patch borrows points of the one before.
+            last = x[len(x) - size :] if along is None else x.index_select(0, along[len(x) - size :])
+            last = attend(last)[full - len(x) :] if full < len(x) else None
+            add_by_rows(attend, x, rows, along, full)
+            if last is not None:
+                add_rows(x, last, along, full)
+            return x
+        if order is not None:
+            x = permute(x, *order)
+        out = by_rows(attend, x[:full], rows)
         if full < len(x):
-            last = self._attend(x[len(x) - size :], size)
-            out = torch.cat([out, last[full - len(x) :]])
+            out = torch.cat([out, attend(x[len(x) - size :])[full - len(x) :]])
         return out if order is None else permute(out, order[1], order[0])
 
     def _attend(self, x: Tensor, size: int) -> Tensor:
@@ -88,10 +113,16 @@ class Block(nn.Module):
 
     def forward(self, x: Tensor, level: Level, order: tuple[Tensor, Tensor] | None) -> Tensor:
         """``[M, C] -> [M, C]``."""
-        x = by_rows(self.conv_out, self.conv(x, level), rows_at_a_time(x.shape[1])).add_(x)
-        x = self._drop(self.attention(self.norm1(x), order)).add_(x)
+        x = self.conv(x, level, self.conv_out).add_(x)
         rows = rows_at_a_time(self.mlp[0].out_features)
-        return self._drop(by_rows(lambda part: self.mlp(self.norm2(part)), x, rows)).add_(x)
+        if not torch.is_grad_enabled() and not self.training:
+            x = self.attention(x, order, self.norm1, add=True)
+            return add_by_rows(self._mlp, x, rows)
+        x = self._drop(self.attention(x, order, self.norm1)).add_(x)
+        return self._drop(by_rows(self._mlp, x, rows)).add_(x)
+
+    def _mlp(self, x: Tensor) -> Tensor:
+        return self.mlp(self.norm2(x))
 
     def _drop(self, x: Tensor) -> Tensor:
         if not self.training or self.drop_path == 0:

@@ -7,8 +7,14 @@ points without the last three bits per halving. That makes one sort serve all gr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import lru_cache
+
 import torch
 from torch import Tensor
+
+LEVELS_AT_ONCE = 4
+"""Halvings that one look-up takes along the Hilbert curve: its table is 48 x 8^4 numbers, which a cache holds."""
 
 
 def z_order(coords: Tensor, bits: int) -> Tensor:
@@ -21,16 +27,12 @@ def z_order(coords: Tensor, bits: int) -> Tensor:
     Returns:
         codes in ``[0, 8**bits)``.  # [N] int64
     """
-    return _interleave([_spread(coords[:, axis]) for axis in range(3)])
+    return curve_codes(coords, bits, ("z",))[0]
 
 
 def hilbert(coords: Tensor, bits: int) -> Tensor:
     """Position along the Hilbert curve, whose consecutive cells always share a face.
 
-    Walks from the highest bit to the lowest, undoing the rotation that the octant of each bit
-    stands for, then Gray-codes the result. Source: J. Skilling, "Programming the Hilbert curve",
-    AIP Conference Proceedings 707 (2004).
-
     Args:
         coords: integer coordinates, each at least 0 and below ``2**bits``.  # [N, 3] int64
         bits: bits per axis, at most 20.
@@ -38,58 +40,109 @@ def hilbert(coords: Tensor, bits: int) -> Tensor:
     Returns:
         codes in ``[0, 8**bits)``.  # [N] int64
     """
-    # Half as wide, the integers take half as long; shifted to the top and back, a bit fills the word as a mask.
-    axes = [coords[:, axis].to(torch.int32, copy=True) for axis in range(3)]
-    for bit in range(bits - 1, 0, -1):
-        low = (1 << bit) - 1
-        for axis in range(3):
-            # Bit set: mirror the first axis below this bit. Bit clear: swap the first axis with this one there.
-            mirrored = ((axes[axis] << (31 - bit)) >> 31) & low
-            if axis:
-                swapped = (axes[0] ^ axes[axis]) & (mirrored ^ low)
-                axes[axis] ^= swapped
-                axes[0] ^= swapped
-            axes[0] ^= mirrored
-    axes[1] ^= axes[0]
-    axes[2] ^= axes[1]
-    parity = axes[2] >> 1  # of the bits above each bit: doubled in reach five times
-    for reach in (1, 2, 4, 8, 16):
-        parity ^= parity >> reach
-    return _interleave([_spread((axis ^ parity).long()) for axis in axes])
+    return curve_codes(coords, bits, ("hilbert",))[0]
 
 
-def curve_codes(coords: Tensor, bits: int, curve: str) -> Tensor:
-    """Codes along a named curve.
+def curve_codes(coords: Tensor, bits: int, curves: Sequence[str]) -> list[Tensor]:
+    """Codes along named curves.
 
     Args:
         coords: integer coordinates, each at least 0 and below ``2**bits``.  # [N, 3] int64
         bits: bits per axis, at most 20.
-        curve: ``z``, ``hilbert``, or either with ``-trans``: the same curve with x and y exchanged.
+        curves: ``z``, ``hilbert``, or either with ``-trans``: the same curve with x and y exchanged.
 
     Returns:
-        codes in ``[0, 8**bits)``.  # [N] int64
+        per curve, codes in ``[0, 8**bits)``.  # [N] int64
 
     Raises:
         ValueError: if there is no such curve.
     """
-    base, _, variant = curve.partition("-")
-    functions = {"z": z_order, "hilbert": hilbert}
-    if base not in functions or variant not in ("", "trans"):
-        raise ValueError(f"no curve {curve!r}; expected z, z-trans, hilbert or hilbert-trans")
     if not 1 <= bits <= 20:
         raise ValueError(f"{bits} bits per axis; expected 1 to 20, so that a code fits an int64")
-    return functions[base](coords[:, [1, 0, 2]] if variant else coords, bits)
+    x, y, z = (_spread(coords[:, axis]) for axis in range(3))
+    codes = []
+    for curve in curves:
+        base, _, variant = curve.partition("-")
+        if base not in ("z", "hilbert") or variant not in ("", "trans"):
+            raise ValueError(f"no curve {curve!r}; expected z, z-trans, hilbert or hilbert-trans")
+        first, second = (y, x) if variant else (x, y)
+        code = (first << 2).bitwise_or_(second << 1).bitwise_or_(z)
+        codes.append(code if base == "z" else _hilbert_from_z(code, bits))
+    return codes
 
 
 def _spread(x: Tensor) -> Tensor:
     """Moves bit k to bit 3k, for k below 21, by halving the distance still to go five times."""
     x = x & 0x1FFFFF
-    x = (x | (x << 32)) & 0x1F00000000FFFF
-    x = (x | (x << 16)) & 0x1F0000FF0000FF
-    x = (x | (x << 8)) & 0x100F00F00F00F00F
-    x = (x | (x << 4)) & 0x10C30C30C30C30C3
-    return (x | (x << 2)) & 0x1249249249249249
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        x |= x << shift
+        x &= mask
+    return x
 
 
-def _interleave(axes: list[Tensor]) -> Tensor:
-    return (axes[0] << 2) | (axes[1] << 1) | axes[2]
+def _hilbert_from_z(code: Tensor, bits: int) -> Tensor:
+    """Hilbert code of each z-order code: octants from the coarsest on, a few levels at a time. # [N] int64"""
+    out, state = torch.zeros_like(code), None
+    while bits:
+        levels = bits % LEVELS_AT_ONCE or LEVELS_AT_ONCE
+        bits -= levels
+        table = _hilbert_table(levels, code.device)
+        place = code >> 3 * bits
+        place &= 8**levels - 1
+        if state is not None:
+            place += state
+        entry = table.index_select(0, place)
+        digits = entry & (8**levels - 1)
+        out <<= 3 * levels
+        out |= digits
+        # What follows is always LEVELS_AT_ONCE wide.
+        state = (entry >> 3 * levels) << 3 * LEVELS_AT_ONCE
+    return out
+
+
+@lru_cache
+def _hilbert_table(levels: int, device: torch.device) -> Tensor:
+    """Digits and next state by state and octants, packed: ``next << 3 * levels | digits``. # [48 * 8**levels] int32"""
+    octants, following = _hilbert_states()
+    digits, state = octants, following
+    for _ in range(levels - 1):  # one level more in front
+        digits = ((octants * digits.shape[1])[:, :, None] + digits[following]).flatten(1)
+        state = state[following].flatten(1)
+    return ((state << 3 * levels) | digits).flatten().to(device, torch.int32)
+
+
+@lru_cache
+def _hilbert_states() -> tuple[Tensor, Tensor]:
+    """The Hilbert curve as an automaton: digit and next state by state and octant, from state 0 on. # [48, 8] int64
+
+    At each bit, a mirror or an exchange of axes applies to all lower bits, according to the octant,
+    and the octant is Gray-coded. A state is what has piled up: which axis each one reads, whether
+    mirrored, and the parity that the Gray code carries down. Source: J. Skilling, "Programming the
+    Hilbert curve", AIP Conference Proceedings 707 (2004).
+    """
+    states = {((0, 1, 2), (0, 0, 0), 0): 0}
+    digits, following = [], []
+    for axes, mirrors, parity in (queue := list(states)):
+        for octant in range(8):
+            source, mirror = list(axes), list(mirrors)
+            bits = [(octant >> (2 - source[i]) & 1) ^ mirror[i] for i in range(3)]
+            for i in range(3):
+                if bits[i]:
+                    mirror[0] ^= 1
+                else:
+                    source[0], source[i] = source[i], source[0]
+                    mirror[0], mirror[i] = mirror[i], mirror[0]
+            gray = bits[0], bits[0] ^ bits[1], bits[0] ^ bits[1] ^ bits[2]
+            reached = tuple(source), tuple(mirror), parity ^ gray[2]
+            if reached not in states:
+                states[reached] = len(states)
+                queue.append(reached)
+            digits.append(sum((bit ^ parity) << (2 - i) for i, bit in enumerate(gray)))
+            following.append(states[reached])
+    return torch.tensor(digits).view(-1, 8), torch.tensor(following).view(-1, 8)

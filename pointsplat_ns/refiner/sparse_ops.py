@@ -122,4 +122,4 @@ def segment_mean(
 ) -> Tensor:
     """Mean over the rows of each cluster. # [size, C]"""
     count = torch.bincount(cluster, minlength=size).to(x.dtype)
-    return x.new_zeros(size, x.shape[1]).index_add(0, cluster, x) / count[:, None]
+    return x.new_zeros(size, x.shape[1]).index_add_(0, cluster, x).div_(count[:, None])

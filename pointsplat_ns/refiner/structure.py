@@ -33,6 +33,13 @@ HALF_KERNEL = [
 ]  # fmt: skip
 """The 13 offsets of a 3x3x3 kernel that come after the centre; the other 13 are their negatives."""
 
+TABLE_PER_CELL = 128
+"""Neighbours are looked up in a table of the whole grid where that has at most so many entries, of 4 bytes, for each
+occupied cell, and searched for otherwise: three to eight times slower, at any size of the grid."""
+
+TABLE_LIMIT = 2**26
+"""Most entries of that table: 256 MB."""
+
 
 @dataclass(frozen=True)
 class Level:
@@ -96,34 +103,33 @@ def build_structure(scene: Gaussians, config: RefinerConfig) -> Structure:
     """
     cube = unit_cube(scene.means)
     units = 2**FINE_BITS if config.grid is None else config.grid << FIXED_GRID_BITS
-    fine = ((cube.positions(scene.means) + 0.5) * units).floor().long().clamp(0, units - 1)
-    order = _canonical_order(scene, curve_codes(fine, FINE_BITS, config.curves[0]))
-    fine = fine[order]
-    codes = [curve_codes(fine, FINE_BITS, curve) for curve in config.curves]
-    shift = FIXED_GRID_BITS if config.grid is not None else _adaptive_shift(codes[0])
+    fine = ((cube.positions(scene.means) + 0.5) * units).long().clamp_(0, units - 1)
+    codes = curve_codes(fine, FINE_BITS, config.curves)
+    order, depths = _canonical_order(scene, codes[0])
+    shift = FIXED_GRID_BITS if config.grid is not None else _adaptive_shift(depths)
     cells_per_side = units / 2**shift
 
     levels = []
     shifts = [min(shift + _log2_product(config.strides[:i]), FINE_BITS) for i in range(len(config.strides) + 1)]
-    first = torch.arange(len(scene), device=scene.device)  # a representative point of each point of the level
+    first = order  # in the scene, a representative point of each point of the level
+    orders = [_argsort_pair(code.index_select(0, order)) for code in codes[1:]]
     for i, s in enumerate(shifts):
-        is_last = i + 1 == len(shifts)
-        cell_of, cell_first = _runs(codes[0][first], s)
-        cells = fine[first[cell_first]] >> s
-        orders = [_argsort_pair(code[first] >> (0 if i == 0 else 3 * s)) for code in codes]
-        cluster, next_first = (None, None) if is_last else _runs(codes[0][first], shifts[i + 1])
+        cell_of, cell_first = _runs(depths, s)
+        cells = fine.index_select(0, first.index_select(0, cell_first)) >> s
+        cluster, next_first = (None, None) if i + 1 == len(shifts) else _runs(depths, shifts[i + 1])
         levels.append(
             Level(
                 size=len(first),
                 cell_of=None if len(cells) == len(first) else cell_of,
                 num_cells=len(cells),
                 neighbours=neighbour_pairs(cells),
-                orders=[None, *orders[1:]],
+                orders=[None, *orders],
                 cluster=cluster,
             )
         )
-        if not is_last:
-            first = first[next_first]
+        if cluster is not None:
+            first, depths = first.index_select(0, next_first), depths.index_select(0, next_first)
+            orders = [_coarser_pair(along, cluster, len(first)) for along, _ in orders]
     return Structure(cube, order, _invert(order), levels, cells_per_side, structure_key(config))
 
 
@@ -131,65 +137,102 @@ def neighbour_pairs(cells: Tensor) -> list[tuple[Tensor, Tensor]]:
     """Existing neighbours of distinct cells in the 3x3x3 kernel.
 
     Args:
-        cells: distinct integer coordinates from 0 to 2^19.  # [M, 3] int64
+        cells: distinct integer coordinates from 0 to 2^20, at least one.  # [M, 3] int64
 
     Returns:
         per offset of :data:`HALF_KERNEL`, the indices ``i`` and ``j`` of all pairs with
-        ``cells[j] == cells[i] + offset``.  # [P], [P] int64
+        ``cells[j] == cells[i] + offset``, ``i`` increasing.  # [P], [P] int64
     """
-    bits = 20
-    keys = ((cells[:, 0] + 1) << 2 * bits) | ((cells[:, 1] + 1) << bits) | (cells[:, 2] + 1)
-    keys, index = keys.sort()
-    end = len(keys) - 1
-    matches = torch.empty_like(index)
-    pairs, column = [], None
-    for dx, dy, dz in HALF_KERNEL:
-        target = keys + ((dx << 2 * bits) + (dy << bits) + dz)
-        if (dx, dy) != column:  # the three cells of a column follow one another in the sorted keys
-            column = (dx, dy)
-            place = torch.searchsorted(keys, target).clamp_(max=end)
-        else:
-            place = (place + (keys.index_select(0, place) < target)).clamp_(max=end)
-        found = keys.index_select(0, place) == target
-        # Scattered into memory order, the pairs come out sorted by it.
-        matches.scatter_(0, index, torch.where(found, index.index_select(0, place), -1))
-        i = (matches >= 0).nonzero()[:, 0]
-        pairs.append((i, matches.index_select(0, i)))
-    return pairs
+    m = len(cells)
+    side = int(cells.max()) + 3  # two empty cells after the last along each axis, so that no offset wraps around
+    keys = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
+    if side**3 <= min(TABLE_PER_CELL * m, TABLE_LIMIT):
+        found, j = _look_up(keys, side)
+    else:
+        found, j = _search(keys, side)
+    counts = torch.bincount(found // m, minlength=len(HALF_KERNEL)).tolist()
+    return list(zip((found % m).split(counts), j.split(counts), strict=True))
 
 
-def _canonical_order(scene: Gaussians, codes: Tensor) -> Tensor:
-    """Indices of the scene sorted by code, ties by the parameters."""
+def _look_up(keys: Tensor, side: int) -> tuple[Tensor, Tensor]:
+    """Pairs by a table of the whole grid: number of the offset times M plus i, increasing, and j. # [P], [P]"""
+    table = torch.zeros(side**3, dtype=torch.int32, device=keys.device)
+    table[keys] = torch.arange(1, len(keys) + 1, dtype=torch.int32, device=keys.device)
+    steps = [[(dx * side + dy) * side + dz] for dx, dy, dz in HALF_KERNEL]
+    target = keys.to(torch.int32) + torch.tensor(steps, dtype=torch.int32, device=keys.device)
+    partner = table.index_select(0, target.flatten())
+    found = partner.nonzero()[:, 0]
+    return found, partner.index_select(0, found).long() - 1
+
+
+def _search(keys: Tensor, side: int) -> tuple[Tensor, Tensor]:
+    """The same pairs by search among the sorted keys, whatever the size of the grid. # [P], [P]"""
+    m = len(keys)
+    keys, index = keys.to(torch.int32 if side**3 < 2**31 else torch.int64).sort()  # half as wide takes half as long
+    following = (keys[1:] == keys[:-1] + 1).nonzero()[:, 0]  # offset (0, 0, 1)
+    found = [index.index_select(0, following)]
+    partners = [index.index_select(0, following + 1)]
+    # The three cells of another column (dx, dy) follow one another in the sorted keys: one search finds all. Its
+    # targets are sorted as well, which halves its time.
+    columns = [(i, (dx * side + dy) * side - 1) for i, (dx, dy, dz) in enumerate(HALF_KERNEL) if dz == -1]
+    numbers, steps = torch.tensor(columns, device=keys.device)[:, :, None].unbind(1)
+    numbered, target = (index + numbers * m).flatten(), (keys + steps.to(keys.dtype)).flatten()
+    place = torch.searchsorted(keys, target)
+    keys = torch.cat([keys, keys.new_full((1,), torch.iinfo(keys.dtype).max)])
+    for dz in range(3):
+        hit = keys.index_select(0, place) == target
+        at = hit.nonzero()[:, 0]
+        found.append(numbered.index_select(0, at).add_(dz * m))
+        partners.append(index.index_select(0, place.index_select(0, at)))
+        place, target = place.add_(hit), target.add_(1)
+    found, order = torch.cat(found).sort()  # into memory order
+    return found, torch.cat(partners).index_select(0, order)
+
+
+def _canonical_order(scene: Gaussians, codes: Tensor) -> tuple[Tensor, Tensor]:
+    """Indices of the scene sorted by code, ties by the parameters, and the bits of each code down to the highest in
+    which it differs from the one before: a cell of ``s`` bits less per axis begins where there are more than
+    ``3 * s``. # [N], [N]"""
     codes, order = codes.sort(stable=True)
-    same = codes[1:] == codes[:-1]
-    tied = torch.zeros(len(codes), dtype=torch.bool, device=codes.device)
-    tied[1:] |= same
-    tied[:-1] |= same
-    place = tied.nonzero()[:, 0]
-    if len(place):
+    depths = torch.frexp((codes[1:] ^ codes[:-1]).double()).exponent
+    depths = torch.cat([depths.new_full((1,), 64), depths])
+    if (depths == 0).any():
+        same = depths[1:] == 0
+        tied = torch.zeros(len(codes), dtype=torch.bool, device=codes.device)
+        tied[1:] |= same
+        tied[:-1] |= same
+        place = tied.nonzero()[:, 0]
         rows = torch.cat([value.flatten(1) for value in scene[order[place]].tensors()], dim=1)
         rank = torch.unique(rows, dim=0, return_inverse=True)[1]
         by_rank = rank.argsort(stable=True)
         by_code = codes[place][by_rank].argsort(stable=True)
         order[place] = order[place[by_rank[by_code]]]
-    return order
+    return order, depths
 
 
-def _adaptive_shift(codes: Tensor) -> int:
-    """Bits to drop per axis from sorted finest codes, so that about one or two positions share a cell."""
-    distinct = codes.unique_consecutive()
+def _adaptive_shift(depths: Tensor) -> int:
+    """Bits to drop per axis of the finest codes, so that about one or two positions share a cell."""
+    cells = torch.bincount(depths, minlength=65).flip(0).cumsum(0).flip(0).tolist()  # of at least so many bits
     for shift in range(FINE_BITS, 0, -1):
-        if (distinct >> 3 * shift).unique_consecutive().numel() >= ADAPTIVE_OCCUPANCY * distinct.numel():
+        if cells[3 * shift + 1] >= ADAPTIVE_OCCUPANCY * cells[1]:
             return shift
     return 0
 
 
-def _runs(codes: Tensor, shift: int) -> tuple[Tensor, Tensor]:
-    """Runs of equal cells in sorted codes: run of each place [M], first place of each run [R]."""
-    cells = codes >> 3 * shift
-    starts = torch.ones_like(cells, dtype=torch.bool)
-    starts[1:] = cells[1:] != cells[:-1]
+def _runs(depths: Tensor, shift: int) -> tuple[Tensor, Tensor]:
+    """Cell of each place [M], first place of each cell [R], of cells that drop ``shift`` bits per axis."""
+    starts = depths > 3 * shift
     return starts.cumsum(0) - 1, starts.nonzero()[:, 0]
+
+
+def _coarser_pair(along: Tensor, cluster: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Order of the next level and its inverse: a curve that visits all points of a cell in one go visits the cells in
+    the order of their first points."""
+    cells = cluster.index_select(0, along)
+    starts = torch.ones_like(cells, dtype=torch.bool)
+    torch.ne(cells[1:], cells[:-1], out=starts[1:])
+    order = cells.masked_select(starts)
+    return order, _invert(order)
 
 
 def _argsort_pair(codes: Tensor) -> tuple[Tensor, Tensor]:

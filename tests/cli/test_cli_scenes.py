@@ -1,8 +1,7 @@
-"""pointsplat prune, refine and export: what they write, and what they say of input that cannot be used."""
+"""pointsplat prune and export: what they write, and what they say of input that cannot be used."""
 
 from __future__ import annotations
 
-import re
 import shutil
 import subprocess
 import sys
@@ -18,6 +17,7 @@ from pointsplat_ns.compaction import COMPARED_VIEWS, IMAGE_SCORES
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.pruning import SCORES, compact, prune, select
+from pointsplat_ns.refined_run import open_refined_run
 from pointsplat_ns.views import views_of_run
 
 SEED = 5
@@ -104,9 +104,9 @@ def test_prune_scores_as_it_is_told(ply, tmp_path):
 @pytest.mark.parametrize(
     "keep", ["0", "1.5", "nan", "inf", "-3", "81", "half", "", "0%", "101%", "0MB", "-1MB", "nanMB", "auto:0"]
 )
-@pytest.mark.parametrize("command", ["prune", "refine"])
+@pytest.mark.parametrize("command", ["prune", "compact"])
 def test_a_keep_that_no_scene_can_satisfy_is_refused(command, keep, ply, refined_run, tmp_path, capsys):
-    using = ("--using", refined_run) if command == "refine" else ()
+    using = ("--using", refined_run) if command == "compact" else ()
     assert "keep is" in refusal(capsys, tmp_path / "out.ply", command, ply, *using, f"--keep={keep}")
 
 
@@ -200,26 +200,6 @@ def test_prune_refuses_options_that_cannot_be_met_before_it_starts(ply, tmp_path
     assert caught.value.code == 1 and "--output is missing" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("degree", [0, 2, 3])
-def test_refine_takes_a_scene_that_the_run_never_saw(degree, refined_run, tmp_path, capsys):
-    dense = random_scene(50, degree)
-    write_ply(dense, tmp_path / "scene.ply")
-    run("refine", tmp_path / "scene.ply", "--using", refined_run, "-o", tmp_path / "out.ply")
-    refined, kept = read_ply(tmp_path / "out.ply"), prune(dense, 0.5).scene
-    assert same(refined, kept.replace(opacities=kept.opacities + 0.5)) and len(refined) == 25
-    assert re.search(r"refined 25 of 50 Gaussians \(50.0 %\)", capsys.readouterr().out)
-    run("refine", tmp_path / "scene.ply", "--using", refined_run, "--keep", "11", "-o", tmp_path / "out.ply")
-    assert len(read_ply(tmp_path / "out.ply")) == 11
-
-
-def test_refine_refuses_what_is_no_refiner(ply, splatfacto_run, tmp_path, capsys):
-    output = tmp_path / "out.ply"
-    said = refusal(capsys, output, "refine", ply, "--using", splatfacto_run)
-    assert "splatfacto-cpu; expected a pointsplat run" in said
-    assert "not a nerfstudio run" in refusal(capsys, output, "refine", ply, "--using", tmp_path)
-    assert "no such file" in refusal(capsys, output, "refine", ply, "--using", tmp_path / "gone")
-
-
 def test_export_writes_the_scene_of_a_splatfacto_run_as_it_is(splatfacto_run, tmp_path):
     (checkpoint,) = (splatfacto_run / "nerfstudio_models").iterdir()
     shutil.copy(checkpoint, tmp_path / "alone.ckpt")
@@ -237,6 +217,47 @@ def test_export_writes_the_refined_scene_of_a_pointsplat_run(refined_run, traine
         assert name in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("supervision", ["auto", "photos", "dense"])
+def test_export_knows_the_scenes_of_a_run_by_the_names_that_its_training_gave_them(
+    supervision, make_refined_run, trained_walls, tmp_path
+):
+    from pointsplat_ns.data.frames import FrameCache
+    from pointsplat_ns.data.scenes import find_scenes
+
+    shutil.copytree(trained_walls / "wall-b", tmp_path / "both" / "wall-b")
+    for folder in ("both", "plys"):
+        for i, name in enumerate(("wall-b.ply", "deep/point cloud.ply")):
+            write_ply(random_scene(30 + i), tmp_path / folder / name)
+    write_ply(random_scene(20), tmp_path / "plys.ply")
+    for data in ("both", "plys", "plys.ply"):
+        if supervision == "photos" and data != "both":
+            continue
+        _, scenes = find_scenes(tmp_path / data, supervision, FrameCache(0), need_data=False)
+        run_folder = make_refined_run(tmp_path / f"of {data}", tmp_path / data, moved=0.5)
+        config = (run_folder / "config.yml").read_text()
+        assert "supervision: auto" in config
+        (run_folder / "config.yml").write_text(config.replace("supervision: auto", f"supervision: {supervision}"))
+        trained = open_refined_run(run_folder)
+        assert list(trained.scenes) == [scene.name for scene in scenes]
+        assert trained.default_scene == scenes[0].name
+        for scene in scenes:
+            run("export", run_folder, "--scene", scene.name, "-o", tmp_path / "out.ply")
+            kept = prune(scene.read_dense(), 0.5).scene
+            assert same(read_ply(tmp_path / "out.ply"), kept.replace(opacities=kept.opacities + 0.5))
+
+
+def test_export_says_that_the_scenes_of_a_run_are_gone(make_refined_run, tmp_path, capsys):
+    write_ply(random_scene(30), tmp_path / "plys" / "a.ply")
+    folder = make_refined_run(tmp_path / "refined", tmp_path / "plys")
+    (tmp_path / "plys" / "a.ply").unlink()
+    (tmp_path / "plys" / "cloud.ply").write_text("ply\n")
+    capsys.readouterr()
+    said = refusal(capsys, tmp_path / "out.ply", "export", folder)
+    assert "config.yml" in said and "no trained Splatfacto run below it" in said and "put its scenes back" in said
+    shutil.rmtree(tmp_path / "plys")
+    assert "its data" in refusal(capsys, tmp_path / "out.ply", "export", folder)
+
+
 def test_export_refuses_a_scene_that_is_not_there(refined_run, splatfacto_run, ply, tmp_path, capsys):
     output = tmp_path / "out.ply"
     assert "wall-a, wall-b" in refusal(capsys, output, "export", refined_run, "--scene", "attic")
@@ -247,7 +268,7 @@ def test_export_refuses_a_scene_that_is_not_there(refined_run, splatfacto_run, p
 
 def test_the_command_as_installed_refuses_with_status_1_and_one_line(tmp_path):
     code = "from pointsplat_ns.cli import main; main()"
-    arguments = ["refine", "gone.ply", "--using", "gone", "-o", str(tmp_path / "out.ply")]
+    arguments = ["compact", "gone.ply", "--using", "gone", "-o", str(tmp_path / "out.ply")]
     done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 1 and done.stdout == ""
     assert done.stderr.startswith("error: gone: no such file") and done.stderr.count("\n") == 1

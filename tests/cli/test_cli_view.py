@@ -37,6 +37,7 @@ def test_report_shows_every_scene_and_variant(tmp_path, capsys):
     shown = capsys.readouterr().out
     rows = [line.replace("│", " ").split() for line in shown.splitlines() if "dense" in line]
     assert [row[:2] for row in rows[:2]] == [["a", "yes"], ["b", "never"]]
+    assert "compared with held-out photos" in " ".join(shown.split())  # a title may be wrapped
     assert shown.count("refined") == 5 and "25.00" in shown and "1,000" in shown and "0.250" in shown
 
 
@@ -45,6 +46,40 @@ def test_report_shows_a_dash_where_lpips_is_unknown(tmp_path, capsys):
     path.write_text(json.dumps(evaluation(lpips=None)))
     main(["report", str(path)])
     assert " - " in capsys.readouterr().out
+
+
+def test_report_keeps_what_was_compared_with_photos_apart_from_what_was_compared_with_dense_renders(tmp_path, capsys):
+    content = evaluation()
+    results = content["results"]
+    first = results["scenes"]["a"]
+    only_dense = {row: {**first[row], "psnr": 44.0} for row in ("pruned", "refined")}
+    only_dense["dense"] = {**first["dense"], "psnr": None}
+    results["reference"] = "photos"
+    for scene in results["scenes"].values():
+        scene["reference"] = "photos"
+    for name in ("c", "d"):
+        results["scenes"][name] = {"seen_in_training": False, "reference": "dense renders", **only_dense}
+    results["against_dense_renders"] = {"reference": "dense renders", "average": only_dense}
+    path = tmp_path / "eval.json"
+    path.write_text(json.dumps(content))
+    main(["report", str(path)])
+    photos, dense = capsys.readouterr().out.split("compared with the dense scenes' own")
+    assert "held-out photos" in photos and "44.00" not in photos and photos.count("average") == 3
+    assert "25.00" not in dense and dense.count("44.00") == 6 and dense.count("average") == 1
+    names = {line.replace("│", " ").split()[0] for line in dense.splitlines() if " dense " in line}
+    assert names == {"c", "d", "average"}
+
+
+def test_report_says_that_all_was_compared_with_dense_renders(tmp_path, capsys):
+    content = evaluation()
+    content["results"]["reference"] = "dense renders"
+    for scene in content["results"]["scenes"].values():
+        scene["reference"] = "dense renders"
+    path = tmp_path / "eval.json"
+    path.write_text(json.dumps(content))
+    main(["report", str(path)])
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "compared with the dense scenes' own renders" in shown and shown.count("refined") == 5
 
 
 @pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"results": {"psnr": 3.0}}', '{"results": {"scenes": {}}}'])

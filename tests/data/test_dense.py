@@ -10,12 +10,13 @@ import pytest
 import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
-from pointsplat_ns.data.dense import PlyScene, SampledPoses, cameras_of, find_plys
+from pointsplat_ns.data.dense import PlyScene, SampledPoses, cameras_of
 from pointsplat_ns.data.frames import FrameCache
 from pointsplat_ns.data.scenes import ScenesDataManagerConfig
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import write_ply
+from pointsplat_ns.io.plys import find_plys
 from pointsplat_ns.poses import sample_views
 from pointsplat_ns.splatfacto_cpu import viewmats_of
 from pointsplat_ns.views import draw

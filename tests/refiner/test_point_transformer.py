@@ -3,6 +3,7 @@ import torch
 import torch.nn.functional as F
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.refiner import rows as rows_module
 from pointsplat_ns.refiner.config import preset
 from pointsplat_ns.refiner.encoder import BatchNorm, SceneNorm
 from pointsplat_ns.refiner.point_transformer import Block, PatchAttention, PointTransformer, SubmanifoldConv
@@ -59,6 +60,19 @@ def test_attention_of_one_point_is_its_own_value():
     module = PatchAttention(8, 2, 6)
     x = torch.randn(1, 8)
     assert torch.allclose(module(x, None), module.proj(module.qkv(x)[:, 16:]), atol=1e-6)
+
+
+@pytest.mark.parametrize("n", [5, 20, 47])
+@pytest.mark.parametrize("ordered", [False, True])
+def test_attention_added_in_place_is_the_sum_even_where_the_last_patch_borrows(n, ordered, monkeypatch):
+    monkeypatch.setattr(rows_module, "CELLS", 2**8)  # one patch at a time
+    torch.manual_seed(0)
+    module, norm = PatchAttention(12, 3, 10).double(), torch.nn.LayerNorm(12).double()
+    x, along = torch.randn(n, 12, dtype=torch.float64), torch.randperm(n)
+    order = (along, along.argsort()) if ordered else None
+    with torch.no_grad():
+        expected = x + module(norm(x), order)
+        assert torch.allclose(module(x.clone(), order, norm, add=True), expected, atol=1e-12)
 
 
 def test_convolution_gives_points_of_one_cell_the_convolution_of_their_mean():

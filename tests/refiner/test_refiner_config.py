@@ -30,6 +30,8 @@ def test_a_configuration_survives_json():
         ({"sh_degree": 4}, "sh_degree is 4"),
         ({"grid": 1000}, "grid is 1000"),
         ({"encoder": "single"}, "encoder is 'single'"),
+        ({"encoder": "concat", "use_appearance": False}, "encoder 'concat' expects both on"),
+        ({"encoder": "concat", "use_position": False}, "encoder 'concat' expects both on"),
         ({"norm": "group"}, "norm is 'group'"),
         ({"patch": 0}, "patch is 0"),
         ({"drop_path": 1.0}, "drop_path is 1.0"),

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.refiner import structure as structure_module
 from pointsplat_ns.refiner.config import FINE_BITS, preset
 from pointsplat_ns.refiner.structure import ADAPTIVE_OCCUPANCY, build_structure, neighbour_pairs
 
@@ -112,3 +113,21 @@ def test_moving_to_a_device_keeps_everything():
     assert moved.levels[0].orders[0] is None
     assert torch.equal(moved.levels[1].neighbours[0][0], structure.levels[1].neighbours[0][0])
     assert moved.built_for == structure.built_for
+
+
+@pytest.mark.parametrize("spread", [1, 3, 100, 2**16 - 1])
+def test_looking_up_and_searching_find_the_pairs_that_brute_force_finds_in_order(spread, monkeypatch):
+    g = torch.Generator().manual_seed(4)
+    cells = torch.cat([torch.randint(0, 8, (120, 3), generator=g), torch.tensor([[0, 0, 0], [spread] * 3])])
+    cells = torch.unique(torch.cat([cells, spread - cells.clamp(max=spread)]), dim=0).clamp(0, spread)
+    cells = torch.unique(cells, dim=0)
+    cells = cells[torch.randperm(len(cells), generator=g)]
+    expected = []
+    for offset in structure_module.HALF_KERNEL:
+        match = (cells[:, None] + torch.tensor(offset) == cells[None]).all(dim=-1)
+        expected.append(match.nonzero().T.tolist())
+    ways = [0, 2**60] if spread <= 100 else [0]  # a table of 2^48 entries fits nowhere
+    for entries in ways:
+        monkeypatch.setattr(structure_module, "TABLE_PER_CELL", entries)
+        monkeypatch.setattr(structure_module, "TABLE_LIMIT", 2**31)
+        assert [[i.tolist(), j.tolist()] for i, j in neighbour_pairs(cells)] == expected

@@ -1,0 +1,104 @@
+"""Dense scenes with the views that benchmarks judge smaller ones by, and what those views show."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io import open_run, read_scene
+from pointsplat_ns.lpips import Lpips, LpipsUnavailable, load_lpips
+from pointsplat_ns.metrics import psnr, ssim
+from pointsplat_ns.poses import sample_views
+from pointsplat_ns.views import Views, draw, views_of_run
+
+COLUMNS = ("psnr", "ssim", "lpips")
+REFERENCES = ("photo", "dense")
+"""What renders are compared with: held-out photos, and the dense scene's own renders of the same views."""
+
+MOST_PSNR = 100.0
+"""In place of the infinite PSNR of equal pictures, so that means stay finite."""
+
+
+@dataclass
+class Scene:
+    """A dense scene, the views it is judged in, and what they show."""
+
+    name: str
+    dense: Gaussians
+    views: Views
+    renders: list[Tensor]  # [H, W, 3] of the dense scene
+    photos: list[Tensor] | None  # [H, W, 3]
+
+
+@torch.no_grad()
+def load(path: Path, count: int) -> Scene:
+    """A run with at most ``count`` of its held-out photos, or a PLY with ``count`` sampled views."""
+    dense = read_scene(path)
+    photos = None
+    if path.suffix == ".ply":
+        name, views = path.stem, sample_views(dense, count)
+    else:
+        name, views, photos = photos_of(path, "test", count)
+    renders = [draw(dense, views, i) for i in range(len(views))]
+    return Scene(name, dense, views, renders, photos)
+
+
+def photos_of(path: Path, split: Literal["train", "test"], count: int) -> tuple[str, Views, list[Tensor]]:
+    """The run's name, and at most ``count`` photos of a split, evenly spread, with the views that they show once
+    undistorted."""
+    from pointsplat_ns.data.frames import FrameCache
+    from pointsplat_ns.data.scenes import TrainedScene
+    from pointsplat_ns.io import scene_name
+    from pointsplat_ns.splatfacto_cpu import viewmats_of
+
+    run = open_run(path)
+    scene = TrainedScene(scene_name(run), run, FrameCache(0))
+    frames = scene.train_frames if split == "train" else scene.eval_frames
+    total = len(frames)
+    taken = range(total) if count >= total else torch.linspace(0, total - 1, count).round().long().tolist()
+    shown = [frames[i] for i in taken]
+    photos = [data["image"][..., :3] for _, data in shown]
+    photos = [photo.float() / 255 if photo.dtype == torch.uint8 else photo.float() for photo in photos]
+    height, width = photos[0].shape[:2]
+    views = dataclasses.replace(
+        views_of_run(path, split),
+        viewmats=torch.cat([viewmats_of(camera.camera_to_worlds) for camera, _ in shown]),
+        Ks=torch.cat([camera.get_intrinsics_matrices() for camera, _ in shown]),
+        width=width,
+        height=height,
+    )
+    return scene_name(run), views, photos
+
+
+@torch.no_grad()
+def compare(scene: Scene, made: Gaussians, lpips: Lpips | None) -> dict[str, float | None]:
+    """Mean metrics over the views, against the dense scene's renders (``dense_*``) and the photos (``photo_*``)."""
+    values: dict[str, list[float]] = {}
+    for i, render in enumerate(scene.renders):
+        image = draw(made, scene.views, i)
+        targets = {"dense": render} | ({"photo": scene.photos[i]} if scene.photos else {})
+        for against, target in targets.items():
+            values.setdefault(f"{against}_psnr", []).append(min(float(psnr(image, target)), MOST_PSNR))
+            values.setdefault(f"{against}_ssim", []).append(float(ssim(image, target)))
+            if lpips is not None:
+                values.setdefault(f"{against}_lpips", []).append(float(lpips(image, target)))
+    names = [f"{against}_{column}" for against in REFERENCES for column in COLUMNS]
+    return {name: fmean(values[name]) if name in values else None for name in names}
+
+
+def lpips_or_none(wanted: bool) -> Lpips | None:
+    """LPIPS if it is wanted and its weights are at hand; says so if they are not."""
+    if not wanted:
+        return None
+    try:
+        return load_lpips("alex", download=False)
+    except LpipsUnavailable as error:
+        print(f"no LPIPS: {error}")
+        return None

@@ -1,0 +1,130 @@
+"""The same scene, turned, mirrored and repainted: what a refiner should repair alike.
+
+A :class:`Transform` is undone without loss, so that a refiner trained on ``undo(refiner(apply(scene)))`` sees endless
+variants of a scene while the pictures it is compared with stay as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.rasterizer.spherical_harmonics import C0, sh_basis
+
+GAINS = (0.7, 1.4)
+"""Least and greatest factor on a colour channel."""
+
+UPRIGHT = 0.5
+"""Share of random rotations that leave the vertical vertical: most scenes have z up, files from elsewhere any axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class Transform:
+    """Turns a scene about the origin, mirrors it through the origin if ``mirrored``, and multiplies and exchanges its
+    colour channels."""
+
+    quat: Tensor  # [4] wxyz, unit
+    mirrored: bool
+    gains: Tensor  # [3] factor on each channel, above 0
+    channels: Tensor  # [3] int64: channel i of the result is channel ``channels[i]`` of the scene
+
+    @cached_property
+    def matrix(self) -> Tensor:
+        """Orthogonal (3, 3) float64 that positions are multiplied by."""
+        from kornia.geometry.conversions import quaternion_to_rotation_matrix
+
+        return quaternion_to_rotation_matrix(self.quat.double()) * (-1.0 if self.mirrored else 1.0)
+
+    def apply(self, scene: Gaussians) -> Gaussians:
+        """The transformed scene."""
+        gains, middle = self._color(scene)
+        moved = self._moved(scene, self.matrix, self.quat)
+        return moved.replace(
+            features_dc=(scene.features_dc * gains + middle)[:, self.channels],
+            features_rest=(moved.features_rest * gains)[..., self.channels],
+        )
+
+    def undo(self, scene: Gaussians) -> Gaussians:
+        """The scene that :meth:`apply` makes this one of."""
+        gains, middle = self._color(scene)
+        back = self.channels.argsort()
+        moved = self._moved(scene, self.matrix.T, self.quat * self.quat.new_tensor([1.0, -1.0, -1.0, -1.0]))
+        return moved.replace(
+            features_dc=(scene.features_dc[:, back] - middle) / gains,
+            features_rest=moved.features_rest[..., back] / gains,
+        )
+
+    def _color(self, scene: Gaussians) -> tuple[Tensor, Tensor]:
+        """Factors on SH coefficients and what is added to the constant ones. Colours are 0.5 + C0 dc, so that a
+        factor on them moves the 0.5, too."""
+        gains = self.gains.to(scene.means)
+        return gains, 0.5 * (gains - 1.0) / C0
+
+    def _moved(self, scene: Gaussians, matrix: Tensor, quat: Tensor) -> Gaussians:
+        """Positions, rotations and directional colours, turned. A covariance does not know a mirroring through the
+        origin, which leaves the rotation alone."""
+        from kornia.geometry.quaternion import Quaternion
+
+        like = scene.means
+        rest, first = [], 0
+        for degree in range(1, scene.sh_degree + 1):
+            size = 2 * degree + 1
+            band = scene.features_rest[:, first : first + size]
+            rest.append(torch.einsum("ij,njc->nic", sh_matrix(matrix, degree).to(like), band))
+            first += size
+        turn = Quaternion(quat.to(like).expand(len(scene), 4))
+        # A zero quaternion stands for the identity.
+        identity = like.new_tensor([1.0, 0.0, 0.0, 0.0])
+        quats = torch.where((scene.quats == 0).all(dim=1, keepdim=True), identity, scene.quats)
+        return scene.replace(
+            means=scene.means @ matrix.T.to(like),
+            quats=(turn * Quaternion(quats)).data,
+            features_rest=torch.cat(rest, dim=1) if rest else scene.features_rest,
+        )
+
+
+def random_transform(generator: torch.Generator | None = None) -> Transform:
+    """A transform drawn at random: any rotation, or one about z (:data:`UPRIGHT`); mirrored or not; gains and order of
+    the colour channels.
+
+    Args:
+        generator: on the CPU; torch's own by default.
+    """
+    upright, mirrored = (torch.rand(2, generator=generator) < torch.tensor([UPRIGHT, 0.5])).tolist()
+    quat = torch.randn(4, generator=generator, dtype=torch.float64)
+    if upright:
+        quat[1:3] = 0.0
+    low, high = GAINS
+    gains = low * (high / low) ** torch.rand(3, generator=generator, dtype=torch.float64)
+    return Transform(quat / quat.norm(), mirrored, gains, torch.randperm(3, generator=generator))
+
+
+@lru_cache(maxsize=1)
+def _directions() -> tuple[Tensor, Tensor]:
+    """Unit directions (M, 3) all around, and the basis of degree 3 there, (M, 16), float64."""
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1)
+    return directions, sh_basis(directions, 3)
+
+
+def sh_matrix(matrix: Tensor, degree: int) -> Tensor:
+    """What turns the coefficients of one SH band as ``matrix`` turns directions.
+
+    The coefficients ``c'`` of the turned function satisfy ``Y(d) c' = Y(matrix^T d) c`` for every direction ``d``;
+    solved by least squares over fixed directions, which a band satisfies exactly.
+
+    Args:
+        matrix: (3, 3) float64, orthogonal.
+        degree: of the band, 1 to 3.
+
+    Returns:
+        (2 degree + 1, 2 degree + 1) float64, orthogonal.
+    """
+    directions, basis = _directions()
+    band = slice(degree**2, (degree + 1) ** 2)
+    turned = sh_basis(directions @ matrix.cpu(), degree)[:, band]
+    return torch.linalg.lstsq(basis[:, band], turned).solution.to(matrix.device)
