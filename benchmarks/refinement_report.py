@@ -18,7 +18,7 @@ REFERENCES = ("photo", "dense")
 ENCODERS = ("concat", "dual")
 PLAIN = ("selected", "fine-tuned", "fine-tuned on photos")
 SHIPPED = "as shipped"
-"""Refined where the rule of ``pointsplat compact`` refines, selected where it falls back."""
+"""Refined by the dual-branch network as far as the rule of ``pointsplat compact`` refines."""
 
 UNSEEN = "unseen"
 GAIN_TARGETS = (("paper", 0.1, 2.0), ("paper", 0.3, 1.0), ("merge", 0.1, 0.7))
@@ -32,9 +32,6 @@ RESOLVED = 2.0
 
 SMALLEST_SPREAD = 1e-9
 """Below it seeds agree exactly, and no number of standard errors can be given."""
-
-TIMES = ("select_seconds", "seconds")
-"""Spent whether or not the rule falls back."""
 
 BySeed = dict[Any, dict[str, float]]
 """By seed (None for what has none) and scene: a value."""
@@ -78,29 +75,14 @@ class Table:
         self.starts = [s for s in ("paper", "merge") if any(row["start"] == s for row in self.rows)]
 
     def values(self, scenes: Iterable[str], keep: float, start: str, variant: str, metric: str) -> BySeed:
-        """A metric of a variant; ``as shipped ENCODER`` is the refined row where the rule found it better, else the
-        selected one."""
+        """A metric of a variant."""
         wanted = set(scenes)
-        shipped = variant.startswith(SHIPPED)
-        rows = self._by.get((keep, start, variant.removeprefix(SHIPPED).strip()), {})
-        selected = self._by.get((keep, start, "selected"), {}).get(None, {})
         result: BySeed = {}
-        for seed, by_scene in rows.items():
+        for seed, by_scene in self._by.get((keep, start, variant), {}).items():
             for scene in wanted & by_scene.keys():
-                row = by_scene[scene]
-                if shipped and metric not in TIMES and falls_back(row):
-                    row = selected.get(scene)
-                if row is not None and row.get(metric) is not None:
-                    result.setdefault(seed, {})[scene] = row[metric]
+                if by_scene[scene].get(metric) is not None:
+                    result.setdefault(seed, {})[scene] = by_scene[scene][metric]
         return result
-
-
-def falls_back(row: dict) -> bool:
-    """Whether the rule leaves a refined scene out: it is not closer to the dense scene, is not finite, or cannot be
-    compared, as no free place to look from was found."""
-    if row["rule_psnr"] is None or row["rule_selected_psnr"] is None:
-        return True
-    return row["rule_psnr"] <= row["rule_selected_psnr"]
 
 
 def difference(left: BySeed, right: BySeed) -> BySeed:
@@ -212,7 +194,7 @@ def judge(table: Table, groups: dict[str, list[str]]) -> list[tuple[str, str]]:
             what = f"{group}, {start} {name}: dual beats concat"
             lines.append((what, f"{_resolved(found[0])}; against dense renders {_resolved(found[1])}"))
     everywhere = sorted({scene for of in groups.values() for scene in of})
-    for variant in ("dual", f"{SHIPPED} dual", "concat", f"{SHIPPED} concat"):
+    for variant in ("dual", SHIPPED, "concat"):
         what = f"all groups: {variant} nowhere worse than selected by more than {-WORST:g} dB"
         lines.append((what, "; ".join(_nowhere(table, everywhere, variant, against) for against in REFERENCES)))
     return lines
@@ -254,15 +236,14 @@ def _nowhere(table: Table, scenes: list[str], variant: str, against: str) -> str
         for start in table.starts:
             values = gains(table, scenes, keep, start, variant, f"{against}_psnr")
             found += [(v, f"{s} {start} {100 * keep:g} % seed {n}") for n, by in values.items() for s, v in by.items()]
-            encoder = variant.removeprefix(SHIPPED).strip()
-            rows = [r for r in table.rows if (r["keep"], r["start"], r["variant"]) == (keep, start, encoder)]
-            out += sum(falls_back(r) for r in rows if r["scene"] in scenes)
+            strengths = table.values(scenes, keep, start, variant, "strength")
+            out += sum(value == 0 for by in strengths.values() for value in by.values())
     if not found:
         return "no data"
     worst, where = min(found)
     below = sum(value < WORST for value, _ in found)
     verdict = "met" if below == 0 else f"MISSED by {WORST - worst:.2f} dB, {below} of {len(found)} cases below"
-    fell = f", {out} of {len(found)} fall back" if variant.startswith(SHIPPED) else ""
+    fell = f", {out} of {len(found)} fall back" if variant == SHIPPED else ""
     head = "" if against == "photo" else "against dense renders "
     return f"{head}{verdict} (worst {worst:+.2f} dB: {where}{fell})"
 
@@ -301,7 +282,7 @@ def main_table(table: Table, scenes: list[str], tune: int) -> list[list[str]]:
     lines = [["100 %", "dense", *_cells(table, scenes, 1.0, "", "dense")]]
     for keep in table.keeps:
         for start in table.starts:
-            names = ["selected", *ENCODERS, *(f"{SHIPPED} {e}" for e in ENCODERS), *PLAIN[1:]]
+            names = ["selected", *ENCODERS, SHIPPED, *PLAIN[1:]]
             for variant in names:
                 if not table.values(scenes, keep, start, variant, "count"):
                     continue
@@ -329,10 +310,10 @@ def gain_table(table: Table, groups: dict[str, list[str]]) -> list[list[str]]:
                 cells = [group, f"{100 * keep:g} %", start]
                 for against in REFERENCES:
                     metric = f"{against}_psnr"
-                    for variant in (*ENCODERS, f"{SHIPPED} dual"):
+                    for variant in (*ENCODERS, SHIPPED):
                         cells.append(_number(spread(gains(table, scenes, keep, start, variant, metric)), 2, True))
                     cells.append(_number(spread(versus_concat(table, scenes, (keep,), start, metric)), 3, True))
-                for variant in ("dual", f"{SHIPPED} dual"):
+                for variant in ("dual", SHIPPED):
                     found = spread(gains(table, scenes, keep, start, variant, "photo_psnr"))
                     cells.append("-" if found is None else f"{found.smallest:+.2f} {found.smallest_at[0]}")
                 lines.append(cells)
@@ -352,7 +333,7 @@ def print_report(table: Table, groups: dict[str, list[str]], settings: dict[str,
         show(f"{group} ({', '.join(scenes)}): {note}", heads, main_table(table, scenes, tune))
     heads = ["group", "kept", "start"]
     for against in REFERENCES:
-        heads += [f"{against}: {name}" for name in (*ENCODERS, "shipped dual", "dual - concat")]
+        heads += [f"{against}: {name}" for name in (*ENCODERS, SHIPPED, "dual - concat")]
     heads += ["smallest dual", "smallest shipped"]
     show("Gains in PSNR over what was selected, dB", heads, gain_table(table, groups))
     console.print("Targets, by PSNR against held-out photos:", style="bold")

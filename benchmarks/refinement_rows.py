@@ -14,9 +14,9 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from held_out import COLUMNS, MOST_PSNR, REFERENCES, Scene, compare, load, photos_of
+from held_out import COLUMNS, REFERENCES, Scene, compare, load, photos_of
 
-from pointsplat_ns.auto_budget import DenseReference
+from pointsplat_ns.auto_budget import Closeness, DenseReference
 from pointsplat_ns.compaction import COMPARED_SIDE, COMPARED_VIEWS
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.fine_tune import fine_tune
@@ -29,10 +29,14 @@ from pointsplat_ns.poses import sample_views
 from pointsplat_ns.pruning import compact
 from pointsplat_ns.refined_run import open_refined_run, prune_options
 from pointsplat_ns.refiner import Refiner, read_metadata
+from pointsplat_ns.shipped import as_far_as_it_helps, helps
 from pointsplat_ns.views import draw, views_of_run
 
 REFINER = "refiner.safetensors"
 """In the folder of every training that reached its end."""
+
+SHIPPED = "as shipped"
+"""Refined by the dual-branch network as far as ``pointsplat compact`` refines."""
 
 DENSE, SELECTED, TUNED, TUNED_PHOTOS = "dense", "selected", "fine-tuned", "fine-tuned on photos"
 
@@ -144,7 +148,7 @@ class Judge:
 
     @cached_property
     def rule(self) -> DenseReference | None:
-        """The dense scene as seen from sampled poses, by which ``pointsplat compact`` of a PLY decides whether to
+        """The dense scene as seen from sampled poses, by which ``pointsplat compact`` of a PLY decides how far to
         refine; None if no free place to look from was found."""
         try:
             views = sample_views(self.scene.dense, COMPARED_VIEWS).resized(COMPARED_SIDE)
@@ -153,10 +157,6 @@ class Judge:
             return None
         mode = self.scene.views.rasterize_mode
         return DenseReference(self.scene.dense, dataclasses.replace(views, rasterize_mode=mode))
-
-    def by_rule(self, made: Gaussians) -> float | None:
-        """PSNR against the dense scene from sampled poses."""
-        return None if self.rule is None else min(self.rule.psnr(made)[0], MOST_PSNR)
 
     def dense_row(self) -> None:
         """The scene itself against its photos."""
@@ -178,21 +178,23 @@ class Judge:
         for start, selected in chosen.items():
             key = self._key(keep, start, SELECTED, None, "")
             if not self.rows.has(key):
-                rule = {"rule_psnr": self.by_rule(selected.scene)}
-                self._add(key, selected.scene, selected.seconds, 0.0, compare_all(self, selected.scene) | rule)
+                self._add(key, selected.scene, selected.seconds, 0.0, compare_all(self, selected.scene))
             for trained in self.refiners:
                 key = self._key(keep, start, trained.encoder, trained.seed, trained.digest)
                 if trained.start != start or self.rows.has(key):
                     continue
                 refined, seconds = selected.refined(trained)
-                values = compare_all(self, refined) | {
-                    "rule_psnr": self.by_rule(refined) if _sound(refined, selected.scene) else None,
-                    "rule_selected_psnr": selected.rule_psnr,
+                about = {
                     "seen": self.name in trained.trained_on,
                     "steps": trained.steps,
                     "supervision": trained.supervision,
                 }
-                self._add(key, refined, selected.seconds, seconds, values)
+                if trained.encoder == "dual":  # first: the refined row says that both are there
+                    shipped, strength, more = self._shipped(selected, refined)
+                    values = compare_all(self, shipped) | about | {"strength": strength}
+                    as_shipped = key | {"variant": SHIPPED}
+                    self._add(as_shipped, shipped, selected.seconds, seconds + more, values)
+                self._add(key, refined, selected.seconds, seconds, compare_all(self, refined) | about)
         if pictures is not None:
             path = pictures / f"{self.name}_{100 * keep:g}.png"
             if self.rows.rows is not before or not path.exists():
@@ -203,6 +205,16 @@ class Judge:
                 if not self.rows.has(key):
                     tuned, seconds = self._fine_tuned(selected.scene, steps, variant == TUNED_PHOTOS)
                     self._add(key, tuned, selected.seconds, seconds, compare_all(self, tuned))
+
+    def _shipped(self, selected: Selected, refined: Gaussians) -> tuple[Gaussians, float, float]:
+        """What ``pointsplat compact`` would give, at which strength (0 where it leaves refinement out), and the seconds
+        that finding out took."""
+        if self.rule is None or selected.before is None or not _sound(refined, selected.scene):
+            return selected.scene, 0.0, 0.0
+        start = time.perf_counter()
+        made, strength, after = as_far_as_it_helps(self.rule, selected.before, selected.scene, refined)
+        kept = helps(selected.before, after)
+        return made if kept else selected.scene, strength if kept else 0.0, time.perf_counter() - start
 
     def _fine_tuned(self, scene: Gaussians, steps: int, photos: bool) -> tuple[Gaussians, float]:
         """Fine-tuned at training poses, no more of them than steps, and seconds with rendering what is wanted."""
@@ -287,9 +299,9 @@ class Selected:
         return self._made[1]
 
     @cached_property
-    def rule_psnr(self) -> float | None:
-        """As the rule sees what was selected."""
-        return self._judge.by_rule(self.scene)
+    def before(self) -> Closeness | None:
+        """How close it comes to the dense scene, from the poses of the rule."""
+        return None if self._judge.rule is None else self._judge.rule.closeness(self.scene)
 
     @torch.no_grad()
     def refined(self, trained: Trained) -> tuple[Gaussians, float]:

@@ -185,12 +185,9 @@ def compact_and_refine(
     if unsound:
         verdict = f"refinement left out: {unsound:,} of {len(refined):,} refined Gaussians are not finite"
     elif reference is not None and before is not None:
-        tried = _try_strengths(reference, before, compacted.to(device), refined.to(device), told)
-        best = min(tried, key=lambda share: tried[share].error)
-        strength = best if _helps(before, tried[best]) else 1.0
-        refined, after = at_strength(compacted, refined, strength), tried[strength]
+        refined, strength, after = as_far_as_it_helps(reference, before, compacted, refined, told)
         verdict = _verdict(before, after, strength)
-    helped = before is not None and after is not None and _helps(before, after)
+    helped = before is not None and after is not None and helps(before, after)
     origin = getattr(poses, "origin", "")
     notes = (*made.notes, origin) if origin and origin not in made.notes else made.notes
     scene = refined if helped else compacted
@@ -205,6 +202,29 @@ def at_strength(before: Gaussians, after: Gaussians, strength: float) -> Gaussia
     mixed = (a.lerp(b, strength) for a, b in zip(before.tensors(), after.tensors(), strict=True))
     values = zip(before.items(), mixed, strict=True)
     return Gaussians(**{name: torch.where(value.isfinite(), value, a) for (name, a), value in values})
+
+
+def as_far_as_it_helps(
+    reference: DenseReference,
+    before: Closeness,
+    compacted: Gaussians,
+    refined: Gaussians,
+    told: Callable[[str, float], None] = lambda what, share: None,
+) -> tuple[Gaussians, float, Closeness]:
+    """The scene at the best share of a refiner's residuals, that share and how close it comes; at full strength if
+    none helps.
+
+    Args:
+        reference: the dense scene's renders.
+        before: how close ``compacted`` comes to them.
+        compacted, refined: before and after refinement.
+        told: called with what is being done and the share done of it, in [0, 1].
+    """
+    device = reference.pictures[0].device
+    tried = _try_strengths(reference, before, compacted.to(device), refined.to(device), told)
+    best = min(tried, key=lambda share: tried[share].error)
+    strength = best if helps(before, tried[best]) else 1.0
+    return at_strength(compacted, refined, strength), strength, tried[strength]
 
 
 def _try_strengths(
@@ -245,7 +265,8 @@ def bottom_of_parabola(at_zero: float, at_half: float, at_one: float) -> float:
     return max(0.0, -slope / (2 * bend))
 
 
-def _helps(before: Closeness, after: Closeness) -> bool:
+def helps(before: Closeness, after: Closeness) -> bool:
+    """Whether refinement is worth keeping, see :data:`WORTH`."""
     return after.psnr >= before.psnr + WORTH and math.isfinite(before.psnr)
 
 
@@ -257,7 +278,7 @@ def _verdict(before: Closeness, after: Closeness, strength: float) -> str:
     if before.ssim is not None and after.ssim is not None:
         figures += f", SSIM {before.ssim:.3f} -> {after.ssim:.3f}"
     figures += f", worst view {before.worst:.2f} -> {after.worst:.2f} dB, closer in {better} of {count}"
-    if _helps(before, after):
+    if helps(before, after):
         share = "" if strength == 1 else f" at {strength:.0%} of its strength"
         return f"refinement{share}: {figures}"
     if after.errors == before.errors:
