@@ -33,6 +33,13 @@ from pointsplat_ns.refiner import Refiner, Structure, preset
 from pointsplat_ns.splatfacto_cpu import SplatfactoCpuModel, SplatfactoCpuModelConfig, viewmats_of
 from pointsplat_ns.transforms import random_transform
 
+PIXEL_LOSSES = {
+    "l1": lambda difference: difference.abs().mean(),
+    # 1e-12 (120 dB) keeps the slope of the root finite where nothing differs.
+    "rmse": lambda difference: (difference.square().mean() + 1e-12).sqrt(),
+}
+"""What a picture's difference (H, W, 3) costs, by the name of the loss."""
+
 _PRUNED = "pruned"
 """Names pruned scenes among what is kept in the cache."""
 
@@ -69,8 +76,11 @@ class PointSplatModelConfig(SplatfactoCpuModelConfig):
     norm: Literal["scene", "batch", "layer"] = "scene"
     """Normalisation outside the attention blocks: scene takes statistics of the scene at hand, in evaluation too; batch
     is the published one, which evaluates with running averages over the training scenes; layer is by Gaussian."""
+    pixel_loss: Literal["l1", "rmse"] = "l1"
+    """What the loss compares pixels by: their mean difference, or the root of the mean squared one, which PSNR is
+    measured by."""
     lpips_weight: float = 0.1
-    """Weight of LPIPS in the loss, beside L1."""
+    """Weight of LPIPS in the loss, beside that of pixels."""
     lpips_net: Literal["auto", "alex", "vgg"] = "auto"
     """Network of the training loss's LPIPS; auto is vgg on CUDA and alex, thirty times cheaper, elsewhere."""
 
@@ -276,7 +286,7 @@ class PointSplatModel(SplatfactoCpuModel):
         """Refine a scene and compare its renders with photos.
 
         Returns:
-            Outputs of the last photo's camera, the losses (L1 and weighted LPIPS, averaged over the photos), and
+            Outputs of the last photo's camera, the losses (of pixels and weighted LPIPS, averaged over the photos), and
             metrics to log. A loss may be NaN or infinite: the trainer then skips the step.
         """
         refined, scene = self.refine(index), self.scenes[index]
@@ -284,13 +294,13 @@ class PointSplatModel(SplatfactoCpuModel):
         net = ("vgg" if self.device.type == "cuda" else "alex") if net == "auto" else net
         lpips = self.lpips_of(net) if self.config.lpips_weight > 0 else None
         outputs: dict[str, Tensor] = {}
-        l1, perceptual, quality = [], [], []
+        pixels, perceptual, quality = [], [], []
         for camera, data in frames:
             outputs = self.draw(refined, scene, camera)
             rgb, photo = outputs["rgb"], self.photo_of(data, outputs["background"])
             if "mask" in data:
                 rgb, photo = rgb * data["mask"], photo * data["mask"]
-            l1.append((rgb - photo).abs().mean())
+            pixels.append(PIXEL_LOSSES[self.config.pixel_loss](rgb - photo))
             quality.append(psnr(rgb.detach(), photo))
             if lpips is not None:
                 try:
@@ -298,7 +308,7 @@ class PointSplatModel(SplatfactoCpuModel):
                 except ImageError as error:  # too small for the network
                     self._lpips[net] = lpips = None
                     CONSOLE.log(f"going on without LPIPS in the loss: {error}")
-        losses = {"l1": torch.stack(l1).mean()}
+        losses = {self.config.pixel_loss: torch.stack(pixels).mean()}
         if perceptual:
             losses["lpips"] = self.config.lpips_weight * torch.stack(perceptual).mean()
         return outputs, losses, {"psnr": torch.stack(quality).mean(), "gaussian_count": len(refined)}

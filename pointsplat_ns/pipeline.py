@@ -28,7 +28,7 @@ from pointsplat_ns.refiner import save_refiner
 REFINER_NAME = "refiner.safetensors"
 """The trained network, in the run's folder: what ``pointsplat refine --using RUN`` needs."""
 
-_REDUCED = ("l1", "lpips", "psnr")
+_REDUCED = ("l1", "rmse", "lpips", "psnr")
 """What is averaged over processes at each step."""
 
 
@@ -236,7 +236,13 @@ class PointSplatPipeline(VanillaPipeline):
                 save_refiner(
                     self.model.refiner,
                     trainer.base_dir / REFINER_NAME,
-                    {"step": str(step), "scenes": ", ".join(names), "keep": str(self.config.model.keep)},
+                    {
+                        "step": str(step),
+                        "scenes": ", ".join(names),
+                        "keep": str(self.config.model.keep),
+                        "score": self.config.model.score,
+                        "opacity_weight": str(self.config.model.opacity_weight),
+                    },
                 )
 
         return [TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], save)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -48,13 +49,13 @@ class SceneSettings:
     def train_command(self, data: Path, output: Path, timestamp: str) -> str:
         """The ``ns-train`` command of the scene."""
         return (
-            f"ns-train splatfacto-cpu --vis tensorboard --timestamp {timestamp} --output-dir {output} "
+            f"ns-train splatfacto-cpu --vis tensorboard --timestamp {timestamp} --output-dir {quote(str(output))} "
             f"--experiment-name {self.name} --max-num-iterations {self.steps} "
             f"--pipeline.model.densify-grad-thresh {self.densify_grad_thresh:.2g} "
             f"--pipeline.model.cull-alpha-thresh {self.cull_alpha_thresh:g} "
             f"--pipeline.model.rasterize-mode {'antialiased' if self.antialiased else 'classic'} "
             f"--pipeline.model.use-scale-regularization {self.scale_regularization} "
-            f"--data {data} replica-data --num-seed-points {self.seed_points}"
+            f"--data {quote(str(data))} replica-data --num-seed-points {self.seed_points}"
         )
 
 
@@ -86,11 +87,12 @@ def refiner_command(scenes: Path, output: Path, name: str, timestamp: str, size:
     unseen = " ".join(f"room{seed}" for seed in UNSEEN_SEEDS)
     more = " ".join(f"{keep:g}" for keep in KEEPS[1:])
     return (
-        f"ns-train pointsplat --vis tensorboard --timestamp {timestamp} --output-dir {output} --experiment-name {name} "
-        f"--max-num-iterations {steps} --data {scenes} --pipeline.datamanager.eval-scenes {unseen} "
+        f"ns-train pointsplat --vis tensorboard --timestamp {timestamp} --experiment-name {name} "
+        f"--output-dir {quote(str(output))} "
+        f"--max-num-iterations {steps} --data {quote(str(scenes))} --pipeline.datamanager.eval-scenes {unseen} "
         f"--pipeline.datamanager.supervision dense --pipeline.datamanager.seed {seed} "
         f"--pipeline.model.size {size} --pipeline.model.keep {KEEPS[0]:g} --pipeline.model.more-keeps {more} "
-        f"--pipeline.model.augment True --pipeline.model.pruned-folder {scenes.parent / 'pruned'}"
+        f"--pipeline.model.augment True --pipeline.model.pruned-folder {quote(str(scenes.parent / 'pruned'))}"
     )
 
 

@@ -195,7 +195,13 @@ def test_the_network_is_saved_by_itself_at_the_end(trained):
     loaded = load_refiner(path).state_dict()
     expected = trainer.pipeline.model.refiner.state_dict()
     assert loaded.keys() == expected.keys() and all(torch.equal(loaded[n], v) for n, v in expected.items())
-    assert read_metadata(path) == {"step": "9", "scenes": "wall-a", "keep": "0.5"}
+    assert read_metadata(path) == {
+        "step": "9",
+        "scenes": "wall-a",
+        "keep": "0.5",
+        "score": "paper",
+        "opacity_weight": "0.3",
+    }
     assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000009.ckpt"]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import time
 from pathlib import Path
@@ -86,8 +85,10 @@ def before_after(views: list[Path], scene: dict, path: Path, rows: int = 3) -> N
         path: the PNG to write.
         rows: how many views to show, spread over all.
     """
-    from matplotlib.figure import Figure
     from matplotlib.image import imread
+    from numpy import array_split
+
+    from pointsplat_ns.cli.pictures import side_by_side
 
     titles = ["photo, held out"]
     for variant in ("dense", "pruned", "refined"):
@@ -95,16 +96,4 @@ def before_after(views: list[Path], scene: dict, path: Path, rows: int = 3) -> N
         size = f"{values['gaussians']:,} Gaussians, {values['megabytes']:.1f} MB"
         titles.append(f"{variant}: {size}, {values['psnr']:.1f} dB")
     shown = views[:: max(1, len(views) // rows)][:rows]
-    images = [imread(view) for view in shown]
-    height, width = images[0].shape[0], images[0].shape[1] // 4
-    figure = Figure(figsize=(16, 4 * len(shown) * height / width + 0.4), layout="constrained")
-    axes = figure.subplots(len(shown), 4, squeeze=False)
-    for row, image in zip(axes, images, strict=True):
-        for column, axis in enumerate(row):
-            axis.imshow(image[:, column * width : (column + 1) * width])
-            axis.set_axis_off()
-    for axis, title in zip(axes[0], titles, strict=True):
-        axis.set_title(title, fontsize=11)
-    beside = path.with_name(f".{path.name}.part")
-    figure.savefig(beside, dpi=100, format="png")
-    os.replace(beside, path)
+    side_by_side([array_split(imread(view), 4, axis=1) for view in shown], titles, path)

@@ -106,8 +106,7 @@ class TrainedScene(DenseScene):
     @property
     def rasterize_mode(self) -> Literal["classic", "antialiased"]:
         """How the run rendered, and how it is rendered from then on."""
-        mode = self.run.model_fields.get("rasterize_mode")
-        return mode if mode in ("classic", "antialiased") else "classic"
+        return self.run.rasterize_mode
 
     @property
     def background(self) -> torch.Tensor:
