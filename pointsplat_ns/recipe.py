@@ -92,7 +92,8 @@ def refiner_command(scenes: Path, output: Path, name: str, timestamp: str, size:
         f"--max-num-iterations {steps} --data {quote(str(scenes))} --pipeline.datamanager.eval-scenes {unseen} "
         f"--pipeline.datamanager.supervision dense --pipeline.datamanager.seed {seed} "
         f"--pipeline.model.size {size} --pipeline.model.keep {KEEPS[0]:g} --pipeline.model.more-keeps {more} "
-        f"--pipeline.model.augment True --pipeline.model.pruned-folder {quote(str(scenes.parent / 'pruned'))}"
+        "--pipeline.model.pixel-loss rmse --pipeline.model.lpips-weight 0.05 --rate-factor 8 "
+        f"--pipeline.model.pruned-folder {quote(str(scenes.parent / 'pruned'))}"
     )
 
 
@@ -120,8 +121,8 @@ Splatting scenes after they were merged to {keeps} of their Gaussians (`score me
   {about["scenes"][-1]}: layout, size, furniture, textures, lights, path and size of the pictures all differ), each
   trained with `splatfacto-cpu` at settings of its own (`pointsplat_ns/recipe.py`). No downloaded data.
 - **Made by:** `{about["command"]}`
-- **Training:** {about["steps"]:,} steps, each one scene and two views, against the dense scene's own renders; scenes
-  turned, mirrored and repainted at random. The command inside:
+- **Training:** {about["steps"]:,} steps, each one scene and two views, against the dense scene's own renders. The
+  command inside:
 
 ```
 {command}

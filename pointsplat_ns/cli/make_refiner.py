@@ -16,8 +16,8 @@ TIMESTAMP = "recipe"
 def make_refiner(
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("outputs/make-refiner"),
     weights: Path | None = None,
-    size: Literal["tiny", "small", "full"] = "small",
-    steps: int = 2000,
+    size: Literal["tiny", "small", "full"] = "tiny",
+    steps: int = 600,
     rooms: int | None = None,
     workers: int | None = None,
     seed: int = 0,
