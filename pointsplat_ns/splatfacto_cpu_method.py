@@ -17,6 +17,7 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 from pointsplat_ns.data.frames import LazyImageDatamanagerConfig
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.memory import keep_freed_memory
 from pointsplat_ns.splatfacto_cpu import SplatfactoCpuModelConfig, SplatfactoCpuPipelineConfig
 
 SPLATFACTO_STEPS = 30_000
@@ -24,7 +25,7 @@ SPLATFACTO_STEPS = 30_000
 
 
 class SplatfactoCpuTrainer(Trainer):
-    """nerfstudio's trainer, which leaves nothing behind when its input cannot be used."""
+    """nerfstudio's trainer, which leaves nothing behind when its input cannot be used, and reuses a CPU's memory."""
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """As nerfstudio's.
@@ -33,6 +34,8 @@ class SplatfactoCpuTrainer(Trainer):
             PointSplatError: if the data cannot be used. The run folder, in which ``ns-train`` has then written
                 nothing but the config, is removed first.
         """
+        if torch.device(self.device).type == "cpu":
+            keep_freed_memory()
         try:
             super().setup(test_mode)
         except PointSplatError:

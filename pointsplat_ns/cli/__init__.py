@@ -16,7 +16,9 @@ def main(args: list[str] | None = None) -> None:
     from pointsplat_ns.cli.scenes import export, prune
     from pointsplat_ns.cli.view import report, rooms
     from pointsplat_ns.errors import PointSplatError
+    from pointsplat_ns.memory import keep_freed_memory
 
+    keep_freed_memory()
     logging.basicConfig(format="%(message)s", level=logging.INFO)
     commands = {
         "compact": compact,

@@ -1,0 +1,35 @@
+"""Freed memory serves again: seen by the pages that the system has to clear."""
+
+import subprocess
+import sys
+
+import pytest
+
+PROGRAM = """
+import resource, sys
+import torch
+from pointsplat_ns.memory import keep_freed_memory
+kept = sys.argv[1] == "keep" and keep_freed_memory()
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    torch.ones(16_000_000) + 1  # two blocks of 64 MB
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+for _ in range(4):  # until what was freed in pieces has come together
+    faults()
+print(kept, faults())
+"""
+
+
+def run(word: str) -> tuple[bool, int]:
+    out = subprocess.run([sys.executable, "-c", PROGRAM, word], capture_output=True, text=True, check=True).stdout
+    kept, faults = out.split()
+    return kept == "True", int(faults)
+
+
+def test_large_tensors_cost_new_pages_once():
+    kept, after = run("keep")
+    if not kept:
+        pytest.skip("not Linux with glibc, where there is nothing to do")
+    before = run("leave")[1]
+    # 128 MB are 31,250 pages of 4 kB; larger pages make fewer.
+    assert after < 0.1 * before
