@@ -26,7 +26,7 @@ from pointsplat_ns.refined_run import network_options
 from pointsplat_ns.refiner import save_refiner
 
 REFINER_NAME = "refiner.safetensors"
-"""The trained network, in the run's folder: what ``pointsplat refine --using RUN`` needs."""
+"""The trained network, in the run's folder: what ``pointsplat compact --using`` takes."""
 
 _REDUCED = ("l1", "rmse", "lpips", "psnr")
 """What is averaged over processes at each step."""

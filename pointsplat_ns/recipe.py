@@ -18,8 +18,8 @@ TRAIN_SEEDS = tuple(range(100, 116))
 UNSEEN_SEEDS = (50, 51, 52, 53)
 """Rooms that it is judged by: never trained on, and nothing was chosen by looking at them."""
 
-KEEPS = (0.1, 0.3, 0.5)
-"""Shares that scenes are merged to in training, each in turn; the first is the one of the evaluation."""
+KEEP = 0.1
+"""Share that scenes are merged to in training."""
 
 
 @dataclass(frozen=True)
@@ -85,13 +85,12 @@ def scene_settings(seed: int) -> SceneSettings:
 def refiner_command(scenes: Path, output: Path, name: str, timestamp: str, size: str, steps: int, seed: int) -> str:
     """The ``ns-train`` command of the refiner."""
     unseen = " ".join(f"room{seed}" for seed in UNSEEN_SEEDS)
-    more = " ".join(f"{keep:g}" for keep in KEEPS[1:])
     return (
         f"ns-train pointsplat --vis tensorboard --timestamp {timestamp} --experiment-name {name} "
         f"--output-dir {quote(str(output))} "
         f"--max-num-iterations {steps} --data {quote(str(scenes))} --pipeline.datamanager.eval-scenes {unseen} "
         f"--pipeline.datamanager.supervision dense --pipeline.datamanager.seed {seed} "
-        f"--pipeline.model.size {size} --pipeline.model.keep {KEEPS[0]:g} --pipeline.model.more-keeps {more} "
+        f"--pipeline.model.size {size} --pipeline.model.keep {KEEP:g} "
         "--pipeline.model.pixel-loss rmse --pipeline.model.lpips-weight 0.05 --rate-factor 8 "
         f"--pipeline.model.pruned-folder {quote(str(scenes.parent / 'pruned'))}"
     )
@@ -111,18 +110,17 @@ def card_text(about: dict[str, Any], results: dict[str, Any], command: str, para
         if not scene["seen_in_training"]:
             rows += [_row(name, variant, scene[variant]) for variant in ("dense", "pruned", "refined")]
     rows += [_row("**mean of these**", v, results["average_unseen"][v]) for v in ("dense", "pruned", "refined")]
-    keeps = ", ".join(f"{100 * keep:g} %" for keep in about["keeps"])
     return f"""# The refiner that ships with pointsplat_ns
 
 A network of {parameters:,} parameters ({results["settings"]["size"]}, dual-branch encoder) that repairs 3D Gaussian
-Splatting scenes after they were merged to {keeps} of their Gaussians (`score merge`). One forward pass, no photos.
+Splatting scenes after they were merged to {100 * about["keep"]:g} % of their Gaussians. One forward pass, no photos.
 
 - **Data:** {len(about["scenes"])} furnished rooms that the package makes itself ({about["scenes"][0]} to
   {about["scenes"][-1]}: layout, size, furniture, textures, lights, path and size of the pictures all differ), each
   trained with `splatfacto-cpu` at settings of its own (`pointsplat_ns/recipe.py`). No downloaded data.
 - **Made by:** `{about["command"]}`
 - **Training:** {about["steps"]:,} steps, each one scene and two views, against the dense scene's own renders. The
-  command inside:
+  command inside, in its output folder:
 
 ```
 {command}

@@ -12,7 +12,7 @@ from pointsplat_ns.data.room_path import STYLES, capture_path
 from pointsplat_ns.data.rooms import make_room
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.recipe import (
-    KEEPS,
+    KEEP,
     TRAIN_SEEDS,
     UNSEEN_SEEDS,
     card_text,
@@ -65,7 +65,7 @@ def test_the_refiner_command_holds_the_unseen_rooms_out():
     assert config.method_name == "pointsplat" and config.max_num_iterations == 70
     assert manager.eval_scenes == tuple(f"room{seed}" for seed in UNSEEN_SEEDS)
     assert (manager.supervision, manager.seed) == ("dense", 3)
-    assert (model.keep, *model.more_keeps) == KEEPS and model.size == "tiny" and model.score == "merge"
+    assert model.keep == KEEP and model.size == "tiny" and model.score == "merge"
     assert model.pruned_folder == Path("o/pruned")
 
 
@@ -104,7 +104,7 @@ def test_the_card_names_rooms_command_and_results():
         "average_unseen": scene,
         "settings": {"size": "tiny"},
     }
-    about = {"scenes": ["room100"], "command": "pointsplat make-refiner", "keeps": [0.1], "keep": 0.1, "steps": 10}
+    about = {"scenes": ["room100"], "command": "pointsplat make-refiner", "keep": 0.1, "steps": 10}
     text = card_text(about, results, "ns-train pointsplat", 664_563)
     assert "| room50 | refined | 26.50 | 0.800 | - | 1,234 |" in text
     assert "room100 |" not in text, "results are of rooms that it was not trained on"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 import tyro
@@ -17,7 +18,7 @@ def make_refiner(
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("outputs/make-refiner"),
     weights: Path | None = None,
     size: Literal["tiny", "small", "full"] = "tiny",
-    steps: int = 600,
+    steps: int = 700,
     rooms: int | None = None,
     workers: int | None = None,
     seed: int = 0,
@@ -39,7 +40,7 @@ def make_refiner(
     from pointsplat_ns.cli.running import finished, run
     from pointsplat_ns.cli.view import read_evaluation, show_report
     from pointsplat_ns.errors import DataError
-    from pointsplat_ns.recipe import KEEPS, TRAIN_SEEDS, UNSEEN_SEEDS, card_text, refiner_command
+    from pointsplat_ns.recipe import KEEP, TRAIN_SEEDS, UNSEEN_SEEDS, card_text, refiner_command
 
     if rooms is not None and not 1 <= rooms <= len(TRAIN_SEEDS):
         raise DataError(f"--rooms {rooms}: expected 1 to {len(TRAIN_SEEDS)}")
@@ -50,11 +51,14 @@ def make_refiner(
 
     name = f"{size}-{steps}-{len(seeds) - len(UNSEEN_SEEDS)}rooms-seed{seed}"
     trained = output / "refiners" / name / "pointsplat" / TIMESTAMP
-    command = refiner_command(output / "scenes", output / "refiners", name, TIMESTAMP, size, steps, seed)
-    if not finished(trained, steps):
-        run(command)
     evaluation, pictures = output / f"{name}.json", output / "pictures" / name
-    run(f"ns-eval --load-config {trained / 'config.yml'} --output-path {evaluation} --render-output-path {pictures}")
+    if not finished(trained, steps):
+        evaluation.unlink(missing_ok=True)
+        run(refiner_command(output / "scenes", output / "refiners", name, TIMESTAMP, size, steps, seed))
+    if not evaluation.is_file():
+        config = quote(str(trained / "config.yml"))
+        written = f"--output-path {quote(str(evaluation))} --render-output-path {quote(str(pictures))}"
+        run(f"ns-eval --load-config {config} {written}")
     results = read_evaluation(evaluation)
     show_report(results)
 
@@ -65,11 +69,12 @@ def make_refiner(
 
     options = "" if rooms is None else f" --rooms {rooms}"
     made_by = f"pointsplat make-refiner --size {size} --steps {steps} --seed {seed}{options}"
-    about = {"command": made_by, "keeps": list(KEEPS), "score": "merge", "keep": KEEPS[0], "steps": steps}
+    about = {"command": made_by, "score": "merge", "keep": KEEP, "steps": steps}
     about["scenes"] = [f"room{s}" for s in seeds[: -len(UNSEEN_SEEDS)]]
     about["unseen"] = {variant: results["average_unseen"][variant] for variant in ("dense", "pruned", "refined")}
     refiner = load_refiner(trained / REFINER_NAME)
     save_refiner(refiner, target / REFINER_NAME, about)
+    command = refiner_command(Path("scenes"), Path("refiners"), name, TIMESTAMP, size, steps, seed)
     card = card_text(about, results, command, sum(p.numel() for p in refiner.parameters()))
     (target / "CARD.md").write_text(card, encoding="utf-8")
     print(f"{target / REFINER_NAME}: the refiner, {(target / REFINER_NAME).stat().st_size / 1e6:.1f} MB")
