@@ -40,7 +40,10 @@ def make_refiner(
     from pointsplat_ns.cli.running import finished, run
     from pointsplat_ns.cli.view import read_evaluation, show_report
     from pointsplat_ns.errors import DataError
+    from pointsplat_ns.io.files import replacing
+    from pointsplat_ns.pipeline import REFINER_NAME
     from pointsplat_ns.recipe import KEEP, TRAIN_SEEDS, UNSEEN_SEEDS, card_text, refiner_command
+    from pointsplat_ns.refiner import load_refiner, save_refiner
 
     if rooms is not None and not 1 <= rooms <= len(TRAIN_SEEDS):
         raise DataError(f"--rooms {rooms}: expected 1 to {len(TRAIN_SEEDS)}")
@@ -63,10 +66,6 @@ def make_refiner(
     show_report(results)
 
     target = weights or output
-    target.mkdir(parents=True, exist_ok=True)
-    from pointsplat_ns.pipeline import REFINER_NAME
-    from pointsplat_ns.refiner import load_refiner, save_refiner
-
     options = "" if rooms is None else f" --rooms {rooms}"
     made_by = f"pointsplat make-refiner --size {size} --steps {steps} --seed {seed}{options}"
     about = {"command": made_by, "score": "merge", "keep": KEEP, "steps": steps}
@@ -76,7 +75,8 @@ def make_refiner(
     save_refiner(refiner, target / REFINER_NAME, about)
     command = refiner_command(Path("scenes"), Path("refiners"), name, TIMESTAMP, size, steps, seed)
     card = card_text(about, results, command, sum(p.numel() for p in refiner.parameters()))
-    (target / "CARD.md").write_text(card, encoding="utf-8")
+    with replacing(target / "CARD.md") as part:
+        part.write_text(card, encoding="utf-8")
     print(f"{target / REFINER_NAME}: the refiner, {(target / REFINER_NAME).stat().st_size / 1e6:.1f} MB")
     print(f"{target / 'CARD.md'}: what it was made of, and what it does")
     print(f"{pictures}: photo, dense, pruned and refined side by side")
