@@ -14,9 +14,8 @@ def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     torch.ones(16_000_000) + 1  # two blocks of 64 MB
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-for _ in range(4):  # until what was freed in pieces has come together
-    faults()
-print(kept, faults())
+# The first rounds break up the memory that there is; later ones find their places.
+print(kept, min(faults() for _ in range(8)))
 """
 
 
