@@ -20,7 +20,8 @@ def demo(
     height: int = 192,
     fresh: bool = False,
 ) -> None:
-    """Train small scenes, prune them, train the refiner, evaluate it on a room that it never saw, export.
+    """Train small scenes, prune them, train the refiner, evaluate it on a room that it never saw, export; and
+    make that room small with the refiner that ships.
 
     Runs the same commands that a person would type, and prints them. What an interrupted demo has
     finished is not done again.
@@ -66,12 +67,16 @@ def demo(
     run(f"ns-eval --load-config {trained / 'config.yml'} --output-path {evaluation} --render-output-path {pictures}")
     splat = output / f"{UNSEEN}_refined.ply"
     run(f"pointsplat export {trained} -o {splat}")
+    dense, small = scenes / UNSEEN / "splatfacto-cpu" / "demo", output / f"{UNSEEN}_compact.ply"
+    views = output / "compact.png"
+    run(f"pointsplat compact {dense} --keep {keep} -o {small} --picture {views}")
 
     results = read_evaluation(evaluation)
     picture = output / "before_after.png"
     before_after(sorted(pictures.glob(f"{UNSEEN}_*.png")), results["scenes"][UNSEEN], picture)
     show_report(results)
     print(f"{splat}: open it in any 3DGS viewer, or run ns-viewer --load-config {trained / 'config.yml'}")
+    print(f"{small}: the same room by pointsplat compact and the refiner that ships; {views} shows it")
     print(f"{picture}: photo, dense, pruned and refined side by side, of a room that the refiner never saw")
     print(f"done in {(time.perf_counter() - start) / 60:.1f} minutes")
 
