@@ -25,8 +25,8 @@ def make_refiner(
 ) -> None:
     """Train a refiner from nothing: make rooms, train a scene of each, learn to repair them, judge it on unseen rooms.
 
-    This is how the refiner that `pointsplat compact` uses was made. No data, no photos and no GPU are needed; it takes
-    hours on a laptop. What an interrupted command has finished is not done again.
+    This is how the refiner that `pointsplat compact` uses was made. No data, no photos and no GPU are needed; two idle
+    cores take less than an hour. What an interrupted command has finished is not done again.
 
     Args:
         output: folder for everything that is made.
