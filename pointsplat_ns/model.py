@@ -108,9 +108,9 @@ def tensors_in(value: Any) -> Iterator[Tensor]:
             yield from tensors_in(entry)
 
 
-def options_of(config: PointSplatModelConfig) -> dict[str, Any]:
-    """Arguments of :func:`pointsplat_ns.pruning.compact` that a config asks for."""
-    return prune_options(config.keep, config.score, config.opacity_weight)
+def options_of(config: PointSplatModelConfig, keep: float | None = None) -> dict[str, Any]:
+    """Arguments of :func:`pointsplat_ns.pruning.compact` that a config asks for, at its own ``keep`` by default."""
+    return prune_options(config.keep if keep is None else keep, config.score, config.opacity_weight)
 
 
 class PointSplatModel(SplatfactoCpuModel):
@@ -125,7 +125,7 @@ class PointSplatModel(SplatfactoCpuModel):
             PointSplatError: if no scene could be pruned as the config asks, or its settings describe no network.
         """
         for keep in (self.config.keep, *self.config.more_keeps):
-            prune_options(keep, self.config.score, self.config.opacity_weight)
+            options_of(self.config, keep)
         if self.config.score not in METHODS:
             raise PointSplatError(f"no score is called {self.config.score!r}; expected one of {', '.join(METHODS)}")
         self.refiner = Refiner(preset(self.config.size, **network_options(vars(self.config))))
@@ -181,7 +181,7 @@ class PointSplatModel(SplatfactoCpuModel):
 
     def _prune(self, index: int, keep: float, dense: Gaussians | None) -> PrunedScene:
         scene = self.scenes[index]
-        options = prune_options(keep, self.config.score, self.config.opacity_weight)
+        options = options_of(self.config, keep)
         stored = stored_path(self.config.pruned_folder, scene.identity, options)
         if stored is not None and stored.is_file():
             pruned, dense_count, seconds = read_pruned(stored)

@@ -21,14 +21,14 @@ from pointsplat_ns import parallel
 from pointsplat_ns.data.scenes import ScenesDataManager, ScenesDataManagerConfig
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.evaluation import SceneReport, evaluate_scene, summarize
-from pointsplat_ns.model import PointSplatModel, PointSplatModelConfig, options_of
+from pointsplat_ns.model import PIXEL_LOSSES, PointSplatModel, PointSplatModelConfig, options_of
 from pointsplat_ns.refined_run import network_options
 from pointsplat_ns.refiner import save_refiner
 
 REFINER_NAME = "refiner.safetensors"
 """The trained network, in the run's folder: what ``pointsplat compact --using`` takes."""
 
-_REDUCED = ("l1", "rmse", "lpips", "psnr")
+_REDUCED = (*PIXEL_LOSSES, "lpips", "psnr")
 """What is averaged over processes at each step."""
 
 

@@ -12,8 +12,8 @@ import torch
 
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.plys import find_plys
-from pointsplat_ns.io.runs import Run, find_runs, open_run, scene_names, shown_scene
+from pointsplat_ns.io.plys import find_runs_and_plys
+from pointsplat_ns.io.runs import Run, open_run, shown_scene
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.pruning import WEIGHTED, compact
 from pointsplat_ns.refiner import Refiner, preset
@@ -111,21 +111,9 @@ def open_refined_run(path: Path | str, need_scenes: bool = True) -> RefinedRun:
 
 
 def _scenes_of(run: Run) -> dict[str, Path]:
-    """Where the scenes are that a run was trained on, by the names that the training gave them
-    (:func:`pointsplat_ns.data.scenes.find_scenes`, which a test compares with this)."""
-    supervision = run.datamanager_fields.get("supervision", "auto")
-    runs: list[Run] = []
-    nothing: SceneError | None = None
-    try:
-        if run.data.suffix.lower() != ".ply":
-            runs = find_runs(run.data, need_data=False)
-    except SceneError as error:
-        nothing = error
-    scenes = {name: found.checkpoint for name, found in zip(scene_names(runs), runs, strict=True)}
-    plys = find_plys(run.data) if supervision == "dense" or (supervision == "auto" and not runs) else []
-    names = set(scenes)
-    for name, path in plys:
-        scenes[f"{name}.ply" if name in names else name] = path
+    """Where the scenes are that a run was trained on, by the names that the training gave them."""
+    runs, plys, nothing = find_runs_and_plys(run.data, run.datamanager_fields.get("supervision", "auto"))
+    scenes = {name: found.checkpoint for name, found in runs.items()} | plys
     if not scenes:
         raise SceneError(f"{run.config_path}: {nothing or f'{run.data}: no Gaussians in it'}; put its scenes back")
     return scenes

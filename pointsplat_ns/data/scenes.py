@@ -28,8 +28,8 @@ from pointsplat_ns.data.frames import FrameCache, Frames, free_memory_share, to_
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.inert_yaml import Tagged
-from pointsplat_ns.io.plys import find_plys
-from pointsplat_ns.io.runs import Run, find_runs, open_run, scene_names, shown_scene
+from pointsplat_ns.io.plys import Supervision, find_runs_and_plys
+from pointsplat_ns.io.runs import Run, open_run, shown_scene
 from pointsplat_ns.io.splatfacto import read_checkpoint
 
 VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
@@ -158,7 +158,7 @@ class TrainedScene(DenseScene):
 
 def find_scenes(
     folder: Path,
-    supervision: Literal["auto", "photos", "dense"],
+    supervision: Supervision,
     cache: FrameCache,
     poses: SampledPoses | None = None,
     device: torch.device | str = "cpu",
@@ -176,14 +176,7 @@ def find_scenes(
     Raises:
         SceneError: if there is no scene, or a run's data is needed and not found.
     """
-    runs: list[Run] = []
-    nothing: SceneError | None = None
-    try:
-        if folder.suffix.lower() != ".ply":
-            runs = find_runs(folder, need_data=False)
-    except SceneError as error:
-        nothing = error
-    plys = find_plys(folder) if supervision == "dense" or (supervision == "auto" and not runs) else []
+    runs, plys, nothing = find_runs_and_plys(folder, supervision)
     if not runs and not plys:
         if nothing is None:
             found = "a PLY file, which has no photos" if supervision == "photos" else "no Gaussians in it"
@@ -194,7 +187,7 @@ def find_scenes(
         raise SceneError(f"{nothing}{hint if supervision == 'photos' else ', or 3DGS PLY files'}") from nothing
     chosen: Literal["photos", "dense"] = "dense" if plys or supervision == "dense" else "photos"
     scenes: list[DenseScene] = []
-    for name, run in zip(scene_names(runs), runs, strict=True):
+    for name, run in runs.items():
         has_photos = True
         if need_data:
             try:
@@ -204,9 +197,7 @@ def find_scenes(
                     raise SceneError(f"{error}, or take --pipeline.datamanager.supervision dense") from error
                 has_photos = False
         scenes.append(TrainedScene(name, run, cache, poses, device, has_photos))
-    taken = {scene.name for scene in scenes}
-    for name, path in plys:
-        scenes.append(PlyScene(f"{name}.ply" if name in taken else name, path, cache, poses, device))
+    scenes += [PlyScene(name, path, cache, poses, device) for name, path in plys.items()]
     return chosen, scenes
 
 
@@ -217,7 +208,7 @@ class ScenesDataManagerConfig(DataManagerConfig):
     _target: type = field(default_factory=lambda: ScenesDataManager)
     data: Path | None = None
     """A trained Splatfacto run, a 3DGS .ply, or a folder above several (the newest run of each experiment is taken)."""
-    supervision: Literal["auto", "photos", "dense"] = "auto"
+    supervision: Supervision = "auto"
     """What renders of the refined scene are compared with in training: photos, or the dense scene's own renders, from
     the dataset's poses or, where there is no dataset, from poses sampled in free space. auto is photos for trained
     runs, and dense for PLY files."""

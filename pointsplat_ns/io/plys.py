@@ -1,15 +1,18 @@
-"""A folder of PLY files as a set of scenes."""
+"""Folders as sets of scenes: PLY files, trained runs, or both."""
 
 from __future__ import annotations
 
 import os
 import re
 from pathlib import Path
+from typing import Literal
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.io.ply_header import read_header
-from pointsplat_ns.io.runs import CONFIG_NAME, distinct
+from pointsplat_ns.io.runs import CONFIG_NAME, Run, distinct, find_runs, scene_names
+
+Supervision = Literal["auto", "photos", "dense"]
 
 
 def find_plys(folder: Path) -> list[tuple[str, Path]]:
@@ -37,6 +40,30 @@ def find_plys(folder: Path) -> list[tuple[str, Path]]:
         names.append(re.sub(r"[^\w.+-]+", "-", "-".join(parts)).strip("-.") or "scene")
         found.append(path)
     return list(zip(distinct(names), found, strict=True))
+
+
+def find_runs_and_plys(
+    folder: Path, supervision: Supervision
+) -> tuple[dict[str, Run], dict[str, Path], SceneError | None]:
+    """The runs and the PLY files at or below ``folder`` that a training takes, by the names that it gives them.
+
+    Args:
+        folder: a run, a PLY file, or any folder above several.
+        supervision: ``photos`` takes runs, ``dense`` both, ``auto`` runs, or PLY files where there is no run.
+
+    Returns:
+        Runs, whose data is not looked for; PLY files; and why there is no run, if looking for one failed.
+    """
+    runs: list[Run] = []
+    nothing: SceneError | None = None
+    try:
+        if folder.suffix.lower() != ".ply":
+            runs = find_runs(folder, need_data=False)
+    except SceneError as error:
+        nothing = error
+    named = dict(zip(scene_names(runs), runs, strict=True))
+    found = find_plys(folder) if supervision == "dense" or (supervision == "auto" and not runs) else []
+    return named, {f"{name}.ply" if name in named else name: path for name, path in found}, nothing
 
 
 def _holds_gaussians(path: Path) -> bool:

@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from pointsplat_ns.bits import interleave, spread_bits
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.scores import log_area
 
@@ -86,19 +87,7 @@ def unit_cells(means: Tensor) -> Tensor:
 def curve_keys(cells: Tensor, offset: float = 0.0) -> Tensor:
     """Places (N,) int64 on the Morton curve of points (N, 3) in the unit cube, after a move by ``offset``."""
     grid = (cells.T + offset).clamp_(0, 1).mul_(2**_BITS - 1).long()
-    keys = torch.zeros_like(grid[0])
-    for axis in grid:
-        # Two zero bits between any two bits, by halves: 20 bits need five steps.
-        for shift, mask in (
-            (32, 0x1F00000000FFFF),
-            (16, 0x1F0000FF0000FF),
-            (8, 0x100F00F00F00F00F),
-            (4, 0x10C30C30C30C30C3),
-            (2, 0x1249249249249249),
-        ):
-            axis = axis.bitwise_or_(axis << shift).bitwise_and_(mask)
-        keys = keys.bitwise_left_shift_(1).bitwise_or_(axis)
-    return keys
+    return interleave(*(spread_bits(axis) for axis in grid))
 
 
 def mass_shares(log_mass: Tensor, run: int, first: int = 0) -> Tensor:

@@ -13,6 +13,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from pointsplat_ns.bits import interleave, spread_bits
+
 LEVELS_AT_ONCE = 4
 """Halvings that one look-up takes along the Hilbert curve: its table is 48 x 8^4 numbers, which a cache holds."""
 
@@ -59,31 +61,15 @@ def curve_codes(coords: Tensor, bits: int, curves: Sequence[str]) -> list[Tensor
     """
     if not 1 <= bits <= 20:
         raise ValueError(f"{bits} bits per axis; expected 1 to 20, so that a code fits an int64")
-    x, y, z = (_spread(coords[:, axis]) for axis in range(3))
+    x, y, z = (spread_bits(coords[:, axis]) for axis in range(3))
     codes = []
     for curve in curves:
         base, _, variant = curve.partition("-")
         if base not in ("z", "hilbert") or variant not in ("", "trans"):
             raise ValueError(f"no curve {curve!r}; expected z, z-trans, hilbert or hilbert-trans")
-        first, second = (y, x) if variant else (x, y)
-        code = (first << 2).bitwise_or_(second << 1).bitwise_or_(z)
+        code = interleave(y, x, z) if variant else interleave(x, y, z)
         codes.append(code if base == "z" else _hilbert_from_z(code, bits))
     return codes
-
-
-def _spread(x: Tensor) -> Tensor:
-    """Moves bit k to bit 3k, for k below 21, by halving the distance still to go five times."""
-    x = x & 0x1FFFFF
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        x |= x << shift
-        x &= mask
-    return x
 
 
 def _hilbert_from_z(code: Tensor, bits: int) -> Tensor:
