@@ -5,43 +5,24 @@ import math
 import pytest
 import torch
 
+from making import ball, same
 from pointsplat_ns.auto_budget import DenseReference
 from pointsplat_ns.compaction import ALL_METHODS, IMAGE_SCORES, Poses, compact_scene
 from pointsplat_ns.distributions import opacity_quantiles, plot_distributions, size_quantiles
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.poses import sample_views
 from pointsplat_ns.pruning import SCORES, Megabytes, WithinPsnr, cut_sh, ply_bytes, prune, select
 
 
-def room(n=400, seed=0, degree=1):
-    """The inside of a ball of radius 2, covered with blobs."""
-    generator = torch.Generator().manual_seed(seed)
-    place = torch.randn(n, 3, generator=generator)
-    place = 2 * place / place.norm(dim=1, keepdim=True)
-    return Gaussians(
-        means=place,
-        scales=torch.full((n, 3), math.log(0.25)) + 0.2 * torch.randn(n, 3, generator=generator),
-        quats=torch.randn(n, 4, generator=generator),
-        opacities=2 + torch.randn(n, 1, generator=generator),
-        features_dc=torch.sin(2 * place),
-        features_rest=0.05 * torch.randn(n, (degree + 1) ** 2 - 1, 3, generator=generator),
-    )
-
-
 @pytest.fixture(scope="module")
 def scene():
-    return room()
+    return ball(400)
 
 
 @pytest.fixture(scope="module")
 def looks(scene):
     return sample_views(scene, 3, 48, 36)
-
-
-def same(a, b):
-    return all(torch.equal(x, y) for x, y in zip(a.tensors(), b.tensors(), strict=True))
 
 
 def test_no_poses_are_asked_for_where_none_are_needed(scene):
@@ -129,11 +110,11 @@ def test_a_run_whose_data_is_gone_is_looked_at_from_sampled_poses_and_it_is_said
     monkeypatch.setattr(compaction, "views_of_run", gone)
     for name, mode in (("wall-a", "classic"), ("wall-b", "antialiased")):  # as the run rendered
         (run,) = (trained_walls / name / "splatfacto-cpu").iterdir()
-        poses = Poses(run, room())
+        poses = Poses(run, ball(400))
         views = poses(2)
         assert len(views) == 2 and views.rasterize_mode == mode
         assert poses.origin == "poses sampled in free space (no dataset: its data is not there)"
-    nothing = Poses(run, room()[:0])
+    nothing = Poses(run, ball(400)[:0])
     with pytest.raises(DataError, match="nothing of the scene can be seen"):
         nothing(2)
     assert nothing.origin == ""

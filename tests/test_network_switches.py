@@ -11,6 +11,7 @@ import tyro
 from nerfstudio.utils.eval_utils import eval_setup
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
+from making import small_config
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.pointsplat_method import pointsplat_config
 from pointsplat_ns.refined_run import open_refined_run
@@ -34,14 +35,7 @@ NETWORKS = {
 
 
 def config_of(data: Path, output_dir: Path, **model):
-    config = pointsplat_config()
-    config.machine.device_type = "cpu"
-    config.output_dir, config.max_num_iterations, config.experiment_name = output_dir, 2, "refiner"
-    config.pipeline.datamanager.data = config.data = data
-    for name, value in {"size": "tiny", "keep": 0.5, "score": "paper", "lpips_weight": 0.0, **model}.items():
-        setattr(config.pipeline.model, name, value)
-    config.set_timestamp()
-    return config
+    return small_config(data, output_dir, 2, **model)
 
 
 @pytest.mark.parametrize("row", NETWORKS)

@@ -20,6 +20,7 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils.eval_utils import eval_setup
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
+from making import same, small_config
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.io import read_ply, read_scene
 from pointsplat_ns.lpips import load_lpips
@@ -34,22 +35,16 @@ from pointsplat_ns.refiner.weights import read_metadata
 VARIANTS = ("dense", "pruned", "refined")
 
 
-def small_config(data: Path, output_dir: Path, steps: int = 10, **model):
-    """The method as registered, at a size for tests; no LPIPS in the loss, so that nothing is downloaded."""
-    config = pointsplat_config()
-    config.machine.device_type = "cpu"
-    config.output_dir, config.max_num_iterations, config.experiment_name = output_dir, steps, "refiner"
-    config.pipeline.datamanager.data = config.data = data
-    for name, value in {"size": "tiny", "keep": 0.5, "score": "paper", "lpips_weight": 0.0, **model}.items():
-        setattr(config.pipeline.model, name, value)
+def fast_config(data: Path, output_dir: Path, steps: int = 10, **model):
+    """The method at a size for tests, at rates for the few steps that they take."""
+    config = small_config(data, output_dir, steps, **model)
     for group in config.optimizers.values():
-        group["optimizer"].lr *= 10  # tests take few steps
-    config.set_timestamp()
+        group["optimizer"].lr *= 10
     return config
 
 
 def pipeline_of(data: Path, eval_scenes: tuple[str, ...] = (), test_mode: str = "test", **model):
-    config = small_config(data, Path("unused"), **model)
+    config = fast_config(data, Path("unused"), **model)
     config.pipeline.datamanager.eval_scenes = eval_scenes
     return config.pipeline.setup(device="cpu", test_mode=test_mode).eval()
 
@@ -59,15 +54,10 @@ def run_of(folder: Path, name: str) -> Path:
     return path
 
 
-def same(a, b) -> bool:
-    """Whether two scenes are equal to the bit."""
-    return all(torch.equal(x, y) for (_, x), (_, y) in zip(a.items(), b.items(), strict=True))
-
-
 @pytest.fixture(scope="module")
 def trained(trained_walls, run_training, tmp_path_factory):
     """A short training on wall-a with wall-b held out: its config, its trainer, and which scenes gave photos."""
-    config = small_config(trained_walls, tmp_path_factory.mktemp("refined"))
+    config = fast_config(trained_walls, tmp_path_factory.mktemp("refined"))
     config.pipeline.datamanager.eval_scenes = ("wall-b",)
     config.steps_per_eval_image = 4
     from pointsplat_ns.model import PointSplatModel
@@ -215,10 +205,10 @@ def test_an_evaluation_while_training_is_logged(trained):
 
 
 def test_a_resumed_training_ends_where_an_unbroken_one_does(trained_walls, run_training, tmp_path):
-    config = small_config(trained_walls, tmp_path / "whole", steps=6)
+    config = fast_config(trained_walls, tmp_path / "whole", steps=6)
     config.steps_per_save, config.save_only_latest_checkpoint = 3, False
     whole, losses = run_training(config)
-    rest = small_config(trained_walls, tmp_path / "rest", steps=2)
+    rest = fast_config(trained_walls, tmp_path / "rest", steps=2)
     rest.load_dir, rest.load_step = config.get_checkpoint_dir(), 3  # after steps 0 to 3
     resumed, last_losses = run_training(rest)
     assert resumed._start_step == 4 and last_losses == losses[4:]
@@ -230,7 +220,7 @@ def test_a_resumed_training_ends_where_an_unbroken_one_does(trained_walls, run_t
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 2000])
 def test_learning_rates_rise_fall_and_never_rise_again(steps):
-    config = small_config(Path("unused"), Path("unused"), steps=steps)
+    config = fast_config(Path("unused"), Path("unused"), steps=steps)
     schedule = config.optimizers["encoder"]["scheduler"]
     with mock.patch.object(config, "_target", lambda fitted, **_: fitted):
         fitted = config.setup().optimizers["encoder"]["scheduler"]
@@ -249,7 +239,7 @@ def test_learning_rates_rise_fall_and_never_rise_again(steps):
 
 
 def test_a_training_that_cannot_start_leaves_no_folder(trained_walls, tmp_path):
-    config = small_config(trained_walls, tmp_path / "outputs")
+    config = fast_config(trained_walls, tmp_path / "outputs")
     config.pipeline.datamanager.eval_scenes = ("no_such_scene",)
     (tmp_path / "outputs" / "of another run").mkdir(parents=True)
     config.save_config()
@@ -485,7 +475,7 @@ def test_a_distorted_scene_of_degree_0_is_judged_as_its_own_run_judges_it(lens_r
 
 
 def test_a_scene_of_degree_0_trains_and_is_viewed(lens_run, run_training, tmp_path):
-    trainer, losses = run_training(small_config(lens_run, tmp_path, steps=2))
+    trainer, losses = run_training(fast_config(lens_run, tmp_path, steps=2))
     assert all(math.isfinite(loss) for loss in losses)
     model = trainer.pipeline.eval().model
     camera, _ = next(trainer.pipeline.datamanager.held_out(0))

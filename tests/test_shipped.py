@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import pointsplat_ns.shipped as shipped
+from making import ball, same
 from pointsplat_ns.auto_budget import DenseReference
 from pointsplat_ns.compaction import compact_scene
 from pointsplat_ns.errors import BudgetError, DataError, SceneError
@@ -34,18 +35,8 @@ TINY |= {"dec_channels": (8,), "dec_depths": (1,), "dec_heads": (1,), "feature_d
 
 
 def room(n: int = 400, degree: int = 1) -> Gaussians:
-    """The inside of a ball of radius 2, covered with coloured blobs, as faint as merging never leaves them."""
-    generator = torch.Generator().manual_seed(0)
-    place = torch.randn(n, 3, generator=generator)
-    place = 2 * place / place.norm(dim=1, keepdim=True)
-    return Gaussians(
-        means=place,
-        scales=torch.full((n, 3), math.log(0.25)) + 0.2 * torch.randn(n, 3, generator=generator),
-        quats=torch.randn(n, 4, generator=generator),
-        opacities=1 + torch.randn(n, 1, generator=generator),
-        features_dc=1 + torch.sin(2 * place),
-        features_rest=0.05 * torch.randn(n, (degree + 1) ** 2 - 1, 3, generator=generator),
-    )
+    """As faint as merging never leaves it."""
+    return ball(n, degree, opacity=1.0, bright=1.0)
 
 
 def tiny_refiner(head: str = "opacities", moved: float = 0.0, seed: int = 1, **config) -> Refiner:
@@ -69,10 +60,6 @@ def scene() -> Gaussians:
 @pytest.fixture(scope="module")
 def looks(scene):
     return sample_views(scene, 3, 48, 36)
-
-
-def same(a: Gaussians, b: Gaussians) -> bool:
-    return all(torch.equal(x, y) for x, y in zip(a.tensors(), b.tensors(), strict=True))
 
 
 def test_a_refiner_that_helps_is_kept_and_the_figures_are_those_of_the_renders(scene, looks):

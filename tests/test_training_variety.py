@@ -9,22 +9,16 @@ import pytest
 import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
+from making import small_config
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.model import PIXEL_LOSSES
-from pointsplat_ns.pointsplat_method import RATES, pointsplat_config
+from pointsplat_ns.pointsplat_method import RATES
 from pointsplat_ns.pruned_files import read_pruned, stored_path, write_pruned
 
 
 def config_of(data: Path, output_dir: Path, steps: int = 6, **model):
-    config = pointsplat_config()
-    config.machine.device_type = "cpu"
-    config.output_dir, config.max_num_iterations, config.experiment_name = output_dir, steps, "refiner"
-    config.pipeline.datamanager.data = config.data = data
-    for name, value in {"size": "tiny", "keep": 0.5, "score": "paper", "lpips_weight": 0.0, **model}.items():
-        setattr(config.pipeline.model, name, value)
-    config.set_timestamp()
-    return config
+    return small_config(data, output_dir, steps, **model)
 
 
 def test_one_network_learns_at_several_budgets_and_is_evaluated_at_the_first(

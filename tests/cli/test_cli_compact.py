@@ -11,6 +11,7 @@ import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 import pointsplat_ns.shipped as shipped
+from making import ball, same
 from pointsplat_ns.cli import main
 from pointsplat_ns.compaction import ALL_METHODS
 from pointsplat_ns.gaussians import Gaussians
@@ -19,23 +20,8 @@ from pointsplat_ns.pruning import compact
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
 
 
-def same(a: Gaussians, b: Gaussians) -> bool:
-    return all(torch.equal(x, y) for x, y in zip(a.tensors(), b.tensors(), strict=True))
-
-
 def room(n: int = 150) -> Gaussians:
-    """The inside of a ball of radius 2, covered with large coloured blobs."""
-    generator = torch.Generator().manual_seed(0)
-    place = torch.randn(n, 3, generator=generator)
-    place = 2 * place / place.norm(dim=1, keepdim=True)
-    return Gaussians(
-        means=place,
-        scales=torch.full((n, 3), -1.0) + 0.2 * torch.randn(n, 3, generator=generator),
-        quats=torch.randn(n, 4, generator=generator),
-        opacities=1 + torch.randn(n, 1, generator=generator),
-        features_dc=1 + torch.sin(2 * place),
-        features_rest=0.05 * torch.randn(n, 3, 3, generator=generator),
-    )
+    return ball(n, log_size=-1.0, opacity=1.0, bright=1.0)
 
 
 def weights(path: Path, head: str, moved: float, **metadata) -> Path:

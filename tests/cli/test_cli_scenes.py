@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
+from making import same
 from pointsplat_ns.auto_budget import DenseReference
 from pointsplat_ns.cli import main
 from pointsplat_ns.compaction import COMPARED_VIEWS, IMAGE_SCORES
@@ -21,10 +22,6 @@ from pointsplat_ns.refined_run import open_refined_run
 from pointsplat_ns.views import views_of_run
 
 SEED = 5
-
-
-def same(a: Gaussians, b: Gaussians) -> bool:
-    return all(torch.equal(x, y) for (_, x), (_, y) in zip(a.items(), b.items(), strict=True))
 
 
 def random_scene(n: int = 80, degree: int = 3) -> Gaussians:

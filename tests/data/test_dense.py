@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
+from making import without_data
 from pointsplat_ns.data.dense import PlyScene, SampledPoses, cameras_of
 from pointsplat_ns.data.frames import FrameCache
 from pointsplat_ns.data.scenes import ScenesDataManagerConfig
@@ -161,9 +162,7 @@ def test_a_run_is_rendered_from_its_datasets_poses_as_it_was_trained(trained_wal
 
 
 def test_a_run_whose_data_is_gone_is_learned_from_its_own_renders(trained_walls, tmp_path):
-    shutil.copytree(trained_walls, tmp_path / "runs")
-    for config in (tmp_path / "runs").rglob("config.yml"):
-        config.write_text(config.read_text().replace("- replica", "- gone_from_here"))
+    without_data(trained_walls, tmp_path / "runs")
     with pytest.raises(SceneError, match="gone_from_here.*supervision dense"):
         manager_of(tmp_path / "runs")
     manager = manager_of(tmp_path / "runs", supervision="dense")

@@ -15,6 +15,7 @@ from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetppDataParser
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
+from making import without_data
 from pointsplat_ns.data.frames import FrameCache
 from pointsplat_ns.data.replica import ReplicaDataParserConfig
 from pointsplat_ns.data.scenes import ScenesDataManagerConfig, TrainedScene, dataparser_of
@@ -259,9 +260,7 @@ def test_held_out_photos_come_in_order_with_their_cameras(trained_walls):
 
 
 def test_inference_needs_no_photos(trained_walls, tmp_path):
-    shutil.copytree(trained_walls, tmp_path / "runs")
-    for config in (tmp_path / "runs").rglob("config.yml"):
-        config.write_text(config.read_text().replace("- replica", "- gone_from_here"))
+    without_data(trained_walls, tmp_path / "runs")
     with pytest.raises(SceneError, match="gone_from_here.*is not there"):
         manager_of(tmp_path / "runs")
     manager = ScenesDataManagerConfig(data=tmp_path / "runs").setup(test_mode="inference")

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from making import same
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import merge_algebra as algebra
@@ -52,10 +53,6 @@ def render(scene: Gaussians, size: int = 64) -> torch.Tensor:
 
 def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
     return float(-10 * torch.log10((a - b).square().mean()))
-
-
-def same(a: Gaussians, b: Gaussians) -> bool:
-    return all(torch.equal(x, y) for x, y in zip(a.tensors(), b.tensors(), strict=True))
 
 
 @pytest.mark.parametrize("k", [1, 2, 7, 100, 299, 300])

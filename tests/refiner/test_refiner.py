@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from making import same
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.refiner import Refiner, preset
@@ -42,10 +43,6 @@ def move_zero_layers(refiner: Refiner) -> Refiner:
         mlp[-1].weight.normal_(std=0.1)
         mlp[-1].bias.normal_(std=0.1)
     return refiner
-
-
-def same(a: Gaussians, b: Gaussians) -> bool:
-    return all(torch.equal(x, y) for x, y in zip(a.tensors(), b.tensors(), strict=True))
 
 
 def residual(after: Gaussians, before: Gaussians) -> list[torch.Tensor]:
