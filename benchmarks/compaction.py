@@ -31,8 +31,8 @@ from rich.table import Table
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, write_ply
-from pointsplat_ns.lpips import Lpips
 from pointsplat_ns.metrics import psnr
+from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.pruning import METHODS, SCORES, compact
 
 RIVAL = "splat-transform"

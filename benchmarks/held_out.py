@@ -11,12 +11,14 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from pointsplat_ns.compression.view_sampling import sample_views
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import open_run, read_scene
-from pointsplat_ns.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.metrics import psnr, ssim
-from pointsplat_ns.poses import sample_views
-from pointsplat_ns.views import Views, draw, views_of_run
+from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.rasterizer import render
+from pointsplat_ns.views import Views
 
 COLUMNS = ("psnr", "ssim", "lpips")
 REFERENCES = ("photo", "dense")
@@ -46,17 +48,17 @@ def load(path: Path, count: int) -> Scene:
         name, views = path.stem, sample_views(dense, count)
     else:
         name, views, photos = photos_of(path, "test", count)
-    renders = [draw(dense, views, i) for i in range(len(views))]
+    renders = [render(dense, views[i]) for i in range(len(views))]
     return Scene(name, dense, views, renders, photos)
 
 
 def photos_of(path: Path, split: Literal["train", "test"], count: int) -> tuple[str, Views, list[Tensor]]:
     """The run's name, and at most ``count`` photos of a split, evenly spread, with the views that they show once
     undistorted."""
-    from pointsplat_ns.data.frames import FrameCache
-    from pointsplat_ns.data.scenes import TrainedScene
+    from pointsplat_ns.geometry.cameras import viewmats_from_opengl
     from pointsplat_ns.io import scene_name
-    from pointsplat_ns.splatfacto_cpu import viewmats_of
+    from pointsplat_ns.nerfstudio_plugin.frames import FrameCache
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
     run = open_run(path)
     scene = TrainedScene(scene_name(run), run, FrameCache(0))
@@ -68,8 +70,8 @@ def photos_of(path: Path, split: Literal["train", "test"], count: int) -> tuple[
     photos = [photo.float() / 255 if photo.dtype == torch.uint8 else photo.float() for photo in photos]
     height, width = photos[0].shape[:2]
     views = dataclasses.replace(
-        views_of_run(path, split),
-        viewmats=torch.cat([viewmats_of(camera.camera_to_worlds) for camera, _ in shown]),
+        dataset_views(path, split),
+        viewmats=torch.cat([viewmats_from_opengl(camera.camera_to_worlds) for camera, _ in shown]),
         Ks=torch.cat([camera.get_intrinsics_matrices() for camera, _ in shown]),
         width=width,
         height=height,
@@ -82,7 +84,7 @@ def compare(scene: Scene, made: Gaussians, lpips: Lpips | None) -> dict[str, flo
     """Mean metrics over the views, against the dense scene's renders (``dense_*``) and the photos (``photo_*``)."""
     values: dict[str, list[float]] = {}
     for i, render in enumerate(scene.renders):
-        image = draw(made, scene.views, i)
+        image = render(made, scene.views[i])
         targets = {"dense": render} | ({"photo": scene.photos[i]} if scene.photos else {})
         for against, target in targets.items():
             values.setdefault(f"{against}_psnr", []).append(min(float(psnr(image, target)), MOST_PSNR))

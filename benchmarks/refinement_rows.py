@@ -16,21 +16,22 @@ from typing import Any
 import torch
 from held_out import COLUMNS, REFERENCES, Scene, compare, load, photos_of
 
-from pointsplat_ns.auto_budget import Closeness, DenseReference
-from pointsplat_ns.compaction import COMPARED_SIDE, COMPARED_VIEWS
+from pointsplat_ns.compression.budget_search import Closeness, DenseReference
+from pointsplat_ns.compression.compact import as_far_as_it_helps, helps
+from pointsplat_ns.compression.fine_tune import fine_tune
+from pointsplat_ns.compression.prune import COMPARED_SIDE, COMPARED_VIEWS
+from pointsplat_ns.compression.refined_run import open_refined_run, prune_options
+from pointsplat_ns.compression.view_sampling import sample_views
 from pointsplat_ns.errors import DataError, PointSplatError
-from pointsplat_ns.fine_tune import fine_tune
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import open_run
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.lpips import Lpips
 from pointsplat_ns.metrics import psnr, ssim
-from pointsplat_ns.poses import sample_views
+from pointsplat_ns.metrics.lpips import Lpips
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning import compact
-from pointsplat_ns.refined_run import open_refined_run, prune_options
+from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner import Refiner, read_metadata
-from pointsplat_ns.shipped import as_far_as_it_helps, helps
-from pointsplat_ns.views import draw, views_of_run
 
 REFINER = "refiner.safetensors"
 """In the folder of every training that reached its end."""
@@ -221,7 +222,7 @@ class Judge:
         if photos:
             _, views, targets = photos_of(self.path, "train", steps)
         else:
-            views, targets = views_of_run(self.path, "train").spread(steps), self.scene.dense
+            views, targets = dataset_views(self.path, "train").spread(steps), self.scene.dense
         start = time.perf_counter()
         return fine_tune(scene, views, targets, steps), time.perf_counter() - start
 
@@ -263,7 +264,7 @@ class Judge:
             if duals:
                 trained = min(duals, key=lambda t: t.seed)
                 made.append((f"{start} + dual, seed {trained.seed}", selected.refined(trained)[0]))
-            panels += [(f"{name}, {len(g):,} Gaussians", draw(g, self.scene.views, index)) for name, g in made]
+            panels += [(f"{name}, {len(g):,} Gaussians", render(g, self.scene.views[index])) for name, g in made]
         captions = [panels[0][0]] + [f"{text}, {float(psnr(image, photo)):.1f} dB" for text, image in panels[1:]]
         _write_panels(path, f"{self.name}, {path.stem.rsplit('_', 1)[1]} % kept", captions, [i for _, i in panels])
 

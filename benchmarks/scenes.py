@@ -114,7 +114,7 @@ def _views_of(path: Path, views: Path | None) -> tuple[Tensor, float]:
 
 
 def _cameras_of(run) -> tuple[Tensor, float]:
-    from pointsplat_ns.data.scenes import dataparser_of
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import dataparser_of
 
     cameras = dataparser_of(run).get_dataparser_outputs(split="test").cameras
     to_world = torch.eye(4).repeat(len(cameras), 1, 1)

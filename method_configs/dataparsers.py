@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
-from pointsplat_ns.plugin import load_specification
+from pointsplat_ns.nerfstudio_plugin.registration import load_specification
 
 
 def _replica() -> DataParserSpecification:
-    from pointsplat_ns.data.replica import ReplicaDataParserConfig
+    from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
 
     return DataParserSpecification(
         config=ReplicaDataParserConfig(),

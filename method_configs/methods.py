@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from nerfstudio.plugins.types import MethodSpecification
 
-from pointsplat_ns.patches import errors_in_one_line
-from pointsplat_ns.plugin import load_specification
+from pointsplat_ns.nerfstudio_plugin.excepthook import errors_in_one_line
+from pointsplat_ns.nerfstudio_plugin.registration import load_specification
 
 
 def _splatfacto_cpu() -> MethodSpecification:
     from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
-    from pointsplat_ns.splatfacto_cpu_method import splatfacto_cpu_config
+    from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import splatfacto_cpu_config
 
     allow_splatfacto_checkpoints()
     errors_in_one_line()
@@ -24,7 +24,7 @@ splatfacto_cpu = load_specification("splatfacto-cpu", _splatfacto_cpu)
 
 
 def _pointsplat() -> MethodSpecification:
-    from pointsplat_ns.pointsplat_method import pointsplat_config
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
 
     return MethodSpecification(
         config=pointsplat_config(),

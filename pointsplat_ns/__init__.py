@@ -1,3 +1,89 @@
-"""pointsplat_ns: small, good 3D Gaussian Splatting scenes, with or without a GPU."""
+"""pointsplat_ns: small, good 3D Gaussian Splatting scenes, with or without a GPU.
+
+>>> import pointsplat_ns as ps
+>>> scene = ps.example_room()                  # or ps.load("room.ply"), a checkpoint, a run
+>>> small = ps.prune(scene, keep="10%")        # by="merge" is the default
+>>> refined = ps.refine(small, ps.load_refiner())
+>>> views = ps.sample_views(scene, 12)
+>>> image = ps.render(refined, views[0])       # [H, W, 3]
+>>> bool(ps.psnr(image, ps.render(scene, views[0])) > 15)
+True
+
+The names below are the whole public API. They are imported when they are first used: ``import pointsplat_ns`` costs
+nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from pointsplat_ns.api import compact, example_room, load, lpips, prune, refine
+    from pointsplat_ns.compression.compact import Compacted
+    from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
+    from pointsplat_ns.compression.view_sampling import sample_views
+    from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
+    from pointsplat_ns.gaussians import Gaussians
+    from pointsplat_ns.io.scene import save
+    from pointsplat_ns.metrics import psnr, ssim
+    from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+    from pointsplat_ns.rasterizer import rasterization, render
+    from pointsplat_ns.views import View, Views
+
+_PUBLIC = {
+    "pointsplat_ns.api": ("compact", "example_room", "load", "lpips", "prune", "refine"),
+    "pointsplat_ns.compression.compact": ("Compacted",),
+    "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner"),
+    "pointsplat_ns.compression.view_sampling": ("sample_views",),
+    "pointsplat_ns.errors": ("BudgetError", "DataError", "PointSplatError", "SceneError"),
+    "pointsplat_ns.gaussians": ("Gaussians",),
+    "pointsplat_ns.io.scene": ("save",),
+    "pointsplat_ns.metrics": ("psnr", "ssim"),
+    "pointsplat_ns.nerfstudio_plugin.dataset_views": ("dataset_views",),
+    "pointsplat_ns.rasterizer": ("rasterization", "render"),
+    "pointsplat_ns.views": ("View", "Views"),
+}
+"""Public names by the module that defines them."""
+
+_HOME = {name: module for module, names in _PUBLIC.items() for name in names}
+
+__all__ = [
+    "BudgetError",
+    "Compacted",
+    "DataError",
+    "Gaussians",
+    "PointSplatError",
+    "SceneError",
+    "TrainedRefiner",
+    "View",
+    "Views",
+    "compact",
+    "dataset_views",
+    "example_room",
+    "load",
+    "load_refiner",
+    "lpips",
+    "prune",
+    "psnr",
+    "rasterization",
+    "refine",
+    "render",
+    "sample_views",
+    "save",
+    "ssim",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,36 +1,66 @@
-"""Poses to look at a scene from, and the picture that a scene gives there. No photos are needed."""
+"""Pinhole cameras to look at a scene from."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Literal, overload
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.rasterizer import rasterization
+
+RasterizeMode = Literal["classic", "antialiased"]
+"""How a scene was trained to be drawn (nerfstudio's ``rasterize_mode``)."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One pinhole camera, and how a scene is drawn from it. An element of :class:`Views`.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> view = ps.sample_views(ps.example_room(), 2)[0]
+        >>> view.width, view.height, tuple(view.viewmat.shape)
+        (320, 240, (4, 4))
+    """
+
+    viewmat: Tensor  # [4, 4] world to camera, OpenCV axes, rigid
+    K: Tensor  # [3, 3] intrinsics, pixels
+    width: int
+    height: int
+    background: Tensor  # [3] in [0, 1]
+    rasterize_mode: RasterizeMode = "classic"
 
 
 @dataclass(frozen=True, eq=False)
 class Views:
     """C pinhole cameras of one image size, and how a scene is drawn from them.
 
+    ``views[0]`` and iteration give a :class:`View`; slices and lists of indices give :class:`Views`.
+
     Raises:
-        DataError: if a shape does not fit the others.
+        DataError: if a shape does not fit the others, or the image has no pixel.
+
+    Example:
+        >>> import torch
+        >>> import pointsplat_ns as ps
+        >>> K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
+        >>> views = ps.Views(torch.eye(4).repeat(3, 1, 1), K.repeat(3, 1, 1), 64, 48, torch.zeros(3))
+        >>> len(views), len(views[1:]), views[0].width
+        (3, 2, 64)
     """
 
     viewmats: Tensor  # [C, 4, 4] world to camera, OpenCV axes, rigid
-    Ks: Tensor  # [C, 3, 3] pixels
+    Ks: Tensor  # [C, 3, 3] intrinsics, pixels
     width: int
     height: int
     background: Tensor  # [3] in [0, 1]
-    rasterize_mode: Literal["classic", "antialiased"] = "classic"
+    rasterize_mode: RasterizeMode = "classic"
 
     def __post_init__(self) -> None:
-        count = self.viewmats.shape[0]
+        count = self.viewmats.shape[0] if self.viewmats.dim() else 0
         for name, shape in (("viewmats", (count, 4, 4)), ("Ks", (count, 3, 3)), ("background", (3,))):
             found = tuple(getattr(self, name).shape)
             if found != shape:
@@ -41,11 +71,19 @@ class Views:
     def __len__(self) -> int:
         return self.viewmats.shape[0]
 
-    def __getitem__(self, index) -> Views:
-        """Some of the views: a slice, or a list or tensor of indices."""
-        return Views(
-            self.viewmats[index], self.Ks[index], self.width, self.height, self.background, self.rasterize_mode
-        )
+    @overload
+    def __getitem__(self, index: int) -> View: ...
+    @overload
+    def __getitem__(self, index: slice | list[int] | Tensor) -> Views: ...
+
+    def __getitem__(self, index: Any) -> View | Views:
+        """One view by an integer; several by a slice, or a list or tensor of indices."""
+        viewmats, Ks = self.viewmats[index], self.Ks[index]
+        kind = View if viewmats.dim() == 2 else Views
+        return kind(viewmats, Ks, self.width, self.height, self.background, self.rasterize_mode)
+
+    def __iter__(self) -> Iterator[View]:
+        return (self[index] for index in range(len(self)))
 
     def spread(self, count: int) -> Views:
         """At most ``count`` of the views, evenly spread over their order."""
@@ -60,59 +98,4 @@ class Views:
             return self
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
         stretch = self.Ks.new_tensor([[width / self.width], [height / self.height], [1.0]])
-        return Views(self.viewmats, self.Ks * stretch, width, height, self.background, self.rasterize_mode)
-
-
-def draw(scene: Gaussians, views: Views, index: int) -> Tensor:
-    """The picture of a scene in one view, (H, W, 3) in [0, 1]. Differentiable."""
-    image, alpha, _ = rasterization(
-        means=scene.means,
-        quats=scene.quats,
-        scales=scene.stds,
-        opacities=scene.alphas,
-        colors=scene.sh,
-        viewmats=views.viewmats[index : index + 1].to(scene.means),
-        Ks=views.Ks[index : index + 1].to(scene.means),
-        width=views.width,
-        height=views.height,
-        sh_degree=scene.sh_degree,
-        rasterize_mode=views.rasterize_mode,
-    )
-    return (image[0] + (1 - alpha[0]) * views.background.to(image)).clamp(0, 1)
-
-
-def views_of_run(path: Path | str, split: Literal["train", "test"] = "train") -> Views:
-    """The poses of a Splatfacto run's dataset, in the frame and at the resolution that it was trained in.
-
-    Args:
-        path: the run's folder, ``config.yml`` or checkpoint.
-        split: which photos' poses.
-
-    Raises:
-        SceneError: if it is no run or its data is gone.
-        DataError: if the poses are not usable, or none is in that split.
-    """
-    import method_configs.methods  # noqa: F401  (completes nerfstudio's imports in the order that it can)
-    from pointsplat_ns.data.frames import FrameCache
-    from pointsplat_ns.data.scenes import TrainedScene
-    from pointsplat_ns.io.runs import open_run, scene_name
-    from pointsplat_ns.splatfacto_cpu import viewmats_of
-
-    run = open_run(path)
-    scene = TrainedScene(scene_name(run), run, FrameCache(0))
-    frames = scene.train_frames if split == "train" else scene.eval_frames
-    cameras = frames.dataset.cameras
-    if len(cameras) == 0:
-        raise DataError(f"{run.data}: no pose in the {split} split; expected at least one")
-    sizes = {(int(w), int(h)) for w, h in zip(cameras.width, cameras.height, strict=True)}
-    if len(sizes) > 1:
-        raise DataError(f"{run.data}: photos of {len(sizes)} sizes; expected one size for all views")
-    ((width, height),) = sizes
-    return Views(
-        viewmats_of(cameras.camera_to_worlds).detach().cpu(),
-        cameras.get_intrinsics_matrices().detach().cpu(),
-        width,
-        height,
-        scene.background,
-        scene.rasterize_mode,
-    )
+        return replace(self, Ks=self.Ks * stretch, width=width, height=height)

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import torch
 
+from making import SHARED_DATA
+
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 WALL_DISTANCE = 2.0
 DEPTH_SCALE = 6553.5
@@ -61,14 +63,14 @@ def wall_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 SEED = 20
-LPIPS_WEIGHTS = Path(__file__).resolve().parents[1] / "../shared/data/weights"
+LPIPS_WEIGHTS = SHARED_DATA / "weights"
 
 
 @pytest.fixture(scope="session")
 def wall_config() -> Callable:
     """A function (scene, output_dir, steps) that gives the config of a short splatfacto-cpu training."""
-    from pointsplat_ns.data.replica import ReplicaDataParserConfig
-    from pointsplat_ns.splatfacto_cpu_method import splatfacto_cpu_config
+    from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
+    from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import splatfacto_cpu_config
 
     def config_of(scene: Path, output_dir: Path, steps: int):
         config = splatfacto_cpu_config()
@@ -155,7 +157,7 @@ def some_lpips(request, monkeypatch) -> bool:
 def make_refined_run() -> Callable:
     """A function that writes a pointsplat run as nerfstudio saves it, whose network adds ``moved`` to every opacity
     logit and nothing else, and gives its folder."""
-    from pointsplat_ns.pointsplat_method import pointsplat_config
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
     from pointsplat_ns.refiner import Refiner, preset
 
     def make(folder: Path, data: Path, eval_scenes: tuple[str, ...] = (), moved: float = 0.0, **model) -> Path:

@@ -1,9 +1,17 @@
-"""The ``pointsplat`` command."""
+"""The ``pointsplat`` command: a thin layer over :mod:`pointsplat_ns`."""
 
 from __future__ import annotations
 
 import logging
 import sys
+
+
+class _Printed(logging.Handler):
+    """Prints what the package finds to the person: findings on standard output, warnings on standard error."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        warns = record.levelno >= logging.WARNING
+        print(self.format(record), file=sys.stderr if warns else sys.stdout)
 
 
 def main(args: list[str] | None = None) -> None:
@@ -12,17 +20,21 @@ def main(args: list[str] | None = None) -> None:
 
     from pointsplat_ns.cli.compact import compact
     from pointsplat_ns.cli.demo import demo
+    from pointsplat_ns.cli.export import export
     from pointsplat_ns.cli.make_refiner import make_refiner
-    from pointsplat_ns.cli.scenes import export, prune
-    from pointsplat_ns.cli.view import report, rooms
+    from pointsplat_ns.cli.prune import prune
+    from pointsplat_ns.cli.report import report
+    from pointsplat_ns.cli.rooms import rooms
     from pointsplat_ns.errors import PointSplatError
-    from pointsplat_ns.memory import keep_freed_memory
+    from pointsplat_ns.system.memory import keep_freed_memory
 
     keep_freed_memory()
-    logging.basicConfig(format="%(message)s", level=logging.INFO)
+    logger = logging.getLogger("pointsplat_ns")
+    logger.handlers, logger.propagate = [_Printed()], False
+    logger.setLevel(logging.INFO)
     commands = {
-        "compact": compact,
         "prune": prune,
+        "compact": compact,
         "export": export,
         "report": report,
         "rooms": rooms,

@@ -36,8 +36,8 @@ def demo(
         height: of a photo, pixels.
         fresh: start over.
     """
+    from pointsplat_ns.cli.report import read_evaluation, rooms, show_report
     from pointsplat_ns.cli.running import finished, run
-    from pointsplat_ns.cli.view import read_evaluation, rooms, show_report
 
     start = time.perf_counter()
     if fresh and output.exists():
@@ -93,7 +93,7 @@ def before_after(views: list[Path], scene: dict, path: Path, rows: int = 3) -> N
     from matplotlib.image import imread
     from numpy import array_split
 
-    from pointsplat_ns.cli.pictures import side_by_side
+    from pointsplat_ns.compression.pictures import side_by_side
 
     titles = ["photo, held out"]
     for variant in ("dense", "pruned", "refined"):

@@ -37,13 +37,19 @@ def make_refiner(
         workers: scenes trained side by side, on one thread each; by default as many as there are cores.
         seed: of the network's initial weights and of the order of scenes and views.
     """
+    from pointsplat_ns.cli.report import read_evaluation, show_report
     from pointsplat_ns.cli.running import finished, run
-    from pointsplat_ns.cli.view import read_evaluation, show_report
     from pointsplat_ns.errors import DataError
     from pointsplat_ns.io.files import replacing
-    from pointsplat_ns.pipeline import REFINER_NAME
-    from pointsplat_ns.recipe import KEEP, TRAIN_SEEDS, UNSEEN_SEEDS, card_text, refiner_command
-    from pointsplat_ns.refiner import load_refiner, save_refiner
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import REFINER_NAME
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.recipe import (
+        KEEP,
+        TRAIN_SEEDS,
+        UNSEEN_SEEDS,
+        card_text,
+        refiner_command,
+    )
+    from pointsplat_ns.refiner import read_refiner, save_refiner
 
     if rooms is not None and not 1 <= rooms <= len(TRAIN_SEEDS):
         raise DataError(f"--rooms {rooms}: expected 1 to {len(TRAIN_SEEDS)}")
@@ -68,10 +74,10 @@ def make_refiner(
     target = weights or output
     options = "" if rooms is None else f" --rooms {rooms}"
     made_by = f"pointsplat make-refiner --size {size} --steps {steps} --seed {seed}{options}"
-    about = {"command": made_by, "score": "merge", "keep": KEEP, "steps": steps}
+    about = {"command": made_by, "by": "merge", "keep": KEEP, "steps": steps}
     about["scenes"] = [f"room{s}" for s in seeds[: -len(UNSEEN_SEEDS)]]
     about["unseen"] = {variant: results["average_unseen"][variant] for variant in ("dense", "pruned", "refined")}
-    refiner = load_refiner(trained / REFINER_NAME)
+    refiner = read_refiner(trained / REFINER_NAME)
     save_refiner(refiner, target / REFINER_NAME, about)
     command = refiner_command(Path("scenes"), Path("refiners"), name, TIMESTAMP, size, steps, seed)
     card = card_text(about, results, command, sum(p.numel() for p in refiner.parameters()))
@@ -85,8 +91,8 @@ def make_refiner(
 def make_scenes(output: Path, seeds: tuple[int, ...], workers: int) -> None:
     """Rooms with photos, and a trained scene of each, ``workers`` at a time with one thread each."""
     from pointsplat_ns.cli.running import finished, run
-    from pointsplat_ns.data.rooms import write_room
-    from pointsplat_ns.recipe import scene_settings
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.recipe import scene_settings
+    from pointsplat_ns.rooms.room import write_room
 
     def make(seed: int) -> None:
         settings = scene_settings(seed)

@@ -7,7 +7,7 @@ Every reader returns a :class:`~pointsplat_ns.gaussians.Gaussians` and raises
 from pointsplat_ns.io.ply import read_ply, write_ply
 from pointsplat_ns.io.runs import Run, find_runs, open_run, scene_name, scene_names
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
-from pointsplat_ns.io.scene import read_scene, write_scene
+from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.io.splatfacto import read_checkpoint
 
 __all__ = [
@@ -21,5 +21,5 @@ __all__ = [
     "scene_name",
     "scene_names",
     "write_ply",
-    "write_scene",
+    "save",
 ]

@@ -42,7 +42,7 @@ def read_scene(path: Path | str) -> Gaussians:
     raise SceneError(f"{path}: a {kind or 'nameless'} file; expected {ACCEPTED}")
 
 
-def write_scene(scene: Gaussians, path: Path | str) -> None:
+def save(scene: Gaussians, path: Path | str) -> None:
     """Write a scene in the format that the name asks for; today a 3DGS PLY.
 
     Raises:

@@ -47,7 +47,7 @@ def ply_bytes(count: int, sh_degree: int) -> int:
     return sum(len(line) + 1 for line in lines) + 4 * len(names) * count
 
 
-def resolve_keep(n: int, keep: Keep, sh_degree: int = 3) -> int:
+def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3) -> int:
     """The number of Gaussians that a budget means for a scene of ``n``.
 
     The type decides: a float is a ratio and an int is a count, so ``1.0`` keeps everything and ``1``
@@ -56,7 +56,8 @@ def resolve_keep(n: int, keep: Keep, sh_degree: int = 3) -> int:
 
     Args:
         n: number of Gaussians in the scene.
-        keep: float ratio in (0, 1], int count in 1..n, or :class:`Megabytes`.
+        keep: float ratio in (0, 1], int count in 1..n, :class:`Megabytes`, or any of them as :func:`parse_keep` reads
+            it.
         sh_degree: of the scene that will be written; it matters to a size alone.
 
     Returns:
@@ -67,11 +68,13 @@ def resolve_keep(n: int, keep: Keep, sh_degree: int = 3) -> int:
             (:class:`WithinPsnr`), or if the scene is empty.
 
     Example:
-        >>> resolve_keep(1000, 0.3), resolve_keep(1000, 1), resolve_keep(1000, 1.0)
-        (300, 1, 1000)
+        >>> resolve_keep(1000, 0.3), resolve_keep(1000, 1), resolve_keep(1000, 1.0), resolve_keep(1000, "25%")
+        (300, 1, 1000, 250)
         >>> resolve_keep(1000, Megabytes(0.1), sh_degree=0)
         1000
     """
+    if isinstance(keep, str):
+        keep = parse_keep(keep)
     if isinstance(keep, WithinPsnr):
         raise BudgetError("keep is auto, which is found by rendering; expected a ratio, a count or a size here")
     if isinstance(keep, Megabytes):

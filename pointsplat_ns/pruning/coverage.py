@@ -14,8 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pointsplat_ns.bits import interleave, spread_bits
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.morton import interleave, spread_bits
 from pointsplat_ns.pruning.scores import log_area
 
 RUN = 12

@@ -2,5 +2,6 @@
 
 from pointsplat_ns.rasterizer.reference import rasterize_reference
 from pointsplat_ns.rasterizer.rendering import rasterization
+from pointsplat_ns.rasterizer.scene import render
 
-__all__ = ["rasterization", "rasterize_reference"]
+__all__ = ["rasterization", "rasterize_reference", "render"]

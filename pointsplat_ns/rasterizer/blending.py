@@ -2,7 +2,7 @@
 
 Tiles of similar length are blended together in blocks that fit the cache, CHUNK Gaussians at a time
 (more where few tiles are left); tiles whose every pixel is saturated are dropped in between. What is
-evaluated per pixel, and how gradients are summed, stands in :mod:`~pointsplat_ns.rasterizer.pairs`.
+evaluated per pixel, and how gradients are summed, stands in :mod:`~pointsplat_ns.rasterizer.quadratics`.
 
 Shapes: P pairs, B tiles of a block, S Gaussians of a chunk, 64 = TILE * TILE pixels, D channels.
 """
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer.compiled import SMALLEST, Kernels, kernels
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, CHUNK, EXACT, TILE, Quality
-from pointsplat_ns.rasterizer.pairs import (
+from pointsplat_ns.rasterizer.quadratics import (
     MOMENTS,
     PIXELS,
     Pairs,

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, CHUNK, TILE
-from pointsplat_ns.rasterizer.pairs import COLOR, QUADRATIC
+from pointsplat_ns.rasterizer.quadratics import COLOR, QUADRATIC
 
 SMALLEST = 8
 """Tiles below which the eager kernels, which take longer chunks, are the faster ones."""

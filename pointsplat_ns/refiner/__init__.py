@@ -3,7 +3,7 @@
 from pointsplat_ns.refiner.config import PRESETS, RefinerConfig, RefinerConfigError, preset
 from pointsplat_ns.refiner.refiner import Refiner
 from pointsplat_ns.refiner.structure import Structure
-from pointsplat_ns.refiner.weights import WeightsError, load_refiner, read_metadata, save_refiner
+from pointsplat_ns.refiner.weights import WeightsError, read_metadata, read_refiner, save_refiner
 
 __all__ = [
     "PRESETS",
@@ -12,8 +12,8 @@ __all__ = [
     "RefinerConfigError",
     "Structure",
     "WeightsError",
-    "load_refiner",
     "preset",
     "read_metadata",
+    "read_refiner",
     "save_refiner",
 ]

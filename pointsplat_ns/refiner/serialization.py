@@ -13,7 +13,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from pointsplat_ns.bits import interleave, spread_bits
+from pointsplat_ns.geometry.morton import interleave, spread_bits
 
 LEVELS_AT_ONCE = 4
 """Halvings that one look-up takes along the Hilbert curve: its table is 48 x 8^4 numbers, which a cache holds."""

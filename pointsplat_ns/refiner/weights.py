@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.io.files import replacing
 from pointsplat_ns.refiner.config import RefinerConfig, RefinerConfigError
 from pointsplat_ns.refiner.refiner import Refiner
 
 FORMAT = "pointsplat-refiner/1"
+
+PRETRAINED = Path(__file__).parent / "pretrained" / "refiner.safetensors"
+"""The refiner that ships; ``CARD.md`` beside it says what it was trained on and what it reaches."""
 
 
 class WeightsError(PointSplatError):
@@ -30,23 +33,17 @@ def save_refiner(refiner: Refiner, path: str | Path, metadata: dict[str, Any] | 
     """
     from safetensors.torch import save_file
 
-    path = Path(path)
     header = {
         "format": FORMAT,
         "config": json.dumps(refiner.config.to_dict()),
         "metadata": json.dumps(metadata or {}),
     }
     state = {name: value.detach().cpu().contiguous() for name, value in refiner.state_dict().items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        save_file(state, beside, metadata=header)
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+    with replacing(path) as part:
+        save_file(state, part, metadata=header)
 
 
-def load_refiner(path: str | Path, device: torch.device | str = "cpu") -> Refiner:
+def read_refiner(path: str | Path, device: torch.device | str = "cpu") -> Refiner:
     """The refiner of a file, in evaluation mode.
 
     Raises:

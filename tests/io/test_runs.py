@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io import find_runs, open_run, read_scene, scene_name, scene_names, write_scene
+from pointsplat_ns.io import find_runs, open_run, read_scene, save, scene_name, scene_names
 from pointsplat_ns.io.inert_yaml import Tagged
 
 
@@ -215,7 +215,7 @@ def test_scene_names_fit_for_files(make_run, experiment, name):
 def test_every_kind_of_path_reads_the_same_scene(make_run, make_scene, tmp_path):
     scene = make_scene(6, 2)
     folder = make_run(scene=scene)
-    write_scene(scene, tmp_path / "deep" / "er" / "scene.PLY")
+    save(scene, tmp_path / "deep" / "er" / "scene.PLY")
     paths = [folder, folder / "config.yml", open_run(folder).checkpoint, tmp_path / "deep" / "er" / "scene.PLY"]
     for path in paths:
         for found, expected in zip(read_scene(path).tensors(), scene.tensors(), strict=True):
@@ -228,5 +228,5 @@ def test_anything_else_is_refused_with_what_is_accepted(make_scene, tmp_path):
     fails(lambda: read_scene(tmp_path / "scene.splat"), tmp_path / "scene.splat", "a .splat file", accepted)
     fails(lambda: read_scene(tmp_path), "a folder without config.yml", accepted)
     fails(lambda: read_scene(tmp_path / "none.ply"), "no such file", accepted)
-    fails(lambda: write_scene(make_scene(), tmp_path / "a.spz"), "cannot write a .spz file")
+    fails(lambda: save(make_scene(), tmp_path / "a.spz"), "cannot write a .spz file")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.splat"]

@@ -10,6 +10,11 @@ import torch
 
 from pointsplat_ns.gaussians import Gaussians
 
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+SHARED_DATA = REPOSITORY.parent / "shared" / "data"
+"""Real captures, splats and weights that tests read in place; they skip where it is absent."""
+
 
 def same(a: Gaussians, b: Gaussians) -> bool:
     """Whether two scenes are equal to the bit."""
@@ -44,7 +49,7 @@ def ball(
 
 def small_config(data: Path, output_dir: Path, steps: int, **model):
     """The method as registered, at a size for tests; no LPIPS in the loss, so that nothing is downloaded."""
-    from pointsplat_ns.pointsplat_method import pointsplat_config
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
 
     config = pointsplat_config()
     config.machine.device_type = "cpu"

@@ -1,0 +1,261 @@
+"""The public functions that put the parts together. ``import pointsplat_ns as ps`` gives them all.
+
+The command line is a thin layer over these: what it can do, one call here can do.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Literal
+
+from torch import Tensor
+
+from pointsplat_ns.compression.compact import Compacted, compact_scene
+from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.trained_refiner import (
+    METHOD,
+    TrainedRefiner,
+    load_refiner,
+    open_refiner_run,
+    scenes_of_run,
+)
+from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.runs import open_run
+from pointsplat_ns.io.scene import read_scene
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.pruning import Keep
+from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.views import Views
+
+logger = logging.getLogger("pointsplat_ns")
+
+Source = Gaussians | str | Path
+"""A scene, or where to read it."""
+
+EXAMPLE = Path(__file__).parent / "examples" / "room.ply"
+"""The scene that ships."""
+
+
+def load(path: str | Path, scene: str | None = None) -> Gaussians:
+    """Read a scene.
+
+    Args:
+        path: a 3DGS ``.ply``, a Splatfacto ``.ckpt``, a Splatfacto run (its folder or ``config.yml``), or a
+            ``pointsplat`` run, whose dense scene is then pruned and refined as it was in the training.
+        scene: which scene of a ``pointsplat`` run; by default the first that it was not trained on, or the first.
+
+    Returns:
+        The scene, float32 on the CPU. Log-scales and logits are kept as the file has them.
+
+    Raises:
+        SceneError: if it is none of these, damaged, or has no such scene.
+
+    Example:
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ps.save(ps.example_room()[:100], f"{folder}/some.ply")
+        ...     len(ps.load(f"{folder}/some.ply"))
+        100
+    """
+    if not _is_refiner_run(path):
+        if scene is not None:
+            raise SceneError(f"scene {scene!r}: {path} holds one scene; leave the name out")
+        return read_scene(path)
+    scenes, shown = scenes_of_run(open_refiner_run(path, need_data=True))
+    chosen = scene or shown
+    if chosen not in scenes:
+        raise SceneError(f"scene {chosen!r}: no such scene in {path}; there are {', '.join(scenes)}")
+    refiner = load_refiner(path)
+    return refine(refiner.settings.prune(read_scene(scenes[chosen])), refiner)
+
+
+def example_room() -> Gaussians:
+    """A small scene to try things on: one of the built-in rooms, trained from 70 of its photos.
+
+    Returns:
+        The scene, float32 on the CPU, in metres with z up.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> ps.example_room().sh_degree
+        1
+    """
+    return read_scene(EXAMPLE)
+
+
+def prune(
+    scene: Source,
+    keep: Keep | str = 0.3,
+    by: str = "merge",
+    *,
+    sh: str = "all",
+    opacity_weight: float | None = None,
+    fine_tune: int = 0,
+    views: Views | str | Path | None = None,
+    progress: bool | Progress = False,
+) -> Gaussians:
+    """Make a scene smaller: merge neighbours, or keep the Gaussians that matter, from the scene alone.
+
+    What was found on the way (SH bands dropped, PSNR reached, where views came from) is logged at level INFO.
+
+    Args:
+        scene: N Gaussians, or the file or run to read them from.
+        keep: how much: a ratio (0.3, "30%"), a count (50000), the size of a PLY ("12MB"), or "auto:35", the smallest
+            scene whose renders reach 35 dB PSNR against those of the given one ("auto" alone means 35).
+        by: the method. "merge" replaces neighbours by one Gaussian each; the others keep Gaussians bit for bit:
+            "coverage", "paper" (eq. 3), "authors", "opacity", "volume", "log-volume", "area", "random", and
+            "lightgaussian" and "pup", which look at the scene from ``views``.
+        sh: SH bands to keep: "all", up to a degree ("0" to "3"), or "auto", those without which renders stay within
+            40 dB.
+        opacity_weight: lambda of "paper", "authors" and "log-volume", in [0, 1]; by default the paper's 0.3.
+        fine_tune: steps of optimising what was kept against the given scene's own renders.
+        views: where to look from, if anything has to be rendered: views, or the run whose dataset has the poses. By
+            default those of the run that ``scene`` names, or poses sampled in free space.
+        progress: True shows a bar; a function is called with what is being done and the share done of it.
+
+    Returns:
+        Exactly as many Gaussians as ``keep`` means, on the device of the given ones.
+
+    Raises:
+        BudgetError: if no such scene can be made.
+        SceneError: if no Gaussian can be drawn, or the file is not usable.
+        DataError: if views are needed and cannot be had.
+        PointSplatError: if there is no such method, or an option does not fit it.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> room = ps.example_room()
+        >>> len(ps.prune(room, keep=1000)), len(ps.prune(room, keep="10%", by="coverage")) / len(room)
+        (1000, 0.1)
+    """
+    dense, source = _read(scene, views)
+    with progress_bar(progress) as report:
+        made = prune_scene(dense, keep, by, sh, opacity_weight, source, fine_tune, report)
+    _log(made.notes)
+    return made.scene
+
+
+def refine(scene: Gaussians, refiner: TrainedRefiner | None = None) -> Gaussians:
+    """Repair a pruned scene by one forward pass of a trained network.
+
+    The network was trained on scenes pruned as ``refiner.settings`` says, and knows no other kind; :func:`compact`
+    checks whether it helps.
+
+    Args:
+        scene: K Gaussians.
+        refiner: from :func:`load_refiner`; by default the one that ships.
+
+    Returns:
+        K Gaussians on the device of the given ones.
+
+    Raises:
+        SceneError: if the SH degree exceeds the network's.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> small = ps.prune(ps.example_room(), keep="10%")
+        >>> len(ps.refine(small, ps.load_refiner())) == len(small)
+        True
+    """
+    return (refiner or load_refiner())(scene)
+
+
+def compact(
+    scene: Source,
+    keep: Keep | str | None = None,
+    refiner: TrainedRefiner | None = None,
+    *,
+    by: str | None = None,
+    sh: str = "all",
+    views: Views | str | Path | None = None,
+    progress: bool | Progress = False,
+) -> Compacted:
+    """Make a scene smaller, repair it with a trained refiner, and check by rendering how far that helps.
+
+    Args:
+        scene: N Gaussians, or the file or run to read them from.
+        keep: how much, as for :func:`prune`; an "auto" PSNR is met before refinement. By default what the refiner was
+            trained with.
+        refiner: from :func:`load_refiner`; by default the one that ships.
+        by: the method, as for :func:`prune`; by default the one that the refiner was trained with.
+        sh: SH bands to keep, as for :func:`prune`.
+        views: where renders are compared, as for :func:`prune`; at most 12 are taken.
+        progress: True shows a bar; a function is called with what is being done and the share done of it.
+
+    Returns:
+        ``.scene``, ``.accepted`` (whether refinement is in it), ``.psnr`` (dB against the given scene's renders),
+        ``.seconds``, ``.verdict`` (all of that in a line), and more: see :class:`Compacted`.
+
+    Raises:
+        BudgetError: if no such scene can be made.
+        SceneError: if no Gaussian can be drawn, the file is not usable, or the SH degree exceeds the refiner's.
+        DataError: if the budget or ``sh`` needs views and none can be had.
+        PointSplatError: if there is no such method.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> result = ps.compact(ps.example_room(), keep="20%")
+        >>> result.psnr > 20, result.seconds > 0
+        (True, True)
+    """
+    dense, source = _read(scene, views)
+    refiner = refiner or load_refiner()
+    with progress_bar(progress) as report:
+        result = compact_scene(dense, refiner, keep, by, sh, source, report)
+    _log((result.verdict, *result.notes))
+    return result
+
+
+def lpips(pred: Tensor, target: Tensor, net: Literal["alex", "vgg"] = "alex") -> Tensor:
+    """LPIPS, the perceptual distance of images (Zhang et al. 2018).
+
+    The backbone's weights are downloaded by torchvision when they are first needed, or taken from the folder or file
+    that the environment variable ``POINTSPLAT_LPIPS_WEIGHTS`` names.
+
+    Args:
+        pred: (H, W, 3) or (B, H, W, 3), in [0, 1]; at least 31 pixels a side for "alex", 16 for "vgg".
+        target: the same shape.
+        net: "alex" is what most papers report, "vgg" what most losses use.
+
+    Returns:
+        A scalar, or (B,); 0 for identical images. Differentiable.
+
+    Raises:
+        LpipsUnavailable: if the weights cannot be had; the text says why.
+        ImageError: if the images cannot be compared.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> room = ps.example_room()
+        >>> image = ps.render(room, ps.sample_views(room, 1)[0])
+        >>> float(ps.lpips(image, image))  # doctest: +SKIP
+        0.0
+    """
+    from pointsplat_ns.metrics.lpips import cached_lpips
+
+    return cached_lpips(net, pred.device)(pred, target)
+
+
+def _read(scene: Source, views: Views | str | Path | None) -> tuple[Gaussians, ViewSource]:
+    """The Gaussians, and where they are looked at from."""
+    dense = scene if isinstance(scene, Gaussians) else load(scene)
+    if isinstance(views, Views):
+        return dense, ViewSource(dense, given=views)
+    run = views if views is not None else None if isinstance(scene, Gaussians) else scene
+    return dense, ViewSource(dense, run=run, dataset_views=dataset_views)
+
+
+def _is_refiner_run(path: str | Path) -> bool:
+    try:
+        return Path(path).suffix.lower() != ".ply" and open_run(path, need_data=False).method_name == METHOD
+    except SceneError:
+        return False  # a scene that stands alone, or nothing that can be read: who reads it says which
+
+
+def _log(lines: tuple[str, ...]) -> None:
+    for line in lines:
+        logger.info("%s", line)

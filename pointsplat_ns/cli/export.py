@@ -1,0 +1,35 @@
+"""``pointsplat export``: the scene of a run as a file."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from pointsplat_ns.cli.scene_options import check_outputs
+
+
+def export(
+    run: tyro.conf.Positional[Path],
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    scene: str | None = None,
+    force: bool = False,
+) -> None:
+    """Write the refined scene of a pointsplat run, or the trained one of a Splatfacto run, as a 3DGS .ply.
+
+    Args:
+        run: the run's folder, config.yml or checkpoint.
+        output: the .ply to write.
+        scene: which scene of a pointsplat run; by default the first that it was not trained on, or the first.
+        force: overwrite what is there.
+    """
+    import pointsplat_ns as ps
+
+    check_outputs(output, force)
+    start = time.perf_counter()
+    exported = ps.load(run, scene)
+    ps.save(exported, output)
+    size = output.stat().st_size / 1e6
+    print(f"{output}: {len(exported):,} Gaussians, {size:.2f} MB, in {time.perf_counter() - start:.1f} s")

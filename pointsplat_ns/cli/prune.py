@@ -1,0 +1,68 @@
+"""``pointsplat prune``: make a scene smaller."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from pointsplat_ns.cli.scene_options import (
+    Bands,
+    Output,
+    Scene,
+    check_outputs,
+    output_beside,
+    say_written,
+    show_distributions,
+)
+
+
+def prune(
+    scene: Scene,
+    output: Output = None,
+    keep: str = "0.3",
+    by: str = "merge",
+    opacity_weight: float | None = None,
+    sh: Bands = "all",
+    fine_tune: int = 0,
+    plot: Path | None = None,
+    dry_run: bool = False,
+    force: bool = False,
+) -> None:
+    """Make a scene smaller: keep the Gaussians that matter, or merge them, from the scene alone.
+
+    Poses, where something has to be rendered, are those of the run's dataset where it is at hand; a bare .ply is looked
+    at from free places within it.
+
+    Args:
+        scene: a 3DGS .ply, a Splatfacto checkpoint, or a run (its folder or config.yml).
+        output: the .ply to write; by default beside the scene, room.ply to room_pruned.ply.
+        keep: how much: a ratio (0.3), a percentage (30%), a count (50000), the size of the file (12MB), or auto:35, the
+            smallest scene whose renders reach 35 dB PSNR against those of the dense scene (auto alone means 35).
+        by: merge replaces neighbours by one Gaussian each and is by far the best; every other method keeps Gaussians as
+            they are: coverage (empties no region), paper (eq. 3), authors (the formula of its released code), opacity,
+            volume, log-volume, area, random; lightgaussian and pup look at the scene from poses.
+        opacity_weight: lambda of paper, authors and log-volume: the weight of opacity; by default the paper's 0.3.
+        sh: SH bands to keep: all, up to a degree, or auto, those without which renders stay within 40 dB.
+        fine_tune: steps of optimising what was kept against the dense scene's own renders.
+        plot: a .png to draw the distributions of opacity and volume in, before and after.
+        dry_run: find and say everything, but write no scene.
+        force: overwrite what is there.
+    """
+    import pointsplat_ns as ps
+    from pointsplat_ns.compression.distributions import plot_distributions
+
+    output = output or output_beside(scene, "pruned")
+    check_outputs(output, force or dry_run, plot)
+    dense = ps.load(scene)
+    start = time.perf_counter()
+    small = ps.prune(
+        dense, keep, by, sh=sh, opacity_weight=opacity_weight, fine_tune=fine_tune, views=scene, progress=True
+    )
+    seconds = time.perf_counter() - start
+    if not dry_run:
+        ps.save(small, output)
+    say_written("kept", len(dense), small, seconds, None if dry_run else output)
+    show_distributions(dense, small)
+    if plot is not None:
+        plot_distributions({"before": dense, "after": small}, plot)
+        print(f"{plot}: opacity and volume, before and after")

@@ -1,0 +1,30 @@
+"""``pointsplat rooms``: data to try things on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+def rooms(
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    seeds: tuple[int, ...] = (0, 1, 2),
+    frames: int = 80,
+    width: int = 320,
+    height: int = 240,
+) -> None:
+    """Make furnished rooms with photos, depth images and poses, in the Replica layout.
+
+    Args:
+        output: folder to make the scenes room0, room1... in, named by their seeds.
+        seeds: one room each; the same seed is the same room.
+        frames: photos a room.
+        width: of a photo, pixels.
+        height: of a photo, pixels.
+    """
+    from pointsplat_ns.rooms.room import write_room
+
+    for seed in seeds:
+        print(write_room(output / f"room{seed}", seed, frames, width, height))

@@ -1,0 +1,88 @@
+"""How close the renders of a smaller scene come to the dense scene's own. No photos are needed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.metrics import SSIM_WINDOW, ssim
+from pointsplat_ns.rasterizer import render
+from pointsplat_ns.views import Views
+
+
+@dataclass(frozen=True)
+class Closeness:
+    """How close a scene's renders come to those of the dense scene."""
+
+    errors: tuple[float, ...]
+    """Mean squared error of each view."""
+    ssim: float | None
+    """Mean over views; None where views are smaller than SSIM's window."""
+
+    @property
+    def error(self) -> float:
+        """Mean squared error over all pixels of all views."""
+        return sum(self.errors) / len(self.errors)
+
+    @property
+    def psnr(self) -> float:
+        """Over all pixels of all views, dB; inf where nothing differs."""
+        return _psnr(self.error)
+
+    @property
+    def worst(self) -> float:
+        """Of the worst view, dB."""
+        return _psnr(max(self.errors))
+
+
+class DenseReference:
+    """Renders of the dense scene, and how close another scene comes to them.
+
+    Args:
+        dense: the scene that is its own reference.
+        views: where to look from.
+    """
+
+    @torch.no_grad()
+    def __init__(self, dense: Gaussians, views: Views):
+        self.views = views
+        self.renders: list[Tensor] = [render(dense, view) for view in views]
+
+    @torch.no_grad()
+    def errors(self, scene: Gaussians) -> list[float]:
+        """Mean squared error of each view."""
+        return [_error(render(scene, self.views[index]), wanted) for index, wanted in enumerate(self.renders)]
+
+    @torch.no_grad()
+    def closeness(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> Closeness:
+        """Errors and SSIM of a scene; ``progress`` is called with the share of the views done."""
+        large_enough = min(self.views.width, self.views.height) >= SSIM_WINDOW
+        errors, similarities = [], []
+        for index, wanted in enumerate(self.renders):
+            drawn = render(scene, self.views[index])
+            errors.append(_error(drawn, wanted))
+            if large_enough:
+                similarities.append(float(ssim(drawn, wanted)))
+            if progress is not None:
+                progress((index + 1) / len(self.renders))
+        return Closeness(tuple(errors), sum(similarities) / len(similarities) if similarities else None)
+
+    def psnr(self, scene: Gaussians) -> tuple[float, float]:
+        """PSNR over all pixels of all views, and of the worst view, dB."""
+        close = Closeness(tuple(self.errors(scene)), None)
+        return close.psnr, close.worst
+
+
+def _error(drawn: Tensor, wanted: Tensor) -> float:
+    """Mean squared error, float64."""
+    return float((drawn.double() - wanted.double()).square().mean())
+
+
+def _psnr(mse: float) -> float:
+    """Of a mean squared error, dB: inf for none, NaN for NaN."""
+    return math.inf if mse == 0 else -10 * math.log10(mse) if mse > 0 else math.nan

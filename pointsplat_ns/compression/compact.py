@@ -1,0 +1,237 @@
+"""Prune, refine, check: a scene is made smaller and refined as far as that brings it closer to what it was."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import torch
+
+from pointsplat_ns.compression.closeness import Closeness, DenseReference
+from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.trained_refiner import TrainedRefiner
+from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.pruning import Keep, need_usable
+from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.views import Views
+
+WORTH = 0.1
+"""Refinement that brings less than this, dB, is left out: which side of zero so little is on depends on the views."""
+
+
+@dataclass(frozen=True, eq=False)
+class Compacted:
+    """A smaller scene, and whether refining it helped. What :func:`pointsplat_ns.compact` gives.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> result = ps.compact(ps.example_room(), keep="20%")
+        >>> result.scene is (result.refined if result.accepted else result.pruned)
+        True
+    """
+
+    scene: Gaussians
+    """``refined`` if that was accepted, ``pruned`` if not."""
+    pruned: Gaussians
+    """Before refinement."""
+    refined: Gaussians
+    """After it, at ``strength``."""
+    strength: float
+    """The share of the refiner's residuals in ``refined``, in (0, 1]: the best that was found, 1 if none helps."""
+    accepted: bool
+    """Whether refinement is in ``scene``."""
+    verdict: str
+    """One line for a person: what refinement brought, or why it was left out."""
+    notes: tuple[str, ...]
+    """Lines for a person: SH bands dropped, PSNR reached, where views came from."""
+    reference: DenseReference | None
+    """The dense scene's renders that both were compared with; None where there is no view to compare in."""
+    before: Closeness | None
+    """How close ``pruned`` comes to them."""
+    after: Closeness | None
+    """How close ``refined`` comes to them; None where it was not compared."""
+    seconds: float
+    """What all of it took."""
+
+    @property
+    def psnr(self) -> float | None:
+        """Of ``scene`` against the dense scene's renders, over all pixels of all views, dB; None where nothing was
+        compared."""
+        close = self.after if self.accepted else self.before
+        return None if close is None else close.psnr
+
+    @property
+    def views(self) -> Views | None:
+        """Where renders were compared."""
+        return None if self.reference is None else self.reference.views
+
+
+def compact_scene(
+    dense: Gaussians,
+    refiner: TrainedRefiner,
+    keep: Keep | str | None = None,
+    by: str | None = None,
+    sh: str = "all",
+    views: ViewSource | None = None,
+    progress: Progress = silent,
+) -> Compacted:
+    """Make a scene smaller and refine it, if that helps.
+
+    The smaller scene and the refined one are rendered from some poses and compared with the dense scene's own renders
+    by the mean squared error over all pixels of all views. On a scene unlike those that it was trained on, a refiner
+    moves the right way but too far: half of the residuals are tried, too, and the share at the bottom of the parabola
+    through the errors at 0, 1/2 and 1, which is where the least error is if pictures change in proportion. The best is
+    kept if it is :data:`WORTH` it. A wanted PSNR (``auto``) is met before refinement, so that it holds in any case.
+
+    Args:
+        dense: N Gaussians.
+        refiner: on the device that it is to run and its scenes are to be rendered on.
+        keep: ratio, count, size or PSNR; by default what the refiner was trained with.
+        by: a method of :data:`~pointsplat_ns.pruning.METHODS`; by default the one that the refiner was trained with.
+        sh: as for :func:`~pointsplat_ns.compression.prune.prune_scene`.
+        views: where to look from; by default poses sampled in free space.
+        progress: called with what is being done and the share done of it, in [0, 1].
+
+    Raises:
+        BudgetError, SceneError, PointSplatError: as :func:`~pointsplat_ns.compression.prune.prune_scene`.
+        SceneError: if the SH degree exceeds the refiner's.
+        DataError: if the budget or ``sh`` needs views and none can be had.
+    """
+    start = time.perf_counter()
+    views = views or ViewSource(dense)
+    need_usable(dense)
+    _need_sh_degree(dense, sh, refiner)
+    settings = refiner.settings
+    by = settings.by if by is None else by
+    weight = settings.opacity_weight if by == settings.by else None
+    made = prune_scene(dense, settings.keep if keep is None else keep, by, sh, weight, views, progress=progress)
+    progress("refining", 0.0)
+    pruned, refined = made.scene, refiner(made.scene)
+    strength, reference, before, after = 1.0, None, None, None
+    unsound = int((pruned.usable() & ~refined.usable()).sum())
+    verdict = ""
+    try:
+        progress("comparing renders", 0.0)
+        reference = DenseReference(dense.to(refiner.device), views.compared())
+        before = reference.closeness(pruned.to(refiner.device))
+    except DataError as error:
+        verdict = f"refinement left out: it cannot be compared with the dense scene ({error})"
+    if unsound:
+        verdict = f"refinement left out: {unsound:,} of {len(refined):,} refined Gaussians are not finite"
+    elif reference is not None and before is not None:
+        refined, strength, after = as_far_as_it_helps(reference, before, pruned, refined, progress)
+        verdict = _verdict(before, after, strength)
+    accepted = before is not None and after is not None and helps(before, after)
+    notes = (*made.notes, views.origin) if views.origin and views.origin not in made.notes else made.notes
+    scene, seconds = refined if accepted else pruned, time.perf_counter() - start
+    return Compacted(scene, pruned, refined, strength, accepted, verdict, notes, reference, before, after, seconds)
+
+
+def _need_sh_degree(dense: Gaussians, sh: str, refiner: TrainedRefiner) -> None:
+    """Refuse, before anything takes long, a scene whose SH the refiner cannot read."""
+    limit = refiner.network.config.sh_degree
+    if dense.sh_degree > limit and (sh == "all" or (sh.isdigit() and int(sh) > limit)):
+        raise SceneError(
+            f"the scene has SH degree {dense.sh_degree}; the refiner {refiner.source} was built for at most {limit}; "
+            f"cut it with --sh {limit}"
+        )
+
+
+def at_strength(before: Gaussians, after: Gaussians, strength: float) -> Gaussians:
+    """The scene that is ``strength``, in [0, 1], of the way from one to another, in the parameters as they are stored;
+    a parameter that is infinite in one of them stays as in ``before``."""
+    if strength == 1:
+        return after
+    mixed = (a.lerp(b, strength) for a, b in zip(before.tensors(), after.tensors(), strict=True))
+    values = zip(before.items(), mixed, strict=True)
+    return Gaussians(**{name: torch.where(value.isfinite(), value, a) for (name, a), value in values})
+
+
+def as_far_as_it_helps(
+    reference: DenseReference,
+    before: Closeness,
+    pruned: Gaussians,
+    refined: Gaussians,
+    progress: Progress = silent,
+) -> tuple[Gaussians, float, Closeness]:
+    """The scene at the best share of a refiner's residuals, that share and how close it comes; at full strength if
+    none helps.
+
+    Args:
+        reference: the dense scene's renders.
+        before: how close ``pruned`` comes to them.
+        pruned, refined: before and after refinement.
+        progress: called with what is being done and the share done of it, in [0, 1].
+    """
+    device = reference.renders[0].device
+    tried = _try_strengths(reference, before, pruned.to(device), refined.to(device), progress)
+    best = min(tried, key=lambda share: tried[share].error)
+    strength = best if helps(before, tried[best]) else 1.0
+    return at_strength(pruned, refined, strength), strength, tried[strength]
+
+
+def _try_strengths(
+    reference: DenseReference, before: Closeness, pruned: Gaussians, refined: Gaussians, progress: Progress
+) -> dict[float, Closeness]:
+    """Closeness by strength; that of 1 is always there."""
+    tried: dict[float, Closeness] = {}
+
+    def attempt(strength: float) -> None:
+        done = len(tried)
+        tried[strength] = reference.closeness(
+            at_strength(pruned, refined, strength), lambda share: progress("comparing renders", (done + share) / 3)
+        )
+
+    attempt(1.0)
+    if tried[1.0].errors != before.errors:
+        attempt(0.5)
+        bottom = bottom_of_parabola(before.error, tried[0.5].error, tried[1.0].error)
+        if 0.05 < bottom < 0.95 and abs(bottom - 0.5) > 0.05:  # nearer ones differ by next to nothing
+            attempt(bottom)
+    progress("comparing renders", 1.0)
+    return tried
+
+
+def bottom_of_parabola(at_zero: float, at_half: float, at_one: float) -> float:
+    """Where in [0, 1] the parabola through three values is least; NaN if a value is not finite.
+
+    Example:
+        >>> round(bottom_of_parabola(0.3**2, 0.2**2, 0.7**2), 6)
+        0.3
+    """
+    if not all(map(math.isfinite, (at_zero, at_half, at_one))):
+        return math.nan
+    bend = 2 * ((at_one - at_half) - (at_half - at_zero))
+    slope = (at_one - at_zero) - bend
+    if bend <= 0 or -slope >= 2 * bend:
+        return 1.0 if at_one < at_zero else 0.0
+    return max(0.0, -slope / (2 * bend))
+
+
+def helps(before: Closeness, after: Closeness) -> bool:
+    """Whether refinement is worth keeping, see :data:`WORTH`."""
+    return after.psnr >= before.psnr + WORTH and math.isfinite(before.psnr)
+
+
+def _verdict(before: Closeness, after: Closeness, strength: float) -> str:
+    """What refinement brought, as a line for a person."""
+    count = len(before.errors)
+    better = sum(new < old for new, old in zip(after.errors, before.errors, strict=True))
+    figures = f"{before.psnr:.2f} -> {after.psnr:.2f} dB against the dense scene's renders in {_views(count)}"
+    if before.ssim is not None and after.ssim is not None:
+        figures += f", SSIM {before.ssim:.3f} -> {after.ssim:.3f}"
+    figures += f", worst view {before.worst:.2f} -> {after.worst:.2f} dB, closer in {better} of {count}"
+    if helps(before, after):
+        share = "" if strength == 1 else f" at {strength:.0%} of its strength"
+        return f"refinement{share}: {figures}"
+    if after.errors == before.errors:
+        return f"refinement left out: it changes nothing, {before.psnr:.2f} dB in {_views(count)}"
+    why = "it does not help" if after.psnr <= before.psnr else f"it brings less than {WORTH:g} dB"
+    return f"refinement left out, {why}: {figures}"
+
+
+def _views(count: int) -> str:
+    return f"{count} view{'s' if count != 1 else ''}"

@@ -1,0 +1,83 @@
+"""Pictures of scenes side by side, with captions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from pointsplat_ns.compression.closeness import Closeness
+from pointsplat_ns.compression.compact import Compacted
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import replacing
+from pointsplat_ns.pruning import ply_bytes
+from pointsplat_ns.rasterizer import render
+
+SHOWN_VIEWS = 3
+"""Views in the picture, spread over those compared."""
+
+
+@torch.no_grad()
+def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> str:
+    """Draw some of the views compared: dense, before and after refinement, side by side.
+
+    Args:
+        dense: the scene that ``result`` was made of.
+        result: of :func:`pointsplat_ns.compact`.
+        path: the PNG to write.
+
+    Returns:
+        A line that says what the picture shows, or why there is none.
+
+    Raises:
+        SceneError: if it cannot be written.
+    """
+    if result.reference is None:
+        return f"{path}: not drawn, as there is no view to draw"
+    views, renders = result.reference.views, result.reference.renders
+    shown = torch.linspace(0, len(views) - 1, min(SHOWN_VIEWS, len(views))).round().int().tolist()
+    names, scenes = ["dense", "before refinement"], [result.pruned]
+    titles = [_title("dense", dense, None), _title("before refinement", result.pruned, result.before)]
+    if result.after is not None:
+        share = "" if result.strength == 1 else f" at {result.strength:.0%}"
+        names.append(f"refined{share}" if result.accepted else "refined (left out)")
+        titles.append(_title(names[-1], result.refined, result.after))
+        scenes.append(result.refined)
+    rows = [[renders[i].cpu(), *(render(scene, views[i]).cpu() for scene in scenes)] for i in shown]
+    side_by_side(rows, titles, path)
+    return f"{path}: {', '.join(names)}, side by side"
+
+
+def _title(name: str, scene: Gaussians, close: Closeness | None) -> str:
+    size = f"{len(scene):,} Gaussians, {ply_bytes(len(scene), scene.sh_degree) / 1e6:.2f} MB"
+    return f"{name}: {size}" + (f", {close.psnr:.2f} dB" if close is not None else "")
+
+
+def side_by_side(rows: list[list[ArrayLike]], titles: list[str], path: Path | str) -> None:
+    """Draw a grid of images of one size, a title above each column.
+
+    Args:
+        rows: images (H, W, 3) in [0, 1], as many in each row as there are titles.
+        titles: of the columns.
+        path: the PNG to write.
+
+    Raises:
+        SceneError: if it cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    height, width = np.shape(rows[0][0])[:2]
+    panel = 16 / max(len(titles), 3)  # inches across
+    size = (panel * len(titles), panel * len(rows) * height / width + 0.4)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(len(rows), len(titles), squeeze=False)
+    for row, images in zip(axes, rows, strict=True):
+        for axis, image in zip(row, images, strict=True):
+            axis.imshow(np.asarray(image))
+            axis.set_axis_off()
+    for axis, title in zip(axes[0], titles, strict=True):
+        axis.set_title(title, fontsize=11)
+    with replacing(path) as part:
+        figure.savefig(part, dpi=100, format="png")

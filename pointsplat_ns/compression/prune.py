@@ -1,0 +1,150 @@
+"""From what a person asks of a smaller scene to that scene: SH bands, then the count, by any method, then fine-tuning.
+
+Views are asked for only where they are needed: by a budget in dB, ``auto`` SH, a method that looks at the scene, or
+fine-tuning.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pointsplat_ns.compression.budget_search import SH_PSNR, needed_sh_degree, smallest_within
+from pointsplat_ns.compression.fine_tune import fine_tune
+from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.pruning import (
+    Keep,
+    WithinPsnr,
+    cut_sh,
+    energy_lost,
+    method_named,
+    need_usable,
+    parse_keep,
+    prune,
+    resolve_keep,
+    score_of,
+    select,
+)
+from pointsplat_ns.pruning.methods import check_opacity_weight
+from pointsplat_ns.system.progress import Progress, silent
+
+SCORED_VIEWS = 40
+"""Views that a method that looks at the scene, or fine-tuning, uses at most; the datasets here have up to 2,000."""
+
+SH_CHOICES = ("all", "auto", "0", "1", "2", "3")
+"""What may be asked of the SH bands."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pruned:
+    """A smaller scene and what was found on the way."""
+
+    scene: Gaussians
+    notes: tuple[str, ...]
+    """Lines for a person: SH bands dropped, PSNR reached, where views came from."""
+
+
+def prune_scene(
+    dense: Gaussians,
+    keep: Keep | str,
+    by: str = "merge",
+    sh: str = "all",
+    opacity_weight: float | None = None,
+    views: ViewSource | None = None,
+    fine_tune_steps: int = 0,
+    progress: Progress = silent,
+) -> Pruned:
+    """Make a scene smaller.
+
+    Args:
+        dense: N Gaussians.
+        keep: ratio, count, size, or the PSNR that renders must reach against those of ``dense``.
+        by: one of :data:`~pointsplat_ns.pruning.METHODS`.
+        sh: "all" keeps the SH bands, a digit cuts them to that degree, "auto" to the lowest degree whose renders
+            reach :data:`~pointsplat_ns.compression.budget_search.SH_PSNR` against those of ``dense``.
+        opacity_weight: lambda of the methods that weigh opacity; by default the paper's.
+        views: where to look from; by default poses sampled in free space.
+        fine_tune_steps: steps of optimising what was kept against the dense scene's own renders.
+        progress: called with what is being done and the share done of it, in [0, 1].
+
+    Raises:
+        BudgetError: if no such scene can be made.
+        SceneError: if no Gaussian of the scene can be drawn.
+        DataError: if views are needed and cannot be had.
+        PointSplatError: if there is no such method, or an option does not fit it.
+    """
+    keep = check_request(len(dense), keep, by, sh, opacity_weight, fine_tune_steps)
+    need_usable(dense)
+    views = views or ViewSource(dense)
+    notes: list[str] = []
+    full = _with_sh(dense, sh, views, progress, notes)
+    report = functools.partial(progress, f"by {by}")
+    if isinstance(keep, WithinPsnr):
+        make = _pruner(full, by, views, opacity_weight)
+        compared = views.compared()
+        found = smallest_within(dense, make, compared, keep.value, functools.partial(progress, "trying counts"))
+        scene = found.scene
+        notes.append(
+            f"renders reach {found.psnr:.1f} dB against the dense scene's, {found.worst:.1f} dB in the worst of "
+            f"{len(compared)} views; {len(found.tried)} counts tried"
+        )
+    else:
+        looks = functools.partial(views.views, SCORED_VIEWS)
+        scene = prune(full, keep, by, looks, opacity_weight, report)
+    if fine_tune_steps:
+        looks = views.views(SCORED_VIEWS)
+        scene = fine_tune(scene, looks, dense, fine_tune_steps, progress=functools.partial(progress, "fine-tuning"))
+        notes.append(f"fine-tuned {fine_tune_steps} steps against the dense scene's renders in {len(looks)} views")
+    return Pruned(scene, (*notes, views.origin) if views.origin else tuple(notes))
+
+
+def check_request(
+    count: int, keep: Keep | str, by: str, sh: str, opacity_weight: float | None, fine_tune_steps: int = 0
+) -> Keep:
+    """Refuse, before anything takes long, what cannot be done with a scene of ``count`` Gaussians; gives the budget.
+
+    Raises:
+        BudgetError, PointSplatError: as :func:`prune_scene`.
+    """
+    check_opacity_weight(method_named(by), opacity_weight)
+    if sh not in SH_CHOICES:
+        raise PointSplatError(f"sh is {sh!r}; expected all, auto or a degree from 0 to 3")
+    if fine_tune_steps < 0:
+        raise PointSplatError(f"{fine_tune_steps} steps of fine-tuning; expected 0 for none, or more")
+    keep = parse_keep(keep) if isinstance(keep, str) else keep
+    if not isinstance(keep, WithinPsnr):
+        resolve_keep(count, keep)
+    return keep
+
+
+def _pruner(scene: Gaussians, by: str, views: ViewSource, opacity_weight: float | None) -> Callable[[int], Gaussians]:
+    """From counts to scenes of as many; a method that has scores computes them once."""
+    method = method_named(by)
+    if method.score is None:
+        return lambda count: prune(scene, count, by)
+    scores = score_of(scene, method, functools.partial(views.views, SCORED_VIEWS), opacity_weight)
+    return lambda count: scene[select(scores, count)]
+
+
+def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress, notes: list[str]) -> Gaussians:
+    """The scene with the SH bands that are asked for."""
+    if sh == "all":
+        return dense
+    reached = ""
+    if sh == "auto":
+        progress("comparing SH degrees", 0.0)
+        degree, psnr = needed_sh_degree(dense, views.compared(), SH_PSNR)
+        if math.isfinite(psnr):
+            reached = f"; renders reach {psnr:.1f} dB against all bands"
+    else:
+        degree = int(sh)
+    if degree >= dense.sh_degree:
+        notes.append(f"SH degree {dense.sh_degree} kept, no band dropped")
+        return dense
+    lost = 100 * energy_lost(dense, degree)
+    notes.append(f"SH degree {dense.sh_degree} cut to {degree}: {lost:.0f} % of the directional energy lost{reached}")
+    return cut_sh(dense, degree)

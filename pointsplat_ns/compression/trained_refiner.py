@@ -1,0 +1,184 @@
+"""A refiner and the kind of scene that it was trained to see: the one that ships, a file of weights, or a run.
+
+Everything is opened without nerfstudio and without running a run's ``config.yml``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.discovery import find_runs_and_plys
+from pointsplat_ns.io.files import one_line
+from pointsplat_ns.io.runs import Run, open_run, shown_scene
+from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
+from pointsplat_ns.pruning import PruneSettings, method_named
+from pointsplat_ns.refiner import Refiner, WeightsError, preset, read_metadata, read_refiner
+from pointsplat_ns.refiner.weights import PRETRAINED
+
+METHOD = "pointsplat"
+"""nerfstudio's name of the method that trains refiners."""
+
+DEFAULTS = {"keep": 0.1, "by": "merge"}
+"""How a file of weights that does not say was trained."""
+
+_PREFIX = "_model.refiner."
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedRefiner:
+    """A network that repairs scenes, and how the scenes that it was trained on were pruned.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> refiner = ps.load_refiner()
+        >>> refiner.settings.by, refiner.settings.keep
+        ('merge', 0.1)
+    """
+
+    network: Refiner
+    settings: PruneSettings
+    source: Path
+
+    @torch.no_grad()
+    def __call__(self, scene: Gaussians) -> Gaussians:
+        """The refined scene, on the device of the given one.
+
+        Raises:
+            SceneError: if the SH degree exceeds the network's.
+        """
+        return self.network(scene.to(self.device)).to(scene.device)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the network is."""
+        return next(self.network.parameters()).device
+
+
+def load_refiner(path: Path | str | None = None, device: torch.device | str | None = None) -> TrainedRefiner:
+    """Load a trained refiner.
+
+    Args:
+        path: a ``.safetensors`` file, or a ``pointsplat`` run (its folder, ``config.yml`` or checkpoint); by default
+            the refiner that ships (``pointsplat_ns/refiner/pretrained/CARD.md`` says what it was trained on).
+        device: where it is to run; by default on CUDA where there is some, else on the CPU.
+
+    Raises:
+        WeightsError: if the file is missing, damaged or of another kind.
+        SceneError: if it is no such run.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> refiner = ps.load_refiner()
+        >>> len(refiner(ps.prune(ps.example_room(), keep=1000)))
+        1000
+    """
+    if device is None:
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    if path is None and not PRETRAINED.is_file():
+        raise WeightsError(
+            f"{PRETRAINED}: the refiner that ships is not there; name another (--refiner RUN_OR_FILE), or make it with "
+            "pointsplat make-refiner"
+        )
+    path = PRETRAINED if path is None else Path(path)
+    kind = path.suffix.lower()
+    if kind == ".safetensors":
+        network, settings = read_refiner(path), _settings_of_file(path)
+    elif path.is_file() and kind not in (".yml", ".yaml", ".ckpt"):
+        raise WeightsError(
+            f"{path}: a {kind or 'nameless'} file; expected a trained pointsplat run (its folder or config.yml), or a "
+            ".safetensors file"
+        )
+    else:
+        network, settings = _read_run(open_refiner_run(path, need_data=False))
+    return TrainedRefiner(network.to(device).eval(), settings, path)
+
+
+def open_refiner_run(path: Path | str, need_data: bool) -> Run:
+    """The ``pointsplat`` run at a path.
+
+    Raises:
+        SceneError: if it is another kind of run, or is damaged.
+    """
+    run = open_run(path, need_data)
+    if run.method_name != METHOD:
+        raise SceneError(f"{path}: a run of the method {run.method_name or 'unknown'}; expected a {METHOD} run")
+    return run
+
+
+def scenes_of_run(run: Run) -> tuple[dict[str, Path], str]:
+    """The checkpoints and PLY files of the dense scenes that a ``pointsplat`` run was trained on, by the names that the
+    training gave them; and which of them is the run's own to viewers and exporters.
+
+    Args:
+        run: opened with its data.
+
+    Raises:
+        SceneError: if there are none any more.
+    """
+    runs, plys, nothing = find_runs_and_plys(run.data, run.datamanager_fields.get("supervision", "auto"))
+    scenes = {name: found.checkpoint for name, found in runs.items()} | plys
+    if not scenes:
+        raise SceneError(f"{run.config_path}: {nothing or f'{run.data}: no Gaussians in it'}; put its scenes back")
+    return scenes, shown_scene(list(scenes), run.datamanager_fields.get("eval_scenes") or ())
+
+
+def settings_from(saved: Mapping[str, Any]) -> PruneSettings:
+    """How scenes were pruned, as a run's model settings or a file's metadata have it. ``by`` was once called ``score``,
+    and a weight was once saved with methods that have none.
+
+    Raises:
+        KeyError: if a setting is missing.
+        PointSplatError, TypeError, ValueError: if one is not usable.
+    """
+    by = saved["by"] if "by" in saved else saved["score"]
+    weight = saved.get("opacity_weight")
+    weighed = weight is not None and method_named(by).weighs_opacity
+    return PruneSettings(float(saved["keep"]), by, float(weight) if weighed else None)
+
+
+def network_options(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Changes to a size's preset that a model's settings ask for. A run from before a setting has its default.
+
+    Raises:
+        KeyError: if the encoder is not named.
+    """
+    defaults = {"use_appearance": True, "use_position": True, "norm": "scene"}
+    return {"encoder": settings["encoder"], **{name: settings.get(name, value) for name, value in defaults.items()}}
+
+
+def _read_run(run: Run) -> tuple[Refiner, PruneSettings]:
+    """The network of a ``pointsplat`` run's checkpoint, and its settings."""
+    try:
+        network = Refiner(preset(run.model_fields["size"], **network_options(run.model_fields)))
+        settings = settings_from(run.model_fields)
+        allow_splatfacto_checkpoints()  # for the numbers in the schedulers' state
+        state = torch.load(run.checkpoint, map_location="cpu", weights_only=True, mmap=True)["pipeline"]
+        network.load_state_dict({k[len(_PREFIX) :]: v for k, v in state.items() if k.startswith(_PREFIX)})
+    except KeyError as error:
+        raise SceneError(f"{run.config_path}: lacks {error}; expected a {METHOD} run of this version") from error
+    except PointSplatError as error:
+        raise SceneError(f"{run.config_path}: {error}") from error
+    except Exception as error:  # a damaged archive can raise nearly anything
+        text = " ".join(str(error).split())[:160]
+        raise SceneError(f"{run.checkpoint}: not a usable {METHOD} checkpoint ({text})") from error
+    return network, settings
+
+
+def _settings_of_file(path: Path) -> PruneSettings:
+    """How scenes were pruned, as the metadata of a file of weights has it."""
+    metadata = read_metadata(path)
+    if "score" in metadata:  # as files of version 1 call it
+        metadata = {"by": metadata["score"], **metadata}
+    try:
+        return settings_from({**DEFAULTS, **metadata})
+    except (PointSplatError, KeyError, TypeError, ValueError) as error:
+        raise WeightsError(
+            f"{path}: metadata not understood ({one_line(error)}); train or download it again"
+        ) from error

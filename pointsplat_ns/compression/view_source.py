@@ -1,0 +1,78 @@
+"""Where a scene is looked at from: views that are given, the poses of its dataset, or poses sampled in free space."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+
+from pointsplat_ns.compression.view_sampling import sample_views
+from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.runs import open_run
+from pointsplat_ns.views import RasterizeMode, Views
+
+COMPARED_VIEWS, COMPARED_SIDE = 12, 400
+"""Views that renders are compared in, and their longer side in pixels: every comparison costs so many renders."""
+
+
+class ViewSource:
+    """Views of a scene, found when they are first asked for: a budget in Gaussians needs none.
+
+    Args:
+        scene: what is looked at.
+        given: views to take; nothing else is then looked for.
+        run: the file or folder that the scene was read from. If that is a run whose data is at hand, its poses serve.
+        dataset_views: reads the poses of a run's dataset.
+    """
+
+    def __init__(
+        self,
+        scene: Gaussians,
+        given: Views | None = None,
+        run: Path | str | None = None,
+        dataset_views: Callable[[Path | str], Views] | None = None,
+    ):
+        self._scene, self._given, self._run, self._dataset_views = scene, given, run, dataset_views
+        self.origin = ""
+        """Where views came from, in words, once there are some."""
+        self._missing = ""
+        self._rasterize_mode: RasterizeMode = "classic"
+
+    @cached_property
+    def _of_dataset(self) -> Views | None:
+        if self._run is None or self._dataset_views is None or Path(self._run).suffix.lower() == ".ply":
+            return None
+        try:
+            self._rasterize_mode = open_run(self._run, need_data=False).rasterize_mode
+        except SceneError:
+            return None  # a checkpoint that stands alone
+        try:
+            return self._dataset_views(self._run)
+        except (SceneError, DataError) as error:
+            self._missing = f" (no dataset: {error})"
+            return None
+
+    def views(self, count: int) -> Views:
+        """At most ``count`` of the given views or of the dataset's training poses, or ``count`` sampled ones; drawn as
+        the run rendered.
+
+        Raises:
+            DataError: if there are none, and no free place to look from.
+        """
+        if self._given is not None:
+            if len(self._given) == 0:
+                raise DataError("no view to look from; expected at least one")
+            self.origin = "given views"
+            return self._given.spread(count)
+        if self._of_dataset is not None:
+            self.origin = "poses of the dataset"
+            return self._of_dataset.spread(count)
+        views = sample_views(self._scene, count)
+        self.origin = f"poses sampled in free space{self._missing}"
+        return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
+
+    def compared(self) -> Views:
+        """The views that renders are compared in: few and small, as every comparison draws all of them."""
+        return self.views(COMPARED_VIEWS).resized(COMPARED_SIDE)

@@ -1,0 +1,1 @@
+"""Rotations, camera axes and space-filling curves: what several parts compute with and none of them owns."""

@@ -1,0 +1,98 @@
+"""Image metrics: PSNR and SSIM (LPIPS, which needs weights, is in :mod:`pointsplat_ns.metrics.lpips`).
+
+Images are (H, W, 3) or (B, H, W, 3), in [0, 1]; values are taken as they are, not clamped. Each metric
+gives a scalar for one image and (B,) for a batch, one value an image, so that averaging is the
+caller's choice.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import PointSplatError
+
+SSIM_WINDOW = 11
+"""Side of SSIM's Gaussian window in pixels; its sigma is 1.5 (Wang et al. 2004)."""
+
+
+class ImageError(PointSplatError, ValueError):
+    """Images that cannot be compared."""
+
+
+def as_nchw(pred: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Both images as (B, 3, H, W), B = 1 for single ones.
+
+    Raises:
+        ImageError: if their shapes differ, are not (H, W, 3) or (B, H, W, 3), or hold no pixel, or if
+            a type is not floating-point.
+    """
+    for name, image in (("pred", pred), ("target", target)):
+        if image.dim() not in (3, 4) or image.shape[-1] != 3 or image.numel() == 0:
+            raise ImageError(f"{name} has shape {tuple(image.shape)}; expected (H, W, 3) or (B, H, W, 3)")
+        if not image.is_floating_point():
+            raise ImageError(f"{name} is {image.dtype}; expected a floating-point image in [0, 1]")
+    if pred.shape != target.shape:
+        raise ImageError(f"pred has shape {tuple(pred.shape)} but target {tuple(target.shape)}; expected the same")
+    single = pred.dim() == 3
+    return tuple((x[None] if single else x).permute(0, 3, 1, 2) for x in (pred, target))  # type: ignore[return-value]
+
+
+def per_image(values: Tensor, like: Tensor) -> Tensor:
+    """``values`` (B,) as a scalar where ``like`` is a single image."""
+    return values[0] if like.dim() == 3 else values
+
+
+def psnr(pred: Tensor, target: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio in dB, ``-10 log10(mean squared error)``, data range 1.
+
+    Identical images give ``inf``, which JSON cannot hold: a writer makes it null.
+
+    Args:
+        pred: (H, W, 3) or (B, H, W, 3), in [0, 1].
+        target: the same shape.
+
+    Returns:
+        A scalar, or (B,).
+
+    Raises:
+        ImageError: if the images cannot be compared.
+
+    Example:
+        >>> round(float(psnr(torch.full((4, 4, 3), 0.6), torch.full((4, 4, 3), 0.5))), 3)
+        20.0
+    """
+    a, b = as_nchw(pred, target)
+    return per_image(-10 * torch.log10((a - b).square().mean(dim=(1, 2, 3))), pred)
+
+
+def ssim(pred: Tensor, target: Tensor) -> Tensor:
+    """Structural similarity (Wang et al. 2004), data range 1.
+
+    11 x 11 Gaussian window of sigma 1.5, population moments, averaged over the channels and over the
+    pixels whose whole window lies inside the image, as in the original publication. This is what
+    pytorch-msssim computes, so what Splatfacto reports. Others fill in the border and average over it
+    too: torchmetrics by reflection, the original 3DGS code with zeros. Their values
+    differ a little and should not be compared with these.
+
+    Args:
+        pred: (H, W, 3) or (B, H, W, 3), in [0, 1], at least 11 pixels a side.
+        target: the same shape.
+
+    Returns:
+        A scalar, or (B,), in [-1, 1]; 1 for identical images. Differentiable.
+
+    Raises:
+        ImageError: if the images cannot be compared or are smaller than the window.
+    """
+    import kornia.metrics
+
+    a, b = as_nchw(pred, target)
+    if min(a.shape[2:]) < SSIM_WINDOW:
+        raise ImageError(
+            f"images of {a.shape[3]} x {a.shape[2]} pixels are smaller than SSIM's window; "
+            f"expected at least {SSIM_WINDOW} x {SSIM_WINDOW}"
+        )
+    # eps=0: the two constants of the definition keep the denominator positive by themselves.
+    values = kornia.metrics.ssim(a.contiguous(), b.contiguous(), SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid")
+    return per_image(values.mean(dim=(1, 2, 3)), pred)

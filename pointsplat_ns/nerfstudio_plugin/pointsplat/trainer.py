@@ -1,0 +1,193 @@
+"""nerfstudio's trainer, for one network over many scenes and perhaps several processes."""
+
+from __future__ import annotations
+
+import functools
+from collections import Counter, defaultdict
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor, nn
+
+from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.nerfstudio_plugin.pointsplat import distributed
+from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import average_gradients
+from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainer
+
+ALL = "all"
+"""Stands for every part of the network in ``gradient_accumulation_steps``."""
+
+
+class AveragingOptimizers(Optimizers):
+    """nerfstudio's optimisers, which step along the mean of the gradients over accumulated steps and processes.
+
+    nerfstudio adds gradients up; their norm, and what clipping makes of it, would then depend on how many there are.
+
+    Args:
+        config, param_groups: as nerfstudio's.
+        counted: steps whose gradients have gathered, by group; the trainer keeps it up to date.
+    """
+
+    def __init__(self, config: dict[str, Any], param_groups: dict[str, list[nn.Parameter]], counted: Mapping[str, int]):
+        super().__init__(config, param_groups)
+        self._counted = counted
+
+    def optimizer_scaler_step_some(self, grad_scaler, param_groups: list[str]) -> None:
+        """As nerfstudio's, with averaged gradients."""
+        for group in param_groups:
+            average_gradients(self.parameters[group], self._counted[group])
+        super().optimizer_scaler_step_some(grad_scaler, param_groups)
+
+
+class PointSplatTrainer(SplatfactoCpuTrainer):
+    """nerfstudio's trainer, with averaged gradients, which leaves out steps that are not finite.
+
+    A step at which a loss or a gradient is NaN or infinite, in any process, changes neither parameters nor the
+    optimisers' state nor running statistics, in all processes alike: with synchronised batch norm one process's NaN is
+    every process's. It is logged with its scene and counted, and left out of the mean of accumulated gradients. The
+    learning-rate schedule goes on: it counts the steps of the run.
+
+    A checkpoint between two updates holds what has gathered.
+    """
+
+    pipeline: PointSplatPipeline
+
+    def __init__(self, config, local_rank: int = 0, world_size: int = 1) -> None:
+        super().__init__(config, local_rank, world_size)
+        steps = self.config.gradient_accumulation_steps
+        self.gradient_accumulation_steps = defaultdict(lambda: steps.get(ALL, 1), steps)
+
+    def setup_optimizers(self) -> AveragingOptimizers:
+        """The optimisers.
+
+        Raises:
+            PointSplatError: if gradients are to gather over no step, or in a part that the network does not have, or
+                the steps that may be skipped are fewer than none.
+        """
+        groups = self.pipeline.get_param_groups()
+        for name, steps in self.config.gradient_accumulation_steps.items():
+            if name not in (*groups, ALL) or steps < 1:
+                raise PointSplatError(
+                    f"--gradient-accumulation-steps {name} {steps}: expected {ALL} or one of {', '.join(groups)}, and "
+                    "at least 1"
+                )
+        if self.config.max_skipped_steps < 0:
+            raise PointSplatError(f"--max-skipped-steps {self.config.max_skipped_steps}: expected at least 0")
+        return AveragingOptimizers(self.config.optimizers.copy(), groups, self.pipeline.counted)
+
+    def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
+        """As nerfstudio's, but for steps that are not finite.
+
+        With a gradient scaler (``--mixed-precision``) a gradient that overflows is the scaler's to deal with.
+
+        Raises:
+            SceneError: if more than ``max_skipped_steps`` have been skipped; a checkpoint is saved first.
+        """
+        pipeline, counted = self.pipeline, self.pipeline.counted
+        statistics = [(buffer, buffer.clone()) for buffer in pipeline.model.refiner.buffers()]
+        gathered = self._set_gradients_aside(step)
+        device_type = self.device.split(":")[0]
+        with torch.autocast(device_type="cpu" if device_type == "mps" else device_type, enabled=self.mixed_precision):
+            _, losses, metrics = pipeline.get_train_loss_dict(step=step)
+            loss = functools.reduce(torch.add, losses.values())
+        faults = pipeline.faults
+        skip = distributed.any_rank(bool(faults), self.device)
+        if not skip:
+            self.grad_scaler.scale(loss).backward()
+            faults = [] if self.grad_scaler.is_enabled() else self._faults_of_gradients()
+            skip = distributed.any_rank(bool(faults), self.device)
+        if skip:
+            self._forget(statistics)
+            self._count(step, pipeline.datamanager.scenes[metrics["scene"]].name, faults)
+        _add_gradients(gathered)
+        for name in self.optimizers.parameters:
+            counted[name] += not skip
+        self._update(step)
+        metrics["skipped_steps"] = pipeline.skipped.total()
+        if self.config.log_gradients:
+            norms = {n: p.grad.norm() for n, p in pipeline.model.named_parameters() if p.grad is not None}
+            metrics |= {f"Gradients/{name}": norm for name, norm in norms.items()}
+            metrics["Gradients/Total"] = sum(norms.values())
+        if skip and pipeline.skipped.total() > self.config.max_skipped_steps:
+            self._stop(step)
+        return loss, losses, metrics
+
+    def _set_gradients_aside(self, step: int) -> list[tuple[nn.Parameter, Tensor]]:
+        """What earlier steps have gathered for the coming update; the network is left without gradients."""
+        gathered = []
+        for name, parameters in self.optimizers.parameters.items():
+            before = step % self.gradient_accumulation_steps[name]
+            held = [(p, p.grad) for p in parameters if p.grad is not None] if before else []
+            if before == 0:
+                self.pipeline.counted[name] = 0
+            self.pipeline.counted.setdefault(name, before if held else 0)  # a checkpoint of an earlier version
+            gathered += held
+        self.optimizers.zero_grad_all()
+        return gathered
+
+    def _faults_of_gradients(self) -> list[str]:
+        """The parts of the network that have a gradient which is not finite, in words."""
+        faults = []
+        for name, parameters in self.optimizers.parameters.items():
+            largest = [p.grad.abs().amax() for p in parameters if p.grad is not None]
+            if largest and not torch.stack(largest).isfinite().all():
+                faults.append(f"the gradient of the {name} is not finite")
+        return faults
+
+    @torch.no_grad()
+    def _forget(self, statistics: list[tuple[Tensor, Tensor]]) -> None:
+        """Undo what a step has done so far."""
+        self.optimizers.zero_grad_all()
+        for buffer, before in statistics:
+            buffer.copy_(before)
+
+    def _count(self, step: int, scene: str, faults: list[str]) -> None:
+        """Count and log the scenes, of all processes, at which a step is left out."""
+        found = distributed.gathered([(scene, "; ".join(faults))] if faults else [])
+        for name, text in found:
+            self.pipeline.skipped[name] += 1
+            if distributed.rank() == 0:
+                total, most = self.pipeline.skipped.total(), self.config.max_skipped_steps
+                CONSOLE.log(f"step {step} is skipped: {name}: {text} ({total} skipped so far; more than {most} stop)")
+
+    def _update(self, step: int) -> None:
+        """Step the optimisers that are due, and the schedules."""
+        every, counted = self.gradient_accumulation_steps, self.pipeline.counted
+        due = [name for name in self.optimizers.parameters if (step + 1) % every[name] == 0 and counted[name]]
+        scale = self.grad_scaler.get_scale()
+        if due:
+            self.optimizers.optimizer_scaler_step_some(self.grad_scaler, due)
+            self.grad_scaler.update()
+        if scale <= self.grad_scaler.get_scale():  # as nerfstudio: not where the scaler left the update out
+            self.optimizers.scheduler_step_all(step)
+
+    def _stop(self, step: int) -> None:
+        """Save a checkpoint and say why training ends."""
+        self.save_checkpoint(step)
+        skipped: Counter[str] = self.pipeline.skipped
+        scenes = ", ".join(f"{name}: {count}" for name, count in skipped.most_common())
+        raise SceneError(
+            f"training stopped at step {step}: losses or gradients were not finite in {skipped.total()} steps, "
+            f"which were skipped ({scenes}); mend these scenes and their photos or leave them out, or, if most scenes "
+            "are named, lower the learning rates; then go on with --load-dir "
+            f"{self.checkpoint_dir} and a higher --max-skipped-steps than {self.config.max_skipped_steps}"
+        )
+
+    def save_checkpoint(self, step: int) -> None:
+        """As nerfstudio's; called in all processes, written by the first."""
+        parts = self.optimizers.parameters
+        waiting = [name for name in parts if (step + 1) % self.gradient_accumulation_steps[name]]
+        for name in waiting:
+            average_gradients(parts[name])  # over processes: what they have gathered becomes one
+        with self.pipeline.saving_gradients(waiting):
+            super().save_checkpoint(step)
+
+
+@torch.no_grad()
+def _add_gradients(gathered: list[tuple[nn.Parameter, Tensor]]) -> None:
+    for parameter, gradient in gathered:
+        parameter.grad = gradient if parameter.grad is None else parameter.grad.add_(gradient)

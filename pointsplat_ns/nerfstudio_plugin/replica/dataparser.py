@@ -1,0 +1,193 @@
+"""nerfstudio dataparser for the NICE-SLAM Replica layout (``replica-data``)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.nerfstudio_plugin.replica.layout import ReplicaScene, load_replica
+
+
+@dataclass
+class ReplicaDataParserConfig(DataParserConfig):
+    """Posed photos, with or without depth images, in the layout that NICE-SLAM gave to Replica"""
+
+    _target: type = field(default_factory=lambda: ReplicaDataParser)
+    """target class to instantiate"""
+    data: Path = Path("data/replica/office0")
+    """Scene folder, with traj.txt and results/; cam_params.json in it or in the folder above."""
+    frame_stride: int = 1
+    """Use every n-th frame, by order of number. Frames of eval_frames or eval_list are kept regardless."""
+    eval_every: int = 10
+    """Hold out every n-th of the used frames for evaluation, the first one included."""
+    eval_frames: tuple[int, ...] = ()
+    """Hold out these frames instead, by the number in the file name."""
+    eval_list: Path | None = None
+    """Hold out the frames listed in this text file instead: numbers or file names, one per line; # starts a comment."""
+    scale_factor: float = 1.0
+    """Multiplies the camera positions and the seed points."""
+    load_seed_points: bool = True
+    """Fuse the depth images of the training frames into points from which Splatfacto starts."""
+    num_seed_points: int = 50_000
+    """Number of seed points at most."""
+    depth_unit_scale_factor: float | None = None
+    """Scene units per count of the depth images. Default: 1 / scale of cam_params.json."""
+    pixel_centers: Literal["auto", "integer", "half"] = "auto"
+    """What cx, cy count from: integer, the first pixel's centre (Replica's own 599.5 of 1200); half, the picture's
+    corner; auto, half where they are exactly half the size and integer elsewhere."""
+
+
+@dataclass
+class ReplicaDataParser(DataParser):
+    """Reads a scene of the Replica layout; no orientation, centring or automatic scaling is applied."""
+
+    config: ReplicaDataParserConfig
+
+    def __init__(self, config: ReplicaDataParserConfig):
+        super().__init__(config)
+        self._scene: ReplicaScene | None = None
+
+    def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
+        """See the base class.
+
+        Args:
+            split: "train", or "val" or "test", which are the same held-out frames.
+
+        Raises:
+            DataError: The folder or the configuration cannot be used.
+        """
+        config = self.config
+        self._check_config()
+        if self._scene is None:  # once for both splits
+            self._scene = load_replica(config.data)
+        scene = self._scene
+        if config.depth_unit_scale_factor is not None:
+            scene = replace(scene, params=replace(scene.params, scale=1.0 / config.depth_unit_scale_factor))
+        train, held_out = self._split(scene)
+        part = scene.select(train if split == "train" else held_out)
+        params = scene.params
+        cx, cy = params.principal_point(config.pixel_centers)
+
+        c2w = part.poses.copy()
+        c2w[:, :3, 1:3] *= -1.0  # OpenCV (y down, z forward) to nerfstudio (y up, z back)
+        c2w[:, :3, 3] *= config.scale_factor
+        cameras = Cameras(
+            camera_to_worlds=torch.from_numpy(c2w[:, :3, :4].astype(np.float32)),
+            fx=params.fx,
+            fy=params.fy,
+            cx=cx,
+            cy=cy,
+            width=params.width,
+            height=params.height,
+            camera_type=CameraType.PERSPECTIVE,
+        )
+        metadata: dict = {}
+        if part.depths is not None:
+            metadata["depth_filenames"] = list(part.depths)
+            metadata["depth_unit_scale_factor"] = 1.0 / params.scale
+        if split == "train" and config.load_seed_points:
+            metadata.update(self._seed_points(part, (cx, cy)))
+        return DataparserOutputs(
+            image_filenames=list(part.photos),
+            cameras=cameras,
+            scene_box=_scene_box(scene, config.scale_factor),
+            dataparser_scale=config.scale_factor,
+            metadata=metadata,
+        )
+
+    def _check_config(self) -> None:
+        config = self.config
+        for name, least in (("frame_stride", 1), ("eval_every", 2), ("num_seed_points", 1)):
+            if getattr(config, name) < least:
+                flag = name.replace("_", "-")
+                raise DataError(f"--{flag} {getattr(config, name)}: expected a whole number of at least {least}")
+        for name in ("scale_factor", "depth_unit_scale_factor"):
+            value = getattr(config, name)
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise DataError(f"--{name.replace('_', '-')} {value}: expected a positive number")
+        if config.eval_frames and config.eval_list is not None:
+            raise DataError("--eval-frames and --eval-list are both given: expected one of them")
+
+    def _split(self, scene: ReplicaScene) -> tuple[list[int], list[int]]:
+        """Positions of the training and of the held-out frames in ``scene``."""
+        config = self.config
+        used = list(range(0, len(scene), config.frame_stride))
+        if config.eval_frames or config.eval_list is not None:
+            wanted, source = list(config.eval_frames), "--eval-frames"
+            if config.eval_list is not None:
+                wanted, source = read_eval_list(config.eval_list), str(config.eval_list)
+            position = {number: i for i, number in enumerate(scene.numbers)}
+            unknown = [n for n in wanted if n not in position]
+            if unknown:
+                raise DataError(
+                    f"{source}: frame {unknown[0]} is not among the {len(scene)} usable frames of {scene.folder} "
+                    f"(numbers {scene.numbers[0]} to {scene.numbers[-1]})"
+                )
+            held_out = sorted({position[n] for n in wanted})
+        else:
+            held_out = used[:: config.eval_every]
+        train = sorted(set(used) - set(held_out))
+        if not train or not held_out:
+            raise DataError(
+                f"{scene.folder}: {len(scene)} usable frames leave {len(train)} for training and {len(held_out)} "
+                "held out; expected at least one of each: change --frame-stride, --eval-every or the list"
+            )
+        return train, held_out
+
+    def _seed_points(self, train: ReplicaScene, principal_point: tuple[float, float]) -> dict[str, torch.Tensor]:
+        from pointsplat_ns.nerfstudio_plugin.replica.seed_points import fuse_depth
+
+        if train.depths is None:
+            CONSOLE.log(f"{train.folder}: no depth images, so no seed points; training starts from random ones")
+            return {}
+        xyz, rgb = fuse_depth(train, self.config.num_seed_points, principal_point, progress=True)
+        if len(xyz) == 0:
+            CONSOLE.log(f"{train.folder}: no pixel of the depth images is known, so no seed points")
+            return {}
+        return {
+            "points3D_xyz": torch.from_numpy(xyz * np.float32(self.config.scale_factor)),
+            "points3D_rgb": torch.from_numpy(rgb),
+        }
+
+
+def read_eval_list(path: Path) -> list[int]:
+    """Frame numbers from a text file: ``120``, ``frame000120`` or ``results/frame000120.jpg`` a line.
+
+    Raises:
+        DataError: No such file, no frame in it, or a line that names none.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
+    except (FileNotFoundError, IsADirectoryError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: not a readable text file ({type(error).__name__}); expected frame numbers") from None
+    numbers = []
+    for count, line in enumerate(lines, start=1):
+        name = line.split("#")[0].strip()
+        if not name:
+            continue
+        match = re.fullmatch(r"(?:frame)?(\d+)", Path(name).stem)
+        if match is None:
+            raise DataError(f"{path}: line {count} is {name!r}; expected a frame number or file name")
+        numbers.append(int(match.group(1)))
+    if not numbers:
+        raise DataError(f"{path}: names no frame; expected a frame number or file name a line")
+    return numbers
+
+
+def _scene_box(scene: ReplicaScene, scale: float) -> SceneBox:
+    """The box of all camera positions, widened on every side by its diagonal (at least one unit)."""
+    centers = scene.poses[:, :3, 3]
+    low, high = centers.min(axis=0), centers.max(axis=0)
+    margin = max(float(np.linalg.norm(high - low)), 1.0)
+    aabb = np.stack([low - margin, high + margin]) * scale
+    return SceneBox(aabb=torch.from_numpy(aabb.astype(np.float32)))

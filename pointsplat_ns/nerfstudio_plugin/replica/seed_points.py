@@ -1,0 +1,131 @@
+"""Seed points: depth images fused into one point cloud, spread evenly over the surfaces."""
+
+import numpy as np
+
+from pointsplat_ns.nerfstudio_plugin.replica.layout import ReplicaScene, read_depth, read_photo
+
+MAX_FRAMES = 200
+"""Depth images read at most: neighbours in a video of 2,000 frames see the same surfaces."""
+
+SAMPLES_PER_POINT = 40
+"""Pixels unprojected per point wanted: enough that a voxel seen at all is averaged over several."""
+
+EDGE = 0.05
+"""A pixel whose depth differs from a neighbour's by more than this share lies on an outline, where
+sensors and resampling invent points between two surfaces. A plane steps that far from one pixel to
+the next only at grazing angles (over 85 degrees for usual lenses)."""
+
+
+def fuse_depth(
+    scene: ReplicaScene,
+    num_points: int,
+    principal_point: tuple[float, float],
+    progress: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Unprojects the depth images of a scene and thins them to about ``num_points`` points.
+
+    Reads at most :data:`MAX_FRAMES` frames, evenly spaced, one at a time, and keeps at most
+    ``num_points * SAMPLES_PER_POINT`` pixels of all of them, so time and memory do not grow with the
+    length of the capture. One point per occupied voxel, the mean of its pixels; the voxel is as
+    large as needed to leave no more than ``num_points``. Deterministic.
+
+    Args:
+        scene: The frames to use (pass training frames only), with depth.
+        num_points: Upper bound on the points returned.
+        principal_point: (cx, cy) with the first pixel's centre at 0.5.
+        progress: Show a progress bar.
+
+    Returns:
+        xyz float32 (P, 3) in scene units and rgb uint8 (P, 3), P <= ``num_points``; P = 0 where no
+        pixel has a depth.
+    """
+    chosen = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), MAX_FRAMES)).round().astype(int))
+    params = scene.params
+    budget = max(num_points * SAMPLES_PER_POINT // len(chosen), 1)
+    step = max(int(np.ceil(np.sqrt(params.width * params.height / budget))), 1)
+    all_xyz, all_rgb = [], []
+    for order, index in enumerate(_tracked(chosen, progress)):
+        depth = read_depth(scene.depths[index], params)
+        valid = _inner(depth)
+        # The grid's offset walks over the step x step cell from frame to frame, in strides prime to it.
+        offset = (order * (step + 1)) % (step * step)
+        v, u = np.mgrid[offset // step : params.height : step, offset % step : params.width : step]
+        v, u = v[valid[v, u]], u[valid[v, u]]
+        z = depth[v, u].astype(np.float64)
+        camera = np.stack(
+            [
+                (u + 0.5 - principal_point[0]) / params.fx * z,
+                (v + 0.5 - principal_point[1]) / params.fy * z,
+                z,
+            ],
+            axis=-1,
+        )
+        pose = scene.poses[index]
+        all_xyz.append((camera @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32))
+        all_rgb.append(read_photo(scene.photos[index], params)[v, u])
+    return voxel_thin(np.concatenate(all_xyz), np.concatenate(all_rgb), num_points)
+
+
+def voxel_thin(xyz: np.ndarray, rgb: np.ndarray, num_points: int) -> tuple[np.ndarray, np.ndarray]:
+    """Averages points over voxels of the smallest size that leaves at most ``num_points`` of them.
+
+    Args:
+        xyz: float32 (M, 3).
+        rgb: uint8 (M, 3).
+        num_points: Upper bound on the result.
+
+    Returns:
+        float32 (P, 3), uint8 (P, 3), in the order of the voxels. The input itself where it is
+        already small enough.
+    """
+    if len(xyz) <= num_points:
+        return xyz, rgb
+    low = xyz.min(axis=0).astype(np.float64)
+    extent = max(float((xyz.max(axis=0) - low).max()), 1e-12)
+    finest, coarsest = extent / 2**20, extent * 1.001  # 20 bits an axis fit an int64 key
+    keys = _voxel_keys(xyz, low, coarsest)
+    # Occupied voxels fall with the size: bisect its logarithm to 1 % of size, 2 % of count.
+    while coarsest / finest > 1.01:
+        size = float(np.sqrt(finest * coarsest))
+        trial = _voxel_keys(xyz, low, size)
+        if len(np.unique(trial)) > num_points:
+            finest = size
+        else:
+            coarsest, keys = size, trial
+    _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    inverse = inverse.reshape(-1)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        sums = [np.bincount(inverse, weights=values[:, i], minlength=len(counts)) for i in range(3)]
+        return np.stack(sums, axis=-1) / counts[:, None]
+
+    points = (mean(xyz.astype(np.float64) - low) + low).astype(np.float32)
+    return points, np.clip(mean(rgb).round(), 0, 255).astype(np.uint8)
+
+
+def _voxel_keys(xyz: np.ndarray, low: np.ndarray, size: float) -> np.ndarray:
+    cell = np.floor((xyz - low) / size).astype(np.int64)
+    return (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
+
+
+def _inner(depth: np.ndarray) -> np.ndarray:
+    """bool (H, W): depth known here and in the four neighbours, and continuous with them."""
+    known = depth > 0
+    inner = known.copy()
+    for axis in (0, 1):
+        before = [slice(None), slice(None)]
+        after = [slice(None), slice(None)]
+        before[axis], after[axis] = slice(None, -1), slice(1, None)
+        a, b = depth[tuple(before)], depth[tuple(after)]
+        joined = (a > 0) & (b > 0) & (np.abs(a - b) <= EDGE * np.minimum(a, b))
+        inner[tuple(before)] &= joined
+        inner[tuple(after)] &= joined
+    return inner
+
+
+def _tracked(items: np.ndarray, progress: bool):
+    if not progress or len(items) < 20:
+        return items
+    from rich.progress import track
+
+    return track(items, description="Seed points from depth", transient=True)

@@ -1,0 +1,146 @@
+"""The ``splatfacto-cpu`` method: how a Splatfacto scene is trained where there may be no GPU."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.models.splatfacto import SplatfactoModelConfig
+
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.nerfstudio_plugin.frames import LazyImageDatamanagerConfig
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig, SplatfactoCpuPipelineConfig
+from pointsplat_ns.system.memory import keep_freed_memory
+
+SPLATFACTO_STEPS = 30_000
+"""The length of training for which nerfstudio chose Splatfacto's schedules."""
+
+
+class SplatfactoCpuTrainer(Trainer):
+    """nerfstudio's trainer, which leaves nothing behind when its input cannot be used, and reuses a CPU's memory."""
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """As nerfstudio's.
+
+        Raises:
+            PointSplatError: if the data cannot be used. The run folder, in which ``ns-train`` has then written
+                nothing but the config, is removed first.
+        """
+        if torch.device(self.device).type == "cpu":
+            keep_freed_memory()
+        try:
+            super().setup(test_mode)
+        except PointSplatError:
+            self._withdraw()
+            raise
+
+    def _withdraw(self) -> None:
+        config = self.base_dir / "config.yml"
+        if not config.is_file() or list(self.base_dir.iterdir()) != [config]:
+            return
+        config.unlink()
+        output_dir = Path(self.config.output_dir)
+        for folder in (self.base_dir, *self.base_dir.parents):
+            if folder == output_dir.parent or any(folder.iterdir()):
+                break
+            folder.rmdir()
+
+
+@dataclass
+class SplatfactoCpuTrainerConfig(TrainerConfig):
+    """nerfstudio's trainer, with Splatfacto's schedules fitted to the length of the run"""
+
+    _target: type = field(default_factory=lambda: SplatfactoCpuTrainer)
+    scale_schedules: bool = True
+    """Shorten Splatfacto's schedules (resolution, SH degree, densification, learning rates) in proportion where the
+    run is shorter than the 30,000 steps they were made for. What was set by hand is left as it is."""
+
+    def setup(self, **kwargs) -> Trainer:
+        """The trainer, for a copy of this config with fitted schedules."""
+        return self._target(fitted_schedules(self) if self.scale_schedules else self, **kwargs)
+
+
+def fitted_schedules(config: TrainerConfig) -> TrainerConfig:
+    """A copy of a config with Splatfacto's 30,000-step schedules shortened to its ``max_num_iterations``.
+
+    Model settings are changed where they are still Splatfacto's defaults, learning-rate schedules where they still
+    end at 30,000. Intervals that wait for gradients to gather (``refine_every``) shrink only below 7,000 steps and
+    not below 25; the opacity reset counts in them and follows.
+    """
+    share = min(1.0, config.max_num_iterations / SPLATFACTO_STEPS)
+    config = copy.deepcopy(config)
+    defaults = SplatfactoModelConfig()
+    model = config.pipeline.model
+    fitted = {
+        name: max(1, round(share * getattr(defaults, name)))
+        for name in (
+            "warmup_length",
+            "resolution_schedule",
+            "sh_degree_interval",
+            "stop_split_at",
+            "stop_screen_size_at",
+        )
+    }
+    fitted["refine_every"] = min(defaults.refine_every, max(25, round(config.max_num_iterations / 70)))
+    for name, value in fitted.items():
+        if getattr(model, name) == getattr(defaults, name):
+            setattr(model, name, value)
+    for group in config.optimizers.values():
+        schedule = group["scheduler"]
+        if isinstance(schedule, ExponentialDecaySchedulerConfig) and schedule.max_steps == SPLATFACTO_STEPS:
+            schedule.max_steps = max(1, round(share * SPLATFACTO_STEPS))
+            schedule.warmup_steps = round(share * schedule.warmup_steps)
+    return config
+
+
+def _optimizers() -> dict[str, dict[str, Any]]:
+    """Splatfacto's optimisers and learning-rate schedules."""
+
+    def group(lr: float, lr_final: float | None = None, **schedule) -> dict[str, Any]:
+        decay = ExponentialDecaySchedulerConfig(lr_final=lr_final, max_steps=SPLATFACTO_STEPS, **schedule)
+        return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": decay if lr_final else None}
+
+    return {
+        "means": group(1.6e-4, 1.6e-6),
+        "features_dc": group(2.5e-3),
+        "features_rest": group(2.5e-3 / 20),
+        "opacities": group(5e-2),
+        "scales": group(5e-3),
+        "quats": group(1e-3),
+        "camera_opt": group(1e-4, 5e-7, warmup_steps=1000, lr_pre_warmup=0),
+        "bilateral_grid": group(2e-3, 1e-4, warmup_steps=1000, lr_pre_warmup=0),
+    }
+
+
+def splatfacto_cpu_config() -> TrainerConfig:
+    """The ``splatfacto-cpu`` method.
+
+    7,000 steps, the shorter of the two lengths that 3DGS reports, take a CPU about an hour on small photos. Training
+    logs to tensorboard and ends by itself; a viewer would share its cores (``--vis viewer`` opens one, and
+    ``ns-viewer`` shows the result). One held-out image is evaluated at times, all of them by ``ns-eval``.
+    """
+    return SplatfactoCpuTrainerConfig(
+        method_name="splatfacto-cpu",
+        machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
+        max_num_iterations=7000,
+        steps_per_save=1000,
+        steps_per_eval_batch=0,
+        steps_per_eval_image=500,
+        steps_per_eval_all_images=0,
+        mixed_precision=False,
+        pipeline=SplatfactoCpuPipelineConfig(
+            datamanager=LazyImageDatamanagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True)),
+            model=SplatfactoCpuModelConfig(),
+        ),
+        optimizers=_optimizers(),
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+        vis="tensorboard",
+    )

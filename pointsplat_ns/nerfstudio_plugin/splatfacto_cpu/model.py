@@ -1,0 +1,335 @@
+"""Splatfacto on any torch device: nerfstudio's model with our rasterizer in place of gsplat's CUDA kernels.
+
+Config, densification, checkpoint keys, cropping, camera optimiser and bilateral grid are nerfstudio's own. Only
+what needs CUDA or a network is replaced: the seed of the scene, the call of the rasterizer, and LPIPS; and SSIM by
+the same in fewer operations.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+from unittest import mock
+
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, SplatfactoModelConfig, random_quat_tensor
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.geometry.cameras import viewmats_from_opengl
+from pointsplat_ns.metrics import ImageError
+from pointsplat_ns.metrics.fast_ssim import fast_ssim
+from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
+from pointsplat_ns.rasterizer import rasterization
+
+LONE_POINT_SCALE = 0.01
+"""Standard deviation, in scene units, of a seed that has no other point to take its size from."""
+
+HALF_LEVEL = 0.5 / 255
+"""Half a step of an 8-bit colour: the nearest to 0 and 1 that a seed's colour logit goes, so that it stays finite."""
+
+
+class _LazyLpips:
+    """LPIPS that is loaded at the first evaluation. Not a module: its weights are no part of a scene's checkpoint."""
+
+    def __init__(self, *args, **kwargs):
+        self.reason: str | None = None
+        """Why there is no LPIPS, once that is known."""
+        self._metric: Any = None
+
+    def __call__(self, image: Tensor, other: Tensor) -> Tensor:
+        """LPIPS of two (1, 3, H, W) images in [0, 1]; NaN, with ``reason`` set, where it cannot be computed."""
+        if self._metric is None and self.reason is None:
+            try:
+                self._metric = load_lpips("alex").to(image.device)
+            except LpipsUnavailable as error:
+                self.reason = str(error)
+        if self._metric is not None:
+            try:
+                return self._metric(image.permute(0, 2, 3, 1), other.permute(0, 2, 3, 1)).mean()
+            except ImageError as error:  # too small for the network
+                self.reason = str(error)
+        return image.new_tensor(math.nan)
+
+
+@dataclass
+class SplatfactoCpuModelConfig(SplatfactoModelConfig):
+    """Splatfacto's config, and the choice of a rasterizer"""
+
+    _target: type = field(default_factory=lambda: SplatfactoCpuModel)
+    backend: Literal["auto", "torch", "gsplat"] = "auto"
+    """What draws: torch runs everywhere; gsplat needs CUDA; auto takes gsplat where its kernels are there."""
+    compiled: bool = False
+    """Blend with kernels made by torch.compile: faster on a CPU with a C++ compiler, after a minute of compiling at the
+    first step (once; the result is kept on disk). Where that fails a warning says why, and training goes on without."""
+    quality: Literal["exact", "balanced", "fast"] = "exact"
+    """What training may give up for speed (see the README for how much); evaluation is always exact."""
+
+
+class SplatfactoCpuModel(SplatfactoModel):
+    """Splatfacto without a need for CUDA or a network.
+
+    Args:
+        config: as Splatfacto's.
+        seed_points: positions (N, 3) in scene units and colours (N, 3) from 0 to 255. Rows that are not finite are
+            dropped and counted; with none left the scene starts from random points, as Splatfacto's does.
+    """
+
+    config: SplatfactoCpuModelConfig
+
+    def populate_modules(self) -> None:
+        """Build what Splatfacto builds, seeded without CUDA and without LPIPS weights."""
+        seeds = None if self.config.random_init else _finite_seeds(self.seed_points)
+        config = self.config
+        # nerfstudio's branch for seed points calls .cuda(); let it make a few random Gaussians and replace them.
+        self.seed_points = None
+        if seeds is not None:
+            self.config = dataclasses.replace(config, num_random=1)
+        with mock.patch("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", _LazyLpips):
+            super().populate_modules()
+        del self.ssim  # a module without parameters or state
+        self.ssim = fast_ssim
+        self.config = config
+        if seeds is not None:
+            self.gauss_params = self._seed_parameters(*seeds)
+        self.seed_points = seeds
+
+    def _seed_parameters(self, points: Tensor, colors: Tensor) -> torch.nn.ParameterDict:
+        """Splatfacto's parameters for N points (N, 3) and their colours (N, 3) from 0 to 255, or (0, 3) if unknown."""
+        num = len(points)
+        num_rest = (self.config.sh_degree + 1) ** 2 - 1
+        distances = torch.from_numpy(self.k_nearest_sklearn(points, 3)[0])
+        if len(colors) == 0:
+            features_dc = torch.rand(num, 3)
+        elif self.config.sh_degree > 0:
+            features_dc = RGB2SH(colors / 255)
+        else:  # colours are optimised as logits
+            features_dc = torch.logit(colors / 255, eps=HALF_LEVEL)
+        values = {
+            "means": points,
+            "scales": distances.mean(dim=1, keepdim=True).log().repeat(1, 3),
+            "quats": random_quat_tensor(num),
+            "features_dc": features_dc,
+            "features_rest": torch.zeros(num, num_rest, 3),
+            "opacities": torch.full((num, 1), math.log(0.1 / 0.9)),
+        }
+        return torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in values.items()})
+
+    def k_nearest_sklearn(self, x: Tensor, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Distances and indices (N, k) of the nearest points at another place.
+
+        Points at one place count once, so that no distance is zero; a row with fewer than ``k`` such neighbours
+        repeats the farthest, and a lone place has distance ``LONE_POINT_SCALE`` and itself as its neighbour.
+        """
+        from sklearn.neighbors import NearestNeighbors
+
+        places, first, inverse = np.unique(x.cpu().numpy(), axis=0, return_index=True, return_inverse=True)
+        inverse = inverse.reshape(-1)
+        found = min(k, len(places) - 1)
+        if found < 1:
+            return np.full((len(x), k), LONE_POINT_SCALE, np.float32), np.tile(first[inverse][:, None], (1, k))
+        distances, indices = NearestNeighbors(n_neighbors=found + 1).fit(places).kneighbors(places)
+        columns = np.minimum(np.arange(1, k + 1), found)
+        # Distinct places can still be closer than float32 can square.
+        distances = np.maximum(distances[:, columns], np.finfo(np.float32).tiny).astype(np.float32)
+        return distances[inverse], first[indices[:, columns]][inverse]
+
+    def load_state_dict(self, dict: Mapping[str, Any], **kwargs):  # type: ignore[override]
+        """As Splatfacto's, and without the LPIPS weights that nerfstudio's own checkpoints carry along."""
+        return super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Splatfacto's callbacks, once the optimisers hold this model's parameters."""
+        if training_callback_attributes.optimizers is not None:
+            self._adopt_optimizers(training_callback_attributes.optimizers)
+        return super().get_training_callbacks(training_callback_attributes)
+
+    def _adopt_optimizers(self, optimizers: Optimizers) -> None:
+        """Point the optimisers at the parameters that loading a checkpoint has made anew.
+
+        nerfstudio builds the optimisers first; a resumed Splatfacto would go on stepping parameters that nothing
+        draws any more.
+        """
+        for name, parameter in self.gauss_params.items():
+            optimizer = optimizers.optimizers.get(name)
+            if optimizer is None:
+                continue
+            (held,) = optimizer.param_groups[0]["params"]
+            if held is not parameter:
+                optimizer.param_groups[0]["params"] = [parameter]
+                optimizer.state[parameter] = optimizer.state.pop(held, {})
+                optimizers.parameters[name] = [parameter]
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Any]:
+        """Draw one camera.
+
+        Args:
+            camera: of shape (1,), on the model's device.
+
+        Returns:
+            ``rgb`` (H, W, 3) in [0, 1], ``accumulation`` (H, W, 1), ``background`` (3,), or (H, W, 3) in evaluation,
+            and ``depth`` (H, W, 1), in scene units along the viewing axis, or None while training without it.
+        """
+        if not isinstance(camera, Cameras):
+            return {}
+        params = self._visible_parameters()
+        if params is None:
+            width, height = int(camera.width.item()), int(camera.height.item())
+            return self.get_empty_outputs(width, height, self.background_color.to(self.device))
+        camera_to_worlds = self.camera_optimizer.apply_to_camera(camera) if self.training else camera.camera_to_worlds
+        intrinsics, width, height = self._drawn_size(camera)
+        with_depth = self.config.output_depth_during_training or not self.training
+        image, alpha, info = self._draw(params, camera_to_worlds, intrinsics, width, height, with_depth)
+        self.last_size = (height, width)
+        if self.training:
+            self.info = info
+            self.strategy.step_pre_backward(
+                self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
+            )
+        background = self._get_background_color()
+        rgb = torch.clamp(image[..., :3] + (1 - alpha) * background, 0.0, 1.0)
+        metadata = camera.metadata or {}
+        if self.training and self.config.use_bilateral_grid and "cam_idx" in metadata:
+            rgb = self._apply_bilateral_grid(rgb, metadata["cam_idx"], height, width)
+        depth = None
+        if with_depth:
+            depth = image[..., 3:4]
+            depth = torch.where(alpha > 0, depth, depth.detach().max())[0]
+        return {
+            "rgb": rgb[0],
+            "depth": depth,
+            "accumulation": alpha[0],
+            "background": background if self.training else background.expand(height, width, 3),
+        }
+
+    def _visible_parameters(self) -> dict[str, Tensor] | None:
+        """The parameters inside the crop box in evaluation, or all; None if the box is empty."""
+        params = dict(self.gauss_params.items())
+        if self.crop_box is None or self.training:
+            return params
+        inside = self.crop_box.within(self.means).reshape(-1)
+        return {name: value[inside] for name, value in params.items()} if inside.any() else None
+
+    def _drawn_size(self, camera: Cameras) -> tuple[Tensor, int, int]:
+        """Intrinsics (1, 3, 3), width and height in pixels at the resolution of this step."""
+        factor = self._get_downscale_factor()
+        intrinsics = camera.get_intrinsics_matrices().to(self.device).clone()
+        intrinsics[:, :2] /= factor
+        return intrinsics, int(camera.width.item()) // factor, int(camera.height.item()) // factor
+
+    def _draw(
+        self,
+        params: dict[str, Tensor],
+        camera_to_worlds: Tensor,
+        intrinsics: Tensor,
+        width: int,
+        height: int,
+        with_depth: bool,
+    ) -> tuple[Tensor, Tensor, dict]:
+        """Image (1, H, W, 3 or 4), opacity (1, H, W, 1) and what densification needs."""
+        if self.config.sh_degree > 0:
+            colors = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
+            degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
+        else:
+            colors, degree = torch.sigmoid(params["features_dc"]), None
+        return self._rasterization(
+            means=params["means"],
+            quats=params["quats"],
+            scales=torch.exp(params["scales"]),
+            opacities=torch.sigmoid(params["opacities"][:, 0]),
+            colors=colors,
+            viewmats=viewmats_from_opengl(camera_to_worlds),
+            Ks=intrinsics,
+            width=width,
+            height=height,
+            packed=False,
+            render_mode="RGB+ED" if with_depth else "RGB",
+            sh_degree=degree,
+            absgrad=self.strategy.absgrad,
+            rasterize_mode=self.config.rasterize_mode,
+        )
+
+    def _rasterization(self, **arguments):
+        """Rasterize as the config has it."""
+        config = self.config
+        return rasterization(**arguments, backend=config.backend, compiled=config.compiled, quality=self._quality)
+
+    @property
+    def _quality(self) -> str:
+        """Evaluation is always exact."""
+        return self.config.quality if self.training else "exact"
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """As Splatfacto's, without LPIPS where it cannot be had (``self.lpips.reason`` then says why)."""
+        metrics, images = super().get_image_metrics_and_images(outputs, batch)
+        return {k: v for k, v in metrics.items() if "lpips" not in k or math.isfinite(v)}, images
+
+
+def _finite_seeds(seeds: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor] | None:
+    """Positions and colours as float32 without rows that are not finite; None if nothing is left."""
+    if seeds is None:
+        return None
+    points, colors = (value.detach().float().cpu() for value in seeds)
+    finite = points.isfinite().all(dim=1)
+    if len(colors) > 0:
+        finite &= colors.isfinite().all(dim=1)
+        colors = colors[finite]
+    if not finite.all():
+        CONSOLE.log(f"{int((~finite).sum())} of {len(points)} seed points are not finite and were dropped")
+    if not finite.any():
+        CONSOLE.log("no seed points are left; training starts from random ones")
+        return None
+    return points[finite].clone(), colors.clone()
+
+
+@dataclass
+class SplatfactoCpuPipelineConfig(VanillaPipelineConfig):
+    """nerfstudio's pipeline, whose evaluation is always valid JSON"""
+
+    _target: type = field(default_factory=lambda: SplatfactoCpuPipeline)
+
+
+class SplatfactoCpuPipeline(VanillaPipeline):
+    """nerfstudio's pipeline; what cannot be computed is null in its evaluation, and never NaN."""
+
+    def get_average_eval_image_metrics(
+        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
+    ) -> dict[str, Any]:
+        """Mean metrics over the held-out frames.
+
+        Args:
+            step: given by the trainer, whose log takes numbers alone: what is not finite is then left out. Without
+                it, as in ``ns-eval``, that is None, and ``lpips_note`` says why LPIPS is missing.
+            output_path: folder for the rendered images, if they are wanted.
+            get_std: add the standard deviation of every metric; that of a single image is None.
+
+        Raises:
+            DataError: if no frame is held out.
+        """
+        if len(self.datamanager.eval_dataset) == 0:
+            raise DataError(
+                f"{self.datamanager.get_datapath()}: no frame is held out, so there is nothing to evaluate on; "
+                "expected at least one: change the dataparser's split"
+            )
+        metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
+        if step is not None:
+            return {name: value for name, value in metrics.items() if math.isfinite(value)}
+        report: dict[str, Any] = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
+        reason = getattr(getattr(self.model, "lpips", None), "reason", None)
+        if reason is not None:
+            report |= {"lpips": None, "lpips_note": reason}
+        return report

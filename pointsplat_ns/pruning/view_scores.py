@@ -1,0 +1,203 @@
+"""Scores that look at a scene through its cameras: the image-driven baselines of the paper's Table 1.
+
+Both need poses and no photos. They are exact sums over every pixel of every view.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.pruning.scores import ScoreError, log_volume
+from pointsplat_ns.rasterizer.pixel_walk import Pairs, sum_over_pixels
+from pointsplat_ns.rasterizer.projection import Projected, project
+from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
+from pointsplat_ns.views import Views
+
+LIGHTGAUSSIAN_BETA = 0.1
+"""Exponent of the normalised volume (LightGaussian, section 3.2)."""
+
+LIGHTGAUSSIAN_LARGEST = 0.9
+"""The volume that normalises: that of the Gaussian at this place among all, the largest first."""
+
+
+def lightgaussian_score(
+    scene: Gaussians, views: Views, beta: float = LIGHTGAUSSIAN_BETA, progress: Callable[[float], None] | None = None
+) -> Tensor:
+    """LightGaussian's global significance (arXiv 2311.17245, eq. 3 and 4).
+
+    ``sum over all pixels of 1(hit) * opacity * T``, times ``min(V / V_90, 1) ** beta``: T is the
+    transmittance in front of the Gaussian at that pixel, V its volume, and V_90 the volume at 90 % of
+    all volumes in descending order. Their released code leaves T and the clamp at 1 out.
+
+    Args:
+        scene: N Gaussians.
+        views: poses to look from.
+        beta: exponent of the volume, at least 0.
+        progress: called with the share done, in [0, 1].
+
+    Returns:
+        Scores (N,), float64; zero where no view sees the Gaussian, NaN where it cannot be drawn.
+
+    Raises:
+        ScoreError: if ``beta`` is negative or not a number.
+        DataError: if there is no view.
+    """
+    if not (0 <= beta < math.inf):
+        raise ScoreError(f"beta is {beta}; expected 0 or more")
+    _need(views)
+    usable = scene.usable()
+    total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
+
+    def passed(pairs: Pairs) -> Tensor:
+        return torch.where(pairs.alpha > 0, pairs.before, 0.0).sum(-1, keepdim=True)
+
+    with torch.no_grad():
+        for index in _each(views, progress):
+            seen = _project(scene.means, scene.stds, scene, views, index)
+            through = sum_over_pixels(seen, views.width, views.height, 1, passed)[:, 0]
+            total.index_add_(0, seen.ids, (seen.opacities * through).double())
+        if bool(usable.any()):
+            logs = log_volume(scene)
+            ranked = logs[usable].sort(descending=True).values
+            relative = logs - ranked[min(int(LIGHTGAUSSIAN_LARGEST * len(ranked)), len(ranked) - 1)]
+            # -Inf - -Inf: a flat Gaussian among flat ones is as large as they are
+            total *= torch.exp(beta * relative.nan_to_num(nan=0.0, posinf=0.0).clamp_max(0.0))
+    return torch.where(usable, total, math.nan)
+
+
+def pup_score(scene: Gaussians, views: Views, progress: Callable[[float], None] | None = None) -> Tensor:
+    """PUP-3DGS's spatial sensitivity (arXiv 2406.10219, section 3.1).
+
+    ``log det H`` with ``H = sum over views, pixels and channels of g g^T``, the Gauss-Newton Hessian of the
+    squared error of the picture, where g is the gradient of a pixel's channel by the mean (3) and the
+    standard deviations (3) of the Gaussian. Exact, with the change of colour with the direction of
+    view included; what is clamped at black or at the maximum of alpha has no gradient.
+
+    Args:
+        scene: N Gaussians.
+        views: poses to look from; their size decides how fine the sensitivity is.
+        progress: called with the share done, in [0, 1].
+
+    Returns:
+        Scores (N,), float64: -Inf where the views do not determine all six (so where no view sees the
+        Gaussian), NaN where it cannot be drawn.
+
+    Raises:
+        DataError: if there is no view.
+    """
+    return log_determinant(sensitivity(scene, views, progress)).where(scene.usable(), math.nan)
+
+
+def sensitivity(scene: Gaussians, views: Views, progress: Callable[[float], None] | None = None) -> Tensor:
+    """The 6 x 6 Hessian blocks of :func:`pup_score`, (N, 6, 6) float64: mean x, y, z, then the standard
+    deviations, per scene unit squared."""
+    _need(views)
+    total = torch.zeros(len(scene), 6, 6, dtype=torch.float64, device=scene.device)
+    for index in _each(views, progress):
+        means, stds = (value.detach().requires_grad_() for value in (scene.means, scene.stds))
+        with torch.enable_grad():
+            seen = _project(means, stds, scene, views, index)
+            colors = sh_to_color(seen.directions, scene.sh.detach()[seen.ids], scene.sh_degree)
+            in_plane = torch.cat([seen.opacities.log()[:, None], seen.means2d, seen.cov2d], dim=1)
+            shape = _jacobian(in_plane, means, stds, seen.ids)  # (M, 6, 6)
+            color = _jacobian(colors, means, stds, seen.ids)  # (M, 3, 6)
+        with torch.no_grad():
+            sums = _second_moments(seen, colors.detach(), views).double()
+            squares, cross, weight = sums[:, :36].view(-1, 6, 6), sums[:, 36:54].view(-1, 3, 6), sums[:, 54]
+            mixed = shape.mT @ cross.mT @ color
+            block = shape.mT @ squares @ shape + mixed + mixed.mT + weight[:, None, None] * (color.mT @ color)
+            total.index_add_(0, seen.ids, block)
+    return total
+
+
+def log_determinant(blocks: Tensor) -> Tensor:
+    """Logarithm of the determinants of symmetric positive semi-definite blocks, (N, D, D) to (N,); -Inf if singular.
+
+    Each block is first scaled to a unit diagonal, so that neither 1e-30 nor 1e30 under- or overflows.
+    """
+    diagonal = blocks.diagonal(dim1=-2, dim2=-1)
+    ok = (diagonal > 0).all(-1) & blocks.isfinite().all(-1).all(-1)
+    root = torch.where(ok[:, None], diagonal, 1.0).sqrt()
+    unit = torch.where(ok[:, None, None], blocks, torch.eye(blocks.shape[-1]).to(blocks))
+    values = torch.linalg.eigvalsh(unit / root[:, :, None] / root[:, None, :])
+    # Below the rounding of the blocks themselves an eigenvalue is not told from zero.
+    ok &= values[:, 0] > 16 * torch.finfo(blocks.dtype).eps
+    result = values.clamp_min(torch.finfo(blocks.dtype).tiny).log().sum(-1) + 2 * root.log().sum(-1)
+    return torch.where(ok, result, -math.inf)
+
+
+def _second_moments(seen: Projected, colors: Tensor, views: Views) -> Tensor:
+    """(M, 55): for the gradient ``r phi`` of a channel by (log opacity, mean x, y, covariance xx, xy, yy), with r its
+    gradient by log alpha, and the weight w of the colour: sums of r^2 phi phi^T, of r w phi (by channel), of w^2."""
+    background = views.background.to(colors)
+
+    def values(pairs: Pairs) -> Tensor:
+        weight = pairs.alpha * pairs.before  # (B, L, 64)
+        shade = colors[pairs.ids]  # (B, L, 3)
+        phi = torch.stack(
+            [
+                torch.ones_like(weight),
+                pairs.gx,
+                pairs.gy,
+                0.5 * pairs.gx * pairs.gx,
+                pairs.gx * pairs.gy,
+                0.5 * pairs.gy * pairs.gy,
+            ],
+            dim=-2,
+        )  # (B, L, 6, 64)
+        steep = pairs.alpha / (1 - pairs.alpha)
+        square = torch.zeros_like(weight)
+        cross = []
+        for channel in range(3):
+            lit = weight * shade[..., channel, None]
+            total = lit.sum(1, keepdim=True) + (pairs.final * background[channel])[:, None]
+            behind = total - lit.cumsum(1)
+            slope = (lit - steep * behind).masked_fill_(pairs.clamped, 0.0)
+            square += slope * slope
+            cross.append((phi @ (slope * weight)[..., None])[..., 0])
+        squares = (phi * square[..., None, :]) @ phi.mT  # (B, L, 6, 6)
+        return torch.cat([squares.flatten(-2), *cross, (weight * weight).sum(-1, keepdim=True)], dim=-1)
+
+    return sum_over_pixels(seen, views.width, views.height, 55, values)
+
+
+def _jacobian(outputs: Tensor, means: Tensor, stds: Tensor, ids: Tensor) -> Tensor:
+    """Derivatives of (M, F) by the means and standard deviations of the same Gaussians, (M, F, 6) float64."""
+    rows = []
+    for column in outputs.unbind(1):
+        grads = torch.autograd.grad(column.sum(), (means, stds), retain_graph=True, materialize_grads=True)
+        rows.append(torch.cat([grad[ids] for grad in grads], dim=1))
+    return torch.stack(rows, dim=1).double()
+
+
+def _project(means: Tensor, stds: Tensor, scene: Gaussians, views: Views, index: int) -> Projected:
+    return project(
+        means,
+        scene.quats.detach(),
+        stds,
+        scene.alphas.detach(),
+        views.viewmats[index].to(means),
+        views.Ks[index].to(means),
+        views.width,
+        views.height,
+        antialiased=views.rasterize_mode == "antialiased",
+    )
+
+
+def _need(views: Views) -> None:
+    if len(views) == 0:
+        raise DataError("no view to score from; expected at least one pose")
+
+
+def _each(views: Views, progress: Callable[[float], None] | None) -> Iterator[int]:
+    """The indices of the views; says after each what share of them is done."""
+    for index in range(len(views)):
+        yield index
+        if progress is not None:
+            progress((index + 1) / len(views))

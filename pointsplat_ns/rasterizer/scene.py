@@ -1,0 +1,51 @@
+"""Pictures of a whole scene."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.rasterizer.rendering import rasterization
+from pointsplat_ns.views import View, Views
+
+
+def render(scene: Gaussians, views: View | Views) -> Tensor:
+    """What a scene looks like from one view or several, over the views' background. Differentiable in the scene.
+
+    Args:
+        scene: N Gaussians, on any device; the picture is made there.
+        views: a :class:`~pointsplat_ns.View`, or :class:`~pointsplat_ns.Views`, whose pictures are then drawn one after
+            the other.
+
+    Returns:
+        Colours in [0, 1]: (H, W, 3) for a view, (C, H, W, 3) for C views.
+
+    Raises:
+        ValueError: if a camera is not finite or has no focal length.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> room = ps.example_room()
+        >>> views = ps.sample_views(room, 2, width=64, height=48)
+        >>> tuple(ps.render(room, views[0]).shape), tuple(ps.render(room, views).shape)
+        ((48, 64, 3), (2, 48, 64, 3))
+    """
+    if isinstance(views, Views):
+        if len(views) == 0:
+            return scene.means.new_zeros(0, views.height, views.width, 3)
+        return torch.stack([render(scene, view) for view in views])
+    image, alpha, _ = rasterization(
+        means=scene.means,
+        quats=scene.quats,
+        scales=scene.stds,
+        opacities=scene.alphas,
+        colors=scene.sh,
+        viewmats=views.viewmat[None].to(scene.means),
+        Ks=views.K[None].to(scene.means),
+        width=views.width,
+        height=views.height,
+        sh_degree=scene.sh_degree,
+        rasterize_mode=views.rasterize_mode,
+    )
+    return (image[0] + (1 - alpha[0]) * views.background.to(image)).clamp(0, 1)

@@ -1,0 +1,272 @@
+"""pointsplat prune and export: what they write, and what they say of input that cannot be used."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
+from making import same
+from pointsplat_ns.cli import main
+from pointsplat_ns.compression.budget_search import DenseReference
+from pointsplat_ns.compression.prune import COMPARED_VIEWS, IMAGE_SCORES
+from pointsplat_ns.compression.refined_run import open_refined_run
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io import read_ply, read_scene, write_ply
+from pointsplat_ns.pruning import SCORES, compact, prune, select
+from pointsplat_ns.views import dataset_views
+
+SEED = 5
+
+
+def random_scene(n: int = 80, degree: int = 3) -> Gaussians:
+    generator = torch.Generator().manual_seed(SEED)
+    sizes = {"means": 3, "scales": 3, "quats": 4, "opacities": 1, "features_dc": 3}
+    values = {name: torch.randn((n, size), generator=generator) for name, size in sizes.items()}
+    return Gaussians(**values, features_rest=torch.randn((n, (degree + 1) ** 2 - 1, 3), generator=generator))
+
+
+@pytest.fixture()
+def ply(tmp_path) -> Path:
+    write_ply(random_scene(), tmp_path / "scene.ply")
+    return tmp_path / "scene.ply"
+
+
+@pytest.fixture()
+def splatfacto_run(trained_walls) -> Path:
+    (run,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
+    return run
+
+
+@pytest.fixture(scope="module")
+def refined_run(make_refined_run, trained_walls, tmp_path_factory) -> Path:
+    return make_refined_run(tmp_path_factory.mktemp("refined"), trained_walls, ("wall-b",), moved=0.5)
+
+
+def run(*args) -> None:
+    main([str(a) for a in args])
+
+
+def refusal(capsys, output: Path, *args) -> str:
+    """The one line on stderr with which a command refuses; it prints nothing else and writes nothing."""
+    before = sorted(output.parent.rglob("*")) if output.parent.is_dir() else None
+    with pytest.raises(SystemExit) as caught:
+        run(*args, "-o", output)
+    said = capsys.readouterr()
+    assert caught.value.code == 1 and said.out == ""
+    assert said.err.startswith("error: ") and said.err.count("\n") == 1
+    assert (sorted(output.parent.rglob("*")) if output.parent.is_dir() else None) == before, "partial output"
+    return said.err
+
+
+@pytest.mark.parametrize("kind", ["ply", "folder", "config", "ckpt", "bare ckpt"])
+def test_prune_takes_every_kind_of_scene(kind, ply, splatfacto_run, tmp_path, capsys):
+    (checkpoint,) = (splatfacto_run / "nerfstudio_models").iterdir()
+    shutil.copy(checkpoint, tmp_path / "alone.ckpt")
+    scene = {
+        "ply": ply,
+        "folder": splatfacto_run,
+        "config": splatfacto_run / "config.yml",
+        "ckpt": checkpoint,
+        "bare ckpt": tmp_path / "alone.ckpt",
+    }[kind]
+    output = tmp_path / "new" / "out.ply"
+    run("prune", scene, "--keep", "0.5", "--by", "paper", "-o", output)
+    dense = read_scene(scene)
+    assert same(read_ply(output), prune(dense, 0.5).scene)
+    said = capsys.readouterr().out
+    assert str(output) in said and f"of {len(dense):,} Gaussians" in said and "MB" in said
+    assert [p.name for p in output.parent.iterdir()] == ["out.ply"]
+
+
+@pytest.mark.parametrize(("keep", "kept"), [("0.25", 20), ("25%", 20), ("7", 7), ("1.0", 80), ("1", 1)])
+def test_keep_is_a_ratio_a_percentage_or_a_count(ply, tmp_path, keep, kept):
+    run("prune", ply, "--by", "paper", "--keep", keep, "-o", tmp_path / "out.ply")
+    assert same(read_ply(tmp_path / "out.ply"), prune(read_ply(ply), kept).scene)
+
+
+def test_prune_scores_as_it_is_told(ply, tmp_path):
+    run("prune", ply, "--keep", "9", "--by", "volume", "-o", tmp_path / "volume.ply")
+    run("prune", ply, "--keep", "9", "--by", "paper", "--opacity-weight", "1.0", "-o", tmp_path / "opacity.ply")
+    dense = read_ply(ply)
+    assert same(read_ply(tmp_path / "volume.ply"), prune(dense, 9, "volume").scene)
+    assert same(read_ply(tmp_path / "opacity.ply"), prune(dense, 9, "opacity").scene)
+
+
+@pytest.mark.parametrize(
+    "keep", ["0", "1.5", "nan", "inf", "-3", "81", "half", "", "0%", "101%", "0MB", "-1MB", "nanMB", "auto:0"]
+)
+@pytest.mark.parametrize("command", ["prune", "compact"])
+def test_a_keep_that_no_scene_can_satisfy_is_refused(command, keep, ply, refined_run, tmp_path, capsys):
+    using = ("--using", refined_run) if command == "compact" else ()
+    assert "keep is" in refusal(capsys, tmp_path / "out.ply", command, ply, *using, f"--keep={keep}")
+
+
+def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
+    output = tmp_path / "out.ply"
+    assert "gone.ply: no such file" in refusal(capsys, output, "prune", tmp_path / "gone.ply")
+    assert "without config.yml" in refusal(capsys, output, "prune", tmp_path)
+    assert "another method" in refusal(capsys, output, "prune", refined_run)
+    half = tmp_path / "half.ply"
+    half.write_bytes(ply.read_bytes()[:-100])
+    assert "half.ply" in refusal(capsys, output, "prune", half)
+    for by in ("paper", "authors", "log-volume"):
+        said = refusal(capsys, output, "prune", ply, "--by", by, "--opacity-weight", "2")
+        assert "opacity_weight is 2.0; expected 0 to 1" in said
+    write_ply(random_scene(3).map(lambda value: value * torch.nan), tmp_path / "nothing.ply")
+    assert "holds no Gaussians" in refusal(capsys, output, "prune", tmp_path / "nothing.ply")
+
+
+def test_an_output_that_cannot_be_written_is_refused(ply, tmp_path, capsys):
+    assert "ends in .ply" in refusal(capsys, tmp_path / "out.splat", "prune", ply)
+    (tmp_path / "folder.ply").mkdir()
+    assert "is a folder" in refusal(capsys, tmp_path / "folder.ply", "prune", ply)
+    assert "cannot be written" in refusal(capsys, ply / "below_a_file.ply", "prune", ply)
+
+
+def test_every_method_can_be_asked_for():
+    from typing import get_args, get_type_hints
+
+    from pointsplat_ns.cli import scenes
+    from pointsplat_ns.compression.prune import ALL_METHODS
+
+    assert get_args(get_type_hints(scenes.prune)["by"]) == ALL_METHODS
+
+
+@pytest.mark.parametrize("by", sorted(SCORES))
+def test_prune_by_a_score_keeps_gaussians_bit_for_bit(by, ply, tmp_path):
+    run("prune", ply, "--keep", "0.3", "--by", by, "-o", tmp_path / "out.ply")
+    assert same(read_ply(tmp_path / "out.ply"), prune(read_ply(ply), 0.3, by).scene)
+
+
+def test_prune_merges_if_not_told_otherwise(ply, tmp_path):
+    run("prune", ply, "--keep", "0.3", "-o", tmp_path / "out.ply")
+    assert same(read_ply(tmp_path / "out.ply"), compact(read_ply(ply), 0.3))
+
+
+@pytest.mark.parametrize("by", ["lightgaussian", "pup"])
+def test_prune_looks_from_the_poses_of_the_run(by, splatfacto_run, tmp_path, capsys):
+    run("prune", splatfacto_run, "--keep", "0.5", "--by", by, "-o", tmp_path / "out.ply")
+    dense, views = read_scene(splatfacto_run), dataset_views(splatfacto_run)
+    wanted = select(IMAGE_SCORES[by](dense, views), len(read_ply(tmp_path / "out.ply")))
+    assert same(read_ply(tmp_path / "out.ply"), dense[wanted])
+    assert "poses of the dataset" in capsys.readouterr().out
+
+
+def test_prune_keeps_what_fits_into_a_file(ply, tmp_path):
+    run("prune", ply, "--by", "opacity", "--keep", "0.005MB", "--sh", "1", "-o", tmp_path / "out.ply")
+    size, row = (tmp_path / "out.ply").stat().st_size, 4 * 26
+    assert size <= 5_000 < size + row and read_ply(tmp_path / "out.ply").sh_degree == 1
+
+
+def test_prune_finds_the_budget_of_a_run_by_rendering(splatfacto_run, tmp_path, capsys):
+    run("prune", splatfacto_run, "--by", "coverage", "--keep", "auto:30", "--sh", "auto", "-o", tmp_path / "out.ply")
+    said = capsys.readouterr().out
+    views = dataset_views(splatfacto_run).spread(COMPARED_VIEWS)
+    reached, _ = DenseReference(read_scene(splatfacto_run), views).psnr(read_ply(tmp_path / "out.ply"))
+    assert reached >= 30 and f"renders reach {reached:.1f} dB" in said and "poses of the dataset" in said
+
+
+def test_a_dry_run_says_all_and_writes_nothing(ply, tmp_path, capsys):
+    before = sorted(tmp_path.iterdir())
+    run("prune", ply, "--by", "coverage", "--keep", "0.25", "--sh", "0", "--dry-run")
+    said = capsys.readouterr().out
+    assert sorted(tmp_path.iterdir()) == before
+    assert "dry run, nothing is written: kept 20 of 80 Gaussians (25.0 %)" in said
+    assert "SH degree 3 cut to 0: 100 % of the directional energy lost" in said and "opacity" in said
+
+
+def test_prune_draws_the_distributions_when_it_is_asked_to(ply, tmp_path):
+    run("prune", ply, "--by", "paper", "-o", tmp_path / "out.ply")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out.ply", "scene.ply"]
+    run("prune", ply, "--by", "paper", "-o", tmp_path / "out.ply", "--plot", tmp_path / "out.png")
+    assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_prune_refuses_options_that_cannot_be_met_before_it_starts(ply, tmp_path, capsys):
+    output = tmp_path / "out.ply"
+    assert "ends in .png" in refusal(capsys, output, "prune", ply, "--plot", tmp_path / "out.jpg")
+    assert "--fine-tune -1" in refusal(capsys, output, "prune", ply, "--fine-tune", "-1")
+    with pytest.raises(SystemExit) as caught:
+        run("prune", ply)
+    assert caught.value.code == 1 and "--output is missing" in capsys.readouterr().err
+
+
+def test_export_writes_the_scene_of_a_splatfacto_run_as_it_is(splatfacto_run, tmp_path):
+    (checkpoint,) = (splatfacto_run / "nerfstudio_models").iterdir()
+    shutil.copy(checkpoint, tmp_path / "alone.ckpt")
+    for i, path in enumerate((splatfacto_run, splatfacto_run / "config.yml", checkpoint, tmp_path / "alone.ckpt")):
+        run("export", path, "-o", tmp_path / f"{i}.ply")
+        assert same(read_ply(tmp_path / f"{i}.ply"), read_scene(checkpoint))
+
+
+def test_export_writes_the_refined_scene_of_a_pointsplat_run(refined_run, trained_walls, tmp_path, capsys):
+    for name, options in (("wall-b", ()), ("wall-a", ("--scene", "wall-a"))):
+        run("export", refined_run, *options, "-o", tmp_path / "out.ply")
+        (source,) = (trained_walls / name / "splatfacto-cpu").iterdir()
+        kept = prune(read_scene(source), 0.5).scene
+        assert same(read_ply(tmp_path / "out.ply"), kept.replace(opacities=kept.opacities + 0.5))
+        assert name in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("supervision", ["auto", "photos", "dense"])
+def test_export_knows_the_scenes_of_a_run_by_the_names_that_its_training_gave_them(
+    supervision, make_refined_run, trained_walls, tmp_path
+):
+    from pointsplat_ns.nerfstudio_plugin.frames import FrameCache
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import find_scenes
+
+    shutil.copytree(trained_walls / "wall-b", tmp_path / "both" / "wall-b")
+    for folder in ("both", "plys"):
+        for i, name in enumerate(("wall-b.ply", "deep/point cloud.ply")):
+            write_ply(random_scene(30 + i), tmp_path / folder / name)
+    write_ply(random_scene(20), tmp_path / "plys.ply")
+    for data in ("both", "plys", "plys.ply"):
+        if supervision == "photos" and data != "both":
+            continue
+        _, scenes = find_scenes(tmp_path / data, supervision, FrameCache(0), need_data=False)
+        run_folder = make_refined_run(tmp_path / f"of {data}", tmp_path / data, moved=0.5)
+        config = (run_folder / "config.yml").read_text()
+        assert "supervision: auto" in config
+        (run_folder / "config.yml").write_text(config.replace("supervision: auto", f"supervision: {supervision}"))
+        trained = open_refined_run(run_folder)
+        assert list(trained.scenes) == [scene.name for scene in scenes]
+        assert trained.default_scene == scenes[0].name
+        for scene in scenes:
+            run("export", run_folder, "--scene", scene.name, "-o", tmp_path / "out.ply")
+            kept = prune(scene.read_dense(), 0.5).scene
+            assert same(read_ply(tmp_path / "out.ply"), kept.replace(opacities=kept.opacities + 0.5))
+
+
+def test_export_says_that_the_scenes_of_a_run_are_gone(make_refined_run, tmp_path, capsys):
+    write_ply(random_scene(30), tmp_path / "plys" / "a.ply")
+    folder = make_refined_run(tmp_path / "refined", tmp_path / "plys")
+    (tmp_path / "plys" / "a.ply").unlink()
+    (tmp_path / "plys" / "cloud.ply").write_text("ply\n")
+    capsys.readouterr()
+    said = refusal(capsys, tmp_path / "out.ply", "export", folder)
+    assert "config.yml" in said and "no trained Splatfacto run below it" in said and "put its scenes back" in said
+    shutil.rmtree(tmp_path / "plys")
+    assert "its data" in refusal(capsys, tmp_path / "out.ply", "export", folder)
+
+
+def test_export_refuses_a_scene_that_is_not_there(refined_run, splatfacto_run, ply, tmp_path, capsys):
+    output = tmp_path / "out.ply"
+    assert "wall-a, wall-b" in refusal(capsys, output, "export", refined_run, "--scene", "attic")
+    assert "holds one scene" in refusal(capsys, output, "export", splatfacto_run, "--scene", "wall-a")
+    assert "gone: no such file" in refusal(capsys, output, "export", tmp_path / "gone")
+    assert "without config.yml" in refusal(capsys, output, "export", tmp_path)
+
+
+def test_the_command_as_installed_refuses_with_status_1_and_one_line(tmp_path):
+    code = "from pointsplat_ns.cli import main; main()"
+    arguments = ["compact", "gone.ply", "--using", "gone", "-o", str(tmp_path / "out.ply")]
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 1 and done.stdout == ""
+    assert done.stderr.startswith("error: gone: no such file") and done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []

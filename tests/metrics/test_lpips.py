@@ -1,0 +1,314 @@
+"""LPIPS against torchmetrics' own, where its weights come from, and how it says that there are none."""
+
+import math
+import os
+import urllib.error
+from io import BytesIO
+
+import pytest
+import torch
+
+from making import SHARED_DATA
+from pointsplat_ns.metrics import ImageError
+from pointsplat_ns.metrics.lpips import _ARCHITECTURES, WEIGHTS_VARIABLE, Lpips, LpipsUnavailable, load_lpips
+
+WEIGHTS = SHARED_DATA / "weights"
+FILES = {"alex": "alexnet_features.pth", "vgg": "vgg16_features.pth"}
+NETS = ["alex", "vgg"]
+
+
+def random_backbone(net, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    state = {}
+    for conv in _ARCHITECTURES[net].convs:
+        out, inner, side = conv.shape
+        # He's initialisation keeps the activations of one size through all layers
+        spread = math.sqrt(2 / (inner * side * side))
+        state[f"features.{conv.index}.weight"] = spread * torch.randn(out, inner, side, side, generator=generator)
+        state[f"features.{conv.index}.bias"] = 0.1 * torch.randn(out, generator=generator)
+    return state
+
+
+@pytest.fixture(scope="module")
+def alex_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("backbone") / "mine.pth"
+    torch.save({**random_backbone("alex"), "classifier.1.weight": torch.zeros(2)}, path)
+    return path
+
+
+@pytest.fixture
+def alex(alex_file):
+    return load_lpips("alex", alex_file)
+
+
+@pytest.fixture(autouse=True)
+def nowhere(tmp_path, monkeypatch):
+    """No variable, an empty hub cache, and a network that answers nothing."""
+    monkeypatch.delenv(WEIGHTS_VARIABLE, raising=False)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
+    asked = []
+
+    def refuse(request, *args, **kwargs):
+        asked.append(request.full_url)
+        raise urllib.error.URLError(OSError(-3, "Temporary failure in name resolution"))
+
+    monkeypatch.setattr(torch.hub, "urlopen", refuse)
+    return asked
+
+
+def pair(*shape, seed=0, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.rand(*shape, 3, generator=generator, dtype=dtype)
+    return (target + 0.1 * torch.randn(*shape, 3, generator=generator, dtype=dtype)).clamp(0, 1), target
+
+
+# Values
+
+
+@pytest.mark.parametrize("net", NETS)
+@pytest.mark.parametrize("real", [False, True])
+def test_lpips_is_torchmetrics(net, real, tmp_path):
+    lpips = pytest.importorskip("torchmetrics.functional.image.lpips")
+    if real:
+        path = WEIGHTS / FILES[net]
+        if not path.is_file():
+            pytest.skip(f"{FILES[net]} is not at hand")
+        state = torch.load(path, weights_only=True)
+    else:
+        state = random_backbone(net)
+        path = tmp_path / "backbone.pth"
+        torch.save(state, path)
+    theirs = lpips._LPIPS(pretrained=True, net=net, pnet_rand=True).eval()
+    for part in theirs.net.children():
+        for index, layer in part.named_children():
+            if hasattr(layer, "weight"):
+                layer.weight.data, layer.bias.data = state[f"features.{index}.weight"], state[f"features.{index}.bias"]
+    a, b = pair(2, 64, 80)
+    expected = theirs(a.permute(0, 3, 1, 2), b.permute(0, 3, 1, 2), normalize=True).flatten()
+    # 1e-5: float32 convolutions; the values are about 0.1
+    assert torch.allclose(load_lpips(net, path)(a, b), expected, atol=1e-5, rtol=1e-5) and expected.min() > 1e-3
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_real_lpips_ranks_a_shift_of_colour_below_noise_below_another_image(net):
+    if not (WEIGHTS / FILES[net]).is_file():
+        pytest.skip(f"{FILES[net]} is not at hand")
+    model = load_lpips(net, WEIGHTS / FILES[net])
+    y, x = torch.meshgrid(torch.linspace(0, 6, 64), torch.linspace(0, 6, 64), indexing="ij")
+    image = torch.stack([x.sin(), y.cos(), (x + y).sin()], dim=-1) * 0.4 + 0.5
+    noise = 0.2 * torch.randn(64, 64, 3, generator=torch.Generator().manual_seed(0))
+    others = [
+        image + 0.02,
+        (image + noise).clamp(0, 1),
+        torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(1)),
+    ]
+    values = [float(model(other, image)) for other in others]
+    assert 0 < values[0] < values[1] < values[2]
+
+
+def test_identical_images_are_at_distance_0_with_a_zero_gradient(alex):
+    for image in (torch.rand(40, 40, 3), torch.zeros(40, 40, 3), torch.ones(40, 40, 3)):
+        pred = image.clone().requires_grad_()
+        value = alex(pred, image)
+        value.backward()
+        assert value == 0 and torch.equal(pred.grad, torch.zeros_like(pred))
+
+
+def test_the_gradient_is_finite_where_every_feature_is_zero(alex_file):
+    state = torch.load(alex_file, weights_only=True)
+    for index in (0, 3, 6, 8, 10):
+        state[f"features.{index}.weight"] = -state[f"features.{index}.weight"].abs()
+        state[f"features.{index}.bias"] = torch.zeros_like(state[f"features.{index}.bias"])
+    torch.save(state, alex_file.parent / "dead.pth")
+    dead = load_lpips("alex", alex_file.parent / "dead.pth")
+    pred = torch.ones(40, 40, 3, requires_grad=True)  # bright: all first features are below zero, so cut off
+    value = dead(pred, torch.zeros(40, 40, 3))
+    value.backward()
+    assert value.isfinite() and pred.grad.isfinite().all()
+
+
+def test_value_and_gradient_in_float32_are_those_of_float64(alex):
+    a, b = pair(40, 44, dtype=torch.float64)
+    results = []
+    for dtype in (torch.float64, torch.float32):
+        pred = a.detach().clone().to(dtype).requires_grad_()
+        value = alex(pred, b.to(dtype))
+        value.backward()
+        assert value.dtype == dtype
+        results.append((value.item(), pred.grad.double()))
+    assert results[1][0] == pytest.approx(results[0][0], rel=1e-4)  # five float32 layers
+    difference = (results[1][1] - results[0][1]).norm() / results[0][1].norm()
+    assert difference < 1e-3  # a ReLU that flips at rounding changes its gradient whole
+
+
+def test_gradient_agrees_with_float64_differences(alex):
+    a, b = pair(31, 31, dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda x: alex(x, b), a.requires_grad_(), fast_mode=True, eps=1e-7, atol=1e-6)
+
+
+def test_lpips_is_symmetric_and_grows_with_noise(alex):
+    a, b = pair(2, 40, 44)
+    assert torch.allclose(alex(a, b), alex(b, a), rtol=1e-5)  # float32 sums
+    values = [float(alex((b[0] + s * (a[0] - b[0])), b[0])) for s in (0.1, 0.3, 1.0)]
+    assert 0 < values[0] < values[1] < values[2]
+
+
+def test_a_batch_gives_one_value_an_image(alex):
+    a, b = pair(3, 40, 44)
+    assert alex(a, b).shape == (3,) and alex(a[0], b[0]).shape == ()
+    assert float(alex(a, b)[1]) == pytest.approx(
+        float(alex(a[1], b[1])), rel=1e-4
+    )  # convolutions of a batch sum otherwise
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_the_smallest_image_works_and_one_below_is_said(net, tmp_path):
+    torch.save(random_backbone(net), tmp_path / "b.pth")
+    model, least = load_lpips(net, tmp_path / "b.pth"), {"alex": 31, "vgg": 16}[net]
+    assert model(*pair(least, least + 5)).isfinite()
+    with pytest.raises(ImageError, match=f"images of {least} x {least - 1} pixels are too small for LPIPS with {net}"):
+        model(*pair(least - 1, least))
+
+
+def test_shapes_are_checked(alex):
+    with pytest.raises(ImageError, match=r"pred has shape \(3, 40, 40\)"):
+        alex(torch.rand(3, 40, 40), torch.rand(3, 40, 40))
+
+
+# As a part of a model
+
+
+def test_a_parent_model_neither_trains_it_nor_saves_it(alex):
+    parent = torch.nn.Module()
+    parent.lpips, parent.layer = alex, torch.nn.Linear(2, 2)
+    assert sorted(parent.state_dict()) == ["layer.bias", "layer.weight"]
+    assert len(list(parent.parameters())) == 2
+    parent.load_state_dict(parent.state_dict(), strict=True)
+    parent.double()
+    assert alex.weight0.dtype == torch.float64  # it moves along
+    parent.train()
+    assert parent.lpips(*pair(40, 40, dtype=torch.float64)).isfinite()
+
+
+# Where the weights come from
+
+
+def test_an_explicit_file_alone_is_tried(alex_file, tmp_path, monkeypatch, nowhere):
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
+    with pytest.raises(LpipsUnavailable, match=r"none\.pth: no such file"):
+        load_lpips("alex", tmp_path / "none.pth")
+    assert not nowhere
+
+
+@pytest.mark.parametrize("name", ["alexnet_features.pth", "alexnet-owt-7be5be79.pth"])
+def test_the_variable_may_name_a_folder(alex_file, alex, tmp_path, monkeypatch, name):
+    (tmp_path / "w").mkdir()
+    os.symlink(alex_file, tmp_path / "w" / name)
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "w"))
+    assert torch.equal(load_lpips("alex").weight0, alex.weight0)
+    with pytest.raises(LpipsUnavailable, match="vgg backbone cannot be downloaded"):
+        load_lpips("vgg")
+
+
+def test_the_variable_may_name_a_file(alex_file, alex, monkeypatch):
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
+    assert torch.equal(load_lpips("alex").weight0, alex.weight0)
+    with pytest.raises(LpipsUnavailable, match=r"mine\.pth: not the weights of LPIPS's vgg backbone; .*has shape"):
+        load_lpips("vgg")
+
+
+def test_a_file_named_for_one_network_is_not_taken_for_the_other(alex_file, tmp_path, monkeypatch, nowhere):
+    os.symlink(alex_file, tmp_path / "alexnet_features.pth")
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "alexnet_features.pth"))
+    with pytest.raises(LpipsUnavailable, match="cannot be downloaded"):
+        load_lpips("vgg")
+    assert nowhere == ["https://download.pytorch.org/models/vgg16-397923af.pth"]
+
+
+def test_a_variable_that_names_nothing_is_said(monkeypatch, tmp_path):
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "gone"))
+    with pytest.raises(LpipsUnavailable, match=f"gone: no such file or folder, though {WEIGHTS_VARIABLE} names it"):
+        load_lpips()
+
+
+def test_the_hub_cache_is_used_without_the_network(alex_file, alex, tmp_path, nowhere):
+    (tmp_path / "hub" / "checkpoints").mkdir(parents=True)
+    os.symlink(alex_file, tmp_path / "hub" / "checkpoints" / "alexnet-owt-7be5be79.pth")
+    assert torch.equal(load_lpips("alex").weight0, alex.weight0) and not nowhere
+
+
+def files_below(folder):
+    return [path for path in folder.rglob("*") if path.is_file()]
+
+
+def test_without_a_network_the_reason_is_one_line_and_no_file_is_left(tmp_path, nowhere):
+    with pytest.raises(LpipsUnavailable) as caught:
+        load_lpips("alex")
+    text = str(caught.value)
+    assert "alex backbone cannot be downloaded ([Errno -3] Temporary failure in name resolution)" in text
+    assert f"set {WEIGHTS_VARIABLE} to a folder with alexnet_features.pth" in text and "\n" not in text
+    assert nowhere == ["https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"] and not files_below(tmp_path)
+
+
+class Answer(BytesIO):
+    """What a proxy might send in place of the weights."""
+
+    def info(self):
+        return self
+
+    def getheaders(self, name):
+        return []
+
+
+def test_a_wrong_download_is_refused_and_leaves_no_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.hub, "urlopen", lambda *args, **kwargs: Answer(b"<html>log in first</html>"))
+    with pytest.raises(LpipsUnavailable, match="cannot be downloaded .invalid hash value"):
+        load_lpips("alex")
+    assert not files_below(tmp_path)
+
+
+def test_a_cut_download_leaves_no_file_and_restores_the_timeout(tmp_path, monkeypatch):
+    import socket
+
+    class Cut(Answer):
+        def read(self, size=-1):
+            raise TimeoutError("timed out")
+
+    monkeypatch.setattr(torch.hub, "urlopen", lambda *args, **kwargs: Cut())
+    with pytest.raises(LpipsUnavailable, match="timed out"):
+        load_lpips("alex")
+    assert not files_below(tmp_path) and socket.getdefaulttimeout() is None
+
+
+def test_a_download_that_is_not_allowed_is_not_tried(nowhere):
+    with pytest.raises(LpipsUnavailable, match="alex backbone is not there"):
+        load_lpips("alex", download=False)
+    assert not nowhere
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"PK garbage", "truncated or not a state dict"),
+        (b"", "truncated or not a state dict"),
+        ([torch.zeros(1)], "holds a list; expected a state dict"),
+        ({"net.0.weight": torch.zeros(1)}, r"lacks 'features.0.weight' \(found net.0.weight\)"),
+        ({"features.0.weight": torch.zeros(64, 3, 3, 3)}, r"has shape \(64, 3, 3, 3\), expected \(64, 3, 11, 11\)"),
+    ],
+)
+def test_files_that_are_no_backbone_are_said(tmp_path, content, message):
+    path = tmp_path / "bad.pth"
+    path.write_bytes(content) if isinstance(content, bytes) else torch.save(content, path)
+    with pytest.raises(LpipsUnavailable, match=message) as caught:
+        load_lpips("alex", path)
+    assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
+
+
+def test_an_unknown_network_is_said():
+    with pytest.raises(LpipsUnavailable, match="no LPIPS network is called 'squeeze'; expected one of alex, vgg"):
+        load_lpips("squeeze")
+
+
+def test_a_missing_linear_weight_is_said():
+    with pytest.raises(LpipsUnavailable, match="lacks 'lin0.model.1.weight'"):
+        Lpips("alex", random_backbone("alex"), {})

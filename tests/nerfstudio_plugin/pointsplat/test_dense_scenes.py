@@ -1,0 +1,203 @@
+"""Dense scenes as their own references: which scenes a folder holds, their poses, their pictures, and the memory."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from unittest import mock
+
+import pytest
+import torch
+
+import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
+from making import without_data
+from pointsplat_ns.compression.view_sampling import sample_views
+from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.cameras import viewmats_from_opengl
+from pointsplat_ns.io import write_ply
+from pointsplat_ns.io.discovery import find_plys
+from pointsplat_ns.nerfstudio_plugin.frames import FrameCache
+from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import PlyScene, SampledPoses, cameras_of
+from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import ScenesDataManagerConfig
+from pointsplat_ns.rasterizer import render
+
+POSES = SampledPoses(train=6, test=3, width=32, height=24, seed=1)
+
+
+def box_room(seed: int, count: int = 900) -> Gaussians:
+    """A closed box of coloured Gaussians, 4 x 3 x 2 scene units: free inside, covered all around."""
+    generator = torch.Generator().manual_seed(seed)
+    means = torch.rand(count, 3, generator=generator) * 2 - 1
+    axis = torch.arange(count) % 3
+    means[torch.arange(count), axis] = torch.sign(means[torch.arange(count), axis])
+    return Gaussians(
+        means=means * torch.tensor([2.0, 1.5, 1.0]),
+        scales=torch.full((count, 3), 0.15).log(),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        opacities=torch.full((count, 1), 4.0),
+        features_dc=torch.randn(count, 3, generator=generator),
+        features_rest=torch.zeros(count, 3, 3),
+    )
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory) -> Path:
+    """A folder of two PLY rooms, one in a folder of its own, beside a point cloud that is no scene."""
+    folder = tmp_path_factory.mktemp("rooms")
+    write_ply(box_room(1), folder / "one.ply")
+    (folder / "deep" / "iteration_7").mkdir(parents=True)
+    write_ply(box_room(2), folder / "deep" / "iteration_7" / "point_cloud.ply")
+    cloud = (
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    )
+    (folder / "cloud.ply").write_text(cloud + "0 0 0\n")
+    (folder / "broken.ply").write_text("nothing")
+    return folder
+
+
+def scene_of(rooms: Path, cache_bytes: int = 1 << 24) -> PlyScene:
+    return PlyScene("one", rooms / "one.ply", FrameCache(cache_bytes), POSES)
+
+
+def manager_of(folder: Path, **settings):
+    settings = {"sampled_poses": 6, "sampled_size": (32, 24), "cache_gigabytes": 0.01, **settings}
+    return ScenesDataManagerConfig(data=folder, **settings).setup(test_mode="val")
+
+
+# which scenes there are
+
+
+def test_a_folder_of_ply_files_is_scenes_learned_from_their_own_renders(rooms):
+    manager = manager_of(rooms)
+    assert [scene.name for scene in manager.scenes] == ["deep-iteration_7-point_cloud", "one"]
+    assert manager.supervision == "dense" and not any(scene.has_photos for scene in manager.scenes)
+    assert [name for name, _ in find_plys(rooms / "one.ply")] == ["one"]
+    assert [scene.name for scene in manager_of(rooms / "one.ply").scenes] == ["one"]
+
+
+def test_beside_runs_ply_files_are_scenes_only_if_that_is_asked_for(trained_walls, rooms, tmp_path):
+    shutil.copytree(trained_walls, tmp_path / "all")
+    shutil.copy(rooms / "one.ply", tmp_path / "all" / "wall-a.ply")
+    inside = next((tmp_path / "all" / "wall-a" / "splatfacto-cpu").iterdir()) / "exported.ply"
+    shutil.copy(rooms / "one.ply", inside)
+    for supervision in ("auto", "photos"):
+        manager = manager_of(tmp_path / "all", supervision=supervision)
+        assert [scene.name for scene in manager.scenes] == ["wall-a", "wall-b"] and manager.supervision == "photos"
+    manager = manager_of(tmp_path / "all", supervision="dense")
+    assert [scene.name for scene in manager.scenes] == ["wall-a", "wall-b", "wall-a.ply"]
+    assert [scene.has_photos for scene in manager.scenes] == [True, True, False] and manager.supervision == "dense"
+
+
+def test_what_holds_no_scene_says_so(rooms, tmp_path):
+    with pytest.raises(SceneError, match="no trained Splatfacto run below it.*or 3DGS PLY files"):
+        manager_of(tmp_path)
+    for data in (rooms, rooms / "one.ply"):
+        with pytest.raises(SceneError, match="supervision dense"):
+            manager_of(data, supervision="photos")
+    with pytest.raises(SceneError, match="cloud.ply: no Gaussians in it; expected a 3DGS .ply"):
+        manager_of(rooms / "cloud.ply")
+    with pytest.raises(SceneError, match="two.ply: no such file"):
+        manager_of(rooms / "two.ply")
+    with pytest.raises(DataError, match="0 sampled poses of 32 x 24 pixels"):
+        manager_of(rooms, sampled_poses=0)
+
+
+def test_a_scene_is_known_wherever_its_file_lies_and_changes_with_its_content(rooms, tmp_path):
+    shutil.copy(rooms / "one.ply", tmp_path / "one.ply")
+    moved = PlyScene("one", tmp_path / "one.ply", FrameCache(0)).identity
+    assert moved == scene_of(rooms).identity
+    write_ply(box_room(3), tmp_path / "one.ply")
+    assert PlyScene("one", tmp_path / "one.ply", FrameCache(0)).identity != moved
+
+
+# poses and pictures
+
+
+def test_cameras_of_views_see_what_the_views_see():
+    views = sample_views(box_room(1), 3, 32, 24, seed=5)
+    cameras = cameras_of(views)
+    # scene units; float32 of numbers up to 2
+    torch.testing.assert_close(
+        viewmats_from_opengl(cameras.camera_to_worlds).double(), views.viewmats, atol=1e-6, rtol=0
+    )
+    torch.testing.assert_close(cameras.get_intrinsics_matrices().double(), views.Ks, atol=1e-5, rtol=0)
+    assert (int(cameras.width[0]), int(cameras.height[0])) == (32, 24)
+
+
+def test_sampled_poses_are_the_same_each_time_and_none_is_in_both_splits(rooms):
+    first, second = scene_of(rooms), scene_of(rooms)
+    assert len(first.train_frames) == 6 and len(first.eval_frames) == 3
+    for split in ("train", "test"):
+        assert torch.equal(first.cameras(split).camera_to_worlds, second.cameras(split).camera_to_worlds)
+    train, held_out = (first.cameras(split).camera_to_worlds.reshape(-1, 12) for split in ("train", "test"))
+    assert torch.cdist(train, held_out).min() > 1e-3
+
+
+def test_targets_are_the_dense_scenes_exact_renders_in_8_bits(rooms):
+    scene = scene_of(rooms)
+    assert not scene.dense(keep=False).means.requires_grad
+    for frames, tolerance in ((scene.rendered_train, 0.5 / 255 + 1e-6), (scene.rendered_eval, 1e-6)):
+        camera, data = frames[-1]
+        views = sample_views(scene.read_dense(), 1, 32, 24)
+        views = type(views)(
+            viewmats_from_opengl(camera.camera_to_worlds), camera.get_intrinsics_matrices(), 32, 24, scene.background
+        )
+        image = data["image"].float() / (255 if data["image"].dtype == torch.uint8 else 1)
+        # half a level where they are rounded, float32 noise where they are not
+        torch.testing.assert_close(image, render(scene.read_dense(), views[0]), atol=tolerance, rtol=0)
+        assert data["image_idx"] == len(frames) - 1 and image.std() > 0.05 and not data["image"].requires_grad
+    assert scene.rendered_train[0][1]["image"].dtype == torch.uint8
+    with pytest.raises(IndexError):
+        scene.rendered_train[6]
+
+
+def test_a_run_is_rendered_from_its_datasets_poses_as_it_was_trained(trained_walls):
+    manager = manager_of(trained_walls, supervision="dense")
+    for index, scene in enumerate(manager.scenes):
+        photos, rendered = scene.train_frames, manager.training_frames(index)
+        assert torch.equal(photos.dataset.cameras.camera_to_worlds, rendered.cameras.camera_to_worlds)
+        error = (photos[0][1]["image"].float() - rendered[0][1]["image"].float()).abs().mean()
+        assert 1 < error < 80, "levels of 255: the run has learned its photos, but is not them"
+        held_out = manager_of(trained_walls).scenes[index].eval_frames
+        assert torch.equal(scene.eval_frames[0][1]["image"], held_out[0][1]["image"]), "photos are what it is judged by"
+
+
+def test_a_run_whose_data_is_gone_is_learned_from_its_own_renders(trained_walls, tmp_path):
+    without_data(trained_walls, tmp_path / "runs")
+    with pytest.raises(SceneError, match="gone_from_here.*supervision dense"):
+        manager_of(tmp_path / "runs")
+    manager = manager_of(tmp_path / "runs", supervision="dense")
+    assert [scene.has_photos for scene in manager.scenes] == [False, False]
+
+
+# memory
+
+
+def test_nothing_is_kept_beyond_the_bound_and_all_is_found_again(rooms):
+    one = scene_of(rooms)
+    dense_bytes = sum(value.numel() * value.element_size() for _, value in one.read_dense().items())
+    unbounded = [data["image"] for _, data in one.rendered_train]
+    picture_bytes = unbounded[0].numel()
+    assert one._cache.num_bytes == dense_bytes + len(unbounded) * picture_bytes
+    for bound in (0, 2 * picture_bytes, dense_bytes + picture_bytes):
+        tight = scene_of(rooms, bound)
+        again = []
+        for _, data in tight.rendered_train:
+            again.append(data["image"])
+            assert tight._cache.num_bytes <= bound
+        assert all(torch.equal(a, b) for a, b in zip(unbounded, again, strict=True))
+
+
+def test_a_kept_picture_needs_no_dense_scene(rooms):
+    scene = scene_of(rooms)
+    first = [data["image"] for _, data in scene.rendered_train]
+    with mock.patch.object(scene, "picture", side_effect=AssertionError("drawn again")):
+        assert all(torch.equal(a, data["image"]) for a, (_, data) in zip(first, scene.rendered_train, strict=True))
+
+
+def test_the_viewer_gets_pictures_in_the_unit_range(rooms):
+    dataset = manager_of(rooms).train_dataset
+    assert len(dataset) == len(dataset.cameras) == 6
+    image = dataset[2]["image"]
+    assert image.shape == (24, 32, 3) and image.dtype == torch.float32 and 0.1 < image.max() <= 1

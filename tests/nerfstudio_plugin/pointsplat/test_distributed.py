@@ -1,0 +1,333 @@
+"""Two processes that train together do what one does with twice the scenes an update. Run as a program: the two."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from unittest import mock
+
+import pytest
+import torch
+from torch import nn
+
+UPDATES = 3
+ROWS, CHANNELS = 10, 4
+BROKEN = {3}, {6}
+"""Places of a broken photo, which the second process meets, and of a broken gradient, which the first does."""
+
+
+def write_rooms(folder: Path) -> None:
+    """Three closed boxes of coloured Gaussians as PLY files."""
+    from pointsplat_ns.gaussians import Gaussians
+    from pointsplat_ns.io import write_ply
+
+    generator = torch.Generator().manual_seed(3)
+    for name in ("a", "b", "c"):
+        means = torch.rand(600, 3, generator=generator) * 2 - 1
+        rows, axis = torch.arange(600), torch.arange(600) % 3
+        means[rows, axis] = torch.sign(means[rows, axis])
+        quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(600, 1)
+        colors = torch.sin(2 * means + torch.randn(3, generator=generator))
+        scales, opacities = torch.full((600, 3), -2.0), torch.full((600, 1), 4.0)
+        write_ply(Gaussians(means, scales, quats, opacities, colors, torch.zeros(600, 0, 3)), folder / f"{name}.ply")
+
+
+def config_of(data: Path, output_dir: Path, steps: int):
+    """The method as registered, tiny, without LPIPS, at constant rates, for a schedule counts steps, not scenes."""
+    import method_configs.methods  # noqa: F401  (completes nerfstudio's imports in the order that it can)
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
+
+    config = pointsplat_config()
+    config.machine.device_type, config.experiment_name, config.timestamp = "cpu", "refiner", "now"
+    config.output_dir, config.max_num_iterations, config.steps_per_eval_image = output_dir, steps, 0
+    manager, model = config.pipeline.datamanager, config.pipeline.model
+    manager.data = config.data = data
+    manager.sampled_poses, manager.sampled_size = 5, (32, 24)
+    model.size, model.keep, model.score, model.lpips_weight = "tiny", 0.4, "paper", 0.0
+    for group in config.optimizers.values():
+        group["scheduler"], group["optimizer"].lr = None, 1e-3
+    return config
+
+
+def train(config, world_size: int = 1) -> dict:
+    """Losses, gradients of the last update, weights and evaluation of a training."""
+    from pointsplat_ns.metrics.lpips import LpipsUnavailable
+
+    trainer = config.setup(local_rank=0, world_size=world_size)
+    trainer.setup()
+    losses, quality, iteration = [], [], trainer.train_iteration
+
+    def recorded(step):
+        loss, parts, metrics = iteration(step)
+        losses.append(loss.item())
+        quality.append(float(metrics["psnr"]))
+        return loss, parts, metrics
+
+    trainer.train_iteration = recorded
+    trainer.train()
+    refiner = trainer.pipeline.model.refiner
+    with mock.patch(
+        "pointsplat_ns.nerfstudio_plugin.pointsplat.model.load_lpips", side_effect=LpipsUnavailable("not in this test")
+    ):
+        report = trainer.pipeline.get_average_eval_image_metrics()
+    return {
+        "losses": losses,
+        "psnr": quality,
+        "gradients": {name: p.grad.clone() for name, p in refiner.named_parameters()},
+        "weights": {name: p.detach().clone() for name, p in refiner.named_parameters()},
+        "statistics": {name: value.clone() for name, value in refiner.named_buffers()},
+        "report": {name: block["refined"]["psnr"] for name, block in report["scenes"].items()},
+        "skipped": dict(trainer.pipeline.skipped),
+        "files": sorted(p.name for p in config.get_base_dir().rglob("*") if p.is_file() and "events" not in p.name),
+    }
+
+
+@contextmanager
+def broken(photos: set[int], gradients: set[int]) -> Iterator[None]:
+    """Within, photos of NaN, and finite losses with a gradient of NaN, at these places in the sequence of scenes."""
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import ScenesDataManager
+
+    next_train, losses_of = ScenesDataManager.next_train, PointSplatPipeline.get_train_loss_dict
+
+    def targets(self, step):
+        scene, frames = next_train(self, step)
+        if self.place(step) in photos:
+            frames = [(camera, {**data, "image": torch.full((24, 32, 3), torch.nan)}) for camera, data in frames]
+        return scene, frames
+
+    def losses(self, step):
+        outputs, parts, metrics = losses_of(self, step)
+        if self.datamanager.place(step) in gradients:
+            weight = self.model.refiner.heads.mlps["scales"][-1].weight
+            parts["l1"] = parts["l1"] + 0 * (0 * weight.sum()).sqrt()  # a root's slope at 0, times 0
+        return outputs, parts, metrics
+
+    with (
+        mock.patch.object(ScenesDataManager, "next_train", targets),
+        mock.patch.object(PointSplatPipeline, "get_train_loss_dict", losses),
+    ):
+        yield
+
+
+def gathering(data: Path, output_dir: Path, steps: int, accumulate: int, norm: str = "scene"):
+    """The config of a training that updates once in some steps, and saves between two updates as well."""
+    config = config_of(data, output_dir, steps)
+    config.gradient_accumulation_steps = {"all": accumulate}
+    config.steps_per_save, config.save_only_latest_checkpoint, config.pipeline.model.norm = 2, False, norm
+    return config
+
+
+def resumed(rooms: Path, folder: Path, name: str, rank: int, norm: str) -> list[dict]:
+    """A training of two processes, and the end of it once more from a checkpoint between two updates."""
+    whole = train(gathering(rooms, folder / f"{name}{rank}", 4, 2, norm), world_size=2)
+    rest = gathering(rooms, folder / f"{name} on {rank}", 1, 2, norm)
+    rest.load_dir, rest.load_step = folder / f"{name}0" / "refiner" / "pointsplat" / "now" / "nerfstudio_models", 2
+    return [whole, train(rest, world_size=2)]
+
+
+def stopped(rooms: Path, output_dir: Path) -> str:
+    """What a training of two processes says when the second one's photos are all broken."""
+    from pointsplat_ns.errors import SceneError
+
+    config = config_of(rooms, output_dir, 20)
+    config.max_skipped_steps = 2
+    with broken(set(range(1, 40, 2)), set()), pytest.raises(SceneError) as caught:
+        train(config, world_size=2)
+    return str(caught.value)
+
+
+def normalise(norm: nn.Module, x: torch.Tensor, weights: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Two steps of a batch norm in training, the gradients of a weighted sum of what comes out, and its statistics."""
+    x = x.clone().requires_grad_()
+    norm(2 * x.detach())
+    out = norm(x)
+    (out * weights).sum().backward()
+    found = {"out": out.detach(), "x": x.grad, "weight": norm.weight.grad, "bias": norm.bias.grad}
+    return found | {name: value.clone() for name, value in norm.named_buffers()}
+
+
+def rows() -> tuple[torch.Tensor, torch.Tensor]:
+    """Points of two scenes of different sizes, far from zero, and weights for the loss."""
+    generator = torch.Generator().manual_seed(7)
+    x = torch.randn(ROWS, CHANNELS, generator=generator, dtype=torch.float64) + 100
+    return x, torch.randn(ROWS, CHANNELS, generator=generator, dtype=torch.float64)
+
+
+def work(rank: int, folder: Path) -> None:
+    """What each of the two processes does."""
+    import torch.distributed as dist
+
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import (
+        average_gradients,
+        gathered,
+        means_over_ranks,
+        synchronise_batch_norm,
+    )
+    from pointsplat_ns.refiner.encoder import BatchNorm
+
+    dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=2)
+    found = train(config_of(folder / "rooms", folder / f"out{rank}", UPDATES), world_size=2)
+    found["resumed"] = resumed(folder / "rooms", folder, "gathering", rank, "scene")
+    with broken(*BROKEN):
+        found["skipping"] = resumed(folder / "rooms", folder, "skipping", rank, "scene")
+    with broken({3}, set()):
+        found["batch norm"] = resumed(folder / "rooms", folder, "batch norm", rank, "batch")
+    found["stopped"] = stopped(folder / "rooms", folder / f"stopped{rank}")
+    x, weights = rows()
+    mine = slice(0, 3) if rank == 0 else slice(3, ROWS)
+    norm = nn.Sequential(BatchNorm(CHANNELS).double())
+    synchronise_batch_norm(norm)
+    found["norm"] = normalise(norm[0], x[mine], weights[mine])
+    found["norm of a point"] = norm[0](x[rank : rank + 1]).detach()
+    found["gathered"] = gathered([rank, "x"])
+    found["means"] = means_over_ranks({"l1": torch.tensor(1.0 + rank), "only": torch.tensor(5.0)}, ("l1", "lpips"))
+    one, none = nn.Parameter(torch.zeros(2)), nn.Parameter(torch.zeros(3))
+    one.grad = torch.full((2,), 1.0 + rank) if rank else None
+    average_gradients([one, none], steps=4)
+    found["averaged"] = (one.grad, none.grad)
+    torch.save(found, folder / f"found{rank}.pt")
+    dist.destroy_process_group()
+
+
+@pytest.fixture(scope="module")
+def together(tmp_path_factory):
+    """What the two processes found, and what one process finds with two scenes an update."""
+    folder = tmp_path_factory.mktemp("parallel")
+    (folder / "rooms").mkdir()
+    write_rooms(folder / "rooms")
+    pair = subprocess.Popen([sys.executable, __file__, folder], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    try:
+        alone = config_of(folder / "rooms", folder / "alone", 2 * UPDATES)
+        alone.gradient_accumulation_steps = {"all": 2}
+        alone = train(alone)
+        with broken(BROKEN[0] | {2}, BROKEN[1] | {7}):  # what either of two processes cannot use, both leave out
+            alone["skipping"] = train(gathering(folder / "rooms", folder / "skipping", 8, 4))
+        text = pair.communicate(timeout=600)[0].decode()
+    finally:
+        pair.kill()
+    assert pair.returncode == 0, text
+    return [torch.load(folder / f"found{rank}.pt") for rank in (0, 1)], alone
+
+
+def test_losses_and_metrics_are_those_of_one_process_with_twice_the_batch(together):
+    found, alone = together
+    for key, tolerance in (("losses", 1e-5), ("psnr", 1e-5)):  # float32 sums in another order, through three updates
+        wanted = [(a + b) / 2 for a, b in zip(alone[key][::2], alone[key][1::2], strict=True)]
+        assert found[0][key] == found[1][key] == pytest.approx(wanted, rel=tolerance)
+    assert len(set(alone["losses"])) == 2 * UPDATES
+
+
+def test_gradients_and_weights_are_those_of_one_process_with_twice_the_batch(together):
+    found, alone = together
+    for key, tolerance in (("gradients", 1e-3), ("weights", 1e-3)):
+        for name, wanted in alone[key].items():
+            assert torch.equal(found[0][key][name], found[1][key][name]), name
+            # Adam's first steps have the size of the rate, whatever that of the gradient: rounding shows where a
+            # gradient is nearly nothing. Shares of the tensor's largest value.
+            error = (found[0][key][name] - wanted).abs().max() / wanted.abs().max().clamp_min(1e-6)
+            assert error < tolerance, (key, name, float(error))
+
+
+def test_each_process_evaluates_its_share_and_all_know_the_whole(together):
+    found, alone = together
+    assert found[0]["report"] == found[1]["report"] and list(found[0]["report"]) == ["a", "b", "c"]
+    assert found[0]["report"] == pytest.approx(alone["report"], abs=1e-2)  # dB, of weights that differ by rounding
+
+
+def test_the_first_process_alone_writes(together):
+    found, alone = together
+    assert {"refiner.safetensors", f"step-{UPDATES - 1:09d}.ckpt"} <= set(found[0]["files"])
+    assert not {"refiner.safetensors"} & set(found[1]["files"]) and not [f for f in found[1]["files"] if "ckpt" in f]
+
+
+@pytest.mark.parametrize("name", ["resumed", "skipping", "batch norm"])
+def test_a_training_interrupted_between_two_updates_ends_as_an_unbroken_one(together, name):
+    for part in together[0]:
+        whole, rest = part[name]
+        assert f"step-{2:09d}.ckpt" in together[0][0][name][0]["files"], "it was saved with gradients in waiting"
+        assert str(rest["losses"]) == str(whole["losses"][3:]) and rest["skipped"] == whole["skipped"]
+        for key in ("weights", "statistics"):
+            for tensor, value in whole[key].items():
+                assert torch.equal(rest[key][tensor], value), (key, tensor)
+    ours, theirs = (part[name][0] for part in together[0])
+    assert all(torch.equal(ours["weights"][n], theirs["weights"][n]) for n in ours["weights"])
+    assert bool(ours["statistics"]) == (name == "batch norm")
+
+
+def test_what_one_process_cannot_use_all_leave_out(together):
+    found, alone = together
+    for part in found:
+        whole = part["skipping"][0]
+        assert [value != value for value in whole["losses"]] == [False, True, False, False], "the mean is NaN, too"
+        assert sum(whole["skipped"].values()) == 2, "the one broken scene of each such step"
+        for name, wanted in alone["skipping"]["weights"].items():
+            error = (whole["weights"][name] - wanted).abs().max() / wanted.abs().max().clamp_min(1e-6)
+            assert error < 1e-3, (name, float(error))  # as above
+    assert found[0]["skipping"][0]["skipped"] == found[1]["skipping"][0]["skipped"]
+    assert sum(alone["skipping"]["skipped"].values()) == 4
+
+
+def test_all_processes_stop_at_once_and_name_the_scenes_of_all(together):
+    texts = [part["stopped"] for part in together[0]]
+    assert all("training stopped at step 2: losses or gradients were not finite in 3 steps" in text for text in texts)
+    names = [re.findall(r"([abc]): (\d)", text) for text in texts]
+    assert names[0] == names[1] and sum(int(count) for _, count in names[0]) == 3
+
+
+def test_batch_norm_is_that_of_all_points(together):
+    from pointsplat_ns.refiner.encoder import BatchNorm
+
+    found, _ = together
+    x, weights = rows()
+    # each process's loss is its own; the mean of their gradients is that of the mean loss
+    wanted = normalise(BatchNorm(CHANNELS).double(), x, weights)
+    parts = [part["norm"] for part in found]
+    tight = {"rtol": 1e-9, "atol": 1e-9}  # float64
+    for name in ("out", "x"):
+        torch.testing.assert_close(torch.cat([part[name] for part in parts]), wanted[name], **tight)
+    for name in ("weight", "bias"):
+        torch.testing.assert_close(parts[0][name] + parts[1][name], wanted[name], **tight)
+    for part in parts:
+        for name in ("running_mean", "running_var", "num_batches_tracked"):
+            torch.testing.assert_close(part[name], wanted[name], **tight)
+    pair = BatchNorm(CHANNELS).double()(x[:2]).detach()
+    torch.testing.assert_close(torch.cat([part["norm of a point"] for part in found]), pair, **tight)
+
+
+def test_numbers_of_several_processes_become_one(together):
+    for part in together[0]:
+        assert part["gathered"] == [0, "x", 1, "x"]
+        assert {name: float(value) for name, value in part["means"].items()} == {"l1": 1.5}
+        assert part["averaged"][0].tolist() == [0.25, 0.25], "(0 + 2) / 2 processes / 4 steps"
+        assert part["averaged"][1].tolist() == [0.0] * 3
+
+
+def test_a_process_alone_is_left_as_it_is():
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import (
+        average_gradients,
+        gathered,
+        means_over_ranks,
+        rank,
+        world_size,
+    )
+
+    assert (rank(), world_size(), gathered([1])) == (0, 1, [1])
+    assert means_over_ranks({"psnr": torch.tensor(3.0)}, ("l1", "psnr")) == {"psnr": torch.tensor(3.0)}
+    parameter = nn.Parameter(torch.zeros(2))
+    average_gradients([parameter], steps=3)
+    assert parameter.grad is None
+
+
+if __name__ == "__main__":
+    import method_configs.methods  # noqa: F401  (what takes seconds to import is imported once, for both)
+
+    child = os.fork()  # nothing has been computed, so there are no threads yet
+    work(0 if child else 1, Path(sys.argv[1]))
+    if child:
+        sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))

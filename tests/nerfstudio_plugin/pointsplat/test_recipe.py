@@ -1,0 +1,111 @@
+"""The recipe of the refiner that ships: its rooms differ, and its commands are ones that ns-train understands."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import pytest
+import torch
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.nerfstudio_plugin.pointsplat.recipe import (
+    KEEP,
+    TRAIN_SEEDS,
+    UNSEEN_SEEDS,
+    card_text,
+    refiner_command,
+    scene_settings,
+)
+from pointsplat_ns.rooms.camera_path import STYLES, capture_path
+from pointsplat_ns.rooms.room import make_room
+
+
+def parsed(command: str):
+    """What ns-train makes of a command line."""
+    import tyro
+    from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+
+    program, *words = shlex.split(command)
+    assert program == "ns-train"
+    return tyro.cli(AnnotatedBaseConfigUnion, args=words)
+
+
+def test_unseen_rooms_are_not_trained_on():
+    assert not set(TRAIN_SEEDS) & set(UNSEEN_SEEDS)
+
+
+def test_settings_follow_from_the_seed_and_differ_between_seeds():
+    every = [scene_settings(seed) for seed in (*TRAIN_SEEDS, *UNSEEN_SEEDS)]
+    assert every == [scene_settings(seed) for seed in (*TRAIN_SEEDS, *UNSEEN_SEEDS)]
+    assert {s.style for s in every} == set(STYLES)
+    for name in ("steps", "seed_points", "densify_grad_thresh"):
+        assert len({getattr(s, name) for s in every}) > 0.9 * len(every), name
+    for name in ("width", "cull_alpha_thresh", "antialiased", "scale_regularization"):
+        assert len({getattr(s, name) for s in every}) > 1, name
+
+
+def test_the_scene_command_says_what_the_settings_say():
+    settings = scene_settings(TRAIN_SEEDS[0])
+    config = parsed(settings.train_command(Path("rooms/a b"), Path("scenes"), "recipe"))
+    model = config.pipeline.model
+    assert config.method_name == "splatfacto-cpu" and config.experiment_name == settings.name
+    assert config.max_num_iterations == settings.steps
+    assert model.densify_grad_thresh == pytest.approx(settings.densify_grad_thresh, rel=0.01)  # two digits
+    assert model.cull_alpha_thresh == settings.cull_alpha_thresh
+    assert model.rasterize_mode == ("antialiased" if settings.antialiased else "classic")
+    assert model.use_scale_regularization == settings.scale_regularization
+    assert config.pipeline.datamanager.dataparser.num_seed_points == settings.seed_points
+    assert config.data == Path("rooms/a b")
+
+
+def test_the_refiner_command_holds_the_unseen_rooms_out():
+    config = parsed(refiner_command(Path("o/scenes"), Path("o/refiners"), "name", "recipe", "tiny", 70, 3))
+    manager, model = config.pipeline.datamanager, config.pipeline.model
+    assert config.method_name == "pointsplat" and config.max_num_iterations == 70
+    assert manager.eval_scenes == tuple(f"room{seed}" for seed in UNSEEN_SEEDS)
+    assert (manager.supervision, manager.seed) == ("dense", 3)
+    assert model.keep == KEEP and model.size == "tiny" and model.score == "merge"
+    assert model.pruned_folder == Path("o/pruned")
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_every_style_gives_level_poses_in_free_space(style):
+    from pointsplat_ns.rooms.camera_path import CLEARANCE, clearance
+
+    room = make_room(7)
+    poses = capture_path(room, 24, 7, style)
+    assert poses.shape == (24, 4, 4)
+    assert (poses[:, 2, 0].abs() < 1e-6).all(), "the horizon is level"
+    turns = poses[:, :3, :3]
+    assert torch.allclose(turns @ turns.transpose(1, 2), torch.eye(3).expand(24, 3, 3), atol=1e-5)
+    assert (clearance(room, poses[:, :3, 3]) > CLEARANCE).all()
+    distinct = {tuple(p) for p in poses[:, :3, 3].mul(1000).round().tolist()}
+    # The camera goes up and down at a stop, too.
+    places = {place[:2] for place in distinct}
+    assert len(places) == 6 if style == "stops" else len(places) > 12
+
+
+def test_styles_look_elsewhere_and_an_unknown_one_is_refused():
+    room = make_room(7)
+    ahead = {style: capture_path(room, 24, 7, style)[:, :3, 2] for style in STYLES}
+    flat = {style: torch.nn.functional.normalize(way[:, :2], dim=1) for style, way in ahead.items()}
+    assert ((flat["rounds"] * flat["outward"]).sum(1) < -0.999).all(), "outward looks the opposite way"
+    assert (flat["stops"][:4] @ flat["stops"][:4].T).min() < -0.99, "at a stop the camera turns all the way"
+    with pytest.raises(DataError, match="no capture style is called 'drone'; expected one of rounds, outward, stops"):
+        capture_path(room, 24, 7, "drone")
+
+
+def test_the_card_names_rooms_command_and_results():
+    values = {"psnr": 25.0, "ssim": 0.8, "lpips": None, "gaussians": 1234.0}
+    scene = {"seen_in_training": False, "dense": values, "pruned": values, "refined": {**values, "psnr": 26.5}}
+    results = {
+        "scenes": {"room50": scene, "room100": {**scene, "seen_in_training": True}},
+        "average_unseen": scene,
+        "settings": {"size": "tiny"},
+    }
+    about = {"scenes": ["room100"], "command": "pointsplat make-refiner", "keep": 0.1, "steps": 10}
+    text = card_text(about, results, "ns-train pointsplat", 664_563)
+    assert "| room50 | refined | 26.50 | 0.800 | - | 1,234 |" in text
+    assert "room100 |" not in text, "results are of rooms that it was not trained on"
+    assert "`pointsplat make-refiner`" in text and "664,563" in text

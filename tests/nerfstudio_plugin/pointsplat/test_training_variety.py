@@ -1,0 +1,133 @@
+"""What makes a training vary (budgets, transforms, rates that fit), and pruned scenes kept on disk."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
+from making import small_config
+from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES
+from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PIXEL_LOSSES
+from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_store import read_pruned, stored_path, write_pruned
+
+
+def config_of(data: Path, output_dir: Path, steps: int = 6, **model):
+    return small_config(data, output_dir, steps, **model)
+
+
+def test_one_network_learns_at_several_budgets_and_is_evaluated_at_the_first(
+    trained_walls, run_training, tmp_path, no_lpips
+):
+    trainer, _ = run_training(config_of(trained_walls, tmp_path, steps=12, more_keeps=(0.25, 40.0)))
+    model = trainer.pipeline.model
+    cached = {key[2] for key in model._cache._entries if key[0] == "pruned"}
+    assert cached == {0.5, 0.25, 40.0}
+    model.eval()
+    assert len(model.refine(0)) == round(0.5 * len(model.scenes[0].read_dense()))
+
+
+def test_a_budget_without_meaning_is_refused_before_anything_is_read(trained_walls, tmp_path):
+    with pytest.raises(BudgetError, match="keep is 1.5"):
+        config_of(trained_walls, tmp_path, more_keeps=(0.3, 1.5)).pipeline.setup(device="cpu")
+
+
+def losses_of(run_training, config) -> list[float]:
+    return run_training(config)[1]
+
+
+def test_transforms_change_what_the_network_sees_and_nothing_else(trained_walls, run_training, tmp_path, no_lpips):
+    """Before the first update residuals are zero, so the first loss is the same; from the second on it is not."""
+    plain = losses_of(run_training, config_of(trained_walls, tmp_path / "plain", steps=4))
+    moved = losses_of(run_training, config_of(trained_walls, tmp_path / "moved", steps=4, augment=True))
+    again = losses_of(run_training, config_of(trained_walls, tmp_path / "again", steps=4, augment=True))
+    assert moved[0] == pytest.approx(plain[0], rel=1e-4)  # undoing a transform rounds: thresholds flip in few pixels
+    assert moved[1:] != plain[1:]
+    assert moved == again, "the same seed draws the same transforms"
+
+
+def test_evaluation_sees_scenes_as_they_are(trained_walls, tmp_path):
+    pipeline = config_of(trained_walls, tmp_path, augment=True).pipeline.setup(device="cpu", test_mode="test").eval()
+    refined, pruned = pipeline.model.refine(0), pipeline.model.pruned_scene(0).pruned
+    assert all(torch.equal(a, b) for a, b in zip(refined.tensors(), pruned.tensors(), strict=True))
+
+
+def test_pruned_scenes_are_taken_from_the_folder(trained_walls, tmp_path, monkeypatch):
+    import pointsplat_ns.nerfstudio_plugin.pointsplat.model as module
+
+    def pruned(**changes):
+        config = config_of(trained_walls, tmp_path, pruned_folder=tmp_path / "pruned", **changes)
+        return config.pipeline.setup(device="cpu", test_mode="test").model.pruned_scene(0)
+
+    first = pruned()
+    files = sorted((tmp_path / "pruned").iterdir())
+    assert len(files) == 1 and files[0].suffix == ".safetensors"
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "compact", lambda *a, **k: pytest.fail("pruned again"))
+        second = pruned()
+    assert all(torch.equal(a, b) for a, b in zip(first.pruned.tensors(), second.pruned.tensors(), strict=True))
+    assert (first.dense_count, first.seconds) == (second.dense_count, second.seconds)
+    assert len(pruned(keep=0.25).pruned) < len(first.pruned)  # another budget is another file
+    assert len(list((tmp_path / "pruned").iterdir())) == 2
+
+
+def test_files_of_pruned_scenes_that_are_damaged_or_of_another_kind_say_so(tmp_path):
+    from safetensors.torch import save_file
+
+    scene = Gaussians.empty(sh_degree=1)
+    path = stored_path(tmp_path, "room/of another kind/now step 3", {"keep": 0.5, "by": "paper"})
+    write_pruned(path, scene, 7, 0.25)
+    found, count, seconds = read_pruned(path)
+    assert (len(found), found.sh_degree, count, seconds) == (0, 1, 7, 0.25)
+    path.write_bytes(path.read_bytes()[:-3] + b"x")
+    with pytest.raises(SceneError, match="not a readable pruned scene"):
+        read_pruned(path)
+    save_file({"means": torch.zeros(1, 3)}, path)
+    with pytest.raises(SceneError, match="format None; expected 'pointsplat-pruned/1'"):
+        read_pruned(path)
+    assert stored_path(None, "room", {}) is None
+    assert stored_path(tmp_path, "../../etc/passwd", {}).parent == tmp_path
+
+
+@pytest.mark.parametrize("factor", [0.0, -1.0, math.nan, math.inf])
+def test_a_factor_of_the_rates_that_is_no_positive_number_is_refused(factor, tmp_path):
+    config = config_of(tmp_path, tmp_path)
+    config.rate_factor = factor
+    with pytest.raises(PointSplatError, match="--rate-factor"):
+        config.setup(local_rank=0, world_size=1)
+
+
+def test_the_factor_multiplies_every_rate(trained_walls, tmp_path):
+    config = config_of(trained_walls, tmp_path)
+    config.rate_factor = 3.0
+    trainer = config.setup(local_rank=0, world_size=1)
+    for name, group in trainer.config.optimizers.items():
+        assert group["optimizer"].lr == pytest.approx(3 * RATES[name])
+    assert config.optimizers["encoder"]["optimizer"].lr == RATES["encoder"], "the config given is left as it is"
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-30, 1e-8, 1e-3, 1.0])
+@pytest.mark.parametrize("name", sorted(PIXEL_LOSSES))
+def test_pixel_losses_at_extremes(name, scale):
+    """Value and gradient in float32 against float64; nothing differs, next to nothing differs, everything differs."""
+    signs = torch.tensor([1.0, -1.0, 0.5]).repeat(16).reshape(4, 4, 3)
+    found, exact = ((signs.to(dtype) * scale).requires_grad_() for dtype in (torch.float32, torch.float64))
+    values = [PIXEL_LOSSES[name](difference) for difference in (found, exact)]
+    for value in values:
+        value.backward()
+    assert values[0].item() == pytest.approx(values[1].item(), rel=1e-5, abs=1e-9)
+    assert found.grad.isfinite().all()
+    assert torch.allclose(found.grad.double(), exact.grad, rtol=1e-4, atol=1e-7)
+
+
+def test_the_pixel_loss_is_the_one_asked_for(trained_walls, run_training, tmp_path, no_lpips):
+    losses = {
+        name: losses_of(run_training, config_of(trained_walls, tmp_path / name, steps=1, pixel_loss=name))[0]
+        for name in PIXEL_LOSSES
+    }
+    assert losses["rmse"] > losses["l1"] > 0, "a root of mean squares is at least the mean"

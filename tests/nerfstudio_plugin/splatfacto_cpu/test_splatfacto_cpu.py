@@ -1,0 +1,360 @@
+"""The splatfacto-cpu model against nerfstudio's own, and its whole life: train, resume, evaluate, export."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from unittest import mock
+
+import pytest
+import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.scene_box import OrientedBox, SceneBox
+from nerfstudio.models import splatfacto as stock
+from nerfstudio.models.splatfacto import SplatfactoModelConfig
+
+import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
+from making import SHARED_DATA
+from pointsplat_ns.errors import DataError, PointSplatError
+from pointsplat_ns.geometry.cameras import viewmats_from_opengl
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import fitted_schedules, splatfacto_cpu_config
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import LONE_POINT_SCALE, SplatfactoCpuModelConfig
+from pointsplat_ns.rasterizer import rasterization
+
+SEED = 20
+WEIGHTS = SHARED_DATA / "weights"
+
+
+def build(config, seeds=None, num_train_data: int = 3):
+    box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    # Stock Splatfacto asks the network for LPIPS weights here; ours must not notice that there is none.
+    with mock.patch("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", lambda **_: torch.nn.Identity()):
+        return config.setup(scene_box=box, num_train_data=num_train_data, seed_points=seeds)
+
+
+def random_seeds(num: int = 40):
+    generator = torch.Generator().manual_seed(SEED)
+    points = torch.rand((num, 3), generator=generator) - 0.5
+    return points, torch.randint(0, 256, (num, 3), generator=generator).float()
+
+
+def camera_at(z: float = 2.0) -> Cameras:
+    pose = torch.eye(4)[None, :3].clone()
+    pose[0, 2, 3] = z
+    return Cameras(
+        camera_to_worlds=pose,
+        fx=50.0,
+        fy=55.0,
+        cx=21.0,
+        cy=15.0,
+        width=43,
+        height=31,
+        camera_type=CameraType.PERSPECTIVE,
+        metadata={"cam_idx": 1},
+    )
+
+
+def pair(**settings):
+    """Our model and nerfstudio's with one set of parameters."""
+    ours = build(SplatfactoCpuModelConfig(**settings), random_seeds())
+    theirs = build(SplatfactoModelConfig(num_random=40, **settings))
+    with torch.no_grad():
+        for name, value in ours.gauss_params.items():
+            theirs.gauss_params[name].copy_(value)
+            if name == "features_rest":
+                value.normal_(generator=torch.Generator().manual_seed(SEED))
+                theirs.gauss_params[name].copy_(value)
+        if settings.get("camera_optimizer"):
+            ours.camera_optimizer.pose_adjustment.fill_(0.01)
+            theirs.camera_optimizer.pose_adjustment.fill_(0.01)
+    for model in (ours, theirs):
+        model.optimizers = {}
+        model.step = 5000
+    return ours, theirs
+
+
+def stock_outputs(model, camera):
+    """Outputs of nerfstudio's own code with its two calls into CUDA replaced."""
+    with (
+        mock.patch.object(stock, "rasterization", rasterization),
+        mock.patch.object(stock, "get_viewmat", viewmats_from_opengl),
+        mock.patch.object(torch.Tensor, "cuda", lambda self: self),
+    ):
+        torch.manual_seed(SEED)
+        return model.get_outputs(camera)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"sh_degree": 0, "background_color": "white"},
+        {"rasterize_mode": "antialiased", "output_depth_during_training": True, "background_color": "black"},
+        {"use_bilateral_grid": True, "camera_optimizer": CameraOptimizerConfig(mode="SO3xR3")},
+    ],
+    ids=["default", "degree0", "antialiased", "bilateral+poses"],
+)
+@pytest.mark.parametrize("training", [True, False])
+def test_outputs_are_those_of_nerfstudio(settings, training):
+    ours, theirs = pair(**settings)
+    ours.train(training), theirs.train(training)
+    ours.step = theirs.step = 3000  # in training: half resolution, all SH degrees
+    torch.manual_seed(SEED)
+    got, expected = ours.get_outputs(camera_at()), stock_outputs(theirs, camera_at())
+    assert got.keys() == expected.keys()
+    assert got["rgb"].shape == ((15, 21, 3) if training else (31, 43, 3))
+    assert got["accumulation"].max() > 0.05, "an empty picture proves nothing"
+    for name, value in expected.items():
+        if value is None:
+            assert got[name] is None
+        else:
+            # One and the same rasterizer and formulas: only the rounding of halved intrinsics may differ.
+            torch.testing.assert_close(got[name], value, atol=1e-5, rtol=1e-5)
+
+
+def test_crop_box_keeps_what_is_inside_and_an_empty_one_gives_background():
+    ours, theirs = pair(background_color="black")
+    ours.eval(), theirs.eval()
+    box = OrientedBox.from_params((0.25, 0.0, 0.0), (0.0, 0.0, 0.0), (0.5, 1.0, 1.0))
+    whole = ours.get_outputs_for_camera(camera_at())
+    got = ours.get_outputs_for_camera(camera_at(), obb_box=box)
+    theirs.set_crop(box)
+    torch.testing.assert_close(got["rgb"], stock_outputs(theirs, camera_at())["rgb"])
+    assert not torch.allclose(got["rgb"], whole["rgb"])
+    far = OrientedBox.from_params((90.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    empty = ours.get_outputs_for_camera(camera_at(), obb_box=far)
+    assert empty["rgb"].shape == (31, 43, 3) and empty["depth"].shape == (31, 43, 1) and not empty["rgb"].any()
+
+
+def test_viewmats_invert_the_pose_and_pass_gradients():
+    generator = torch.Generator().manual_seed(SEED)
+    rotation = torch.linalg.qr(torch.randn((2, 3, 3), generator=generator, dtype=torch.float64))[0]
+    pose = torch.cat([rotation, torch.randn((2, 3, 1), generator=generator, dtype=torch.float64)], dim=2)
+    inverse = torch.linalg.inv(torch.cat([pose, pose.new_tensor([[[0, 0, 0, 1.0]]] * 2)], dim=1))
+    flip = torch.diag(pose.new_tensor([1.0, -1.0, -1.0, 1.0]))
+    torch.testing.assert_close(viewmats_from_opengl(pose), flip @ inverse, atol=1e-12, rtol=0)
+    assert torch.autograd.gradcheck(viewmats_from_opengl, pose.requires_grad_())
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"sh_degree": 0}, {"use_bilateral_grid": True, "camera_optimizer": CameraOptimizerConfig(mode="SE3")}],
+)
+def test_state_has_the_keys_and_shapes_of_a_stock_model(settings):
+    ours = build(SplatfactoCpuModelConfig(**settings), random_seeds())
+    theirs = build(SplatfactoModelConfig(num_random=40, **settings))
+    shapes = [{name: (v.shape, v.dtype) for name, v in model.state_dict().items()} for model in (ours, theirs)]
+    assert shapes[0] == shapes[1]
+
+
+def test_a_stock_checkpoint_loads_with_the_lpips_weights_it_carries():
+    theirs = build(SplatfactoModelConfig(num_random=7))
+    state = {**theirs.state_dict(), "lpips.net.net.slice1.0.weight": torch.zeros(64, 3, 11, 11)}
+    ours = build(SplatfactoCpuModelConfig(), random_seeds())
+    ours.load_state_dict(state, strict=True)
+    assert torch.equal(ours.means, theirs.means)
+    theirs.load_state_dict(ours.state_dict(), strict=True)
+
+
+def test_seeds_give_the_parameters_that_splatfacto_gives():
+    points, colors = random_seeds()
+    ours = build(SplatfactoCpuModelConfig(), (points, colors))
+    with mock.patch.object(torch.Tensor, "cuda", lambda self: self):
+        theirs = build(SplatfactoModelConfig(), (points.clone(), colors))
+    for name in ("means", "scales", "features_dc", "features_rest", "opacities"):
+        torch.testing.assert_close(ours.gauss_params[name], theirs.gauss_params[name])
+
+
+@pytest.mark.parametrize("num", [1, 2, 3, 4])
+def test_few_seeds_have_finite_sizes(num):
+    points, colors = random_seeds(num)
+    scales = build(SplatfactoCpuModelConfig(), (points, colors)).scales
+    assert scales.shape == (num, 3) and scales.isfinite().all()
+    if num == 1:
+        assert torch.allclose(scales.exp(), torch.tensor(LONE_POINT_SCALE))
+
+
+def test_coincident_seeds_take_their_size_from_other_places():
+    points, colors = random_seeds(6)
+    alone = build(SplatfactoCpuModelConfig(), (points, colors)).scales
+    twice = build(SplatfactoCpuModelConfig(), (points.repeat(5, 1), colors.repeat(5, 1))).scales
+    torch.testing.assert_close(twice, alone.repeat(5, 1))
+
+
+def test_seeds_that_nearly_coincide_or_lie_far_out_have_finite_sizes():
+    points = torch.tensor([[0.0, 0, 0], [1e-30, 0, 0], [1e6, 0, 0], [1e6 + 1, 0, 0], [-1e18, 0, 0]])
+    assert build(SplatfactoCpuModelConfig(), (points, torch.zeros(5, 3))).scales.isfinite().all()
+
+
+def test_seeds_that_are_not_finite_are_dropped_and_none_left_means_random_ones():
+    points, colors = random_seeds(6)
+    points[2, 1] = math.nan
+    points[4, 0] = math.inf
+    assert build(SplatfactoCpuModelConfig(), (points, colors)).num_points == 4
+    nothing = (torch.full((3, 3), math.nan), colors[:3])
+    assert build(SplatfactoCpuModelConfig(num_random=9), nothing).num_points == 9
+    assert build(SplatfactoCpuModelConfig(num_random=9), (torch.zeros(0, 3), torch.zeros(0, 3))).num_points == 9
+
+
+@pytest.mark.parametrize("level", [0.0, 255.0])
+def test_pure_colours_stay_finite_at_degree_0(level):
+    model = build(SplatfactoCpuModelConfig(sh_degree=0), (random_seeds(4)[0], torch.full((4, 3), level)))
+    assert model.features_dc.isfinite().all()
+    assert torch.allclose(model.colors, torch.tensor(level / 255), atol=0.5 / 255 + 1e-6)  # within half a level
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="asks what happens without CUDA")
+def test_asking_for_gsplat_without_cuda_says_so():
+    model = build(SplatfactoCpuModelConfig(backend="gsplat"), random_seeds()).eval()
+    with pytest.raises(PointSplatError, match="backend gsplat.*cpu.*use auto or torch"):
+        model.get_outputs(camera_at())
+
+
+def test_schedules_follow_the_length_of_the_run_and_spare_what_was_set_by_hand():
+    config = splatfacto_cpu_config()
+    config.max_num_iterations = 3000
+    config.pipeline.model.warmup_length = 77
+    fitted = fitted_schedules(config)
+    model = fitted.pipeline.model
+    assert (model.resolution_schedule, model.sh_degree_interval, model.stop_split_at) == (300, 100, 1500)
+    assert model.warmup_length == 77 and model.refine_every == 43
+    assert fitted.optimizers["means"]["scheduler"].max_steps == 3000
+    assert fitted.optimizers["camera_opt"]["scheduler"].warmup_steps == 100
+    assert config.pipeline.model.resolution_schedule == 3000, "the config itself, which is saved, is left alone"
+    config.max_num_iterations = 50_000
+    assert fitted_schedules(config).pipeline.model.resolution_schedule == 3000
+    assert fitted_schedules(config).optimizers["means"]["scheduler"].max_steps == 30_000
+
+
+def test_a_run_that_cannot_start_leaves_no_folder(tmp_path, wall_config, run_training):
+    config = wall_config(tmp_path / "no_such_scene", tmp_path / "outputs", steps=5)
+    (tmp_path / "outputs").mkdir()
+    (tmp_path / "outputs" / "of another run").mkdir()
+    with pytest.raises(DataError, match="no_such_scene"):
+        run_training(config)
+    assert [path.name for path in (tmp_path / "outputs").iterdir()] == ["of another run"]
+
+
+@pytest.fixture(scope="module")
+def trained(wall_scene, wall_config, run_training, tmp_path_factory):
+    """A short run on the painted wall: its config, its trainer and its losses."""
+    config = wall_config(wall_scene, tmp_path_factory.mktemp("outputs"), steps=50)
+    return config, *run_training(config)
+
+
+def checkpoint_of(config) -> Path:
+    (path,) = config.get_checkpoint_dir().glob("*.ckpt")
+    return path
+
+
+def test_training_lowers_the_loss_and_densifies(trained):
+    _, trainer, losses = trained
+    assert sum(losses[-5:]) < 0.5 * sum(losses[:5])
+    assert trainer.pipeline.model.num_points > 300
+    assert all(value.isfinite().all() for value in trainer.pipeline.model.gauss_params.values())
+
+
+def test_checkpoint_has_splatfactos_layout_and_loads_weights_only(trained):
+    config, trainer, _ = trained
+    state = torch.load(checkpoint_of(config), map_location="cpu", weights_only=True)
+    assert set(state) == {"step", "pipeline", "optimizers", "schedulers", "scalers"}
+    theirs = build(SplatfactoModelConfig(num_random=5))
+    assert set(state["pipeline"]) == {f"_model.{name}" for name in theirs.state_dict()}
+    theirs.load_state_dict({name.removeprefix("_model."): value for name, value in state["pipeline"].items()})
+    assert torch.equal(theirs.means, trainer.pipeline.model.means)
+    assert set(state["optimizers"]) == set(theirs.get_param_groups())
+
+
+def test_resuming_goes_on_from_the_checkpoint_and_still_learns(
+    trained, wall_scene, wall_config, run_training, tmp_path
+):
+    config, first, before = trained
+    again = wall_config(wall_scene, tmp_path, steps=10)
+    again.load_dir = config.get_checkpoint_dir()
+    saved = first.pipeline.model.means.detach().clone()
+    trainer, losses = run_training(again)
+    model = trainer.pipeline.model
+    assert trainer._start_step == 50 and trainer.step == 59
+    assert losses[0] < 0.5 * before[0], "resumed from scratch"
+    assert model.means.shape != saved.shape or not torch.equal(model.means, saved), "resumed but no longer learning"
+    for name, parameter in model.gauss_params.items():
+        assert trainer.optimizers.optimizers[name].param_groups[0]["params"] == [parameter]
+        assert trainer.optimizers.optimizers[name].state[parameter]["exp_avg"].shape == parameter.shape
+
+
+def test_ns_eval_writes_valid_json(trained, tmp_path, some_lpips):
+    from nerfstudio.scripts.eval import ComputePSNR
+
+    config, _, _ = trained
+    output = tmp_path / "eval.json"
+    ComputePSNR(load_config=config.get_base_dir() / "config.yml", output_path=output).main()
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    results = json.loads(output.read_text(), parse_constant=refuse)["results"]
+    assert results["psnr"] > 15 and 0 < results["ssim"] <= 1 and results["fps"] > 0
+    if WEIGHTS.exists():
+        assert 0 < results["lpips"] < 1 and "lpips_note" not in results
+    else:
+        assert results["lpips"] is None and "no network" in results["lpips_note"]
+
+
+@pytest.mark.parametrize("get_std", [True, False])
+def test_what_is_not_finite_is_null_in_a_report_and_absent_from_the_training_log(trained, get_std, some_lpips):
+    _, trainer, _ = trained
+    pipeline = trainer.pipeline
+    frames = list(pipeline.datamanager.fixed_indices_eval_dataloader)[:1]
+    with mock.patch.object(type(pipeline.datamanager), "fixed_indices_eval_dataloader", frames):
+        report = pipeline.get_average_eval_image_metrics(get_std=get_std)
+        log = pipeline.get_average_eval_image_metrics(step=3, get_std=get_std)
+    assert report["psnr"] > 15
+    assert ("psnr_std" in report) == get_std
+    assert report.get("psnr_std") is None, "one image has no standard deviation"
+    assert all(isinstance(value, float) and math.isfinite(value) for value in log.values())
+    assert "psnr" in log and "psnr_std" not in log
+
+
+def test_without_lpips_weights_the_metric_is_null_with_a_reason(trained, no_lpips):
+    pipeline = trained[1].pipeline
+    with mock.patch.object(pipeline.model, "lpips", type(pipeline.model.lpips)()):
+        report = pipeline.get_average_eval_image_metrics(get_std=True)
+        metrics, _ = pipeline.get_eval_image_metrics_and_images(step=1)
+    assert report["lpips"] is None and "no network" in report["lpips_note"]
+    assert "lpips" not in metrics and "psnr" in metrics
+
+
+def test_photos_too_small_for_lpips_have_no_lpips_but_the_other_metrics(trained, monkeypatch):
+    if not WEIGHTS.exists():
+        pytest.skip(f"{WEIGHTS} is not here")
+    monkeypatch.setenv("POINTSPLAT_LPIPS_WEIGHTS", str(WEIGHTS))
+    model = trained[1].pipeline.model
+    with mock.patch.object(model, "lpips", type(model.lpips)()) as lpips:
+        small = torch.full((20, 20, 3), 0.5)
+        outputs = {"rgb": small, "background": torch.zeros(3)}
+        metrics, _ = model.get_image_metrics_and_images(outputs, {"image": small + 0.1})
+    assert "lpips" not in metrics and metrics["psnr"] == pytest.approx(20, abs=1e-3) and "pixels" in lpips.reason
+
+
+def test_evaluating_without_held_out_frames_says_so(trained):
+    _, trainer, _ = trained
+    with (
+        mock.patch.object(trainer.pipeline.datamanager, "eval_dataset", []),
+        pytest.raises(DataError, match="held out"),
+    ):
+        trainer.pipeline.get_average_eval_image_metrics()
+
+
+def test_ns_export_writes_the_scene(trained, tmp_path):
+    from nerfstudio.scripts.exporter import ExportGaussianSplat
+    from plyfile import PlyData
+
+    config, trainer, _ = trained
+    ExportGaussianSplat(load_config=config.get_base_dir() / "config.yml", output_dir=tmp_path).main()
+    vertices = PlyData.read(tmp_path / "splat.ply")["vertex"]
+    model = trainer.pipeline.model
+    drawn = model.opacities[:, 0] >= -5.5373  # ns-export drops opacities below 1/255
+    assert vertices.count == int(drawn.sum()) > 0
+    assert torch.equal(torch.from_numpy(vertices["x"].copy()), model.means[drawn, 0].detach())

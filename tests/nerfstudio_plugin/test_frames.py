@@ -1,0 +1,292 @@
+"""Posed photos loaded when due."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetppDataParserConfig
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.data.scene_box import SceneBox
+
+from making import SHARED_DATA
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.nerfstudio_plugin.frames import FrameCache, Frames, LazyImageDatamanagerConfig
+from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
+
+WIDTH, HEIGHT = 40, 30
+FOX = SHARED_DATA / "scannetpp/fox"
+
+
+def make_dataset(
+    folder: Path,
+    num: int = 5,
+    distortion: list[float] | None = None,
+    camera_type: CameraType = CameraType.PERSPECTIVE,
+    masks: bool = False,
+    scale: float = 1.0,
+) -> InputDataset:
+    rng = np.random.default_rng(7)
+    photos, mask_paths = [], []
+    for i in range(num):
+        small = rng.integers(0, 256, (6, 8, 3), dtype=np.uint8)
+        photos.append(folder / f"photo{i}.png")
+        cv2.imwrite(str(photos[-1]), cv2.resize(small, (WIDTH, HEIGHT)))
+        mask_paths.append(folder / f"mask{i}.png")
+        mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        mask[:, : 5 + i] = 0
+        cv2.imwrite(str(mask_paths[-1]), mask)
+    poses = torch.eye(4)[None, :3].repeat(num, 1, 1)
+    poses[:, 0, 3] = torch.arange(num)
+    cameras = Cameras(
+        camera_to_worlds=poses,
+        fx=35.0,
+        fy=36.0,
+        cx=20.5,
+        cy=14.0,
+        width=WIDTH,
+        height=HEIGHT,
+        distortion_params=None if distortion is None else torch.tensor(distortion),
+        camera_type=camera_type,
+    )
+    outputs = DataparserOutputs(
+        image_filenames=photos,
+        cameras=cameras,
+        mask_filenames=mask_paths if masks else None,
+        scene_box=SceneBox(aabb=torch.zeros(2, 3)),
+    )
+    return InputDataset(outputs, scale_factor=scale)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "camera_type"),
+    [
+        (None, CameraType.PERSPECTIVE),
+        ([0.1, -0.05, 0.0, 0.0, 0.01, -0.01], CameraType.PERSPECTIVE),
+        ([0.05, 0.01, 0.0, 0.0, 0.0, 0.0], CameraType.FISHEYE),
+    ],
+    ids=["pinhole", "opencv", "fisheye"],
+)
+@pytest.mark.parametrize("masks", [False, True])
+def test_image_mask_and_intrinsics_are_those_nerfstudio_caches(tmp_path, distortion, camera_type, masks):
+    dataset = make_dataset(tmp_path, distortion=distortion, camera_type=camera_type, masks=masks)
+    frames = Frames(dataset)
+    before = dataset.cameras.get_intrinsics_matrices().clone()
+    got = [frames[i] for i in range(5)]
+    got_again = [frames[i] for i in range(5)]
+    assert torch.equal(dataset.cameras.get_intrinsics_matrices(), before), "undistorting must not compound"
+
+    manager = FullImageDatamanager.__new__(FullImageDatamanager)
+    torch.nn.Module.__init__(manager)
+    manager.config = FullImageDatamanagerConfig(cache_images_type="uint8")
+    manager.train_dataset, manager.device = dataset, "cpu"
+    expected = manager._load_images("train", cache_images_device="gpu")
+    for i, (camera, data) in enumerate(got):
+        assert torch.equal(data["image"], expected[i]["image"]) and data["image"].dtype == torch.uint8
+        assert torch.equal(data["image"], got_again[i][1]["image"])
+        assert ("mask" in data) == masks and data["image_idx"] == i
+        if masks:
+            assert torch.equal(data["mask"], expected[i]["mask"]) and data["mask"].dtype == torch.bool
+        theirs = dataset.cameras[i : i + 1]
+        assert camera.shape == (1,)
+        assert torch.equal(camera.get_intrinsics_matrices(), theirs.get_intrinsics_matrices())
+        assert (int(camera.width), int(camera.height)) == (int(theirs.width), int(theirs.height))
+        assert data["image"].shape[:2] == (int(camera.height), int(camera.width))
+        assert torch.equal(camera.camera_to_worlds, theirs.camera_to_worlds)
+
+
+def test_a_lower_resolution_scales_photo_and_camera_together(tmp_path):
+    camera, data = Frames(make_dataset(tmp_path, scale=0.5, masks=True))[3]
+    assert data["image"].shape == (HEIGHT // 2, WIDTH // 2, 3) and data["mask"].shape == (HEIGHT // 2, WIDTH // 2, 1)
+    assert float(camera.fx) == 17.5 and int(camera.width) == WIDTH // 2
+
+
+def test_float_images_lie_between_0_and_1(tmp_path):
+    image = Frames(make_dataset(tmp_path), image_type="float32")[0][1]["image"]
+    assert image.dtype == torch.float32 and 0 <= image.min() and image.max() <= 1
+
+
+def test_negative_indices_count_from_the_end_and_outside_is_an_index_error(tmp_path):
+    frames = Frames(make_dataset(tmp_path))
+    assert frames[-1][1]["image_idx"] == 4 and len(frames) == 5
+    for index in (5, -6):
+        with pytest.raises(IndexError, match="of 5"):
+            frames[index]
+    assert [data["image_idx"] for _, data in frames] == [0, 1, 2, 3, 4]
+
+
+def test_cache_stays_within_its_bytes_and_drops_the_longest_unused(tmp_path):
+    photo = WIDTH * HEIGHT * 3
+    cache = FrameCache(max_bytes=2 * photo)
+    dataset = make_dataset(tmp_path)
+    frames = Frames(dataset, cache=cache)
+    reads = []
+    read = dataset.get_data
+    dataset.get_data = lambda index, **kwargs: reads.append(index) or read(index, **kwargs)
+    for index in (0, 1, 0, 2, 0, 1):
+        assert frames[index][1]["image_idx"] == index
+        assert cache.num_bytes <= cache.max_bytes
+    assert reads == [0, 1, 2, 1] and len(cache) == 2
+
+
+def test_a_photo_larger_than_the_cache_is_handed_out_and_not_kept(tmp_path):
+    cache = FrameCache(max_bytes=10)
+    assert Frames(make_dataset(tmp_path), cache=cache)[0][1]["image"].shape == (HEIGHT, WIDTH, 3)
+    assert len(cache) == 0 and cache.num_bytes == 0
+
+
+def test_two_scenes_share_a_cache_without_mixing(tmp_path):
+    (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
+    cache = FrameCache(max_bytes=10**9)
+    first = Frames(make_dataset(tmp_path / "a"), cache=cache)
+    second = Frames(make_dataset(tmp_path / "b", scale=0.5), cache=cache)
+    assert first[0][1]["image"].shape != second[0][1]["image"].shape
+    assert len(cache) == 2
+
+
+def test_prefetched_photos_are_decoded_once_by_another_thread(tmp_path):
+    dataset = make_dataset(tmp_path)
+    frames = Frames(dataset)
+    readers = []
+    read = dataset.get_data
+
+    def recorded(index, **kwargs):
+        readers.append((index, threading.current_thread().name))
+        return read(index, **kwargs)
+
+    dataset.get_data = recorded
+    frames.prefetch([1, 2])
+    frames.prefetch([2, 1])
+    assert frames[1][1]["image_idx"] == 1 and frames[2][1]["image_idx"] == 2
+    assert sorted(index for index, _ in readers) == [1, 2]
+    assert all(name.startswith("frames") for _, name in readers)
+
+
+def test_many_threads_get_the_right_photos(tmp_path):
+    dataset = make_dataset(tmp_path)
+    expected = [dataset.get_data(i, image_type="uint8")["image"] for i in range(5)]
+    frames = Frames(dataset, cache=FrameCache(max_bytes=2 * WIDTH * HEIGHT * 3))
+    wrong = []
+
+    def work(seed):
+        for index in np.random.default_rng(seed).integers(0, 5, 30):
+            frames.prefetch([(int(index) + 1) % 5])
+            if not torch.equal(frames[int(index)][1]["image"], expected[index]):
+                wrong.append(index)
+
+    threads = [threading.Thread(target=work, args=(seed,)) for seed in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+
+
+def test_writing_to_what_was_handed_out_does_not_change_the_next(tmp_path):
+    frames = Frames(make_dataset(tmp_path))
+    camera, data = frames[0]
+    camera.rescale_output_resolution(0.5)
+    del data["image"]
+    camera, data = frames[0]
+    assert int(camera.width) == WIDTH and "image" in data
+
+
+@pytest.mark.parametrize("prefetched", [False, True])
+@pytest.mark.parametrize("damage", ["missing", "truncated", "text", "other size", "mask"])
+def test_a_bad_photo_is_named(tmp_path, damage, prefetched):
+    frames = Frames(make_dataset(tmp_path, masks=True))
+    photo = tmp_path / "photo2.png"
+    if damage == "missing":
+        photo.unlink()
+    elif damage == "truncated":
+        photo.write_bytes(photo.read_bytes()[:200])
+    elif damage == "text":
+        photo.write_text("not a photo")
+    elif damage == "other size":
+        for path in (photo, tmp_path / "mask2.png"):
+            cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH + 2, 3 if path == photo else 1), np.uint8))
+    else:
+        (tmp_path / "mask2.png").unlink()
+    if prefetched:
+        frames.prefetch([2])
+    with pytest.raises(DataError, match="mask2.png" if damage == "mask" else "photo2.png"):
+        frames[2]
+    assert frames[1][1]["image_idx"] == 1
+
+
+def test_a_lens_that_cannot_be_undone_is_named(tmp_path):
+    dataset = make_dataset(tmp_path, distortion=[0.1, 0.0, 0.0, 0.2, 0.0, 0.0])
+    with pytest.raises(DataError, match="photo0.png.*distortion"):
+        Frames(dataset)[0]
+
+
+def datamanagers(wall_scene, **settings):
+    parser = ReplicaDataParserConfig(data=wall_scene, load_seed_points=False, eval_every=3)
+    lazy = LazyImageDatamanagerConfig(dataparser=parser, **settings).setup(device="cpu")
+    stock = FullImageDatamanagerConfig(dataparser=parser, cache_images_type="uint8").setup(device="cpu")
+    return lazy, stock
+
+
+def test_datamanager_gives_what_nerfstudios_gives_in_its_order(wall_scene):
+    lazy, stock = datamanagers(wall_scene, cache_gigabytes=3e-5)  # room for three photos
+    for step in range(2 * len(lazy.train_dataset) + 1):
+        (camera, data), (other, expected) = lazy.next_train(step), stock.next_train(step)
+        assert data["image_idx"] == expected["image_idx"] == camera.metadata["cam_idx"]
+        assert torch.equal(data["image"], expected["image"])
+        assert torch.equal(camera.camera_to_worlds, other.camera_to_worlds)
+        assert torch.equal(camera.get_intrinsics_matrices(), other.get_intrinsics_matrices())
+    assert lazy.frame_cache.num_bytes <= 3e4
+    assert lazy.get_train_rays_per_batch() == stock.get_train_rays_per_batch()
+    ours, theirs = list(lazy.fixed_indices_eval_dataloader), list(stock.fixed_indices_eval_dataloader)
+    assert len(ours) == len(theirs) == len(lazy.fixed_indices_eval_dataloader) > 1
+    for (camera, data), (other, expected) in zip(ours, theirs, strict=True):
+        assert torch.equal(data["image"], expected["image"])
+        assert torch.equal(camera.camera_to_worlds, other.camera_to_worlds)
+    seen = [lazy.next_eval(step)[1]["image_idx"] for step in range(len(ours))]
+    assert sorted(seen) == list(range(len(ours)))
+    assert [d["image_idx"] for d in lazy.cached_train] == list(range(len(lazy.train_dataset)))
+    assert torch.equal(lazy.cached_eval[1]["image"], theirs[1][1]["image"])
+
+
+def test_more_than_500_photos_need_neither_pinned_memory_nor_room(tmp_path):
+    dataset = make_dataset(tmp_path, num=1)
+    outputs = dataset._dataparser_outputs
+    outputs.image_filenames = outputs.image_filenames * 501
+    outputs.cameras = Cameras(torch.eye(4)[None, :3].repeat(501, 1, 1), 35.0, 36.0, 20.5, 14.0, WIDTH, HEIGHT)
+
+    class Parser:
+        includes_time = False
+
+        def get_dataparser_outputs(self, split):
+            return outputs
+
+    class Config:
+        data = tmp_path
+
+        def setup(self):
+            return Parser()
+
+    config = LazyImageDatamanagerConfig(dataparser=Config(), cache_gigabytes=1e-5)
+    manager = config.setup(device="cpu")
+    indices = [manager.next_train(step)[1]["image_idx"] for step in range(6)]
+    assert len(set(indices)) == 6 and manager.frame_cache.num_bytes <= 1e4
+
+
+def test_real_photos_with_lens_distortion_are_undone_alike_in_training_and_evaluation():
+    if not FOX.exists():
+        pytest.skip(f"{FOX} is not here")
+    manager = LazyImageDatamanagerConfig(dataparser=ScanNetppDataParserConfig(data=FOX)).setup(device="cpu")
+    _, train = manager.next_train(0)
+    train_camera = manager.train_frames[train["image_idx"]][0]
+    eval_camera, held_out = manager.next_eval(0)
+    assert manager.train_dataset.cameras.distortion_params.any()
+    assert train_camera.distortion_params is None and eval_camera.distortion_params is None
+    assert torch.equal(train_camera.get_intrinsics_matrices(), eval_camera.get_intrinsics_matrices())
+    assert train["image"].shape == held_out["image"].shape != (640, 360, 3)

@@ -1,0 +1,127 @@
+"""How the package enters nerfstudio's commands."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+from pointsplat_ns.nerfstudio_plugin.registration import load_specification
+
+FORKED = """
+import importlib, os, sys, traceback, warnings
+warnings.simplefilter("ignore")
+import cv2, torch, torchmetrics, torchvision, viser, wandb, gsplat, nerfacc, sklearn.neighbors  # shared by every case
+
+def refuse(*args, **kwargs):
+    raise OSError("an import used the network or CUDA")
+
+def new_modules():
+    import nerfstudio.plugins.registry as methods, nerfstudio.plugins.registry_dataparser as dataparsers
+    from importlib.metadata import EntryPoints
+    methods.entry_points = dataparsers.entry_points = lambda group: EntryPoints()
+    import nerfstudio.configs.method_configs
+    before = set(sys.modules)
+    import method_configs.methods, method_configs.dataparsers
+    return {name.split(".")[0] for name in set(sys.modules) - before}
+
+def case(name):
+    import socket
+    socket.socket.connect = socket.getaddrinfo = torch.cuda.init = torch.cuda._lazy_init = refuse
+    if name == "new modules":
+        new = new_modules() - {"method_configs", "pointsplat_ns"}
+        # What the two modules import beyond nerfstudio must be nothing that takes time.
+        assert new <= {"plyfile", "unittest"}, f"the plugin also imports {sorted(new)}"
+        return
+    importlib.import_module(name)
+    import method_configs.methods, method_configs.dataparsers
+    from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+    from nerfstudio.plugins.types import MethodSpecification
+    for spec, kind in ((method_configs.methods.splatfacto_cpu, MethodSpecification),
+                       (method_configs.dataparsers.replica, DataParserSpecification)):
+        assert isinstance(spec, kind), spec
+
+for name in sys.argv[1:]:
+    child = os.fork()
+    if child == 0:
+        try:
+            case(name)
+        except BaseException as error:
+            traceback.print_exc()
+            print(f"{name}: {type(error).__name__}: {error}", flush=True)
+        else:
+            print(f"{name}: fine", flush=True)
+        os._exit(0)
+    os.waitpid(child, 0)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="saves imports by forking")
+def test_any_module_may_come_first_and_imports_no_network_no_cuda_and_little_else():
+    # nerfstudio imports entry points from inside its own imports, so the order decides what is half imported.
+    # (That nerfstudio itself may come first is what every test that parses its command line proves.)
+    cases = ["method_configs.methods", "pointsplat_ns.nerfstudio_plugin.replica.dataparser", "new modules"]
+    result = subprocess.run([sys.executable, "-c", FORKED, *cases], capture_output=True, text=True, timeout=300)
+    lines = [line for line in result.stdout.splitlines() if line.split(":")[0] in cases]
+    assert lines == [f"{name}: fine" for name in cases], result.stdout + result.stderr
+
+
+def test_a_specification_that_fails_to_load_becomes_one_line():
+    def broken():
+        raise ImportError("no module named 'x'")
+
+    line = load_specification("some-method", broken)
+    assert line == "some-method of pointsplat-ns, which failed to load (ImportError: no module named 'x')"
+    assert load_specification("some-method", dict) == {}
+
+
+def test_entry_points_name_what_nerfstudio_expects():
+    names = {
+        group: {entry.name: entry.value for entry in entry_points(group=f"nerfstudio.{group}")}
+        for group in ("method_configs", "dataparser_configs")
+    }
+    assert names["method_configs"]["splatfacto-cpu"] == "method_configs.methods:splatfacto_cpu"
+    assert names["dataparser_configs"]["replica-data"] == "method_configs.dataparsers:replica"
+
+
+@pytest.mark.parametrize(
+    ("dataparser", "kind"),
+    [
+        ([], "NerfstudioDataParserConfig"),
+        (["nerfstudio-data"], "NerfstudioDataParserConfig"),
+        (["scannetpp-data"], "ScanNetppDataParserConfig"),
+        (["replica-data", "--eval-every", "5"], "ReplicaDataParserConfig"),
+    ],
+)
+def test_ns_train_parses_every_dataparser(dataparser, kind, tmp_path):
+    import tyro
+    from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+
+    arguments = ["splatfacto-cpu", "--data", str(tmp_path), "--max-num-iterations", "12", *dataparser]
+    config = tyro.cli(AnnotatedBaseConfigUnion, args=arguments)
+    parser = config.pipeline.datamanager.dataparser
+    assert type(parser).__name__ == kind
+    assert config.data == tmp_path and config.max_num_iterations == 12
+    if kind == "NerfstudioDataParserConfig":
+        assert parser.load_3D_points, "Splatfacto starts from the points that come with the data"
+
+
+def test_an_input_error_ends_a_command_with_one_line_and_status_1():
+    # Run without nerfstudio, whose import takes seconds; method_configs.methods installs this same hook.
+    code = (
+        "from pointsplat_ns.errors import DataError\n"
+        "from pointsplat_ns.nerfstudio_plugin.excepthook import errors_in_one_line\n"
+        "errors_in_one_line()\nerrors_in_one_line()\n"
+        "raise {}\n"
+    )
+    run = [sys.executable, "-c"]
+    ours = subprocess.run([*run, code.format("DataError('traj.txt: 3 poses')")], capture_output=True, text=True)
+    assert (ours.returncode, ours.stderr) == (1, "error: traj.txt: 3 poses\n")
+    bug = subprocess.run([*run, code.format("ValueError('a bug')")], capture_output=True, text=True)
+    assert bug.returncode == 1 and "Traceback" in bug.stderr and "a bug" in bug.stderr
+    methods = Path(__file__).parents[2] / "method_configs" / "methods.py"
+    assert "errors_in_one_line()" in methods.read_text()

@@ -1,0 +1,298 @@
+"""Merging of Gaussians: exact counts, what is preserved, and what must survive at the extremes."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from making import same
+from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.pruning import merge_algebra as algebra
+from pointsplat_ns.pruning import merging
+from pointsplat_ns.pruning.merge import merge
+from pointsplat_ns.rasterizer import rasterization
+
+
+def cloud(n: int, seed: int = 0, sh_degree: int = 1) -> Gaussians:
+    """``n`` random Gaussians in a unit cube."""
+    g = torch.Generator().manual_seed(seed)
+    rest = (sh_degree + 1) ** 2 - 1
+    return Gaussians(
+        means=torch.rand(n, 3, generator=g),
+        scales=-3 + 0.5 * torch.randn(n, 3, generator=g),
+        quats=torch.randn(n, 4, generator=g),
+        opacities=torch.randn(n, 1, generator=g),
+        features_dc=torch.randn(n, 3, generator=g),
+        features_rest=0.1 * torch.randn(n, rest, 3, generator=g),
+    )
+
+
+def wall(side: int = 40, seed: int = 0) -> Gaussians:
+    """A flat wall of round disks, of a smooth colour gradient, that covers itself several times."""
+    g = torch.Generator().manual_seed(seed)
+    axis = torch.linspace(-1, 1, side)
+    x, y = (v.reshape(-1) for v in torch.meshgrid(axis, axis, indexing="xy"))
+    n = side * side
+    means = torch.stack([x, y, torch.zeros(n)], 1) + 0.004 * torch.randn(n, 3, generator=g)
+    colours = torch.stack([x, y, -x], 1)
+    scales = torch.tensor([math.log(2 / side), math.log(2 / side), -7.0]).repeat(n, 1)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
+    return Gaussians(means, scales, quats, torch.full((n, 1), 1.5), colours, torch.zeros(n, 0, 3))
+
+
+def render(scene: Gaussians, size: int = 64) -> torch.Tensor:
+    view = torch.eye(4)
+    view[2, 3] = 2.0
+    K = torch.tensor([[size * 1.2, 0, size / 2], [0, size * 1.2, size / 2], [0, 0, 1.0]])
+    args = (scene.means, scene.quats, scene.stds, scene.alphas, scene.sh, view[None], K[None], size, size)
+    return rasterization(*args, sh_degree=scene.sh_degree)[0][0]
+
+
+def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
+    return float(-10 * torch.log10((a - b).square().mean()))
+
+
+@pytest.mark.parametrize("k", [1, 2, 7, 100, 299, 300])
+def test_gives_exactly_k_that_can_be_drawn(k):
+    merged = merge(cloud(300), k)
+    assert len(merged.scene) == k
+    assert bool(merged.scene.usable().all())
+    assert int(merged.sizes.sum()) == int((merged.assignment >= 0).sum())
+    assert bool((merged.sizes >= 1).all())
+
+
+def test_keeping_all_returns_the_scene_bit_for_bit_even_with_nan():
+    scene = cloud(20)
+    scene.means[3] = math.nan
+    kept = merge(scene, 20).scene
+    assert all(
+        torch.equal(a.nan_to_num(7.0), b.nan_to_num(7.0)) for a, b in zip(scene.tensors(), kept.tensors(), strict=True)
+    )
+
+
+def test_what_is_merged_with_nothing_is_bit_for_bit_as_it_was():
+    scene = cloud(200)
+    merged = merge(scene, 150)
+    alone = (merged.sizes == 1).nonzero()[:, 0]
+    assert len(alone) > 50
+    where = torch.stack([(merged.assignment == a).nonzero()[0, 0] for a in alone])
+    assert same(merged.scene[alone], scene[where])
+
+
+def test_the_same_input_gives_the_same_output():
+    assert same(merge(cloud(500), 60).scene, merge(cloud(500), 60).scene)
+
+
+def test_a_smooth_wall_at_a_quarter_looks_the_same_and_far_better_than_a_quarter_of_it():
+    scene = wall()
+    dense = render(scene)
+    k = len(scene) // 4
+    merged = psnr(render(merge(scene, k).scene), dense)
+    thinned = psnr(render(scene[torch.arange(0, len(scene), 4)]), dense)
+    assert merged > 30  # a difference of 3 % of the range is hardly seen
+    assert merged > thinned + 6
+
+
+def test_deepening_brings_opaque_walls_closer_to_what_they_were(monkeypatch):
+    scene = wall()
+    dense = render(scene)
+    for share in (4, 10, 30):
+        monkeypatch.undo()
+        deepened = psnr(render(merge(scene, len(scene) // share).scene), dense)
+        monkeypatch.setattr(merging, "DEEPENING", 0.0)
+        assert deepened > psnr(render(merge(scene, len(scene) // share).scene), dense) + 0.1
+
+
+def test_an_edge_between_colours_stays_where_it_is():
+    scene = wall()
+    left = scene.means[:, 0] < 0
+    black_white = torch.where(left[:, None], -1.7, 1.7).expand(-1, 3).clone()
+    scene = scene.replace(features_dc=black_white)
+    merged = merge(scene, len(scene) // 4)
+    # None of the merged has members of both colours: same-coloured neighbours were always cheaper.
+    for side in (left, ~left):
+        assert not set(merged.assignment[side].tolist()) & set(merged.assignment[~side].tolist())
+
+
+def test_two_coincident_halves_become_one_of_their_common_mass():
+    one = cloud(1)
+    pair = Gaussians.cat([one, one]).replace(opacities=torch.zeros(2, 1))
+    merged = merge(pair, 1).scene
+    # Mass 0.5 + 0.5 less the integral of what is covered twice, 0.25 G^2: half of 0.25; then deepened for two members.
+    want = 1 - 0.125 ** (2**merging.DEEPENING)
+    assert float(merged.alphas) == pytest.approx(want, rel=1e-5)  # float32, 7 digits
+    torch.testing.assert_close(merged.means, one.means)
+    torch.testing.assert_close(merged.scales.sort().values, one.scales.sort().values, rtol=1e-4, atol=1e-4)
+
+
+def test_deepening_leaves_one_member_as_it_is_and_grows_with_their_number_up_to_opaque():
+    alphas = torch.tensor([0.0, 1e-12, 0.3, 0.3, 0.3, 0.9, 1.0], dtype=torch.float64)
+    sizes = torch.tensor([10**6, 16, 1, 2, 16, 10**6, 10**6])
+    most = merging.MOST_DRAWN
+    want = torch.tensor([0, 2e-12, 0.3, 1 - 0.7 ** (2**0.25), 1 - 0.7**2, most, most], dtype=torch.float64)
+    # rel: 1 - (1 - a)^p to all digits even where a is far below float64's spacing at 1
+    torch.testing.assert_close(merging._deepened(alphas, sizes), want, rtol=1e-11, atol=0)
+    assert float((merging._deepened(alphas.float(), sizes) - want).abs().max()) < 1e-6  # float32, 7 digits
+
+
+def test_colour_of_a_pair_is_the_mean_by_mass():
+    pair = cloud(2)
+    pair = pair.replace(scales=torch.full((2, 3), -2.0), opacities=torch.logit(torch.tensor([[0.6], [0.2]])))
+    merged = merge(pair, 1).scene
+    torch.testing.assert_close(merged.sh, 0.75 * pair[0].sh + 0.25 * pair[1].sh)
+
+
+def test_first_and_second_moments_of_a_pair_are_those_of_its_mass():
+    pair = cloud(2, seed=4).replace(opacities=torch.full((2, 1), -3.0))  # faint: no growth
+    merged = merge(pair, 1).scene.to(torch.float64)
+    pair = pair.to(torch.float64)
+    cov = algebra.unpack(algebra.covariances(pair.scales, pair.quats))
+    mass = algebra.shadow(algebra.pack(cov))
+    w = (mass / mass.sum())[:, None]
+    mean = (w * pair.means).sum(0)
+    apart = pair.means - mean
+    want = (w[..., None] * (cov + apart[:, :, None] * apart[:, None])).sum(0)
+    torch.testing.assert_close(merged.means[0], mean, rtol=1e-5, atol=1e-6)  # stored as float32
+    torch.testing.assert_close(
+        algebra.unpack(algebra.covariances(merged.scales, merged.quats))[0], want, rtol=1e-4, atol=1e-7
+    )
+
+
+def test_change_of_the_picture_is_the_integral_it_claims_to_be():
+    """Against a sum over a fine grid in the plane, for pairs of disks in that plane."""
+    flat = cloud(2, seed=1).replace(
+        means=torch.tensor([[0.0, 0, 0], [0.08, 0.03, 0]]),
+        scales=torch.tensor([[-3.0, -2.6, -9.0], [-2.7, -3.2, -9.0]]),
+        quats=torch.tensor([[1.0, 0, 0, 0.2], [1.0, 0, 0, -0.4]]),
+        opacities=torch.tensor([[0.3], [-0.6]]),
+    )
+    state = merging._start(flat)
+    i, j = torch.tensor([0]), torch.tensor([1])
+    pairs = merging._pair(state, i, j, merging._join(state, i, j))
+    f = torch.tensor([[0.2, -0.5], [0.4, 0.1]], dtype=torch.float64)
+    w = float(pairs.weight)
+    fk = w * f[0] + (1 - w) * f[1]
+    ai, aj, ak = state.alphas[i], state.alphas[j], pairs.alphas
+    dots = [(f[a] * f[b]).sum()[None] for a, b in ((0, 0), (1, 1), (0, 1))]
+    got = float(merging._change(pairs, ai, aj, *dots)) * 2 * math.pi
+    axis = torch.linspace(-0.6, 0.7, 1301, dtype=torch.float64)
+    grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1)
+
+    def splat(mean, cov):
+        d = grid - mean[:2]
+        inverse = torch.linalg.inv(algebra.unpack(cov[None])[0, :2, :2])
+        return torch.exp(-0.5 * (d @ inverse * d).sum(-1))[..., None]
+
+    picture = ai * f[0] * splat(state.means[0], state.cov[0]) + aj * f[1] * splat(state.means[1], state.cov[1])
+    picture = picture - ak * fk * splat(pairs.means[0], pairs.cov[0])
+    want = float(picture.square().sum()) * 0.001**2
+    assert got == pytest.approx(want, rel=1e-4)  # the grid's own error
+
+
+def test_the_shadow_is_the_root_mean_square_over_directions():
+    g = torch.Generator().manual_seed(3)
+    six = algebra.covariances(torch.randn(1, 3, generator=g).double(), torch.randn(1, 4, generator=g).double())
+    ways = torch.nn.functional.normalize(torch.randn(200_000, 3, generator=g).double(), dim=1)
+    areas = algebra.flat_area(algebra.flatten(six.expand(len(ways), 6), *algebra.plane(ways)))
+    assert float(algebra.shadow(six)) == pytest.approx(float(areas.square().mean().sqrt()), rel=0.01)  # 200,000 samples
+
+
+def test_normals_are_the_thinnest_axes():
+    g = torch.Generator().manual_seed(5)
+    logs = torch.tensor([-1.0, -2.0, -6.0]).repeat(50, 1)
+    quats = torch.randn(50, 4, generator=g).double()
+    along = algebra.normals(algebra.covariances(logs.double(), quats))
+    cosine = (along * algebra.rotations(quats)[:, :, 2]).sum(1).abs()
+    assert float(cosine.min()) > 0.9999
+
+
+def extreme_scenes():
+    base = cloud(60)
+    grow = base.scales.clone()
+    grow[7] = 80.0
+    spread = base.scales.clone()
+    spread[::2], spread[1::2] = 80.0, -80.0
+    flat = base.scales.clone()
+    flat[:, 2] = -math.inf
+    points = torch.full_like(base.scales, -math.inf)
+    far = base.means.clone()
+    far[0] = 1e7
+    logits = base.opacities.clone()
+    logits[::2], logits[1::2] = math.inf, -math.inf
+    return {
+        "log-scales of +-80": base.replace(scales=spread),
+        "a single giant": base.replace(scales=grow),
+        "a zero axis": base.replace(scales=flat),
+        "zero scales": base.replace(scales=points),
+        "all coincident": base.replace(means=base.means[:1].expand(60, 3).clone()),
+        "all the same": base[torch.zeros(60, dtype=torch.long)],
+        "a far outlier": base.replace(means=far),
+        "all far away": base.replace(means=base.means + 1e6),
+        "infinite logits": base.replace(opacities=logits),
+        "all opaque": base.replace(opacities=torch.full((60, 1), math.inf)),
+        "all invisible": base.replace(opacities=torch.full((60, 1), -math.inf)),
+        "zero quaternions": base.replace(quats=torch.zeros(60, 4)),
+        "huge colours": base.replace(features_dc=base.features_dc * 1e15),
+        "float64": base.to(torch.float64),
+        "half precision": base.to(torch.float16),
+    }
+
+
+@pytest.mark.parametrize("k", [1, 20, 59])
+@pytest.mark.parametrize("name", list(extreme_scenes()))
+def test_extremes_give_k_drawable_gaussians(name, k):
+    scene = extreme_scenes()[name]
+    merged = merge(scene, k).scene
+    assert len(merged) == k and merged.dtype == scene.dtype
+    assert bool(merged.usable().all())
+
+
+def test_many_coincident_gaussians_are_merged_in_few_rounds():
+    reports = []
+    scene = cloud(4000)
+    scene = scene.replace(means=torch.zeros(4000, 3))
+    assert len(merge(scene, 40, progress=reports.append).scene) == 40
+    assert len(reports) < 40
+    assert reports == sorted(reports) and reports[-1] == 1.0
+
+
+def test_nan_and_meaningless_infinities_are_never_part_of_the_result():
+    scene = cloud(50)
+    scene.means[3, 1] = math.nan
+    scene.scales[4] = math.inf
+    scene.features_dc[5] = math.nan
+    merged = merge(scene, 30)
+    assert merged.assignment[[3, 4, 5]].tolist() == [-1, -1, -1]
+    assert bool(merged.scene.usable().all())
+
+
+def test_the_invisible_go_first_and_the_least_opaque_of_them_before():
+    scene = cloud(50)
+    scene.opacities[:20, 0] = -torch.arange(10.0, 30.0)
+    merged = merge(scene, 30)
+    assert bool((merged.assignment[:20] == -1).all()) and same(merged.scene, scene[20:])
+    assert same(merge(scene, 33).scene, Gaussians.cat([scene[:3], scene[20:]]))
+
+
+@pytest.mark.parametrize("k", [0, -1, 51])
+def test_an_impossible_count_is_an_error(k):
+    with pytest.raises(BudgetError, match="expected 1 to 50"):
+        merge(cloud(50), k)
+
+
+def test_more_than_can_be_drawn_is_an_error():
+    scene = cloud(50)
+    scene.means[:10] = math.nan
+    with pytest.raises(BudgetError, match="40 of 50"):
+        merge(scene, 45)
+
+
+def test_float32_and_float64_make_the_same_scene():
+    """All work is in float64, so only the last rounding differs."""
+    single, double = cloud(300), cloud(300).to(torch.float64)
+    # alphas are computed in the scene's own precision, whence the tolerance
+    a, b = render(merge(single, 60).scene), render(merge(double, 60).scene.to(torch.float32))
+    assert psnr(a, b) > 50

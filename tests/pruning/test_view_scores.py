@@ -1,0 +1,182 @@
+"""The image-driven scores against brute force: one picture, one pixel and one Gaussian at a time."""
+
+import math
+
+import pytest
+import torch
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.pruning.view_scores import lightgaussian_score, log_determinant, pup_score, sensitivity
+from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from pointsplat_ns.rasterizer.projection import project
+from pointsplat_ns.views import Views
+
+WIDTH, HEIGHT = 10, 9  # four tiles, three of them cut off
+
+
+def make(n=8, degree=2, seed=3, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator, dtype=dtype)
+
+    return Gaussians(
+        means=0.4 * normal(n, 3),
+        scales=0.3 * normal(n, 3) - 1.5,
+        quats=normal(n, 4),
+        opacities=normal(n, 1) + 1,
+        features_dc=normal(n, 3),
+        features_rest=0.3 * normal(n, (degree + 1) ** 2 - 1, 3),
+    )
+
+
+def views(mode="classic", count=2):
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    viewmats[:, 2, 3] = 3.0
+    viewmats[:, 0, 3] = 0.3 * torch.arange(count)
+    K = torch.tensor([[10.0, 0, 5], [0, 10, 4.5], [0, 0, 1]], dtype=torch.float64)
+    return Views(viewmats, K.repeat(count, 1, 1), WIDTH, HEIGHT, torch.tensor([0.3, 0.2, 0.6]), mode)
+
+
+def hessians_by_definition(scene, views):
+    """Every channel of every pixel differentiated by itself."""
+    total = torch.zeros(len(scene), 6, 6, dtype=scene.dtype)
+    for i in range(len(views)):
+        means, stds = scene.means.clone().requires_grad_(), scene.stds.clone().requires_grad_()
+        image, alpha, _ = rasterization(
+            means,
+            scene.quats,
+            stds,
+            scene.alphas,
+            scene.sh,
+            views.viewmats[i : i + 1].to(scene.dtype),
+            views.Ks[i : i + 1].to(scene.dtype),
+            WIDTH,
+            HEIGHT,
+            sh_degree=scene.sh_degree,
+            rasterize_mode=views.rasterize_mode,
+        )
+        image = image[0] + (1 - alpha[0]) * views.background.to(image)
+        for value in image.reshape(-1):
+            gradient = torch.cat(torch.autograd.grad(value, (means, stds), retain_graph=True), dim=1)
+            total += gradient[:, :, None] * gradient[:, None, :]
+    return total
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("case", ["ordinary", "opaque", "behind a wall"])
+def test_the_hessian_is_the_sum_over_pixels_of_outer_products(mode, case):
+    scene = make()
+    if case == "opaque":  # alpha is held at its maximum and has no gradient there
+        scene = scene.replace(opacities=torch.full_like(scene.opacities, 9.0))
+    if case == "behind a wall":  # pixels are finished before the last Gaussians
+        front = torch.tensor([[0.0, 0.0, -1.0]], dtype=scene.dtype).repeat(3, 1)
+        means, scales = scene.means.clone(), scene.scales.clone()
+        means[:3], scales[:3] = front, 0.5
+        scene = scene.replace(means=means, scales=scales, opacities=scene.opacities.abs() + 4)
+    looks = views(mode)[[1]]
+    wanted, found = hessians_by_definition(scene, looks), sensitivity(scene, looks)
+    # 1e-10 of the largest entry: both sum some thousand terms in float64, in another order
+    assert (found - wanted).abs().max() <= 1e-10 * wanted.abs().max()
+    assert wanted.abs().amax(dim=(1, 2)).min() > 0 or case == "behind a wall"
+
+
+def test_the_pup_score_is_the_logarithm_of_the_determinant_of_the_sum_over_views():
+    scene = make(5)
+    wanted = torch.linalg.slogdet(hessians_by_definition(scene, views())).logabsdet
+    # 1e-6: the determinants are of matrices with condition numbers up to 1e6
+    assert torch.allclose(pup_score(scene, views()), wanted, atol=1e-6)
+
+
+def hits_by_definition(scene, views):
+    """For each Gaussian, the sum over the pixels that it is drawn on of the transmittance in front of it."""
+    total = torch.zeros(len(scene), dtype=torch.float64)
+    for i in range(len(views)):
+        seen = project(
+            scene.means, scene.quats, scene.stds, scene.alphas, views.viewmats[i], views.Ks[i], WIDTH, HEIGHT
+        )
+        order = seen.depths.argsort()
+        for y in range(HEIGHT):
+            for x in range(WIDTH):
+                through = 1.0
+                for j in order.tolist():
+                    d = torch.tensor([x + 0.5, y + 0.5], dtype=torch.float64) - seen.means2d[j]
+                    xx, xy, yy = seen.conics[j]
+                    power = -0.5 * (xx * d[0] ** 2 + 2 * xy * d[0] * d[1] + yy * d[1] ** 2)
+                    alpha = min(ALPHA_MAX, float(seen.opacities[j] * power.exp()))
+                    if alpha < ALPHA_MIN:
+                        continue
+                    if through * (1 - alpha) <= TRANSMITTANCE_MIN:
+                        break
+                    total[seen.ids[j]] += through
+                    through *= 1 - alpha
+    return total
+
+
+def test_lightgaussian_counts_hits_by_what_lies_in_front():
+    scene = make(5, degree=0)
+    volume = scene.stds.prod(dim=1)
+    largest = volume.sort(descending=True).values[int(0.9 * 5)]
+    wanted = hits_by_definition(scene, views()) * scene.alphas * (volume / largest).clamp_max(1) ** 0.1
+    # 1e-9: a few hundred terms in float64
+    assert torch.allclose(lightgaussian_score(scene, views()), wanted, rtol=1e-9)
+    plain = hits_by_definition(scene, views()) * scene.alphas
+    assert torch.allclose(lightgaussian_score(scene, views(), beta=0.0), plain, rtol=1e-9)
+
+
+@pytest.mark.parametrize("score", [lightgaussian_score, pup_score])
+def test_what_no_view_sees_is_worth_least_and_what_cannot_be_drawn_nothing(score):
+    scene = make(6)
+    means = scene.means.clone()
+    means[1] = torch.tensor([0.0, 0.0, -50.0])  # behind the cameras
+    means[4] = math.nan
+    found = score(scene.replace(means=means), views(count=3))
+    others = found[[0, 2, 3, 5]]
+    assert found[4].isnan() and found[1] < others.min() and others.isfinite().all()
+
+
+@pytest.mark.parametrize("score", [lightgaussian_score, pup_score])
+@pytest.mark.parametrize("case", ["infinite logits", "flat", "huge", "tiny", "one", "empty"])
+def test_extremes_give_no_nan(score, case):
+    scene = make(6, dtype=torch.float32)
+    flat = scene.scales.clone()
+    flat[:, 1] = -math.inf
+    scene = {
+        "infinite logits": lambda: scene.replace(opacities=torch.tensor([math.inf, -math.inf] * 3)[:, None]),
+        "flat": lambda: scene.replace(scales=flat),
+        "huge": lambda: scene.replace(scales=torch.full_like(scene.scales, 80.0)),
+        "tiny": lambda: scene.replace(scales=torch.full_like(scene.scales, -80.0)),
+        "one": lambda: scene[:1],
+        "empty": lambda: scene[:0],
+    }[case]()
+    found = score(scene, views())
+    assert found.shape == (len(scene),) and not found.isnan().any() and (found < math.inf).all()
+
+
+def test_float32_agrees_with_float64():
+    scene = make(dtype=torch.float32)
+    single, double = (pup_score(scene.to(dtype), views(count=3)) for dtype in (torch.float32, torch.float64))
+    # 0.05 of a logarithm: gradients of pixels in float32, squared, in matrices of condition numbers up to 1e6
+    assert torch.allclose(single, double, atol=0.05)
+
+
+@pytest.mark.parametrize("factor", [1e-40, 1.0, 1e40])
+def test_determinants_neither_overflow_nor_underflow(factor):
+    generator = torch.Generator().manual_seed(0)
+    root = torch.randn(4, 6, 6, generator=generator, dtype=torch.float64)
+    blocks = root @ root.mT
+    wanted = torch.logdet(blocks) + 6 * math.log(factor)
+    assert torch.allclose(log_determinant(blocks * factor), wanted, rtol=1e-9)
+    singular = root[:, :, :3] @ root[:, :, :3].mT * factor
+    assert (log_determinant(singular) == -math.inf).all()
+    assert (log_determinant(torch.zeros(2, 6, 6).double()) == -math.inf).all()
+
+
+def test_bad_requests_are_said():
+    for score in (lightgaussian_score, pup_score):
+        with pytest.raises(DataError, match="no view"):
+            score(make(), views()[:0])
+    with pytest.raises(ValueError, match="beta is -1; expected 0 or more"):
+        lightgaussian_score(make(), views(), beta=-1)

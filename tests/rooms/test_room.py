@@ -1,0 +1,258 @@
+"""The built-in rooms: repeatable, watertight, lit, with highlights that move, and readable as Replica scenes."""
+
+import json
+import logging
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_depth, read_photo
+from pointsplat_ns.rooms.camera_path import CLEARANCE, clearance
+from pointsplat_ns.rooms.raycast import BOX, CHARTS, chart_points, chart_starts, trace_camera
+from pointsplat_ns.rooms.room import capture_path, default_intrinsics, make_room, render_room, write_room
+from pointsplat_ns.rooms.textures import Canvas
+
+WIDTH, HEIGHT = 96, 72
+
+
+@pytest.fixture(scope="module")
+def room():
+    return make_room(3)
+
+
+@pytest.fixture(scope="module")
+def poses(room):
+    return capture_path(room, 40, 3)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    return write_room(tmp_path_factory.mktemp("rooms") / "room1", seed=1, frames=6, width=64, height=48, progress=False)
+
+
+def picture(room, pose, **options):
+    return render_room(room, pose, default_intrinsics(WIDTH, HEIGHT), WIDTH, HEIGHT, **options)
+
+
+def unproject(pose, depth):
+    K = default_intrinsics(WIDTH, HEIGHT)
+    v, u = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    camera = torch.stack([(u - K[0, 2]) / K[0, 0] * depth, (v - K[1, 2]) / K[1, 1] * depth, depth], dim=-1)
+    return camera.reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
+
+
+def test_a_seed_gives_the_same_room_path_and_picture_and_another_seed_another(room, poses):
+    again = make_room(3)
+    assert torch.equal(again.spec.primitives.center, room.spec.primitives.center)
+    assert torch.equal(capture_path(again, 40, 3), poses)
+    first, second = picture(room, poses[5]), picture(again, poses[5])
+    assert torch.equal(first[0], second[0]) and torch.equal(first[1], second[1])
+    other = make_room(7)
+    assert other.spec.kind == room.spec.kind == "dining" and other.spec.size != room.spec.size
+
+
+def test_rooms_differ_in_kind_size_and_furniture():
+    specs = [make_room(seed).spec for seed in range(12)]
+    assert {spec.kind for spec in specs} == {"living", "bedroom", "study", "dining"}
+    assert len({spec.size for spec in specs}) == 12
+    assert all(40 < len(spec.primitives) < 130 for spec in specs)
+    assert all(2 <= len(spec.lights) <= 4 for spec in specs)
+
+
+def test_depth_is_the_distance_to_the_walls_along_the_optical_axis(room):
+    pose = torch.eye(4)  # straight down from just under the ceiling lamp's height, beside it
+    pose[:3, :3] = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    width, depth, _ = room.spec.size
+    pose[:3, 3] = torch.tensor([width / 2 - 0.3, 0.0, 2.2])
+    _, z = picture(room, pose)
+    lowest = float(z.max())
+    assert lowest == pytest.approx(2.2, abs=1e-5)  # the floor: nothing is deeper
+    # And a wall seen squarely from the middle: every pixel of it has the same depth.
+    up = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # looks along +y
+    pose[:3, :3], pose[:3, 3] = up, torch.tensor([0.0, 0.0, room.spec.size[2] - 0.35])
+    _, z = picture(room, pose)
+    wall = (z - depth / 2).abs() < 1e-4
+    assert wall.float().mean() > 0.1 and float(z.max()) <= depth / 2 + 1e-4
+
+
+def test_matte_surfaces_keep_their_colour_from_view_to_view(room, poses):
+    first, second = 4, 6
+    color_a, depth_a = picture(room, poses[first], highlights=False)
+    color_b, depth_b = picture(room, poses[second], highlights=False)
+    K = default_intrinsics(WIDTH, HEIGHT)
+    there = (unproject(poses[first], depth_a) - poses[second][:3, 3]) @ poses[second][:3, :3]
+    z = there[:, 2]
+    safe = z.clamp(min=0.1)
+    u, v = there[:, 0] / safe * K[0, 0] + K[0, 2], there[:, 1] / safe * K[1, 1] + K[1, 2]
+    inside = (z > 0.1) & (u > 1) & (u < WIDTH - 1) & (v > 1) & (v < HEIGHT - 1)
+    grid = torch.stack([u / WIDTH * 2 - 1, v / HEIGHT * 2 - 1], dim=-1)[None, None]
+
+    def look(image):
+        sampled = torch.nn.functional.grid_sample(image[None], grid, align_corners=False)
+        return sampled[0, :, 0].T
+
+    seen = inside & ((look(depth_b[None])[:, 0] - z).abs() < 0.02 * z)
+    assert int(seen.sum()) > 0.3 * WIDTH * HEIGHT
+    error = (look(color_b.permute(2, 0, 1)) - color_a.reshape(-1, 3)).abs().mean(dim=-1)[seen]
+    # Interpolating a picture blurs its edges; elsewhere colours agree to a few grey levels.
+    assert float(error.median()) < 0.02 and float(error.mean()) < 0.05
+
+
+def test_highlights_brighten_only_and_move_with_the_viewer(room, poses):
+    peaks = []
+    for k in range(0, 40, 2):
+        plain, depth = picture(room, poses[k], highlights=False)
+        shiny, _ = picture(room, poses[k])
+        gain = (shiny - plain).mean(dim=-1)
+        assert float(gain.min()) > -1e-5  # rounding of the gamma curve
+        floor = unproject(poses[k], depth)[:, 2] < 0.03
+        gain = torch.where(floor, gain.reshape(-1), 0)
+        if float(gain.max()) > 0.03:
+            peaks.append(unproject(poses[k], depth)[gain.argmax()])
+    assert len(peaks) >= 4
+    apart = torch.cdist(torch.stack(peaks), torch.stack(peaks))
+    assert float(apart.max()) > 0.5  # metres that the brightest gleam on the floor wanders
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_cameras_keep_clear_of_furniture_move_smoothly_and_look_level(seed):
+    room = make_room(seed)
+    poses = capture_path(room, 80, seed)
+    assert float(clearance(room, poses[:, :3, 3]).min()) >= CLEARANCE
+    rotation = poses[:, :3, :3].double()
+    assert torch.allclose(rotation.transpose(1, 2) @ rotation, torch.eye(3).double(), atol=1e-6)
+    assert torch.all(torch.linalg.det(rotation) > 0)
+    assert torch.all(poses[:, 2, 0].abs() < 1e-6)  # no roll
+    steps = (poses[1:, :3, 3] - poses[:-1, :3, 3]).norm(dim=-1)
+    assert float(steps.max()) < 0.45
+    turns = (rotation[1:, :, 2] * rotation[:-1, :, 2]).sum(-1).clamp(-1, 1).arccos().rad2deg()
+    assert float(turns.max()) < 30  # of the 78 degrees of view: neighbours always overlap by more than half
+    assert float(poses[:, 2, 3].max() - poses[:, 2, 3].min()) > 0.3
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_walk_sees_nearly_all_of_the_shell_from_several_places(seed):
+    room = make_room(seed)
+    poses, prims = capture_path(room, 80, seed), room.spec.primitives
+    width, height = 64, 48
+    K = default_intrinsics(width, height)
+    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    rays = torch.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], torch.ones_like(u)])
+    size = torch.tensor(room.spec.size)
+    views = torch.zeros(8, 8, 5)  # cells of the shell's six sides, in room coordinates
+    for pose in poses:
+        z, index = trace_camera(prims, pose, rays, K, 1)
+        points = (pose[:3, :3] @ (rays * z).reshape(3, -1)).T + pose[:3, 3]
+        shell = points[(index == 0).reshape(-1)]
+        cell = ((shell / size + torch.tensor([0.5, 0.5, 0.0])) * torch.tensor([8, 8, 5])).long()
+        cell = torch.minimum(cell.clamp(min=0), torch.tensor([7, 7, 4]))
+        seen = torch.zeros_like(views)
+        seen[cell[:, 0], cell[:, 1], cell[:, 2]] = 1
+        views += seen
+    sides = torch.ones(8, 8, 5, dtype=torch.bool)
+    sides[1:-1, 1:-1, 1:-1] = False
+    assert float((views[sides] >= 3).float().mean()) > 0.8  # the rest is under beds and behind wardrobes
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_pictures_are_neither_black_nor_blown_out_and_have_texture(seed):
+    room = make_room(seed)
+    for pose in capture_path(room, 8, seed)[::3]:
+        rgb, depth = picture(room, pose)
+        assert torch.isfinite(rgb).all() and float(rgb.min()) >= 0 and float(rgb.max()) <= 1
+        assert 0.25 < float(rgb.mean()) < 0.8
+        assert float((rgb.amax(-1) < 0.02).float().mean()) < 0.03
+        assert float((rgb.amin(-1) > 0.99).float().mean()) < 0.05
+        assert float(rgb.std()) > 0.08
+        assert torch.isfinite(depth).all() and float(depth.min()) > 0.1
+
+
+def test_walls_hide_what_is_behind_them(room, poses):
+    farthest = float(torch.tensor(room.spec.size).norm())
+    for pose in poses[::8]:
+        depth = picture(room, pose)[1]
+        points = unproject(pose, depth)
+        half = torch.tensor(room.spec.size) / 2
+        assert torch.all((points - room.spec.primitives.center[0]).abs() <= half + 1e-4)
+        assert float(depth.max()) < farthest
+
+
+def test_every_material_paints_colours_in_range():
+    for seed in range(6):
+        spec = make_room(seed).spec
+        for number, material in enumerate(spec.materials):
+            image = material.paint(Canvas(0.8, 0.5, 40, 25, seed=number))
+            assert image.shape == (25, 40, 3) and np.isfinite(image).all()
+            assert image.min() >= -1e-6 and image.max() < 1.5
+
+
+def test_pictures_hang_on_walls_the_right_way_round(room):
+    starts, prims = chart_starts(room.spec.primitives), room.spec.primitives
+    assert len(room.spec.materials) == int(starts[-1]) + CHARTS[int(prims.kind[-1])]
+    # On the inner side of each wall: a larger v is lower, a larger u further right for who faces it.
+    for face in range(4):
+        corner = chart_points(prims, 0, face, torch.tensor([0.2, 0.8, 0.2]), torch.tensor([0.5, 0.5, 0.9]))
+        points, normal = corner
+        across, down = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
+        assert float(down[2]) < 0 and int(prims.kind[0]) == BOX
+        right = torch.linalg.cross(-normal[:, 0], torch.tensor([0.0, 0.0, 1.0]))
+        assert float(across @ right) > 0
+
+
+def test_a_written_room_reads_back_as_a_replica_scene_without_a_warning(written, caplog):
+    with caplog.at_level(logging.WARNING):
+        scene = load_replica(written)
+    assert not caplog.records
+    assert len(scene) == 6 and scene.depths is not None
+    assert scene.params.principal_point() == (32.0, 24.0)
+    assert {p.name for p in written.iterdir()} == {"results", "traj.txt", "cam_params.json"}
+    room = make_room(1)
+    expected = capture_path(room, 6, 1)
+    assert np.allclose(scene.poses, expected.numpy(), atol=1e-6)  # nine digits, then made orthonormal
+    rgb, depth = render_room(room, expected[2], default_intrinsics(64, 48), 64, 48)
+    assert np.abs(read_depth(scene.depths[2], scene.params) - depth.numpy()).max() < 1.01 / 6553.5
+    assert np.abs(read_photo(scene.photos[2], scene.params) / 255.0 - rgb.numpy()).mean() < 0.012  # JPEG at 97
+
+
+def test_the_dataparser_reads_a_written_room_with_seed_points_on_its_surfaces(written):
+    from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
+
+    outputs = ReplicaDataParserConfig(data=written, num_seed_points=800).setup().get_dataparser_outputs("train")
+    assert len(outputs.image_filenames) == 5
+    xyz = outputs.metadata["points3D_xyz"]
+    assert 500 < len(xyz) <= 800
+    size = torch.tensor(make_room(1).spec.size)
+    # A voxel's mean lies within the voxel, 0.2 m here.
+    assert torch.all((xyz - torch.tensor([0, 0, 1.0]) * size / 2).abs() < size / 2 + 0.01)
+
+
+def test_writing_leaves_nothing_behind_when_it_fails_and_keeps_what_is_there(tmp_path, monkeypatch):
+    target = tmp_path / "room"
+    target.mkdir()
+    (target / "mine.txt").write_text("kept")
+    with pytest.raises(DataError, match="not an empty folder"):
+        write_room(target, 0, 2, 16, 12, progress=False)
+    assert (target / "mine.txt").read_text() == "kept"
+
+    def full(*args, **kwargs):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", full)
+    with pytest.raises(OSError, match="no space"):
+        write_room(tmp_path / "other", 0, 2, 16, 12, progress=False)
+    assert [p.name for p in tmp_path.iterdir()] == ["room"]
+
+
+def test_impossible_requests_are_refused_in_one_line(tmp_path):
+    with pytest.raises(DataError, match="room seed -1"):
+        make_room(-1)
+    with pytest.raises(DataError, match="at least 2 frames"):
+        write_room(tmp_path / "r", 0, frames=1)
+
+
+def test_camera_file_states_replicas_own_convention(written):
+    camera = json.loads((written / "cam_params.json").read_text())["camera"]
+    assert (camera["cx"], camera["cy"], camera["scale"]) == (31.5, 23.5, 6553.5)
