@@ -1,7 +1,7 @@
 # Each target sets up what it needs: an environment in $(VENV), made once and renewed when pyproject.toml changes.
 #   make test    run the test suite
-#   make lint    check style
-#   make demo    the whole method on built-in rooms: train, prune, refine, evaluate, export
+#   make lint    check style, types and the direction of imports
+#   make demo    a built-in scene made small, then the whole method: train, prune, refine, evaluate, export
 # Use an environment of your own with `make test VENV=/path/to/env`.
 
 VENV ?= .venv
@@ -10,6 +10,9 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.10 python3; do \
 	"$$p" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 13))' >/dev/null 2>&1 && { echo "$$p"; break; }; \
 	done)
 STAMP := $(VENV)/.pointsplat-installed
+
+# Tests run side by side in so many processes, on one thread each.
+WORKERS ?= 2
 
 # Threads that wait for one another spin briefly and then sleep: much faster where other programs run as well.
 export GOMP_SPINCOUNT ?= 20000
@@ -27,14 +30,16 @@ $(STAMP): pyproject.toml | $(VENV)/bin/python
 	@touch $@
 
 test: $(STAMP)
-	$(VENV)/bin/python -m pytest
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses $(WORKERS)
 
 lint: $(STAMP)
 	$(VENV)/bin/python -m ruff check .
 	$(VENV)/bin/python -m ruff format --check .
+	$(VENV)/bin/python -m mypy
+	$(VENV)/bin/lint-imports --no-cache
 
 demo: $(STAMP)
 	$(VENV)/bin/pointsplat demo
 
 clean:
-	rm -rf build *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache .hypothesis
