@@ -4,6 +4,7 @@ Every reader returns a :class:`~pointsplat_ns.gaussians.Gaussians` and raises
 :class:`~pointsplat_ns.errors.SceneError` with one line that names the file and the fault.
 """
 
+from pointsplat_ns.io.files import content_hash
 from pointsplat_ns.io.ply import read_ply, write_ply
 from pointsplat_ns.io.runs import Run, find_runs, open_run, scene_name, scene_names
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
@@ -13,6 +14,7 @@ from pointsplat_ns.io.splatfacto import read_checkpoint
 __all__ = [
     "Run",
     "allow_splatfacto_checkpoints",
+    "content_hash",
     "find_runs",
     "open_run",
     "read_checkpoint",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 from collections.abc import Iterator
@@ -30,6 +31,26 @@ def require_file(path: Path | str, what: str) -> Path:
     if not path.is_file():
         raise SceneError(f"{path}: not a regular file; expected {what}")
     return path
+
+
+def content_hash(path: Path | str) -> str:
+    """SHA-256 of a file's bytes, as 64 hexadecimal digits: the same file gives the same text, whatever its name.
+
+    Args:
+        path: the file; read in pieces, so that its size does not matter.
+
+    Raises:
+        SceneError: if there is no such file, or it cannot be read.
+    """
+    path = require_file(path, "a scene to read")
+    digest = hashlib.sha256()
+    try:
+        with path.open("rb") as stream:
+            while piece := stream.read(1 << 20):
+                digest.update(piece)
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
+    return digest.hexdigest()
 
 
 def one_line(error: BaseException, limit: int = 160) -> str:
