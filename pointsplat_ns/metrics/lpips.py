@@ -11,14 +11,16 @@ from __future__ import annotations
 import importlib.util
 import os
 import socket
-from collections.abc import Mapping
+import threading
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import torch
-import torch.nn.functional as F
+from cachetools import LRUCache, TTLCache
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.metrics import ImageError, as_nchw, per_image
@@ -31,6 +33,10 @@ WEIGHTS_VARIABLE = "POINTSPLAT_LPIPS_WEIGHTS"
 DOWNLOAD_TIMEOUT_S = 15.0
 """Silence of a server after which a download is given up."""
 
+RETRY_AFTER_S = 600.0
+"""How long :func:`cached_lpips` takes a failure for granted: a download that times out at every evaluation step would
+cost more than the step."""
+
 _NORM_EPS = 1e-8
 """Inside the square root of a feature's length, as torchmetrics has it: keeps the gradient finite at 0."""
 
@@ -40,57 +46,39 @@ class LpipsUnavailable(PointSplatError):
 
 
 @dataclass(frozen=True)
-class _Conv:
-    """A convolution with ReLU, and what surrounds it."""
+class _Backbone:
+    """What LPIPS takes from one of torchvision's networks."""
 
-    index: int  # in torchvision's ``features``
-    shape: tuple[int, int, int]  # out channels, in channels, kernel side
-    stride: int = 1
-    padding: int = 1
-    pool: int = 0  # side of the max-pooling of stride 2 before it; 0 for none
-    tap: bool = False  # compared by LPIPS after its ReLU
-
-
-@dataclass(frozen=True)
-class _Architecture:
-    convs: tuple[_Conv, ...]
-    minimum: int  # image side below which the last feature map is empty
+    taps: tuple[int, ...]  # layers of ``features``, each a ReLU, whose output is compared
+    channels: tuple[int, ...]  # of those outputs
+    minimum: int  # image side below which the last of them is empty
     files: tuple[str, ...]  # usual file names; the last is torchvision's own
     url: str = "https://download.pytorch.org/models/"
 
 
-_ARCHITECTURES: dict[str, _Architecture] = {
-    "alex": _Architecture(
-        convs=(
-            _Conv(0, (64, 3, 11), stride=4, padding=2, tap=True),
-            _Conv(3, (192, 64, 5), padding=2, pool=3, tap=True),
-            _Conv(6, (384, 192, 3), pool=3, tap=True),
-            _Conv(8, (256, 384, 3), tap=True),
-            _Conv(10, (256, 256, 3), tap=True),
-        ),
+_BACKBONES: dict[str, _Backbone] = {
+    "alex": _Backbone(
+        taps=(1, 4, 7, 9, 11),
+        channels=(64, 192, 384, 256, 256),
         minimum=31,
         files=("alexnet_features.pth", "alexnet-owt-7be5be79.pth"),
     ),
-    "vgg": _Architecture(
-        convs=(
-            _Conv(0, (64, 3, 3)),
-            _Conv(2, (64, 64, 3), tap=True),
-            _Conv(5, (128, 64, 3), pool=2),
-            _Conv(7, (128, 128, 3), tap=True),
-            _Conv(10, (256, 128, 3), pool=2),
-            _Conv(12, (256, 256, 3)),
-            _Conv(14, (256, 256, 3), tap=True),
-            _Conv(17, (512, 256, 3), pool=2),
-            _Conv(19, (512, 512, 3)),
-            _Conv(21, (512, 512, 3), tap=True),
-            _Conv(24, (512, 512, 3), pool=2),
-            _Conv(26, (512, 512, 3)),
-            _Conv(28, (512, 512, 3), tap=True),
-        ),
+    "vgg": _Backbone(
+        taps=(3, 8, 15, 22, 29),
+        channels=(64, 128, 256, 512, 512),
         minimum=16,
         files=("vgg16_features.pth", "vgg16-397923af.pth"),
     ),
 }
+
+
+def empty_features(net: Net) -> nn.Sequential:
+    """torchvision's layers up to the last that LPIPS compares, without memory for their weights."""
+    from torchvision import models
+
+    with torch.device("meta"):
+        network = models.alexnet(weights=None) if net == "alex" else models.vgg16(weights=None, init_weights=False)
+    return network.features[: _BACKBONES[net].taps[-1] + 1]
 
 
 class Lpips(nn.Module):
@@ -112,22 +100,21 @@ class Lpips(nn.Module):
     def __init__(self, net: Net, backbone: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:
         super().__init__()
         self.net = net
-        self._architecture = _ARCHITECTURES[net]
+        self._backbone = _BACKBONES[net]
         # Mean and standard deviation of ImageNet, in units of [-1, 1], as LPIPS was fitted with.
-        self._frozen("shift", torch.tensor([-0.030, -0.088, -0.188]).reshape(1, 3, 1, 1))
-        self._frozen("spread", torch.tensor([0.458, 0.448, 0.450]).reshape(1, 3, 1, 1))
-        tap = 0
-        for conv in self._architecture.convs:
-            out, inner, side = conv.shape
-            key = f"features.{conv.index}"
-            self._frozen(f"weight{conv.index}", _expect(backbone, f"{key}.weight", (out, inner, side, side)))
-            self._frozen(f"bias{conv.index}", _expect(backbone, f"{key}.bias", (out,)))
-            if conv.tap:
-                self._frozen(f"linear{tap}", _expect(linear, f"lin{tap}.model.1.weight", (1, out, 1, 1)))
-                tap += 1
+        self._freeze(self, "shift", torch.tensor([-0.030, -0.088, -0.188]).reshape(1, 3, 1, 1))
+        self._freeze(self, "spread", torch.tensor([0.458, 0.448, 0.450]).reshape(1, 3, 1, 1))
+        self.features = empty_features(net)
+        for index, layer in self.features.named_children():
+            for name, parameter in list(layer.named_parameters()):
+                delattr(layer, name)
+                self._freeze(layer, name, _expect(backbone, f"features.{index}.{name}", tuple(parameter.shape)))
+        for tap, channels in enumerate(self._backbone.channels):
+            self._freeze(self, f"linear{tap}", _expect(linear, f"lin{tap}.model.1.weight", (1, channels, 1, 1)))
 
-    def _frozen(self, name: str, value: Tensor) -> None:
-        self.register_buffer(name, value.detach().to(torch.float32, copy=True), persistent=False)
+    @staticmethod
+    def _freeze(module: nn.Module, name: str, value: Tensor) -> None:
+        module.register_buffer(name, value.detach().to(torch.float32, copy=True), persistent=False)
 
     def forward(self, pred: Tensor, target: Tensor) -> Tensor:
         """LPIPS of each image pair.
@@ -143,30 +130,28 @@ class Lpips(nn.Module):
             ImageError: if the images cannot be compared or are too small for the network.
         """
         a, b = as_nchw(pred, target)
-        least = self._architecture.minimum
+        least = self._backbone.minimum
         if min(a.shape[2:]) < least:
             raise ImageError(
                 f"images of {a.shape[3]} x {a.shape[2]} pixels are too small for LPIPS with {self.net}; "
                 f"expected at least {least} x {least}"
             )
         total = a.new_zeros(a.shape[0])
-        for tap, (fa, fb) in enumerate(zip(self._features(a), self._features(b), strict=True)):
+        for tap, (fa, fb) in enumerate(zip(self._compared(a), self._compared(b), strict=True)):
             weight = self.get_buffer(f"linear{tap}").to(fa.dtype)
             total = total + (weight * (fa - fb).square()).sum(dim=1).mean(dim=(1, 2))
         return per_image(total, pred)
 
-    def _features(self, images: Tensor) -> list[Tensor]:
+    def _compared(self, images: Tensor) -> list[Tensor]:
         """Feature maps of images (B, 3, H, W) in [0, 1], each pixel's of length 1 over the channels."""
         x = (2 * images - 1 - self.shift.to(images.dtype)) / self.spread.to(images.dtype)
-        taps = []
-        for conv in self._architecture.convs:
-            if conv.pool:
-                x = F.max_pool2d(x, conv.pool, 2)
-            weight, bias = (self.get_buffer(f"{part}{conv.index}").to(x.dtype) for part in ("weight", "bias"))
-            x = F.relu(F.conv2d(x, weight, bias, conv.stride, conv.padding))
-            if conv.tap:
-                taps.append(x / torch.sqrt(x.square().sum(dim=1, keepdim=True) + _NORM_EPS))
-        return taps
+        maps = []
+        for index, layer in enumerate(self.features):
+            # In the type of the images, so that float64 ones are compared in float64.
+            x = functional_call(layer, {name: value.to(x.dtype) for name, value in layer.named_buffers()}, x)
+            if index in self._backbone.taps:
+                maps.append(x / torch.sqrt(x.square().sum(dim=1, keepdim=True) + _NORM_EPS))
+        return maps
 
 
 def load_lpips(net: Net = "alex", backbone: Path | str | None = None, download: bool = True) -> Lpips:
@@ -188,34 +173,104 @@ def load_lpips(net: Net = "alex", backbone: Path | str | None = None, download: 
     Example:
         >>> load_lpips("alex", backbone="alexnet_features.pth")  # doctest: +SKIP
     """
-    if net not in _ARCHITECTURES:
-        raise LpipsUnavailable(f"no LPIPS network is called {net!r}; expected one of {', '.join(_ARCHITECTURES)}")
+    if net not in _BACKBONES:
+        raise LpipsUnavailable(f"no LPIPS network is called {net!r}; expected one of {', '.join(_BACKBONES)}")
     linear = _load(_linear_file(net))
-    if backbone is not None:
-        return _build(net, Path(backbone), linear)
+    path = _local_file(net) if backbone is None else Path(backbone)
+    if path is None:
+        path = _hub_file(net)
+        _download(net, path, download)
+    state = _load(path)
+    try:
+        return Lpips(net, state, linear)
+    except LpipsUnavailable as error:
+        raise LpipsUnavailable(f"{path}: not the weights of LPIPS's {net} backbone; {error}") from error
+
+
+def cached_lpips(net: Net, device: torch.device | str) -> Lpips:
+    """LPIPS on a device, loaded at the first call and the same object afterwards.
+
+    A failure is remembered as well, for ``RETRY_AFTER_S`` seconds or until another file is found or
+    the environment variable changes: weights that appear are seen at the next call, and a download that
+    timed out is not tried again at every step. What must not change in its course, a training loss for
+    one, keeps the answer of its first call.
+
+    Args:
+        net: as for :func:`load_lpips`, which says where the weights come from.
+        device: where the images are that it will compare.
+
+    Raises:
+        LpipsUnavailable: if no weights can be had; one line with the reason.
+    """
+    place = (net, str(torch.device(device)), os.environ.get(WEIGHTS_VARIABLE), torch.hub.get_dir())
+    with _cache_lock:
+        lpips = _loaded.get(place)
+        if lpips is not None:
+            return lpips
+        path = _local_file(net) if net in _BACKBONES else None
+        attempt = (place, path, path.stat().st_mtime_ns if path is not None else None)
+        if attempt in _failures:
+            raise LpipsUnavailable(_failures[attempt])
+        try:
+            lpips = _loaded[place] = load_lpips(net).to(device)
+        except LpipsUnavailable as error:
+            _failures[attempt] = str(error)
+            raise
+        return lpips
+
+
+class ReportedLpips:
+    """LPIPS for a report that goes on without it.
+
+    Not a module: its weights are no part of what a model saves.
+
+    Args:
+        net: as for :func:`load_lpips`.
+    """
+
+    def __init__(self, net: Net = "alex"):
+        self.net = net
+        self.reason: str | None = None
+        """Why a value is missing, the latest reason if there are several; None while none is missing."""
+
+    def __call__(self, pred: Tensor, target: Tensor) -> Tensor | None:
+        """LPIPS as :meth:`Lpips.forward` gives it; None, with ``reason`` set, where it cannot be computed."""
+        try:
+            return cached_lpips(self.net, pred.device)(pred, target)
+        except (LpipsUnavailable, ImageError) as error:  # no weights, or an image too small for the network
+            self.reason = str(error)
+            return None
+
+
+_loaded: LRUCache[Hashable, Lpips] = LRUCache(maxsize=4)  # 10 MB for alex, 59 MB for vgg
+_failures: TTLCache[Hashable, str] = TTLCache(maxsize=16, ttl=RETRY_AFTER_S)
+_cache_lock = threading.Lock()
+
+
+def _local_file(net: Net) -> Path | None:
+    """The backbone's file on this machine: what the environment variable names, or torch hub's copy.
+
+    Raises:
+        LpipsUnavailable: if the variable names nothing that exists.
+    """
     named = os.environ.get(WEIGHTS_VARIABLE)
     if named:
         place = Path(named).expanduser()
         if not place.exists():
             raise LpipsUnavailable(f"{place}: no such file or folder, though {WEIGHTS_VARIABLE} names it")
         if place.is_dir():
-            found = next((place / name for name in _ARCHITECTURES[net].files if (place / name).is_file()), None)
+            found = next((place / name for name in _BACKBONES[net].files if (place / name).is_file()), None)
             if found is not None:
-                return _build(net, found, linear)
-        elif not any(place.name in other.files for key, other in _ARCHITECTURES.items() if key != net):
-            return _build(net, place, linear)  # but for a file that its name says is the other network's
-    cached = Path(torch.hub.get_dir()) / "checkpoints" / _ARCHITECTURES[net].files[-1]
-    if not cached.is_file():
-        _download(net, cached, download)
-    return _build(net, cached, linear)
+                return found
+        elif not any(place.name in other.files for key, other in _BACKBONES.items() if key != net):
+            return place  # but for a file that its name says is the other network's
+    cached = _hub_file(net)
+    return cached if cached.is_file() else None
 
 
-def _build(net: Net, path: Path, linear: Mapping[str, Tensor]) -> Lpips:
-    state = _load(path)
-    try:
-        return Lpips(net, state, linear)
-    except LpipsUnavailable as error:
-        raise LpipsUnavailable(f"{path}: not the weights of LPIPS's {net} backbone; {error}") from error
+def _hub_file(net: Net) -> Path:
+    """Where torchvision's download belongs."""
+    return Path(torch.hub.get_dir()) / "checkpoints" / _BACKBONES[net].files[-1]
 
 
 def _load(path: Path) -> Mapping[str, Tensor]:
@@ -249,7 +304,7 @@ def _linear_file(net: Net) -> Path:
 
 def _download(net: Net, target: Path, allowed: bool) -> None:
     """torchvision's download into torch hub's cache; whole and of the right hash, or not at all."""
-    remedy = f"set {WEIGHTS_VARIABLE} to a folder with {' or '.join(_ARCHITECTURES[net].files)}"
+    remedy = f"set {WEIGHTS_VARIABLE} to a folder with {' or '.join(_BACKBONES[net].files)}"
     if not allowed:
         raise LpipsUnavailable(f"{target}: LPIPS's {net} backbone is not there; {remedy}")
     timeout = socket.getdefaulttimeout()
@@ -257,7 +312,7 @@ def _download(net: Net, target: Path, allowed: bool) -> None:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         torch.hub.download_url_to_file(
-            _ARCHITECTURES[net].url + target.name, str(target), target.stem.split("-")[-1], progress=False
+            _BACKBONES[net].url + target.name, str(target), target.stem.split("-")[-1], progress=False
         )
     except Exception as error:  # no route, no name, a proxy's page, a full disk: all mean no LPIPS
         reason = getattr(error, "reason", None) or getattr(error, "strerror", None) or error

@@ -5,12 +5,22 @@ import os
 import urllib.error
 from io import BytesIO
 
+import cachetools
 import pytest
 import torch
 
 from making import SHARED_DATA
 from pointsplat_ns.metrics import ImageError
-from pointsplat_ns.metrics.lpips import _ARCHITECTURES, WEIGHTS_VARIABLE, Lpips, LpipsUnavailable, load_lpips
+from pointsplat_ns.metrics.lpips import (
+    RETRY_AFTER_S,
+    WEIGHTS_VARIABLE,
+    Lpips,
+    LpipsUnavailable,
+    ReportedLpips,
+    cached_lpips,
+    empty_features,
+    load_lpips,
+)
 
 WEIGHTS = SHARED_DATA / "weights"
 FILES = {"alex": "alexnet_features.pth", "vgg": "vgg16_features.pth"}
@@ -20,12 +30,10 @@ NETS = ["alex", "vgg"]
 def random_backbone(net, seed=0):
     generator = torch.Generator().manual_seed(seed)
     state = {}
-    for conv in _ARCHITECTURES[net].convs:
-        out, inner, side = conv.shape
-        # He's initialisation keeps the activations of one size through all layers
-        spread = math.sqrt(2 / (inner * side * side))
-        state[f"features.{conv.index}.weight"] = spread * torch.randn(out, inner, side, side, generator=generator)
-        state[f"features.{conv.index}.bias"] = 0.1 * torch.randn(out, generator=generator)
+    for name, empty in empty_features(net).state_dict().items():
+        # He's initialisation keeps the activations of one size through all layers.
+        spread = math.sqrt(2 / empty[0].numel()) if name.endswith("weight") else 0.1
+        state[f"features.{name}"] = spread * torch.randn(empty.shape, generator=generator)
     return state
 
 
@@ -185,9 +193,105 @@ def test_a_parent_model_neither_trains_it_nor_saves_it(alex):
     assert len(list(parent.parameters())) == 2
     parent.load_state_dict(parent.state_dict(), strict=True)
     parent.double()
-    assert alex.weight0.dtype == torch.float64  # it moves along
+    assert alex.features[0].weight.dtype == torch.float64  # it moves along
     parent.train()
     assert parent.lpips(*pair(40, 40, dtype=torch.float64)).isfinite()
+
+
+# Loaded once
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Empty caches, and the time that failures are remembered by, in a list of one number."""
+    now = [0.0]
+    failures = cachetools.TTLCache(16, ttl=RETRY_AFTER_S, timer=lambda: now[0])
+    monkeypatch.setattr("pointsplat_ns.metrics.lpips._failures", failures)
+    monkeypatch.setattr("pointsplat_ns.metrics.lpips._loaded", cachetools.LRUCache(4))
+    return now
+
+
+def test_cached_lpips_is_loaded_once(alex_file, clock, monkeypatch):
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
+    assert cached_lpips("alex", "cpu") is cached_lpips("alex", torch.device("cpu"))
+
+
+def test_cached_lpips_gives_what_load_lpips_gives(alex_file, alex, clock, monkeypatch):
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
+    assert torch.equal(cached_lpips("alex", "cpu")(*pair(40, 40)), alex(*pair(40, 40)))
+
+
+def test_cached_lpips_is_on_the_device_asked_for(alex_file, clock, monkeypatch):
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
+    assert {buffer.device.type for buffer in cached_lpips("alex", "meta").buffers()} == {"meta"}
+
+
+def test_a_failed_download_is_not_tried_at_every_call(clock, nowhere):
+    texts = []
+    for _ in range(3):
+        with pytest.raises(LpipsUnavailable) as caught:
+            cached_lpips("alex", "cpu")
+        texts.append(str(caught.value))
+    assert len(nowhere) == 1 and len(set(texts)) == 1
+
+
+def test_a_failed_download_is_tried_again_later(clock, nowhere):
+    for clock[0] in (0.0, RETRY_AFTER_S - 1, RETRY_AFTER_S + 1):
+        with pytest.raises(LpipsUnavailable):
+            cached_lpips("alex", "cpu")
+    assert len(nowhere) == 2
+
+
+def test_weights_that_appear_after_a_failure_are_taken_at_once(alex_file, clock, tmp_path):
+    with pytest.raises(LpipsUnavailable):
+        cached_lpips("alex", "cpu")
+    (tmp_path / "hub" / "checkpoints").mkdir(parents=True, exist_ok=True)
+    os.symlink(alex_file, tmp_path / "hub" / "checkpoints" / "alexnet-owt-7be5be79.pth")
+    assert cached_lpips("alex", "cpu").net == "alex"
+
+
+def test_a_variable_that_is_set_after_a_failure_is_followed_at_once(alex_file, clock, monkeypatch):
+    with pytest.raises(LpipsUnavailable):
+        cached_lpips("alex", "cpu")
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
+    assert cached_lpips("alex", "cpu").net == "alex"
+
+
+def test_a_damaged_file_that_is_replaced_after_a_failure_is_read_again(alex_file, clock, tmp_path, monkeypatch):
+    path = tmp_path / "backbone.pth"
+    path.write_bytes(b"cut")
+    os.utime(path, (1, 1))
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(path))
+    for _ in range(2):
+        with pytest.raises(LpipsUnavailable, match="truncated"):
+            cached_lpips("alex", "cpu")
+    path.write_bytes(alex_file.read_bytes())
+    assert cached_lpips("alex", "cpu").net == "alex"
+
+
+def test_an_unknown_network_is_said_by_the_cached_one_too(clock):
+    with pytest.raises(LpipsUnavailable, match="no LPIPS network is called 'squeeze'"):
+        cached_lpips("squeeze", "cpu")
+
+
+# In a report
+
+
+def test_a_report_has_the_value_and_no_reason(alex_file, alex, clock, monkeypatch):
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
+    lpips = ReportedLpips("alex")
+    assert torch.equal(lpips(*pair(40, 40)), alex(*pair(40, 40))) and lpips.reason is None
+
+
+def test_a_report_without_weights_has_the_reason_and_no_value(clock):
+    lpips = ReportedLpips("alex")
+    assert lpips(*pair(40, 40)) is None and "alex backbone cannot be downloaded" in lpips.reason
+
+
+def test_a_report_on_an_image_too_small_has_the_reason_and_no_value(alex_file, clock, monkeypatch):
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
+    lpips = ReportedLpips("alex")
+    assert lpips(*pair(20, 40)) is None and "40 x 20 pixels are too small" in lpips.reason
 
 
 # Where the weights come from
@@ -205,14 +309,14 @@ def test_the_variable_may_name_a_folder(alex_file, alex, tmp_path, monkeypatch, 
     (tmp_path / "w").mkdir()
     os.symlink(alex_file, tmp_path / "w" / name)
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "w"))
-    assert torch.equal(load_lpips("alex").weight0, alex.weight0)
+    assert torch.equal(load_lpips("alex").features[0].weight, alex.features[0].weight)
     with pytest.raises(LpipsUnavailable, match="vgg backbone cannot be downloaded"):
         load_lpips("vgg")
 
 
 def test_the_variable_may_name_a_file(alex_file, alex, monkeypatch):
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
-    assert torch.equal(load_lpips("alex").weight0, alex.weight0)
+    assert torch.equal(load_lpips("alex").features[0].weight, alex.features[0].weight)
     with pytest.raises(LpipsUnavailable, match=r"mine\.pth: not the weights of LPIPS's vgg backbone; .*has shape"):
         load_lpips("vgg")
 
@@ -234,7 +338,7 @@ def test_a_variable_that_names_nothing_is_said(monkeypatch, tmp_path):
 def test_the_hub_cache_is_used_without_the_network(alex_file, alex, tmp_path, nowhere):
     (tmp_path / "hub" / "checkpoints").mkdir(parents=True)
     os.symlink(alex_file, tmp_path / "hub" / "checkpoints" / "alexnet-owt-7be5be79.pth")
-    assert torch.equal(load_lpips("alex").weight0, alex.weight0) and not nowhere
+    assert torch.equal(load_lpips("alex").features[0].weight, alex.features[0].weight) and not nowhere
 
 
 def files_below(folder):
