@@ -165,7 +165,7 @@ def make_refined_run() -> Callable:
         config.output_dir, config.experiment_name = folder, "refiner"
         config.pipeline.datamanager.data = config.data = data
         config.pipeline.datamanager.eval_scenes = eval_scenes
-        for name, value in {"size": "tiny", "keep": 0.5, "score": "paper", **model}.items():
+        for name, value in {"size": "tiny", "keep": 0.5, "by": "paper", **model}.items():
             setattr(config.pipeline.model, name, value)
         config.set_timestamp()
         config.save_config()

@@ -36,7 +36,8 @@ def demo(
         height: of a photo, pixels.
         fresh: start over.
     """
-    from pointsplat_ns.cli.report import read_evaluation, rooms, show_report
+    from pointsplat_ns.cli.report import read_evaluation, show_report
+    from pointsplat_ns.cli.rooms import rooms
     from pointsplat_ns.cli.running import finished, run
 
     start = time.perf_counter()

@@ -55,7 +55,7 @@ def small_config(data: Path, output_dir: Path, steps: int, **model):
     config.machine.device_type = "cpu"
     config.output_dir, config.max_num_iterations, config.experiment_name = output_dir, steps, "refiner"
     config.pipeline.datamanager.data = config.data = data
-    for name, value in {"size": "tiny", "keep": 0.5, "score": "paper", "lpips_weight": 0.0, **model}.items():
+    for name, value in {"size": "tiny", "keep": 0.5, "by": "paper", "lpips_weight": 0.0, **model}.items():
         setattr(config.pipeline.model, name, value)
     config.set_timestamp()
     return config

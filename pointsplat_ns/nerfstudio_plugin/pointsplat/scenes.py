@@ -39,6 +39,14 @@ _NO_SEEDS = ("load_seed_points", "load_3D_points")
 """Settings of dataparsers that gather seed points, which a trained scene has no use for."""
 
 
+_FORMER_DATAPARSERS = {
+    "pointsplat_ns.data.replica.ReplicaDataParserConfig": (
+        "pointsplat_ns.nerfstudio_plugin.replica.dataparser.ReplicaDataParserConfig"
+    ),
+}
+"""What runs of earlier versions call a dataparser, and what it is called today."""
+
+
 def dataparser_of(run: Run) -> DataParser:
     """The dataparser that a run was trained with, set up as it was then.
 
@@ -51,19 +59,22 @@ def dataparser_of(run: Run) -> DataParser:
     from nerfstudio.configs.dataparser_configs import all_dataparsers
 
     known = {f"{type(c).__module__}.{type(c).__qualname__}": type(c) for c in all_dataparsers.values()}
-    if run.dataparser_class not in known:
+    name = _FORMER_DATAPARSERS.get(run.dataparser_class, run.dataparser_class)
+    if name not in known:
         raise SceneError(
             f"{run.config_path}: trained with the dataparser {run.dataparser_class or 'of another kind'}, which is not "
             "installed here; install the plugin that provides it"
         )
-    config = known[run.dataparser_class]()
+    config = known[name]()
     fields = {f.name for f in dataclasses.fields(config)}
-    for name, value in run.dataparser_fields.items():
-        if name not in fields:
-            raise SceneError(f"{run.config_path}: its dataparser has no setting {name!r}; install the version it had")
+    for field_name, value in run.dataparser_fields.items():
+        if field_name not in fields:
+            raise SceneError(
+                f"{run.config_path}: its dataparser has no setting {field_name!r}; install the version it had"
+            )
         if isinstance(value, Tagged):
             continue  # an object: the default stands
-        setattr(config, name, False if name in _NO_SEEDS else value)
+        setattr(config, field_name, False if field_name in _NO_SEEDS else value)
     config.data = run.data
     return config.setup()
 

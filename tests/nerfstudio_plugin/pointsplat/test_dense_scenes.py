@@ -18,7 +18,8 @@ from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.io.discovery import find_plys
 from pointsplat_ns.nerfstudio_plugin.frames import FrameCache
-from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import PlyScene, SampledPoses, cameras_of
+from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views
+from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import PlyScene, SampledPoses
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import ScenesDataManagerConfig
 from pointsplat_ns.rasterizer import render
 
@@ -116,7 +117,7 @@ def test_a_scene_is_known_wherever_its_file_lies_and_changes_with_its_content(ro
 
 def test_cameras_of_views_see_what_the_views_see():
     views = sample_views(box_room(1), 3, 32, 24, seed=5)
-    cameras = cameras_of(views)
+    cameras = cameras_of_views(views)
     # scene units; float32 of numbers up to 2
     torch.testing.assert_close(
         viewmats_from_opengl(cameras.camera_to_worlds).double(), views.viewmats, atol=1e-6, rtol=0

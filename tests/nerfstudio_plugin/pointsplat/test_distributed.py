@@ -48,7 +48,7 @@ def config_of(data: Path, output_dir: Path, steps: int):
     manager, model = config.pipeline.datamanager, config.pipeline.model
     manager.data = config.data = data
     manager.sampled_poses, manager.sampled_size = 5, (32, 24)
-    model.size, model.keep, model.score, model.lpips_weight = "tiny", 0.4, "paper", 0.0
+    model.size, model.keep, model.by, model.lpips_weight = "tiny", 0.4, "paper", 0.0
     for group in config.optimizers.values():
         group["scheduler"], group["optimizer"].lr = None, 1e-3
     return config

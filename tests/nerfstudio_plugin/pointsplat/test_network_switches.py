@@ -12,7 +12,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import small_config
-from pointsplat_ns.compression.refined_run import open_refined_run
+from pointsplat_ns.compression.trained_refiner import load_refiner
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
 from pointsplat_ns.refiner import RefinerConfigError
@@ -47,7 +47,7 @@ def test_each_network_trains_and_its_run_opens_again(trained_walls, run_training
     assert len(losses) == 2 and trainer.pipeline.skipped.total() == 0
     assert sum(p.numel() for p in refiner.parameters()) == 664_563 + more
     again = eval_setup(config.get_base_dir() / "config.yml")[1]
-    for opened in (open_refined_run(config.get_base_dir()).refiner, again.model.refiner):
+    for opened in (load_refiner(config.get_base_dir()).network, again.model.refiner):
         assert opened.config == refiner.config
         wanted = refiner.state_dict()
         assert opened.state_dict().keys() == wanted.keys()
@@ -63,11 +63,11 @@ def test_a_run_from_before_the_switches_opens_with_what_there_was(make_refined_r
     old, count = re.subn(r"^ +(use_appearance|use_position|norm): .*\n", "", text, flags=re.M)
     assert count == 3
     (run / "config.yml").write_text(old)
-    config = open_refined_run(run).refiner.config
+    config = load_refiner(run).network.config
     assert config.use_appearance and config.use_position and config.norm == "scene"
     (run / "config.yml").write_text(text.replace("use_position: true", "use_position: false"))
     with pytest.raises(SceneError, match="not a usable pointsplat checkpoint"):
-        open_refined_run(run)  # the weights are those of the whole network
+        load_refiner(run)  # the weights are those of the whole network
 
 
 @pytest.mark.parametrize(

@@ -27,9 +27,9 @@ from pointsplat_ns.metrics import ImageError
 from pointsplat_ns.metrics.lpips import load_lpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES, pointsplat_config
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import REFINER_NAME
-from pointsplat_ns.pruning import compact, prune
+from pointsplat_ns.pruning import METHODS, prune, score_of, select
 from pointsplat_ns.rasterizer import rasterization
-from pointsplat_ns.refiner import load_refiner
+from pointsplat_ns.refiner import read_refiner
 from pointsplat_ns.refiner.weights import read_metadata
 
 VARIANTS = ("dense", "pruned", "refined")
@@ -77,10 +77,10 @@ def trained(trained_walls, run_training, tmp_path_factory):
 
 
 def test_by_default_scenes_are_merged(trained_walls):
-    assert pointsplat_config().pipeline.model.score == "merge"
-    pipeline = pipeline_of(trained_walls, score="merge", keep=0.25)
+    assert pointsplat_config().pipeline.model.by == "merge"
+    pipeline = pipeline_of(trained_walls, by="merge", keep=0.25)
     dense = read_scene(run_of(trained_walls, "wall-a"))
-    wanted = compact(dense, 0.25, "merge")
+    wanted = prune(dense, 0.25, "merge")
     made = pipeline.model.pruned_scene(0).pruned
     assert len(made) == len(dense) // 4
     assert same(made, wanted)
@@ -91,9 +91,9 @@ def test_untrained_the_refined_scene_is_the_pruned_one_to_the_bit(trained_walls)
     for index, scene in enumerate(pipeline.datamanager.scenes):
         dense = scene.read_dense()
         made = pipeline.model.pruned_scene(index)
-        expected = prune(dense, 0.5, "paper", opacity_weight=0.3)
         assert len(made.pruned) == math.floor(len(dense) / 2 + 0.5) and made.dense_count == len(dense)
-        assert same(made.pruned, dense[expected.indices]), "kept rows are the dense ones"
+        kept = select(score_of(dense, METHODS["paper"], opacity_weight=0.3), len(made.pruned))
+        assert same(made.pruned, dense[kept]), "kept rows are the dense ones"
         assert same(pipeline.model.refine(index), made.pruned)
         assert made.pruned.sh_degree == dense.sh_degree
 
@@ -115,8 +115,8 @@ def test_what_one_scene_cannot_give_names_the_scene(trained_walls):
     pipeline = pipeline_of(trained_walls, keep=1e6)
     with pytest.raises(BudgetError, match=r"wall-a.*\.ckpt: keep is 1000000 Gaussians; expected 1 to"):
         pipeline.model.pruned_scene(0)
-    with pytest.raises(PointSplatError, match="no score is called 'beauty'; expected one of merge"):
-        pipeline_of(trained_walls, score="beauty")
+    with pytest.raises(PointSplatError, match="no method is called 'beauty'; expected one of merge"):
+        pipeline_of(trained_walls, by="beauty")
     with pytest.raises(PointSplatError, match="opacity_weight is 1.5; expected 0 to 1"):
         pipeline_of(trained_walls, opacity_weight=1.5).model.pruned_scene(0)
 
@@ -182,15 +182,15 @@ def test_the_checkpoint_holds_the_network_and_nothing_else(trained):
 def test_the_network_is_saved_by_itself_at_the_end(trained):
     config, trainer, _ = trained
     path = config.get_base_dir() / REFINER_NAME
-    loaded = load_refiner(path).state_dict()
+    loaded = read_refiner(path).state_dict()
     expected = trainer.pipeline.model.refiner.state_dict()
     assert loaded.keys() == expected.keys() and all(torch.equal(loaded[n], v) for n, v in expected.items())
     assert read_metadata(path) == {
         "step": "9",
         "scenes": "wall-a",
         "keep": "0.5",
-        "score": "paper",
-        "opacity_weight": "0.3",
+        "by": "paper",
+        "opacity_weight": None,
     }
     assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000009.ckpt"]
 
@@ -375,7 +375,7 @@ def test_the_evaluation_compares_dense_pruned_and_refined(evaluated, some_lpips,
     assert report["psnr_std"] > 0 and ("lpips_note" in report) != some_lpips
     assert not evaluated.training and not evaluated.model.training, "the viewer and the exporter go on as they were"
     network = {"size": "tiny", "encoder": "dual", "use_appearance": True, "use_position": True, "norm": "scene"}
-    assert report["settings"] == {**network, "keep": 0.5, "by": "paper", "opacity_weight": 0.3}
+    assert report["settings"] == {**network, "keep": 0.5, "by": "paper", "opacity_weight": None}
     assert sorted(p.name for p in tmp_path.iterdir()) == [f"wall-{s}_000{i}.png" for s in "ab" for i in (0, 1)]
     assert cv2.imread(str(tmp_path / "wall-a_0000.png")).shape == (48, 4 * 64, 3)
 
@@ -525,7 +525,7 @@ def test_a_crop_box_keeps_what_is_inside_and_an_empty_one_gives_background(evalu
 def test_both_exporters_write_the_refined_scene_with_the_photos_gone(trained, trained_walls, wall_scene, tmp_path):
     from nerfstudio.scripts.exporter import ExportGaussianSplat
 
-    from pointsplat_ns.cli.scenes import export
+    from pointsplat_ns.cli.export import export
 
     config, trainer, _ = trained
     expected = trainer.pipeline.eval().model.gaussians
@@ -543,13 +543,13 @@ def test_both_exporters_write_the_refined_scene_with_the_photos_gone(trained, tr
 
 
 def test_the_cli_exports_any_scene_of_the_run(trained, trained_walls, tmp_path):
-    from pointsplat_ns.cli.scenes import export
+    from pointsplat_ns.cli.export import export
 
     config, trainer, _ = trained
     export(config.get_base_dir(), tmp_path / "a.ply", scene="wall-a")
     assert same(read_ply(tmp_path / "a.ply"), trainer.pipeline.eval().model.refine(0))
-    assert not same(read_ply(tmp_path / "a.ply"), prune(read_scene(run_of(trained_walls, "wall-a")), 0.5).scene)
-    with pytest.raises(SceneError, match="--scene wall-z: no such scene.*wall-a, wall-b"):
+    assert not same(read_ply(tmp_path / "a.ply"), prune(read_scene(run_of(trained_walls, "wall-a")), 0.5))
+    with pytest.raises(SceneError, match="scene 'wall-z': no such scene.*wall-a, wall-b"):
         export(config.get_base_dir(), tmp_path / "z.ply", scene="wall-z")
     assert not (tmp_path / "z.ply").exists()
 

@@ -65,7 +65,7 @@ def test_the_refiner_command_holds_the_unseen_rooms_out():
     assert config.method_name == "pointsplat" and config.max_num_iterations == 70
     assert manager.eval_scenes == tuple(f"room{seed}" for seed in UNSEEN_SEEDS)
     assert (manager.supervision, manager.seed) == ("dense", 3)
-    assert model.keep == KEEP and model.size == "tiny" and model.score == "merge"
+    assert model.keep == KEEP and model.size == "tiny" and model.by == "merge"
     assert model.pruned_folder == Path("o/pruned")
 
 

@@ -45,7 +45,7 @@ def config_of(data: Path, output_dir: Path, steps: int):
     config.pipeline.datamanager.data = config.data = data
     config.pipeline.datamanager.sampled_poses, config.pipeline.datamanager.sampled_size = 6, (48, 36)
     model = config.pipeline.model
-    model.size, model.keep, model.score, model.lpips_weight = "tiny", 0.4, "paper", 0.0
+    model.size, model.keep, model.by, model.lpips_weight = "tiny", 0.4, "paper", 0.0
     config.set_timestamp()
     return config
 

@@ -15,6 +15,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PIXEL_LOSSES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_store import read_pruned, stored_path, write_pruned
+from pointsplat_ns.pruning import PruneSettings
 
 
 def config_of(data: Path, output_dir: Path, steps: int = 6, **model):
@@ -58,8 +59,6 @@ def test_evaluation_sees_scenes_as_they_are(trained_walls, tmp_path):
 
 
 def test_pruned_scenes_are_taken_from_the_folder(trained_walls, tmp_path, monkeypatch):
-    import pointsplat_ns.nerfstudio_plugin.pointsplat.model as module
-
     def pruned(**changes):
         config = config_of(trained_walls, tmp_path, pruned_folder=tmp_path / "pruned", **changes)
         return config.pipeline.setup(device="cpu", test_mode="test").model.pruned_scene(0)
@@ -68,7 +67,7 @@ def test_pruned_scenes_are_taken_from_the_folder(trained_walls, tmp_path, monkey
     files = sorted((tmp_path / "pruned").iterdir())
     assert len(files) == 1 and files[0].suffix == ".safetensors"
     with monkeypatch.context() as patch:
-        patch.setattr(module, "compact", lambda *a, **k: pytest.fail("pruned again"))
+        patch.setattr(PruneSettings, "prune", lambda *a, **k: pytest.fail("pruned again"))
         second = pruned()
     assert all(torch.equal(a, b) for a, b in zip(first.pruned.tensors(), second.pruned.tensors(), strict=True))
     assert (first.dense_count, first.seconds) == (second.dense_count, second.seconds)
@@ -80,7 +79,7 @@ def test_files_of_pruned_scenes_that_are_damaged_or_of_another_kind_say_so(tmp_p
     from safetensors.torch import save_file
 
     scene = Gaussians.empty(sh_degree=1)
-    path = stored_path(tmp_path, "room/of another kind/now step 3", {"keep": 0.5, "by": "paper"})
+    path = stored_path(tmp_path, "room/of another kind/now step 3", PruneSettings(0.5, "paper"))
     write_pruned(path, scene, 7, 0.25)
     found, count, seconds = read_pruned(path)
     assert (len(found), found.sh_degree, count, seconds) == (0, 1, 7, 0.25)
@@ -90,8 +89,8 @@ def test_files_of_pruned_scenes_that_are_damaged_or_of_another_kind_say_so(tmp_p
     save_file({"means": torch.zeros(1, 3)}, path)
     with pytest.raises(SceneError, match="format None; expected 'pointsplat-pruned/1'"):
         read_pruned(path)
-    assert stored_path(None, "room", {}) is None
-    assert stored_path(tmp_path, "../../etc/passwd", {}).parent == tmp_path
+    assert stored_path(None, "room", PruneSettings(0.5)) is None
+    assert stored_path(tmp_path, "../../etc/passwd", PruneSettings(0.5)).parent == tmp_path
 
 
 @pytest.mark.parametrize("factor", [0.0, -1.0, math.nan, math.inf])
