@@ -12,17 +12,14 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
-from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetppDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.scene_box import SceneBox
 
-from making import SHARED_DATA
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.nerfstudio_plugin.frames import FrameCache, Frames, LazyImageDatamanagerConfig
-from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
+from pointsplat_ns.nerfstudio_plugin.frames import Frames
+from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
 
 WIDTH, HEIGHT = 40, 30
-FOX = SHARED_DATA / "scannetpp/fox"
 
 
 def make_dataset(
@@ -124,7 +121,7 @@ def test_negative_indices_count_from_the_end_and_outside_is_an_index_error(tmp_p
 
 def test_cache_stays_within_its_bytes_and_drops_the_longest_unused(tmp_path):
     photo = WIDTH * HEIGHT * 3
-    cache = FrameCache(max_bytes=2 * photo)
+    cache = MemoryCache(max_bytes=2 * photo)
     dataset = make_dataset(tmp_path)
     frames = Frames(dataset, cache=cache)
     reads = []
@@ -137,14 +134,14 @@ def test_cache_stays_within_its_bytes_and_drops_the_longest_unused(tmp_path):
 
 
 def test_a_photo_larger_than_the_cache_is_handed_out_and_not_kept(tmp_path):
-    cache = FrameCache(max_bytes=10)
+    cache = MemoryCache(max_bytes=10)
     assert Frames(make_dataset(tmp_path), cache=cache)[0][1]["image"].shape == (HEIGHT, WIDTH, 3)
     assert len(cache) == 0 and cache.num_bytes == 0
 
 
 def test_two_scenes_share_a_cache_without_mixing(tmp_path):
     (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
-    cache = FrameCache(max_bytes=10**9)
+    cache = MemoryCache(max_bytes=10**9)
     first = Frames(make_dataset(tmp_path / "a"), cache=cache)
     second = Frames(make_dataset(tmp_path / "b", scale=0.5), cache=cache)
     assert first[0][1]["image"].shape != second[0][1]["image"].shape
@@ -172,7 +169,7 @@ def test_prefetched_photos_are_decoded_once_by_another_thread(tmp_path):
 def test_many_threads_get_the_right_photos(tmp_path):
     dataset = make_dataset(tmp_path)
     expected = [dataset.get_data(i, image_type="uint8")["image"] for i in range(5)]
-    frames = Frames(dataset, cache=FrameCache(max_bytes=2 * WIDTH * HEIGHT * 3))
+    frames = Frames(dataset, cache=MemoryCache(max_bytes=2 * WIDTH * HEIGHT * 3))
     wrong = []
 
     def work(seed):
@@ -225,68 +222,3 @@ def test_a_lens_that_cannot_be_undone_is_named(tmp_path):
     dataset = make_dataset(tmp_path, distortion=[0.1, 0.0, 0.0, 0.2, 0.0, 0.0])
     with pytest.raises(DataError, match="photo0.png.*distortion"):
         Frames(dataset)[0]
-
-
-def datamanagers(wall_scene, **settings):
-    parser = ReplicaDataParserConfig(data=wall_scene, load_seed_points=False, eval_every=3)
-    lazy = LazyImageDatamanagerConfig(dataparser=parser, **settings).setup(device="cpu")
-    stock = FullImageDatamanagerConfig(dataparser=parser, cache_images_type="uint8").setup(device="cpu")
-    return lazy, stock
-
-
-def test_datamanager_gives_what_nerfstudios_gives_in_its_order(wall_scene):
-    lazy, stock = datamanagers(wall_scene, cache_gigabytes=3e-5)  # room for three photos
-    for step in range(2 * len(lazy.train_dataset) + 1):
-        (camera, data), (other, expected) = lazy.next_train(step), stock.next_train(step)
-        assert data["image_idx"] == expected["image_idx"] == camera.metadata["cam_idx"]
-        assert torch.equal(data["image"], expected["image"])
-        assert torch.equal(camera.camera_to_worlds, other.camera_to_worlds)
-        assert torch.equal(camera.get_intrinsics_matrices(), other.get_intrinsics_matrices())
-    assert lazy.frame_cache.num_bytes <= 3e4
-    assert lazy.get_train_rays_per_batch() == stock.get_train_rays_per_batch()
-    ours, theirs = list(lazy.fixed_indices_eval_dataloader), list(stock.fixed_indices_eval_dataloader)
-    assert len(ours) == len(theirs) == len(lazy.fixed_indices_eval_dataloader) > 1
-    for (camera, data), (other, expected) in zip(ours, theirs, strict=True):
-        assert torch.equal(data["image"], expected["image"])
-        assert torch.equal(camera.camera_to_worlds, other.camera_to_worlds)
-    seen = [lazy.next_eval(step)[1]["image_idx"] for step in range(len(ours))]
-    assert sorted(seen) == list(range(len(ours)))
-    assert [d["image_idx"] for d in lazy.cached_train] == list(range(len(lazy.train_dataset)))
-    assert torch.equal(lazy.cached_eval[1]["image"], theirs[1][1]["image"])
-
-
-def test_more_than_500_photos_need_neither_pinned_memory_nor_room(tmp_path):
-    dataset = make_dataset(tmp_path, num=1)
-    outputs = dataset._dataparser_outputs
-    outputs.image_filenames = outputs.image_filenames * 501
-    outputs.cameras = Cameras(torch.eye(4)[None, :3].repeat(501, 1, 1), 35.0, 36.0, 20.5, 14.0, WIDTH, HEIGHT)
-
-    class Parser:
-        includes_time = False
-
-        def get_dataparser_outputs(self, split):
-            return outputs
-
-    class Config:
-        data = tmp_path
-
-        def setup(self):
-            return Parser()
-
-    config = LazyImageDatamanagerConfig(dataparser=Config(), cache_gigabytes=1e-5)
-    manager = config.setup(device="cpu")
-    indices = [manager.next_train(step)[1]["image_idx"] for step in range(6)]
-    assert len(set(indices)) == 6 and manager.frame_cache.num_bytes <= 1e4
-
-
-def test_real_photos_with_lens_distortion_are_undone_alike_in_training_and_evaluation():
-    if not FOX.exists():
-        pytest.skip(f"{FOX} is not here")
-    manager = LazyImageDatamanagerConfig(dataparser=ScanNetppDataParserConfig(data=FOX)).setup(device="cpu")
-    _, train = manager.next_train(0)
-    train_camera = manager.train_frames[train["image_idx"]][0]
-    eval_camera, held_out = manager.next_eval(0)
-    assert manager.train_dataset.cameras.distortion_params.any()
-    assert train_camera.distortion_params is None and eval_camera.distortion_params is None
-    assert torch.equal(train_camera.get_intrinsics_matrices(), eval_camera.get_intrinsics_matrices())
-    assert train["image"].shape == held_out["image"].shape != (640, 360, 3)

@@ -16,7 +16,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.nerfstudio_plugin.frames import LazyImageDatamanagerConfig
+from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig, SplatfactoCpuPipelineConfig
 from pointsplat_ns.system.memory import keep_freed_memory
 

@@ -1,0 +1,107 @@
+"""A nerfstudio datamanager that reads photos when they are due.
+
+nerfstudio's own full-image datamanager decodes every photo at the first step, keeps all of them and, past 500 photos,
+pins their memory, which raises where there is no CUDA.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+import torch
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.datasets.base_dataset import InputDataset
+
+from pointsplat_ns.nerfstudio_plugin.frames import LOOK_AHEAD, Frame, Frames, to_device
+from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache, free_memory_share
+
+
+@dataclass
+class LazyImageDatamanagerConfig(FullImageDatamanagerConfig):
+    """nerfstudio's full-image datamanager, with photos read when they are due."""
+
+    _target: type = field(default_factory=lambda: LazyImageDatamanager)
+    cache_images: Literal["cpu", "gpu"] = "cpu"
+    """Has no effect here: decoded photos stay in main memory, within cache_gigabytes."""
+    cache_images_type: Literal["uint8", "float32"] = "uint8"
+    """The image type returned from manager, caching images in uint8 saves memory"""
+    cache_gigabytes: float | None = None
+    """Memory for decoded photos; by default a quarter of what is free. What does not fit is read again."""
+
+
+class LazyImageDatamanager(FullImageDatamanager):
+    """Full images and cameras in nerfstudio's order and for nerfstudio's seeds, decoded when they are due."""
+
+    config: LazyImageDatamanagerConfig
+
+    @cached_property
+    def frame_cache(self) -> MemoryCache:
+        """Decoded photos of both splits."""
+        gigabytes = self.config.cache_gigabytes
+        return MemoryCache(free_memory_share() if gigabytes is None else int(gigabytes * 1e9))
+
+    @cached_property
+    def train_frames(self) -> Frames:
+        """Training photos by index."""
+        return self._frames_of(self.train_dataset)
+
+    @cached_property
+    def eval_frames(self) -> Frames:
+        """Held-out photos by index."""
+        return self._frames_of(self.eval_dataset)
+
+    def _frames_of(self, dataset: InputDataset) -> Frames:
+        workers = self.config.max_thread_workers or 2
+        return Frames(dataset, self.config.cache_images_type, self.frame_cache, workers)
+
+    def _load_images(
+        self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
+    ) -> list[dict[str, torch.Tensor]]:
+        """Every photo of a split at once, in main memory, for code that asks nerfstudio's datamanager for that."""
+        return [data for _, data in (self.train_frames if split == "train" else self.eval_frames)]
+
+    @property
+    def fixed_indices_eval_dataloader(self) -> _EvalLoader:  # type: ignore[override]  # a list that need not fit
+        """Every held-out frame in order, decoded one after the other."""
+        return _EvalLoader(self.eval_frames, self.device)
+
+    def get_train_rays_per_batch(self) -> int:
+        """Pixels of a training photo (the first one's, if they differ)."""
+        cameras = self.train_dataset.cameras
+        return int(cameras.height[0]) * int(cameras.width[0])
+
+    def next_train(self, step: int) -> Frame:
+        """The next training frame, every one once before any twice."""
+        index = self.train_unseen_cameras.pop(0)
+        if not self.train_unseen_cameras:
+            self.train_unseen_cameras = self.sample_train_cameras()
+        frame = self.train_frames[index]
+        self.train_frames.prefetch(self.train_unseen_cameras[:LOOK_AHEAD])
+        camera, data = to_device(frame, self.device)
+        camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
+        return camera, data
+
+    def next_eval_image(self, step: int) -> Frame:
+        """A held-out frame at random, every one once before any twice."""
+        index = self.eval_unseen_cameras.pop(random.randint(0, len(self.eval_unseen_cameras) - 1))
+        if not self.eval_unseen_cameras:
+            self.eval_unseen_cameras = list(range(len(self.eval_dataset)))
+        return to_device(self.eval_frames[index], self.device)
+
+
+class _EvalLoader:
+    """``(camera, data)`` of every held-out frame, on a device, one at a time."""
+
+    def __init__(self, frames: Frames, device: torch.device | str):
+        self._frames = frames
+        self._device = device
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (to_device(frame, self._device) for frame in self._frames)
