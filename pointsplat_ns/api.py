@@ -12,7 +12,7 @@ from typing import Literal
 from torch import Tensor
 
 from pointsplat_ns.compression.compact import Compacted, compact_scene
-from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.prune import check_options, prune_scene
 from pointsplat_ns.compression.trained_refiner import (
     METHOD,
     TrainedRefiner,
@@ -33,7 +33,7 @@ from pointsplat_ns.views import Views
 logger = logging.getLogger("pointsplat_ns")
 
 Source = Gaussians | str | Path
-"""A scene, or where to read it."""
+"""A dense scene, or where to read it."""
 
 EXAMPLE = Path(__file__).parent / "examples" / "room.ply"
 """The scene that ships."""
@@ -66,11 +66,14 @@ def load(path: str | Path, scene: str | None = None) -> Gaussians:
             raise SceneError(f"scene {scene!r}: {path} holds one scene; leave the name out")
         return read_scene(path)
     scenes, shown = scenes_of_run(open_refiner_run(path, need_data=True))
-    chosen = scene or shown
+    chosen = shown if scene is None else scene
     if chosen not in scenes:
         raise SceneError(f"scene {chosen!r}: no such scene in {path}; there are {', '.join(scenes)}")
     refiner = load_refiner(path)
-    return refine(refiner.settings.prune(read_scene(scenes[chosen])), refiner)
+    settings = refiner.settings
+    refined = refine(settings.prune(read_scene(scenes[chosen])), refiner)
+    _log((f"{chosen}: pruned by {settings.by} (keep {settings.keep:g}) and refined, as in the training",))
+    return refined
 
 
 def example_room() -> Gaussians:
@@ -103,7 +106,7 @@ def prune(
     What was found on the way (SH bands dropped, PSNR reached, where views came from) is logged at level INFO.
 
     Args:
-        scene: N Gaussians, or the file or run to read them from.
+        scene: N Gaussians, or where to read them: a PLY, a checkpoint, or a Splatfacto run.
         keep: how much: a ratio (0.3, "30%"), a count (50000), the size of a PLY ("12MB"), or "auto:35", the smallest
             scene whose renders reach 35 dB PSNR against those of the given one ("auto" alone means 35).
         by: the method. "merge" replaces neighbours by one Gaussian each; the others keep Gaussians bit for bit:
@@ -132,11 +135,12 @@ def prune(
         >>> len(ps.prune(room, keep=1000)), len(ps.prune(room, keep="10%", by="coverage")) / len(room)
         (1000, 0.1)
     """
+    budget = check_options(keep, by, sh, opacity_weight, fine_tune)  # before the scene is read
     dense, source = _read(scene, views)
     with progress_bar(progress) as report:
-        made = prune_scene(dense, keep, by, sh, opacity_weight, source, fine_tune, report)
-    _log(made.notes)
-    return made.scene
+        pruned = prune_scene(dense, budget, by, sh, opacity_weight, source, fine_tune, report)
+    _log(pruned.notes)
+    return pruned.scene
 
 
 def refine(scene: Gaussians, refiner: TrainedRefiner | None = None) -> Gaussians:
@@ -177,7 +181,7 @@ def compact(
     """Make a scene smaller, repair it with a trained refiner, and check by rendering how far that helps.
 
     Args:
-        scene: N Gaussians, or the file or run to read them from.
+        scene: N Gaussians, or where to read them: a PLY, a checkpoint, or a Splatfacto run.
         keep: how much, as for :func:`prune`; an "auto" PSNR is met before refinement. By default what the refiner was
             trained with.
         refiner: from :func:`load_refiner`; by default the one that ships.
@@ -202,8 +206,10 @@ def compact(
         >>> result.psnr > 20, result.seconds > 0
         (True, True)
     """
-    dense, source = _read(scene, views)
     refiner = refiner or load_refiner()
+    settings = refiner.settings
+    check_options(settings.keep if keep is None else keep, by or settings.by, sh)  # before the scene is read
+    dense, source = _read(scene, views)
     with progress_bar(progress) as report:
         result = compact_scene(dense, refiner, keep, by, sh, source, report)
     _log((result.verdict, *result.notes))
@@ -241,8 +247,13 @@ def lpips(pred: Tensor, target: Tensor, net: Literal["alex", "vgg"] = "alex") ->
 
 
 def _read(scene: Source, views: Views | str | Path | None) -> tuple[Gaussians, ViewSource]:
-    """The Gaussians, and where they are looked at from."""
-    dense = scene if isinstance(scene, Gaussians) else load(scene)
+    """The Gaussians to make fewer, and where renders of them are compared.
+
+    A ``pointsplat`` run is refused: its scene has been pruned already.
+    """
+    if isinstance(views, (str, Path)) and not Path(views).exists():
+        raise SceneError(f"{views}: no such file or folder; expected views, or a run whose dataset has the poses")
+    dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
     if isinstance(views, Views):
         return dense, ViewSource(dense, given=views)
     run = views if views is not None else None if isinstance(scene, Gaussians) else scene

@@ -4,18 +4,34 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 
-class _Printed(logging.Handler):
-    """Prints what the package finds to the person: findings on standard output, warnings on standard error."""
+class _PrintHandler(logging.Handler):
+    """Prints what the package logs: findings on standard output, warnings on standard error."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        warns = record.levelno >= logging.WARNING
-        print(self.format(record), file=sys.stderr if warns else sys.stdout)
+        is_warning = record.levelno >= logging.WARNING
+        print(self.format(record), file=sys.stderr if is_warning else sys.stdout)
+
+
+@contextmanager
+def _log_printed() -> Iterator[None]:
+    """Print the package's log, from level INFO on, while the context is open."""
+    logger = logging.getLogger("pointsplat_ns")
+    handlers, propagate, level = logger.handlers, logger.propagate, logger.level
+    logger.handlers, logger.propagate = [_PrintHandler()], False
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.handlers, logger.propagate = handlers, propagate
+        logger.setLevel(level)
 
 
 def main(args: list[str] | None = None) -> None:
-    """Run one subcommand; input that cannot be used ends it with one line and exit status 1."""
+    """Run one subcommand. Input that cannot be used ends it with one line and exit status 1."""
     import tyro
 
     from pointsplat_ns.cli.compact import compact
@@ -29,10 +45,7 @@ def main(args: list[str] | None = None) -> None:
     from pointsplat_ns.system.memory import keep_freed_memory
 
     keep_freed_memory()
-    logger = logging.getLogger("pointsplat_ns")
-    logger.handlers, logger.propagate = [_Printed()], False
-    logger.setLevel(logging.INFO)
-    commands = {
+    commands: dict[str, Callable[..., None]] = {
         "prune": prune,
         "compact": compact,
         "export": export,
@@ -42,7 +55,8 @@ def main(args: list[str] | None = None) -> None:
         "demo": demo,
     }
     try:
-        tyro.extras.subcommand_cli_from_dict(commands, prog="pointsplat", args=args)
+        with _log_printed():
+            tyro.extras.subcommand_cli_from_dict(commands, prog="pointsplat", args=args)
     except PointSplatError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)

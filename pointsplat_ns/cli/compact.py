@@ -13,8 +13,8 @@ from pointsplat_ns.cli.scene_options import (
     Scene,
     check_outputs,
     output_beside,
-    say_written,
-    show_distributions,
+    print_distributions,
+    print_result,
 )
 
 
@@ -37,29 +37,33 @@ def compact(
 
     Args:
         scene: a 3DGS .ply, a Splatfacto checkpoint, or a run (its folder or config.yml).
-        output: the .ply to write; by default beside the scene, room.ply to room_compact.ply.
+        output: the .ply to write; by default beside the scene: room_compact.ply for room.ply, compact.ply in the folder
+            of a run.
         keep: how much, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is met before refinement, so that
             refinement can only do better. By default what the refiner was trained with.
         refiner: a trained pointsplat run (its folder or config.yml), or a .safetensors file; by default the refiner
-            that ships.
+            that ships. --using is the same.
         by: the method of prune; by default the one that the refiner was trained with.
         sh: SH bands to keep, as for prune: all, up to a degree, or auto.
         picture: a .png to draw some views in: dense, before and after refinement, side by side.
         dry_run: find and say everything, but write no scene.
-        force: overwrite what is there.
+        force: overwrite files that exist.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.compression.pictures import plot_comparison
+    from pointsplat_ns.compression.prune import check_options
+    from pointsplat_ns.io import read_scene
 
     output = output or output_beside(scene, "compact")
-    check_outputs(output, force or dry_run, picture)
+    check_outputs(None if dry_run else output, picture, force)
     trained = ps.load_refiner(refiner)
-    dense = ps.load(scene)
+    check_options(trained.settings.keep if keep is None else keep, by or trained.settings.by, sh)
+    dense = read_scene(scene)
     result = ps.compact(dense, keep, trained, by=by, sh=sh, views=scene, progress=True)
     if not dry_run:
         ps.save(result.scene, output)
     what = "kept and refined" if result.accepted else "kept"
-    say_written(what, len(dense), result.scene, result.seconds, None if dry_run else output)
-    show_distributions(dense, result.scene)
+    print_result(what, len(dense), result.scene, result.seconds, None if dry_run else output)
+    print_distributions(dense, result.scene)
     if picture is not None:
         print(plot_comparison(dense, result, picture))

@@ -23,11 +23,11 @@ def export(
         run: the run's folder, config.yml or checkpoint.
         output: the .ply to write.
         scene: which scene of a pointsplat run; by default the first that it was not trained on, or the first.
-        force: overwrite what is there.
+        force: overwrite a file that exists.
     """
     import pointsplat_ns as ps
 
-    check_outputs(output, force)
+    check_outputs(output, None, force)
     start = time.perf_counter()
     exported = ps.load(run, scene)
     ps.save(exported, output)

@@ -11,8 +11,8 @@ from pointsplat_ns.cli.scene_options import (
     Scene,
     check_outputs,
     output_beside,
-    say_written,
-    show_distributions,
+    print_distributions,
+    print_result,
 )
 
 
@@ -35,7 +35,8 @@ def prune(
 
     Args:
         scene: a 3DGS .ply, a Splatfacto checkpoint, or a run (its folder or config.yml).
-        output: the .ply to write; by default beside the scene, room.ply to room_pruned.ply.
+        output: the .ply to write; by default beside the scene: room_pruned.ply for room.ply, pruned.ply in the folder
+            of a run.
         keep: how much: a ratio (0.3), a percentage (30%), a count (50000), the size of the file (12MB), or auto:35, the
             smallest scene whose renders reach 35 dB PSNR against those of the dense scene (auto alone means 35).
         by: merge replaces neighbours by one Gaussian each and is by far the best; every other method keeps Gaussians as
@@ -46,14 +47,17 @@ def prune(
         fine_tune: steps of optimising what was kept against the dense scene's own renders.
         plot: a .png to draw the distributions of opacity and volume in, before and after.
         dry_run: find and say everything, but write no scene.
-        force: overwrite what is there.
+        force: overwrite files that exist.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.compression.distributions import plot_distributions
+    from pointsplat_ns.compression.prune import check_options
+    from pointsplat_ns.io import read_scene
 
     output = output or output_beside(scene, "pruned")
-    check_outputs(output, force or dry_run, plot)
-    dense = ps.load(scene)
+    check_outputs(None if dry_run else output, plot, force)
+    check_options(keep, by, sh, opacity_weight, fine_tune)
+    dense = read_scene(scene)
     start = time.perf_counter()
     small = ps.prune(
         dense, keep, by, sh=sh, opacity_weight=opacity_weight, fine_tune=fine_tune, views=scene, progress=True
@@ -61,8 +65,8 @@ def prune(
     seconds = time.perf_counter() - start
     if not dry_run:
         ps.save(small, output)
-    say_written("kept", len(dense), small, seconds, None if dry_run else output)
-    show_distributions(dense, small)
+    print_result("kept", len(dense), small, seconds, None if dry_run else output)
+    print_distributions(dense, small)
     if plot is not None:
         plot_distributions({"before": dense, "after": small}, plot)
         print(f"{plot}: opacity and volume, before and after")

@@ -1,4 +1,4 @@
-"""What commands that turn one scene into another have in common: arguments, where the result goes, what is said."""
+"""What the commands that make a smaller scene share: arguments, where the result goes, what is printed of it."""
 
 from __future__ import annotations
 
@@ -16,22 +16,36 @@ Bands = Literal["all", "auto", "0", "1", "2", "3"]
 
 
 def output_beside(scene: Path, suffix: str) -> Path:
-    """The name of the result where the user gives none: beside the file, ``room.ply`` to ``room_pruned.ply``; in the
-    folder of a run, whose checkpoint folder nerfstudio wants to itself."""
+    """Where the result goes if the user does not say.
+
+    Args:
+        scene: the file or folder that is read.
+        suffix: names the result.
+
+    Returns:
+        For a file, one beside it: ``room_pruned.ply`` for ``room.ply``. For a run, one in its folder: ``pruned.ply``;
+        never among its checkpoints, as nerfstudio takes every file there for one.
+    """
     if scene.is_dir():
         return scene / f"{suffix}.ply"
-    if scene.parent.name == "nerfstudio_models":
-        return scene.parent.parent / f"{suffix}.ply"
+    if scene.absolute().parent.name == "nerfstudio_models":
+        return scene.absolute().parents[1] / f"{suffix}.ply"
     if scene.suffix.lower() in (".yml", ".yaml"):
         return scene.with_name(f"{suffix}.ply")
     return scene.with_name(f"{scene.stem}_{suffix}.ply")
 
 
-def check_outputs(scene: Path, force: bool, picture: Path | None = None) -> None:
-    """Refuse, before anything takes minutes, what could not be written in the end.
+def check_outputs(scene: Path | None, picture: Path | None, force: bool) -> None:
+    """Refuse, before anything takes minutes, files that could not be written in the end.
+
+    Args:
+        scene: the .ply to write, if one is.
+        picture: the .png to write, if one is.
+        force: whether files that exist may be overwritten.
 
     Raises:
-        SceneError: if ``scene`` is no .ply, is there already without ``force``, or ``picture`` is no .png.
+        SceneError: if a name has another ending, is that of a folder, or is that of a file that must not be
+            overwritten.
     """
     from pointsplat_ns.errors import SceneError
 
@@ -42,12 +56,12 @@ def check_outputs(scene: Path, force: bool, picture: Path | None = None) -> None
             )
         if path is not None and path.is_dir():
             raise SceneError(f"{path}: is a folder; expected the name of a file to write")
-    if scene.exists() and not force:
-        raise SceneError(f"{scene}: is there already; name another with -o, or overwrite it with --force")
+        if path is not None and path.exists() and not force:
+            raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
 
 
-def say_written(what: str, before: int, scene: Gaussians, seconds: float, where: Path | None) -> None:
-    """One line on the result; ``where`` is None in a dry run."""
+def print_result(what: str, before: int, scene: Gaussians, seconds: float, where: Path | None) -> None:
+    """Print a line on the result; ``where`` is None in a dry run."""
     from pointsplat_ns.pruning import ply_bytes
 
     share = f" ({100 * len(scene) / before:.1f} %)" if before else ""
@@ -56,8 +70,8 @@ def say_written(what: str, before: int, scene: Gaussians, seconds: float, where:
     print(f"{place}: {what} {len(scene):,} of {before:,} Gaussians{share}, {size:.2f} MB, in {seconds:.1f} s")
 
 
-def show_distributions(before: Gaussians, after: Gaussians) -> None:
-    """A table of what there was and what there is."""
+def print_distributions(before: Gaussians, after: Gaussians) -> None:
+    """Print a table of counts, file sizes and quantiles, before and after."""
     from rich.console import Console
     from rich.table import Table
 

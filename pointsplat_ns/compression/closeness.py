@@ -56,18 +56,18 @@ class DenseReference:
     @torch.no_grad()
     def errors(self, scene: Gaussians) -> list[float]:
         """Mean squared error of each view."""
-        return [_error(render(scene, self.views[index]), wanted) for index, wanted in enumerate(self.renders)]
+        return [_error(render(scene, view), target) for view, target in zip(self.views, self.renders, strict=True)]
 
     @torch.no_grad()
     def closeness(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> Closeness:
         """Errors and SSIM of a scene; ``progress`` is called with the share of the views done."""
         large_enough = min(self.views.width, self.views.height) >= SSIM_WINDOW
         errors, similarities = [], []
-        for index, wanted in enumerate(self.renders):
-            drawn = render(scene, self.views[index])
-            errors.append(_error(drawn, wanted))
+        for index, target in enumerate(self.renders):
+            image = render(scene, self.views[index])
+            errors.append(_error(image, target))
             if large_enough:
-                similarities.append(float(ssim(drawn, wanted)))
+                similarities.append(float(ssim(image, target)))
             if progress is not None:
                 progress((index + 1) / len(self.renders))
         return Closeness(tuple(errors), sum(similarities) / len(similarities) if similarities else None)
@@ -78,9 +78,9 @@ class DenseReference:
         return close.psnr, close.worst
 
 
-def _error(drawn: Tensor, wanted: Tensor) -> float:
+def _error(image: Tensor, target: Tensor) -> float:
     """Mean squared error, float64."""
-    return float((drawn.double() - wanted.double()).square().mean())
+    return float((image.double() - target.double()).square().mean())
 
 
 def _psnr(mse: float) -> float:

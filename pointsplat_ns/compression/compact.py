@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import torch
 
 from pointsplat_ns.compression.closeness import Closeness, DenseReference
-from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.prune import check_options, prune_scene
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning import Keep, need_usable
+from pointsplat_ns.pruning import Keep, method_named, need_usable
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.views import Views
 
@@ -101,15 +101,16 @@ def compact_scene(
         DataError: if the budget or ``sh`` needs views and none can be had.
     """
     start = time.perf_counter()
-    views = views or ViewSource(dense)
-    need_usable(dense)
-    _need_sh_degree(dense, sh, refiner)
     settings = refiner.settings
     by = settings.by if by is None else by
-    weight = settings.opacity_weight if by == settings.by else None
-    made = prune_scene(dense, settings.keep if keep is None else keep, by, sh, weight, views, progress=progress)
+    keep = check_options(settings.keep if keep is None else keep, by, sh)
+    weight = settings.opacity_weight if method_named(by).weighs_opacity else None
+    need_usable(dense)
+    _need_sh_degree(dense, sh, refiner)
+    views = views or ViewSource(dense)
+    smaller = prune_scene(dense, keep, by, sh, weight, views, progress=progress)
     progress("refining", 0.0)
-    pruned, refined = made.scene, refiner(made.scene)
+    pruned, refined = smaller.scene, refiner(smaller.scene)
     strength, reference, before, after = 1.0, None, None, None
     unsound = int((pruned.usable() & ~refined.usable()).sum())
     verdict = ""
@@ -125,7 +126,9 @@ def compact_scene(
         refined, strength, after = as_far_as_it_helps(reference, before, pruned, refined, progress)
         verdict = _verdict(before, after, strength)
     accepted = before is not None and after is not None and helps(before, after)
-    notes = (*made.notes, views.origin) if views.origin and views.origin not in made.notes else made.notes
+    notes = smaller.notes
+    if views.origin and views.origin not in notes:
+        notes = (*notes, views.origin)
     scene, seconds = refined if accepted else pruned, time.perf_counter() - start
     return Compacted(scene, pruned, refined, strength, accepted, verdict, notes, reference, before, after, seconds)
 

@@ -37,70 +37,70 @@ def fine_tune(
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> Gaussians:
-    """Optimise a scene to give wanted pictures; no Gaussian comes or goes.
+    """Optimise the parameters of a scene so that its renders come closer to target images. The count stays.
 
-    Each step draws one view and takes one step of Adam on 0.8 L1 + 0.2 (1 - SSIM); every view comes once
+    Each step renders one view and takes one step of Adam on 0.8 L1 + 0.2 (1 - SSIM); every view comes once
     before any comes twice. Parameters that are not finite (an opacity of 1, a flat axis) stay as they are.
 
     Args:
         scene: K Gaussians.
         views: poses.
-        targets: the dense scene, whose own renders are then wanted, or one picture (H, W, 3) in [0, 1] a view.
-        steps: how many.
+        targets: the dense scene, whose own renders are then the targets, or one image (H, W, 3) in [0, 1] a view.
+        steps: of optimisation.
         rates: of Adam by name of the parameter, that of the means per extent of the scene; :data:`RATES` by default.
-        seed: the order of the views.
+        seed: of the order of the views.
         progress: called with the share done, in [0, 1].
 
     Returns:
         K Gaussians; ``scene`` is left as it is.
 
     Raises:
-        DataError: if there is no view, or pictures and views do not fit.
+        DataError: if there is no view, or the images do not fit the views.
     """
     if len(views) == 0:
         raise DataError("no view to fine-tune on; expected at least one pose")
     if not isinstance(targets, Gaussians) and len(targets) != len(views):
         raise DataError(f"{len(targets)} pictures for {len(views)} views; expected one each")
     extent = float((scene.means.detach().double() - scene.means.detach().double().mean(0)).norm(dim=1).quantile(0.9))
-    made = {name: value.detach().clone().requires_grad_() for name, value in scene.items()}
-    fixed = {name: ~value.detach().isfinite() for name, value in made.items()}
+    parameters = {name: value.detach().clone().requires_grad_() for name, value in scene.items()}
+    fixed = {name: ~value.detach().isfinite() for name, value in parameters.items()}
     rates = {**RATES, **(rates or {})}
     rates["means"] *= extent or 1.0
-    groups = [{"params": [value], "lr": rates[name]} for name, value in made.items() if value.numel()]
+    groups = [{"params": [value], "lr": rates[name]} for name, value in parameters.items() if value.numel()]
     optimizer = torch.optim.Adam(groups, eps=1e-15)
-    known: dict[int, Tensor] = {}
+    target_images: dict[int, Tensor] = {}
     order: list[int] = []
     generator = random.Random(seed)
     for step in range(steps):
         if not order:
             order = generator.sample(range(len(views)), len(views))
         index = order.pop()
-        if index not in known:
-            known[index] = _target(targets, views, index, scene)
+        if index not in target_images:
+            target_images[index] = _target(targets, views, index, scene)
         optimizer.zero_grad()
-        picture = render(Gaussians(**made), views[index])
-        _loss(picture, known[index]).backward()
-        for name, value in made.items():
+        image = render(Gaussians(**parameters), views[index])
+        _loss(image, target_images[index]).backward()
+        for name, value in parameters.items():
             if value.grad is not None:
                 value.grad[fixed[name]] = 0.0  # and what is not finite has no finite gradient
         optimizer.step()
         if progress is not None:
             progress((step + 1) / steps)
-    return Gaussians(**made).detach()
+    return Gaussians(**parameters).detach()
 
 
 def _target(targets: Gaussians | Sequence[Tensor], views: Views, index: int, like: Gaussians) -> Tensor:
     if isinstance(targets, Gaussians):
         with torch.no_grad():
             return render(targets, views[index])
-    picture = targets[index].to(like.means)
-    if tuple(picture.shape) != (views.height, views.width, 3):
-        raise DataError(f"picture {index} has shape {tuple(picture.shape)}; expected {(views.height, views.width, 3)}")
-    return picture
+    image = targets[index].to(like.means)
+    if tuple(image.shape) != (views.height, views.width, 3):
+        raise DataError(f"picture {index} has shape {tuple(image.shape)}; expected {(views.height, views.width, 3)}")
+    return image
 
 
-def _loss(picture: Tensor, target: Tensor) -> Tensor:
-    l1 = (picture - target).abs().mean()
-    if min(picture.shape[:2]) < SSIM_WINDOW:
+def _loss(image: Tensor, target: Tensor) -> Tensor:
+    l1 = (image - target).abs().mean()
+    if min(image.shape[:2]) < SSIM_WINDOW:
         return l1
-    return (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - ssim(picture, target))
+    return (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - ssim(image, target))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pointsplat_ns.compression.budget_search import SH_PSNR, needed_sh_degree, smallest_within
 from pointsplat_ns.compression.fine_tune import fine_tune
 from pointsplat_ns.compression.view_source import ViewSource
-from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.errors import BudgetError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import (
     Keep,
@@ -77,14 +77,16 @@ def prune_scene(
         DataError: if views are needed and cannot be had.
         PointSplatError: if there is no such method, or an option does not fit it.
     """
-    keep = check_request(len(dense), keep, by, sh, opacity_weight, fine_tune_steps)
+    keep = check_options(keep, by, sh, opacity_weight, fine_tune_steps)
+    if not isinstance(keep, WithinPsnr):
+        resolve_keep(len(dense), keep, _lowest_degree(dense, sh))
     need_usable(dense)
     views = views or ViewSource(dense)
     notes: list[str] = []
     full = _with_sh(dense, sh, views, progress, notes)
     report = functools.partial(progress, f"by {by}")
     if isinstance(keep, WithinPsnr):
-        make = _pruner(full, by, views, opacity_weight)
+        make = _pruner(full, by, views, opacity_weight, report)
         compared = views.compared()
         found = smallest_within(dense, make, compared, keep.value, functools.partial(progress, "trying counts"))
         scene = found.scene
@@ -93,22 +95,25 @@ def prune_scene(
             f"{len(compared)} views; {len(found.tried)} counts tried"
         )
     else:
-        looks = functools.partial(views.views, SCORED_VIEWS)
-        scene = prune(full, keep, by, looks, opacity_weight, report)
+        scene = prune(full, keep, by, functools.partial(views.views, SCORED_VIEWS), opacity_weight, report)
     if fine_tune_steps:
-        looks = views.views(SCORED_VIEWS)
-        scene = fine_tune(scene, looks, dense, fine_tune_steps, progress=functools.partial(progress, "fine-tuning"))
-        notes.append(f"fine-tuned {fine_tune_steps} steps against the dense scene's renders in {len(looks)} views")
+        seen = views.views(SCORED_VIEWS)
+        scene = fine_tune(scene, seen, dense, fine_tune_steps, progress=functools.partial(progress, "fine-tuning"))
+        notes.append(f"fine-tuned {fine_tune_steps} steps against the dense scene's renders in {len(seen)} views")
     return Pruned(scene, (*notes, views.origin) if views.origin else tuple(notes))
 
 
-def check_request(
-    count: int, keep: Keep | str, by: str, sh: str, opacity_weight: float | None, fine_tune_steps: int = 0
+def check_options(
+    keep: Keep | str, by: str, sh: str = "all", opacity_weight: float | None = None, fine_tune_steps: int = 0
 ) -> Keep:
-    """Refuse, before anything takes long, what cannot be done with a scene of ``count`` Gaussians; gives the budget.
+    """Refuse, before a scene is read, options of :func:`prune_scene` that fit no scene.
+
+    Returns:
+        ``keep``, parsed if it is text.
 
     Raises:
-        BudgetError, PointSplatError: as :func:`prune_scene`.
+        BudgetError: if ``keep`` is no budget.
+        PointSplatError: if there is no such method, or an option does not fit it.
     """
     check_opacity_weight(method_named(by), opacity_weight)
     if sh not in SH_CHOICES:
@@ -116,17 +121,29 @@ def check_request(
     if fine_tune_steps < 0:
         raise PointSplatError(f"{fine_tune_steps} steps of fine-tuning; expected 0 for none, or more")
     keep = parse_keep(keep) if isinstance(keep, str) else keep
-    if not isinstance(keep, WithinPsnr):
-        resolve_keep(count, keep)
+    if isinstance(keep, WithinPsnr) and not 0 < keep.value < math.inf:
+        raise BudgetError(f"the wanted PSNR is {keep.value} dB; expected a positive number, such as 35")
     return keep
 
 
-def _pruner(scene: Gaussians, by: str, views: ViewSource, opacity_weight: float | None) -> Callable[[int], Gaussians]:
-    """From counts to scenes of as many; a method that has scores computes them once."""
+def _lowest_degree(dense: Gaussians, sh: str) -> int:
+    """The lowest SH degree that the smaller scene may have: what fits into a size depends on it."""
+    return dense.sh_degree if sh == "all" else 0 if sh == "auto" else min(int(sh), dense.sh_degree)
+
+
+def _pruner(
+    scene: Gaussians,
+    by: str,
+    views: ViewSource,
+    opacity_weight: float | None,
+    progress: Callable[[float], None],
+) -> Callable[[int], Gaussians]:
+    """From a count to a scene of as many Gaussians. Scores are computed once, for all counts."""
     method = method_named(by)
     if method.score is None:
         return lambda count: prune(scene, count, by)
-    scores = score_of(scene, method, functools.partial(views.views, SCORED_VIEWS), opacity_weight)
+    progress(0.0)
+    scores = score_of(scene, method, functools.partial(views.views, SCORED_VIEWS), opacity_weight, progress)
     return lambda count: scene[select(scores, count)]
 
 

@@ -138,9 +138,9 @@ def settings_from(saved: Mapping[str, Any]) -> PruneSettings:
         PointSplatError, TypeError, ValueError: if one is not usable.
     """
     by = saved["by"] if "by" in saved else saved["score"]
-    weight = saved.get("opacity_weight")
-    weighed = weight is not None and method_named(by).weighs_opacity
-    return PruneSettings(float(saved["keep"]), by, float(weight) if weighed else None)
+    saved_weight = saved.get("opacity_weight")
+    weight = None if saved_weight is None else float(saved_weight)
+    return PruneSettings(float(saved["keep"]), by, weight if method_named(by).weighs_opacity else None)
 
 
 def network_options(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Poses in the free space of a scene that comes without any: a PLY and nothing else."""
+"""Views of a scene that comes without cameras: poses in its free space."""
 
 from __future__ import annotations
 
@@ -18,18 +18,21 @@ FIELD_OF_VIEW = 70.0
 
 BACKGROUND = (0.0, 0.0, 0.0)
 
-_PROBE = 32
-"""Longer side of the small pictures by which a place is judged, pixels."""
+_PROBE_SIDE = 32
+"""Longer side of the depth image by which a camera position is judged, pixels."""
 
 _TOO_NEAR = 0.05
-"""Nothing but a few pixels may be nearer than this share of the content's diagonal."""
+"""Distance, as a share of the diagonal of the content's box, below which a surface is too near to the camera."""
+
+_NEAR_PIXELS = 0.05
+"""Share of the pixels that may show a surface that is too near."""
 
 _COVERED = 0.7
-"""Share of the picture that must show something: mean accumulated alpha."""
+"""Mean accumulated alpha that the image must have: it shows something nearly everywhere."""
 
-_ROUNDS = (0.7, 1.0, 1.0, 1.5, 2.5, 4.0)
-"""Sizes, relative to the content's box, of the boxes that places are drawn from, one after the other: first inside, as
-in a room, then around, as about an object."""
+_BOX_SIZES = (0.7, 1.0, 1.0, 1.5, 2.5, 4.0)
+"""Sizes, relative to the content's box, of the boxes that camera positions are drawn from, one after the other: first
+inside, as in a room, then around, as about an object."""
 
 
 def content_box(scene: Gaussians) -> tuple[Tensor, Tensor]:
@@ -55,27 +58,39 @@ def content_box(scene: Gaussians) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def sample_views(scene: Gaussians, count: int, width: int = 320, height: int = 240, seed: int = 0) -> Views:
-    """Poses in free space that look at the content of a scene.
+    """Sample cameras that stand in free space and look at the content of a scene.
 
-    A place is drawn at random in the box of the scene's content, and looks at a Gaussian drawn by
-    alpha times area. It is taken if a small picture from there shows that it is free: nearly all of it is
-    covered, and nearly nothing of it is very near. Where there is no such place inside, places around the
-    box are tried. Rolls are arbitrary: what is up is not known of a scene without poses.
+    A camera position is drawn at random in the box that holds 90 % of the scene's opacity, and a target among the
+    Gaussians with probability proportional to opacity times area. The camera is kept if a small depth image from there
+    shows free space: nearly all of it is covered, and nearly nothing of it is very near. Where there is no such
+    position inside, larger boxes are tried. The z axis is taken to point up.
 
     Args:
         scene: N Gaussians.
-        count: how many views.
-        width, height: of the views, pixels.
-        seed: the same seed gives the same views.
+        count: number of views, at least 1.
+        width: of the images, pixels.
+        height: of the images, pixels. The field of view is 70 degrees across the longer side.
+        seed: the same scene and seed give the same views.
 
     Returns:
-        ``count`` views over black.
+        ``count`` views, on the CPU, over black: ``viewmats`` (count, 4, 4) from world to camera in OpenCV axes and
+        ``Ks`` (count, 3, 3) in pixels, float64. Fewer where the search finds fewer.
 
     Raises:
-        DataError: if the scene has nothing to look at, or no free place was found.
+        DataError: if ``count`` or the size is not positive, the scene has nothing to look at, or no free position was
+            found.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> room = ps.example_room()
+        >>> views = ps.sample_views(room, 3, width=64, height=48)
+        >>> len(views), tuple(views.viewmats.shape), (views.width, views.height)
+        (3, (3, 4, 4), (64, 48))
     """
     if count < 1:
         raise DataError(f"{count} views asked for; expected at least 1")
+    if min(width, height) < 1:
+        raise DataError(f"views of {width} x {height} pixels asked for; expected at least 1 x 1")
     low, high = content_box(scene)
     diagonal = float((high - low).norm())
     if diagonal == 0:  # one Gaussian, or all at one place: as large as they are
@@ -86,14 +101,14 @@ def sample_views(scene: Gaussians, count: int, width: int = 320, height: int = 2
     chances = torch.softmax(weights.clamp_max(_not_giant(weights)), dim=0)
     cumulative = chances.cumsum(0)
     taken: list[Tensor] = []
-    for size in _ROUNDS:
+    for size in _BOX_SIZES:
         for _ in range(2):
-            places = torch.rand(2 * count, 3, generator=generator, dtype=torch.float64) - 0.5
-            places = 0.5 * (low + high).cpu() + size * places * (high - low).cpu().clamp_min(0.25 * diagonal)
+            positions = torch.rand(2 * count, 3, generator=generator, dtype=torch.float64) - 0.5
+            positions = 0.5 * (low + high).cpu() + size * positions * (high - low).cpu().clamp_min(0.25 * diagonal)
             drawn = torch.rand(2 * count, generator=generator, dtype=torch.float64) * cumulative[-1]
             targets = scene.means.cpu().double()[torch.searchsorted(cumulative, drawn).clamp_max(len(scene) - 1)]
             targets = targets.clamp(low.cpu() - diagonal, high.cpu() + diagonal)
-            viewmats = look_at(places, targets)
+            viewmats = look_at(positions, targets)
             candidates = _views(viewmats, width, height)
             for index in range(len(candidates)):
                 if len(taken) < count and _is_free(scene, candidates, index, _TOO_NEAR * diagonal):
@@ -107,10 +122,10 @@ def sample_views(scene: Gaussians, count: int, width: int = 320, height: int = 2
     return _views(torch.stack(taken), width, height)
 
 
-def look_at(places: Tensor, targets: Tensor) -> Tensor:
-    """World-to-camera matrices (C, 4, 4) of cameras at ``places`` (C, 3) that look at ``targets`` (C, 3), with z up
+def look_at(positions: Tensor, targets: Tensor) -> Tensor:
+    """World-to-camera matrices (C, 4, 4) of cameras at ``positions`` (C, 3) that look at ``targets`` (C, 3), with z up
     where that is possible; OpenCV axes."""
-    forward = targets - places
+    forward = targets - positions
     length = forward.norm(dim=1, keepdim=True)
     ahead = forward.new_tensor([1.0, 0.0, 0.0]).expand_as(forward)
     forward = torch.where(length > 0, forward / length.clamp_min(1e-300), ahead)
@@ -121,9 +136,9 @@ def look_at(places: Tensor, targets: Tensor) -> Tensor:
     right = right / right.norm(dim=1, keepdim=True)
     down = torch.linalg.cross(forward, right)
     rotation = torch.stack([right, down, forward], dim=1)  # (C, 3, 3) world to camera
-    viewmats = torch.eye(4, dtype=places.dtype).repeat(len(places), 1, 1)
+    viewmats = torch.eye(4, dtype=positions.dtype).repeat(len(positions), 1, 1)
     viewmats[:, :3, :3] = rotation
-    viewmats[:, :3, 3] = -(rotation @ places[..., None])[..., 0]
+    viewmats[:, :3, 3] = -(rotation @ positions[..., None])[..., 0]
     return viewmats
 
 
@@ -140,9 +155,9 @@ def _not_giant(weights: Tensor) -> float:
 
 
 def _is_free(scene: Gaussians, views: Views, index: int, near: float) -> bool:
-    """Whether a view is from free space: it shows a covered picture with nearly nothing nearer than ``near``."""
-    small = views[[index]].resized(_PROBE)
-    picture, alpha, _ = rasterization(
+    """Whether a camera stands in free space: its image is covered, with nearly nothing nearer than ``near``."""
+    small = views[[index]].resized(_PROBE_SIDE)
+    image, alpha, _ = rasterization(
         scene.means,
         scene.quats,
         scene.stds,
@@ -154,6 +169,6 @@ def _is_free(scene: Gaussians, views: Views, index: int, near: float) -> bool:
         small.height,
         render_mode="ED",
     )
-    depth = picture[0, ..., 0]
+    depth = image[0, ..., 0]
     too_near = (alpha[0, ..., 0] > 0.5) & (depth < near)
-    return bool(alpha.mean() >= _COVERED) and bool(too_near.float().mean() < 0.05)
+    return bool(alpha.mean() >= _COVERED) and bool(too_near.float().mean() < _NEAR_PIXELS)

@@ -14,16 +14,17 @@ from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.views import RasterizeMode, Views
 
 COMPARED_VIEWS, COMPARED_SIDE = 12, 400
-"""Views that renders are compared in, and their longer side in pixels: every comparison costs so many renders."""
+"""Number of views that renders are compared in, and their longer side in pixels. A comparison draws all of them."""
 
 
 class ViewSource:
-    """Views of a scene, found when they are first asked for: a budget in Gaussians needs none.
+    """Views of a scene, found when they are first needed: a budget in Gaussians needs none.
 
     Args:
-        scene: what is looked at.
-        given: views to take; nothing else is then looked for.
-        run: the file or folder that the scene was read from. If that is a run whose data is at hand, its poses serve.
+        scene: what the views show.
+        given: views to use; the other arguments are then ignored.
+        run: the file or folder that the scene was read from. If that is a run whose data is at hand, its training
+            poses are used.
         dataset_views: reads the poses of a run's dataset.
     """
 
@@ -55,15 +56,15 @@ class ViewSource:
             return None
 
     def views(self, count: int) -> Views:
-        """At most ``count`` of the given views or of the dataset's training poses, or ``count`` sampled ones; drawn as
-        the run rendered.
+        """At most ``count`` of the given views or of the dataset's training poses, or ``count`` sampled ones, with the
+        run's rasterize mode.
 
         Raises:
-            DataError: if there are none, and no free place to look from.
+            DataError: if there are none and none can be sampled.
         """
         if self._given is not None:
             if len(self._given) == 0:
-                raise DataError("no view to look from; expected at least one")
+                raise DataError("the views given are empty; expected at least one view")
             self.origin = "given views"
             return self._given.spread(count)
         if self._of_dataset is not None:
@@ -74,5 +75,5 @@ class ViewSource:
         return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
 
     def compared(self) -> Views:
-        """The views that renders are compared in: few and small, as every comparison draws all of them."""
+        """The views that renders are compared in: at most 12, at most 400 pixels wide or high."""
         return self.views(COMPARED_VIEWS).resized(COMPARED_SIDE)

@@ -1,87 +1,117 @@
-"""From what a person asks for to a smaller scene: what is combined, what is told, what is refused."""
+"""From what a person asks for to a smaller scene: what is combined, what is noted, what is refused."""
 
+from __future__ import annotations
+
+import dataclasses
 import math
 
 import pytest
 import torch
 
 from making import ball, same
-from pointsplat_ns.compression.budget_search import DenseReference
+from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.distributions import opacity_quantiles, plot_distributions, size_quantiles
-from pointsplat_ns.compression.prune import ALL_METHODS, IMAGE_SCORES, Poses, compact_scene
+from pointsplat_ns.compression.prune import SH_CHOICES, Pruned, check_options, prune_scene
 from pointsplat_ns.compression.view_sampling import sample_views
-from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
-from pointsplat_ns.io import write_ply
-from pointsplat_ns.pruning import SCORES, Megabytes, WithinPsnr, cut_sh, ply_bytes, prune, select
+from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.pruning import METHODS, Keep, Megabytes, WithinPsnr, cut_sh, ply_bytes, prune, select
+from pointsplat_ns.views import Views
 
 
 @pytest.fixture(scope="module")
-def scene():
+def scene() -> Gaussians:
     return ball(400)
 
 
 @pytest.fixture(scope="module")
-def looks(scene):
+def views(scene) -> Views:
     return sample_views(scene, 3, 48, 36)
 
 
-def test_no_poses_are_asked_for_where_none_are_needed(scene):
-    def refuse(count):
-        raise AssertionError("poses were asked for")
-
-    made = compact_scene(scene, 0.25, "coverage", sh="0", poses=refuse)
-    assert same(made.scene, cut_sh(prune(scene, 0.25, "coverage").scene, 0))
-    assert made.notes == ("SH degree 1 cut to 0: 100 % of the directional energy lost",)
+def pruned(scene: Gaussians, views: Views, keep: Keep | str, by: str, **options) -> Pruned:
+    """Pruned with renders compared in the given views."""
+    return prune_scene(scene, keep, by, **options, views=ViewSource(scene, given=views))
 
 
-@pytest.mark.parametrize("by", sorted(IMAGE_SCORES))
-def test_an_image_driven_score_is_computed_once_and_chooses(by, scene, looks, monkeypatch):
+class Refusing(ViewSource):
+    """Views that must not be asked for."""
+
+    def views(self, count: int) -> Views:
+        raise AssertionError("views were asked for")
+
+
+def test_no_views_are_asked_for_where_none_are_needed(scene):
+    result = prune_scene(scene, 0.25, "coverage", sh="0", views=Refusing(scene))
+    assert same(result.scene, cut_sh(prune(scene, 0.25, "coverage"), 0))
+    assert result.notes == ("SH degree 1 cut to 0: 100 % of the directional energy lost",)
+
+
+@pytest.mark.parametrize("by", sorted(name for name, method in METHODS.items() if method.needs_views))
+def test_a_score_that_looks_at_the_scene_is_computed_once_and_chooses(by, scene, views, monkeypatch):
     calls = []
-    score = IMAGE_SCORES[by]
-    monkeypatch.setitem(IMAGE_SCORES, by, lambda *args: calls.append(1) or score(*args))
-    made = compact_scene(scene, WithinPsnr(20.0), by, poses=lambda count: looks)
-    assert calls == [1] and same(made.scene, scene[select(score(scene, looks), len(made.scene))])
+    method = METHODS[by]
+
+    def counted(*args, **options):
+        calls.append(1)
+        return method.score(*args, **options)
+
+    monkeypatch.setitem(METHODS, by, dataclasses.replace(method, score=counted))
+    result = pruned(scene, views, WithinPsnr(20.0), by)
+    assert calls == [1]
+    assert same(result.scene, scene[select(method.score(scene, views), len(result.scene))])
 
 
 def test_a_size_counts_the_bands_that_are_left(scene):
-    made = compact_scene(scene, Megabytes(0.01), "opacity", sh="0")
-    assert ply_bytes(len(made.scene), 0) <= 10_000 < ply_bytes(len(made.scene) + 1, 0)
+    result = prune_scene(scene, Megabytes(0.01), "opacity", sh="0")
+    assert ply_bytes(len(result.scene), 0) <= 10_000 < ply_bytes(len(result.scene) + 1, 0)
 
 
-def test_an_auto_budget_is_measured_against_the_scene_with_all_its_bands(scene, looks):
-    made = compact_scene(scene, WithinPsnr(22.0), "coverage", sh="0", poses=lambda count: looks)
-    assert made.scene.sh_degree == 0 and DenseReference(scene, looks).psnr(made.scene)[0] >= 22
-    assert any("renders reach" in note and "3 views" in note for note in made.notes)
-
-
-def test_auto_sh_keeps_bands_that_are_seen_and_drops_those_that_are_not(scene, looks):
+@pytest.mark.parametrize("sh", ["0", "auto"])
+def test_a_size_that_only_fits_without_bands_is_no_reason_to_refuse(sh, scene, views):
     faint = scene.replace(features_rest=scene.features_rest * 1e-3)
-    assert compact_scene(faint, 1.0, "paper", sh="auto", poses=lambda count: looks).scene.sh_degree == 0
+    size = Megabytes(ply_bytes(1, 0) / 1e6)
+    with pytest.raises(BudgetError, match="too small for one Gaussian of SH degree 1"):
+        pruned(faint, views, size, "opacity")
+    assert len(pruned(faint, views, size, "opacity", sh=sh).scene) == 1
+
+
+def test_an_auto_budget_is_measured_against_the_scene_with_all_its_bands(scene, views):
+    result = pruned(scene, views, WithinPsnr(22.0), "coverage", sh="0")
+    assert result.scene.sh_degree == 0 and DenseReference(scene, views).psnr(result.scene)[0] >= 22
+    assert any("renders reach" in note and "3 views" in note for note in result.notes)
+
+
+def test_auto_sh_keeps_bands_that_are_seen_and_drops_those_that_are_not(scene, views):
+    faint = scene.replace(features_rest=scene.features_rest * 1e-3)
+    assert pruned(faint, views, 1.0, "paper", sh="auto").scene.sh_degree == 0
     strong = scene.replace(features_rest=scene.features_rest * 10)
-    made = compact_scene(strong, 1.0, "paper", sh="auto", poses=lambda count: looks)
-    assert made.scene.sh_degree == 1 and made.notes == ("SH degree 1 kept, no band dropped",)
+    result = pruned(strong, views, 1.0, "paper", sh="auto")
+    assert result.scene.sh_degree == 1
+    assert result.notes == ("SH degree 1 kept, no band dropped", "given views")
 
 
-def test_fine_tuning_follows_where_it_is_asked_for(scene, looks):
-    plain = compact_scene(scene, 0.3, "coverage").scene
-    tuned = compact_scene(scene, 0.3, "coverage", poses=lambda count: looks, fine_tune_steps=10).scene
-    reference = DenseReference(scene, looks)
+def test_fine_tuning_follows_where_it_is_asked_for(scene, views):
+    plain = prune_scene(scene, 0.3, "coverage").scene
+    tuned = pruned(scene, views, 0.3, "coverage", fine_tune_steps=10).scene
+    reference = DenseReference(scene, views)
     assert len(tuned) == len(plain) and reference.psnr(tuned)[0] > reference.psnr(plain)[0]
 
 
-def test_progress_names_what_is_done(scene, looks):
-    told = []
-    compact_scene(
+def test_progress_names_what_is_done(scene, views):
+    steps = []
+    pruned(
         scene,
+        views,
         WithinPsnr(20.0),
         "lightgaussian",
         sh="auto",
-        poses=lambda count: looks,
         fine_tune_steps=2,
-        progress=lambda what, share: told.append((what, share)),
+        progress=lambda what, share: steps.append((what, share)),
     )
-    assert all(0 <= share <= 1 for _, share in told)
-    assert list(dict.fromkeys(what for what, _ in told)) == [
+    assert all(0 <= share <= 1 for _, share in steps)
+    assert list(dict.fromkeys(what for what, _ in steps)) == [
         "comparing SH degrees",
         "by lightgaussian",
         "trying counts",
@@ -89,55 +119,43 @@ def test_progress_names_what_is_done(scene, looks):
     ]
 
 
-def test_a_bare_scene_is_looked_at_from_sampled_poses_and_a_run_from_its_own(scene, trained_walls, tmp_path):
-    write_ply(scene, tmp_path / "scene.ply")
-    bare = Poses(tmp_path / "scene.ply", scene)
-    assert len(bare(2)) == 2 and bare.origin == "poses sampled in free space"
-    (run,) = (trained_walls / "wall-b" / "splatfacto-cpu").iterdir()
-    own = Poses(run, scene)
-    views = own(4)
-    assert len(views) == 4 and own.origin == "poses of the dataset"
-    assert (views.width, views.height) == (64, 48) and views.rasterize_mode == "antialiased"
-    assert views.background.tolist() == [1.0, 1.0, 1.0]
-
-
-def test_a_run_whose_data_is_gone_is_looked_at_from_sampled_poses_and_it_is_said(trained_walls, tmp_path, monkeypatch):
-    import pointsplat_ns.compression.prune as compaction
-
-    def gone(path):
-        raise SceneError("its data is not there")
-
-    monkeypatch.setattr(compaction, "dataset_views", gone)
-    for name, mode in (("wall-a", "classic"), ("wall-b", "antialiased")):  # as the run rendered
-        (run,) = (trained_walls / name / "splatfacto-cpu").iterdir()
-        poses = Poses(run, ball(400))
-        views = poses(2)
-        assert len(views) == 2 and views.rasterize_mode == mode
-        assert poses.origin == "poses sampled in free space (no dataset: its data is not there)"
-    nothing = Poses(run, ball(400)[:0])
-    with pytest.raises(DataError, match="nothing of the scene can be seen"):
-        nothing(2)
-    assert nothing.origin == ""
-
-
-@pytest.mark.parametrize("by", ALL_METHODS)
+@pytest.mark.parametrize("by", METHODS)
 @pytest.mark.parametrize("keep", [0, 0.0, 1.5, math.nan, 401, -1, Megabytes(1e-6), WithinPsnr(math.nan)])
-def test_what_cannot_be_made_is_refused_by_every_method(by, keep, scene, looks):
+def test_what_cannot_be_made_is_refused_by_every_method_before_it_looks(by, keep, scene):
     with pytest.raises(BudgetError):
-        compact_scene(scene, keep, by, poses=lambda count: looks)
+        prune_scene(scene, keep, by, views=Refusing(scene))
 
 
-def test_what_is_no_scene_method_or_degree_is_refused(scene):
+def test_what_is_no_scene_is_refused(scene):
     with pytest.raises(SceneError, match="can be drawn"):
-        compact_scene(scene.map(lambda value: value * math.nan), 0.5, "coverage")
-    with pytest.raises(PointSplatError, match="no method is called 'best'"):
-        compact_scene(scene, 0.5, "best")
-    with pytest.raises(PointSplatError, match="sh is '4'; expected all, auto or a degree from 0 to 3"):
-        compact_scene(scene, 0.5, "paper", sh="4")
+        prune_scene(scene.map(lambda value: value * math.nan), 0.5, "coverage")
 
 
-def test_the_methods_are_those_of_pruning_and_the_image_driven():
-    assert set(ALL_METHODS) == {"merge", *SCORES, *IMAGE_SCORES}
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"by": "best"}, f"no method is called 'best'; expected one of {', '.join(METHODS)}"),
+        ({"sh": "4"}, "sh is '4'; expected all, auto or a degree from 0 to 3"),
+        ({"keep": "half"}, "keep is 'half'"),
+        ({"keep": WithinPsnr(-1.0)}, "the wanted PSNR is -1.0 dB"),
+        ({"fine_tune_steps": -1}, "-1 steps of fine-tuning; expected 0 for none, or more"),
+        ({"by": "merge", "opacity_weight": 0.5}, "opacity weight 0.5: merge does not weigh opacity"),
+    ],
+)
+def test_options_that_fit_no_scene_are_refused_without_one(options, message):
+    with pytest.raises(PointSplatError, match=message):
+        check_options(**{"keep": 0.5, "by": "paper", **options})
+
+
+@pytest.mark.parametrize("by", sorted(name for name, method in METHODS.items() if not method.weighs_opacity))
+def test_an_opacity_weight_is_refused_by_every_method_that_has_none(by, scene):
+    with pytest.raises(PointSplatError, match="choose one of paper, authors, log-volume"):
+        prune_scene(scene, 0.5, by, opacity_weight=0.5, views=Refusing(scene))
+
+
+@pytest.mark.parametrize("sh", SH_CHOICES)
+def test_every_choice_of_bands_may_be_asked_for(sh):
+    assert check_options("10%", "merge", sh) == 0.1
 
 
 def test_distributions_are_numbers_and_a_picture(scene, tmp_path):

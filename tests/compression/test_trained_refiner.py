@@ -1,0 +1,256 @@
+"""A trained refiner is loaded from a file of weights or from a run, without nerfstudio."""
+
+from __future__ import annotations
+
+import importlib.resources
+import math
+import subprocess
+import sys
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+import torch
+
+import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
+import pointsplat_ns as ps
+from making import REPOSITORY, ball, same
+from pointsplat_ns.compression import trained_refiner
+from pointsplat_ns.compression.trained_refiner import load_refiner, open_refiner_run, scenes_of_run, settings_from
+from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.pruning import PruneSettings, prune
+from pointsplat_ns.refiner import Refiner, WeightsError, preset, save_refiner
+from pointsplat_ns.refiner.weights import PRETRAINED
+
+
+def random_scene(n: int = 60, degree: int = 3) -> Gaussians:
+    generator = torch.Generator().manual_seed(7)
+
+    def normal(*shape):
+        return torch.randn(shape, generator=generator)
+
+    return Gaussians(
+        means=normal(n, 3),
+        scales=normal(n, 3) - 3,
+        quats=normal(n, 4),
+        opacities=normal(n, 1),
+        features_dc=normal(n, 3),
+        features_rest=0.1 * normal(n, (degree + 1) ** 2 - 1, 3),
+    )
+
+
+def network(head: str = "scales", moved: float = 0.2) -> Refiner:
+    """An untrained refiner whose residual is ``moved`` for every value of one attribute, zero for the others."""
+    torch.manual_seed(1)
+    refiner = Refiner(preset("tiny"))
+    with torch.no_grad():
+        [*refiner.heads.mlps[head].modules()][-1].bias.fill_(moved)
+    return refiner
+
+
+@pytest.mark.parametrize(
+    ("metadata", "settings"),
+    [
+        ({}, PruneSettings(0.1, "merge")),
+        ({"keep": 0.3, "by": "coverage", "steps": 5}, PruneSettings(0.3, "coverage")),
+        ({"keep": 0.3, "score": "coverage", "steps": 5}, PruneSettings(0.3, "coverage")),
+        ({"keep": "0.3", "score": "paper", "opacity_weight": "0.7"}, PruneSettings(0.3, "paper", 0.7)),
+        ({"keep": 0.3, "by": "merge", "opacity_weight": 0.3}, PruneSettings(0.3, "merge")),
+        ({"keep": 500}, PruneSettings(500, "merge")),
+    ],
+)
+def test_a_file_of_weights_says_what_it_was_trained_with(metadata, settings, tmp_path):
+    save_refiner(network(), tmp_path / "r.safetensors", metadata)
+    loaded = load_refiner(tmp_path / "r.safetensors")
+    assert loaded.settings == settings
+    assert loaded.source == tmp_path / "r.safetensors"
+    assert not loaded.network.training
+
+
+def test_a_file_of_weights_refines(tmp_path):
+    save_refiner(network("scales", 0.2), tmp_path / "r.safetensors")
+    loaded, scene = load_refiner(tmp_path / "r.safetensors", "cpu"), ball(60)
+    assert loaded.device == torch.device("cpu")
+    assert same(loaded(scene), scene.replace(scales=scene.scales + 0.2))
+    assert not loaded(scene).means.requires_grad
+
+
+@pytest.mark.parametrize(
+    "metadata", [{"keep": "some"}, {"keep": 1.5}, {"score": "best"}, {"keep": None}, {"opacity_weight": []}]
+)
+def test_metadata_that_make_no_sense_are_refused_in_one_line(metadata, tmp_path):
+    save_refiner(network(), tmp_path / "r.safetensors", metadata)
+    with pytest.raises(WeightsError, match="r.safetensors: metadata not understood") as caught:
+        load_refiner(tmp_path / "r.safetensors")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_run_is_a_refiner_too(make_refined_run, tmp_path):
+    run = make_refined_run(tmp_path, tmp_path / "nowhere", moved=0.5, keep=0.25, by="opacity")
+    loaded, scene = load_refiner(run), ball(60)
+    assert loaded.settings == PruneSettings(0.25, "opacity") and loaded.source == run
+    assert same(loaded(scene), scene.replace(opacities=scene.opacities + 0.5))
+
+
+def test_a_run_from_before_the_method_was_called_by_is_read(make_refined_run, tmp_path):
+    run = make_refined_run(tmp_path, tmp_path / "nowhere", keep=0.25, by="opacity")
+    text = (run / "config.yml").read_text()
+    assert "\n    by: opacity\n" in text
+    (run / "config.yml").write_text(text.replace("\n    by: opacity\n", "\n    score: opacity\n"))
+    assert load_refiner(run).settings == PruneSettings(0.25, "opacity")
+
+
+def test_anything_else_is_no_refiner(tmp_path):
+    (tmp_path / "scene.ply").touch()
+    with pytest.raises(WeightsError, match="scene.ply: a .ply file; expected a trained pointsplat run"):
+        load_refiner(tmp_path / "scene.ply")
+    with pytest.raises(SceneError, match="no such file"):
+        load_refiner(tmp_path / "gone")
+    with pytest.raises(WeightsError, match="no such file"):
+        load_refiner(tmp_path / "gone.safetensors")
+
+
+def test_where_the_refiner_that_ships_is_missing_it_is_said_what_to_do(tmp_path, monkeypatch):
+    monkeypatch.setattr(trained_refiner, "PRETRAINED", tmp_path / "refiner.safetensors")
+    with pytest.raises(
+        WeightsError, match="not there; .*--refiner RUN_OR_FILE.*, or .*pointsplat make-refiner"
+    ) as caught:
+        load_refiner()
+    assert "\n" not in str(caught.value)
+    save_refiner(Refiner(preset("tiny")), tmp_path / "refiner.safetensors", {"keep": 0.2})
+    assert load_refiner().settings == PruneSettings(0.2, "merge")
+
+
+def test_the_installed_package_holds_the_refiner_that_ships_and_its_card():
+    folder = importlib.resources.files("pointsplat_ns") / "refiner" / "pretrained"
+    assert PRETRAINED.samefile(str(folder / "refiner.safetensors"))
+    assert PRETRAINED.stat().st_size <= 10e6 and (folder / "CARD.md").is_file()
+    scene = ball(60, degree=3)
+    refined = load_refiner()(scene)
+    assert len(refined) == 60 and bool(refined.usable().all())
+
+
+def test_the_weights_are_named_as_package_data():
+    if sys.version_info < (3, 11):
+        pytest.skip("tomllib came with Python 3.11")
+    import tomllib
+
+    settings = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+    patterns = settings["tool"]["setuptools"]["package-data"]["pointsplat_ns"]
+    for name in ("refiner/pretrained/refiner.safetensors", "refiner/pretrained/CARD.md"):
+        assert any(fnmatch(name, pattern) for pattern in patterns)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_a_scene_of_any_size_and_degree_is_pruned_and_refined(make_refined_run, trained_walls, tmp_path, degree):
+    loaded = load_refiner(make_refined_run(tmp_path, trained_walls, moved=0.25, keep=0.4, by="opacity"))
+    dense = random_scene(degree=degree)
+    small = loaded(loaded.settings.prune(dense))
+    pruned = prune(dense, 0.4, "opacity")
+    assert len(small) == 24 and small.sh_degree == degree
+    assert torch.equal(small.opacities, pruned.opacities + 0.25) and torch.equal(small.means, pruned.means)
+    assert not small.means.requires_grad and not loaded.network.training
+    assert len(ps.compact(dense, 7, loaded).scene) == 7 and len(ps.compact(dense, 0.1, loaded).scene) == 6
+    with pytest.raises(BudgetError, match="keep is 61 Gaussians; expected 1 to 60"):
+        ps.compact(dense, 61, loaded)
+
+
+def test_scenes_are_known_by_name_and_the_first_held_out_is_the_default(make_refined_run, trained_walls, tmp_path):
+    def scenes_and_shown(folder: str, eval_scenes: tuple[str, ...] = ()) -> tuple[dict[str, Path], str]:
+        run = make_refined_run(tmp_path / folder, trained_walls, eval_scenes)
+        return scenes_of_run(open_refiner_run(run, need_data=True))
+
+    scenes, shown = scenes_and_shown("1")
+    assert list(scenes) == ["wall-a", "wall-b"] and shown == "wall-a"
+    assert all(path.suffix == ".ckpt" and path.is_file() for path in scenes.values())
+    assert scenes_and_shown("2", ("wall-b",))[1] == "wall-b"
+    # The viewer and ns-export show the first held-out scene by name, whatever the order on the command line was.
+    assert scenes_and_shown("3", ("wall-b", "wall-a"))[1] == "wall-a"
+
+
+def test_the_refiner_alone_needs_no_scenes(make_refined_run, tmp_path):
+    run = make_refined_run(tmp_path, Path("/not/on/this/machine"))
+    assert load_refiner(run).settings == PruneSettings(0.5, "paper")
+    with pytest.raises(SceneError, match="config.yml: its data .*is not there"):
+        open_refiner_run(run, need_data=True)
+
+
+def test_it_opens_in_a_process_that_has_not_loaded_nerfstudio(make_refined_run, tmp_path):
+    run = make_refined_run(tmp_path, Path("nowhere"))
+    code = (
+        "import sys; from pointsplat_ns.compression.trained_refiner import load_refiner; "
+        f"load_refiner({str(run)!r}); assert 'nerfstudio' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_runs_of_another_method_are_refused(trained_walls, tmp_path):
+    (splatfacto,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
+    with pytest.raises(SceneError, match="a run of the method splatfacto-cpu; expected a pointsplat run"):
+        load_refiner(splatfacto)
+    with pytest.raises(SceneError, match="no such file or folder"):
+        load_refiner(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize(
+    ("found", "damaged", "message"),
+    [
+        ("size: tiny", "size: small", "not a usable pointsplat checkpoint"),
+        ("size: tiny", "size: huge", "config.yml: .*huge"),
+        ("size: tiny\n", "sighs: tiny\n", "config.yml: lacks 'size'"),
+        ("keep: 0.5", "keep: 1.5", r"config.yml: keep is 1.5; expected a ratio"),
+        ("keep: 0.5", "keep: half", "half"),
+    ],
+)
+def test_a_damaged_configuration_is_refused_in_one_line(
+    found, damaged, message, make_refined_run, trained_walls, tmp_path
+):
+    run = make_refined_run(tmp_path, trained_walls)
+    text = (run / "config.yml").read_text()
+    assert found in text
+    (run / "config.yml").write_text(text.replace(found, damaged))
+    with pytest.raises(SceneError, match=message) as caught:
+        load_refiner(run)
+    assert "\n" not in str(caught.value) and str(run) in str(caught.value)
+
+
+def test_a_damaged_checkpoint_is_refused(make_refined_run, tmp_path):
+    run = make_refined_run(tmp_path, Path("nowhere"))
+    checkpoint = run / "nerfstudio_models" / "step-000000009.ckpt"
+    whole = checkpoint.read_bytes()
+    checkpoint.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(SceneError, match="no complete checkpoint"):
+        load_refiner(run)
+    torch.save({"step": 9, "pipeline": {}}, checkpoint)
+    with pytest.raises(SceneError, match="step-000000009.ckpt: not a usable pointsplat checkpoint"):
+        load_refiner(run)
+
+
+def test_code_in_the_config_is_never_run(make_refined_run, tmp_path):
+    run = make_refined_run(tmp_path, Path("nowhere"))
+    config, trap = run / "config.yml", tmp_path / "sprung"
+    config.write_text(
+        config.read_text().replace("keep: 0.5", f"keep: !!python/object/apply:os.system ['touch {trap}']")
+    )
+    with pytest.raises(SceneError):
+        load_refiner(run)
+    assert not trap.exists()
+
+
+def test_settings_tell_ratios_from_counts():
+    assert settings_from({"keep": 0.3, "by": "paper", "opacity_weight": 0.2}) == PruneSettings(0.3, "paper", 0.2)
+    saved = settings_from({"keep": 500.0, "score": "volume", "opacity_weight": 0.2})
+    assert saved == PruneSettings(500, "volume") and type(saved.keep) is int
+    assert type(settings_from({"keep": 1, "by": "volume"}).keep) is float, "1 is everything, as 1.0 is"
+    for keep in (0.0, -1.0, 1.5, 2.5, math.nan, math.inf):
+        with pytest.raises(BudgetError, match="keep is .*expected a ratio"):
+            settings_from({"keep": keep, "by": "paper", "opacity_weight": 0.3})
+
+
+def test_settings_without_a_method_or_with_one_that_needs_views_are_refused():
+    with pytest.raises(KeyError):
+        settings_from({"keep": 0.3})
+    with pytest.raises(PointSplatError, match="pup looks at a scene from poses"):
+        settings_from({"keep": 0.3, "by": "pup"})

@@ -1,0 +1,87 @@
+"""Where a scene is looked at from: given views, the poses of its dataset, poses sampled in free space."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from making import ball
+from pointsplat_ns.compression.view_sampling import sample_views
+from pointsplat_ns.compression.view_source import COMPARED_SIDE, COMPARED_VIEWS, ViewSource
+from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.views import Views
+
+
+@pytest.fixture(scope="module")
+def scene() -> Gaussians:
+    return ball(400)
+
+
+def run_of(trained_walls: Path, name: str) -> Path:
+    (run,) = (trained_walls / name / "splatfacto-cpu").iterdir()
+    return run
+
+
+def test_a_bare_scene_is_looked_at_from_sampled_poses(scene):
+    bare = ViewSource(scene, run="scene.ply", dataset_views=dataset_views)
+    assert len(bare.views(2)) == 2
+    assert bare.origin == "poses sampled in free space"
+
+
+def test_a_run_is_looked_at_from_its_own_poses(scene, trained_walls):
+    source = ViewSource(scene, run=run_of(trained_walls, "wall-b"), dataset_views=dataset_views)
+    views = source.views(4)
+    assert len(views) == 4 and source.origin == "poses of the dataset"
+    assert (views.width, views.height) == (64, 48) and views.rasterize_mode == "antialiased"
+    assert views.background.tolist() == [1.0, 1.0, 1.0]
+
+
+def data_is_gone(path: Path | str) -> Views:
+    raise SceneError("its data is not there")
+
+
+@pytest.mark.parametrize(("name", "mode"), [("wall-a", "classic"), ("wall-b", "antialiased")])
+def test_a_run_whose_data_is_gone_is_looked_at_from_sampled_poses_as_it_rendered(name, mode, scene, trained_walls):
+    source = ViewSource(scene, run=run_of(trained_walls, name), dataset_views=data_is_gone)
+    views = source.views(2)
+    assert len(views) == 2 and views.rasterize_mode == mode
+    assert source.origin == "poses sampled in free space (no dataset: its data is not there)"
+
+
+def test_a_run_whose_data_is_gone_and_whose_scene_shows_nothing_has_no_views(scene, trained_walls):
+    nothing = ViewSource(scene[:0], run=run_of(trained_walls, "wall-a"), dataset_views=data_is_gone)
+    with pytest.raises(DataError, match="nothing of the scene can be seen"):
+        nothing.views(2)
+    assert nothing.origin == ""
+
+
+def test_given_views_go_before_all_others(scene, trained_walls):
+    given = sample_views(scene, 3, 48, 36)
+    source = ViewSource(scene, given, run_of(trained_walls, "wall-a"), data_is_gone)
+    assert source.views(9) is given and source.origin == "given views"
+    with pytest.raises(DataError, match="the views given are empty"):
+        ViewSource(scene, given[:0]).views(3)
+
+
+def test_renders_are_compared_in_few_small_views(scene):
+    given = sample_views(scene, 2, 900, 600)
+    many = given[[0, 1] * 20]
+    compared = ViewSource(scene, given=many).compared()
+    assert len(compared) == COMPARED_VIEWS
+    assert max(compared.width, compared.height) == COMPARED_SIDE
+
+
+def test_views_are_spread_resized_and_checked(ball_views):
+    assert torch.equal(ball_views.spread(2).viewmats, ball_views.viewmats[[0, 3]])
+    assert ball_views.spread(9) is ball_views
+    half = ball_views.resized(32)
+    assert (half.width, half.height) == (32, 24) and torch.allclose(half.Ks[:, :2], ball_views.Ks[:, :2] / 2)
+    assert ball_views.resized(64) is ball_views
+    with pytest.raises(DataError, match="viewmats of the views has shape"):
+        Views(torch.eye(4), ball_views.Ks, 8, 8, torch.zeros(3))
+    with pytest.raises(DataError, match="0 x 8 pixels"):
+        Views(ball_views.viewmats, ball_views.Ks, 0, 8, torch.zeros(3))
