@@ -40,7 +40,7 @@ def test_a_ratio_is_within_half_a_gaussian_of_what_was_asked(n, ratio):
     assert abs(k - n * ratio) <= 0.5 + 1e-6 or k == 1  # 1e-6: n * ratio has itself been rounded
 
 
-@pytest.mark.parametrize("keep", [0.0, -0.1, 1.0001, math.nan, math.inf, -math.inf, "0.5", None, True])
+@pytest.mark.parametrize("keep", [0.0, -0.1, 1.0001, math.nan, math.inf, -math.inf, b"0.5", None, True])
 def test_what_is_no_ratio_is_said(keep):
     with pytest.raises(BudgetError) as caught:
         resolve_keep(1000, keep)

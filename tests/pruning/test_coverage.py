@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning import SCORES, coverage_score, prune
-from pointsplat_ns.pruning.coverage import curve_keys, mass_shares, unit_cells
+from pointsplat_ns.pruning import METHODS, score_of, select
+from pointsplat_ns.pruning.coverage import coverage_score, curve_keys, mass_shares, unit_cells
 
 
 def scene_at(means, log_scales=-3.0, logits=1.0):
@@ -94,7 +94,7 @@ def test_no_region_is_emptied_at_ten_percent_where_other_scores_empty_one():
     scene = scene_at(torch.cat([big, small]), scales, logits)
     cell = (scene.means[:, 0] > 0.5) * 16 + (scene.means[:, 1] * 4).long().clamp_max(3) * 4
     cell = cell + (scene.means[:, 2] * 4).long().clamp_max(3)
-    kept = {by: prune(scene, 0.1, by).indices for by in ("coverage", "paper", "area", "opacity")}
+    kept = {by: select(score_of(scene, METHODS[by]), 200) for by in ("coverage", "paper", "area", "opacity")}
     regions = {by: len(cell[indices].unique()) for by, indices in kept.items()}
     assert regions["coverage"] == 32 and max(regions["paper"], regions["area"]) < 20
 
@@ -124,7 +124,3 @@ def test_scale_and_place_of_the_scene_do_not_matter():
     moved = scene.replace(means=scene.means * 1024 + 4096, scales=scene.scales + math.log(1024))
     # 1e-5: masses are compared by logarithms in float32; none stands on the border of a cell here
     assert torch.allclose(coverage_score(moved), coverage_score(scene), atol=1e-5)
-
-
-def test_coverage_is_the_first_of_the_scores():
-    assert next(iter(SCORES)) == "coverage"

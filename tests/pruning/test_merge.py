@@ -10,8 +10,8 @@ import torch
 from making import same
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning import merge_algebra as algebra
-from pointsplat_ns.pruning import merging
+from pointsplat_ns.pruning import covariance as algebra
+from pointsplat_ns.pruning import merge as merging
 from pointsplat_ns.pruning.merge import merge
 from pointsplat_ns.rasterizer import rasterization
 

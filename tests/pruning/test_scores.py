@@ -7,7 +7,10 @@ import pytest
 import torch
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning import SCORES, WEIGHTED, paper_score, prune
+from pointsplat_ns.pruning import METHODS, prune
+from pointsplat_ns.pruning.scores import paper_score
+
+SCORES = {name: method.score for name, method in METHODS.items() if method.score and not method.needs_views}
 
 
 def make(n=50, degree=1, seed=0, dtype=torch.float32):
@@ -181,7 +184,7 @@ def test_no_score_of_what_can_be_drawn_is_nan(name, case):
     score = SCORES[name](scene)
     assert not score.isnan().any()
     assert (score < math.inf).all() or name == "opacity"  # whose score is the logit
-    assert len(prune(scene, 7, name).indices) == 7
+    assert len(prune(scene, 7, name)) == 7
 
 
 @pytest.mark.parametrize("name", sorted(set(SCORES) - {"random"}))
@@ -215,10 +218,10 @@ def test_a_single_giant_is_found_and_leaves_the_others_apart(name):
 @pytest.mark.parametrize("name", sorted(set(SCORES) - {"random"}))
 def test_of_equal_gaussians_at_one_place_any_will_do(name):
     scene = make(1)[[0] * 30]
-    assert SCORES[name](scene).isfinite().all() and len(prune(scene, 10, name).scene) == 10
+    assert SCORES[name](scene).isfinite().all() and len(prune(scene, 10, name)) == 10
 
 
-@pytest.mark.parametrize("name", WEIGHTED)
+@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if method.weighs_opacity])
 def test_every_weighted_score_says_a_weight_outside_its_range(name):
     with pytest.raises(ValueError, match="expected 0 to 1"):
         SCORES[name](make(), opacity_weight=1.5)
