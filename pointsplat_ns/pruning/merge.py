@@ -19,6 +19,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import SH_C0, Gaussians
+from pointsplat_ns.geometry.neighbours import nearest_and_walk
 from pointsplat_ns.pruning.covariance import (
     TINY,
     covariances,
@@ -216,16 +217,13 @@ def _start(scene: Gaussians) -> _State:
 def _neighbours(means: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Pairs (i, j), i < j, each once, of every centre with its nearest; and a walk (n,) through all centres in the
     order of the tree's leaves."""
-    from scipy.spatial import cKDTree
-
     n = len(means)
-    tree = cKDTree(means.numpy(), balanced_tree=False)
-    near = torch.from_numpy(tree.query(means.numpy(), k=min(n, NEIGHBOURS + 1), workers=torch.get_num_threads())[1])
+    _, near, walk = nearest_and_walk(means, NEIGHBOURS + 1)
     one, other = torch.arange(n).repeat_interleave(near.shape[1]), near.reshape(-1)
     key = torch.unique(torch.minimum(one, other) * n + torch.maximum(one, other))
     first, second = key // n, key % n
     apart = first != second
-    return first[apart], second[apart], torch.from_numpy(tree.indices).long()
+    return first[apart], second[apart], walk
 
 
 def _join(state: _State, i: Tensor, j: Tensor) -> _Joined:
