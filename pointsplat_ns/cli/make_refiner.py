@@ -92,7 +92,7 @@ def make_scenes(output: Path, seeds: tuple[int, ...], workers: int) -> None:
     """Rooms with photos, and a trained scene of each, ``workers`` at a time with one thread each."""
     from pointsplat_ns.cli.running import finished, run
     from pointsplat_ns.nerfstudio_plugin.pointsplat.recipe import scene_settings
-    from pointsplat_ns.rooms.room import write_room
+    from pointsplat_ns.rooms import write_room
 
     def make(seed: int) -> None:
         settings = scene_settings(seed)

@@ -24,7 +24,7 @@ def rooms(
         width: of a photo, pixels.
         height: of a photo, pixels.
     """
-    from pointsplat_ns.rooms.room import write_room
+    from pointsplat_ns.rooms import write_room
 
     for seed in seeds:
         print(write_room(output / f"room{seed}", seed, frames, width, height))

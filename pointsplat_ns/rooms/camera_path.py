@@ -1,16 +1,13 @@
 """Where a person with a camera would walk through a room: free of furniture, seeing all of it."""
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
-
-if TYPE_CHECKING:
-    from pointsplat_ns.rooms.room import Room
+from pointsplat_ns.rooms.room import Room
 
 CLEARANCE = 0.30  # metres kept from walls and furniture
 CELL = 0.08  # metres, grid on which free space is searched
@@ -24,22 +21,27 @@ look at them; or from a few places, turning on each."""
 _STOPS = 6  # places of the style "stops"
 
 
-def capture_path(room: "Room", frames: int, seed: int, style: str = "rounds") -> Tensor:
+def capture_path(room: Room, frames: int, seed: int, style: str = "rounds") -> Tensor:
     """Poses along two rounds through a room.
 
     Height and pitch vary on the way. Every position keeps at least :data:`CLEARANCE` from all surfaces.
 
     Args:
-        room: The room.
-        frames: Number of poses.
-        seed: Start angle, direction and swing of the walk.
-        style: One of :data:`STYLES`.
+        room: the room.
+        frames: number of poses, F.
+        seed: decides where the walk starts, its direction and its swing.
+        style: one of :data:`STYLES`.
 
     Returns:
-        (F, 4, 4) float32 camera-to-world, OpenCV axes, z of the world up.
+        (F, 4, 4) float32 camera-to-world, OpenCV axes, z of the world up, metres.
 
     Raises:
-        DataError: No such style, or no free place in the room.
+        DataError: if there is no such style, or no free place in the room.
+
+    Example:
+        >>> from pointsplat_ns.rooms import make_room
+        >>> tuple(capture_path(make_room(seed=3), frames=5, seed=3).shape)
+        (5, 4, 4)
     """
     if style not in STYLES:
         raise DataError(f"no capture style is called {style!r}; expected one of {', '.join(STYLES)}")
@@ -61,21 +63,22 @@ def capture_path(room: "Room", frames: int, seed: int, style: str = "rounds") ->
         gaze = gaze + math.pi
     elif style == "stops":
         at = np.floor(share * _STOPS)
-        route = route[np.searchsorted(share, at / _STOPS)]
+        # Rounding may put the last place behind the last frame.
+        route = route[np.minimum(np.searchsorted(share, at / _STOPS), frames - 1)]
         gaze = turn * 2 * math.pi * (share * _STOPS - at) + at
     pitch = -0.22 + 0.24 * np.sin(2 * math.pi * (5 * share + rng.random()))
     positions = np.concatenate([route, heights[:, None]], axis=1)
     return torch.stack([_look(p, g, t) for p, g, t in zip(positions, gaze, pitch, strict=True)])
 
 
-def clearance(room: "Room", points: Tensor) -> Tensor:
+def clearance(room: Room, points: Tensor) -> Tensor:
     """Distance in metres from points (M, 3) to the nearest wall or furniture's bounding box: (M,)."""
     shell = room.spec.primitives
     walls = (shell.half[0] - (points - shell.center[0]).abs()).amin(dim=-1)
     return torch.minimum(walls, shell.distance(points))
 
 
-def _free_cells(room: "Room", top: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _free_cells(room: Room, top: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """bool (Y, X) cells of the largest connected free area, and the cells' coordinates."""
     from scipy import ndimage
 
@@ -106,7 +109,7 @@ def _route(free: np.ndarray, xs: np.ndarray, ys: np.ndarray, angle: np.ndarray) 
     middle = np.array([xs[free.any(0)].mean(), ys[free.any(1)].mean()])
     offset = cells - middle
     bearing, radius = np.arctan2(offset[:, 1], offset[:, 0]), np.hypot(offset[:, 0], offset[:, 1])
-    stops = []
+    stops: list[int] = []
     for target in np.linspace(angle[0], angle[-1], 17):
         apart = np.abs((bearing - target + math.pi) % (2 * math.pi) - math.pi)
         near = apart < 0.35
@@ -114,7 +117,7 @@ def _route(free: np.ndarray, xs: np.ndarray, ys: np.ndarray, angle: np.ndarray) 
         if near.any():
             share = 0.85 if len(stops) < 8 else 0.55
             wanted = share * radius[near].max()
-            stops.append(np.flatnonzero(near)[np.argmin(np.abs(radius[near] - wanted) + apart[near])])
+            stops.append(int(np.flatnonzero(near)[np.argmin(np.abs(radius[near] - wanted) + apart[near])]))
     walk = _walk(cells, stops)
     length = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(walk, axis=0).T))])
     fine = np.linspace(0, length[-1], 16 * len(angle))

@@ -1,200 +1,65 @@
-"""Sampled rooms: which furniture stands where, of what material, under which lights."""
+"""Sampled rooms: which furniture stands where along the walls and in the middle, under which lights."""
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Callable
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from pointsplat_ns.rooms import textures as tex
-from pointsplat_ns.rooms.raycast import BOX, CHARTS, CYLINDER, ELLIPSOID, Primitives
+from pointsplat_ns.rooms.building import Builder, Frame, Light, Material, RoomSpec, Vec
+from pointsplat_ns.rooms.furniture import (
+    bed,
+    bookshelf,
+    chair,
+    desk,
+    dresser,
+    floor_lamp,
+    plant,
+    sofa,
+    table,
+    tv_bench,
+    wardrobe,
+)
+from pointsplat_ns.rooms.palette import Palette, hsv
 
-Vec = tuple[float, float, float]
+GAP = 0.06  # metres left between neighbouring pieces
+DOOR, WINDOW = 0.0, 0.85  # metres of wall free below an opening; no piece of furniture has these heights
+OPENINGS = (DOOR, WINDOW)
 
+Wall = tuple[Frame, float]
+"""The middle of a wall's foot, and its length in metres."""
+Taken = list[tuple[float, float, float]]
+"""What stands or opens along a wall: from, to, and the lowest height that is free above or below it, metres."""
+Floor = list[tuple[float, float, float, float]]
+"""Rectangles of the floor that are taken: x0, x1, y0, y1 in metres."""
 
-@dataclass(frozen=True)
-class Material:
-    """How a surface looks.
+Piece = Callable[[Builder, Frame, Palette, Vec], Light | None]
+"""Builds a piece of furniture of a width, depth and height; gives the light of a lamp."""
 
-    Attributes:
-        paint: Its colour, linear light.
-        gloss: Strength of the highlight, 0 for a matte surface.
-        shininess: Blinn-Phong exponent.
-        emission: Radiance of a shining surface as a multiple of ``paint``; 0 for the others.
-    """
+SIZES: dict[Piece, Vec] = {
+    bed: (1.5, 2.0, 0.95),
+    plant: (0.62, 0.62, 1.5),
+    floor_lamp: (0.4, 0.4, 1.65),
+    bookshelf: (1.0, 0.3, 1.9),
+    wardrobe: (1.1, 0.55, 2.0),
+    dresser: (1.0, 0.45, 0.8),
+    tv_bench: (1.4, 0.4, 0.45),
+    desk: (1.3, 0.65, 0.74),
+    sofa: (1.9, 0.88, 0.8),
+}
+"""Usual width, depth and height in metres."""
 
-    paint: tex.Painter
-    gloss: float = 0.0
-    shininess: float = 30.0
-    emission: float = 0.0
-
-
-@dataclass(frozen=True)
-class Light:
-    """A rectangle that shines on the side of its normal, or a ball's middle that shines all around.
-
-    Attributes:
-        center, edge_u, edge_v: Middle and half edges, world (edges are zero for a point).
-        normal: Unit vector, or None for a point.
-        color: Radiance times area (RGB).
-    """
-
-    center: Vec
-    edge_u: Vec
-    edge_v: Vec
-    normal: Vec | None
-    color: Vec
-
-
-@dataclass(frozen=True)
-class RoomSpec:
-    """What a seed decided about a room.
-
-    Attributes:
-        seed: The seed.
-        kind: "living", "bedroom", "study" or "dining".
-        size: Width (x), depth (y) and height (z) in metres.
-        primitives: All solids; number 0 is the room itself.
-        materials: One material per chart of each solid, in order.
-        lights: The light sources.
-    """
-
-    seed: int
-    kind: str
-    size: Vec
-    primitives: Primitives
-    materials: tuple[Material, ...]
-    lights: tuple[Light, ...]
-
-
-@dataclass
-class Frame:
-    """A place to build at: origin on the floor and rotation about z."""
-
-    x: float
-    y: float
-    yaw: float
-
-    def point(self, p: Vec) -> Vec:
-        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
-        return (self.x + cos * p[0] - sin * p[1], self.y + sin * p[0] + cos * p[1], p[2])
-
-
-@dataclass
-class Builder:
-    """Collects solids in the frames that furniture is built in."""
-
-    rows: list[tuple] = field(default_factory=list)
-    materials: list[Material] = field(default_factory=list)
-
-    def add(
-        self,
-        kind: int,
-        at: Frame,
-        center: Vec,
-        half: Vec,
-        material: Material | dict[int, Material],
-        turn: float = 0.0,
-        opaque: bool = True,
-    ) -> None:
-        """One solid; ``material`` may be a dict from face to material, with -1 for the other faces."""
-        self.rows.append((kind, at.point(center), half, at.yaw + turn, opaque))
-        for face in range(CHARTS[kind]):
-            chosen = material.get(face, material.get(-1)) if isinstance(material, dict) else material
-            self.materials.append(chosen)
-
-    def box(self, at: Frame, center: Vec, size: Vec, material, turn: float = 0.0, opaque: bool = True) -> None:
-        """A box of full extents ``size`` whose middle is ``center``."""
-        self.add(BOX, at, center, (size[0] / 2, size[1] / 2, size[2] / 2), material, turn, opaque)
-
-    def tube(self, at: Frame, foot: Vec, radius: float, height: float, material, opaque: bool = True) -> None:
-        """An upright cylinder standing on ``foot``."""
-        center = (foot[0], foot[1], foot[2] + height / 2)
-        self.add(CYLINDER, at, center, (radius, radius, height / 2), material, opaque=opaque)
-
-    def ball(self, at: Frame, center: Vec, half: Vec, material, turn: float = 0.0, opaque: bool = True) -> None:
-        """An ellipsoid with half axes ``half``."""
-        self.add(ELLIPSOID, at, center, half, material, turn, opaque)
-
-    def primitives(self) -> Primitives:
-        kind, center, half, yaw, opaque = zip(*self.rows, strict=True)
-        return Primitives(
-            kind=torch.tensor(kind),
-            center=torch.tensor(center, dtype=torch.float32),
-            half=torch.tensor(half, dtype=torch.float32),
-            yaw=torch.tensor(yaw, dtype=torch.float32),
-            opaque=torch.tensor(opaque),
-        )
-
-
-def hsv(hue: float, saturation: float, value: float) -> tex.Color:
-    """Linear-light colour of hue, saturation and value in [0, 1]."""
-    import colorsys
-
-    r, g, b = colorsys.hsv_to_rgb(hue % 1.0, saturation, value)
-    return (r**2.2, g**2.2, b**2.2)
-
-
-class Palette:
-    """The colours and materials of one room, drawn once so that its pieces belong together."""
-
-    def __init__(self, rng: np.random.Generator):
-        hue = rng.random()
-        self.rng = rng
-        self.accents = [hsv(hue + d + rng.uniform(-0.04, 0.04), rng.uniform(0.5, 0.85), rng.uniform(0.45, 0.85))
-                        for d in (0.0, 0.08, 0.33, 0.55, 0.5)]  # fmt: skip
-        self.wall = hsv(rng.random(), rng.uniform(0.05, 0.28), rng.uniform(0.78, 0.92))
-        self.wood_tone = hsv(rng.uniform(0.05, 0.1), rng.uniform(0.4, 0.65), rng.uniform(0.5, 0.85))
-        self.dark_wood = hsv(rng.uniform(0.03, 0.08), rng.uniform(0.5, 0.7), rng.uniform(0.32, 0.5))
-        self.pale = hsv(rng.uniform(0.05, 0.15), 0.08, 0.9)
-
-    def accent(self) -> tex.Color:
-        return self.accents[self.rng.integers(len(self.accents))]
-
-    def wood(self) -> Material:
-        tone = self.wood_tone if self.rng.random() < 0.6 else self.dark_wood
-        return Material(tex.wood(tone), gloss=self.rng.uniform(0.04, 0.12), shininess=self.rng.uniform(30, 80))
-
-    def cloth(self) -> Material:
-        check = self.rng.choice([0.0, 0.0, 0.14, 0.2])
-        return Material(tex.fabric(self.accent(), self.accent(), float(check)))
-
-    def lacquer(self) -> Material:
-        return Material(tex.plain(self.accent(), 0.15, 0.12), gloss=0.35, shininess=float(self.rng.uniform(40, 110)))
-
-    def metal(self) -> Material:
-        return Material(tex.plain((0.3, 0.3, 0.32), 0.1), gloss=0.5, shininess=60.0)
-
-    def floor(self) -> Material:
-        style = self.rng.integers(4)
-        if style == 0:
-            a, b = hsv(0.1, 0.12, 0.85), hsv(self.rng.random(), 0.3, 0.5)
-            return Material(tex.tiles(a, b, float(self.rng.uniform(0.28, 0.45))), gloss=0.16, shininess=90.0)
-        if style == 1:
-            tone = hsv(self.rng.random(), 0.2, 0.62)
-            return Material(tex.fabric(tone, self.accent(), 0.5))
-        tone = self.wood_tone if style == 2 else self.dark_wood
-        board = float(self.rng.uniform(0.1, 0.2))
-        return Material(tex.wood(tone, board=board), gloss=0.12, shininess=float(self.rng.uniform(40, 90)))
-
-    def wall_material(self) -> Material:
-        style = self.rng.integers(5)
-        if style == 0:
-            return Material(tex.bricks(hsv(self.rng.uniform(0.0, 0.07), 0.5, 0.66)))
-        if style == 1:
-            other = tuple(0.78 * v for v in self.wall)
-            return Material(tex.stripes([self.wall, other], float(self.rng.uniform(0.08, 0.16))))
-        if style == 2:
-            motif = tuple(float(m) for m in 0.5 * np.asarray(self.wall) + 0.5 * np.asarray(self.accent()))
-            return Material(tex.wallpaper(self.wall, motif, float(self.rng.uniform(0.25, 0.4))))
-        return Material(tex.plain(self.wall, 0.07, 0.4))
+ROOMS: dict[str, list[Piece]] = {
+    "living": [sofa, tv_bench, bookshelf, floor_lamp, plant, dresser],
+    "bedroom": [bed, wardrobe, dresser, floor_lamp, bookshelf, plant],
+    "study": [desk, bookshelf, bookshelf, sofa, plant, floor_lamp, dresser],
+    "dining": [dresser, bookshelf, plant, tv_bench, floor_lamp, wardrobe],
+}
+"""What is set out along the walls of each kind of room, in this order, as far as there is space."""
 
 
 def sample_room(seed: int) -> RoomSpec:
     """Draws a furnished room; the same seed gives the same room."""
-    from pointsplat_ns.rooms.furniture import furnish
-
     rng = np.random.default_rng([seed, 20])
     kind = ("living", "bedroom", "study", "dining")[seed % 4]
     size = (float(rng.uniform(3.8, 6.0)), float(rng.uniform(3.4, 5.0)), float(rng.uniform(2.4, 2.9)))
@@ -203,12 +68,165 @@ def sample_room(seed: int) -> RoomSpec:
     return RoomSpec(seed, kind, size, builder.primitives(), tuple(builder.materials), tuple(lights))
 
 
-def light_samples(light: Light, side: int) -> Tensor:
-    """(side * side, 3) points spread over a light; one point for a ball."""
-    center = torch.tensor(light.center)
-    if light.normal is None:
-        return center[None]
-    steps = (torch.arange(side) + 0.5) / side * 2 - 1
-    u, v = torch.meshgrid(steps, steps, indexing="ij")
-    edges = torch.tensor(light.edge_u), torch.tensor(light.edge_v)
-    return center + u.reshape(-1, 1) * edges[0] + v.reshape(-1, 1) * edges[1]
+def furnish(b: Builder, pal: Palette, kind: str, size: Vec, rng: np.random.Generator) -> list[Light]:
+    """Builds the shell, openings, wall furniture, middle group and wall pictures; returns the lights."""
+    width, depth, height = size
+    room = Frame(0, 0, 0)
+    wall, other = pal.wall_material(), Material(tex.plain(pal.wall, 0.07, 0.4))
+    ceiling = Material(tex.plain((0.8, 0.79, 0.76), 0.05, 0.6))
+    accent_wall = int(rng.integers(4))
+    shell = {face: wall if face == accent_wall or rng.random() < 0.35 else other for face in range(4)}
+    b.box(room, (0, 0, height / 2), size, {**shell, 4: pal.floor(), 5: ceiling})
+    skirting = Material(tex.plain(pal.pale), gloss=0.05)
+    for wall_at, length in _walls(width, depth):
+        b.box(wall_at, (0, 0.008, 0.05), (length - 0.02, 0.016, 0.1), skirting)
+    lights = []
+    walls = _walls(width, depth)
+    taken: list[Taken] = [[], [], [], []]
+    floor: Floor = []
+
+    first = int(rng.integers(4))
+    for number, k in enumerate((first, (first + 1 + int(rng.integers(3))) % 4)):
+        at, length = walls[k]
+        if number == 0 or rng.random() < 0.6:
+            lights.append(_window(b, at, length, height, pal, taken[k]))
+    k = (first + 2) % 4
+    at, length = walls[k]
+    x = float(rng.choice([-1, 1])) * (length / 2 - 0.65)
+    if not _blocked(taken[k], x - 0.5, x + 0.5, 0.0):
+        b.box(at, (x, 0.025, 1.0), (0.9, 0.05, 2.0), {-1: pal.wood(), 3: Material(tex.door(pal.wood_tone), 0.08, 50.0)})
+        taken[k].append((x - 0.5, x + 0.5, DOOR))
+        cx, cy, _ = at.point((x, 0.5, 0))
+        floor.append((cx - 0.5, cx + 0.5, cy - 0.5, cy + 0.5))
+
+    _middle(b, pal, kind, size, rng, floor)
+    for piece in ROOMS[kind]:
+        light = _against_wall(b, pal, piece, walls, taken, floor, rng)
+        if light is not None:
+            lights.append(light)
+    _pictures(b, pal, walls, taken, height, rng)
+    lights.append(_ceiling_lamp(b, room, height))
+    return lights
+
+
+def _walls(width: float, depth: float) -> list[Wall]:
+    return [
+        (Frame(0, -depth / 2, 0.0), width),
+        (Frame(width / 2, 0, math.pi / 2), depth),
+        (Frame(0, depth / 2, math.pi), width),
+        (Frame(-width / 2, 0, -math.pi / 2), depth),
+    ]
+
+
+def _blocked(taken: Taken, x0: float, x1: float, top: float) -> bool:
+    return any(x0 < b and a < x1 and top > free for a, b, free in taken)
+
+
+def _window(b: Builder, at: Frame, length: float, height: float, pal: Palette, taken: Taken) -> Light:
+    w = float(pal.rng.uniform(1.1, min(2.0, length - 1.6)))
+    h, sill = 1.25, 0.95
+    x = float(pal.rng.uniform(-1, 1)) * (length - w - 1.2) / 2
+    z = sill + h / 2
+    panes = Material(tex.window(hsv(0.57, 0.45, 0.9), hsv(0.28, 0.45, 0.55), (2 if w < 1.5 else 3, 2)), emission=1.7)
+    white = Material(tex.plain(pal.pale), gloss=0.1)
+    b.box(at, (x, 0.01, z), (w, 0.02, h), {-1: white, 3: panes}, opaque=False)
+    b.box(at, (x, 0.08, sill - 0.02), (w + 0.2, 0.16, 0.04), white)
+    curtain = Material(tex.stripes([pal.accent(), pal.pale, pal.accent()], 0.09))
+    for s in (-1, 1):
+        b.box(at, (x + s * (w / 2 + 0.16), 0.09, z - 0.05), (0.3, 0.06, h + 0.3), curtain)
+    b.box(at, (x, 0.1, sill + h + 0.14), (w + 0.8, 0.03, 0.03), pal.metal())
+    taken.append((x - w / 2 - 0.35, x + w / 2 + 0.35, WINDOW))
+    into = at.point((0, 1, 0))
+    normal = (into[0] - at.x, into[1] - at.y, 0.0)
+    along = at.point((1, 0, 0))
+    edge = ((along[0] - at.x) * w / 2, (along[1] - at.y) * w / 2, 0.0)
+    area = w * h
+    return Light(at.point((x, 0.03, z)), edge, (0, 0, h / 2), normal, (1.5 * area, 1.62 * area, 1.8 * area))
+
+
+def _ceiling_lamp(b: Builder, at: Frame, height: float) -> Light:
+    glow = Material(tex.plain((1.0, 0.92, 0.78), 0.02), emission=1.6)
+    rim = Material(tex.plain((0.25, 0.24, 0.22)), gloss=0.3)
+    b.tube(at, (0, 0, height - 0.09), 0.26, 0.07, {-1: rim, 1: glow}, opaque=False)
+    return Light((0, 0, height - 0.1), (0.2, 0, 0), (0, 0.2, 0), (0, 0, -1), (2.0, 1.75, 1.35))
+
+
+def _middle(b: Builder, pal: Palette, kind: str, size: Vec, rng: np.random.Generator, floor: Floor) -> None:
+    """The rug and, except in bedrooms, the table in the middle."""
+    width, depth, _ = size
+    cx, cy = float(rng.uniform(-0.25, 0.25)), float(rng.uniform(-0.2, 0.2))
+    at = Frame(cx, cy, float(rng.uniform(-0.25, 0.25)))
+    w, d = float(rng.uniform(0.35, 0.48)) * width, float(rng.uniform(0.35, 0.45)) * depth
+    b.box(at, (0, 0, 0.006), (w, d, 0.012), Material(tex.rug([pal.accent(), pal.pale, pal.accents[3]])))
+    if kind == "dining":
+        top = (float(rng.uniform(1.1, 1.5)), float(rng.uniform(0.75, 0.9)), 0.74)
+        table(b, at, pal, top)
+        for s in (-1, 1):
+            for x in (-0.28 * top[0], 0.28 * top[0]):
+                spot = at.point((x, s * (top[1] / 2 + 0.12), 0))
+                chair(b, Frame(spot[0], spot[1], at.yaw + (math.pi if s > 0 else 0.0)), pal)
+        reach = 0.95
+    elif kind == "living":
+        table(b, at, pal, (float(rng.uniform(0.8, 1.1)), 0.55, 0.42))
+        reach = 0.6
+    elif kind == "study":
+        r = 0.3
+        b.tube(at, (0, 0, 0.012), r, 0.4, pal.cloth())
+        reach = r
+    else:
+        return
+    floor.append((cx - reach, cx + reach, cy - reach, cy + reach))
+
+
+def _against_wall(
+    b: Builder,
+    pal: Palette,
+    piece: Piece,
+    walls: list[Wall],
+    taken: list[Taken],
+    floor: Floor,
+    rng: np.random.Generator,
+) -> Light | None:
+    """Tries places along the walls until the piece stands clear of all others; gives up after some."""
+    w, d, h = (float(v * rng.uniform(0.92, 1.1)) for v in SIZES[piece])
+    reach = d + (0.6 if piece is desk else 0.0)
+    for _ in range(60):
+        k = int(rng.integers(4))
+        at, length = walls[k]
+        room_for = (length - w) / 2 - 0.08
+        if room_for <= 0:
+            continue
+        x = float(rng.uniform(-room_for, room_for))
+        if _blocked(taken[k], x - w / 2 - GAP, x + w / 2 + GAP, h + (0.6 if piece in (tv_bench, desk) else 0.0)):
+            continue
+        ends = [at.point(p) for p in ((x - w / 2, 0.02, 0), (x + w / 2, reach, 0))]
+        x0, x1 = sorted(p[0] for p in ends)
+        y0, y1 = sorted(p[1] for p in ends)
+        if any(x0 < f[1] + GAP and f[0] < x1 + GAP and y0 < f[3] + GAP and f[2] < y1 + GAP for f in floor):
+            continue
+        floor.append((x0, x1, y0, y1))
+        taken[k].append((x - w / 2, x + w / 2, h + (0.75 if piece in (tv_bench, desk, dresser) else 0.1)))
+        origin = at.point((x, 0.025, 0))
+        return piece(b, Frame(origin[0], origin[1], at.yaw), pal, (w, d, h))
+    return None
+
+
+def _pictures(
+    b: Builder, pal: Palette, walls: list[Wall], taken: list[Taken], height: float, rng: np.random.Generator
+) -> None:
+    for k, (at, length) in enumerate(walls):
+        hung: list[tuple[float, float]] = []
+        for _ in range(14):
+            w, h = float(rng.uniform(0.45, 0.95)), float(rng.uniform(0.4, 0.75))
+            x = float(rng.uniform(-1, 1)) * (length - w - 0.3) / 2
+            z = float(rng.uniform(1.45, 1.7))
+            over = any(a - 0.12 < x + w / 2 and x - w / 2 < c + 0.12 for a, c in hung)
+            under = [free for a, c, free in taken[k] if x - w / 2 < c and a < x + w / 2]
+            if over or any(free in OPENINGS or z - h / 2 < free for free in under) or z + h / 2 > height - 0.15:
+                continue
+            hung.append((x - w / 2, x + w / 2))
+            art = Material(tex.picture(pal.accents + [pal.pale]), gloss=0.08, shininess=60.0)
+            frame = Material(tex.plain(pal.dark_wood), gloss=0.15)
+            b.box(at, (x, 0.015, z), (w, 0.03, h), {3: art, -1: frame})
+            if len(hung) == 3:
+                break

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rooms.layout import RoomSpec, light_samples
+from pointsplat_ns.rooms.building import Light, RoomSpec
 from pointsplat_ns.rooms.raycast import CHARTS, chart_points, chart_size, dot, occluded, surface, trace, unit
 from pointsplat_ns.rooms.textures import Canvas
 
@@ -218,7 +218,7 @@ def _direct(spec: RoomSpec, position: Tensor, normal: Tensor) -> tuple[Tensor, T
     count = position.shape[1]
     total, seen = torch.zeros(count, 3), torch.zeros(count, len(spec.lights))
     for k, light in enumerate(spec.lights):
-        samples = light_samples(light, LIGHT_SIDE)
+        samples = _light_samples(light, LIGHT_SIDE)
         color = torch.tensor(light.color)
         for sample in samples:
             offset = sample[:, None] - position
@@ -234,6 +234,17 @@ def _direct(spec: RoomSpec, position: Tensor, normal: Tensor) -> tuple[Tensor, T
             total += (cosine * leaving * free / squared / math.pi / len(samples))[:, None] * color
             seen[:, k] += free / len(samples)
     return total, seen
+
+
+def _light_samples(light: Light, side: int) -> Tensor:
+    """(side * side, 3) points spread over a light; one point for a ball."""
+    center = torch.tensor(light.center)
+    if light.normal is None:
+        return center[None]
+    steps = (torch.arange(side) + 0.5) / side * 2 - 1
+    u, v = torch.meshgrid(steps, steps, indexing="ij")
+    edges = torch.tensor(light.edge_u), torch.tensor(light.edge_v)
+    return center + u.reshape(-1, 1) * edges[0] + v.reshape(-1, 1) * edges[1]
 
 
 def _gather(spec: RoomSpec, texture: Grid, position: Tensor, normal: Tensor, shapes: list[tuple[int, int]]):

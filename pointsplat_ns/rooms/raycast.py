@@ -65,7 +65,10 @@ class Primitives:
     def solids(self) -> list["_Solid"]:
         """Each primitive as plain numbers, for the loops over rays."""
         rows = zip(self.kind.tolist(), self.center.tolist(), self.half.tolist(), self.yaw.tolist(), strict=True)
-        return [_Solid(kind, *center, *half, math.cos(yaw), math.sin(yaw)) for kind, center, half, yaw in rows]
+        return [
+            _Solid(kind, x, y, z, hx, hy, hz, math.cos(yaw), math.sin(yaw))
+            for kind, (x, y, z), (hx, hy, hz), yaw in rows
+        ]
 
     def corners(self) -> Tensor:
         """(P, 8, 3), corners of each bounding box, world."""

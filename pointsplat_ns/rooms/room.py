@@ -1,246 +1,43 @@
-"""Built-in synthetic rooms: procedural, furnished, lit, with highlights that move with the viewer.
+"""A room: what its seed decided about it, with its textures and light."""
 
->>> room = make_room(seed=3)
->>> poses = capture_path(room, frames=40, seed=3)
->>> K = default_intrinsics(320, 240)
->>> rgb, depth = render_room(room, poses[0], K, 320, 240)
-"""
-
-import json
-import os
-import shutil
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-
-import numpy as np
-import torch
-from torch import Tensor
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.rooms.camera_path import capture_path
-from pointsplat_ns.rooms.layout import Light, RoomSpec, sample_room
-from pointsplat_ns.rooms.light import BakedRoom, bake, one_thread
-from pointsplat_ns.rooms.raycast import dot, surface, trace_camera, unit
-
-DEPTH_SCALE = 6553.5  # raw counts per metre, as in Replica's files: 10 m fill 16 bits
-SUBPIXELS = 2  # rays per pixel and axis
-_BAND = 1 << 15  # rays of a band of rows
-FOCAL = 0.62  # focal length over width: 78 degrees across
-
-__all__ = ["Room", "capture_path", "default_intrinsics", "make_room", "render_room", "write_room"]
+from pointsplat_ns.rooms.building import RoomSpec
+from pointsplat_ns.rooms.layout import sample_room
+from pointsplat_ns.rooms.light import BakedRoom, bake
 
 
 @dataclass(frozen=True)
 class Room:
-    """A synthetic room; its textures and light are computed when first pictured."""
+    """A synthetic room; its textures and light are computed when it is first rendered.
+
+    Attributes:
+        spec: its kind, size, solids, materials and lights.
+    """
 
     spec: RoomSpec
 
     @cached_property
     def baked(self) -> BakedRoom:
+        """Textures and light; computing them takes a second or two."""
         return bake(self.spec)
 
 
 def make_room(seed: int) -> Room:
     """The room of a seed: its kind, size, furniture, materials and lights.
 
+    Args:
+        seed: 0 or more; the same seed gives the same room.
+
     Raises:
-        DataError: A negative seed.
+        DataError: if the seed is negative.
+
+    Example:
+        >>> make_room(3).spec.kind
+        'dining'
     """
     if seed < 0:
         raise DataError(f"room seed {seed}: expected 0 or more")
     return Room(sample_room(seed))
-
-
-def default_intrinsics(width: int, height: int) -> Tensor:
-    """(3, 3) intrinsics in pixels of the rooms' camera, the first pixel's centre at (0.5, 0.5)."""
-    focal = FOCAL * width
-    return torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-
-
-def render_room(
-    room: Room,
-    c2w: Tensor,  # [4, 4]
-    K: Tensor,  # [3, 3]
-    width: int,
-    height: int,
-    highlights: bool = True,
-) -> tuple[Tensor, Tensor]:
-    """Pictures a room.
-
-    Args:
-        room: The room.
-        c2w: (4, 4) camera-to-world, OpenCV axes, inside the room.
-        K: (3, 3) intrinsics in pixels, the first pixel's centre at (0.5, 0.5).
-        width, height: Pixels.
-        highlights: False leaves out all that depends on the viewer (for tests and comparison).
-
-    Returns:
-        rgb (H, W, 3) in [0, 1], sRGB-like (gamma 2.2), and depth (H, W) along the optical axis in
-        metres, of the ray through each pixel's centre.
-    """
-    c2w, K = c2w.float(), K.float()
-    step = max(_BAND // (width * SUBPIXELS**2), 1)
-    bands = []
-    with one_thread(), torch.no_grad():
-        for first in range(0, height, step):
-            band = K.clone()
-            band[1, 2] -= first
-            bands.append(_render_band(room, c2w, band, width, min(step, height - first), highlights))
-    rgb, depth = zip(*bands, strict=True)
-    return torch.cat(rgb), torch.cat(depth)
-
-
-def _render_band(room: Room, c2w: Tensor, K: Tensor, width: int, height: int, highlights: bool):
-    """:func:`render_room` for some rows: small enough that intermediate results stay in the cache."""
-    prims, baked = room.spec.primitives, room.baked
-    rays = _camera_rays(K, width, height, SUBPIXELS)
-    depth, index = trace_camera(prims, c2w, rays, K, SUBPIXELS)
-    radiance = _shade(baked, c2w, rays, K, depth, index, highlights)
-    display = 1.0 - torch.exp(-radiance * (1.6 * baked.exposure))  # [SH, SW, 3]
-    display = display.reshape(height, SUBPIXELS, width, SUBPIXELS, 3).mean(dim=(1, 3))
-    center, _ = trace_camera(prims, c2w, _camera_rays(K, width, height, 1), K, 1)
-    return display.clamp(0, 1) ** (1 / 2.2), center
-
-
-def write_room(
-    folder: Path,
-    seed: int,
-    frames: int = 80,
-    width: int = 320,
-    height: int = 240,
-    progress: bool = True,
-    style: str = "rounds",
-) -> Path:
-    """Writes a captured room in the Replica layout, beside ``folder`` first and then renamed to it.
-
-    Args:
-        folder: The scene folder to make; its parents are made too.
-        seed: Which room.
-        frames: Pictures to take.
-        width, height: Pixels of a picture.
-        progress: Show a progress bar.
-        style: How the camera is led, see :func:`capture_path`.
-
-    Returns:
-        ``folder``.
-
-    Raises:
-        DataError: ``folder`` exists and is not empty, or a size is not positive.
-    """
-    from PIL import Image
-
-    folder = Path(folder)
-    if frames < 2 or width < 8 or height < 8:
-        raise DataError(f"room of {frames} frames, {width} x {height}: expected at least 2 frames of 8 x 8 pixels")
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise DataError(f"{folder}: exists and is not an empty folder; remove it or name another")
-    room = make_room(seed)
-    poses = capture_path(room, frames, seed, style)
-    K = default_intrinsics(width, height)
-    partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
-    try:
-        (partial / "results").mkdir(parents=True)
-        for number in _tracked(range(frames), progress, f"Room {seed} ({room.spec.kind})"):
-            rgb, depth = render_room(room, poses[number], K, width, height)
-            pixels = (rgb * 255).round().to(torch.uint8).numpy()
-            raw = (depth * DEPTH_SCALE).round().clamp(0, 65534).numpy().astype(np.uint16)
-            # Without chroma subsampling: coloured edges stay sharp.
-            Image.fromarray(pixels).save(partial / "results" / f"frame{number:06d}.jpg", quality=97, subsampling=0)
-            Image.fromarray(raw).save(partial / "results" / f"depth{number:06d}.png", compress_level=1)
-        lines = [" ".join(f"{v:.9g}" for v in pose.double().reshape(-1).tolist()) for pose in poses]
-        (partial / "traj.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
-        # Replica's files count from the first pixel's centre, hence the half pixel less.
-        camera = {
-            "w": width,
-            "h": height,
-            "fx": float(K[0, 0]),
-            "fy": float(K[1, 1]),
-            "cx": width / 2 - 0.5,
-            "cy": height / 2 - 0.5,
-            "scale": DEPTH_SCALE,
-        }
-        (partial / "cam_params.json").write_text(json.dumps({"camera": camera}, indent=1) + "\n", encoding="utf-8")
-        os.replace(partial, folder)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-    return folder
-
-
-def _camera_rays(K: Tensor, width: int, height: int, subpixels: int) -> Tensor:
-    """(3, H * s, W * s) camera-space directions with z = 1 through the middles of all subpixels."""
-    x = (torch.arange(width * subpixels) + 0.5) / subpixels
-    y = (torch.arange(height * subpixels) + 0.5) / subpixels
-    v, u = torch.meshgrid(y, x, indexing="ij")
-    return torch.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], torch.ones_like(u)])
-
-
-def _shade(baked: BakedRoom, c2w: Tensor, rays: Tensor, K: Tensor, depth: Tensor, index: Tensor, highlights: bool):
-    """Radiance (SH, SW, 3): texture times baked light, plus what shines, plus highlights."""
-    shape = depth.shape
-    z = depth.reshape(-1)
-    direction = c2w[:3, :3] @ rays.reshape(3, -1)
-    points = c2w[:3, 3:] + direction * z
-    hits = surface(baked.spec.primitives, points, index.reshape(-1))
-    view = -unit(direction)
-    facing = dot(view, hits.normal).abs().clamp(min=0.05)
-    # A sample's patch is z / f wide and stretched by 1 / facing one way: the geometric mean of both.
-    footprint = z / (K[0, 0] * SUBPIXELS) / facing.sqrt()
-    color = baked.texture.sample_footprint(hits.chart, hits.u, hits.v, footprint)
-    light = baked.light.sample(hits.chart, hits.u, hits.v, torch.zeros_like(hits.chart))
-    emission = baked.emission[hits.chart]
-    # What shines is shown as painted, whatever the room's exposure.
-    radiance = color * (light[:, :3] + emission[:, None] / baked.exposure)
-    if highlights:
-        for k, source in enumerate(baked.spec.lights):
-            seen = light[:, 3 + k] * baked.gloss[hits.chart]
-            part = (seen > 1e-3).nonzero()[:, 0]
-            shininess = baked.shininess[hits.chart[part]]
-            where = (values.index_select(1, part) for values in (points, hits.normal, view))
-            lobe = _highlight(source, *where, shininess)
-            tint = torch.tensor(source.color)
-            radiance.index_add_(0, part, (seen[part] * lobe)[:, None] * (tint / tint.max() / baked.exposure))
-    return radiance.reshape(*shape, 3)
-
-
-def _highlight(light: Light, points: Tensor, normal: Tensor, view: Tensor, shininess: Tensor) -> Tensor:
-    """Blinn-Phong highlight (M,) of one light at points (3, M), in [0, 4].
-
-    The half vector is taken to the point of the light nearest to where the mirrored view ray meets
-    its plane (a representative point, Karis 2013), so that a window gives a window-shaped gleam.
-    Schlick's factor, four times the strength at grazing view, follows the half vector.
-    """
-    mirrored = 2 * dot(view, normal) * normal - view
-    way = unit(_representative(light, points, mirrored) - points)
-    half = unit(way + view)
-    cosine = dot(half, normal).clamp(min=1e-6)
-    lobe = torch.exp(shininess * torch.log(cosine))
-    if light.normal is not None:
-        leaving = -dot(way, light.normal)
-        lobe = lobe * leaving.clamp(0, 0.3) / 0.3  # a soft end at the light's own plane
-    lobe = lobe * (dot(way, normal) / 0.1).clamp(0, 1)  # and at the surface's horizon
-    return lobe * (1 + 3 * (1 - dot(half, view).clamp(0, 1)) ** 5)
-
-
-def _representative(light: Light, points: Tensor, mirrored: Tensor) -> Tensor:
-    """(3, M) or (3, 1) points of a light."""
-    center = torch.tensor(light.center)[:, None]
-    if light.normal is None:
-        return center
-    slope = dot(mirrored, light.normal).clamp(max=-1e-3)
-    distance = dot(center - points, light.normal) / slope
-    meet = points + mirrored * distance.clamp(0, 100) - center
-    target = center
-    for edge in (light.edge_u, light.edge_v):
-        along = (dot(meet, edge) / dot(edge, edge)).clamp(-1, 1)
-        target = target + along * torch.tensor(edge)[:, None]
-    return target
-
-
-def _tracked(items, progress: bool, description: str):
-    if not progress:
-        return items
-    from rich.progress import track
-
-    return track(items, description=description)

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from pointsplat_ns.rooms import make_room
 from pointsplat_ns.rooms.raycast import (
     BOX,
     CHARTS,
@@ -19,7 +20,6 @@ from pointsplat_ns.rooms.raycast import (
     trace_camera,
     unit_interval,
 )
-from pointsplat_ns.rooms.room import make_room
 
 
 def solids(*rows):

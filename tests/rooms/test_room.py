@@ -10,9 +10,9 @@ from PIL import Image
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_depth, read_photo
-from pointsplat_ns.rooms.camera_path import CLEARANCE, clearance
+from pointsplat_ns.rooms import capture_path, default_intrinsics, make_room, render_room, write_room
+from pointsplat_ns.rooms.camera_path import CLEARANCE, STYLES, clearance
 from pointsplat_ns.rooms.raycast import BOX, CHARTS, chart_points, chart_starts, trace_camera
-from pointsplat_ns.rooms.room import capture_path, default_intrinsics, make_room, render_room, write_room
 from pointsplat_ns.rooms.textures import Canvas
 
 WIDTH, HEIGHT = 96, 72
@@ -131,6 +131,12 @@ def test_cameras_keep_clear_of_furniture_move_smoothly_and_look_level(seed):
     turns = (rotation[1:, :, 2] * rotation[:-1, :, 2]).sum(-1).clamp(-1, 1).arccos().rad2deg()
     assert float(turns.max()) < 30  # of the 78 degrees of view: neighbours always overlap by more than half
     assert float(poses[:, 2, 3].max() - poses[:, 2, 3].min()) > 0.3
+
+
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("frames", [2, 6, 7])
+def test_every_style_gives_the_frames_that_were_asked_for(room, style, frames):
+    assert capture_path(room, frames, 3, style).shape == (frames, 4, 4)
 
 
 @pytest.mark.parametrize("seed", [1, 2])

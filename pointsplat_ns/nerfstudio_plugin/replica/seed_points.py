@@ -2,7 +2,9 @@
 
 import numpy as np
 
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.replica.layout import ReplicaScene, read_depth, read_photo
+from pointsplat_ns.system.progress import tracked
 
 MAX_FRAMES = 200
 """Depth images read at most: neighbours in a video of 2,000 frames see the same surfaces."""
@@ -14,6 +16,9 @@ EDGE = 0.05
 """A pixel whose depth differs from a neighbour's by more than this share lies on an outline, where
 sensors and resampling invent points between two surfaces. A plane steps that far from one pixel to
 the next only at grazing angles (over 85 degrees for usual lenses)."""
+
+WORTH_A_BAR = 20
+"""Depth images from which on a progress bar is shown: fewer take about a second."""
 
 
 def fuse_depth(
@@ -38,14 +43,21 @@ def fuse_depth(
     Returns:
         xyz float32 (P, 3) in scene units and rgb uint8 (P, 3), P <= ``num_points``; P = 0 where no
         pixel has a depth.
+
+    Raises:
+        DataError: The scene has no depth images.
     """
+    depths = scene.depths
+    if depths is None:
+        raise DataError(f"{scene.folder}: no depth images; expected one for every photo")
     chosen = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), MAX_FRAMES)).round().astype(int))
     params = scene.params
     budget = max(num_points * SAMPLES_PER_POINT // len(chosen), 1)
     step = max(int(np.ceil(np.sqrt(params.width * params.height / budget))), 1)
     all_xyz, all_rgb = [], []
-    for order, index in enumerate(_tracked(chosen, progress)):
-        depth = read_depth(scene.depths[index], params)
+    shown = progress and len(chosen) >= WORTH_A_BAR
+    for order, index in enumerate(tracked(chosen, "Seed points from depth", len(chosen), shown)):
+        depth = read_depth(depths[index], params)
         valid = _inner(depth)
         # The grid's offset walks over the step x step cell from frame to frame, in strides prime to it.
         offset = (order * (step + 1)) % (step * step)
@@ -121,11 +133,3 @@ def _inner(depth: np.ndarray) -> np.ndarray:
         inner[tuple(before)] &= joined
         inner[tuple(after)] &= joined
     return inner
-
-
-def _tracked(items: np.ndarray, progress: bool):
-    if not progress or len(items) < 20:
-        return items
-    from rich.progress import track
-
-    return track(items, description="Seed points from depth", transient=True)

@@ -2,6 +2,7 @@
 
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -216,6 +217,12 @@ def test_seed_points_avoid_outlines_and_unknown_pixels(tmp_path):
     xyz, _ = fuse_depth(scene, 1000, scene.params.principal_point())
     # Lost: the columns on both sides of the step, the unknown pixel and its two other neighbours.
     assert len(xyz) == 6 * 6 - 3 and set(np.unique(xyz[:, 2])) == {1.0, 3.0}
+
+
+def test_seed_points_of_a_scene_without_depth_are_refused(tmp_path):
+    scene = load_replica(write_scene(tmp_path / "s"))
+    with pytest.raises(DataError, match="no depth images"):
+        fuse_depth(replace(scene, depths=None), 1000, scene.params.principal_point())
 
 
 def test_thinning_is_even_bounded_and_keeps_means():

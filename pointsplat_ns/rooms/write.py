@@ -1,0 +1,89 @@
+"""Rooms as data sets on disk, as if somebody had captured them."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.rooms.camera_path import capture_path
+from pointsplat_ns.rooms.render import default_intrinsics, render_room
+from pointsplat_ns.rooms.room import make_room
+from pointsplat_ns.system.progress import Progress, tracked
+
+DEPTH_SCALE = 6553.5  # raw counts per metre, as in Replica's files: 10 m fill 16 bits
+
+
+def write_room(
+    folder: Path,
+    seed: int,
+    frames: int = 80,
+    width: int = 320,
+    height: int = 240,
+    progress: bool | Progress = True,
+    style: str = "rounds",
+) -> Path:
+    """Write photos, depth images and poses of a room in the Replica layout: whole, or not at all.
+
+    Args:
+        folder: the scene folder to make; its parents are made too.
+        seed: which room.
+        frames: photos to take, at least 2.
+        width: of a photo, pixels, at least 8.
+        height: of a photo, pixels, at least 8.
+        progress: True shows a bar; a function is called with what is being done and the share done of it.
+        style: how the camera is led, see :func:`~pointsplat_ns.rooms.camera_path.capture_path`.
+
+    Returns:
+        ``folder``.
+
+    Raises:
+        DataError: if ``folder`` exists and is not an empty folder, or there are too few frames or pixels.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     scene = write_room(Path(folder) / "room3", seed=3, frames=2, width=32, height=24, progress=False)
+        ...     sorted(path.name for path in scene.iterdir())
+        ['cam_params.json', 'results', 'traj.txt']
+    """
+    from PIL import Image
+
+    folder = Path(folder)
+    if frames < 2 or width < 8 or height < 8:
+        raise DataError(f"room of {frames} frames, {width} x {height}: expected at least 2 frames of 8 x 8 pixels")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise DataError(f"{folder}: exists and is not an empty folder; remove it or name another")
+    room = make_room(seed)
+    poses = capture_path(room, frames, seed, style)
+    K = default_intrinsics(width, height)
+    partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
+    try:
+        (partial / "results").mkdir(parents=True)
+        for number in tracked(range(frames), f"Room {seed} ({room.spec.kind})", frames, progress):
+            rgb, depth = render_room(room, poses[number], K, width, height)
+            pixels = (rgb * 255).round().to(torch.uint8).numpy()
+            raw = (depth * DEPTH_SCALE).round().clamp(0, 65534).numpy().astype(np.uint16)
+            # Without chroma subsampling: coloured edges stay sharp.
+            Image.fromarray(pixels).save(partial / "results" / f"frame{number:06d}.jpg", quality=97, subsampling=0)
+            Image.fromarray(raw).save(partial / "results" / f"depth{number:06d}.png", compress_level=1)
+        lines = [" ".join(f"{v:.9g}" for v in pose.double().reshape(-1).tolist()) for pose in poses]
+        (partial / "traj.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        # Replica's files count from the first pixel's centre, hence the half pixel less.
+        camera = {
+            "w": width,
+            "h": height,
+            "fx": float(K[0, 0]),
+            "fy": float(K[1, 1]),
+            "cx": width / 2 - 0.5,
+            "cy": height / 2 - 0.5,
+            "scale": DEPTH_SCALE,
+        }
+        (partial / "cam_params.json").write_text(json.dumps({"camera": camera}, indent=1) + "\n", encoding="utf-8")
+        os.replace(partial, folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return folder
