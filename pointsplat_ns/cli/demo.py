@@ -67,10 +67,10 @@ def demo(
     evaluation, pictures = output / "evaluation.json", output / "pictures"
     run(f"ns-eval --load-config {trained / 'config.yml'} --output-path {evaluation} --render-output-path {pictures}")
     splat = output / f"{UNSEEN}_refined.ply"
-    run(f"pointsplat export {trained} -o {splat}")
+    run(f"pointsplat export {trained} -o {splat} --force")
     dense, small = scenes / UNSEEN / "splatfacto-cpu" / "demo", output / f"{UNSEEN}_compact.ply"
     views = output / "compact.png"
-    run(f"pointsplat compact {dense} --keep {keep} -o {small} --picture {views}")
+    run(f"pointsplat compact {dense} --keep {keep} -o {small} --picture {views} --force")
 
     results = read_evaluation(evaluation)
     picture = output / "before_after.png"

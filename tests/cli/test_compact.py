@@ -10,13 +10,14 @@ import pytest
 import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
-import pointsplat_ns.compression.compact as shipped
+import pointsplat_ns.compression.compact as compact_module
 from making import ball, same
+from pointsplat_ns import api
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression.prune import ALL_METHODS
+from pointsplat_ns.compression import trained_refiner
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, read_scene, write_ply
-from pointsplat_ns.pruning import compact
+from pointsplat_ns.pruning import METHODS, prune
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
 
 
@@ -30,7 +31,7 @@ def weights(path: Path, head: str, moved: float, **metadata) -> Path:
     refiner = Refiner(preset("tiny"))
     with torch.no_grad():
         [*refiner.heads.mlps[head].modules()][-1].bias.fill_(moved)
-    save_refiner(refiner, path, {"keep": 0.5, "score": "opacity", **metadata})
+    save_refiner(refiner, path, {"keep": 0.5, "by": "opacity", **metadata})
     return path
 
 
@@ -69,12 +70,12 @@ def refusal(capsys, output: Path, *args) -> str:
 
 def test_refinement_that_helps_is_written_and_shown(ply, helps, tmp_path, capsys):
     output = tmp_path / "new" / "small.ply"
-    run("compact", ply, "--using", helps, "-o", output, "--picture", tmp_path / "shown.png")
-    kept = compact(read_ply(ply), 0.5, "opacity")
+    run("compact", ply, "--refiner", helps, "-o", output, "--picture", tmp_path / "shown.png")
+    kept = prune(read_ply(ply), 0.5, "opacity")
     assert same(read_ply(output), kept.replace(scales=kept.scales + 0.05))
     said = capsys.readouterr().out
     assert re.search(r"small.ply: kept and refined 75 of 150 Gaussians \(50.0 %\), .* MB, in .* s", said)
-    before, after = map(float, re.search(r"\nrefinement: ([\d.]+) -> ([\d.]+) dB .* in 12 views", said).groups())
+    before, after = map(float, re.search(r"(?m)^refinement: ([\d.]+) -> ([\d.]+) dB .* in 12 views", said).groups())
     assert after > before
     assert "\nposes sampled in free space\n" in said and "SH degree" in said
     assert "shown.png: dense, before refinement, refined, side by side" in said
@@ -84,69 +85,71 @@ def test_refinement_that_helps_is_written_and_shown(ply, helps, tmp_path, capsys
 
 
 def test_refinement_that_harms_is_left_out_and_it_is_said(ply, harms, tmp_path, capsys):
-    run("compact", ply, "--using", harms, "-o", tmp_path / "small.ply", "--picture", tmp_path / "shown.png")
-    assert same(read_ply(tmp_path / "small.ply"), compact(read_ply(ply), 0.5, "opacity"))
+    run("compact", ply, "--refiner", harms, "-o", tmp_path / "small.ply", "--picture", tmp_path / "shown.png")
+    assert same(read_ply(tmp_path / "small.ply"), prune(read_ply(ply), 0.5, "opacity"))
     said = capsys.readouterr().out
     assert "small.ply: kept 75 of 150" in said
-    before, after = map(
-        float, re.search(r"\nrefinement left out, it does not help: ([\d.]+) -> ([\d.]+) dB", said).groups()
-    )
+    left_out = re.search(r"(?m)^refinement left out, it does not help: ([\d.]+) -> ([\d.]+) dB", said)
+    before, after = map(float, left_out.groups())
     assert after < before and "refined (left out), side by side" in said
 
 
 def test_options_go_before_what_the_refiner_was_trained_with_and_a_dry_run_writes_nothing(ply, helps, tmp_path, capsys):
     options = ("--keep", "9", "--by", "merge", "--sh", "0")
-    run("compact", ply, "--using", helps, *options, "-o", tmp_path / "small.ply")
-    made = read_ply(tmp_path / "small.ply")
-    assert len(made) == 9 and made.sh_degree == 0
+    run("compact", ply, "--refiner", helps, *options, "-o", tmp_path / "small.ply")
+    small = read_ply(tmp_path / "small.ply")
+    assert len(small) == 9 and small.sh_degree == 0
     said = capsys.readouterr().out
     (tmp_path / "small.ply").unlink()
-    run("compact", ply, "--using", helps, *options, "--dry-run")
+    run("compact", ply, "--refiner", helps, *options, "--dry-run")
     dry = capsys.readouterr().out
     assert "dry run, nothing is written" in dry and list(tmp_path.iterdir()) == []
-    assert said.splitlines()[1:] == dry.splitlines()[1:]
+    assert [line for line in said.splitlines() if "small.ply" not in line] == [
+        line for line in dry.splitlines() if "dry run" not in line
+    ]
 
 
 def test_an_auto_budget_is_met_with_or_without_refinement(ply, helps, tmp_path, capsys):
     for by in ("coverage", "merge"):
-        run("compact", ply, "--using", helps, "--keep", "auto:20", "--by", by, "-o", tmp_path / "small.ply")
+        run("compact", ply, "--refiner", helps, "--keep", "auto:20", "--by", by, "-o", tmp_path / f"{by}.ply")
         said = capsys.readouterr().out
-        reached = float(re.search(r"\nrenders reach ([\d.]+) dB", said)[1])
-        before, after = map(float, re.search(r"\nrefinement.*?([\d.]+) -> ([\d.]+) dB", said).groups())
+        reached = float(re.search(r"(?m)^renders reach ([\d.]+) dB", said)[1])
+        before, after = map(float, re.search(r"(?m)^refinement.*?([\d.]+) -> ([\d.]+) dB", said).groups())
         assert before == pytest.approx(reached, abs=0.06) and before >= 20  # the same views, another rounding
 
 
 def test_a_run_is_compared_from_the_poses_of_its_dataset_and_as_it_was_drawn(helps, trained_walls, tmp_path, capsys):
     (source,) = (trained_walls / "wall-b" / "splatfacto-cpu").iterdir()
     seen = []
-    draw_one = shipped.DenseReference
+    dense_reference = compact_module.DenseReference
 
-    class Watched(draw_one):
+    class Watched(dense_reference):
         def __init__(self, dense, views):
             seen.append((views.rasterize_mode, views.background.tolist(), views.width))
             super().__init__(dense, views)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shipped, "DenseReference", Watched)
-        run("compact", source, "--using", helps, "-o", tmp_path / "small.ply")
+        patch.setattr(compact_module, "DenseReference", Watched)
+        run("compact", source, "--refiner", helps, "-o", tmp_path / "small.ply")
     assert "poses of the dataset" in capsys.readouterr().out
     assert seen == [("antialiased", [1.0, 1.0, 1.0], 64)]
     assert len(read_ply(tmp_path / "small.ply")) == round(len(read_scene(source)) / 2 + 0.1)
 
 
-def test_a_trained_run_may_be_used(ply, make_refined_run, tmp_path, capsys):
-    using = make_refined_run(tmp_path / "run", tmp_path / "nowhere", moved=-6.0)
-    run("compact", ply, "--using", using, "-o", tmp_path / "small.ply")
-    assert same(read_ply(tmp_path / "small.ply"), compact(read_ply(ply), 0.5, "paper"))
+@pytest.mark.parametrize("option", ["--refiner", "--using"])  # as it was once called
+def test_a_trained_run_may_be_used(option, ply, make_refined_run, tmp_path, capsys):
+    trained = make_refined_run(tmp_path / "run", tmp_path / "nowhere", moved=-6.0)
+    run("compact", ply, option, trained, "-o", tmp_path / "small.ply")
+    assert same(read_ply(tmp_path / "small.ply"), prune(read_ply(ply), 0.5, "paper"))
     assert "left out, it does not help" in capsys.readouterr().out
 
 
-def test_without_using_it_is_the_refiner_that_ships(ply, tmp_path, capsys, monkeypatch):
+def test_if_none_is_named_it_is_the_refiner_that_ships(ply, tmp_path, capsys, monkeypatch):
     (tmp_path / "empty").mkdir()
-    monkeypatch.setattr(shipped, "SHIPPED", tmp_path / "refiner.safetensors")
+    monkeypatch.setattr(trained_refiner, "PRETRAINED", tmp_path / "refiner.safetensors")
     said = refusal(capsys, tmp_path / "empty" / "small.ply", ply)
-    assert "--using RUN_OR_FILE" in said and "pointsplat make-refiner" in said
-    weights(shipped.SHIPPED, "scales", 0.15, keep=0.2)
+    assert "--refiner RUN_OR_FILE" in said and "pointsplat make-refiner" in said
+    weights(tmp_path / "refiner.safetensors", "scales", 0.15, keep=0.2)
     run("compact", ply, "-o", tmp_path / "small.ply")
     assert len(read_ply(tmp_path / "small.ply")) == 30
 
@@ -154,7 +157,7 @@ def test_without_using_it_is_the_refiner_that_ships(ply, tmp_path, capsys, monke
 def test_where_nothing_can_be_compared_that_is_said_and_no_picture_is_drawn(helps, tmp_path, capsys):
     write_ply(room()[5:6].replace(opacities=torch.tensor([[-4.0]])), tmp_path / "faint.ply")
     run(
-        *("compact", tmp_path / "faint.ply", "--using", helps, "--keep", "1"),
+        *("compact", tmp_path / "faint.ply", "--refiner", helps, "--keep", "1"),
         *("-o", tmp_path / "small.ply", "--picture", tmp_path / "shown.png"),
     )
     said = capsys.readouterr().out
@@ -166,35 +169,50 @@ def test_where_nothing_can_be_compared_that_is_said_and_no_picture_is_drawn(help
 def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
     ply, helps, trained_walls, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(shipped, "compact_scene", None)  # a call of it would be no error of ours
+    monkeypatch.setattr(api, "prune_scene", None)  # a call of it would be no error of ours
+    monkeypatch.setattr(compact_module, "prune_scene", None)
     output = tmp_path / "small.ply"
     (splatfacto,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
-    said = refusal(capsys, output, ply, "--using", splatfacto)
+    said = refusal(capsys, output, ply, "--refiner", splatfacto)
     assert "splatfacto-cpu; expected a pointsplat run" in said
-    assert "expected a trained pointsplat run" in refusal(capsys, output, ply, "--using", ply)
-    assert "no such file" in refusal(capsys, output, ply, "--using", tmp_path / "gone")
-    assert "no such file" in refusal(capsys, output, ply, "--using", tmp_path / "gone.safetensors")
+    assert "expected a trained pointsplat run" in refusal(capsys, output, ply, "--refiner", ply)
+    assert "no such file" in refusal(capsys, output, ply, "--refiner", tmp_path / "gone")
+    assert "no such file" in refusal(capsys, output, ply, "--refiner", tmp_path / "gone.safetensors")
     torn = tmp_path / "torn.safetensors"
     torn.write_bytes(helps.read_bytes()[:1000])
-    assert "torn.safetensors: not a readable" in refusal(capsys, output, ply, "--using", torn)
-    assert "gone.ply: no such file" in refusal(capsys, output, tmp_path / "gone.ply", "--using", helps)
-    assert "keep is 'half'" in refusal(capsys, output, ply, "--using", helps, "--keep", "half")
-    assert "ends in .ply" in refusal(capsys, tmp_path / "small.splat", ply, "--using", helps)
-    assert "ends in .png" in refusal(capsys, output, ply, "--using", helps, "--picture", tmp_path / "shown.jpg")
+    assert "torn.safetensors: not a readable" in refusal(capsys, output, ply, "--refiner", torn)
+    assert "gone.ply: no such file" in refusal(capsys, output, tmp_path / "gone.ply", "--refiner", helps)
+    assert "keep is 'half'" in refusal(capsys, output, ply, "--refiner", helps, "--keep", "half")
+    assert "ends in .ply" in refusal(capsys, tmp_path / "small.splat", ply, "--refiner", helps)
+    assert "ends in .png" in refusal(capsys, output, ply, "--refiner", helps, "--picture", tmp_path / "shown.jpg")
     write_ply(room()[:0], tmp_path / "empty.ply")
-    assert "Gaussians" in refusal(capsys, output, tmp_path / "empty.ply", "--using", helps)
+    assert "Gaussians" in refusal(capsys, output, tmp_path / "empty.ply", "--refiner", helps)
     refiner = Refiner(preset("tiny", sh_degree=0))
     save_refiner(refiner, tmp_path / "flat.safetensors")
-    said = refusal(capsys, output, ply, "--using", tmp_path / "flat.safetensors")
+    said = refusal(capsys, output, ply, "--refiner", tmp_path / "flat.safetensors")
     assert "SH degree 1" in said and "--sh 0" in said
-    with pytest.raises(SystemExit) as caught:
-        run("compact", ply, "--using", helps)
-    assert caught.value.code == 1 and "--output is missing" in capsys.readouterr().err
 
 
-def test_every_method_can_be_asked_for():
-    from typing import get_args
+def test_a_name_is_made_up_where_none_is_given(helps, tmp_path, capsys):
+    write_ply(room(), tmp_path / "room.ply")
+    run("compact", tmp_path / "room.ply", "--refiner", helps)
+    assert len(read_ply(tmp_path / "room_compact.ply")) == 75
+    assert f"{tmp_path / 'room_compact.ply'}: kept and refined 75 of 150" in capsys.readouterr().out
 
-    from pointsplat_ns.cli.scenes import Method
 
-    assert get_args(Method) == ALL_METHODS
+def test_files_that_exist_are_only_overwritten_by_force(ply, helps, tmp_path, capsys):
+    output, shown = tmp_path / "small.ply", tmp_path / "shown.png"
+    output.write_text("precious")
+    said = refusal(capsys, output, ply, "--refiner", helps)
+    assert f"{output}: exists already" in said and "--force" in said
+    shown.write_text("precious")
+    said = refusal(capsys, tmp_path / "other.ply", ply, "--refiner", helps, "--picture", shown)
+    assert f"{shown}: exists already" in said and "--force" in said
+    assert output.read_text() == shown.read_text() == "precious"
+    run("compact", ply, "--refiner", helps, "-o", output, "--picture", shown, "--force")
+    assert len(read_ply(output)) == 75 and shown.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_method_that_there_is_not_is_refused_with_the_list_of_those_there_are(ply, helps, tmp_path, capsys):
+    said = refusal(capsys, tmp_path / "small.ply", ply, "--refiner", helps, "--by", "best")
+    assert f"expected one of {', '.join(METHODS)}" in said

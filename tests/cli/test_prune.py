@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import re
 import shutil
 import subprocess
 import sys
@@ -13,13 +15,13 @@ import torch
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 from making import same
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression.budget_search import DenseReference
-from pointsplat_ns.compression.prune import COMPARED_VIEWS, IMAGE_SCORES
-from pointsplat_ns.compression.refined_run import open_refined_run
+from pointsplat_ns.compression.closeness import DenseReference
+from pointsplat_ns.compression.trained_refiner import open_refiner_run, scenes_of_run
+from pointsplat_ns.compression.view_source import COMPARED_VIEWS
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, read_scene, write_ply
-from pointsplat_ns.pruning import SCORES, compact, prune, select
-from pointsplat_ns.views import dataset_views
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.pruning import METHODS, prune, select
 
 SEED = 5
 
@@ -52,16 +54,18 @@ def run(*args) -> None:
     main([str(a) for a in args])
 
 
-def refusal(capsys, output: Path, *args) -> str:
-    """The one line on stderr with which a command refuses; it prints nothing else and writes nothing."""
+def refusal(capsys, output: Path, *args, warnings: int = 0) -> str:
+    """The line on stderr with which a command refuses, after so many lines of warnings; it prints nothing else and
+    writes nothing."""
     before = sorted(output.parent.rglob("*")) if output.parent.is_dir() else None
     with pytest.raises(SystemExit) as caught:
         run(*args, "-o", output)
     said = capsys.readouterr()
     assert caught.value.code == 1 and said.out == ""
-    assert said.err.startswith("error: ") and said.err.count("\n") == 1
+    *warned, error = said.err.splitlines()
+    assert error.startswith("error: ") and len(warned) == warnings
     assert (sorted(output.parent.rglob("*")) if output.parent.is_dir() else None) == before, "partial output"
-    return said.err
+    return error
 
 
 @pytest.mark.parametrize("kind", ["ply", "folder", "config", "ckpt", "bare ckpt"])
@@ -78,7 +82,7 @@ def test_prune_takes_every_kind_of_scene(kind, ply, splatfacto_run, tmp_path, ca
     output = tmp_path / "new" / "out.ply"
     run("prune", scene, "--keep", "0.5", "--by", "paper", "-o", output)
     dense = read_scene(scene)
-    assert same(read_ply(output), prune(dense, 0.5).scene)
+    assert same(read_ply(output), prune(dense, 0.5, "paper"))
     said = capsys.readouterr().out
     assert str(output) in said and f"of {len(dense):,} Gaussians" in said and "MB" in said
     assert [p.name for p in output.parent.iterdir()] == ["out.ply"]
@@ -87,15 +91,15 @@ def test_prune_takes_every_kind_of_scene(kind, ply, splatfacto_run, tmp_path, ca
 @pytest.mark.parametrize(("keep", "kept"), [("0.25", 20), ("25%", 20), ("7", 7), ("1.0", 80), ("1", 1)])
 def test_keep_is_a_ratio_a_percentage_or_a_count(ply, tmp_path, keep, kept):
     run("prune", ply, "--by", "paper", "--keep", keep, "-o", tmp_path / "out.ply")
-    assert same(read_ply(tmp_path / "out.ply"), prune(read_ply(ply), kept).scene)
+    assert same(read_ply(tmp_path / "out.ply"), prune(read_ply(ply), kept, "paper"))
 
 
 def test_prune_scores_as_it_is_told(ply, tmp_path):
     run("prune", ply, "--keep", "9", "--by", "volume", "-o", tmp_path / "volume.ply")
     run("prune", ply, "--keep", "9", "--by", "paper", "--opacity-weight", "1.0", "-o", tmp_path / "opacity.ply")
     dense = read_ply(ply)
-    assert same(read_ply(tmp_path / "volume.ply"), prune(dense, 9, "volume").scene)
-    assert same(read_ply(tmp_path / "opacity.ply"), prune(dense, 9, "opacity").scene)
+    assert same(read_ply(tmp_path / "volume.ply"), prune(dense, 9, "volume"))
+    assert same(read_ply(tmp_path / "opacity.ply"), prune(dense, 9, "opacity"))
 
 
 @pytest.mark.parametrize(
@@ -129,31 +133,36 @@ def test_an_output_that_cannot_be_written_is_refused(ply, tmp_path, capsys):
     assert "cannot be written" in refusal(capsys, ply / "below_a_file.ply", "prune", ply)
 
 
-def test_every_method_can_be_asked_for():
-    from typing import get_args, get_type_hints
-
-    from pointsplat_ns.cli import scenes
-    from pointsplat_ns.compression.prune import ALL_METHODS
-
-    assert get_args(get_type_hints(scenes.prune)["by"]) == ALL_METHODS
+@pytest.mark.parametrize("command", ["prune", "compact"])
+def test_a_method_that_there_is_not_is_refused_with_the_list_of_those_there_are(command, ply, tmp_path, capsys):
+    said = refusal(capsys, tmp_path / "out.ply", command, ply, "--by", "best")
+    assert f"no method is called 'best'; expected one of {', '.join(METHODS)}" in said
 
 
-@pytest.mark.parametrize("by", sorted(SCORES))
+def test_the_help_names_every_method(capsys):
+    with pytest.raises(SystemExit) as caught:
+        run("prune", "--help")
+    words = re.findall(r"[\w-]+", capsys.readouterr().out)
+    assert caught.value.code == 0
+    assert set(METHODS) - set(words) == set()
+
+
+@pytest.mark.parametrize("by", sorted(n for n, method in METHODS.items() if method.score and not method.needs_views))
 def test_prune_by_a_score_keeps_gaussians_bit_for_bit(by, ply, tmp_path):
     run("prune", ply, "--keep", "0.3", "--by", by, "-o", tmp_path / "out.ply")
-    assert same(read_ply(tmp_path / "out.ply"), prune(read_ply(ply), 0.3, by).scene)
+    assert same(read_ply(tmp_path / "out.ply"), prune(read_ply(ply), 0.3, by))
 
 
 def test_prune_merges_if_not_told_otherwise(ply, tmp_path):
     run("prune", ply, "--keep", "0.3", "-o", tmp_path / "out.ply")
-    assert same(read_ply(tmp_path / "out.ply"), compact(read_ply(ply), 0.3))
+    assert same(read_ply(tmp_path / "out.ply"), prune(read_ply(ply), 0.3, "merge"))
 
 
 @pytest.mark.parametrize("by", ["lightgaussian", "pup"])
 def test_prune_looks_from_the_poses_of_the_run(by, splatfacto_run, tmp_path, capsys):
     run("prune", splatfacto_run, "--keep", "0.5", "--by", by, "-o", tmp_path / "out.ply")
     dense, views = read_scene(splatfacto_run), dataset_views(splatfacto_run)
-    wanted = select(IMAGE_SCORES[by](dense, views), len(read_ply(tmp_path / "out.ply")))
+    wanted = select(METHODS[by].score(dense, views), len(read_ply(tmp_path / "out.ply")))
     assert same(read_ply(tmp_path / "out.ply"), dense[wanted])
     assert "poses of the dataset" in capsys.readouterr().out
 
@@ -184,17 +193,109 @@ def test_a_dry_run_says_all_and_writes_nothing(ply, tmp_path, capsys):
 def test_prune_draws_the_distributions_when_it_is_asked_to(ply, tmp_path):
     run("prune", ply, "--by", "paper", "-o", tmp_path / "out.ply")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out.ply", "scene.ply"]
-    run("prune", ply, "--by", "paper", "-o", tmp_path / "out.ply", "--plot", tmp_path / "out.png")
+    run("prune", ply, "--by", "paper", "-o", tmp_path / "out.ply", "--plot", tmp_path / "out.png", "--force")
     assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_prune_refuses_options_that_cannot_be_met_before_it_starts(ply, tmp_path, capsys):
     output = tmp_path / "out.ply"
     assert "ends in .png" in refusal(capsys, output, "prune", ply, "--plot", tmp_path / "out.jpg")
-    assert "--fine-tune -1" in refusal(capsys, output, "prune", ply, "--fine-tune", "-1")
+    assert "-1 steps of fine-tuning" in refusal(capsys, output, "prune", ply, "--fine-tune", "-1")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--by", "best"), "no method is called 'best'"),
+        (("--by", "merge", "--opacity-weight", "0.5"), "opacity weight 0.5: merge does not weigh opacity"),
+        (("--keep", "half"), "keep is 'half'"),
+        (("--fine-tune", "-1"), "-1 steps of fine-tuning"),
+    ],
+)
+def test_options_that_fit_no_scene_are_refused_before_one_is_read(options, message, tmp_path, capsys):
+    assert message in refusal(capsys, tmp_path / "out.ply", "prune", tmp_path / "not_there.ply", *options)
+
+
+@pytest.mark.parametrize("by", sorted(name for name, method in METHODS.items() if not method.weighs_opacity))
+def test_an_opacity_weight_that_would_do_nothing_is_refused(by, ply, tmp_path, capsys):
+    said = refusal(capsys, tmp_path / "out.ply", "prune", ply, "--by", by, "--opacity-weight", "0.5")
+    assert f"{by} does not weigh opacity" in said and "paper, authors, log-volume" in said
+
+
+def test_a_ply_is_written_beside_the_scene_where_no_name_is_given_and_it_is_said(ply, capsys):
+    run("prune", ply, "--keep", "10%")
+    assert sorted(p.name for p in ply.parent.iterdir()) == ["scene.ply", "scene_pruned.ply"]
+    assert same(read_ply(ply.with_name("scene_pruned.ply")), prune(read_ply(ply), 0.1, "merge"))
+    assert f"{ply.with_name('scene_pruned.ply')}: kept 8 of 80 Gaussians" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("named", ["folder", "config", "ckpt", "ckpt seen from its folder"])
+def test_a_run_gets_its_ply_in_its_folder_and_never_among_its_checkpoints(named, splatfacto_run, tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    shutil.copytree(splatfacto_run, folder)
+    before = sorted(folder.rglob("*"))
+    (checkpoint,) = (folder / "nerfstudio_models").iterdir()
+    scene = {"folder": folder, "config": folder / "config.yml", "ckpt": checkpoint}.get(named, Path(checkpoint.name))
+    if named == "ckpt seen from its folder":
+        monkeypatch.chdir(checkpoint.parent)
+    run("prune", scene, "--keep", "10%", "--by", "opacity")
+    assert set(folder.rglob("*")) - set(before) == {folder / "pruned.ply"}
+
+
+def test_a_checkpoint_that_stands_alone_gets_its_ply_beside_it(splatfacto_run, tmp_path):
+    (checkpoint,) = (splatfacto_run / "nerfstudio_models").iterdir()
+    shutil.copy(checkpoint, tmp_path / "alone.ckpt")
+    run("prune", tmp_path / "alone.ckpt", "--keep", "10%", "--by", "opacity")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["alone.ckpt", "alone_pruned.ply"]
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_scene_that_exists_is_only_overwritten_by_force(named, ply, capsys):
+    output = ply.with_name("mine.ply" if named else "scene_pruned.ply")
+    options = ("-o", output) if named else ()
+    output.write_text("precious")
     with pytest.raises(SystemExit) as caught:
-        run("prune", ply)
-    assert caught.value.code == 1 and "--output is missing" in capsys.readouterr().err
+        run("prune", ply, *options)
+    said = capsys.readouterr().err
+    assert caught.value.code == 1
+    assert f"{output}: exists already" in said and "--force" in said
+    assert output.read_text() == "precious"
+    run("prune", ply, *options, "--force")
+    assert len(read_ply(output)) == 24
+
+
+def test_the_scene_itself_is_not_overwritten_either(ply, tmp_path, capsys):
+    before = ply.read_bytes()
+    assert "exists already" in refusal(capsys, ply, "prune", ply)
+    assert "exists already" in refusal(capsys, ply, "export", ply)
+    assert ply.read_bytes() == before
+
+
+def test_a_plot_that_exists_is_only_overwritten_by_force(ply, tmp_path, capsys):
+    (tmp_path / "plot.png").write_text("precious")
+    said = refusal(capsys, tmp_path / "out.ply", "prune", ply, "--plot", tmp_path / "plot.png")
+    assert "plot.png: exists already" in said and "--force" in said
+
+
+def test_a_dry_run_is_not_stopped_by_what_it_would_overwrite(ply, capsys):
+    ply.with_name("scene_pruned.ply").write_text("precious")
+    run("prune", ply, "--by", "opacity", "--dry-run")
+    assert "dry run, nothing is written" in capsys.readouterr().out
+    assert ply.with_name("scene_pruned.ply").read_text() == "precious"
+
+
+def test_the_log_of_the_package_is_printed_while_a_command_runs_and_no_longer(ply, tmp_path, capsys):
+    logger = logging.getLogger("pointsplat_ns")
+    before = logger.handlers, logger.propagate, logger.level
+    content = bytearray(ply.read_bytes())
+    first_row = content.index(b"end_header\n") + len(b"end_header\n")
+    content[first_row : first_row + 4] = b"\xff" * 4  # NaN
+    (tmp_path / "spoiled.ply").write_bytes(content)
+    run("prune", tmp_path / "spoiled.ply", "--by", "opacity", "--sh", "0", "--keep", "9")
+    said = capsys.readouterr()
+    assert "SH degree 3 cut to 0" in said.out
+    assert "dropped 1 of 80 Gaussians" in said.err and "dropped" not in said.out
+    assert (logger.handlers, logger.propagate, logger.level) == before
 
 
 def test_export_writes_the_scene_of_a_splatfacto_run_as_it_is(splatfacto_run, tmp_path):
@@ -207,9 +308,9 @@ def test_export_writes_the_scene_of_a_splatfacto_run_as_it_is(splatfacto_run, tm
 
 def test_export_writes_the_refined_scene_of_a_pointsplat_run(refined_run, trained_walls, tmp_path, capsys):
     for name, options in (("wall-b", ()), ("wall-a", ("--scene", "wall-a"))):
-        run("export", refined_run, *options, "-o", tmp_path / "out.ply")
+        run("export", refined_run, *options, "-o", tmp_path / "out.ply", "--force")
         (source,) = (trained_walls / name / "splatfacto-cpu").iterdir()
-        kept = prune(read_scene(source), 0.5).scene
+        kept = prune(read_scene(source), 0.5, "paper")
         assert same(read_ply(tmp_path / "out.ply"), kept.replace(opacities=kept.opacities + 0.5))
         assert name in capsys.readouterr().out
 
@@ -234,12 +335,12 @@ def test_export_knows_the_scenes_of_a_run_by_the_names_that_its_training_gave_th
         config = (run_folder / "config.yml").read_text()
         assert "supervision: auto" in config
         (run_folder / "config.yml").write_text(config.replace("supervision: auto", f"supervision: {supervision}"))
-        trained = open_refined_run(run_folder)
-        assert list(trained.scenes) == [scene.name for scene in scenes]
-        assert trained.default_scene == scenes[0].name
+        found, shown = scenes_of_run(open_refiner_run(run_folder, need_data=True))
+        assert list(found) == [scene.name for scene in scenes]
+        assert shown == scenes[0].name
         for scene in scenes:
-            run("export", run_folder, "--scene", scene.name, "-o", tmp_path / "out.ply")
-            kept = prune(scene.read_dense(), 0.5).scene
+            run("export", run_folder, "--scene", scene.name, "-o", tmp_path / "out.ply", "--force")
+            kept = prune(scene.read_dense(), 0.5, "paper")
             assert same(read_ply(tmp_path / "out.ply"), kept.replace(opacities=kept.opacities + 0.5))
 
 
@@ -249,7 +350,7 @@ def test_export_says_that_the_scenes_of_a_run_are_gone(make_refined_run, tmp_pat
     (tmp_path / "plys" / "a.ply").unlink()
     (tmp_path / "plys" / "cloud.ply").write_text("ply\n")
     capsys.readouterr()
-    said = refusal(capsys, tmp_path / "out.ply", "export", folder)
+    said = refusal(capsys, tmp_path / "out.ply", "export", folder, warnings=1)  # cloud.ply: no Gaussians in it
     assert "config.yml" in said and "no trained Splatfacto run below it" in said and "put its scenes back" in said
     shutil.rmtree(tmp_path / "plys")
     assert "its data" in refusal(capsys, tmp_path / "out.ply", "export", folder)
@@ -265,7 +366,7 @@ def test_export_refuses_a_scene_that_is_not_there(refined_run, splatfacto_run, p
 
 def test_the_command_as_installed_refuses_with_status_1_and_one_line(tmp_path):
     code = "from pointsplat_ns.cli import main; main()"
-    arguments = ["compact", "gone.ply", "--using", "gone", "-o", str(tmp_path / "out.ply")]
+    arguments = ["compact", "gone.ply", "--refiner", "gone", "-o", str(tmp_path / "out.ply")]
     done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 1 and done.stdout == ""
     assert done.stderr.startswith("error: gone: no such file") and done.stderr.count("\n") == 1
