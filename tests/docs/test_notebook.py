@@ -1,0 +1,50 @@
+"""The notebook runs from top to bottom and shows what it promises."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+NOTEBOOK = Path(__file__).parents[2] / "docs" / "quickstart.ipynb"
+
+CELL_TIMEOUT = 300
+"""Seconds, for a machine that is busy with other things; an idle core runs the whole notebook in less than a minute."""
+
+
+@pytest.fixture(scope="module")
+def executed(tmp_path_factory: pytest.TempPathFactory) -> nbformat.NotebookNode:
+    """The notebook with what its cells put out, run in a folder of its own on one thread."""
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    folder = tmp_path_factory.mktemp("notebook")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OMP_NUM_THREADS", "1")
+        patch.setenv("MPLCONFIGDIR", str(folder))
+        client = NotebookClient(
+            notebook, timeout=CELL_TIMEOUT, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
+        )
+        client.execute()
+    return notebook
+
+
+def outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
+    return [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+
+
+def test_notebook_shows_three_pictures(executed):
+    assert sum("image/png" in output.get("data", {}) for output in outputs(executed)) == 3
+
+
+def test_notebook_says_what_compacting_brought(executed):
+    said = "".join(output.text for output in outputs(executed) if output.output_type == "stream")
+    assert "against the dense scene's renders" in said
+
+
+def test_notebook_prints_no_warnings(executed):
+    assert not [output for output in outputs(executed) if output.get("name") == "stderr"]
+
+
+def test_notebook_is_small():
+    assert NOTEBOOK.stat().st_size < 600_000  # pictures in it are for a reader, not for the history of the project

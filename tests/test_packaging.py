@@ -1,0 +1,143 @@
+"""The wheel and the sdist install and run in a clean environment.
+
+Both are built from a copy of the tracked files. The environment is a new one that sees the dependencies of the running
+one, but not its installation of this package.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import pointsplat_ns as ps
+
+ROOT = Path(__file__).parents[1]
+SHIPPED = (
+    "pointsplat_ns/py.typed",
+    "pointsplat_ns/examples/room.ply",
+    "pointsplat_ns/refiner/pretrained/refiner.safetensors",
+    "pointsplat_ns/refiner/pretrained/CARD.md",
+    "method_configs/methods.py",
+)
+"""What is needed and is not found by following imports."""
+
+GAUSSIANS = 1000
+
+
+def run(*command: str | Path, cwd: Path) -> str:
+    """Run a command and give what it printed; the test fails with its words if it does."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PIP_"))}
+    environment |= {"OMP_NUM_THREADS": "1", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
+    done = subprocess.run(list(map(str, command)), cwd=cwd, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, f"{' '.join(map(str, command))}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def tracked_files() -> list[str]:
+    """What git tracks and is there, relative to the root."""
+    try:
+        listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("no git, or no checkout: which files belong to the project is not known")
+    return [name for name in listed.split("\0") if name and (ROOT / name).is_file()]
+
+
+@pytest.fixture(scope="module")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The wheel of the tracked files, and that of their sdist."""
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
+    for name in tracked_files():
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, source / name)
+    run(sys.executable, "-m", "build", "--no-isolation", "--sdist", "--outdir", out, cwd=source)
+    run(sys.executable, "-m", "build", "--no-isolation", "--wheel", "--outdir", out, cwd=source)
+    [wheel], [sdist] = out.glob("*.whl"), out.glob("*.tar.gz")
+    offline = ("--quiet", "--no-deps", "--no-index", "--no-build-isolation")
+    run(sys.executable, "-m", "pip", "wheel", *offline, "--wheel-dir", out / "again", sdist, cwd=out)
+    [again] = (out / "again").glob("*.whl")
+    return {"wheel": wheel, "sdist": again}
+
+
+@dataclass(frozen=True)
+class Installed:
+    """A distribution in an environment of its own."""
+
+    environment: Path
+    folder: Path  # with a small room.ply, to work in
+
+    @property
+    def python(self) -> Path:
+        return self.environment / "bin" / "python"
+
+    @property
+    def pointsplat(self) -> Path:
+        return self.environment / "bin" / "pointsplat"
+
+
+@pytest.fixture(scope="module", params=["wheel", "sdist"])
+def installed(request, wheels: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    """The package, installed from the wheel or by way of the sdist."""
+    folder = tmp_path_factory.mktemp(request.param)
+    environment = folder / "environment"
+    run(sys.executable, "-m", "venv", "--without-pip", environment, cwd=folder)
+    [packages] = (environment / "lib").glob("python*/site-packages")
+    # A folder that a .pth file names is searched for modules, but .pth files in it are not read: what installs this
+    # package editably is one of those.
+    (packages / "dependencies.pth").write_text(f"{sysconfig.get_paths()['purelib']}\n")
+    pip = (sys.executable, "-m", "pip", "--python", environment / "bin" / "python")
+    run(*pip, "install", "--quiet", "--no-deps", "--no-index", "--ignore-installed", wheels[request.param], cwd=folder)
+    ps.save(ps.prune(ps.example_room(), GAUSSIANS, by="coverage"), folder / "room.ply")
+    return Installed(environment, folder)
+
+
+def test_sdist_gives_the_same_wheel(wheels):
+    files = []
+    for path in wheels.values():
+        with zipfile.ZipFile(path) as archive:
+            files.append({entry.filename: entry.CRC for entry in archive.infolist()})
+    assert files[0] == files[1]
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_wheel_holds(wheels, name):
+    with zipfile.ZipFile(wheels["wheel"]) as archive:
+        assert archive.getinfo(name).file_size == (ROOT / name).stat().st_size
+
+
+def test_wheel_leaves_out_tests_and_benchmarks(wheels):
+    with zipfile.ZipFile(wheels["wheel"]) as archive:
+        tops = {name.split("/")[0] for name in archive.namelist()}
+    assert {top for top in tops if not top.endswith(".dist-info")} == {"pointsplat_ns", "method_configs"}
+
+
+def test_installed_package_is_the_one_imported(installed):
+    where = run(installed.python, "-c", "import pointsplat_ns; print(pointsplat_ns.__file__)", cwd=installed.folder)
+    assert Path(where.strip()).is_relative_to(installed.environment)
+
+
+def test_installed_prune_makes_a_scene_small(installed):
+    run(installed.pointsplat, "prune", "room.ply", "--keep", "10%", cwd=installed.folder)
+    assert len(ps.load(installed.folder / "room_pruned.ply")) == GAUSSIANS // 10
+
+
+def test_installed_compact_finds_the_refiner_that_ships(installed):
+    run(installed.pointsplat, "compact", "room.ply", "--keep", "20%", cwd=installed.folder)
+    assert len(ps.load(installed.folder / "room_compact.ply")) == GAUSSIANS // 5
+
+
+def test_installed_plugin_is_found_by_nerfstudio(installed):
+    code = (
+        "from importlib.metadata import entry_points as e;"
+        "print(sorted({p.name for g in ('method_configs', 'dataparser_configs') for p in e(group='nerfstudio.' + g)}))"
+    )
+    assert run(installed.python, "-c", code, cwd=installed.folder).strip() == str(
+        ["pointsplat", "replica-data", "splatfacto-cpu"]
+    )
