@@ -7,10 +7,9 @@ coefficients of red, then green, then blue. Normals carry nothing and are writte
 
 from __future__ import annotations
 
+import io
 import re
-from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import torch
@@ -22,7 +21,7 @@ from pointsplat_ns.io.files import keep_usable, one_line, replacing, require_fil
 from pointsplat_ns.io.ply_header import Element, Header, read_header
 
 CHUNK_ROWS = 16384
-"""Rows read at a time, about 4 MB: columns are then gathered out of the processor's cache."""
+"""Rows taken apart at a time, about 4 MB: they stay in the processor's cache until all their columns are copied."""
 
 _MEANS = ["x", "y", "z"]
 _NORMALS = ["nx", "ny", "nz"]
@@ -48,21 +47,24 @@ def read_ply(path: Path | str) -> Gaussians:
     Raises:
         SceneError: if the file is not a PLY, is truncated, or lacks a property.
     """
+    from plyfile import PlyData, PlyParseError
+
     path = require_file(path, "a 3DGS PLY file")
     try:
         with path.open("rb") as stream:
             header = read_header(stream, path)
-            vertex = _gaussian_element(header, path)
-            names = _wanted(vertex, path)
-            blocks = (_binary if header.order else _ascii)(stream, header, vertex, names, path)
-            table = np.empty((vertex.count, len(names)), np.float32)
-            row = 0
-            for block in blocks:
-                table[row : row + len(block)] = block
-                row += len(block)
+        vertex = _gaussian_element(header, path)
+        k = _num_rest(vertex, path)
+        with _GaussiansAlone(path, header) as stream:
+            # Binary rows are mapped, not read: only the Gaussians below take memory.
+            rows = PlyData.read(stream, mmap="r")["vertex"].data
+            scene = _scene(rows, k)
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
-    return keep_usable(_scene(torch.from_numpy(table)), path)
+    except (PlyParseError, ValueError, OverflowError) as error:
+        wanted = f"{vertex.count} Gaussians of {len(vertex.properties)} numbers"
+        raise SceneError(f"{path}: damaged PLY ({one_line(error)}); expected {wanted}") from error
+    return keep_usable(scene, path)
 
 
 def write_ply(scene: Gaussians, path: Path | str) -> None:
@@ -99,17 +101,30 @@ def _rest_names(count: int) -> list[str]:
     return [f"f_rest_{i}" for i in range(count)]
 
 
+class _GaussiansAlone(io.FileIO):
+    """A PLY file as plyfile is to see it: with a header that has been checked and that ends with the Gaussians, so
+    that neither comments in other encodings nor what follows the Gaussians can be in the way."""
+
+    def __init__(self, path: Path, header: Header):
+        super().__init__(path)
+        self.seek(header.size)
+        self._header = io.BytesIO(header.up_to("vertex"))
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Bytes of the header until it ends, then of the file."""
+        return self._header.read(size) or super().read(-1 if size is None else size)
+
+
 def _gaussian_element(header: Header, path: Path) -> Element:
     """The element that holds the Gaussians, its declared count checked against the bytes in the file."""
     found = {element.name: element for element in header.elements}
     vertex = found.get("vertex")
     if vertex is None:
         raise SceneError(f"{path}: PLY has no element 'vertex' (found {', '.join(found) or 'none'})")
-    if vertex.has_list:
-        bad = next(name for name, kind in vertex.properties if kind == "list")
-        raise SceneError(f"{path}: vertex property {bad!r} is a list; expected a number per Gaussian")
+    if vertex.lists:
+        raise SceneError(f"{path}: vertex property {vertex.lists[0]!r} is a list; expected a number per Gaussian")
     before = header.before("vertex")
-    listed = next((element.name for element in before if element.has_list), None)
+    listed = next((element.name for element in before if element.lists), None)
     if listed is not None and header.order:
         raise SceneError(f"{path}: element {listed!r} of lists stands before 'vertex'; expected 'vertex' first")
     available = path.stat().st_size - header.size - sum(_least_bytes(element, header) for element in before)
@@ -126,13 +141,13 @@ def _gaussian_element(header: Header, path: Path) -> Element:
 def _least_bytes(element: Element, header: Header) -> int:
     """Bytes that an element takes at least: exact in binary; a digit and a separator a number in ASCII."""
     if header.order:
-        return element.count * element.dtype(header.order).itemsize
+        return element.count * element.row_bytes
     # The last line of a file needs no newline.
     return max(element.count * 2 * len(element.properties) - 1, 0)
 
 
-def _wanted(vertex: Element, path: Path) -> list[str]:
-    """Names of the properties of a Gaussian in the order x, dc, rest, opacity, scale, rot."""
+def _num_rest(vertex: Element, path: Path) -> int:
+    """How many SH coefficients a Gaussian has beside the constant one, all properties being there."""
     present = {name for name, _ in vertex.properties}
     if "packed_position" in present:
         raise SceneError(f"{path}: a compressed PLY (property 'packed_position'); export it uncompressed")
@@ -150,62 +165,29 @@ def _wanted(vertex: Element, path: Path) -> list[str]:
             f"{path}: has {len(rest)} f_rest properties; expected {', '.join(map(str, counts[:-1]))} or {counts[-1]} "
             f"(SH degree 0 to {MAX_SH_DEGREE})"
         )
-    return [*_MEANS, *_DC, *_rest_names(len(rest)), *_OPACITY, *_SCALES, *_QUATS]
+    return len(rest) // 3
 
 
-def _binary(stream: BinaryIO, header: Header, vertex: Element, names: list[str], path: Path) -> Iterator[np.ndarray]:
-    """Blocks of rows (R, len(names)) float32 of a binary file."""
-    dtype = vertex.dtype(header.order)
-    order = [name for name, _ in vertex.properties]
-    columns = [order.index(name) for name in names]
-    uniform = all(kind == "f4" for _, kind in vertex.properties)
-    stream.seek(
-        header.size + sum(element.count * element.dtype(header.order).itemsize for element in header.before("vertex"))
-    )
-    for start in range(0, vertex.count, CHUNK_ROWS):
-        want = min(CHUNK_ROWS, vertex.count - start)
-        data = stream.read(want * dtype.itemsize)
-        if len(data) < want * dtype.itemsize:
-            raise SceneError(f"{path}: truncated while it was read, at Gaussian {start + len(data) // dtype.itemsize}")
-        if uniform:
-            yield np.frombuffer(data, header.order + "f4").reshape(want, len(order))[:, columns]
-            continue
-        rows = np.frombuffer(data, dtype)
-        with np.errstate(over="ignore"):  # a double beyond float32 becomes Inf and is dropped with the others
-            yield np.stack([rows[name].astype(np.float32) for name in names], axis=1)
+def _scene(rows: np.ndarray, k: int) -> Gaussians:
+    """The scene of structured rows (N,) with ``k`` coefficients of each channel beyond the constant one."""
+    from numpy.lib.recfunctions import structured_to_unstructured
 
-
-def _ascii(stream: BinaryIO, header: Header, vertex: Element, names: list[str], path: Path) -> Iterator[np.ndarray]:
-    """Blocks of rows (R, len(names)) float32 of an ASCII file."""
-    order = [name for name, _ in vertex.properties]
-    columns = [order.index(name) for name in names]
-    stream.seek(header.size)
-    for element in header.before("vertex"):
-        for _ in range(element.count):
-            if not stream.readline():
-                raise SceneError(f"{path}: truncated in element {element.name!r}, before the Gaussians")
-    for start in range(0, vertex.count, CHUNK_ROWS):
-        block = []
-        for number in range(start, min(start + CHUNK_ROWS, vertex.count)):
-            line = stream.readline()
-            if not line:
-                raise SceneError(
-                    f"{path}: truncated; the header declares {vertex.count} Gaussians, the file holds {number}"
-                )
-            words = line.split()
-            if len(words) != len(order):
-                raise SceneError(f"{path}: Gaussian {number} has {len(words)} numbers; expected {len(order)}")
-            try:
-                block.append([float(words[column]) for column in columns])
-            except ValueError as error:
-                raise SceneError(f"{path}: Gaussian {number} is not all numbers ({one_line(error, 80)})") from error
-        with np.errstate(over="ignore"):
-            yield np.array(block, np.float64).astype(np.float32)
-
-
-def _scene(table: Tensor) -> Gaussians:
-    """A scene from columns x, dc, rest, opacity, scale, rot: (N, 14 + 3K) to Gaussians of K coefficients."""
-    n, k = table.shape[0], (table.shape[1] - 14) // 3
-    means, dc, rest, opacities, scales, quats = table.split([3, 3, 3 * k, 1, 3, 4], dim=1)
-    rest = rest.reshape(n, 3, k).transpose(1, 2)
-    return Gaussians(*(value.contiguous() for value in (means, scales, quats, opacities, dc, rest)))
+    columns = {
+        "means": _MEANS,
+        "scales": _SCALES,
+        "quats": _QUATS,
+        "opacities": _OPACITY,
+        "features_dc": _DC,
+        # Channel-major in the file, channel last in a scene.
+        "features_rest": [f"f_rest_{channel * k + i}" for i in range(k) for channel in range(3)],
+    }
+    tables = {name: np.empty((len(rows), len(fields)), np.float32) for name, fields in columns.items()}
+    # A double beyond float32 becomes Inf and is dropped with the others.
+    with np.errstate(over="ignore"):
+        for start in range(0, len(rows), CHUNK_ROWS):
+            chunk = slice(start, start + CHUNK_ROWS)
+            for name, fields in columns.items():
+                if fields:
+                    tables[name][chunk] = structured_to_unstructured(rows[chunk][fields], np.float32)
+    tensors = {name: torch.from_numpy(table) for name, table in tables.items()}
+    return Gaussians(**{**tensors, "features_rest": tensors["features_rest"].reshape(len(rows), k, 3)})

@@ -18,11 +18,12 @@ MAX_HEADER_BYTES = 1 << 20
 """A 3DGS header has about 1.5 kB; comments may make it longer, but not by a thousandfold."""
 
 _TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
-    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
-    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+    "char": "int8", "int8": "int8", "uchar": "uint8", "uint8": "uint8",
+    "short": "int16", "int16": "int16", "ushort": "uint16", "uint16": "uint16",
+    "int": "int32", "int32": "int32", "uint": "uint32", "uint32": "uint32",
+    "float": "float32", "float32": "float32", "double": "float64", "float64": "float64",
 }  # fmt: skip
+_NAMES = _TYPES.keys()
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -33,15 +34,18 @@ class Element:
     name: str
     count: int
     properties: tuple[tuple[str, str], ...]
-    """``(name, numpy type)`` in the file's order; the type of a list is ``"list"``."""
+    """``(name, type)`` in the file's order. A type is a PLY name that numpy knows too (``float32``), that of a list
+    ``list uint8 int32``."""
 
     @property
-    def has_list(self) -> bool:
-        return any(kind == "list" for _, kind in self.properties)
+    def lists(self) -> tuple[str, ...]:
+        """Names of the list properties."""
+        return tuple(name for name, kind in self.properties if kind.startswith("list"))
 
-    def dtype(self, order: str) -> np.dtype:
-        """Layout of one binary row; ``order`` is ``"<"`` or ``">"``. Only without list properties."""
-        return np.dtype([(name, order + kind) for name, kind in self.properties])
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of one binary row, if no property is a list."""
+        return sum(np.dtype(kind).itemsize for _, kind in self.properties)
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,15 @@ class Header:
     def before(self, name: str) -> tuple[Element, ...]:
         """The elements that precede the one called ``name``."""
         return self.elements[: [element.name for element in self.elements].index(name)]
+
+    def up_to(self, name: str) -> bytes:
+        """A header in ASCII without comments that ends with the element called ``name``."""
+        form = next(form for form, order in _ORDERS.items() if order == self.order)
+        lines = ["ply", f"format {form} 1.0"]
+        for element in self.elements[: len(self.before(name)) + 1]:
+            lines.append(f"element {element.name} {element.count}")
+            lines += [f"property {kind} {prop}" for prop, kind in element.properties]
+        return "\n".join([*lines, "end_header", ""]).encode("ascii", "backslashreplace")
 
 
 def read_header(stream: BinaryIO, path: Path) -> Header:
@@ -80,8 +93,8 @@ def read_header(stream: BinaryIO, path: Path) -> Header:
             elements.append((words[1], int(words[2][:19]), []))
         elif keyword == "property" and elements and len(words) == 3 and words[1] in _TYPES:
             elements[-1][2].append((words[2], _TYPES[words[1]]))
-        elif keyword == "property" and elements and len(words) == 5 and words[1] == "list":
-            elements[-1][2].append((words[4], "list"))
+        elif keyword == "property" and elements and len(words) == 5 and words[1] == "list" and {*words[2:4]} <= _NAMES:
+            elements[-1][2].append((words[4], f"list {_TYPES[words[2]]} {_TYPES[words[3]]}"))
         else:
             raise SceneError(f"{path}: PLY header line {number} is not understood: {line[:80]!r}")
     if order is None:

@@ -139,6 +139,37 @@ def test_crlf_header_is_read(tmp_path):
     assert same_bits(scene, read_ply(tmp_path / "b.ply"))
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_comments_in_any_encoding_are_passed_over(tmp_path, text):
+    scene = make(5, 0)
+    write_ply(scene, tmp_path / "a.ply")
+    rewrite(tmp_path / "b.ply", rows_of(tmp_path / "a.ply"), text=text, byte_order="<")
+    comment = "comment \u5ba4\nelement vertex".encode()
+    (tmp_path / "b.ply").write_bytes((tmp_path / "b.ply").read_bytes().replace(b"element vertex", comment, 1))
+    assert same_bits(scene, read_ply(tmp_path / "b.ply"))
+
+
+@pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
+def test_what_follows_the_gaussians_is_not_read(tmp_path, form):
+    scene = make(5, 0)
+    write_ply(scene, tmp_path / "a.ply")
+    rewrite(tmp_path / "b.ply", rows_of(tmp_path / "a.ply"), text=form == "ascii", byte_order="<")
+    faces = b"element face 1000000000000000\nproperty list uchar int vertex_indices\nend_header"
+    (tmp_path / "b.ply").write_bytes((tmp_path / "b.ply").read_bytes().replace(b"end_header", faces, 1))
+    assert same_bits(scene, read_ply(tmp_path / "b.ply"))
+
+
+def test_lists_before_the_gaussians_are_passed_over_in_ascii_and_refused_in_binary(tmp_path):
+    scene = make(5, 0)
+    write_ply(scene, tmp_path / "a.ply")
+    faces = PlyElement.describe(np.array([([1, 2, 3],), ([4],)], [("vertex_indices", "O")]), "face")
+    for text in (True, False):
+        vertex = PlyElement.describe(rows_of(tmp_path / "a.ply"), "vertex")
+        PlyData([faces, vertex], text=text, byte_order="<").write(str(tmp_path / f"{text}.ply"))
+    assert same_bits(scene, read_ply(tmp_path / "True.ply"))
+    fails(tmp_path / "False.ply", "element 'face' of lists stands before 'vertex'")
+
+
 def test_all_zero_rows_stay(tmp_path, caplog):
     scene = make(3, 0).map(torch.zeros_like)
     write_ply(scene, tmp_path / "a.ply")
@@ -298,12 +329,13 @@ def test_no_format_is_said(tmp_path):
 @pytest.mark.parametrize(
     ("damage", "fragment"),
     [
-        (lambda lines: [*lines[:-1], lines[-1].rsplit(" ", 1)[0] + "\n"], "Gaussian 2 has 16 numbers; expected 17"),
+        (lambda lines: [*lines[:-1], lines[-1].rsplit(" ", 1)[0] + "\n"], "row 2: property 'rot_3': early end-of-line"),
         (
             lambda lines: [*lines[:-1], lines[-1].replace(lines[-1].split()[0], "what", 1)],
-            "Gaussian 2 is not all numbers",
+            "row 2: property 'x': malformed input",
         ),
-        (lambda lines: lines[:-1], "holds 2"),
+        (lambda lines: [*lines[:-1], lines[-1].rstrip() + " 1\n"], "row 2: expected end-of-line"),
+        (lambda lines: lines[:-1], "row 2: early end-of-file"),
     ],
 )
 def test_damaged_ascii_is_said_with_its_row(tmp_path, damage, fragment):
@@ -311,7 +343,7 @@ def test_damaged_ascii_is_said_with_its_row(tmp_path, damage, fragment):
     rewrite(tmp_path / "b.ply", rows_of(tmp_path / "a.ply"), text=True)
     lines = (tmp_path / "b.ply").read_text().splitlines(keepends=True)
     (tmp_path / "b.ply").write_text("".join(damage(lines)))
-    fails(tmp_path / "b.ply", fragment)
+    fails(tmp_path / "b.ply", "damaged PLY", fragment, "expected 3 Gaussians of 17 numbers")
 
 
 def test_no_file_and_a_folder_are_said(tmp_path):
