@@ -8,8 +8,9 @@ out. Activated values are properties, computed when asked for.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -38,15 +39,39 @@ def sh_degree_of(num_rest: int) -> int:
 
 @dataclass(frozen=True)
 class Gaussians:
-    """N Gaussians, on one device and of one floating dtype.
+    """A scene of N Gaussians, on one device and of one floating dtype, in Splatfacto's own parametrisation.
+
+    Attributes:
+        means: (N, 3) positions, world, scene units.
+        scales: (N, 3) natural logarithms of the standard deviations along the Gaussian's own axes, which are in scene
+            units; -Inf is a flat axis.
+        quats: (N, 4) rotations of those axes into the world, quaternions wxyz of any length; zero is the identity.
+        opacities: (N, 1) logits; +Inf is opacity 1 and -Inf opacity 0.
+        features_dc: (N, 3) constant SH coefficient of red, green and blue: colour = 0.5 + :data:`SH_C0` * features_dc.
+        features_rest: (N, (d+1)^2 - 1, 3) the other coefficients of SH degree d, from 0 to 3.
 
     Raises:
-        SceneError: if a shape, device or dtype does not fit the others.
+        SceneError: if a shape, device or dtype does not fit the others, or no SH degree has so many coefficients.
 
     Example:
-        >>> scene = Gaussians.empty(sh_degree=3)
-        >>> len(scene), scene.sh_degree
-        (0, 3)
+        Two Gaussians: a grey ball of standard deviation 0.1, nearly opaque, and a red disc beside it.
+
+        >>> import torch
+        >>> import pointsplat_ns as ps
+        >>> from pointsplat_ns.gaussians import SH_C0
+        >>> scene = ps.Gaussians(
+        ...     means=torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
+        ...     scales=torch.tensor([[0.1, 0.1, 0.1], [0.2, 0.2, 0.001]]).log(),
+        ...     quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(2, 1),
+        ...     opacities=torch.logit(torch.tensor([[0.95], [0.5]])),
+        ...     features_dc=(torch.tensor([[0.5, 0.5, 0.5], [1.0, 0.0, 0.0]]) - 0.5) / SH_C0,
+        ...     features_rest=torch.zeros(2, 0, 3),
+        ... )
+        >>> len(scene), scene.sh_degree, scene.alphas.tolist()[1]
+        (2, 0, 0.5)
+        >>> disc = scene[1]  # or a slice, a mask or a tensor of indices; always a scene
+        >>> disc.means.tolist()
+        [[1.0, 0.0, 0.0]]
     """
 
     means: Tensor  # [N, 3] scene units
@@ -76,14 +101,14 @@ class Gaussians:
             raise SceneError(f"parameters are {self.means.dtype}; expected a floating-point type")
 
     @classmethod
-    def empty(cls, sh_degree: int = 0, **kwargs) -> Gaussians:
-        """A scene of no Gaussians; ``kwargs`` go to ``torch.empty`` (dtype, device)."""
+    def empty(cls, sh_degree: int = 0, **kwargs: Any) -> Gaussians:
+        """A scene of no Gaussians; ``kwargs`` (dtype, device) go to ``torch.empty``."""
         rest = (sh_degree + 1) ** 2 - 1
         shapes = ((0, 3), (0, 3), (0, 4), (0, 1), (0, 3), (0, rest, 3))
         return cls(*(torch.empty(shape, **kwargs) for shape in shapes))
 
     @classmethod
-    def cat(cls, scenes: list[Gaussians]) -> Gaussians:
+    def cat(cls, scenes: Sequence[Gaussians]) -> Gaussians:
         """All Gaussians of several scenes of one SH degree, in order."""
         return cls(*(torch.cat(parts) for parts in zip(*(s.tensors() for s in scenes), strict=True)))
 
@@ -95,7 +120,7 @@ class Gaussians:
         """The parameter tensors, in the order of the fields."""
         return [value for _, value in self.items()]
 
-    def map(self, function) -> Gaussians:
+    def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """A scene whose every parameter is ``function(parameter)``."""
         return Gaussians(*(function(value) for value in self.tensors()))
 
@@ -106,13 +131,13 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
-    def __getitem__(self, index) -> Gaussians:
-        """Select by slice, boolean mask (N,) or index tensor (K,). An integer selects one Gaussian."""
+    def __getitem__(self, index: int | slice | list[int] | Tensor) -> Gaussians:
+        """The scene of some Gaussians: by slice, boolean mask (N,), list or tensor of indices (K,), or one integer."""
         if isinstance(index, int):
             index = [index]
         return self.map(lambda value: value[index])
 
-    def to(self, *args, **kwargs) -> Gaussians:
+    def to(self, *args: Any, **kwargs: Any) -> Gaussians:
         """As ``torch.Tensor.to``, for every parameter."""
         return self.map(lambda value: value.to(*args, **kwargs))
 
@@ -122,14 +147,17 @@ class Gaussians:
 
     @property
     def device(self) -> torch.device:
+        """Where all parameters are."""
         return self.means.device
 
     @property
     def dtype(self) -> torch.dtype:
+        """The floating type of all parameters."""
         return self.means.dtype
 
     @property
     def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
         return sh_degree_of(self.features_rest.shape[1])
 
     @property

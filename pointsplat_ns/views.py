@@ -19,6 +19,15 @@ RasterizeMode = Literal["classic", "antialiased"]
 class View:
     """One pinhole camera, and how a scene is drawn from it. An element of :class:`Views`.
 
+    Attributes:
+        viewmat: (4, 4), takes world to camera coordinates, OpenCV axes (x right, y down, z forward); a rigid motion
+            in scene units.
+        K: (3, 3) intrinsics in pixels, the first pixel's centre at (0.5, 0.5).
+        width: of the image, pixels.
+        height: of the image, pixels.
+        background: (3,) colour behind the scene, RGB in [0, 1].
+        rasterize_mode: how the scene was trained to be drawn.
+
     Example:
         >>> import pointsplat_ns as ps
         >>> view = ps.sample_views(ps.example_room(), 2)[0]
@@ -38,7 +47,17 @@ class View:
 class Views:
     """C pinhole cameras of one image size, and how a scene is drawn from them.
 
-    ``views[0]`` and iteration give a :class:`View`; slices and lists of indices give :class:`Views`.
+    ``views[0]`` and iteration give a :class:`View`; slices, lists of indices, index tensors and boolean masks give
+    :class:`Views`.
+
+    Attributes:
+        viewmats: (C, 4, 4), take world to camera coordinates, OpenCV axes (x right, y down, z forward); rigid motions
+            in scene units.
+        Ks: (C, 3, 3) intrinsics in pixels, the first pixel's centre at (0.5, 0.5).
+        width: of every image, pixels.
+        height: of every image, pixels.
+        background: (3,) colour behind the scene, RGB in [0, 1].
+        rasterize_mode: how the scene was trained to be drawn.
 
     Raises:
         DataError: if a shape does not fit the others, or the image has no pixel.
@@ -77,7 +96,11 @@ class Views:
     def __getitem__(self, index: slice | list[int] | Tensor) -> Views: ...
 
     def __getitem__(self, index: Any) -> View | Views:
-        """One view by an integer; several by a slice, or a list or tensor of indices."""
+        """One view by an integer; several by a slice, a list or tensor of indices, or a boolean mask (C,).
+
+        Raises:
+            IndexError: if there is no such view.
+        """
         viewmats, Ks = self.viewmats[index], self.Ks[index]
         kind = View if viewmats.dim() == 2 else Views
         return kind(viewmats, Ks, self.width, self.height, self.background, self.rasterize_mode)
@@ -86,13 +109,13 @@ class Views:
         return (self[index] for index in range(len(self)))
 
     def spread(self, count: int) -> Views:
-        """At most ``count`` of the views, evenly spread over their order."""
+        """At most ``count`` of the views, evenly spread over their order, the first and the last among them."""
         if count >= len(self):
             return self
         return self[torch.linspace(0, len(self) - 1, count).round().long()]
 
     def resized(self, max_side: int) -> Views:
-        """The same views with the longer side of the image at most ``max_side`` pixels."""
+        """The same views with the longer side of the image at most ``max_side`` pixels; never more pixels than now."""
         factor = max_side / max(self.width, self.height)
         if factor >= 1:
             return self
