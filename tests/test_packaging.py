@@ -19,6 +19,8 @@ import pytest
 
 import pointsplat_ns as ps
 
+pytestmark = pytest.mark.xdist_group("packaging")  # one process builds and installs for all tests of this file
+
 ROOT = Path(__file__).parents[1]
 SHIPPED = (
     "pointsplat_ns/py.typed",
@@ -128,6 +130,7 @@ def test_installed_prune_makes_a_scene_small(installed):
     assert len(ps.load(installed.folder / "room_pruned.ply")) == GAUSSIANS // 10
 
 
+@pytest.mark.parametrize("installed", ["wheel"], indirect=True)  # that of the sdist is the same
 def test_installed_compact_finds_the_refiner_that_ships(installed):
     run(installed.pointsplat, "compact", "room.ply", "--keep", "20%", cwd=installed.folder)
     assert len(ps.load(installed.folder / "room_compact.ply")) == GAUSSIANS // 5

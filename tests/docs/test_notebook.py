@@ -8,6 +8,8 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+pytestmark = pytest.mark.xdist_group("notebook")  # one process runs it for all tests of this file
+
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "quickstart.ipynb"
 
 CELL_TIMEOUT = 300
