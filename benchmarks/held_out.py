@@ -57,11 +57,11 @@ def photos_of(path: Path, split: Literal["train", "test"], count: int) -> tuple[
     undistorted."""
     from pointsplat_ns.geometry.cameras import viewmats_from_opengl
     from pointsplat_ns.io import scene_name
-    from pointsplat_ns.nerfstudio_plugin.frames import FrameCache
+    from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
     from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
     run = open_run(path)
-    scene = TrainedScene(scene_name(run), run, FrameCache(0))
+    scene = TrainedScene(scene_name(run), run, MemoryCache(0))
     frames = scene.train_frames if split == "train" else scene.eval_frames
     total = len(frames)
     taken = range(total) if count >= total else torch.linspace(0, total - 1, count).round().long().tolist()

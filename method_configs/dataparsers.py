@@ -12,7 +12,9 @@ from pointsplat_ns.nerfstudio_plugin.registration import load_specification
 
 def _replica() -> DataParserSpecification:
     from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
+    from pointsplat_ns.nerfstudio_plugin.third_party_warnings import quiet_nerfstudio
 
+    quiet_nerfstudio()  # here, because nerfstudio loads dataparsers before what raises the warnings
     return DataParserSpecification(
         config=ReplicaDataParserConfig(),
         description="Posed RGB-D frames in the layout that NICE-SLAM gave to Replica.",

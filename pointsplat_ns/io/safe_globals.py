@@ -7,6 +7,9 @@ here rebuilds such a scalar from its bytes; none of it can run code from the fil
 
 from __future__ import annotations
 
+import importlib
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -20,11 +23,9 @@ def allow_splatfacto_checkpoints() -> None:
     add = getattr(torch.serialization, "add_safe_globals", None)
     if add is None:
         return
-    try:
-        from numpy._core.multiarray import scalar  # numpy 2
-    except ImportError:
-        from numpy.core.multiarray import scalar  # numpy 1
-    allowed: list = [np.dtype, type(np.dtype(np.float64))]
+    # numpy 2 renamed the module.
+    scalar = importlib.import_module(f"numpy.{'_core' if hasattr(np, '_core') else 'core'}.multiarray").scalar
+    allowed: list[Any] = [np.dtype, type(np.dtype(np.float64))]
     if _torch_version() >= (2, 6):
         # A checkpoint may come from the other major version of numpy, so both names stand for this function.
         allowed += [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]

@@ -11,9 +11,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError
-
-SSIM_WINDOW = 11
-"""Side of SSIM's Gaussian window in pixels; its sigma is 1.5 (Wang et al. 2004)."""
+from pointsplat_ns.metrics.structural_similarity import SSIM_WINDOW, ssim_map
 
 
 class ImageError(PointSplatError, ValueError):
@@ -34,8 +32,9 @@ def as_nchw(pred: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
             raise ImageError(f"{name} is {image.dtype}; expected a floating-point image in [0, 1]")
     if pred.shape != target.shape:
         raise ImageError(f"pred has shape {tuple(pred.shape)} but target {tuple(target.shape)}; expected the same")
-    single = pred.dim() == 3
-    return tuple((x[None] if single else x).permute(0, 3, 1, 2) for x in (pred, target))  # type: ignore[return-value]
+    if pred.dim() == 3:
+        pred, target = pred[None], target[None]
+    return pred.permute(0, 3, 1, 2), target.permute(0, 3, 1, 2)
 
 
 def per_image(values: Tensor, like: Tensor) -> Tensor:
@@ -84,15 +83,16 @@ def ssim(pred: Tensor, target: Tensor) -> Tensor:
 
     Raises:
         ImageError: if the images cannot be compared or are smaller than the window.
-    """
-    import kornia.metrics
 
+    Example:
+        >>> image = torch.linspace(0, 1, 16 * 16 * 3).reshape(16, 16, 3)
+        >>> round(float(ssim(image, image)), 3), float(ssim(image, 1 - image)) < 0
+        (1.0, True)
+    """
     a, b = as_nchw(pred, target)
     if min(a.shape[2:]) < SSIM_WINDOW:
         raise ImageError(
             f"images of {a.shape[3]} x {a.shape[2]} pixels are smaller than SSIM's window; "
             f"expected at least {SSIM_WINDOW} x {SSIM_WINDOW}"
         )
-    # eps=0: the two constants of the definition keep the denominator positive by themselves.
-    values = kornia.metrics.ssim(a.contiguous(), b.contiguous(), SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid")
-    return per_image(values.mean(dim=(1, 2, 3)), pred)
+    return per_image(ssim_map(a, b).mean(dim=(1, 2, 3)), pred)

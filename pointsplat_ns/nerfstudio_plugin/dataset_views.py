@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstudio
 from pointsplat_ns.views import Views
 
 
@@ -36,14 +37,14 @@ expected a nerfstudio run
     """
     from pointsplat_ns.io.runs import open_run, scene_name
 
-    run = open_run(path)  # before nerfstudio is imported
+    run = open_run(path)  # before nerfstudio is imported, which takes seconds
+    import_nerfstudio()
 
-    import method_configs.methods  # noqa: F401  (completes nerfstudio's imports in the order that it can)
     from pointsplat_ns.nerfstudio_plugin.cameras import views_of_cameras
-    from pointsplat_ns.nerfstudio_plugin.frames import FrameCache
+    from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
     from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
-    scene = TrainedScene(scene_name(run), run, FrameCache(0))
+    scene = TrainedScene(scene_name(run), run, MemoryCache(0))
     frames = scene.train_frames if split == "train" else scene.eval_frames
     cameras = frames.dataset.cameras
     if len(cameras) == 0:

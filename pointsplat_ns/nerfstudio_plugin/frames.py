@@ -38,13 +38,6 @@ class PhotoKey(CacheKey[Frame]):
     index: int
 
 
-class FrameCache(MemoryCache):
-    """TRANSITION: removed once nothing names it."""
-
-    def put(self, key: Any, value: Any, num_bytes: int | None = None) -> None:
-        super().put(key, value, _bytes_of(value[1]) if num_bytes is None else num_bytes)
-
-
 class Frames:
     """The posed photos of one split of a dataset.
 

@@ -1,35 +1,40 @@
 """Splatfacto on any torch device: nerfstudio's model with our rasterizer in place of gsplat's CUDA kernels.
 
-Config, densification, checkpoint keys, cropping, camera optimiser and bilateral grid are nerfstudio's own. Only
-what needs CUDA or a network is replaced: the seed of the scene, the call of the rasterizer, and LPIPS; and SSIM by
-the same in fewer operations.
+Config, densification, checkpoint keys, cropping, camera optimiser and bilateral grid are nerfstudio's own. What needs
+CUDA or a network is replaced: the seed of the scene, the call of the rasterizer, and LPIPS; and SSIM by the same in
+fewer operations.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
-from unittest import mock
 
-import numpy as np
 import torch
+from gsplat.strategy import DefaultStrategy
+from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.model_components.lib_bilagrid import BilateralGrid
 from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, SplatfactoModelConfig, random_quat_tensor
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
+from torchmetrics.image import PeakSignalNoiseRatio
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
-from pointsplat_ns.metrics import ImageError
-from pointsplat_ns.metrics.fast_ssim import fast_ssim
-from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
+from pointsplat_ns.geometry.neighbours import nearest
+from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
+from pointsplat_ns.metrics.lpips import ReportedLpips
+from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.rasterizer import rasterization
 
 LONE_POINT_SCALE = 0.01
@@ -39,27 +44,25 @@ HALF_LEVEL = 0.5 / 255
 """Half a step of an 8-bit colour: the nearest to 0 and 1 that a seed's colour logit goes, so that it stays finite."""
 
 
-class _LazyLpips:
-    """LPIPS that is loaded at the first evaluation. Not a module: its weights are no part of a scene's checkpoint."""
+VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
+"""What a scene trained over random backgrounds is shown over: the viewer's own colour, as in Splatfacto."""
 
-    def __init__(self, *args, **kwargs):
-        self.reason: str | None = None
-        """Why there is no LPIPS, once that is known."""
-        self._metric: Any = None
+
+class LpipsMetric:
+    """LPIPS as nerfstudio calls its metrics. Not a module: its weights are no part of a scene's checkpoint."""
+
+    def __init__(self) -> None:
+        self._lpips = ReportedLpips("alex")
+
+    @property
+    def reason(self) -> str | None:
+        """Why a value was missing, once one was."""
+        return self._lpips.reason
 
     def __call__(self, image: Tensor, other: Tensor) -> Tensor:
         """LPIPS of two (1, 3, H, W) images in [0, 1]; NaN, with ``reason`` set, where it cannot be computed."""
-        if self._metric is None and self.reason is None:
-            try:
-                self._metric = load_lpips("alex").to(image.device)
-            except LpipsUnavailable as error:
-                self.reason = str(error)
-        if self._metric is not None:
-            try:
-                return self._metric(image.permute(0, 2, 3, 1), other.permute(0, 2, 3, 1)).mean()
-            except ImageError as error:  # too small for the network
-                self.reason = str(error)
-        return image.new_tensor(math.nan)
+        value = self._lpips(image.permute(0, 2, 3, 1), other.permute(0, 2, 3, 1))
+        return image.new_tensor(math.nan) if value is None else value.mean()
 
 
 @dataclass
@@ -88,27 +91,53 @@ class SplatfactoCpuModel(SplatfactoModel):
     config: SplatfactoCpuModelConfig
 
     def populate_modules(self) -> None:
-        """Build what Splatfacto builds, seeded without CUDA and without LPIPS weights."""
-        seeds = None if self.config.random_init else _finite_seeds(self.seed_points)
+        """Build what Splatfacto builds, without CUDA and without weights for LPIPS.
+
+        Splatfacto's own method, which mixes all of it, is not called: it puts seed points on CUDA and downloads LPIPS.
+        """
         config = self.config
-        # nerfstudio's branch for seed points calls .cuda(); let it make a few random Gaussians and replace them.
-        self.seed_points = None
-        if seeds is not None:
-            self.config = dataclasses.replace(config, num_random=1)
-        with mock.patch("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", _LazyLpips):
-            super().populate_modules()
-        del self.ssim  # a module without parameters or state
-        self.ssim = fast_ssim
-        self.config = config
-        if seeds is not None:
-            self.gauss_params = self._seed_parameters(*seeds)
-        self.seed_points = seeds
+        self.seed_points = None if config.random_init else _finite_seeds(self.seed_points)
+        self.gauss_params = self._seed_parameters(*(self.seed_points or _random_seeds(config)))
+        self.camera_optimizer: CameraOptimizer = config.camera_optimizer.setup(
+            num_cameras=self.num_train_data, device="cpu"
+        )
+        if config.use_bilateral_grid:
+            x, y, w = config.grid_shape
+            self.bil_grids = BilateralGrid(num=self.num_train_data, grid_X=x, grid_Y=y, grid_W=w)
+        self.psnr = PeakSignalNoiseRatio(data_range=1.0)
+        self.ssim = mean_ssim
+        self.lpips = LpipsMetric()  # type: ignore[assignment]  # Splatfacto's is torchmetrics' module
+        self.step = 0
+        self.crop_box: OrientedBox | None = None
+        self.background_color = (
+            torch.tensor(VISER_BACKGROUND)
+            if config.background_color == "random"
+            else get_color(config.background_color)
+        )
+        self.strategy = DefaultStrategy(
+            prune_opa=config.cull_alpha_thresh,
+            grow_grad2d=config.densify_grad_thresh,
+            grow_scale3d=config.densify_size_thresh,
+            grow_scale2d=config.split_screen_size,
+            prune_scale3d=config.cull_scale_thresh,
+            prune_scale2d=config.cull_screen_size,
+            refine_scale2d_stop_iter=config.stop_screen_size_at,
+            refine_start_iter=config.warmup_length,
+            refine_stop_iter=config.stop_split_at,
+            reset_every=config.reset_alpha_every * config.refine_every,
+            refine_every=config.refine_every,
+            pause_refine_after_reset=self.num_train_data + config.refine_every,
+            absgrad=config.use_absgrad,
+            revised_opacity=False,
+            verbose=True,
+        )
+        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
 
     def _seed_parameters(self, points: Tensor, colors: Tensor) -> torch.nn.ParameterDict:
         """Splatfacto's parameters for N points (N, 3) and their colours (N, 3) from 0 to 255, or (0, 3) if unknown."""
         num = len(points)
         num_rest = (self.config.sh_degree + 1) ** 2 - 1
-        distances = torch.from_numpy(self.k_nearest_sklearn(points, 3)[0])
+        quats = random_quat_tensor(num)
         if len(colors) == 0:
             features_dc = torch.rand(num, 3)
         elif self.config.sh_degree > 0:
@@ -117,34 +146,15 @@ class SplatfactoCpuModel(SplatfactoModel):
             features_dc = torch.logit(colors / 255, eps=HALF_LEVEL)
         values = {
             "means": points,
-            "scales": distances.mean(dim=1, keepdim=True).log().repeat(1, 3),
-            "quats": random_quat_tensor(num),
+            "scales": _distance_to_others(points, 3).log().repeat(1, 3),
+            "quats": quats,
             "features_dc": features_dc,
             "features_rest": torch.zeros(num, num_rest, 3),
             "opacities": torch.full((num, 1), math.log(0.1 / 0.9)),
         }
         return torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in values.items()})
 
-    def k_nearest_sklearn(self, x: Tensor, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """Distances and indices (N, k) of the nearest points at another place.
-
-        Points at one place count once, so that no distance is zero; a row with fewer than ``k`` such neighbours
-        repeats the farthest, and a lone place has distance ``LONE_POINT_SCALE`` and itself as its neighbour.
-        """
-        from sklearn.neighbors import NearestNeighbors
-
-        places, first, inverse = np.unique(x.cpu().numpy(), axis=0, return_index=True, return_inverse=True)
-        inverse = inverse.reshape(-1)
-        found = min(k, len(places) - 1)
-        if found < 1:
-            return np.full((len(x), k), LONE_POINT_SCALE, np.float32), np.tile(first[inverse][:, None], (1, k))
-        distances, indices = NearestNeighbors(n_neighbors=found + 1).fit(places).kneighbors(places)
-        columns = np.minimum(np.arange(1, k + 1), found)
-        # Distinct places can still be closer than float32 can square.
-        distances = np.maximum(distances[:, columns], np.finfo(np.float32).tiny).astype(np.float32)
-        return distances[inverse], first[indices[:, columns]][inverse]
-
-    def load_state_dict(self, dict: Mapping[str, Any], **kwargs):  # type: ignore[override]
+    def load_state_dict(self, dict: Mapping[str, Any], **kwargs):  # type: ignore[override]  # nerfstudio narrows torch's too
         """As Splatfacto's, and without the LPIPS weights that nerfstudio's own checkpoints carry along."""
         return super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
 
@@ -172,7 +182,7 @@ class SplatfactoCpuModel(SplatfactoModel):
                 optimizer.state[parameter] = optimizer.state.pop(held, {})
                 optimizers.parameters[name] = [parameter]
 
-    def get_outputs(self, camera: Cameras) -> dict[str, Any]:
+    def get_outputs(self, camera: Cameras | RayBundle) -> dict[str, Any]:
         """Draw one camera.
 
         Args:
@@ -267,7 +277,7 @@ class SplatfactoCpuModel(SplatfactoModel):
         return rasterization(**arguments, backend=config.backend, compiled=config.compiled, quality=self._quality)
 
     @property
-    def _quality(self) -> str:
+    def _quality(self) -> Literal["exact", "balanced", "fast"]:
         """Evaluation is always exact."""
         return self.config.quality if self.training else "exact"
 
@@ -277,6 +287,27 @@ class SplatfactoCpuModel(SplatfactoModel):
         """As Splatfacto's, without LPIPS where it cannot be had (``self.lpips.reason`` then says why)."""
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         return {k: v for k, v in metrics.items() if "lpips" not in k or math.isfinite(v)}, images
+
+
+def _random_seeds(config: SplatfactoModelConfig) -> tuple[Tensor, Tensor]:
+    """Positions (N, 3) in a cube around the origin, without colours, as Splatfacto starts where it has no points."""
+    return (torch.rand(config.num_random, 3) - 0.5) * config.random_scale, torch.zeros(0, 3)
+
+
+def _distance_to_others(points: Tensor, k: int) -> Tensor:
+    """Mean distance (N, 1) from each point (N, 3) to the ``k`` nearest at another place, float32 and positive.
+
+    Points at one place count once, so that no distance is zero. Where there are fewer than ``k`` other places, the
+    farthest counts for those that are missing; a lone place has ``LONE_POINT_SCALE``.
+    """
+    places, place_of = torch.unique(points, dim=0, return_inverse=True)
+    if len(places) < 2:
+        return torch.full((len(points), 1), LONE_POINT_SCALE)
+    distances = nearest(places, k + 1)[0][:, 1:]
+    missing = distances[:, -1:].expand(-1, k - distances.shape[1])
+    # Distinct places can still be closer than float32 can square.
+    distances = torch.cat([distances, missing], dim=1).clamp(min=torch.finfo(torch.float32).tiny).float()
+    return distances.mean(dim=1, keepdim=True)[place_of]
 
 
 def _finite_seeds(seeds: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor] | None:
@@ -302,6 +333,11 @@ class SplatfactoCpuPipelineConfig(VanillaPipelineConfig):
 
     _target: type = field(default_factory=lambda: SplatfactoCpuPipeline)
 
+    def setup(self, **kwargs) -> Any:
+        """The pipeline. nerfstudio's trainer and its ``ns-*`` commands read the checkpoint right after this."""
+        allow_splatfacto_checkpoints()
+        return super().setup(**kwargs)
+
 
 class SplatfactoCpuPipeline(VanillaPipeline):
     """nerfstudio's pipeline; what cannot be computed is null in its evaluation, and never NaN."""
@@ -320,16 +356,16 @@ class SplatfactoCpuPipeline(VanillaPipeline):
         Raises:
             DataError: if no frame is held out.
         """
-        if len(self.datamanager.eval_dataset) == 0:
+        if not self.datamanager.eval_dataset:
             raise DataError(
                 f"{self.datamanager.get_datapath()}: no frame is held out, so there is nothing to evaluate on; "
                 "expected at least one: change the dataparser's split"
             )
+        self.model.lpips = lpips = LpipsMetric()  # whose reason is that of this evaluation alone
         metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
         if step is not None:
             return {name: value for name, value in metrics.items() if math.isfinite(value)}
         report: dict[str, Any] = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
-        reason = getattr(getattr(self.model, "lpips", None), "reason", None)
-        if reason is not None:
-            report |= {"lpips": None, "lpips_note": reason}
+        if lpips.reason is not None:
+            report |= {"lpips": None, "lpips_note": lpips.reason}
         return report

@@ -15,7 +15,6 @@ from nerfstudio.data.scene_box import OrientedBox, SceneBox
 from nerfstudio.models import splatfacto as stock
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
-import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import SHARED_DATA
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl

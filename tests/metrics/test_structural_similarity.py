@@ -6,7 +6,7 @@ import pytest
 import torch
 from pytorch_msssim import SSIM
 
-from pointsplat_ns.metrics.fast_ssim import fast_ssim
+from pointsplat_ns.metrics.structural_similarity import mean_ssim
 
 
 def images(*shape: int, dtype=torch.float64):
@@ -21,16 +21,16 @@ def images(*shape: int, dtype=torch.float64):
 def test_value_and_gradient_are_pytorch_msssims(size, batch):
     image, other = images(batch, 3, *size)
     stock = SSIM(data_range=1.0, size_average=True, channel=3)
-    value, expected = fast_ssim(image, other), stock(image, other)
+    value, expected = mean_ssim(image, other), stock(image, other)
     # pytorch-msssim keeps its window in float32: 1e-7 relative on moments of order 1, over C2 = 9e-4 at worst.
     torch.testing.assert_close(value, expected, atol=1e-5, rtol=0)
     (gradient,), (other_gradient,) = (torch.autograd.grad(v, image) for v in (value, expected))
     assert (gradient - other_gradient).abs().max() <= 1e-4 * other_gradient.abs().max()
 
 
-def test_gradcheck():
+def test_gradients_agree_with_float64_differences():
     image, other = images(1, 2, 12, 13)
-    assert torch.autograd.gradcheck(fast_ssim, (image, other.requires_grad_()))
+    assert torch.autograd.gradcheck(mean_ssim, (image, other.requires_grad_()))
 
 
 @pytest.mark.parametrize("level", [0.0, 1e-4, 0.5, 1.0])
@@ -39,7 +39,7 @@ def test_flat_images_in_float32_match_float64_in_value_and_gradient(level):
     result = {}
     for dtype in (torch.float32, torch.float64):
         image = torch.full((1, 3, 20, 20), level, dtype=dtype).requires_grad_()
-        value = fast_ssim(image, (image + noise.to(dtype)).detach())
+        value = mean_ssim(image, (image + noise.to(dtype)).detach())
         value.backward()
         result[dtype] = value.detach().double(), image.grad.double()
     # Variances are differences of squares near level^2, so 6e-8 of it is lost, relative to C2 = 9e-4.
@@ -49,4 +49,4 @@ def test_flat_images_in_float32_match_float64_in_value_and_gradient(level):
 
 def test_identical_images_give_1():
     image, _ = images(1, 3, 16, 16)
-    assert fast_ssim(image, image.detach()).item() == pytest.approx(1.0, abs=1e-12)
+    assert mean_ssim(image, image.detach()).item() == pytest.approx(1.0, abs=1e-12)
