@@ -14,6 +14,7 @@ from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import CosineDecaySchedulerConfig, MultiStepSchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
@@ -72,6 +73,9 @@ class PointSplatTrainerConfig(TrainerConfig):
     so what is broken is as broken when its turn comes again, and between the turns of one broken scene the others
     would start the count anew for ever."""
 
+    # nerfstudio's setting of text-to-NeRF methods is no option here.
+    prompt: Suppress[Fixed[str | None]] = None
+
     def setup(self, **kwargs) -> Trainer:
         """The trainer, for a copy of this config whose rates are those asked for and whose schedules end with the run.
 
@@ -105,12 +109,11 @@ class PointSplatTrainerConfig(TrainerConfig):
 
 def _steps_done(config: TrainerConfig) -> int:
     """Steps behind the checkpoint that a run is to resume from, by its name; 0 for a new run."""
-    step = config.load_step
-    if config.load_dir is not None and step is None:
-        step = max((_step_of(path) for path in config.load_dir.glob("step-*.ckpt")), default=-1)
-    elif config.load_dir is None:
-        step = -1 if config.load_checkpoint is None else _step_of(config.load_checkpoint)
-    return step + 1
+    if config.load_dir is None:
+        return 0 if config.load_checkpoint is None else _step_of(config.load_checkpoint) + 1
+    if config.load_step is not None:
+        return config.load_step + 1
+    return max((_step_of(path) for path in config.load_dir.glob("step-*.ckpt")), default=-1) + 1
 
 
 def _step_of(checkpoint: Path) -> int:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import itertools
 import random
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -22,20 +21,33 @@ from torch import Tensor
 
 from pointsplat_ns.compression.view_sampling import BACKGROUND, sample_views
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import content_hash
 from pointsplat_ns.io.ply import read_ply
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
-from pointsplat_ns.nerfstudio_plugin.frames import FrameCache
+from pointsplat_ns.nerfstudio_plugin.memory_cache import CacheKey, MemoryCache
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.views import RasterizeMode
 
 Split = Literal["train", "test"]
-
-_DENSE = 0
-"""Place of a scene's Gaussians among what it keeps in the cache; its pictures have their own numbers."""
 
 _FINGERPRINT_BYTES = 1 << 16
 """Read at either end of a PLY to tell it from others: enough for thousands of numbers."""
 
-_numbers = itertools.count(-1, -1)  # names what is kept in a shared cache; Frames count upwards
+
+@dataclass(frozen=True)
+class DenseKey(CacheKey[Gaussians]):
+    """Names the Gaussians of a scene in a cache that several scenes share."""
+
+    scene: str
+
+
+@dataclass(frozen=True)
+class RenderKey(CacheKey[tuple[Cameras, dict[str, Any]]]):
+    """Names a render of a scene in a cache that several scenes share."""
+
+    scene: str
+    split: Split
+    index: int
 
 
 @dataclass(frozen=True)
@@ -62,26 +74,34 @@ class DenseScene:
 
     has_photos = False
     """Whether ``train_frames`` and ``eval_frames`` are photos; they are the scene's own renders otherwise."""
-    rasterize_mode: Literal["classic", "antialiased"] = "classic"
-    """How the scene is drawn."""
 
     def __init__(
         self,
         name: str,
         source: Path,
-        cache: FrameCache,
+        cache: MemoryCache,
         poses: SampledPoses | None = None,
         device: torch.device | str = "cpu",
     ):
         self.name, self.source = name, source
-        self._cache, self._device = cache, device
+        self.cache, self._device = cache, device
         self._poses = SampledPoses() if poses is None else poses
-        self._number = next(_numbers)
 
     @property
     def identity(self) -> str:
-        """Tells this scene from any other, wherever its folder is moved."""
+        """What a training remembers of the scene: the same wherever its folder is moved, and another for another
+        training of a scene of that name."""
         raise NotImplementedError
+
+    @cached_property
+    def content(self) -> str:
+        """SHA-256 of the file that holds the Gaussians: what is made of them and kept on disk is found by it."""
+        return content_hash(self.source)
+
+    @property
+    def rasterize_mode(self) -> RasterizeMode:
+        """How the scene is drawn."""
+        return "classic"
 
     @property
     def background(self) -> Tensor:
@@ -94,13 +114,11 @@ class DenseScene:
 
     def dense(self, keep: bool) -> Gaussians:
         """The Gaussians, from the cache if they are there; ``keep`` puts them there, as long as there is room."""
-        key = (self._number, _DENSE)
-        known = self._cache.get(key)
-        if known is not None:
-            return Gaussians(**known[1])
-        dense = self.read_dense()
-        if keep:
-            self._cache.put(key, (None, dict(dense.items())))  # type: ignore[arg-type]
+        dense = self.cache.get(DenseKey(self.name))
+        if dense is None:
+            dense = self.read_dense()
+            if keep:
+                self.cache.put(DenseKey(self.name), dense, sum(value.nbytes for value in dense.tensors()))
         return dense
 
     def cameras(self, split: Split) -> Cameras:
@@ -117,12 +135,12 @@ class DenseScene:
     @cached_property
     def rendered_train(self) -> RenderedFrames:
         """What the dense scene shows from the training poses, in 8 bits as photos are."""
-        return RenderedFrames(self, self.cameras("train"), "uint8")
+        return RenderedFrames(self, "train", "uint8")
 
     @cached_property
     def rendered_eval(self) -> RenderedFrames:
         """What the dense scene shows from the held-out poses, not rounded."""
-        return RenderedFrames(self, self.cameras("test"), "float32")
+        return RenderedFrames(self, "test", "float32")
 
     @property
     def train_frames(self) -> Any:
@@ -145,7 +163,10 @@ class DenseScene:
 
 
 class PlyScene(DenseScene):
-    """A 3DGS PLY and nothing else: no photos, no poses."""
+    """A 3DGS PLY and nothing else: no photos, no poses.
+
+    A PLY says nothing of its training, so its identity is its name and a fingerprint of its content.
+    """
 
     def read_dense(self) -> Gaussians:
         """As the file has them."""
@@ -162,20 +183,20 @@ class PlyScene(DenseScene):
         return f"{self.name}/ply {hashlib.sha256(content + str(size).encode()).hexdigest()[:16]}"
 
 
-class RenderedFrames(Sequence):
+class RenderedFrames(Sequence[tuple[Cameras, dict[str, Any]]]):
     """Pictures that a dense scene gives of itself, drawn when they are asked for and kept while the cache has room.
 
     ``frames[i]`` is ``(camera, data)`` as that of :class:`~pointsplat_ns.nerfstudio_plugin.frames.Frames`.
 
     Args:
         scene: what is drawn.
-        cameras: of shape (C,), on the CPU.
+        split: whose cameras they are drawn from.
         image_type: pictures in [0, 255] and rounded, or in [0, 1].
     """
 
-    def __init__(self, scene: DenseScene, cameras: Cameras, image_type: Literal["uint8", "float32"]):
-        self._scene, self.cameras, self.image_type = scene, cameras, image_type
-        self._number = next(_numbers)
+    def __init__(self, scene: DenseScene, split: Split, image_type: Literal["uint8", "float32"]):
+        self._scene, self._split, self.image_type = scene, split, image_type
+        self.cameras = scene.cameras(split)
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -184,15 +205,15 @@ class RenderedFrames(Sequence):
         if not -len(self) <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
         index %= len(self)
-        key = (self._number, index)
-        frame = self._scene._cache.get(key)
+        key = RenderKey(self._scene.name, self._split, index)
+        frame = self._scene.cache.get(key)
         if frame is None:
             camera = self.cameras[index : index + 1]
             image = self._scene.picture(camera)
             if self.image_type == "uint8":
                 image = (255 * image).round().to(torch.uint8)
             frame = camera, {"image": image, "image_idx": index}
-            self._scene._cache.put(key, frame)
+            self._scene.cache.put(key, frame, image.nbytes)
         return copy.deepcopy(frame[0]), frame[1].copy()
 
     def __iter__(self) -> Iterator[tuple[Cameras, dict[str, Any]]]:

@@ -103,6 +103,11 @@ class SyncedBatchNorm(BatchNorm):
     torch's own synchronised batch norm needs a GPU.
     """
 
+    running_mean: Tensor
+    running_var: Tensor
+    num_batches_tracked: Tensor
+    momentum: float
+
     def forward(self, x: Tensor) -> Tensor:
         if not self.training or world_size() == 1:
             return super().forward(x)

@@ -5,20 +5,21 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.metrics import ImageError, psnr, ssim
-from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
+from pointsplat_ns.metrics import psnr, ssim
+from pointsplat_ns.metrics.lpips import ReportedLpips
+from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
+from pointsplat_ns.system.progress import tracked
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel
@@ -45,61 +46,62 @@ class SceneReport:
 @torch.no_grad()
 def evaluate_scene(
     model: PointSplatModel,
-    scene: TrainedScene,
+    scene: DenseScene,
     variants: dict[str, Gaussians],
     frames: Iterable[tuple[Cameras, dict]],
-    progress: bool,
+    count: int,
+    lpips: ReportedLpips,
     picture_folder: Path | None = None,
+    progress: bool = False,
 ) -> SceneReport:
     """Render each variant at each photo's camera and compare.
 
     Args:
-        model: draws, and has LPIPS if it can be had; in evaluation mode.
+        model: draws; in evaluation mode.
+        scene: says how it is drawn.
         variants: by name, on the model's device.
         frames: cameras of shape (1,) and their photos.
-        progress: show a bar.
+        count: how many frames there are, for the bar.
+        lpips: one view whose LPIPS it cannot compute leaves the scene without any.
         picture_folder: where to write a picture of every view, if anywhere.
+        progress: show a bar.
 
     Raises:
         DataError: if there is no photo.
     """
     values: dict[str, dict[str, list[float]]] = {v: {m: [] for m in METRICS} for v in variants}
     seconds: dict[str, list[float]] = {v: [] for v in variants}
-    columns = (TextColumn("evaluating {task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    lpips = model.lpips_of("alex")
     picture, views = None, 0
-    with Progress(*columns, transient=True, disable=not progress) as bar:
-        total = len(frames) if hasattr(frames, "__len__") else len(scene.eval_frames)
-        task = bar.add_task(scene.name, total=total)
-        for camera, data in frames:
-            pictures = []
-            for name, gaussians in variants.items():
-                start = _now(model.device)
-                outputs = model.draw(gaussians, scene, camera)
-                seconds[name].append(_now(model.device) - start)
-                photo = model.photo_of(data, outputs["background"])
-                rgb = outputs["rgb"]
-                pictures = pictures or [photo]
-                pictures.append(rgb)
-                values[name]["psnr"].append(float(psnr(rgb, photo)))
-                values[name]["ssim"].append(float(ssim(rgb, photo)))
-                if lpips is not None:
-                    try:
-                        values[name]["lpips"].append(float(lpips(rgb, photo)))
-                    except ImageError as error:
-                        model.lpips_reason, lpips = str(error), None
-            picture = torch.cat(pictures, dim=1)
-            if picture_folder is not None:
-                _write_picture(picture, picture_folder / f"{scene.name}_{views:04d}.png")
-            views += 1
-            bar.advance(task)
+    for camera, data in tracked(frames, f"evaluating {scene.name}", count, progress):
+        pictures: list[Tensor] = []
+        for name, gaussians in variants.items():
+            start = _now(model.device)
+            outputs = model.draw(gaussians, scene, camera)
+            seconds[name].append(_now(model.device) - start)
+            photo = model.photo_of(data, outputs["background"])
+            rgb = outputs["rgb"]
+            pictures = pictures or [photo]
+            pictures.append(rgb)
+            values[name]["psnr"].append(float(psnr(rgb, photo)))
+            values[name]["ssim"].append(float(ssim(rgb, photo)))
+            distance = lpips(rgb, photo)
+            if distance is not None:
+                values[name]["lpips"].append(float(distance))
+        picture = torch.cat(pictures, dim=1)
+        if picture_folder is not None:
+            _write_picture(picture, picture_folder / f"{scene.name}_{views:04d}.png")
+        views += 1
     if views == 0:
-        raise DataError(f"{scene.run.data}: no frame is held out, so there is nothing to evaluate on; change the split")
+        raise DataError(
+            f"{scene.source}: no frame of its data is held out, so there is nothing to evaluate on; change the "
+            "dataparser's split"
+        )
+    if any(len(per_view["lpips"]) < views for per_view in values.values()):
+        for per_view in values.values():  # no mean of the other views would be comparable
+            per_view["lpips"] = []
     rows = {}
     for name, gaussians in variants.items():
-        # LPIPS that failed at one view is not known for all, and no mean of the others is comparable.
-        complete = {metric: per_view if len(per_view) == views else [] for metric, per_view in values[name].items()}
-        rows[name] = {metric: _mean(complete[metric]) for metric in METRICS}
+        rows[name] = {metric: _mean(values[name][metric]) for metric in METRICS}
         rows[name] |= {"gaussians": len(gaussians), "megabytes": gaussians.megabytes}
         rows[name]["fps"] = 1.0 / statistics.median(seconds[name])
     return SceneReport(scene.name, views, rows, values, last_picture=picture)
@@ -131,6 +133,38 @@ def summarize(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
     return summary
 
 
+def summarize_by_reference(reports: list[SceneReport], has_photos: list[bool], with_std: bool) -> dict[str, Any]:
+    """:func:`summarize`, where no mean mixes what was compared with photos and what was compared with the dense
+    scene's own renders.
+
+    Args:
+        reports: of all scenes.
+        has_photos: of each of them, whether it was compared with photos.
+        with_std: add the standard deviation of the refined scenes' metrics over photos.
+    """
+    names = {True: "photos", False: "dense renders"}
+    parts = {
+        photos: summarize([r for r, kind in zip(reports, has_photos, strict=True) if kind == photos], with_std)
+        for photos in sorted(set(has_photos), reverse=True)
+    }
+    for photos, part in parts.items():
+        part["reference"] = names[photos]
+        for row in part["scenes"].values():
+            row["reference"] = names[photos]
+    summary = next(iter(parts.values()))
+    if len(parts) == 2:
+        other = parts[False]
+        rows = {**summary["scenes"], **other.pop("scenes")}
+        summary["scenes"] = {r.name: rows[r.name] for r in reports}
+        summary["against_dense_renders"] = other
+    return summary
+
+
+def only_finite(values: dict[str, Any]) -> dict[str, float]:
+    """What nerfstudio's writers can log."""
+    return {name: v for name, v in values.items() if isinstance(v, float) and math.isfinite(v)}
+
+
 def _average(reports: list[SceneReport]) -> dict[str, dict[str, float | None]]:
     """Means over scenes, by variant."""
     return {
@@ -139,10 +173,10 @@ def _average(reports: list[SceneReport]) -> dict[str, dict[str, float | None]]:
     }
 
 
-def _mean(values: list[float | None]) -> float | None:
+def _mean(values: Sequence[float | None]) -> float | None:
     """Mean of numbers; None if there is none, one is unknown, or the mean is not finite."""
-    known = [v for v in values if v is not None]
-    return _finite(sum(known) / len(known)) if known and len(known) == len(values) else None
+    numbers = [v for v in values if v is not None]
+    return _finite(sum(numbers) / len(numbers)) if numbers and len(numbers) == len(values) else None
 
 
 def _finite(value: Any) -> Any:
@@ -156,7 +190,7 @@ def _now(device: torch.device) -> float:
 
 
 def _write_picture(picture: Tensor, path: Path) -> None:
-    from torchvision.utils import save_image
+    from PIL import Image
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_image(picture.permute(2, 0, 1).cpu(), path)
+    Image.fromarray((255 * picture).round().to(torch.uint8).cpu().numpy()).save(path)

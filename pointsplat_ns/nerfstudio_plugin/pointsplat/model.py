@@ -6,47 +6,37 @@ viewer and ``ns-export gaussian-splat`` work on it unchanged. Only the network i
 
 from __future__ import annotations
 
-import dataclasses
+import math
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
-from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.models.splatfacto import SH2RGB
-from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.models.base_model import ModelConfig
+from nerfstudio.models.splatfacto import SH2RGB, SplatfactoModel
 from torch import Tensor
+from tyro.conf import Fixed, Suppress
 
-from pointsplat_ns.compression.trained_refiner import network_options
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
-from pointsplat_ns.metrics import ImageError, psnr
-from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
-from pointsplat_ns.nerfstudio_plugin.frames import FrameCache
+from pointsplat_ns.metrics import psnr
+from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
-from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_store import read_pruned, stored_path, write_pruned
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModel, SplatfactoCpuModelConfig
+from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PhotoLoss
+from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes import PrunedScene, PrunedScenes
+from pointsplat_ns.nerfstudio_plugin.rasterizer_options import RasterizerOptions
 from pointsplat_ns.pruning import PruneSettings
-from pointsplat_ns.refiner import Refiner, Structure, preset
+from pointsplat_ns.refiner import Refiner, preset
 from pointsplat_ns.refiner.augmentation import random_transform
-
-PIXEL_LOSSES = {
-    "l1": lambda difference: difference.abs().mean(),
-    # 1e-12 (120 dB) keeps the slope of the root finite where nothing differs.
-    "rmse": lambda difference: (difference.square().mean() + 1e-12).sqrt(),
-}
-"""What a picture's difference (H, W, 3) costs, by the name of the loss."""
-
-_PRUNED = "pruned"
-"""Names pruned scenes among what is kept in the cache."""
 
 
 @dataclass
-class PointSplatModelConfig(SplatfactoCpuModelConfig):
+class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     """Which Gaussians are kept, and the network that repairs them"""
 
     _target: type = field(default_factory=lambda: PointSplatModel)
@@ -85,65 +75,86 @@ class PointSplatModelConfig(SplatfactoCpuModelConfig):
     lpips_net: Literal["auto", "alex", "vgg"] = "auto"
     """Network of the training loss's LPIPS; auto is vgg on CUDA and alex, thirty times cheaper, elsewhere."""
 
+    # What nerfstudio gives every model and this one does not look at is no option of the command line.
+    enable_collider: Suppress[Fixed[bool]] = False
+    collider_params: Suppress[Fixed[dict[str, float] | None]] = None
+    loss_coefficients: Suppress[Fixed[dict[str, float]]] = field(default_factory=dict)
+    eval_num_rays_per_chunk: Suppress[Fixed[int]] = 4096
+    prompt: Suppress[Fixed[str | None]] = None
 
-@dataclass
-class PrunedScene:
-    """What training and evaluation need of a scene, made once."""
+    sh_degree: ClassVar[int] = 3
+    """What ``ns-export`` looks at: above 0 colours are SH coefficients. A scene may have any degree."""
 
-    scene: DenseScene
-    dense_count: int
-    pruned: Gaussians
-    structure: Structure | None
-    seconds: float  # to choose and select, without reading
+    def prune_settings(self, keep: float | None = None) -> PruneSettings:
+        """How scenes are pruned, at the config's own ``keep`` by default.
+
+        Raises:
+            PointSplatError: if no scene could be pruned so.
+        """
+        return PruneSettings(self.keep if keep is None else keep, self.by, self.opacity_weight)
+
+    def network_options(self) -> dict[str, Any]:
+        """Changes to the preset of the network's size."""
+        return {
+            "encoder": self.encoder,
+            "use_appearance": self.use_appearance,
+            "use_position": self.use_position,
+            "norm": self.norm,
+        }
+
+    def check(self) -> None:
+        """Refuse what no scene could be trained with, and options that would have no effect.
+
+        Raises:
+            PointSplatError: if there is such an option.
+        """
+        for keep in (self.keep, *self.more_keeps):
+            self.prune_settings(keep)
+        if not 0 <= self.lpips_weight < math.inf:  # NaN fails too
+            raise PointSplatError(
+                f"--pipeline.model.lpips-weight {self.lpips_weight:g}: expected a finite number, 0 or above"
+            )
+        if self.lpips_weight == 0 and self.lpips_net != "auto":
+            raise PointSplatError(
+                f"--pipeline.model.lpips-net {self.lpips_net}: at --pipeline.model.lpips-weight 0 the loss has no "
+                "LPIPS; give a weight above 0, or leave the network out"
+            )
+        if self.backend == "gsplat" and (self.compiled or self.quality != "exact"):
+            option = "compiled True" if self.compiled else f"quality {self.quality}"
+            raise PointSplatError(
+                f"--pipeline.model.{option}: has no effect on --pipeline.model.backend gsplat; leave it out, or take "
+                "the backend torch or auto"
+            )
 
 
-def tensors_in(value: Any) -> Iterator[Tensor]:
-    """Every tensor held by a dataclass, tuple or list, however deep."""
-    if isinstance(value, Tensor):
-        yield value
-    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        for entry in dataclasses.fields(value):
-            yield from tensors_in(getattr(value, entry.name))
-    elif isinstance(value, (tuple, list)):
-        for entry in value:
-            yield from tensors_in(entry)
-
-
-def settings_of(config: PointSplatModelConfig, keep: float | None = None) -> PruneSettings:
-    """How a config asks for scenes to be pruned, at its own ``keep`` by default."""
-    return PruneSettings(config.keep if keep is None else keep, config.by, config.opacity_weight)
-
-
-class PointSplatModel(SplatfactoCpuModel):
+class PointSplatModel(SplatfactoModel):
     """See the module. The pipeline hands over the scenes with :meth:`attach` before anything is drawn."""
 
-    config: PointSplatModelConfig
+    config: PointSplatModelConfig  # type: ignore[assignment]  # Splatfacto's options would have no effect here
 
     def populate_modules(self) -> None:
         """Build the network; nothing of a scene is a parameter.
 
         Raises:
-            PointSplatError: if no scene could be pruned as the config asks, or its settings describe no network.
+            PointSplatError: if the config asks for what cannot be, or its settings describe no network.
         """
-        for keep in (self.config.keep, *self.config.more_keeps):
-            settings_of(self.config, keep)
-        self.refiner = Refiner(preset(self.config.size, **network_options(vars(self.config))))
-        self.camera_optimizer = CameraOptimizerConfig(mode="off").setup(num_cameras=1, device="cpu")
-        self.crop_box = None
-        self.step = 0
+        self.config.check()
+        self.refiner = Refiner(preset(self.config.size, **self.config.network_options()))
+        self.crop_box: OrientedBox | None = None
         self.scenes: list[DenseScene] = []
         self.shown = 0
-        self._cache = FrameCache(0)
-        self._latest: tuple[tuple[int, float], PrunedScene] | None = None
+        """Which scene the viewer and the exporter get."""
+        self.loss = PhotoLoss(self.config.pixel_loss, self.config.lpips_weight, self.config.lpips_net)
+        self._pruned = self._pruned_within(MemoryCache(0))
         self._refined: tuple[int, Gaussians] | None = None
-        self._lpips: dict[str, Lpips | None] = {}
-        self.lpips_reason: str | None = None
-        """Why there is no LPIPS, once that is known."""
 
-    def attach(self, scenes: list[DenseScene], shown: int, cache: FrameCache) -> None:
+    def attach(self, scenes: list[DenseScene], shown: int, cache: MemoryCache) -> None:
         """Take the scenes to work on, which of them is the model's own to the viewer and the exporter, and where pruned
         scenes are kept."""
-        self.scenes, self.shown, self._cache, self._latest = scenes, shown, cache, None
+        self.scenes, self.shown, self._pruned = scenes, shown, self._pruned_within(cache)
+
+    def _pruned_within(self, cache: MemoryCache) -> PrunedScenes:
+        return PrunedScenes(cache, self.config.pruned_folder, self.refiner.prepare)
 
     def load_state_dict(self, dict, **kwargs):  # type: ignore[override]
         """The network's weights; Splatfacto's own method would look for Gaussians.
@@ -155,7 +166,7 @@ class PointSplatModel(SplatfactoCpuModel):
         try:
             return torch.nn.Module.load_state_dict(self, dict, **{**kwargs, "strict": True})
         except RuntimeError as error:
-            options = ", ".join(f"{name} {value}" for name, value in network_options(vars(self.config)).items())
+            options = ", ".join(f"{name} {value}" for name, value in self.config.network_options().items())
             raise SceneError(
                 f"the checkpoint does not hold a network of size {self.config.size} with {options}; expected the "
                 "settings that it was trained with"
@@ -170,52 +181,37 @@ class PointSplatModel(SplatfactoCpuModel):
         return self.refiner.parameter_groups()
 
     def pruned_scene(self, index: int, dense: Gaussians | None = None, keep: float | None = None) -> PrunedScene:
-        """A scene, pruned and serialized; kept while the cache has room for it, the latest in any case. Who has read
-        the dense scene may give it; ``keep`` is the config's by default."""
-        key = (index, self.config.keep if keep is None else keep)
-        if self._latest is None or self._latest[0] != key:
-            known = self._cache.get((_PRUNED, *key))
-            self._latest = (key, self._prune(*key, dense) if known is None else known[0])  # type: ignore[arg-type]
-        return self._latest[1]
+        """A scene, pruned and serialized.
 
-    def _prune(self, index: int, keep: float, dense: Gaussians | None) -> PrunedScene:
-        scene = self.scenes[index]
-        settings = settings_of(self.config, keep)
-        stored = stored_path(self.config.pruned_folder, scene.identity, settings)
-        if stored is not None and stored.is_file():
-            pruned, dense_count, seconds = read_pruned(stored)
-        else:
-            dense = scene.dense(keep=False) if dense is None else dense
-            start = time.perf_counter()
-            try:
-                pruned = settings.prune(dense)
-            except PointSplatError as error:
-                raise type(error)(f"{scene.source}: {error}") from error
-            dense_count, seconds = len(dense), time.perf_counter() - start
-            if stored is not None:
-                write_pruned(stored, pruned, dense_count, seconds)
-        pruned = pruned.to(self.device)
-        structure = self.refiner.prepare(pruned)
-        made = PrunedScene(scene, dense_count, pruned, structure, seconds)
-        self._cache.put((_PRUNED, index, keep), (made, dict(enumerate(tensors_in(made)))))  # type: ignore[arg-type]
-        CONSOLE.log(f"{scene.name}: kept {len(pruned):,} of {dense_count:,} Gaussians")
-        return made
+        Args:
+            index: of the scene.
+            dense: its Gaussians, if they have been read already.
+            keep: the config's by default.
+
+        Raises:
+            PointSplatError: if this scene cannot be pruned so.
+        """
+        return self._pruned.get(self.scenes[index], self.config.prune_settings(keep), self.device, dense)
 
     def refine(self, index: int) -> Gaussians:
         """The refined scene; differentiable in training, computed once for the same weights in evaluation."""
         if self.training:
             self._refined = None
-            keeps = (self.config.keep, *self.config.more_keeps)
-            made = self.pruned_scene(index, keep=keeps[int(torch.randint(len(keeps), ()))] if len(keeps) > 1 else None)
+            seen = self.pruned_scene(index, keep=self._drawn_keep())
             if not self.config.augment:
-                return self.refiner(made.pruned, made.structure)
+                return self.refiner(seen.pruned, seen.structure)
             transform = random_transform()
-            return transform.undo(self.refiner(transform.apply(made.pruned)))
-        made = self.pruned_scene(index)
+            return transform.undo(self.refiner(transform.apply(seen.pruned)))
         if self._refined is None or self._refined[0] != index:
+            seen = self.pruned_scene(index)
             with torch.no_grad():
-                self._refined = (index, self.refiner(made.pruned, made.structure))
+                self._refined = index, self.refiner(seen.pruned, seen.structure)
         return self._refined[1]
+
+    def _drawn_keep(self) -> float | None:
+        """The budget of a training step: one of several, at random."""
+        keeps = (self.config.keep, *self.config.more_keeps)
+        return keeps[int(torch.randint(len(keeps), ()))] if len(keeps) > 1 else None
 
     def timed_refine(self, index: int) -> tuple[Gaussians, float]:
         """As :meth:`refine` in evaluation, computed anew, and the seconds that it took."""
@@ -237,7 +233,8 @@ class PointSplatModel(SplatfactoCpuModel):
             ``rgb`` (H, W, 3) in [0, 1], ``accumulation`` (H, W, 1), ``depth`` (H, W, 1) in scene units, ``background``.
         """
         width, height = int(camera.width.item()), int(camera.height.item())
-        image, alpha, _ = self._rasterization(
+        image, alpha, _ = self.config.rasterize(
+            training=self.training,
             means=gaussians.means,
             quats=gaussians.quats,
             scales=gaussians.stds,
@@ -262,7 +259,7 @@ class PointSplatModel(SplatfactoCpuModel):
             outputs["depth"] = torch.where(alpha[0] > 0, depth, depth.max())
         return outputs
 
-    def get_outputs(self, camera: Cameras) -> dict[str, Any]:
+    def get_outputs(self, camera: RayBundle | Cameras) -> dict[str, Any]:
         """The shown scene, refined, from one camera; cropped where the viewer asks for it."""
         if not isinstance(camera, Cameras):
             return {}
@@ -270,16 +267,6 @@ class PointSplatModel(SplatfactoCpuModel):
         if self.crop_box is not None and not self.training:
             gaussians = gaussians[self.crop_box.within(gaussians.means).reshape(-1)]
         return self.draw(gaussians, self.scenes[self.shown], camera)
-
-    def lpips_of(self, net: str) -> Lpips | None:
-        """LPIPS with a backbone, loaded once; None, with ``lpips_reason`` set, where it cannot be had."""
-        if net not in self._lpips:
-            try:
-                self._lpips[net] = load_lpips(net).to(self.device)  # type: ignore[arg-type]
-            except LpipsUnavailable as error:
-                self._lpips[net], self.lpips_reason = None, str(error)
-                CONSOLE.log(f"going on without LPIPS: {error}")
-        return self._lpips[net]
 
     def losses(self, index: int, frames: list[tuple[Cameras, dict]]) -> tuple[dict, dict[str, Tensor], dict]:
         """Refine a scene and compare its renders with photos.
@@ -289,36 +276,20 @@ class PointSplatModel(SplatfactoCpuModel):
             metrics to log. A loss may be NaN or infinite: the trainer then skips the step.
         """
         refined, scene = self.refine(index), self.scenes[index]
-        net = self.config.lpips_net
-        net = ("vgg" if self.device.type == "cuda" else "alex") if net == "auto" else net
-        lpips = self.lpips_of(net) if self.config.lpips_weight > 0 else None
         outputs: dict[str, Tensor] = {}
-        pixels, perceptual, quality = [], [], []
+        pairs = []
         for camera, data in frames:
             outputs = self.draw(refined, scene, camera)
-            rgb, photo = outputs["rgb"], self.photo_of(data, outputs["background"])
-            if "mask" in data:
-                rgb, photo = rgb * data["mask"], photo * data["mask"]
-            pixels.append(PIXEL_LOSSES[self.config.pixel_loss](rgb - photo))
-            quality.append(psnr(rgb.detach(), photo))
-            if lpips is not None:
-                try:
-                    perceptual.append(lpips(rgb, photo))
-                except ImageError as error:  # too small for the network
-                    self._lpips[net] = lpips = None
-                    CONSOLE.log(f"going on without LPIPS in the loss: {error}")
-        losses = {self.config.pixel_loss: torch.stack(pixels).mean()}
-        if perceptual:
-            losses["lpips"] = self.config.lpips_weight * torch.stack(perceptual).mean()
-        return outputs, losses, {"psnr": torch.stack(quality).mean(), "gaussian_count": len(refined)}
-
-    def _get_downscale_factor(self) -> int:
-        """1: nothing is gained by starting coarse, as Splatfacto does."""
-        return 1
+            mask = data.get("mask", 1)
+            pairs.append((outputs["rgb"] * mask, self.photo_of(data, outputs["background"]) * mask))
+        quality = torch.stack([psnr(render.detach(), photo) for render, photo in pairs]).mean()
+        return outputs, self.loss(pairs), {"psnr": quality, "gaussian_count": len(refined)}
 
     def photo_of(self, data: dict[str, Any], background: Tensor) -> Tensor:
         """A photo (H, W, 3) in [0, 1], over ``background`` where it has an alpha channel."""
-        return self.composite_with_background(self.get_gt_img(data["image"]), background)
+        image = data["image"]
+        image = image.float() / 255 if image.dtype == torch.uint8 else image
+        return self.composite_with_background(image.to(self.device), background)
 
     # What nerfstudio's viewer and exporter read of a Splatfacto model.
 

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import random
-from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -18,24 +14,23 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch.cuda.amp.grad_scaler import GradScaler
 
-from pointsplat_ns.compression.trained_refiner import network_options
 from pointsplat_ns.errors import SceneError
+from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat import distributed
-from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import SceneReport, evaluate_scene, summarize
-from pointsplat_ns.nerfstudio_plugin.pointsplat.model import (
-    PIXEL_LOSSES,
-    PointSplatModel,
-    PointSplatModelConfig,
-    settings_of,
+from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager, ScenesDataManagerConfig
+from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
+    SceneReport,
+    evaluate_scene,
+    only_finite,
+    summarize_by_reference,
 )
-from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import ScenesDataManager, ScenesDataManagerConfig
+from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import LOSSES
+from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
+from pointsplat_ns.nerfstudio_plugin.pointsplat.training_state import TrainingState
 from pointsplat_ns.refiner import save_refiner
 
 REFINER_NAME = "refiner.safetensors"
 """The trained network, in the run's folder: what ``pointsplat compact --using`` takes."""
-
-_REDUCED = (*PIXEL_LOSSES, "lpips", "psnr")
-"""What is averaged over processes at each step."""
 
 
 @dataclass
@@ -85,50 +80,22 @@ class PointSplatPipeline(VanillaPipeline):
         distributed.share_state(self.model.refiner)
         if world_size > 1:
             distributed.synchronise_batch_norm(self.model.refiner)
-        self._saved_groups: list[str] = []
-        self.faults: list[str] = []
-        """Losses of the latest training step in this process that were not finite, in words."""
-        self.counted: dict[str, int] = {}
-        """Steps whose gradients are gathered, by part of the network."""
-        self.skipped: Counter[str] = Counter()
-        """Steps that were left out because a loss or a gradient was not finite, by scene, over all processes."""
         scenes, indices = self.datamanager.scenes, self.datamanager.train_indices
-        self.trained_on: set[str] = {scenes[i].identity for i in indices} if test_mode == "val" else set()
-        """Identities of the scenes that the network has been trained on, resumed trainings included."""
+        trained_on = [scenes[i].identity for i in indices] if test_mode == "val" else []
+        self.training_state = TrainingState(self.model.get_param_groups(), trained_on)
+        """What the training has done so far; a checkpoint holds it."""
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What a checkpoint says beside the weights: which scenes they were trained on, how many steps were skipped,
-        and gradients in waiting."""
-        state: dict[str, Any] = {"trained_on": sorted(self.trained_on), "skipped": dict(self.skipped)}
-        if self._saved_groups:
-            groups = self.get_param_groups()
-            state["gradients"] = {name: [p.grad for p in groups[name]] for name in self._saved_groups}
-            state["counted"] = {name: self.counted[name] for name in self._saved_groups if name in self.counted}
-        return state
-
-    @contextmanager
-    def saving_gradients(self, groups: list[str]) -> Iterator[None]:
-        """Within, a checkpoint holds the gradients of these parts of the network."""
-        self._saved_groups = groups
-        try:
-            yield
-        finally:
-            self._saved_groups = []
+        """What a checkpoint says beside the weights; torch asks for it."""
+        return self.training_state.to_dict()
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Remember what a checkpoint was trained on, and say so if scenes have gone since; take up gradients that
-        were gathering when it was saved, and the count of skipped steps, but for those of scenes that are gone."""
-        for name, gradients in state.get("gradients", {}).items():
-            for p, gradient in zip(self.get_param_groups()[name], gradients, strict=True):
-                p.grad = None if gradient is None else gradient.to(p)
-        self.counted.update(state.get("counted", {}))
-        names = {scene.name for scene in self.datamanager.scenes}
-        self.skipped = Counter({name: count for name, count in state.get("skipped", {}).items() if name in names})
-        known = set(state["trained_on"])
-        gone = known - {scene.identity for scene in self.datamanager.scenes}
+        """Take up what a checkpoint says beside the weights, and say so if scenes have gone since."""
+        scenes = self.datamanager.scenes
+        self.training_state.load(state, [scene.name for scene in scenes])
+        gone = set(state["trained_on"]) - {scene.identity for scene in scenes}
         if gone:
             CONSOLE.log(f"trained on {', '.join(sorted(gone))}, which {self.datamanager.get_datapath()} no longer has")
-        self.trained_on |= known
 
     @property
     def model(self) -> PointSplatModel:
@@ -141,17 +108,21 @@ class PointSplatPipeline(VanillaPipeline):
         Random numbers (the order of serialization curves, dropped paths) depend on the seed and the place of the
         scene in the sequence alone, as the choice of scene and photos does: a resumed training goes on as if it had
         never stopped. Several processes take turns in that sequence; the values of their losses and metrics are the
-        mean over processes, the gradients each process's own. Losses that are not finite are in ``faults``.
+        mean over processes, the gradients each process's own.
+
+        Returns:
+            Outputs of the last photo's camera; losses; and metrics, among which ``faults`` has the losses of this
+            process that are not finite, in words.
         """
         place = self.datamanager.place(step)
         torch.manual_seed(random.Random(f"{self.config.datamanager.seed} network {place}").getrandbits(63))
         index, frames = self.datamanager.next_train(step)
         outputs, losses, metrics = self.model.losses(index, frames)
-        self.faults = [f"the {name} loss is {v.item()}" for name, v in losses.items() if not v.isfinite()]
-        means = distributed.means_over_ranks({**losses, "psnr": metrics["psnr"]}, _REDUCED)
+        faults = [f"the {name} loss is {v.item()}" for name, v in losses.items() if not v.isfinite()]
+        means = distributed.means_over_ranks({**losses, "psnr": metrics["psnr"]}, (*LOSSES, "psnr"))
         if self.world_size > 1:
             losses = {name: distributed.with_value(value, means[name]) for name, value in losses.items()}
-        metrics |= {"psnr": means["psnr"], "scene": index}
+        metrics |= {"psnr": means["psnr"], "scene": index, "faults": faults}
         return outputs, losses, metrics
 
     @torch.no_grad()
@@ -170,14 +141,13 @@ class PointSplatPipeline(VanillaPipeline):
         training = self.training
         self.eval()
         index, frames = self.datamanager.next_eval_image(step)
-        made = self.model.pruned_scene(index)
-        report = evaluate_scene(
-            self.model, made.scene, {"pruned": made.pruned, "refined": self.model.refine(index)}, frames, False
-        )
+        variants = {"pruned": self.model.pruned_scene(index).pruned, "refined": self.model.refine(index)}
+        scene = self.datamanager.scenes[index]
+        report = evaluate_scene(self.model, scene, variants, frames, 1, ReportedLpips())
         pixels = int(frames[0][0].height) * int(frames[0][0].width)
         metrics: dict[str, Any] = {"num_rays": pixels}
         for variant, values in report.variants.items():
-            metrics |= _finite({f"{name}_{variant}": value for name, value in values.items()})
+            metrics |= only_finite({f"{name}_{variant}": value for name, value in values.items()})
         self.train(training)
         return metrics, {"photo_pruned_refined": report.last_picture}
 
@@ -202,35 +172,34 @@ class PointSplatPipeline(VanillaPipeline):
         """
         training = self.training
         self.eval()
-        manager, model = self.datamanager, self.model
+        manager, model, lpips = self.datamanager, self.model, ReportedLpips()
         reports: list[SceneReport] = []
-        mine = range(distributed.rank(), len(manager.scenes), self.world_size)
-        for index in mine:
+        for index in range(distributed.rank(), len(manager.scenes), self.world_size):
             scene = manager.scenes[index]
             dense = scene.dense(keep=False)
-            made = model.pruned_scene(index, dense)
+            smaller = model.pruned_scene(index, dense)
             refined, seconds = model.timed_refine(index)
-            variants = {"dense": dense.to(model.device), "pruned": made.pruned, "refined": refined}
-            report = evaluate_scene(model, scene, variants, manager.held_out(index), True, output_path)
-            report.seen_in_training = scene.identity in self.trained_on
-            report.seconds = {"prune": made.seconds, "refine": seconds}
+            variants = {"dense": dense.to(model.device), "pruned": smaller.pruned, "refined": refined}
+            frames, count = manager.held_out(index), len(scene.eval_frames)
+            report = evaluate_scene(model, scene, variants, frames, count, lpips, output_path, progress=True)
+            report.seen_in_training = scene.identity in self.training_state.trained_on
+            report.seconds = {"prune": smaller.seconds, "refine": seconds}
             report.last_picture = None
             reports.append(report)
         self.train(training)
         order = {scene.name: index for index, scene in enumerate(manager.scenes)}
         reports = sorted(distributed.gathered(reports), key=lambda report: order[report.name])
         summary = summarize_by_reference(reports, [scene.has_photos for scene in manager.scenes], get_std)
+        config = self.config.model
         summary["settings"] = {
-            "size": self.config.model.size,
-            **network_options(vars(self.config.model)),
-            **dataclasses.asdict(settings_of(self.config.model)),
+            "size": config.size,
+            **config.network_options(),
+            **dataclasses.asdict(config.prune_settings()),
         }
         summary["supervision"] = manager.supervision
-        if model.lpips_reason is not None:
-            summary["lpips_note"] = model.lpips_reason
-        if step is None:
-            return summary
-        return _finite(summary)
+        if lpips.reason is not None:
+            summary["lpips_note"] = lpips.reason
+        return summary if step is None else only_finite(summary)
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         """Saves the network by itself at the end of training, for use without the scenes that it was trained on."""
@@ -252,29 +221,3 @@ class PointSplatPipeline(VanillaPipeline):
                 )
 
         return [TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], save)]
-
-
-def summarize_by_reference(reports: list[SceneReport], has_photos: list[bool], with_std: bool) -> dict[str, Any]:
-    """:func:`~pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation.summarize`, where no mean mixes what was compared with photos and what was
-    compared with the dense scene's own renders."""
-    names = {True: "photos", False: "dense renders"}
-    parts = {
-        photos: summarize([r for r, kind in zip(reports, has_photos, strict=True) if kind == photos], with_std)
-        for photos in sorted(set(has_photos), reverse=True)
-    }
-    for photos, part in parts.items():
-        part["reference"] = names[photos]
-        for row in part["scenes"].values():
-            row["reference"] = names[photos]
-    summary = next(iter(parts.values()))
-    if len(parts) == 2:
-        other = parts[False]
-        rows = {**summary["scenes"], **other.pop("scenes")}
-        summary["scenes"] = {r.name: rows[r.name] for r in reports}
-        summary["against_dense_renders"] = other
-    return summary
-
-
-def _finite(values: dict[str, Any]) -> dict[str, float]:
-    """What nerfstudio's writers can log."""
-    return {name: v for name, v in values.items() if isinstance(v, float) and math.isfinite(v)}

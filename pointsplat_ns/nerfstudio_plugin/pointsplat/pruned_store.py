@@ -17,18 +17,18 @@ FORMAT = "pointsplat-pruned/1"
 """Changes whenever a method of pruning does, so that no file of an older one is taken."""
 
 
-def stored_path(folder: Path | None, identity: str, settings: PruneSettings) -> Path | None:
-    """Where a scene pruned with some options belongs; None without a folder.
+def stored_path(folder: Path, name: str, content: str, settings: PruneSettings) -> Path:
+    """Where a scene that is pruned in some way belongs.
 
     Args:
         folder: of all pruned scenes.
-        identity: tells the dense scene from any other.
-        options: arguments of :func:`pointsplat_ns.pruning.methods`.
+        name: of the scene, for a person who looks into the folder.
+        content: SHA-256 of the file that the dense scene is read from. A scene that is trained again has another,
+            whatever its run is called.
+        settings: how it is pruned.
     """
-    if folder is None:
-        return None
-    described = json.dumps([FORMAT, identity, dataclasses.asdict(settings)], sort_keys=True)
-    readable = re.sub(r"[^\w.+-]+", "-", identity.split("/")[0]).strip("-.") or "scene"
+    described = json.dumps([FORMAT, content, dataclasses.asdict(settings)], sort_keys=True)
+    readable = re.sub(r"[^\w.+-]+", "-", name).strip("-.") or "scene"
     return folder / f"{readable}-{hashlib.sha256(described.encode()).hexdigest()[:16]}.safetensors"
 
 

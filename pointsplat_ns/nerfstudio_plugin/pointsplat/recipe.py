@@ -117,7 +117,8 @@ Splatting scenes after they were merged to {100 * about["keep"]:g} % of their Ga
 
 - **Data:** {len(about["scenes"])} furnished rooms that the package makes itself ({about["scenes"][0]} to
   {about["scenes"][-1]}: layout, size, furniture, textures, lights, path and size of the pictures all differ), each
-  trained with `splatfacto-cpu` at settings of its own (`pointsplat_ns/nerfstudio_plugin/pointsplat/recipe.py`). No downloaded data.
+  trained with `splatfacto-cpu` at settings of its own (`pointsplat_ns/nerfstudio_plugin/pointsplat/recipe.py`). No
+  downloaded data.
 - **Made by:** `{about["command"]}`
 - **Training:** {about["steps"]:,} steps, each one scene and two views, against the dense scene's own renders. The
   command inside, in its output folder:

@@ -1,4 +1,4 @@
-"""Trained scenes with their posed photos, one or many, as the refiner is trained and evaluated on.
+"""Trained scenes with their posed photos, one or many, that the refiner is trained and evaluated on.
 
 A trained run knows its data, its dataparser and its frame, so the run is all that a person names:
 ``--data`` takes one run, or any folder above several. Photos are not needed where the dense scene's own
@@ -8,29 +8,26 @@ renders are what the refiner learns from: ``--data`` may then name PLY files, to
 from __future__ import annotations
 
 import dataclasses
-import random
-from collections.abc import Iterator
-from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.datamanagers.base_datamanager import DataManager, DataManagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.colors import get_color
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.discovery import Supervision, find_runs_and_plys
 from pointsplat_ns.io.inert_yaml import Tagged
-from pointsplat_ns.io.runs import Run, open_run, shown_scene
+from pointsplat_ns.io.runs import Run, open_run
 from pointsplat_ns.io.splatfacto import read_checkpoint
-from pointsplat_ns.nerfstudio_plugin.frames import FrameCache, Frames, free_memory_share, to_device
+from pointsplat_ns.nerfstudio_plugin.frames import Frames
+from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, PlyScene, SampledPoses, Split
+from pointsplat_ns.views import RasterizeMode
 
 VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What Splatfacto evaluates over where it trained with random backgrounds."""
@@ -95,7 +92,7 @@ class TrainedScene(DenseScene):
         self,
         name: str,
         run: Run,
-        cache: FrameCache,
+        cache: MemoryCache,
         poses: SampledPoses | None = None,
         device: torch.device | str = "cpu",
         has_photos: bool = True,
@@ -106,7 +103,11 @@ class TrainedScene(DenseScene):
 
     @property
     def identity(self) -> str:
-        """Tells this trained scene from any other, wherever its folder is moved: EXPERIMENT/METHOD/TIME, step."""
+        """EXPERIMENT/METHOD/TIME, step: a scene that is trained again has another time, and is another scene.
+
+        Not by content: a scene that replaces one of the same name, time and step is held to be known to the network,
+        for it shows the same place.
+        """
         run = self.run
         return f"{self.name}/{run.method_name}/{run.timestamp} step {run.step}"
 
@@ -115,7 +116,7 @@ class TrainedScene(DenseScene):
         return read_checkpoint(self.run.checkpoint)
 
     @property
-    def rasterize_mode(self) -> Literal["classic", "antialiased"]:
+    def rasterize_mode(self) -> RasterizeMode:
         """How the run rendered, and how it is rendered from then on."""
         return self.run.rasterize_mode
 
@@ -148,7 +149,7 @@ class TrainedScene(DenseScene):
     def _frames(self, split: str) -> Frames:
         scale = self.run.datamanager_fields.get("camera_res_scale_factor", 1.0)
         scale = float(scale) if isinstance(scale, (int, float)) else 1.0
-        return Frames(InputDataset(self._outputs(split), scale), cache=self._cache)
+        return Frames(InputDataset(self._outputs(split), scale), cache=self.cache)
 
     @cached_property
     def train_frames(self) -> Any:
@@ -170,7 +171,7 @@ class TrainedScene(DenseScene):
 def find_scenes(
     folder: Path,
     supervision: Supervision,
-    cache: FrameCache,
+    cache: MemoryCache,
     poses: SampledPoses | None = None,
     device: torch.device | str = "cpu",
     need_data: bool = True,
@@ -210,172 +211,3 @@ def find_scenes(
         scenes.append(TrainedScene(name, run, cache, poses, device, has_photos))
     scenes += [PlyScene(name, path, cache, poses, device) for name, path in plys.items()]
     return chosen, scenes
-
-
-@dataclass
-class ScenesDataManagerConfig(DataManagerConfig):
-    """Trained scenes with their posed photos"""
-
-    _target: type = field(default_factory=lambda: ScenesDataManager)
-    data: Path | None = None
-    """A trained Splatfacto run, a 3DGS .ply, or a folder above several (the newest run of each experiment is taken)."""
-    supervision: Supervision = "auto"
-    """What renders of the refined scene are compared with in training: photos, or the dense scene's own renders, from
-    the dataset's poses or, where there is no dataset, from poses sampled in free space. auto is photos for trained
-    runs, and dense for PLY files."""
-    sampled_poses: int = 40
-    """Poses sampled to train on in a scene that has no dataset (a fifth as many again are held out)."""
-    sampled_size: tuple[int, int] = (320, 240)
-    """Width and height in pixels of pictures from sampled poses."""
-    eval_scenes: tuple[str, ...] = ()
-    """Names of scenes never to train on, to see how the refiner does on scenes that it does not know."""
-    images_per_step: int = 2
-    """Training photos of one scene rendered at each step (the paper: 2)."""
-    cache_gigabytes: float | None = None
-    """Memory for decoded photos, dense and pruned scenes and their renders; by default a quarter of what is free. What
-    does not fit is made again when it is due."""
-    seed: int = 0
-    """Chooses the order of scenes and photos."""
-
-
-class ScenesDataManager(DataManager):
-    """Hands out, at each step, one scene and some of its training photos.
-
-    What a step gets depends on the seed and the step alone, so that a resumed training goes on as if
-    it had never stopped. Of W processes, process R takes the places R, W + R, 2 W + R... of one sequence:
-    together they see what one process sees in W times the steps.
-
-    Raises:
-        SceneError: if ``data`` holds no trained run, or ``eval_scenes`` names one that is not there.
-    """
-
-    config: ScenesDataManagerConfig
-
-    def __init__(
-        self,
-        config: ScenesDataManagerConfig,
-        device: torch.device | str = "cpu",
-        test_mode: Literal["test", "val", "inference"] = "val",
-        world_size: int = 1,
-        local_rank: int = 0,
-        **kwargs: Any,
-    ):
-        self.config, self.device, self.test_mode = config, device, test_mode
-        self.world_size, self.local_rank = world_size, local_rank
-        if config.data is None:
-            raise SceneError("--data is missing: expected a trained Splatfacto run, a .ply, or a folder above several")
-        if config.images_per_step < 1:
-            raise DataError(f"--images-per-step {config.images_per_step}: expected at least 1")
-        if config.sampled_poses < 1 or min(config.sampled_size) < 1:
-            size = "{} x {}".format(*config.sampled_size)
-            raise DataError(f"{config.sampled_poses} sampled poses of {size} pixels: expected at least 1 of 1 x 1")
-        gigabytes = config.cache_gigabytes
-        self.cache = FrameCache(free_memory_share() if gigabytes is None else int(gigabytes * 1e9))
-        held_out_poses = max(1, config.sampled_poses // 5)
-        poses = SampledPoses(config.sampled_poses, held_out_poses, *config.sampled_size, seed=config.seed)
-        self.supervision, self.scenes = find_scenes(
-            Path(config.data), config.supervision, self.cache, poses, device, need_data=test_mode != "inference"
-        )
-        names = [scene.name for scene in self.scenes]
-        unknown = [name for name in config.eval_scenes if name not in names]
-        if unknown:
-            raise SceneError(
-                f"--eval-scenes {unknown[0]}: no such scene in {config.data}; there are {', '.join(names)}"
-            )
-        self.train_indices = [i for i, name in enumerate(names) if name not in config.eval_scenes]
-        self.eval_indices = [i for i, name in enumerate(names) if name in config.eval_scenes] or self.train_indices
-        if not self.train_indices:
-            raise SceneError(f"--eval-scenes names all {len(names)} scenes of {config.data}; none is left to train on")
-        self.shown = names.index(shown_scene(names, config.eval_scenes))
-        """The scene that the viewer and the exporter get."""
-        training = ", ".join(names[i] for i in self.train_indices)
-        held_out = ", ".join(config.eval_scenes) or "no scene (held-out photos of the training scenes serve)"
-        targets = "photos" if self.supervision == "photos" else "renders of the dense scenes"
-        CONSOLE.log(f"training scenes: {training}; trained on: {targets}; evaluation on: {held_out}")
-        super().__init__()
-
-    @property
-    def train_dataset(self) -> InputDataset | None:  # type: ignore[override]
-        """Training photos of the shown scene, for the viewer."""
-        return None if self.test_mode == "inference" else self.training_frames(self.shown).dataset
-
-    @property
-    def eval_dataset(self) -> InputDataset | None:  # type: ignore[override]
-        """Held-out photos of the shown scene, for the viewer."""
-        return None if self.test_mode == "inference" else self.scenes[self.shown].eval_frames.dataset
-
-    @property
-    def includes_time(self) -> bool:
-        """No scene moves."""
-        return False
-
-    def setup_train(self) -> None:
-        """Nothing to set up: photos are read when they are due."""
-
-    def setup_eval(self) -> None:
-        """Nothing to set up: photos are read when they are due."""
-
-    def training_frames(self, scene: int) -> Any:
-        """What a scene is learned from: its photos, or the dense scene's own renders."""
-        scene_at = self.scenes[scene]
-        return scene_at.train_frames if self.supervision == "photos" else scene_at.rendered_train
-
-    def place(self, step: int) -> int:
-        """Where this process is in the sequence of scenes at a step of its own."""
-        return step * self.world_size + self.local_rank
-
-    def _choice(self, step: int) -> tuple[int, list[int]]:
-        """Scene and photos of a step: each scene once before any twice, photos at random without repetition."""
-        step = self.place(step)
-        epoch, place = divmod(step, len(self.train_indices))
-        order = random.Random(f"{self.config.seed} scenes {epoch}").sample(self.train_indices, len(self.train_indices))
-        scene = order[place]
-        count = len(self.training_frames(scene))
-        chosen = random.Random(f"{self.config.seed} photos {step}")
-        return scene, chosen.sample(range(count), min(self.config.images_per_step, count))
-
-    def next_train(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
-        """Index of a training scene, and some of its training photos with their cameras, on the device."""
-        scene, photos = self._choice(step)
-        targets = self.training_frames(scene)
-        frames = [to_device(targets[i], self.device) for i in photos]
-        next_scene, next_photos = self._choice(step + 1)
-        self.training_frames(next_scene).prefetch(next_photos)
-        return scene, frames
-
-    def next_eval(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
-        """Index of an evaluation scene, and one of its held-out photos."""
-        scene = self.eval_indices[step % len(self.eval_indices)]
-        frames = self.scenes[scene].eval_frames
-        if len(frames) == 0:
-            raise DataError(
-                f"{self.scenes[scene].source}: no frame of its data is held out; change the dataparser's split"
-            )
-        index = random.Random(f"{self.config.seed} eval {step}").randrange(len(frames))
-        return scene, [to_device(frames[index], self.device)]
-
-    def next_eval_image(self, step: int):  # type: ignore[override]
-        """As :meth:`next_eval`."""
-        return self.next_eval(step)
-
-    def held_out(self, scene: int) -> Iterator[tuple[Cameras, dict[str, Any]]]:
-        """Every held-out photo of a scene with its camera, on the device."""
-        return (to_device(frame, self.device) for frame in self.scenes[scene].eval_frames)
-
-    def get_train_rays_per_batch(self) -> int:
-        """Pixels of a step, for nerfstudio's log."""
-        cameras = self.training_frames(self.train_indices[0]).dataset.cameras
-        return int(cameras.height[0]) * int(cameras.width[0]) * self.config.images_per_step
-
-    def get_eval_rays_per_batch(self) -> int:
-        """Pixels of a held-out photo, for nerfstudio's log."""
-        return self.get_train_rays_per_batch() // self.config.images_per_step
-
-    def get_datapath(self) -> Path:
-        """What ``--data`` named."""
-        assert self.config.data is not None
-        return self.config.data
-
-    def get_param_groups(self) -> dict:
-        """Nothing here is trained."""
-        return {}

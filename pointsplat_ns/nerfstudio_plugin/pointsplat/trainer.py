@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import functools
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
@@ -17,6 +17,9 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat import distributed
 from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import average_gradients
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainer
+
+if TYPE_CHECKING:
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.config import PointSplatTrainerConfig
 
 ALL = "all"
 """Stands for every part of the network in ``gradient_accumulation_steps``."""
@@ -54,6 +57,7 @@ class PointSplatTrainer(SplatfactoCpuTrainer):
     A checkpoint between two updates holds what has gathered.
     """
 
+    config: PointSplatTrainerConfig
     pipeline: PointSplatPipeline
 
     def __init__(self, config, local_rank: int = 0, world_size: int = 1) -> None:
@@ -77,7 +81,7 @@ class PointSplatTrainer(SplatfactoCpuTrainer):
                 )
         if self.config.max_skipped_steps < 0:
             raise PointSplatError(f"--max-skipped-steps {self.config.max_skipped_steps}: expected at least 0")
-        return AveragingOptimizers(self.config.optimizers.copy(), groups, self.pipeline.counted)
+        return AveragingOptimizers(self.config.optimizers.copy(), groups, self.pipeline.training_state.counted)
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
         """As nerfstudio's, but for steps that are not finite.
@@ -87,14 +91,14 @@ class PointSplatTrainer(SplatfactoCpuTrainer):
         Raises:
             SceneError: if more than ``max_skipped_steps`` have been skipped; a checkpoint is saved first.
         """
-        pipeline, counted = self.pipeline, self.pipeline.counted
+        pipeline, state, every = self.pipeline, self.pipeline.training_state, self.gradient_accumulation_steps
         statistics = [(buffer, buffer.clone()) for buffer in pipeline.model.refiner.buffers()]
-        gathered = self._set_gradients_aside(step)
+        gathered = state.set_gradients_aside(step, every)
         device_type = self.device.split(":")[0]
         with torch.autocast(device_type="cpu" if device_type == "mps" else device_type, enabled=self.mixed_precision):
             _, losses, metrics = pipeline.get_train_loss_dict(step=step)
             loss = functools.reduce(torch.add, losses.values())
-        faults = pipeline.faults
+        faults = metrics.pop("faults")
         skip = distributed.any_rank(bool(faults), self.device)
         if not skip:
             self.grad_scaler.scale(loss).backward()
@@ -103,31 +107,15 @@ class PointSplatTrainer(SplatfactoCpuTrainer):
         if skip:
             self._forget(statistics)
             self._count(step, pipeline.datamanager.scenes[metrics["scene"]].name, faults)
-        _add_gradients(gathered)
-        for name in self.optimizers.parameters:
-            counted[name] += not skip
-        self._update(step)
-        metrics["skipped_steps"] = pipeline.skipped.total()
+        self._update(step, state.gather(gathered, step, every, skip))
+        metrics["skipped_steps"] = state.skipped.total()
         if self.config.log_gradients:
             norms = {n: p.grad.norm() for n, p in pipeline.model.named_parameters() if p.grad is not None}
             metrics |= {f"Gradients/{name}": norm for name, norm in norms.items()}
             metrics["Gradients/Total"] = sum(norms.values())
-        if skip and pipeline.skipped.total() > self.config.max_skipped_steps:
+        if skip and state.skipped.total() > self.config.max_skipped_steps:
             self._stop(step)
         return loss, losses, metrics
-
-    def _set_gradients_aside(self, step: int) -> list[tuple[nn.Parameter, Tensor]]:
-        """What earlier steps have gathered for the coming update; the network is left without gradients."""
-        gathered = []
-        for name, parameters in self.optimizers.parameters.items():
-            before = step % self.gradient_accumulation_steps[name]
-            held = [(p, p.grad) for p in parameters if p.grad is not None] if before else []
-            if before == 0:
-                self.pipeline.counted[name] = 0
-            self.pipeline.counted.setdefault(name, before if held else 0)  # a checkpoint of an earlier version
-            gathered += held
-        self.optimizers.zero_grad_all()
-        return gathered
 
     def _faults_of_gradients(self) -> list[str]:
         """The parts of the network that have a gradient which is not finite, in words."""
@@ -148,16 +136,15 @@ class PointSplatTrainer(SplatfactoCpuTrainer):
     def _count(self, step: int, scene: str, faults: list[str]) -> None:
         """Count and log the scenes, of all processes, at which a step is left out."""
         found = distributed.gathered([(scene, "; ".join(faults))] if faults else [])
+        skipped = self.pipeline.training_state.skipped
         for name, text in found:
-            self.pipeline.skipped[name] += 1
+            skipped[name] += 1
             if distributed.rank() == 0:
-                total, most = self.pipeline.skipped.total(), self.config.max_skipped_steps
+                total, most = skipped.total(), self.config.max_skipped_steps
                 CONSOLE.log(f"step {step} is skipped: {name}: {text} ({total} skipped so far; more than {most} stop)")
 
-    def _update(self, step: int) -> None:
-        """Step the optimisers that are due, and the schedules."""
-        every, counted = self.gradient_accumulation_steps, self.pipeline.counted
-        due = [name for name in self.optimizers.parameters if (step + 1) % every[name] == 0 and counted[name]]
+    def _update(self, step: int, due: list[str]) -> None:
+        """Step the optimisers of the parts of the network that are due, and all schedules."""
         scale = self.grad_scaler.get_scale()
         if due:
             self.optimizers.optimizer_scaler_step_some(self.grad_scaler, due)
@@ -168,26 +155,17 @@ class PointSplatTrainer(SplatfactoCpuTrainer):
     def _stop(self, step: int) -> None:
         """Save a checkpoint and say why training ends."""
         self.save_checkpoint(step)
-        skipped: Counter[str] = self.pipeline.skipped
+        skipped = self.pipeline.training_state.skipped
         scenes = ", ".join(f"{name}: {count}" for name, count in skipped.most_common())
         raise SceneError(
             f"training stopped at step {step}: losses or gradients were not finite in {skipped.total()} steps, "
-            f"which were skipped ({scenes}); mend these scenes and their photos or leave them out, or, if most scenes "
-            "are named, lower the learning rates; then go on with --load-dir "
+            f"which were skipped ({scenes}); repair these scenes and their photos or leave them out, or, if most "
+            "scenes are named, lower the learning rates; then go on with --load-dir "
             f"{self.checkpoint_dir} and a higher --max-skipped-steps than {self.config.max_skipped_steps}"
         )
 
     def save_checkpoint(self, step: int) -> None:
         """As nerfstudio's; called in all processes, written by the first."""
-        parts = self.optimizers.parameters
-        waiting = [name for name in parts if (step + 1) % self.gradient_accumulation_steps[name]]
-        for name in waiting:
-            average_gradients(parts[name])  # over processes: what they have gathered becomes one
-        with self.pipeline.saving_gradients(waiting):
-            super().save_checkpoint(step)
-
-
-@torch.no_grad()
-def _add_gradients(gathered: list[tuple[nn.Parameter, Tensor]]) -> None:
-    for parameter, gradient in gathered:
-        parameter.grad = gradient if parameter.grad is None else parameter.grad.add_(gradient)
+        for name in self.pipeline.training_state.waiting:
+            average_gradients(self.optimizers.parameters[name])  # over processes: what they have gathered becomes one
+        super().save_checkpoint(step)

@@ -17,10 +17,10 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.io.discovery import find_plys
-from pointsplat_ns.nerfstudio_plugin.frames import FrameCache
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views
+from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
+from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import PlyScene, SampledPoses
-from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import ScenesDataManagerConfig
 from pointsplat_ns.rasterizer import render
 
 POSES = SampledPoses(train=6, test=3, width=32, height=24, seed=1)
@@ -58,7 +58,7 @@ def rooms(tmp_path_factory) -> Path:
 
 
 def scene_of(rooms: Path, cache_bytes: int = 1 << 24) -> PlyScene:
-    return PlyScene("one", rooms / "one.ply", FrameCache(cache_bytes), POSES)
+    return PlyScene("one", rooms / "one.ply", MemoryCache(cache_bytes), POSES)
 
 
 def manager_of(folder: Path, **settings):
@@ -106,10 +106,10 @@ def test_what_holds_no_scene_says_so(rooms, tmp_path):
 
 def test_a_scene_is_known_wherever_its_file_lies_and_changes_with_its_content(rooms, tmp_path):
     shutil.copy(rooms / "one.ply", tmp_path / "one.ply")
-    moved = PlyScene("one", tmp_path / "one.ply", FrameCache(0)).identity
+    moved = PlyScene("one", tmp_path / "one.ply", MemoryCache(0)).identity
     assert moved == scene_of(rooms).identity
     write_ply(box_room(3), tmp_path / "one.ply")
-    assert PlyScene("one", tmp_path / "one.ply", FrameCache(0)).identity != moved
+    assert PlyScene("one", tmp_path / "one.ply", MemoryCache(0)).identity != moved
 
 
 # poses and pictures
@@ -180,13 +180,13 @@ def test_nothing_is_kept_beyond_the_bound_and_all_is_found_again(rooms):
     dense_bytes = sum(value.numel() * value.element_size() for _, value in one.read_dense().items())
     unbounded = [data["image"] for _, data in one.rendered_train]
     picture_bytes = unbounded[0].numel()
-    assert one._cache.num_bytes == dense_bytes + len(unbounded) * picture_bytes
+    assert one.cache.num_bytes == dense_bytes + len(unbounded) * picture_bytes
     for bound in (0, 2 * picture_bytes, dense_bytes + picture_bytes):
         tight = scene_of(rooms, bound)
         again = []
         for _, data in tight.rendered_train:
             again.append(data["image"])
-            assert tight._cache.num_bytes <= bound
+            assert tight.cache.num_bytes <= bound
         assert all(torch.equal(a, b) for a, b in zip(unbounded, again, strict=True))
 
 

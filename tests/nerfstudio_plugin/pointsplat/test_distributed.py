@@ -71,9 +71,7 @@ def train(config, world_size: int = 1) -> dict:
     trainer.train_iteration = recorded
     trainer.train()
     refiner = trainer.pipeline.model.refiner
-    with mock.patch(
-        "pointsplat_ns.nerfstudio_plugin.pointsplat.model.load_lpips", side_effect=LpipsUnavailable("not in this test")
-    ):
+    with mock.patch("pointsplat_ns.metrics.lpips.cached_lpips", side_effect=LpipsUnavailable("not in this test")):
         report = trainer.pipeline.get_average_eval_image_metrics()
     return {
         "losses": losses,
@@ -82,7 +80,7 @@ def train(config, world_size: int = 1) -> dict:
         "weights": {name: p.detach().clone() for name, p in refiner.named_parameters()},
         "statistics": {name: value.clone() for name, value in refiner.named_buffers()},
         "report": {name: block["refined"]["psnr"] for name, block in report["scenes"].items()},
-        "skipped": dict(trainer.pipeline.skipped),
+        "skipped": dict(trainer.pipeline.training_state.skipped),
         "files": sorted(p.name for p in config.get_base_dir().rglob("*") if p.is_file() and "events" not in p.name),
     }
 
@@ -90,8 +88,8 @@ def train(config, world_size: int = 1) -> dict:
 @contextmanager
 def broken(photos: set[int], gradients: set[int]) -> Iterator[None]:
     """Within, photos of NaN, and finite losses with a gradient of NaN, at these places in the sequence of scenes."""
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager
     from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import ScenesDataManager
 
     next_train, losses_of = ScenesDataManager.next_train, PointSplatPipeline.get_train_loss_dict
 

@@ -44,7 +44,7 @@ def test_each_network_trains_and_its_run_opens_again(trained_walls, run_training
     config = config_of(trained_walls, tmp_path, **changes)
     trainer, losses = run_training(config)
     refiner = trainer.pipeline.model.refiner
-    assert len(losses) == 2 and trainer.pipeline.skipped.total() == 0
+    assert len(losses) == 2 and trainer.pipeline.training_state.skipped.total() == 0
     assert sum(p.numel() for p in refiner.parameters()) == 664_563 + more
     again = eval_setup(config.get_base_dir() / "config.yml")[1]
     for opened in (load_refiner(config.get_base_dir()).network, again.model.refiner):

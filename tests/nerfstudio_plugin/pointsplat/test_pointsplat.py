@@ -24,8 +24,9 @@ from making import same, small_config
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.io import read_ply, read_scene
 from pointsplat_ns.metrics import ImageError
-from pointsplat_ns.metrics.lpips import load_lpips
+from pointsplat_ns.metrics.lpips import ReportedLpips, load_lpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES, pointsplat_config
+from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PhotoLoss
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import REFINER_NAME
 from pointsplat_ns.pruning import METHODS, prune, score_of, select
 from pointsplat_ns.rasterizer import rasterization
@@ -129,10 +130,8 @@ def test_a_scene_is_drawn_as_it_was_trained(trained_walls):
         modes.append((arguments["rasterize_mode"], arguments["sh_degree"]))
         return rasterization(**arguments)
 
-    with (
-        mock.patch.object(type(pipeline.model), "_rasterization", lambda self, **arguments: recorded(**arguments)),
-        torch.no_grad(),
-    ):
+    place = "pointsplat_ns.nerfstudio_plugin.rasterizer_options.rasterization"
+    with mock.patch(place, recorded), torch.no_grad():
         for index in (0, 1):
             pipeline.model.losses(index, [next(pipeline.datamanager.held_out(index))])
     assert modes == [("classic", 3), ("antialiased", 1)]
@@ -279,7 +278,7 @@ def test_lpips_is_part_of_the_loss_where_it_can_be_had(trained_walls, some_lpips
     sum(losses.values()).backward()
     assert all(p.grad.isfinite().all() for p in pipeline.model.refiner.parameters() if p.grad is not None)
     if not some_lpips:
-        assert set(losses) == {"l1"} and "no network" in pipeline.model.lpips_reason
+        assert set(losses) == {"l1"} and "no network" in pipeline.model.loss.no_lpips_reason
         return
     with torch.no_grad():
         outputs = pipeline.model.draw(pipeline.model.pruned_scene(0).pruned, pipeline.datamanager.scenes[0], frame[0])
@@ -330,13 +329,13 @@ def test_a_scene_trained_again_since_is_not_the_one_that_the_network_has_seen(tr
     pipeline = other.pipeline.setup(device="cpu", test_mode="test")
     state = torch.load(next(config.get_checkpoint_dir().iterdir()), weights_only=True)
     pipeline.load_pipeline(state["pipeline"], state["step"])
-    seen = [scene.identity in pipeline.trained_on for scene in pipeline.datamanager.scenes]
+    seen = [scene.identity in pipeline.training_state.trained_on for scene in pipeline.datamanager.scenes]
     assert seen == [True, False], "a run is the same wherever its folder is"
     timestamp = pipeline.datamanager.scenes[0].run.timestamp
     (again / "config.yml").write_text(text.replace(timestamp, "2031-01-01_000000"))
     pipeline = other.pipeline.setup(device="cpu", test_mode="test")
     pipeline.load_pipeline(state["pipeline"], state["step"])
-    assert not any(scene.identity in pipeline.trained_on for scene in pipeline.datamanager.scenes)
+    assert not any(scene.identity in pipeline.training_state.trained_on for scene in pipeline.datamanager.scenes)
 
 
 def test_photos_too_small_for_lpips_are_trained_on_with_l1_alone(evaluated):
@@ -344,15 +343,15 @@ def test_photos_too_small_for_lpips_are_trained_on_with_l1_alone(evaluated):
         raise ImageError("images of 8 x 8 pixels are too small")
 
     index, frames = evaluated.datamanager.next_eval(0)
-    config = evaluated.model.config
-    nets = mock.patch.object(evaluated.model, "_lpips", {"alex": too_small, "vgg": too_small})
-    with nets, mock.patch.object(config, "lpips_weight", 0.1):
+    loss = PhotoLoss("l1", 0.1, "auto")
+    nets = mock.patch("pointsplat_ns.nerfstudio_plugin.pointsplat.losses.cached_lpips", lambda *_: too_small)
+    with nets, mock.patch.object(evaluated.model, "loss", loss):
         assert set(evaluated.model.losses(index, frames)[1]) == {"l1"}
+    assert loss.no_lpips_reason == "images of 8 x 8 pixels are too small"
 
 
 def test_the_evaluation_compares_dense_pruned_and_refined(evaluated, some_lpips, tmp_path):
-    with mock.patch.object(evaluated.model, "_lpips", {}), mock.patch.object(evaluated.model, "lpips_reason", None):
-        report = evaluated.get_average_eval_image_metrics(output_path=tmp_path, get_std=True)
+    report = evaluated.get_average_eval_image_metrics(output_path=tmp_path, get_std=True)
     assert json.loads(json.dumps(report, allow_nan=False)) == report
     assert set(report["scenes"]) == {"wall-a", "wall-b"}
     for index, (name, block) in enumerate(report["scenes"].items()):
@@ -381,8 +380,7 @@ def test_the_evaluation_compares_dense_pruned_and_refined(evaluated, some_lpips,
 
 
 def test_dense_is_judged_as_its_own_run_judges_it(evaluated, trained_walls, no_lpips):
-    with mock.patch.object(evaluated.model, "_lpips", {}):
-        report = evaluated.get_average_eval_image_metrics()
+    report = evaluated.get_average_eval_image_metrics()
     for name in ("wall-a", "wall-b"):
         own = eval_setup(run_of(trained_walls, name) / "config.yml")[1].get_average_eval_image_metrics()
         # dB; the same pictures but for rounding of float32, in which a SH coefficient's colour is computed
@@ -392,9 +390,9 @@ def test_dense_is_judged_as_its_own_run_judges_it(evaluated, trained_walls, no_l
 
 @pytest.mark.parametrize("get_std", [True, False])
 def test_one_view_and_no_lpips_still_give_valid_json(evaluated, no_lpips, get_std):
-    manager, model = evaluated.datamanager, evaluated.model
+    manager = evaluated.datamanager
     frames = {i: list(manager.held_out(i))[:1] for i in (0, 1)}
-    with mock.patch.object(manager, "held_out", frames.get), mock.patch.object(model, "_lpips", {}):
+    with mock.patch.object(manager, "held_out", frames.get):
         report = evaluated.get_average_eval_image_metrics(get_std=get_std)
         log = evaluated.get_average_eval_image_metrics(step=3, get_std=get_std)
     json.dumps(report, allow_nan=False)
@@ -412,10 +410,8 @@ def test_an_exact_picture_has_no_finite_psnr_and_is_null(evaluated, no_lpips):
     gaussians = scene.read_dense()
     with torch.no_grad():
         exact = model.draw(gaussians, scene, camera)["rgb"]
-    with mock.patch.object(model, "_lpips", {}):
-        report = evaluate_scene(
-            model, scene, dict.fromkeys(VARIANTS, gaussians), [(camera, {"image": exact})], progress=False
-        )
+    variants = dict.fromkeys(VARIANTS, gaussians)
+    report = evaluate_scene(model, scene, variants, [(camera, {"image": exact})], 1, ReportedLpips())
     summary = summarize([report], with_std=True)
     json.dumps(summary, allow_nan=False)
     assert summary["psnr"] is None and summary["ssim"] == pytest.approx(1.0)
@@ -435,9 +431,10 @@ def test_lpips_that_fails_at_one_view_is_null_for_all(evaluated):
 
     dense = scene.read_dense()
     variants = {"dense": dense, "refined": dense}
-    with mock.patch.object(model, "_lpips", {"alex": fails_at_the_third}), mock.patch.object(model, "lpips_reason", ""):
-        report = evaluate_scene(model, scene, variants, evaluated.datamanager.held_out(0), progress=False)
-        assert model.lpips_reason == "too small"
+    frames, lpips = evaluated.datamanager.held_out(0), ReportedLpips()
+    with mock.patch("pointsplat_ns.metrics.lpips.cached_lpips", lambda *_: fails_at_the_third):
+        report = evaluate_scene(model, scene, variants, frames, 2, lpips)
+    assert lpips.reason == "too small"
     assert report.variants["dense"]["lpips"] is None and report.variants["refined"]["lpips"] is None
 
 

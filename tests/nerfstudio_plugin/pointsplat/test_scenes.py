@@ -18,8 +18,9 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its 
 from making import without_data
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io.runs import open_run
-from pointsplat_ns.nerfstudio_plugin.frames import FrameCache
-from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import ScenesDataManagerConfig, TrainedScene, dataparser_of
+from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
+from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
+from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene, dataparser_of
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
 
 NUM_TRAIN, NUM_HELD_OUT = 9, 2  # of the wall's 11 frames, every tenth held out
@@ -46,7 +47,7 @@ def make_run(folder: Path, wall_config, scene: Path, change=lambda config: None)
 
 
 def scene_of(run: Path) -> TrainedScene:
-    return TrainedScene("scene", open_run(run), FrameCache(1 << 20))
+    return TrainedScene("scene", open_run(run), MemoryCache(1 << 20))
 
 
 # --data

@@ -141,7 +141,8 @@ def test_pruned_scenes_are_kept_within_the_bound_and_made_again_alike(rooms):
     config.pipeline.datamanager.cache_gigabytes = 0.0
     none_kept = config.pipeline.setup(device="cpu", test_mode="test").model
     config.pipeline.datamanager.cache_gigabytes = 0.05
-    kept = config.pipeline.setup(device="cpu", test_mode="test").model
+    pipeline = config.pipeline.setup(device="cpu", test_mode="test")
+    kept = pipeline.model
     made = [kept.pruned_scene(index) for index in range(3)]
     again = [none_kept.pruned_scene(index) for index in (0, 1, 2, 0)]
     assert all(kept.pruned_scene(index) is made[index] for index in range(3))
@@ -150,7 +151,7 @@ def test_pruned_scenes_are_kept_within_the_bound_and_made_again_alike(rooms):
         assert all(torch.equal(a, b) for (_, a), (_, b) in zip(one.pruned.items(), other.pruned.items(), strict=True))
     structures = made[0].structure
     smallest = structures.order.numel() * 8 + sum(v.numel() * 4 for _, v in made[0].pruned.items())
-    assert kept._cache.num_bytes > 3 * smallest, "neighbour tables count, too"
+    assert pipeline.datamanager.cache.num_bytes > 3 * smallest, "neighbour tables count, too"
 
 
 # resuming
@@ -202,8 +203,8 @@ def test_dropped_paths_and_shuffled_curves_are_those_of_an_unbroken_training(roo
 @contextmanager
 def broken(kind: str, steps: set[int]) -> Iterator[None]:
     """Within, these training steps have a photo of NaN or of infinity, or a gradient of NaN with a finite loss."""
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager
     from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import ScenesDataManager
 
     next_train, losses_of = ScenesDataManager.next_train, PointSplatPipeline.get_train_loss_dict
 
@@ -275,7 +276,7 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_counted(rooms, tmp_pat
     moved = [name for name in weights[0] if not torch.equal(weights[2][name], weights[1][name])]
     assert any("running" in name for name in moved) and any("heads" in name for name in moved)
     scene = trainer.pipeline.datamanager.scenes[metrics[1]["scene"]].name
-    assert trainer.pipeline.skipped == {scene: 1} and [m["skipped_steps"] for m in metrics] == [0, 1, 1]
+    assert trainer.pipeline.training_state.skipped == {scene: 1} and [m["skipped_steps"] for m in metrics] == [0, 1, 1]
     text = f"step 1 is skipped: {scene}: {said} (1 skipped so far; more than 10 stop)"
     assert [call.args[0] for call in log.call_args_list if "skipped" in call.args[0]] == [text]
     assert all(schedule.last_epoch == 3 for schedule in trainer.optimizers.schedulers.values()), "it counts steps"
@@ -313,7 +314,7 @@ def test_a_gradient_scaler_deals_with_its_own_overflows_and_changes_nothing_else
             torch.testing.assert_close(value, wanted, rtol=1e-3, atol=1e-6, msg=name)
         with broken("gradient", {1}):
             trainer, scaled = step_by_step(config, range(4))
-    assert trainer.grad_scaler.get_scale() == 512.0 and trainer.pipeline.skipped.total() == 0
+    assert trainer.grad_scaler.get_scale() == 512.0 and trainer.pipeline.training_state.skipped.total() == 0
     assert equal(scaled[1][0]["heads.mlps.scales.6.weight"], torch.zeros(3, 64)), "the part that overflowed stays"
     assert not equal(scaled[3][0], scaled[1][0])
 
@@ -333,7 +334,10 @@ def test_an_interrupted_training_skips_as_an_unbroken_one(rooms, run_training, t
         resumed, last_losses = run_training(rest)
     assert [math.isnan(loss) for loss in losses] == [step in (1, 4, 6) for step in range(8)]
     assert str(last_losses) == str(losses[stop + 1 :])
-    assert whole.pipeline.skipped == resumed.pipeline.skipped and whole.pipeline.skipped.total() == 3
+    assert (
+        whole.pipeline.training_state.skipped == resumed.pipeline.training_state.skipped
+        and whole.pipeline.training_state.skipped.total() == 3
+    )
     assert equal(whole.pipeline.model.refiner.state_dict(), resumed.pipeline.model.refiner.state_dict())
 
 
@@ -354,7 +358,7 @@ def test_after_too_many_skipped_steps_training_stops_and_names_the_scenes(rooms,
     rest = config_of(rooms, tmp_path / "rest", 2)
     rest.load_dir, rest.max_skipped_steps = config.get_checkpoint_dir(), 4
     resumed, losses = run_training(rest)
-    assert len(losses) == 2 and resumed.pipeline.skipped.total() == 4
+    assert len(losses) == 2 and resumed.pipeline.training_state.skipped.total() == 4
     rest.max_skipped_steps = -1
     with pytest.raises(PointSplatError, match="--max-skipped-steps -1: expected at least 0"):
         rest.setup(local_rank=0, world_size=1).setup()
@@ -363,9 +367,9 @@ def test_after_too_many_skipped_steps_training_stops_and_names_the_scenes(rooms,
 def test_the_count_of_a_scene_that_is_gone_is_gone(rooms):
     pipeline = config_of(rooms, Path("unused"), 1).pipeline.setup(device="cpu", test_mode="val")
     pipeline.set_extra_state({"trained_on": [], "skipped": {"room1": 3, "cellar": 8}})
-    assert pipeline.skipped == {"room1": 3}
+    assert pipeline.training_state.skipped == {"room1": 3}
     pipeline.set_extra_state({"trained_on": []})  # a checkpoint of an earlier version
-    assert pipeline.skipped.total() == 0
+    assert pipeline.training_state.skipped.total() == 0
 
 
 # accumulation, rates, schedules

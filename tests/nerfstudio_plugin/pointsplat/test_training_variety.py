@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,8 @@ from making import small_config
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES
-from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PIXEL_LOSSES
+from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PIXEL_LOSSES
+from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes import PrunedKey
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_store import read_pruned, stored_path, write_pruned
 from pointsplat_ns.pruning import PruneSettings
 
@@ -27,8 +29,9 @@ def test_one_network_learns_at_several_budgets_and_is_evaluated_at_the_first(
 ):
     trainer, _ = run_training(config_of(trained_walls, tmp_path, steps=12, more_keeps=(0.25, 40.0)))
     model = trainer.pipeline.model
-    cached = {key[2] for key in model._cache._entries if key[0] == "pruned"}
-    assert cached == {0.5, 0.25, 40.0}
+    cache = trainer.pipeline.datamanager.cache
+    for keep in (0.5, 0.25, 40.0):
+        assert any(cache.get(PrunedKey(s.name, model.config.prune_settings(keep))) for s in model.scenes), keep
     model.eval()
     assert len(model.refine(0)) == round(0.5 * len(model.scenes[0].read_dense()))
 
@@ -79,7 +82,7 @@ def test_files_of_pruned_scenes_that_are_damaged_or_of_another_kind_say_so(tmp_p
     from safetensors.torch import save_file
 
     scene = Gaussians.empty(sh_degree=1)
-    path = stored_path(tmp_path, "room/of another kind/now step 3", PruneSettings(0.5, "paper"))
+    path = stored_path(tmp_path, "room", "a5" * 32, PruneSettings(0.5, "paper"))
     write_pruned(path, scene, 7, 0.25)
     found, count, seconds = read_pruned(path)
     assert (len(found), found.sh_degree, count, seconds) == (0, 1, 7, 0.25)
@@ -89,8 +92,48 @@ def test_files_of_pruned_scenes_that_are_damaged_or_of_another_kind_say_so(tmp_p
     save_file({"means": torch.zeros(1, 3)}, path)
     with pytest.raises(SceneError, match="format None; expected 'pointsplat-pruned/1'"):
         read_pruned(path)
-    assert stored_path(None, "room", PruneSettings(0.5)) is None
-    assert stored_path(tmp_path, "../../etc/passwd", PruneSettings(0.5)).parent == tmp_path
+
+
+def test_a_stored_scene_lies_in_the_folder_whatever_the_scene_is_called(tmp_path):
+    assert stored_path(tmp_path, "../../etc/passwd", "a5" * 32, PruneSettings(0.5)).parent == tmp_path
+
+
+def trained_anew(run: Path) -> None:
+    """Another scene in the place of a run's: same folder, name, time and step."""
+    (checkpoint,) = (run / "nerfstudio_models").iterdir()
+    state = torch.load(checkpoint, weights_only=True)
+    means = state["pipeline"]["_model.gauss_params.means"]
+    state["pipeline"]["_model.gauss_params.means"] = means + 1.0
+    torch.save(state, checkpoint)
+
+
+def test_a_scene_that_is_trained_again_under_the_same_name_is_pruned_anew(trained_walls, tmp_path):
+    shutil.copytree(trained_walls, tmp_path / "runs")
+
+    def pruned():
+        config = config_of(tmp_path / "runs", tmp_path, pruned_folder=tmp_path / "pruned")
+        pipeline = config.pipeline.setup(device="cpu", test_mode="test")
+        return pipeline.model.pruned_scene(0).pruned, pipeline.datamanager.scenes[0]
+
+    before, scene = pruned()
+    (run,) = (tmp_path / "runs" / "wall-a" / "splatfacto-cpu").iterdir()
+    trained_anew(run)
+    after, again = pruned()
+    assert again.identity == scene.identity, "proves too little"
+    torch.testing.assert_close(after.means, before.means + 1.0)
+
+
+def test_stored_scenes_are_told_apart_by_content_and_settings(tmp_path):
+    settings = PruneSettings(0.5, "paper")
+    path = stored_path(tmp_path, "room", "a5" * 32, settings)
+    assert path == stored_path(tmp_path, "room", "a5" * 32, settings)
+    others = [
+        stored_path(tmp_path, "room", "5a" * 32, settings),
+        stored_path(tmp_path, "room", "a5" * 32, PruneSettings(0.25, "paper")),
+        stored_path(tmp_path, "room", "a5" * 32, PruneSettings(0.5, "merge")),
+        stored_path(tmp_path, "room", "a5" * 32, PruneSettings(0.5, "paper", 0.7)),
+    ]
+    assert len({path, *others}) == 5
 
 
 @pytest.mark.parametrize("factor", [0.0, -1.0, math.nan, math.inf])

@@ -1,0 +1,117 @@
+"""Scenes that are pruned once: kept in memory while there is room, and on disk where there is a folder for them."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.nerfstudio_plugin.memory_cache import CacheKey, MemoryCache
+from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
+from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_store import read_pruned, stored_path, write_pruned
+from pointsplat_ns.pruning import PruneSettings
+from pointsplat_ns.refiner import Structure
+
+
+@dataclass(frozen=True, eq=False)
+class PrunedScene:
+    """What training and evaluation need of a scene, computed once."""
+
+    dense_count: int
+    pruned: Gaussians
+    """On the device of the network."""
+    structure: Structure | None
+    """The neighbour tables of the pruned scene; None if it is empty."""
+    seconds: float
+    """That pruning took, without reading."""
+
+
+@dataclass(frozen=True)
+class PrunedKey(CacheKey[PrunedScene]):
+    """Names a pruned scene in a cache that several scenes share."""
+
+    scene: str
+    settings: PruneSettings
+
+
+class PrunedScenes:
+    """Prunes scenes, and finds again what was pruned.
+
+    Args:
+        cache: where pruned scenes are kept; the latest one is kept in any case.
+        folder: where they are kept on disk, found again by the content of the dense scene's file; None for nowhere.
+        prepare: computes the neighbour tables that the network needs.
+    """
+
+    def __init__(self, cache: MemoryCache, folder: Path | None, prepare: Callable[[Gaussians], Structure | None]):
+        self._cache, self._folder, self._prepare = cache, folder, prepare
+        self._latest: tuple[PrunedKey, PrunedScene] | None = None
+
+    def get(
+        self,
+        scene: DenseScene,
+        settings: PruneSettings,
+        device: torch.device | str,
+        dense: Gaussians | None = None,
+    ) -> PrunedScene:
+        """A scene, pruned and serialized.
+
+        Args:
+            scene: what to prune.
+            settings: how.
+            device: where the network is.
+            dense: the scene's Gaussians, if they have been read already.
+
+        Raises:
+            PointSplatError: if this scene cannot be pruned so; the text names it.
+        """
+        key = PrunedKey(scene.name, settings)
+        if self._latest is None or self._latest[0] != key:
+            found = self._cache.get(key)
+            if found is None:
+                found = self._make(scene, settings, device, dense)
+                self._cache.put(key, found, sum(tensor.nbytes for tensor in tensors_in(found)))
+            self._latest = key, found
+        return self._latest[1]
+
+    def _make(
+        self, scene: DenseScene, settings: PruneSettings, device: torch.device | str, dense: Gaussians | None
+    ) -> PrunedScene:
+        """A scene from the folder, or pruned now and put there."""
+        stored = None if self._folder is None else stored_path(self._folder, scene.name, scene.content, settings)
+        if stored is not None and stored.is_file():
+            pruned, dense_count, seconds = read_pruned(stored)
+        else:
+            dense = scene.dense(keep=False) if dense is None else dense
+            start = time.perf_counter()
+            try:
+                pruned = settings.prune(dense)
+            except PointSplatError as error:
+                raise type(error)(f"{scene.source}: {error}") from error
+            dense_count, seconds = len(dense), time.perf_counter() - start
+            if stored is not None:
+                write_pruned(stored, pruned, dense_count, seconds)
+        CONSOLE.log(f"{scene.name}: kept {len(pruned):,} of {dense_count:,} Gaussians")
+        pruned = pruned.to(device)
+        return PrunedScene(dense_count, pruned, self._prepare(pruned), seconds)
+
+
+def tensors_in(value: Any) -> Iterator[Tensor]:
+    """Every tensor held by a dataclass, tuple or list, however deep."""
+    if isinstance(value, Tensor):
+        yield value
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        for entry in dataclasses.fields(value):
+            yield from tensors_in(getattr(value, entry.name))
+    elif isinstance(value, (tuple, list)):
+        for entry in value:
+            yield from tensors_in(entry)
