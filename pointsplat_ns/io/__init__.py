@@ -4,9 +4,10 @@ Every reader returns a :class:`~pointsplat_ns.gaussians.Gaussians` and raises
 :class:`~pointsplat_ns.errors.SceneError` with one line that names the file and the fault.
 """
 
+from pointsplat_ns.io.discovery import find_runs
 from pointsplat_ns.io.files import content_hash
 from pointsplat_ns.io.ply import read_ply, write_ply
-from pointsplat_ns.io.runs import Run, find_runs, open_run, scene_name, scene_names
+from pointsplat_ns.io.runs import Run, open_run, scene_name
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.io.splatfacto import read_checkpoint
@@ -21,7 +22,6 @@ __all__ = [
     "read_ply",
     "read_scene",
     "scene_name",
-    "scene_names",
-    "write_ply",
     "save",
+    "write_ply",
 ]

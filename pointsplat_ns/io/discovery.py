@@ -1,18 +1,92 @@
-"""Folders as sets of scenes: PLY files, trained runs, or both."""
+"""Folders as sets of scenes: trained runs, PLY files, or both."""
 
 from __future__ import annotations
 
 import os
-import re
+from collections.abc import Iterable
+from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.files import logger
+from pointsplat_ns.io.files import file_stem, logger
 from pointsplat_ns.io.ply_header import read_header
-from pointsplat_ns.io.runs import CONFIG_NAME, Run, distinct, find_runs, scene_names
+from pointsplat_ns.io.runs import CONFIG_NAME, Run, open_run, scene_name
 
 Supervision = Literal["auto", "photos", "dense"]
+"""What a training compares renders with: a run's photos, or renders of the scene before it was pruned."""
+
+
+def find_runs_and_plys(
+    folder: Path, supervision: Supervision
+) -> tuple[dict[str, Run], dict[str, Path], SceneError | None]:
+    """The runs and the PLY files at or below ``folder`` that a training takes, by the names that it gives them.
+
+    Args:
+        folder: a run, a PLY file, or any folder above several.
+        supervision: ``photos`` takes runs, ``dense`` both, ``auto`` runs, or PLY files where there is no run.
+
+    Returns:
+        Runs, whose data is not looked for; PLY files; and why there is no run, if looking for one failed.
+    """
+    runs: list[Run] = []
+    why_no_run: SceneError | None = None
+    try:
+        if folder.suffix.lower() != ".ply":
+            runs = find_runs(folder, need_data=False)
+    except SceneError as error:
+        why_no_run = error
+    named = dict(zip(scene_names(runs), runs, strict=True))
+    found = find_plys(folder) if supervision == "dense" or (supervision == "auto" and not runs) else []
+    return named, {f"{name}.ply" if name in named else name: path for name, path in found}, why_no_run
+
+
+def find_runs(folder: Path | str, need_data: bool = True) -> list[Run]:
+    """Every Gaussian scene trained below ``folder``: the newest run of each experiment that has a
+    complete checkpoint, sorted by experiment name.
+
+    Below a folder, runs of other methods and runs without a complete checkpoint are passed over.
+
+    Args:
+        folder: a run, or any folder above some.
+        need_data: as for :func:`open_run`.
+
+    Raises:
+        SceneError: if there is none, if ``folder`` is itself a run of another method, or if the data of one is
+            needed and not found.
+    """
+    folder = Path(folder)
+    if not folder.exists():
+        raise SceneError(f"{folder}: no such folder; expected one with trained nerfstudio runs in it")
+    if not folder.is_dir() or (folder / CONFIG_NAME).is_file():
+        run = open_run(folder, need_data)
+        if not run.is_gaussian_scene:
+            raise SceneError(
+                f"{run.folder}: a run of the method {run.method_name or 'unknown'}; expected a trained Splatfacto run"
+            )
+        return [run]
+    newest: dict[Path, Run] = {}
+    passed: list[str] = []
+    for place in _run_folders(folder):
+        try:
+            run = open_run(place, need_data=False)
+        except SceneError as error:
+            passed.append(str(error))
+            logger.warning("passed over: %s", error)
+            continue
+        if not run.is_gaussian_scene:
+            passed.append(f"{run.folder}: method {run.method_name or 'unknown'}")
+            continue
+        key = _experiment_folder(run)
+        if key not in newest or _when(run) > _when(newest[key]):
+            newest[key] = run
+    if not newest:
+        seen = f"; passed over {len(passed)}, such as {passed[0]}" if passed else ""
+        raise SceneError(
+            f"{folder}: no trained Splatfacto run below it; expected EXPERIMENT/METHOD/TIME/{CONFIG_NAME}{seen}"
+        )
+    runs = sorted(newest.values(), key=lambda run: (scene_name(run), str(run.folder)))
+    return [open_run(run.folder, need_data) for run in runs] if need_data else runs
 
 
 def find_plys(folder: Path) -> list[tuple[str, Path]]:
@@ -37,33 +111,60 @@ def find_plys(folder: Path) -> list[tuple[str, Path]]:
             logger.warning("passed over %s: no Gaussians in it", path)
             continue
         parts = path.relative_to(root).with_suffix("").parts
-        names.append(re.sub(r"[^\w.+-]+", "-", "-".join(parts)).strip("-.") or "scene")
+        names.append(file_stem("-".join(parts)))
         found.append(path)
     return list(zip(distinct(names), found, strict=True))
 
 
-def find_runs_and_plys(
-    folder: Path, supervision: Supervision
-) -> tuple[dict[str, Run], dict[str, Path], SceneError | None]:
-    """The runs and the PLY files at or below ``folder`` that a training takes, by the names that it gives them.
+def distinct(names: Iterable[str]) -> list[str]:
+    """The names, with ``-2``, ``-3``... added where two would be the same."""
+    found: list[str] = []
+    for base in names:
+        name, count = base, 1
+        while name in found:
+            count += 1
+            name = f"{base}-{count}"
+        found.append(name)
+    return found
 
-    Args:
-        folder: a run, a PLY file, or any folder above several.
-        supervision: ``photos`` takes runs, ``dense`` both, ``auto`` runs, or PLY files where there is no run.
 
-    Returns:
-        Runs, whose data is not looked for; PLY files; and why there is no run, if looking for one failed.
-    """
-    runs: list[Run] = []
-    nothing: SceneError | None = None
+def scene_names(runs: list[Run]) -> list[str]:
+    """:func:`scene_name` of each run, made distinct."""
+    return distinct(scene_name(run) for run in runs)
+
+
+def shown_scene(names: list[str], eval_scenes: Iterable[str]) -> str:
+    """Which of several scenes the viewer and the exporters get: the first that is held out of training, or the
+    first."""
+    held_out = set(eval_scenes)
+    return next((name for name in names if name in held_out), names[0])
+
+
+def _run_folders(folder: Path) -> list[Path]:
+    """Folders below ``folder`` that hold a ``config.yml``, sorted; nothing is looked for inside one."""
+    found = []
+    for place, inner, files in os.walk(folder):
+        if CONFIG_NAME in files:
+            found.append(Path(place))
+            inner.clear()
+        inner[:] = sorted(name for name in inner if not name.startswith("."))
+    return found
+
+
+def _experiment_folder(run: Run) -> Path:
+    """What runs of one experiment have in common: the folder EXPERIMENT of EXPERIMENT/METHOD/TIMESTAMP.
+    A run that was moved out of that layout stands for itself."""
+    place = run.folder.resolve()
+    as_laid_out = (place.parent.name, place.name) == (run.method_name, run.timestamp)
+    return place.parents[1] if as_laid_out else place
+
+
+def _when(run: Run) -> tuple[float, int]:
+    """Sorts runs by age: nerfstudio's own timestamp, the checkpoint's where the user chose another name."""
     try:
-        if folder.suffix.lower() != ".ply":
-            runs = find_runs(folder, need_data=False)
-    except SceneError as error:
-        nothing = error
-    named = dict(zip(scene_names(runs), runs, strict=True))
-    found = find_plys(folder) if supervision == "dense" or (supervision == "auto" and not runs) else []
-    return named, {f"{name}.ply" if name in named else name: path for name, path in found}, nothing
+        return datetime.strptime(run.timestamp, "%Y-%m-%d_%H%M%S").timestamp(), run.step
+    except ValueError:
+        return run.checkpoint.stat().st_mtime, run.step
 
 
 def _holds_gaussians(path: Path) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -58,6 +59,12 @@ def one_line(error: BaseException, limit: int = 160) -> str:
     lines = str(error).strip().splitlines()
     text = lines[0].strip() if lines else type(error).__name__
     return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def file_stem(text: str) -> str:
+    """The letters, digits and ``_ . + -`` of ``text``, as a scene's name that is fit for a file; "scene" if there are
+    none."""
+    return re.sub(r"[^\w.+-]+", "-", text).strip("-.") or "scene"
 
 
 @contextmanager

@@ -9,11 +9,8 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,7 +18,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.files import logger, one_line
+from pointsplat_ns.io.files import file_stem, logger, one_line
 from pointsplat_ns.io.inert_yaml import Tagged, read_config
 from pointsplat_ns.io.splatfacto import is_complete
 
@@ -129,111 +126,12 @@ def open_run(path: Path | str, need_data: bool = True) -> Run:
     )
 
 
-def find_runs(folder: Path | str, need_data: bool = True) -> list[Run]:
-    """Every Gaussian scene trained below ``folder``: the newest run of each experiment that has a
-    complete checkpoint, sorted by experiment name.
-
-    Below a folder, runs of other methods and runs without a complete checkpoint are passed over.
-
-    Args:
-        folder: a run, or any folder above some.
-        need_data: as for :func:`open_run`.
-
-    Raises:
-        SceneError: if there is none, if ``folder`` is itself a run of another method, or if the data of one is
-            needed and not found.
-    """
-    folder = Path(folder)
-    if not folder.exists():
-        raise SceneError(f"{folder}: no such folder; expected one with trained nerfstudio runs in it")
-    if not folder.is_dir() or (folder / CONFIG_NAME).is_file():
-        run = open_run(folder, need_data)
-        if not run.is_gaussian_scene:
-            raise SceneError(
-                f"{run.folder}: a run of the method {run.method_name or 'unknown'}; expected a trained Splatfacto run"
-            )
-        return [run]
-    newest: dict[Path, Run] = {}
-    passed: list[str] = []
-    for place in _run_folders(folder):
-        try:
-            run = open_run(place, need_data=False)
-        except SceneError as error:
-            passed.append(str(error))
-            logger.warning("passed over: %s", error)
-            continue
-        if not run.is_gaussian_scene:
-            passed.append(f"{run.folder}: method {run.method_name or 'unknown'}")
-            continue
-        key = _experiment_folder(run)
-        if key not in newest or _when(run) > _when(newest[key]):
-            newest[key] = run
-    if not newest:
-        seen = f"; passed over {len(passed)}, such as {passed[0]}" if passed else ""
-        raise SceneError(
-            f"{folder}: no trained Splatfacto run below it; expected EXPERIMENT/METHOD/TIME/{CONFIG_NAME}{seen}"
-        )
-    runs = sorted(newest.values(), key=lambda run: (scene_name(run), str(run.folder)))
-    return [open_run(run.folder, need_data) for run in runs] if need_data else runs
-
-
 def scene_name(run: Run) -> str:
     """A short name for the scene, fit for a file: the experiment's, or its data's if it has none."""
     name = run.experiment_name if run.experiment_name not in ("", "unnamed") else ""
     data = run.data.parent if run.data.suffix else run.data
     name = name or data.name or run.folder.name
-    return re.sub(r"[^\w.+-]+", "-", name).strip("-.") or "scene"
-
-
-def distinct(names: Iterable[str]) -> list[str]:
-    """The names, with ``-2``, ``-3``... added where two would be the same."""
-    found: list[str] = []
-    for base in names:
-        name, count = base, 1
-        while name in found:
-            count += 1
-            name = f"{base}-{count}"
-        found.append(name)
-    return found
-
-
-def scene_names(runs: list[Run]) -> list[str]:
-    """:func:`scene_name` of each run, made distinct."""
-    return distinct(scene_name(run) for run in runs)
-
-
-def shown_scene(names: list[str], eval_scenes: Iterable[str]) -> str:
-    """Which of several scenes the viewer and the exporters get: the first that is held out of training, or the
-    first."""
-    held_out = set(eval_scenes)
-    return next((name for name in names if name in held_out), names[0])
-
-
-def _run_folders(folder: Path) -> list[Path]:
-    """Folders below ``folder`` that hold a ``config.yml``, sorted; nothing is looked for inside one."""
-    found = []
-    for place, inner, files in os.walk(folder):
-        if CONFIG_NAME in files:
-            found.append(Path(place))
-            inner.clear()
-        inner[:] = sorted(name for name in inner if not name.startswith("."))
-    return found
-
-
-def _experiment_folder(run: Run) -> Path:
-    """What runs of one experiment have in common: the folder EXPERIMENT of EXPERIMENT/METHOD/TIMESTAMP.
-    A run that was moved out of that layout stands for itself."""
-    place = run.folder.resolve()
-    as_laid_out = (place.parent.name, place.name) == (run.method_name, run.timestamp)
-    return place.parents[1] if as_laid_out else place
-
-
-def _when(run: Run) -> tuple[float, int]:
-    """Sorts runs by age: nerfstudio's own timestamp, the checkpoint's where the user chose another name."""
-    try:
-        return datetime.strptime(run.timestamp, "%Y-%m-%d_%H%M%S").timestamp(), run.step
-    except ValueError:
-        return run.checkpoint.stat().st_mtime, run.step
+    return file_stem(name)
 
 
 def _tagged(parent: Tagged, name: str, path: Path) -> Tagged:

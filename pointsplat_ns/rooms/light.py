@@ -301,12 +301,12 @@ def _fill(image: Tensor, buried: Tensor, fallback: Tensor) -> Tensor:
         return image
     if bool(buried.all()):
         return fallback.expand_as(image)
-    known = (~buried).float()[None, None]
-    values = image.permute(2, 0, 1)[None] * known
-    while not bool(known.all()):
+    lit = (~buried).float()[None, None]
+    values = image.permute(2, 0, 1)[None] * lit
+    while not bool(lit.all()):
         total = torch.nn.functional.avg_pool2d(values, 3, 1, 1)
-        share = torch.nn.functional.avg_pool2d(known, 3, 1, 1)
-        fresh = (known == 0) & (share > 0)
+        share = torch.nn.functional.avg_pool2d(lit, 3, 1, 1)
+        fresh = (lit == 0) & (share > 0)
         values = torch.where(fresh, total / share.clamp(min=1e-6), values)
-        known = torch.where(fresh, torch.ones_like(known), known)
+        lit = torch.where(fresh, torch.ones_like(lit), lit)
     return values[0].permute(1, 2, 0)

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io import find_runs, open_run, read_scene, save, scene_name, scene_names
+from pointsplat_ns.io import find_runs, open_run, read_scene, save, scene_name
+from pointsplat_ns.io.discovery import scene_names
 from pointsplat_ns.io.inert_yaml import Tagged
 
 

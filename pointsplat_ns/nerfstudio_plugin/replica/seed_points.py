@@ -121,9 +121,9 @@ def _voxel_keys(xyz: np.ndarray, low: np.ndarray, size: float) -> np.ndarray:
 
 
 def _inner(depth: np.ndarray) -> np.ndarray:
-    """bool (H, W): depth known here and in the four neighbours, and continuous with them."""
-    known = depth > 0
-    inner = known.copy()
+    """bool (H, W): depth measured here and in the four neighbours, and continuous with them."""
+    measured = depth > 0
+    inner = measured.copy()
     for axis in (0, 1):
         before = [slice(None), slice(None)]
         after = [slice(None), slice(None)]
