@@ -5,20 +5,15 @@ import math
 import pytest
 import torch
 
+from making import normal_scene, same
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians, sh_degree_of
-
-
-def make(n=5, degree=3, dtype=torch.float32):
-    generator = torch.Generator().manual_seed(n + 10 * degree)
-    shapes = [(n, 3), (n, 3), (n, 4), (n, 1), (n, 3), (n, (degree + 1) ** 2 - 1, 3)]
-    return Gaussians(*(torch.randn(shape, generator=generator, dtype=dtype) for shape in shapes))
 
 
 @pytest.mark.parametrize(("rest", "degree"), [(0, 0), (3, 1), (8, 2), (15, 3)])
 def test_sh_degree_follows_from_the_number_of_coefficients(rest, degree):
     assert sh_degree_of(rest) == degree
-    assert make(4, degree).sh_degree == degree
+    assert normal_scene(4, degree).sh_degree == degree
 
 
 @pytest.mark.parametrize("rest", [1, 7, 14, 16, 24])
@@ -39,41 +34,41 @@ def test_other_numbers_of_coefficients_are_refused(rest):
 )
 def test_a_wrong_shape_is_named(name, shape, message):
     with pytest.raises(SceneError, match=message):
-        make().replace(**{name: torch.zeros(shape)})
+        normal_scene().replace(**{name: torch.zeros(shape)})
 
 
 def test_mixed_or_integer_types_are_named():
     with pytest.raises(SceneError, match="scales is torch.float64 .* means are torch.float32"):
-        make().replace(scales=torch.zeros(5, 3, dtype=torch.float64))
+        normal_scene().replace(scales=torch.zeros(5, 3, dtype=torch.float64))
     with pytest.raises(SceneError, match="torch.int64; expected a floating-point type"):
-        make().map(lambda value: value.long())
+        normal_scene().map(lambda value: value.long())
 
 
 @pytest.mark.parametrize(
     "index", [slice(1, 4), torch.tensor([4, 0, 0]), torch.tensor([True, False, True, False, False]), 2, -1]
 )
 def test_selection_takes_the_same_rows_of_every_parameter(index):
-    scene = make()
+    scene = normal_scene()
     rows = [index] if isinstance(index, int) else index
     for name, value in scene[index].items():
         assert torch.equal(value, getattr(scene, name)[rows]), name
 
 
 def test_selecting_nothing_leaves_an_empty_scene_of_the_same_degree():
-    empty = make(5, 2)[torch.zeros(5, dtype=torch.bool)]
+    empty = normal_scene(5, 2)[torch.zeros(5, dtype=torch.bool)]
     assert len(empty) == 0 and empty.sh_degree == 2
     assert len(Gaussians.empty(sh_degree=2)) == 0
     assert Gaussians.empty(1).usable().shape == (0,)
 
 
 def test_cat_undoes_a_split():
-    scene = make(6)
+    scene = normal_scene(6)
     joined = Gaussians.cat([scene[:2], scene[2:]])
-    assert all(torch.equal(a, b) for a, b in zip(scene.tensors(), joined.tensors(), strict=True))
+    assert same(scene, joined)
 
 
 def test_activated_values_at_the_extremes():
-    scene = make(3).replace(
+    scene = normal_scene(3).replace(
         opacities=torch.tensor([[math.inf], [-math.inf], [0.0]]), scales=torch.tensor([[-math.inf, 0.0, 1.0]] * 3)
     )
     assert scene.alphas.tolist() == [1.0, 0.0, 0.5]
@@ -81,13 +76,13 @@ def test_activated_values_at_the_extremes():
 
 
 def test_megabytes_count_59_floats_a_gaussian_at_degree_3():
-    assert make(1000).megabytes == pytest.approx(0.236)
+    assert normal_scene(1000).megabytes == pytest.approx(0.236)
 
 
 @pytest.mark.parametrize("name", ["means", "scales", "quats", "opacities", "features_dc", "features_rest"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_usable_tells_meaningless_values_from_meaningful_ones(name, value):
-    scene = make()
+    scene = normal_scene()
     spoiled = getattr(scene, name).clone()
     spoiled[2].view(-1)[0] = value
     meaningful = (name == "opacities" and math.isinf(value)) or (name == "scales" and value == -math.inf)
@@ -96,10 +91,10 @@ def test_usable_tells_meaningless_values_from_meaningful_ones(name, value):
 
 
 def test_usable_holds_for_finite_values_whose_sum_overflows():
-    assert make().replace(means=torch.full((5, 3), 3e38)).usable().all()
+    assert normal_scene().replace(means=torch.full((5, 3), 3e38)).usable().all()
 
 
 def test_usable_finds_infinities_that_cancel_in_a_sum():
     means = torch.zeros(5, 3)
     means[1, 0], means[3, 0] = math.inf, -math.inf
-    assert make().replace(means=means).usable().tolist() == [True, False, True, False, True]
+    assert normal_scene().replace(means=means).usable().tolist() == [True, False, True, False, True]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from pointsplat_ns.gaussians import Gaussians
+from making import normal_scene
 
 _MAKE_CONFIG = """
 import sys, yaml
@@ -34,12 +34,6 @@ for method, model in (("splatfacto", SplatfactoModelConfig()), ("nerfacto", Mode
 """
 
 
-def _make_scene(n=5, degree=3, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    shapes = [(n, 3), (n, 3), (n, 4), (n, 1), (n, 3), (n, (degree + 1) ** 2 - 1, 3)]
-    return Gaussians(*(torch.randn(shape, generator=generator) for shape in shapes))
-
-
 def _checkpoint_of(scene, step=29999, prefix="_model.gauss_params."):
     """The content of a checkpoint with all that nerfstudio's trainer puts in one."""
     parameters = {name: torch.nn.Parameter(value.clone()) for name, value in scene.items()}
@@ -58,12 +52,6 @@ def _checkpoint_of(scene, step=29999, prefix="_model.gauss_params."):
         "schedulers": schedulers,
         "scalers": {},
     }
-
-
-@pytest.fixture
-def make_scene():
-    """``make_scene(n, degree, seed)``: a random scene."""
-    return _make_scene
 
 
 @pytest.fixture
@@ -102,7 +90,7 @@ def make_run(tmp_path, config_texts):
         text = text.replace("timestamp: 2024-05-06_070809", f"timestamp: {time}")
         (folder / "config.yml").write_text(text)
         for step in steps:
-            content = _checkpoint_of(_make_scene(seed=step) if scene is None else scene, step)
+            content = _checkpoint_of(normal_scene(seed=step) if scene is None else scene, step)
             torch.save(content, folder / "nerfstudio_models" / f"step-{step:09d}.ckpt")
         (tmp_path / "data" / "kitchen").mkdir(parents=True, exist_ok=True)
         return Path(folder)

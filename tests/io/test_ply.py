@@ -12,21 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from plyfile import PlyData, PlyElement, PlyListProperty
 
+from making import normal_scene, same_bits
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import ply, read_ply, write_ply
-
-
-def make(n=7, degree=3, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    shapes = [(n, 3), (n, 3), (n, 4), (n, 1), (n, 3), (n, (degree + 1) ** 2 - 1, 3)]
-    return Gaussians(*(torch.randn(shape, generator=generator) for shape in shapes))
-
-
-def same_bits(a, b):
-    return all(
-        torch.equal(x.view(torch.int32), y.view(torch.int32)) for x, y in zip(a.tensors(), b.tensors(), strict=True)
-    )
 
 
 def rows_of(path):
@@ -50,7 +39,7 @@ def column_names(degree):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("n", [0, 1, 7])
 def test_round_trip_is_exact_to_the_bit(tmp_path, n, degree):
-    scene = make(n, degree)
+    scene = normal_scene(n, degree)
     write_ply(scene, tmp_path / "a.ply")
     back = read_ply(tmp_path / "a.ply")
     assert back.sh_degree == degree and same_bits(scene, back)
@@ -76,21 +65,21 @@ def test_round_trip_holds_for_any_value_with_a_meaning(tmp_path_factory, table, 
 
 def test_round_trip_crosses_the_boundaries_of_chunks(tmp_path, monkeypatch):
     monkeypatch.setattr(ply, "CHUNK_ROWS", 3)
-    scene = make(10, 1)
+    scene = normal_scene(10, 1)
     write_ply(scene, tmp_path / "a.ply")
     assert same_bits(scene, read_ply(tmp_path / "a.ply"))
 
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_written_header_is_the_references_to_the_letter(tmp_path, degree):
-    write_ply(make(7, degree), tmp_path / "a.ply")
+    write_ply(normal_scene(7, degree), tmp_path / "a.ply")
     header = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0].decode()
     expected = ["ply", "format binary_little_endian 1.0", "element vertex 7"]
     assert header.splitlines() == expected + [f"property float {name}" for name in column_names(degree)]
 
 
 def test_written_columns_hold_what_their_names_say(tmp_path):
-    scene = make(4, 3)
+    scene = normal_scene(4, 3)
     write_ply(scene, tmp_path / "a.ply")
     rows = rows_of(tmp_path / "a.ply")
     assert rows["z"].tolist() == scene.means[:, 2].tolist()
@@ -106,7 +95,7 @@ def test_written_columns_hold_what_their_names_say(tmp_path):
 
 @pytest.mark.parametrize("options", [{"byte_order": ">"}, {"text": True}, {"byte_order": "<", "comments": ["by hand"]}])
 def test_other_encodings_read_the_same(tmp_path, options):
-    scene = make(5, 2).replace(opacities=torch.tensor([[math.inf], [-math.inf], [0.0], [1.0], [-4.0]]))
+    scene = normal_scene(5, 2).replace(opacities=torch.tensor([[math.inf], [-math.inf], [0.0], [1.0], [-4.0]]))
     write_ply(scene, tmp_path / "a.ply")
     rewrite(tmp_path / "b.ply", rows_of(tmp_path / "a.ply"), **options)
     assert same_bits(scene, read_ply(tmp_path / "b.ply"))
@@ -114,7 +103,7 @@ def test_other_encodings_read_the_same(tmp_path, options):
 
 @pytest.mark.parametrize("text", [False, True])
 def test_properties_in_any_order_and_unknown_ones_are_fine(tmp_path, text):
-    scene = make(5, 1)
+    scene = normal_scene(5, 1)
     write_ply(scene, tmp_path / "a.ply")
     rows = rows_of(tmp_path / "a.ply")
     order = [*reversed(rows.dtype.names), "red", "weight"]
@@ -132,7 +121,7 @@ def test_properties_in_any_order_and_unknown_ones_are_fine(tmp_path, text):
 
 
 def test_crlf_header_is_read(tmp_path):
-    scene = make(5, 0)
+    scene = normal_scene(5, 0)
     write_ply(scene, tmp_path / "a.ply")
     header, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
     (tmp_path / "b.ply").write_bytes((header + b"end_header\n").replace(b"\n", b"\r\n") + data)
@@ -141,7 +130,7 @@ def test_crlf_header_is_read(tmp_path):
 
 @pytest.mark.parametrize("text", [False, True])
 def test_comments_in_any_encoding_are_passed_over(tmp_path, text):
-    scene = make(5, 0)
+    scene = normal_scene(5, 0)
     write_ply(scene, tmp_path / "a.ply")
     rewrite(tmp_path / "b.ply", rows_of(tmp_path / "a.ply"), text=text, byte_order="<")
     comment = "comment \u5ba4\nelement vertex".encode()
@@ -151,7 +140,7 @@ def test_comments_in_any_encoding_are_passed_over(tmp_path, text):
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
 def test_what_follows_the_gaussians_is_not_read(tmp_path, form):
-    scene = make(5, 0)
+    scene = normal_scene(5, 0)
     write_ply(scene, tmp_path / "a.ply")
     rewrite(tmp_path / "b.ply", rows_of(tmp_path / "a.ply"), text=form == "ascii", byte_order="<")
     faces = b"element face 1000000000000000\nproperty list uchar int vertex_indices\nend_header"
@@ -160,7 +149,7 @@ def test_what_follows_the_gaussians_is_not_read(tmp_path, form):
 
 
 def test_lists_before_the_gaussians_are_passed_over_in_ascii_and_refused_in_binary(tmp_path):
-    scene = make(5, 0)
+    scene = normal_scene(5, 0)
     write_ply(scene, tmp_path / "a.ply")
     faces = PlyElement.describe(np.array([([1, 2, 3],), ([4],)], [("vertex_indices", "O")]), "face")
     for text in (True, False):
@@ -171,13 +160,13 @@ def test_lists_before_the_gaussians_are_passed_over_in_ascii_and_refused_in_bina
 
 
 def test_all_zero_rows_stay(tmp_path, caplog):
-    scene = make(3, 0).map(torch.zeros_like)
+    scene = normal_scene(3, 0).map(torch.zeros_like)
     write_ply(scene, tmp_path / "a.ply")
     assert same_bits(scene, read_ply(tmp_path / "a.ply")) and not caplog.records
 
 
 def test_rows_without_meaning_are_dropped_counted_and_said(tmp_path, caplog):
-    scene = make(6, 1)
+    scene = normal_scene(6, 1)
     path = tmp_path / "a.ply"
     write_ply(scene, path)
     rows = rows_of(path)
@@ -190,7 +179,7 @@ def test_rows_without_meaning_are_dropped_counted_and_said(tmp_path, caplog):
 
 
 def test_a_double_beyond_float32_is_dropped_not_read_as_infinite(tmp_path):
-    write_ply(make(3, 0), tmp_path / "a.ply")
+    write_ply(normal_scene(3, 0), tmp_path / "a.ply")
     rows = rows_of(tmp_path / "a.ply")
     wide = rows.astype([(name, "f8") for name in rows.dtype.names])
     wide["y"][1] = 1e300
@@ -201,13 +190,13 @@ def test_a_double_beyond_float32_is_dropped_not_read_as_infinite(tmp_path):
 def test_writing_leaves_out_rows_without_meaning_too(tmp_path, caplog):
     means = torch.zeros(4, 3)
     means[2] = math.nan
-    write_ply(make(4, 0).replace(means=means), tmp_path / "a.ply")
+    write_ply(normal_scene(4, 0).replace(means=means), tmp_path / "a.ply")
     assert len(rows_of(tmp_path / "a.ply")) == 3
     assert "dropped 1 of 4" in caplog.text
 
 
 def test_double_scenes_and_scenes_in_a_graph_can_be_written(tmp_path):
-    scene = make(3, 1)
+    scene = normal_scene(3, 1)
     write_ply(scene.map(lambda value: value.double().requires_grad_()), tmp_path / "a.ply")
     assert same_bits(scene, read_ply(tmp_path / "a.ply"))
 
@@ -226,7 +215,7 @@ def fails(path, *fragments):
 
 @pytest.fixture
 def good(tmp_path):
-    write_ply(make(7, 3), tmp_path / "scene.ply")
+    write_ply(normal_scene(7, 3), tmp_path / "scene.ply")
     return tmp_path / "scene.ply"
 
 
@@ -339,7 +328,7 @@ def test_no_format_is_said(tmp_path):
     ],
 )
 def test_damaged_ascii_is_said_with_its_row(tmp_path, damage, fragment):
-    write_ply(make(3, 0), tmp_path / "a.ply")
+    write_ply(normal_scene(3, 0), tmp_path / "a.ply")
     rewrite(tmp_path / "b.ply", rows_of(tmp_path / "a.ply"), text=True)
     lines = (tmp_path / "b.ply").read_text().splitlines(keepends=True)
     (tmp_path / "b.ply").write_text("".join(damage(lines)))
@@ -356,7 +345,7 @@ def test_no_file_and_a_folder_are_said(tmp_path):
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
     path = tmp_path / "a.ply"
-    write_ply(make(2, 0), path)
+    write_ply(normal_scene(2, 0), path)
     old = path.read_bytes()
 
     def fail(self, stream):
@@ -366,10 +355,10 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
 
     monkeypatch.setattr(PlyData, "write", fail)
     with pytest.raises(SceneError, match=r"a\.ply: cannot be written \(No space left on device\)"):
-        write_ply(make(5, 0), path)
+        write_ply(normal_scene(5, 0), path)
     assert path.read_bytes() == old and [p.name for p in tmp_path.iterdir()] == ["a.ply"]
 
 
 def test_writing_to_a_folder_is_said(tmp_path):
     with pytest.raises(SceneError, match="is a folder"):
-        write_ply(make(1, 0), tmp_path)
+        write_ply(normal_scene(1, 0), tmp_path)

@@ -10,16 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from making import normal_scene, same_bits
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import SH_C0
 from pointsplat_ns.io import allow_splatfacto_checkpoints, read_checkpoint
 from pointsplat_ns.io.splatfacto import PREFIXES
-
-
-def same_bits(a, b):
-    return all(
-        torch.equal(x.view(torch.int32), y.view(torch.int32)) for x, y in zip(a.tensors(), b.tensors(), strict=True)
-    )
 
 
 def fails(path, *fragments):
@@ -33,14 +28,14 @@ def fails(path, *fragments):
 
 @pytest.mark.parametrize("prefix", PREFIXES)
 @pytest.mark.parametrize("degree", [1, 3])
-def test_parameters_come_back_to_the_bit(tmp_path, checkpoint_of, make_scene, prefix, degree):
-    scene = make_scene(6, degree)
+def test_parameters_come_back_to_the_bit(tmp_path, checkpoint_of, prefix, degree):
+    scene = normal_scene(6, degree)
     torch.save(checkpoint_of(scene, prefix=prefix), tmp_path / "step-000000001.ckpt")
     assert same_bits(scene, read_checkpoint(tmp_path / "step-000000001.ckpt"))
 
 
-def test_the_scene_outlives_its_file(tmp_path, checkpoint_of, make_scene):
-    scene = make_scene(1000, 3)
+def test_the_scene_outlives_its_file(tmp_path, checkpoint_of):
+    scene = normal_scene(1000, 3)
     path = tmp_path / "a.ckpt"
     torch.save(checkpoint_of(scene), path)
     back = read_checkpoint(path)
@@ -49,31 +44,31 @@ def test_the_scene_outlives_its_file(tmp_path, checkpoint_of, make_scene):
     assert same_bits(scene, back)
 
 
-def test_colour_logits_of_degree_0_become_sh_of_the_same_colour(tmp_path, checkpoint_of, make_scene):
+def test_colour_logits_of_degree_0_become_sh_of_the_same_colour(tmp_path, checkpoint_of):
     # Splatfacto seeds white and black points with infinite logits in float32.
     logits = torch.tensor([[0.0, math.inf, -math.inf], [2.0, -3.0, 88.0]])
-    torch.save(checkpoint_of(make_scene(2, 0).replace(features_dc=logits)), tmp_path / "a.ckpt")
+    torch.save(checkpoint_of(normal_scene(2, 0).replace(features_dc=logits)), tmp_path / "a.ckpt")
     scene = read_checkpoint(tmp_path / "a.ckpt")
     colours = 0.5 + SH_C0 * scene.features_dc
     # 2e-7: two roundings of float32 around values of at most 1
     assert torch.allclose(colours, torch.sigmoid(logits), atol=2e-7, rtol=0) and len(scene) == 2
 
 
-def test_half_precision_parameters_are_read_as_float32(tmp_path, checkpoint_of, make_scene):
-    content = checkpoint_of(make_scene(3, 1))
+def test_half_precision_parameters_are_read_as_float32(tmp_path, checkpoint_of):
+    content = checkpoint_of(normal_scene(3, 1))
     content["pipeline"] = {key: value.half() for key, value in content["pipeline"].items()}
     torch.save(content, tmp_path / "a.ckpt")
     scene = read_checkpoint(tmp_path / "a.ckpt")
-    assert scene.dtype == torch.float32 and torch.equal(scene.means, make_scene(3, 1).means.half().float())
+    assert scene.dtype == torch.float32 and torch.equal(scene.means, normal_scene(3, 1).means.half().float())
 
 
-def test_the_old_file_format_of_torch_is_read(tmp_path, checkpoint_of, make_scene):
-    torch.save(checkpoint_of(make_scene(4, 2)), tmp_path / "a.ckpt", _use_new_zipfile_serialization=False)
-    assert same_bits(make_scene(4, 2), read_checkpoint(tmp_path / "a.ckpt"))
+def test_the_old_file_format_of_torch_is_read(tmp_path, checkpoint_of):
+    torch.save(checkpoint_of(normal_scene(4, 2)), tmp_path / "a.ckpt", _use_new_zipfile_serialization=False)
+    assert same_bits(normal_scene(4, 2), read_checkpoint(tmp_path / "a.ckpt"))
 
 
-def test_rows_without_meaning_are_dropped_counted_and_said(tmp_path, checkpoint_of, make_scene, caplog):
-    scene = make_scene(5, 1)
+def test_rows_without_meaning_are_dropped_counted_and_said(tmp_path, checkpoint_of, caplog):
+    scene = normal_scene(5, 1)
     scene.means[3, 1] = math.nan
     scene.opacities[0] = math.inf
     torch.save(checkpoint_of(scene), tmp_path / "a.ckpt")
@@ -93,8 +88,8 @@ def in_fresh_python(code, *arguments):
     )
 
 
-def test_stock_loading_fails_before_the_registration_and_works_after_it(tmp_path, checkpoint_of, make_scene):
-    torch.save(checkpoint_of(make_scene()), tmp_path / "a.ckpt")
+def test_stock_loading_fails_before_the_registration_and_works_after_it(tmp_path, checkpoint_of):
+    torch.save(checkpoint_of(normal_scene()), tmp_path / "a.ckpt")
     code = """
 import sys, torch
 try:
@@ -116,9 +111,9 @@ print("nerfstudio" in sys.modules)
 
 
 @pytest.mark.parametrize("core", ["core", "_core"])
-def test_a_checkpoint_written_with_either_numpy_loads(tmp_path, checkpoint_of, make_scene, core):
+def test_a_checkpoint_written_with_either_numpy_loads(tmp_path, checkpoint_of, core):
     path = tmp_path / "a.ckpt"
-    torch.save(checkpoint_of(make_scene()), path)
+    torch.save(checkpoint_of(normal_scene()), path)
     with zipfile.ZipFile(path) as archive:
         entries = {info.filename: archive.read(info) for info in archive.infolist()}
     with zipfile.ZipFile(path, "w") as archive:
@@ -126,7 +121,7 @@ def test_a_checkpoint_written_with_either_numpy_loads(tmp_path, checkpoint_of, m
             data = data.replace(f"cnumpy.{NUMPY_CORE}.multiarray\n".encode(), f"cnumpy.{core}.multiarray\n".encode())
             archive.writestr(name, data)
     assert any(f"cnumpy.{core}.multiarray\nscalar".encode() in data for data in zipfile_data(path))
-    assert same_bits(make_scene(), read_checkpoint(path))
+    assert same_bits(normal_scene(), read_checkpoint(path))
 
 
 def zipfile_data(path):
@@ -144,16 +139,16 @@ class Bomb:
         return (print, ("this must never be printed",))
 
 
-def test_a_checkpoint_that_would_run_code_is_refused_and_runs_none(tmp_path, checkpoint_of, make_scene, capsys):
-    content = checkpoint_of(make_scene())
+def test_a_checkpoint_that_would_run_code_is_refused_and_runs_none(tmp_path, checkpoint_of, capsys):
+    content = checkpoint_of(normal_scene())
     content["extra"] = Bomb()
     torch.save(content, tmp_path / "a.ckpt")
     fails(tmp_path / "a.ckpt", "holds an object of type", "print")
     assert "never" not in capsys.readouterr().out
 
 
-def test_object_arrays_do_not_pass_as_numpy_scalars(tmp_path, checkpoint_of, make_scene):
-    content = checkpoint_of(make_scene())
+def test_object_arrays_do_not_pass_as_numpy_scalars(tmp_path, checkpoint_of):
+    content = checkpoint_of(normal_scene())
     content["extra"] = np.array([1, "a"], dtype=object)
     torch.save(content, tmp_path / "a.ckpt")
     fails(tmp_path / "a.ckpt", "holds an object of type numpy")
@@ -163,9 +158,9 @@ def test_object_arrays_do_not_pass_as_numpy_scalars(tmp_path, checkpoint_of, mak
 
 
 @pytest.mark.parametrize("share", [0.01, 0.5, 0.99, 0.9999])
-def test_a_truncated_checkpoint_is_said(tmp_path, checkpoint_of, make_scene, share):
+def test_a_truncated_checkpoint_is_said(tmp_path, checkpoint_of, share):
     path = tmp_path / "a.ckpt"
-    torch.save(checkpoint_of(make_scene(50)), path)
+    torch.save(checkpoint_of(normal_scene(50)), path)
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
     fails(path, "truncated")
@@ -177,9 +172,9 @@ def test_garbage_is_said(tmp_path, content):
     fails(tmp_path / "a.ckpt", "expected a checkpoint that Splatfacto saved")
 
 
-def test_damage_inside_a_whole_archive_is_said(tmp_path, checkpoint_of, make_scene):
+def test_damage_inside_a_whole_archive_is_said(tmp_path, checkpoint_of):
     path = tmp_path / "a.ckpt"
-    torch.save(checkpoint_of(make_scene()), path)
+    torch.save(checkpoint_of(normal_scene()), path)
     with zipfile.ZipFile(path) as archive:
         entries = {info.filename: archive.read(info) for info in archive.infolist()}
     with zipfile.ZipFile(path, "w") as archive:
@@ -210,8 +205,8 @@ def test_a_file_that_is_no_nerfstudio_checkpoint_is_said(tmp_path, content, foun
 
 
 @pytest.mark.parametrize("name", ["scales", "quats", "opacities", "features_dc", "features_rest"])
-def test_a_missing_parameter_is_named(tmp_path, checkpoint_of, make_scene, name):
-    content = checkpoint_of(make_scene())
+def test_a_missing_parameter_is_named(tmp_path, checkpoint_of, name):
+    content = checkpoint_of(normal_scene())
     del content["pipeline"]["_model.gauss_params." + name]
     torch.save(content, tmp_path / "a.ckpt")
     fails(tmp_path / "a.ckpt", f"lacks the key '_model.gauss_params.{name}'")
@@ -227,8 +222,8 @@ def test_a_missing_parameter_is_named(tmp_path, checkpoint_of, make_scene, name)
         (torch.zeros(1).expand(10**12, 4), "more than the file can hold"),
     ],
 )
-def test_a_parameter_that_cannot_be_one_is_named(tmp_path, checkpoint_of, make_scene, value, fragment):
-    content = checkpoint_of(make_scene())
+def test_a_parameter_that_cannot_be_one_is_named(tmp_path, checkpoint_of, value, fragment):
+    content = checkpoint_of(normal_scene())
     content["pipeline"]["_model.gauss_params.quats"] = value
     torch.save(content, tmp_path / "a.ckpt")
     fails(tmp_path / "a.ckpt", fragment, "quats")

@@ -1,4 +1,4 @@
-"""What several test modules make: scenes, settings of a training, runs whose data is gone."""
+"""What several test modules make: scenes, cameras, settings of a training, runs whose data is gone."""
 
 from __future__ import annotations
 
@@ -17,8 +17,27 @@ SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 
 
 def same(a: Gaussians, b: Gaussians) -> bool:
-    """Whether two scenes are equal to the bit."""
+    """Whether all parameters of two scenes are equal; -0 equals 0, NaN equals nothing."""
     return all(torch.equal(x, y) for x, y in zip(a.tensors(), b.tensors(), strict=True))
+
+
+def same_bits(a: Gaussians, b: Gaussians) -> bool:
+    """Whether all parameters of two float32 scenes have the same bits."""
+    return same(*(scene.map(lambda value: value.view(torch.int32).double()) for scene in (a, b)))
+
+
+def normal_scene(n: int = 5, degree: int = 3, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:
+    """A scene whose every parameter is drawn from the standard normal distribution.
+
+    Args:
+        n: how many Gaussians.
+        degree: of SH.
+        seed: the same seed gives the same scene.
+        dtype: of the parameters.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    shapes = [(n, 3), (n, 3), (n, 4), (n, 1), (n, 3), (n, (degree + 1) ** 2 - 1, 3)]
+    return Gaussians(*(torch.randn(shape, generator=generator, dtype=dtype) for shape in shapes))
 
 
 def ball(
@@ -45,6 +64,73 @@ def ball(
         features_dc=bright + torch.sin(2 * place),
         features_rest=0.05 * torch.randn(n, (degree + 1) ** 2 - 1, 3, generator=generator),
     )
+
+
+def box_room(seed: int, count: int = 900, size: float = 0.15, smooth: bool = False) -> Gaussians:
+    """A closed box of opaque Gaussians, 4 x 3 x 2 scene units: free inside, covered all around.
+
+    Args:
+        seed: the same seed gives the same room.
+        count: how many Gaussians.
+        size: their standard deviation.
+        smooth: colours change smoothly over the walls; otherwise each Gaussian has one of its own.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    means = torch.rand(count, 3, generator=generator) * 2 - 1
+    rows, axis = torch.arange(count), torch.arange(count) % 3
+    means[rows, axis] = torch.sign(means[rows, axis])
+    phase = torch.randn(3 if smooth else (count, 3), generator=generator)
+    return Gaussians(
+        means=means * torch.tensor([2.0, 1.5, 1.0]),
+        scales=torch.full((count, 3), size).log(),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        opacities=torch.full((count, 1), 4.0),
+        features_dc=torch.sin(2 * means + phase) if smooth else phase,
+        features_rest=torch.zeros(count, 3, 3),
+    )
+
+
+def splats_in_view(
+    n: int,
+    seed: int = 0,
+    dtype: torch.dtype = torch.float64,
+    scale: float = -3.0,
+    spread: float = 0.8,
+    opacity: float = 1.0,
+) -> list[torch.Tensor]:
+    """What a rasterizer takes, before the camera of :func:`camera_askew`: means (N, 3), quats (N, 4), scales (N, 3),
+    opacities (N,) and SH of degree 3 (N, 16, 3).
+
+    Args:
+        n: how many Gaussians.
+        seed: the same seed gives the same ones.
+        dtype: of the tensors; all are drawn in float64.
+        scale: mean of the log-scales.
+        spread: standard deviation of the log-scales.
+        opacity: opacities are uniform from 0 to this.
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    def randn(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    means = randn(n, 3) * torch.tensor([1.0, 1.0, 0.5], dtype=torch.float64) + torch.tensor([0, 0, 3.0]).double()
+    scales = torch.exp(randn(n, 3) * spread + scale)
+    opacities = torch.rand(n, generator=generator, dtype=torch.float64) * opacity
+    return [value.to(dtype) for value in (means, randn(n, 4), scales, opacities, randn(n, 16, 3) * 0.3)]
+
+
+def camera_askew(
+    dtype: torch.dtype = torch.float64, angle: float = 0.2, cx: float = 20.0, cy: float = 13.0, focal: float = 40.0
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """World-to-camera matrix (4, 4), turned by ``angle`` radians and moved a little, and intrinsics (3, 3) in pixels
+    whose principal point is not the middle of any usual image."""
+    K = torch.tensor([[focal, 0, cx], [0, 1.05 * focal, cy], [0, 0, 1]], dtype=dtype)
+    view = torch.eye(4, dtype=dtype)
+    c, s = math.cos(angle), math.sin(angle)
+    view[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=dtype)
+    view[:3, 3] = torch.tensor([0.1, -0.1, 0.2], dtype=dtype)
+    return view, K
 
 
 def small_config(data: Path, output_dir: Path, steps: int, **model):
