@@ -42,6 +42,7 @@ def case(name):
     from nerfstudio.plugins.registry_dataparser import DataParserSpecification
     from nerfstudio.plugins.types import MethodSpecification
     for spec, kind in ((method_configs.methods.splatfacto_cpu, MethodSpecification),
+                       (method_configs.methods.pointsplat, MethodSpecification),
                        (method_configs.dataparsers.replica, DataParserSpecification)):
         assert isinstance(spec, kind), spec
 
@@ -64,7 +65,11 @@ for name in sys.argv[1:]:
 def test_any_module_may_come_first_and_imports_no_network_no_cuda_and_little_else():
     # nerfstudio imports entry points from inside its own imports, so the order decides what is half imported.
     # (That nerfstudio itself may come first is what every test that parses its command line proves.)
-    cases = ["method_configs.methods", "pointsplat_ns.nerfstudio_plugin.replica.dataparser", "new modules"]
+    modules = (
+        *("replica.dataparser", "frames", "splatfacto_cpu.model", "pointsplat.config"),
+        "pointsplat.scenes",  # what dataset_views imports
+    )
+    cases = ["method_configs.methods", *(f"pointsplat_ns.nerfstudio_plugin.{name}" for name in modules), "new modules"]
     result = subprocess.run([sys.executable, "-c", FORKED, *cases], capture_output=True, text=True, timeout=300)
     lines = [line for line in result.stdout.splitlines() if line.split(":")[0] in cases]
     assert lines == [f"{name}: fine" for name in cases], result.stdout + result.stderr

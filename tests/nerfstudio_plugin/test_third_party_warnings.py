@@ -78,8 +78,9 @@ def test_a_training_prints_no_warning(wall_scene, tmp_path):
 
 def test_a_command_that_reads_poses_with_nerfstudio_prints_no_warning(trained_walls, tmp_path):
     # In a fresh process dataset_views is what first imports nerfstudio.
+    (run,) = (config.parent for config in (trained_walls / "wall-a").rglob("config.yml"))
     result = run_quietly(
-        *("pointsplat", "prune", trained_walls / "wall-a", "--keep", "50%", "--by", "lightgaussian"),
+        *("pointsplat", "prune", run, "--keep", "50%", "--by", "lightgaussian"),
         *("-o", tmp_path / "small.ply"),
     )
     assert (result.returncode, result.stderr) == (0, "")

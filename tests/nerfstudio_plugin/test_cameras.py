@@ -1,0 +1,81 @@
+"""nerfstudio's cameras and ours are the same cameras."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
+from pointsplat_ns.views import Views
+
+SEED = 20
+BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
+
+
+def some_cameras(num: int = 3) -> Cameras:
+    """Turned and moved at random, off-centre, with unequal focal lengths."""
+    generator = torch.Generator().manual_seed(SEED)
+    turn = torch.linalg.qr(torch.randn(num, 3, 3, generator=generator))[0]
+    turn = turn * torch.linalg.det(turn)[:, None, None]
+    poses = torch.cat([turn, torch.randn(num, 3, 1, generator=generator)], dim=2)
+    return Cameras(poses, 35.0, 36.0, 20.5, 14.0, 40, 30, camera_type=CameraType.PERSPECTIVE)
+
+
+@pytest.fixture
+def views() -> Views:
+    return views_of_cameras(some_cameras(), BACKGROUND, "antialiased")
+
+
+def test_a_view_sees_a_point_at_the_pixel_where_nerfstudios_ray_to_it_starts(views):
+    cameras = some_cameras()
+    at = torch.tensor([12.5, 31.5])  # row and column, at pixel centres as nerfstudio counts
+    rays = cameras.generate_rays(torch.tensor([[1]]), coords=at[None])
+    point = rays.origins[0] + 2.5 * rays.directions[0]
+    in_camera = views.viewmats[1] @ torch.cat([point, torch.ones(1)])
+    pixel = views.Ks[1] @ in_camera[:3]
+    assert in_camera[2] > 0
+    # 1e-3 pixels: float32 rays
+    torch.testing.assert_close(pixel[:2] / pixel[2], at.flip(0), atol=1e-3, rtol=0)
+
+
+def test_views_have_the_size_of_the_cameras(views):
+    assert (len(views), views.width, views.height) == (3, 40, 30)
+
+
+def test_views_are_drawn_over_the_background_given(views):
+    assert torch.equal(views.background, BACKGROUND)
+
+
+def test_views_are_drawn_as_asked_for(views):
+    assert views.rasterize_mode == "antialiased"
+
+
+def test_cameras_of_views_have_the_poses_that_the_views_were_made_of(views):
+    # 1e-6: one inversion of a float32 pose
+    back = cameras_of_views(views).camera_to_worlds
+    torch.testing.assert_close(back, some_cameras().camera_to_worlds, atol=1e-6, rtol=0)
+
+
+def test_cameras_of_views_have_their_intrinsics(views):
+    assert torch.equal(cameras_of_views(views).get_intrinsics_matrices(), some_cameras().get_intrinsics_matrices())
+
+
+def test_cameras_of_views_are_pinhole_cameras_of_their_size(views):
+    cameras = cameras_of_views(views)
+    assert cameras.distortion_params is None
+    assert (cameras.width.unique().tolist(), cameras.height.unique().tolist()) == ([40], [30])
+
+
+def test_cameras_of_views_in_float64_are_float32_as_nerfstudio_needs_them(views):
+    double = Views(views.viewmats.double(), views.Ks.double(), views.width, views.height, BACKGROUND)
+    cameras = cameras_of_views(double)
+    assert (cameras.camera_to_worlds.dtype, cameras.fx.dtype) == (torch.float32, torch.float32)
+
+
+def test_cameras_of_several_sizes_are_refused():
+    cameras = some_cameras()
+    cameras.width = torch.tensor([[40], [41], [40]])
+    with pytest.raises(DataError, match="photos of 2 sizes; expected one size for all views"):
+        views_of_cameras(cameras, BACKGROUND)
