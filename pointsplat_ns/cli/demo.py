@@ -1,13 +1,20 @@
-"""``pointsplat demo``: the whole method, end to end, on rooms that the package makes itself."""
+"""``pointsplat demo``: a scene made small at once, then the whole method on rooms that the package makes itself."""
 
 from __future__ import annotations
 
+import shlex
 import shutil
 import time
 from pathlib import Path
 
 UNSEEN = "room2"
 """The room that the refiner is not trained on."""
+
+TIMESTAMP = "demo"
+"""Names the runs, so that what is finished is found again."""
+
+TRAINING_MINUTES = 15
+"""What training takes on two cores, as `docs/benchmarks.md` has it measured."""
 
 
 def demo(
@@ -20,8 +27,8 @@ def demo(
     height: int = 192,
     fresh: bool = False,
 ) -> None:
-    """Train small scenes, prune them, train the refiner, evaluate it on a room that it never saw, export; and
-    make that room small with the refiner that ships.
+    """Make the scene that ships small and picture it, which takes a minute. Then go on to train, which may be stopped:
+    train small scenes, prune them, train the refiner, evaluate it on a room that it never saw, and export.
 
     Runs the same commands that a person would type, and prints them. What an interrupted demo has
     finished is not done again.
@@ -36,47 +43,90 @@ def demo(
         height: of a photo, pixels.
         fresh: start over.
     """
-    from pointsplat_ns.cli.report import read_evaluation, show_report
-    from pointsplat_ns.cli.rooms import rooms
-    from pointsplat_ns.cli.running import finished, run
-
-    start = time.perf_counter()
     if fresh and output.exists():
         shutil.rmtree(output)
-    names = ["room0", "room1", UNSEEN]
-    missing = [name for name in names if not (output / "rooms" / name).is_dir()]
-    if missing:
-        rooms(output / "rooms", tuple(int(name[4:]) for name in missing), frames, width, height)
+    compact_example(output, keep)
+    print(
+        f"\nThat is a usable result. The demo now goes on to train scenes and a refiner of its own, for about "
+        f"{TRAINING_MINUTES} minutes on two cores.\nIt may be stopped at any time with Ctrl-C; started again, it does "
+        "not repeat what it has finished.",
+        flush=True,
+    )
+    train_and_judge(output, keep, scene_steps, refiner_steps, (frames, width, height))
 
-    scenes = output / "scenes"
+
+def compact_example(output: Path, keep: float) -> None:
+    """The scene that ships, made small with the refiner that ships, and a picture of both.
+
+    Args:
+        output: folder for the scene, the smaller one and the picture.
+        keep: share of the Gaussians to keep.
+    """
+    import pointsplat_ns as ps
+    from pointsplat_ns.nerfstudio_plugin.running import run
+
+    start = time.perf_counter()
+    dense, small, picture = (output / f"example{end}" for end in (".ply", "_compact.ply", ".png"))
+    ps.save(ps.example_room(), dense)
+    words = ["pointsplat", "compact", str(dense), "--keep", f"{keep:g}", "-o", str(small), "--picture", str(picture)]
+    run(shlex.join([*words, "--force"]))
+    print(f"\n{picture}: the scene before and after, side by side")
+    print(f"{small}: the smaller scene; open it in any 3DGS viewer")
+    print(f"made in {time.perf_counter() - start:.0f} seconds")
+
+
+def train_and_judge(
+    output: Path, keep: float, scene_steps: int, refiner_steps: int, photos: tuple[int, int, int]
+) -> None:
+    """Train a scene of each of three rooms and a refiner on two of them; judge it on the third, and export that.
+
+    Args:
+        output: folder for everything that is made.
+        keep: share of the Gaussians to keep.
+        scene_steps: training steps of each room.
+        refiner_steps: training steps of the refiner.
+        photos: of each room: how many, their width and height in pixels.
+    """
+    from pointsplat_ns.cli.report import show_report
+    from pointsplat_ns.nerfstudio_plugin.commands import (
+        REFINER_METHOD,
+        SCENE_METHOD,
+        evaluate_command,
+        run_folder,
+        train_refiner_command,
+        train_scene_command,
+    )
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.results import read_evaluation
+    from pointsplat_ns.nerfstudio_plugin.running import finished, run
+    from pointsplat_ns.rooms import write_room
+
+    start = time.perf_counter()
+    rooms, scenes, refiners = output / "rooms", output / "scenes", output / "refiner"
+    names = ["room0", "room1", UNSEEN]
     for name in names:
-        if not finished(scenes / name / "splatfacto-cpu" / "demo", scene_steps):
-            run(
-                "ns-train splatfacto-cpu --vis tensorboard --timestamp demo "
-                f"--output-dir {scenes} --experiment-name {name} --max-num-iterations {scene_steps} "
-                f"--data {output / 'rooms' / name} replica-data --num-seed-points 20000"
-            )
-    trained = output / "refiner" / "rooms" / "pointsplat" / "demo"
+        if not (rooms / name).is_dir():
+            print(write_room(rooms / name, int(name[4:]), *photos))
+    for name in names:
+        if not finished(run_folder(scenes, name, SCENE_METHOD, TIMESTAMP), scene_steps):
+            run(train_scene_command(rooms / name, scenes, name, scene_steps, TIMESTAMP, seed_points=20_000))
+    trained = run_folder(refiners, "rooms", REFINER_METHOD, TIMESTAMP)
     if not finished(trained, refiner_steps):
-        run(
-            "ns-train pointsplat --vis tensorboard --timestamp demo "
-            f"--output-dir {output / 'refiner'} --experiment-name rooms --max-num-iterations {refiner_steps} "
-            f"--data {scenes} --pipeline.datamanager.eval-scenes {UNSEEN} "
-            f"--pipeline.model.keep {keep} --pipeline.model.size tiny"
-        )
+        options = {"pipeline.model.keep": keep, "pipeline.model.size": "tiny"}
+        run(train_refiner_command(scenes, refiners, "rooms", refiner_steps, TIMESTAMP, (UNSEEN,), options))
     evaluation, pictures = output / "evaluation.json", output / "pictures"
-    run(f"ns-eval --load-config {trained / 'config.yml'} --output-path {evaluation} --render-output-path {pictures}")
-    splat = output / f"{UNSEEN}_refined.ply"
-    run(f"pointsplat export {trained} -o {splat} --force")
-    dense, small = scenes / UNSEEN / "splatfacto-cpu" / "demo", output / f"{UNSEEN}_compact.ply"
-    views = output / "compact.png"
-    run(f"pointsplat compact {dense} --keep {keep} -o {small} --picture {views} --force")
+    run(evaluate_command(trained, evaluation, pictures))
+    refined, small = output / f"{UNSEEN}_refined.ply", output / f"{UNSEEN}_compact.ply"
+    run(shlex.join(["pointsplat", "export", str(trained), "-o", str(refined), "--force"]))
+    dense, views = run_folder(scenes, UNSEEN, SCENE_METHOD, TIMESTAMP), output / "compact.png"
+    words = ["pointsplat", "compact", str(dense), "--keep", f"{keep:g}", "-o", str(small), "--picture", str(views)]
+    run(shlex.join([*words, "--force"]))
 
     results = read_evaluation(evaluation)
     picture = output / "before_after.png"
     before_after(sorted(pictures.glob(f"{UNSEEN}_*.png")), results["scenes"][UNSEEN], picture)
     show_report(results)
-    print(f"{splat}: open it in any 3DGS viewer, or run ns-viewer --load-config {trained / 'config.yml'}")
+    config = shlex.quote(str(trained / "config.yml"))
+    print(f"{refined}: open it in any 3DGS viewer, or run ns-viewer --load-config {config}")
     print(f"{small}: the same room by pointsplat compact and the refiner that ships; {views} shows it")
     print(f"{picture}: photo, dense, pruned and refined side by side, of a room that the refiner never saw")
     print(f"done in {(time.perf_counter() - start) / 60:.1f} minutes")
@@ -93,6 +143,7 @@ def before_after(views: list[Path], scene: dict, path: Path, rows: int = 3) -> N
     """
     from matplotlib.image import imread
     from numpy import array_split
+    from numpy.typing import ArrayLike
 
     from pointsplat_ns.compression.pictures import side_by_side
 
@@ -102,4 +153,5 @@ def before_after(views: list[Path], scene: dict, path: Path, rows: int = 3) -> N
         size = f"{values['gaussians']:,} Gaussians, {values['megabytes']:.1f} MB"
         titles.append(f"{variant}: {size}, {values['psnr']:.1f} dB")
     shown = views[:: max(1, len(views) // rows)][:rows]
-    side_by_side([array_split(imread(view), 4, axis=1) for view in shown], titles, path)
+    images: list[list[ArrayLike]] = [[*array_split(imread(view), len(titles), axis=1)] for view in shown]
+    side_by_side(images, titles, path)

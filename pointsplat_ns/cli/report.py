@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import tyro
 
-ROWS = ("dense", "pruned", "refined")
+from pointsplat_ns.nerfstudio_plugin.pointsplat.results import VARIANTS, read_evaluation
 
 PHOTOS = "photos"
 """What an evaluation that does not say was compared with."""
@@ -34,24 +33,6 @@ def show_report(results: dict[str, Any]) -> None:
         Console().print(table)
     if "lpips_note" in results:
         print(f"no LPIPS: {results['lpips_note']}")
-
-
-def read_evaluation(path: Path) -> dict[str, Any]:
-    """The results in a file that ``ns-eval`` wrote of a pointsplat run.
-
-    Raises:
-        DataError: if it is something else.
-    """
-    from pointsplat_ns.errors import DataError
-
-    try:
-        results = json.loads(path.read_text("utf-8"))["results"]
-        assert set(ROWS) <= set(next(iter(results["scenes"].values())))
-        return results
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); expected what ns-eval wrote") from error
-    except (ValueError, KeyError, TypeError, AttributeError, AssertionError, StopIteration) as error:
-        raise DataError(f"{path}: not an evaluation of a pointsplat run; expected what ns-eval wrote") from error
 
 
 def report_tables(results: dict[str, Any]) -> list:
@@ -84,7 +65,7 @@ def _table(results: dict[str, Any], part: dict[str, Any]):
         averages = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
         blocks += [("average", seen, part[key]) for seen, key in averages if key in part]
     for title, seen, block in blocks:
-        for i, row in enumerate(ROWS):
+        for i, row in enumerate(VARIANTS):
             values = block[row]
             table.add_row(
                 title if i == 0 else "",
@@ -96,7 +77,7 @@ def _table(results: dict[str, Any], part: dict[str, Any]):
                 _number(values["gaussians"], 0),
                 _number(values["megabytes"], 2),
                 _number(values["fps"], 1),
-                end_section=i == len(ROWS) - 1,
+                end_section=i == len(VARIANTS) - 1,
             )
     return table
 

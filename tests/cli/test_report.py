@@ -1,14 +1,12 @@
-"""The commands that make data and show results, and the demo in small."""
+"""The commands that make data and show results."""
 
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
 from pointsplat_ns.cli import main
-from pointsplat_ns.io.ply import read_ply
 
 
 def evaluation(lpips: float | None = 0.25) -> dict:
@@ -97,33 +95,3 @@ def test_rooms_are_named_by_their_seeds(tmp_path):
     main(["rooms", "-o", str(tmp_path / "r"), "--seeds", "3", "--frames", "2", "--width", "32", "--height", "24"])
     assert sorted(p.name for p in (tmp_path / "r").iterdir()) == ["room3"]
     assert len(list((tmp_path / "r" / "room3" / "results").glob("frame*"))) == 2
-
-
-def test_the_demo_runs_end_to_end_and_does_nothing_twice(tmp_path, capfd, monkeypatch):
-    monkeypatch.setenv("POINTSPLAT_LPIPS_WEIGHTS", str(tmp_path))  # no weights there, and no download
-    output = tmp_path / "demo"
-    small = "--scene-steps 12 --refiner-steps 3 --frames 11 --width 64 --height 48 --keep 0.5".split()
-    main(["demo", "--output", str(output), *small])
-    shown = capfd.readouterr().out
-    assert "room2   │ never │ dense" in shown and "refined" in shown
-    assert (output / "before_after.png").stat().st_size > 10_000
-    results = json.loads((output / "evaluation.json").read_text())["results"]
-    assert results["scenes"]["room2"]["seen_in_training"] is False
-    assert results["scenes"]["room0"]["seen_in_training"] is True
-    kept = results["scenes"]["room2"]["refined"]["gaussians"]
-    assert len(read_ply(output / "room2_refined.ply")) == kept
-    assert abs(kept - results["scenes"]["room2"]["dense"]["gaussians"] / 2) <= 1
-    before = {p: p.stat().st_mtime_ns for p in output.rglob("*.ckpt")}
-    main(["demo", "--output", str(output), *small])
-    assert before == {p: p.stat().st_mtime_ns for p in output.rglob("*.ckpt")}
-    assert "ns-train" not in capfd.readouterr().out
-
-
-def test_the_demo_says_which_command_failed(tmp_path, capfd):
-    output = tmp_path / "demo"
-    for seed in range(3):
-        Path(output / "rooms" / f"room{seed}").mkdir(parents=True)  # rooms without a photo
-    with pytest.raises(SystemExit) as end:
-        main(["demo", "--output", str(output)])
-    error = capfd.readouterr().err
-    assert end.value.code == 1 and "ns-train splatfacto-cpu" in error.splitlines()[-1]

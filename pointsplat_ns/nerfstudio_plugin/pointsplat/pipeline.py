@@ -26,11 +26,9 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
 )
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import LOSSES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
+from pointsplat_ns.nerfstudio_plugin.pointsplat.results import REFINER_NAME
 from pointsplat_ns.nerfstudio_plugin.pointsplat.training_state import TrainingState
 from pointsplat_ns.refiner import save_refiner
-
-REFINER_NAME = "refiner.safetensors"
-"""The trained network, in the run's folder: what ``pointsplat compact --using`` takes."""
 
 
 @dataclass

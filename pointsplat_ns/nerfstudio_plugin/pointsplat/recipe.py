@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from shlex import quote
 from typing import Any
 
 import numpy as np
 
+from pointsplat_ns.nerfstudio_plugin.commands import train_refiner_command, train_scene_command
 from pointsplat_ns.rooms.camera_path import STYLES
 
 TRAIN_SEEDS = tuple(range(100, 116))
@@ -48,15 +48,13 @@ class SceneSettings:
 
     def train_command(self, data: Path, output: Path, timestamp: str) -> str:
         """The ``ns-train`` command of the scene."""
-        return (
-            f"ns-train splatfacto-cpu --vis tensorboard --timestamp {timestamp} --output-dir {quote(str(output))} "
-            f"--experiment-name {self.name} --max-num-iterations {self.steps} "
-            f"--pipeline.model.densify-grad-thresh {self.densify_grad_thresh:.2g} "
-            f"--pipeline.model.cull-alpha-thresh {self.cull_alpha_thresh:g} "
-            f"--pipeline.model.rasterize-mode {'antialiased' if self.antialiased else 'classic'} "
-            f"--pipeline.model.use-scale-regularization {self.scale_regularization} "
-            f"--data {quote(str(data))} replica-data --num-seed-points {self.seed_points}"
-        )
+        options = {
+            "pipeline.model.densify-grad-thresh": f"{self.densify_grad_thresh:.2g}",
+            "pipeline.model.cull-alpha-thresh": self.cull_alpha_thresh,
+            "pipeline.model.rasterize-mode": "antialiased" if self.antialiased else "classic",
+            "pipeline.model.use-scale-regularization": self.scale_regularization,
+        }
+        return train_scene_command(data, output, self.name, self.steps, timestamp, self.seed_points, options)
 
 
 def scene_settings(seed: int) -> SceneSettings:
@@ -84,16 +82,18 @@ def scene_settings(seed: int) -> SceneSettings:
 
 def refiner_command(scenes: Path, output: Path, name: str, timestamp: str, size: str, steps: int, seed: int) -> str:
     """The ``ns-train`` command of the refiner."""
-    unseen = " ".join(f"room{seed}" for seed in UNSEEN_SEEDS)
-    return (
-        f"ns-train pointsplat --vis tensorboard --timestamp {timestamp} --experiment-name {name} "
-        f"--output-dir {quote(str(output))} "
-        f"--max-num-iterations {steps} --data {quote(str(scenes))} --pipeline.datamanager.eval-scenes {unseen} "
-        f"--pipeline.datamanager.supervision dense --pipeline.datamanager.seed {seed} "
-        f"--pipeline.model.size {size} --pipeline.model.keep {KEEP:g} "
-        "--pipeline.model.pixel-loss rmse --pipeline.model.lpips-weight 0.05 --rate-factor 8 "
-        f"--pipeline.model.pruned-folder {quote(str(scenes.parent / 'pruned'))}"
-    )
+    options = {
+        "pipeline.datamanager.supervision": "dense",
+        "pipeline.datamanager.seed": seed,
+        "pipeline.model.size": size,
+        "pipeline.model.keep": KEEP,
+        "pipeline.model.pixel-loss": "rmse",
+        "pipeline.model.lpips-weight": 0.05,
+        "rate-factor": 8,
+        "pipeline.model.pruned-folder": scenes.parent / "pruned",
+    }
+    unseen = tuple(f"room{seed}" for seed in UNSEEN_SEEDS)
+    return train_refiner_command(scenes, output, name, steps, timestamp, unseen, options)
 
 
 def card_text(about: dict[str, Any], results: dict[str, Any], command: str, parameters: int) -> str:

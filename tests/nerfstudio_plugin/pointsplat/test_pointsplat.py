@@ -27,7 +27,7 @@ from pointsplat_ns.metrics import ImageError
 from pointsplat_ns.metrics.lpips import ReportedLpips, load_lpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES, pointsplat_config
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PhotoLoss
-from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import REFINER_NAME
+from pointsplat_ns.nerfstudio_plugin.pointsplat.results import REFINER_NAME
 from pointsplat_ns.pruning import METHODS, prune, score_of, select
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.refiner import read_refiner

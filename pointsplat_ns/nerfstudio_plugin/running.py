@@ -1,4 +1,4 @@
-"""Running other commands from a command, so that what they finished is not done again."""
+"""Running command lines one after the other, so that what an interrupted one finished is not done again."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.io.runs import open_run
+from pointsplat_ns.nerfstudio_plugin.third_party_warnings import PYTHONWARNINGS
+
 SHORT_SPIN = {"GOMP_SPINCOUNT": "20000"}
 """OpenMP threads that wait spin for some microseconds, then sleep. By default they spin on, which on a busy machine
 holds up the thread that they wait for; threads that sleep at once (OMP_WAIT_POLICY=PASSIVE) wake too late."""
@@ -16,9 +20,6 @@ holds up the thread that they wait for; threads that sleep at once (OMP_WAIT_POL
 
 def finished(run: Path, steps: int) -> bool:
     """Whether a run's training reached its last step; what an interrupted one left is removed."""
-    from pointsplat_ns.errors import SceneError
-    from pointsplat_ns.io.runs import open_run
-
     try:
         if open_run(run, need_data=False).step == steps - 1:
             return True
@@ -33,27 +34,25 @@ def run(command: str, log: Path | None = None, threads: int | None = None) -> No
 
     Args:
         command: the command line.
-        log: a file for what it says; by default it says it here.
+        log: a file for what it says; by default that is shown here.
         threads: that torch may use in it; by default as many as it likes.
 
     Raises:
         PointSplatError: if it fails.
     """
-    from pointsplat_ns.errors import PointSplatError
-
     print(f"\n$ {command}", flush=True)
     program, *arguments = shlex.split(command)
     beside = Path(sys.executable).parent / program
-    environment = {**SHORT_SPIN, **os.environ}
+    environment = {**SHORT_SPIN, "PYTHONWARNINGS": PYTHONWARNINGS, **os.environ}
     if threads is not None:
         environment["OMP_NUM_THREADS"] = str(threads)
     words = [str(beside) if beside.exists() else program, *arguments]
     if log is None:
-        status, where = subprocess.run(words, env=environment).returncode, "its own words are above"
+        status, where = subprocess.run(words, env=environment).returncode, "what it said is above"
     else:
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("wb") as stream:
             status = subprocess.run(words, env=environment, stdout=stream, stderr=subprocess.STDOUT).returncode
-        where = f"its own words are in {log}"
+        where = f"what it said is in {log}"
     if status != 0:
         raise PointSplatError(f"{command}: ended with exit status {status}; {where}")

@@ -1,0 +1,128 @@
+"""The refiner that ships, from nothing: rooms, a trained scene of each, a training, an evaluation and a card."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.io.files import replacing
+from pointsplat_ns.nerfstudio_plugin.commands import REFINER_METHOD, SCENE_METHOD, evaluate_command, run_folder
+from pointsplat_ns.nerfstudio_plugin.pointsplat.recipe import (
+    KEEP,
+    TRAIN_SEEDS,
+    UNSEEN_SEEDS,
+    card_text,
+    refiner_command,
+    scene_settings,
+)
+from pointsplat_ns.nerfstudio_plugin.pointsplat.results import REFINER_NAME, VARIANTS, read_evaluation
+from pointsplat_ns.nerfstudio_plugin.running import finished, run
+from pointsplat_ns.refiner import read_refiner, save_refiner
+from pointsplat_ns.rooms import write_room
+
+TIMESTAMP = "recipe"
+"""Names the runs, so that what is finished is found again."""
+
+
+@dataclass(frozen=True)
+class MadeRefiner:
+    """What :func:`make_refiner` made."""
+
+    weights: Path
+    card: Path
+    """What the weights were made of, and what they do."""
+    pictures: Path
+    """Folder of pictures: photo, dense, pruned and refined side by side."""
+    results: dict[str, Any]
+    """Of the evaluation."""
+
+
+def make_refiner(
+    output: Path,
+    weights: Path | None = None,
+    size: Literal["tiny", "small", "full"] = "tiny",
+    steps: int = 700,
+    rooms: int | None = None,
+    workers: int | None = None,
+    seed: int = 0,
+) -> MadeRefiner:
+    """Make rooms, train a scene of each, train a refiner on them, and judge it on rooms that it never saw.
+
+    The commands are printed and run as a person would type them. What an interrupted call has finished is not done
+    again.
+
+    Args:
+        output: folder for everything that is made.
+        weights: folder for refiner.safetensors and CARD.md; by default the output folder.
+        size: of the network.
+        steps: of its training.
+        rooms: train on the first so many rooms only; by default on all.
+        workers: scenes trained side by side, on one thread each; by default as many as there are cores.
+        seed: of the network's initial weights and of the order of scenes and views.
+
+    Raises:
+        DataError: if there are not so many rooms, or no steps.
+        PointSplatError: if a command fails.
+    """
+    if rooms is not None and not 1 <= rooms <= len(TRAIN_SEEDS):
+        raise DataError(f"--rooms {rooms}: expected 1 to {len(TRAIN_SEEDS)}")
+    if steps < 1:
+        raise DataError(f"--steps {steps}: expected at least 1")
+    train_seeds = TRAIN_SEEDS[:rooms]
+    _make_scenes(output, (*train_seeds, *UNSEEN_SEEDS), workers or os.cpu_count() or 1)
+
+    name = f"{size}-{steps}-{len(train_seeds)}rooms-seed{seed}"
+    trained = run_folder(output / "refiners", name, REFINER_METHOD, TIMESTAMP)
+    evaluation, pictures = output / f"{name}.json", output / "pictures" / name
+    if not finished(trained, steps):
+        evaluation.unlink(missing_ok=True)
+        run(refiner_command(output / "scenes", output / "refiners", name, TIMESTAMP, size, steps, seed))
+    if not evaluation.is_file():
+        run(evaluate_command(trained, evaluation, pictures))
+    results = read_evaluation(evaluation)
+
+    options = "" if rooms is None else f" --rooms {rooms}"
+    about = {
+        "command": f"pointsplat make-refiner --size {size} --steps {steps} --seed {seed}{options}",
+        "by": "merge",
+        "keep": KEEP,
+        "steps": steps,
+        "scenes": [f"room{seed}" for seed in train_seeds],
+        "unseen": {variant: results["average_unseen"][variant] for variant in VARIANTS},
+    }
+    target = weights or output
+    refiner = read_refiner(trained / REFINER_NAME)
+    save_refiner(refiner, target / REFINER_NAME, about)
+    command = refiner_command(Path("scenes"), Path("refiners"), name, TIMESTAMP, size, steps, seed)
+    with replacing(target / "CARD.md") as part:
+        parameters = sum(p.numel() for p in refiner.parameters())
+        part.write_text(card_text(about, results, command, parameters), encoding="utf-8")
+    return MadeRefiner(target / REFINER_NAME, target / "CARD.md", pictures, results)
+
+
+def _make_scenes(output: Path, seeds: tuple[int, ...], workers: int) -> None:
+    """Rooms with photos, and a trained scene of each, ``workers`` at a time with one thread each."""
+
+    def make(seed: int) -> None:
+        settings = scene_settings(seed)
+        trained = run_folder(output / "scenes", settings.name, SCENE_METHOD, TIMESTAMP)
+        if finished(trained, settings.steps):
+            return
+        data = output / "rooms" / settings.name
+        if not data.is_dir():
+            write_room(data, seed, settings.frames, settings.width, settings.height, False, settings.style)
+        command = settings.train_command(data, output / "scenes", TIMESTAMP)
+        run(command, output / "logs" / f"{settings.name}.txt", threads=1)
+
+    with ThreadPoolExecutor(workers) as pool:
+        jobs = [pool.submit(make, seed) for seed in seeds]
+        try:
+            for job in jobs:
+                job.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
