@@ -15,6 +15,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.geometry.cameras import flip_camera_axes
 from pointsplat_ns.nerfstudio_plugin.replica.layout import ReplicaScene, load_replica
 
 
@@ -78,11 +79,10 @@ class ReplicaDataParser(DataParser):
         params = scene.params
         cx, cy = params.principal_point(config.pixel_centers)
 
-        c2w = part.poses.copy()
-        c2w[:, :3, 1:3] *= -1.0  # OpenCV (y down, z forward) to nerfstudio (y up, z back)
-        c2w[:, :3, 3] *= config.scale_factor
+        camera_to_worlds = flip_camera_axes(torch.from_numpy(part.poses))[:, :3]  # OpenCV to nerfstudio's OpenGL
+        camera_to_worlds[:, :, 3] *= config.scale_factor
         cameras = Cameras(
-            camera_to_worlds=torch.from_numpy(c2w[:, :3, :4].astype(np.float32)),
+            camera_to_worlds=camera_to_worlds.float(),
             fx=params.fx,
             fy=params.fy,
             cx=cx,
