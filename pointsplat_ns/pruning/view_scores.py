@@ -14,7 +14,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.scores import ScoreError, log_volume
-from pointsplat_ns.rasterizer.pixel_walk import Pairs, sum_over_pixels
+from pointsplat_ns.rasterizer.pixel_walk import PixelBlock, sum_over_pixels
 from pointsplat_ns.rasterizer.projection import Projected, project
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.views import Views
@@ -54,8 +54,8 @@ def lightgaussian_score(
     usable = scene.usable()
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
 
-    def passed(pairs: Pairs) -> Tensor:
-        return torch.where(pairs.alpha > 0, pairs.before, 0.0).sum(-1, keepdim=True)
+    def passed(block: PixelBlock) -> Tensor:
+        return torch.where(block.alpha > 0, block.before, 0.0).sum(-1, keepdim=True)
 
     with torch.no_grad():
         for index in _each(views, progress):
@@ -137,28 +137,28 @@ def _second_moments(seen: Projected, colors: Tensor, views: Views) -> Tensor:
     gradient by log alpha, and the weight w of the colour: sums of r^2 phi phi^T, of r w phi (by channel), of w^2."""
     background = views.background.to(colors)
 
-    def values(pairs: Pairs) -> Tensor:
-        weight = pairs.alpha * pairs.before  # (B, L, 64)
-        shade = colors[pairs.ids]  # (B, L, 3)
+    def values(block: PixelBlock) -> Tensor:
+        weight = block.alpha * block.before  # (B, L, 64)
+        shade = colors[block.ids]  # (B, L, 3)
         phi = torch.stack(
             [
                 torch.ones_like(weight),
-                pairs.gx,
-                pairs.gy,
-                0.5 * pairs.gx * pairs.gx,
-                pairs.gx * pairs.gy,
-                0.5 * pairs.gy * pairs.gy,
+                block.gx,
+                block.gy,
+                0.5 * block.gx * block.gx,
+                block.gx * block.gy,
+                0.5 * block.gy * block.gy,
             ],
             dim=-2,
         )  # (B, L, 6, 64)
-        steep = pairs.alpha / (1 - pairs.alpha)
+        steep = block.alpha / (1 - block.alpha)
         square = torch.zeros_like(weight)
         cross = []
         for channel in range(3):
             lit = weight * shade[..., channel, None]
-            total = lit.sum(1, keepdim=True) + (pairs.final * background[channel])[:, None]
+            total = lit.sum(1, keepdim=True) + (block.final * background[channel])[:, None]
             behind = total - lit.cumsum(1)
-            slope = (lit - steep * behind).masked_fill_(pairs.clamped, 0.0)
+            slope = (lit - steep * behind).masked_fill_(block.clamped, 0.0)
             square += slope * slope
             cross.append((phi @ (slope * weight)[..., None])[..., 0])
         squares = (phi * square[..., None, :]) @ phi.mT  # (B, L, 6, 6)

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.constants import ALPHA_MAX, CHUNK, TILE
+from pointsplat_ns.rasterizer.alpha import alphas_, is_clamped, step
+from pointsplat_ns.rasterizer.constants import CHUNK, TILE
 from pointsplat_ns.rasterizer.quadratics import COLOR, QUADRATIC
 
 SMALLEST = 8
@@ -34,8 +35,7 @@ def _alpha(row: Tensor, basis: Tensor, alpha_min: Tensor) -> Tensor:
     log2 = row[:, QUADRATIC : QUADRATIC + 1]
     for term in range(1, 6):
         log2 = log2 + row[:, QUADRATIC + term : QUADRATIC + term + 1] * basis[term]
-    alpha = torch.exp2(log2).clamp_max(ALPHA_MAX)
-    return torch.where(alpha > alpha_min, alpha, 0.0)
+    return alphas_(log2, alpha_min)
 
 
 def blend_chunk(
@@ -56,13 +56,11 @@ def blend_chunk(
     colors = list(blended.unbind(1))
     for k in range(CHUNK):
         row = rows[:, k]
-        alpha = _alpha(row, basis, alpha_min)
-        after = through * (1.0 - alpha)
-        drawn = after > transmittance_min
-        weight = torch.where(drawn, alpha * through, 0.0)
+        alpha, after = step(_alpha(row, basis, alpha_min), through, transmittance_min)
+        weight = alpha * through
         colors = [c + weight * row[:, COLOR + d : COLOR + d + 1] for d, c in enumerate(colors)]
-        last = torch.where(drawn, after, last)
-        through = torch.where(drawn, after, 0.0)
+        last = torch.where(after > 0, after, last)
+        through = after
     return through, torch.stack(colors, 1), last
 
 
@@ -79,13 +77,10 @@ def blend_chunk_backward(
     through = before
     alphas, weights = [], []
     for k in range(CHUNK):
-        alpha = _alpha(rows[:, k], basis, alpha_min)
-        after = through * (1.0 - alpha)
-        drawn = after > transmittance_min
-        alpha = torch.where(drawn, alpha, 0.0)
+        alpha, after = step(_alpha(rows[:, k], basis, alpha_min), through, transmittance_min)
         alphas.append(alpha)
         weights.append(alpha * through)
-        through = torch.where(drawn, after, 0.0)
+        through = after
     grads = []
     for k in range(CHUNK - 1, -1, -1):
         shade = pixels[:, 0] * rows[:, k, COLOR : COLOR + 1]
@@ -93,7 +88,7 @@ def blend_chunk_backward(
             shade = shade + pixels[:, d] * rows[:, k, COLOR + d : COLOR + d + 1]
         term = weights[k] * shade
         grad = term - alphas[k] / (1.0 - alphas[k]) * behind
-        grads.append(torch.where(alphas[k] < ALPHA_MAX * (1 - 1e-6), grad, 0.0))
+        grads.append(torch.where(is_clamped(alphas[k]), 0.0, grad))
         behind = behind + term
     return torch.stack(grads[::-1], 1), torch.stack(weights, 1), behind
 

@@ -16,17 +16,19 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
+from pointsplat_ns.rasterizer.alpha import alphas_, is_clamped, is_drawn, last_transmittance, transmittances
+from pointsplat_ns.rasterizer.constants import ALPHA_MIN, TILE, TRANSMITTANCE_MIN
 from pointsplat_ns.rasterizer.projection import Projected
+from pointsplat_ns.rasterizer.quadratics import LOG2E, PIXELS
 from pointsplat_ns.rasterizer.tiles import Footprints
 
-PIXELS = TILE * TILE
 _BLOCK_VALUES = 2**20
 """Values of one (B, L, 64) array: 4 MB in float32, of which a walk holds a dozen."""
 
 
-class Pairs(NamedTuple):
-    """The pairs of a block of tiles, front to back along L. Nothing is drawn where ``alpha`` is zero."""
+class PixelBlock(NamedTuple):
+    """Every Gaussian of a block of tiles on every pixel, front to back along L. Where ``alpha`` is zero it is not
+    drawn, and ``before`` means nothing."""
 
     ids: Tensor  # [B, L] rows of the projected Gaussians
     alpha: Tensor  # [B, L, 64]
@@ -38,7 +40,7 @@ class Pairs(NamedTuple):
 
 
 def sum_over_pixels(
-    seen: Projected, width: int, height: int, columns: int, values: Callable[[Pairs], Tensor]
+    seen: Projected, width: int, height: int, columns: int, values: Callable[[PixelBlock], Tensor]
 ) -> Tensor:
     """Sum a function of every pair of Gaussian and pixel over the pixels of one view.
 
@@ -59,7 +61,7 @@ def sum_over_pixels(
     gaussians, starts, across = lists.gaussians, lists.offsets, footprints.columns
     xx, xy, yy = cov2d.unbind(-1)
     # As the rasterizer keeps it: extent in x given y, and extent in y; both terms are positive.
-    shapes = [*means2d.unbind(-1), yy / det, xy / yy, 1.0 / yy, seen.opacities.detach().log()]
+    shapes = [*means2d.unbind(-1), yy / det, xy / yy, 1.0 / yy, seen.opacities.detach().log2()]
     table = torch.stack(shapes, dim=-1)  # (M, 6)
     lengths, order = torch.sort(starts.diff(), descending=True)
     occupied = int((lengths > 0).sum())
@@ -76,25 +78,23 @@ def sum_over_pixels(
         pixel_x = (tiles % across * TILE)[:, None] + place_x  # (B, 64)
         pixel_y = torch.div(tiles, across, rounding_mode="floor")[:, None] * TILE + place_y
         inside = (pixel_x < width) & (pixel_y < height)
-        pairs = _pairs(table[ids], ids, pixel_x, pixel_y, listed, inside)
-        total.index_add_(0, ids[listed], values(pairs)[listed])
+        block = _walk(table[ids], ids, pixel_x, pixel_y, listed, inside)
+        total.index_add_(0, ids[listed], values(block)[listed])
         begin += size
     return total
 
 
-def _pairs(shape: Tensor, ids: Tensor, pixel_x: Tensor, pixel_y: Tensor, listed: Tensor, inside: Tensor) -> Pairs:
+def _walk(shape: Tensor, ids: Tensor, pixel_x: Tensor, pixel_y: Tensor, listed: Tensor, inside: Tensor) -> PixelBlock:
     """Alphas and transmittances of a block; ``shape`` is (B, L, 6), pixels are (B, 64), ``listed`` is (B, L)."""
-    mx, my, a, r, d, log_opacity = (value[..., None] for value in shape.unbind(-1))
+    mx, my, a, r, d, log2_opacity = (value[..., None] for value in shape.unbind(-1))
     x, y = pixel_x[:, None] + 0.5 - mx, pixel_y[:, None] + 0.5 - my
     across = x - r * y
     gx = a * across
-    alpha = (log_opacity - 0.5 * (gx * across + d * y * y)).exp()
-    alpha = torch.where(listed[..., None] & inside[:, None] & (alpha >= ALPHA_MIN), alpha, 0.0)
-    clamped = alpha >= ALPHA_MAX
-    alpha = alpha.clamp_max(ALPHA_MAX)
-    after = torch.cumprod(1 - alpha, dim=1)
-    # A pixel is finished before the Gaussian that would bring its transmittance too low.
-    alpha = torch.where(after > TRANSMITTANCE_MIN, alpha, 0.0)
-    after = torch.cumprod(1 - alpha, dim=1)
-    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
-    return Pairs(ids, alpha, before, after[:, -1], gx, d * y - r * gx, clamped)
+    log2_alpha = log2_opacity - 0.5 * LOG2E * (gx * across + d * y * y)
+    alpha = alphas_(torch.where(listed[..., None] & inside[:, None], log2_alpha, -torch.inf), ALPHA_MIN)
+    clamped = is_clamped(alpha)
+    through = alpha.new_empty(alpha.shape[0], alpha.shape[1] + 1, PIXELS)
+    transmittances(1.0 - alpha, torch.ones_like(alpha[:, 0]), out=through)
+    drawn = is_drawn(through[:, 1:], TRANSMITTANCE_MIN)
+    final = last_transmittance(through, drawn)
+    return PixelBlock(ids, alpha.mul_(drawn), through[:, :-1], final, gx, d * y - r * gx, clamped)

@@ -29,7 +29,7 @@ MOMENTS = 6
 """Sums over pixels that are kept of each pair: of g times w, w^2, dv, dv^2, w dv and 1."""
 
 _NEVER = -1e4  # log2 alpha of the padding
-_LOG2E, _LN2 = 1.0 / math.log(2.0), math.log(2.0)
+LOG2E, _LN2 = 1.0 / math.log(2.0), math.log(2.0)
 _X, _Y, _R, _A, _D = range(5)  # columns of the table
 QUADRATIC, COLOR = 5, 11
 """First columns of the coefficients and of the colours."""
@@ -49,7 +49,7 @@ def table_of(means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, col
     they do not depend on the tile, then the colour.
     """
     xx, xy, yy = cov2d.unbind(-1)
-    a, r, d = _LOG2E * yy / det, xy / yy, _LOG2E / yy
+    a, r, d = LOG2E * yy / det, xy / yy, LOG2E / yy
     ar = a * r
     zero = torch.zeros_like(a)
     columns = [*means2d.unbind(-1), r, a, d, opacities.log2(), zero, zero, -0.5 * a, ar, -0.5 * (ar * r + d)]
@@ -58,8 +58,8 @@ def table_of(means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, col
     return table
 
 
-class Pairs(NamedTuple):
-    """One chunk of pairs, tile by tile."""
+class Quadratics(NamedTuple):
+    """Those of a chunk of Gaussians in each tile of a block, and the colours of these Gaussians."""
 
     s: Tensor  # [B * S] w at the tile's centre, pixels
     ey: Tensor  # [B * S] dv at the tile's centre, pixels
@@ -69,7 +69,7 @@ class Pairs(NamedTuple):
     rows: Tensor  # [B, S, 11 + D] what the last two are views of
 
 
-def gather(table: Tensor, ids: Tensor, x: Tensor, y: Tensor) -> Pairs:
+def gather(table: Tensor, ids: Tensor, x: Tensor, y: Tensor) -> Quadratics:
     """The quadratics and colours of the pairs ``ids`` (B * S,) of tiles centred at x, y (B,)."""
     rows = table.index_select(0, ids)
     size = ids.numel() // x.numel()
@@ -82,10 +82,10 @@ def gather(table: Tensor, ids: Tensor, x: Tensor, y: Tensor) -> Pairs:
     torch.neg(a_s, out=quadratic[:, 1])
     torch.sub(a_s.mul_(r), d_ey, out=quadratic[:, 2])
     rows = rows.view(-1, size, rows.shape[1])
-    return Pairs(s, ey, r, quadratic, rows[..., COLOR:], rows)
+    return Quadratics(s, ey, r, quadratic, rows[..., COLOR:], rows)
 
 
-def moments(pairs: Pairs, sums: Tensor, out: Tensor) -> None:
+def moments(pairs: Quadratics, sums: Tensor, out: Tensor) -> None:
     """The MOMENTS of pairs, where g is the gradient of log alpha (to base e).
 
     ``sums`` (6, B * S) are those of g times the basis. Writes (B * S, 6) columns of ``out``.

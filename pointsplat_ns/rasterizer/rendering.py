@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.rasterizer.backends import use_gsplat
-from pointsplat_ns.rasterizer.blending import MEMORY_BUDGET, BlendOptions, blend
+from pointsplat_ns.rasterizer.blending import blend
 from pointsplat_ns.rasterizer.constants import EPS2D, QUALITIES, TILE, Quality
+from pointsplat_ns.rasterizer.frame import MEMORY_BUDGET, BlendOptions
 from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, project
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.rasterizer.tiles import Footprints

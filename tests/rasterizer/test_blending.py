@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.rasterizer import blending, rasterization
+from pointsplat_ns.rasterizer import blending, frame, rasterization
 from pointsplat_ns.rasterizer.compiled import kernels
 from pointsplat_ns.rasterizer.constants import CHUNK, QUALITIES
 from pointsplat_ns.rasterizer.tiles import Footprints
@@ -90,7 +90,7 @@ def test_regions_cover_every_tile_once_and_keep_within_the_budget_where_tiles_al
 def test_long_chunks_of_few_tiles_equal_short_ones(n, size, monkeypatch):
     scene = make_scene(n=n, size=size, seed=n, dtype=torch.float64)
     long = draw(scene)
-    monkeypatch.setattr(blending, "_LONGEST_CHUNK", CHUNK)
+    monkeypatch.setattr(frame, "_LONGEST_CHUNK", CHUNK)
     assert_same(long, draw(scene), 1e-12)  # products and sums in another order
 
 
@@ -160,11 +160,11 @@ def test_compiled_kernels_equal_eager_ones():
 PROBE = """
 import torch, warnings, sys
 warnings.simplefilter("ignore")
-with warnings.catch_warnings(record=True) as told:
+with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     from pointsplat_ns.rasterizer.compiled import kernels
     made = kernels(3)
-ours = [str(w.message) for w in told if "stays eager" in str(w.message)]
+ours = [str(w.message) for w in caught if "stays eager" in str(w.message)]
 print("NONE" if made is None else "MADE", len(ours), ours[0] if ours else "", sep="|")
 """
 

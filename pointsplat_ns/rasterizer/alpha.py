@@ -1,0 +1,103 @@
+"""The rule of alpha and transmittance: which Gaussian is drawn on which pixel, and how strongly.
+
+Alpha is ``min(ALPHA_MAX, opacity * exp(-sigma))``, where sigma is half the squared Mahalanobis distance of the pixel.
+A Gaussian is not drawn on a pixel where its alpha is lower than a threshold. From front to back, each Gaussian drawn
+multiplies the transmittance by ``1 - alpha``; a pixel is finished before the Gaussian that would bring it to a second
+threshold or less. (3DGS, section 6; the thresholds stand in :mod:`~pointsplat_ns.rasterizer.constants`.)
+
+Every path follows the rule by calling what stands here, but for
+:func:`~pointsplat_ns.rasterizer.reference.rasterize_reference`, which writes it out once more to check it.
+
+Shapes: B tiles, S Gaussians of a chunk from front to back, 64 pixels of a tile.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX
+
+STEP_BY_STEP = 64
+"""Longer chunks are scanned in fewer, larger operations."""
+
+_GROUP = 16
+"""Gaussians of one of these operations."""
+
+
+def alphas_(log2_alpha: Tensor, alpha_min: float | Tensor, may_clamp: bool = True) -> Tensor:
+    """Alphas, zero where a Gaussian is not drawn, in place of their unclamped logarithms to base 2.
+
+    Args:
+        log2_alpha: any shape, overwritten.
+        alpha_min: alphas up to this are not drawn.
+        may_clamp: False saves a pass where no opacity exceeds ALPHA_MAX.
+    """
+    alpha = log2_alpha.exp2_()
+    if may_clamp:
+        alpha = alpha.clamp_(max=ALPHA_MAX)
+    if isinstance(alpha_min, Tensor):  # of compiled code, which would be compiled anew for every number
+        return torch.where(alpha > alpha_min, alpha, 0.0)
+    return F.threshold_(alpha, alpha_min, 0.0)
+
+
+def is_clamped(alpha: Tensor) -> Tensor:
+    """Where alpha is held at ALPHA_MAX: it has no gradient there."""
+    return alpha >= ALPHA_MAX * (1 - 1e-6)  # room for the rounding of ALPHA_MAX to float32
+
+
+def is_drawn(after: Tensor, transmittance_min: float | Tensor, out: Tensor | None = None) -> Tensor:
+    """Where the pixel is not finished, from the transmittance that a Gaussian would leave; written to ``out`` as 0 and
+    1 if that is given."""
+    return torch.gt(after, transmittance_min, out=out)
+
+
+def step(alpha: Tensor, before: Tensor, transmittance_min: float | Tensor) -> tuple[Tensor, Tensor]:
+    """Pass one Gaussian.
+
+    Args:
+        alpha: (B, 64) of :func:`alphas_`.
+        before: (B, 64) transmittance in front of it; 0 where the pixel is finished.
+
+    Returns:
+        Its alpha, now 0 where the pixel is finished, and the transmittance behind it, 0 where the pixel is finished.
+    """
+    after = before * (1.0 - alpha)
+    drawn = is_drawn(after, transmittance_min)
+    return torch.where(drawn, alpha, 0.0), torch.where(drawn, after, 0.0)
+
+
+def transmittances(passing: Tensor, before: Tensor, out: Tensor) -> Tensor:
+    """Transmittance in front of each Gaussian of a chunk and behind the last, as if no pixel were ever finished.
+
+    Args:
+        passing: (B, S, 64), 1 - alpha.
+        before: (B, 64), in front of the first.
+        out: (B, S + 1, 64), written and returned.
+    """
+    out[:, 0] = before
+    if passing.shape[1] <= STEP_BY_STEP or passing.shape[1] % _GROUP:
+        steps = out.unbind(1)
+        for k, factor in enumerate(passing.unbind(1)):
+            torch.mul(steps[k], factor, out=steps[k + 1])
+        return out
+    groups = out[:, 1:].unflatten(1, (-1, _GROUP))  # products of each group at once, then group by group
+    steps, factors = groups.unbind(2), passing.unflatten(1, (-1, _GROUP)).unbind(2)
+    steps[0].copy_(factors[0])
+    for k in range(1, _GROUP):
+        torch.mul(steps[k - 1], factors[k], out=steps[k])
+    for group in groups.unbind(1):
+        group.mul_(before[:, None])
+        before = group[:, -1]
+    return out
+
+
+def last_transmittance(through: Tensor, drawn: Tensor) -> Tensor:
+    """The transmittance (B, 64) behind the last Gaussian drawn.
+
+    Args:
+        through: (B, S + 1, 64) of :func:`transmittances`.
+        drawn: (B, S, 64), 0 or 1 or boolean, of :func:`is_drawn` of ``through[:, 1:]``.
+    """
+    return through.gather(1, drawn.sum(1, keepdim=True).long())[:, 0]

@@ -1,0 +1,115 @@
+"""What one region of an image is blended from: its tiles, the Gaussians listed for each, and their quadratics.
+
+Shapes: B tiles of a block, S Gaussians of a chunk, 64 = TILE * TILE pixels, D channels.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pointsplat_ns.rasterizer.compiled import Kernels, kernels
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, CHUNK, EXACT, TILE, Quality
+from pointsplat_ns.rasterizer.quadratics import PIXELS, basis_of, table_of
+from pointsplat_ns.rasterizer.tiles import Footprints, Region
+
+_BLOCK_PAIRS = 2**12  # pairs evaluated at once, for each thread of a CPU: 1 MB a work array in float32
+_BLOCK_PAIRS_COMPILED = 2**11  # compiled kernels have no calls to save, and fit the cache better
+_BLOCK_PAIRS_GPU = 2**18
+_LONGEST_CHUNK = 1024
+
+MEMORY_BUDGET = 2**31
+"""Bytes that the lists of pairs of one image may take before it is drawn in several regions."""
+
+
+class BlendOptions(NamedTuple):
+    """How to blend."""
+
+    quality: Quality = EXACT
+    compiled: bool = False
+    """Use compiled kernels where the machine can make them (float32, CPU)."""
+    memory_budget: int = MEMORY_BUDGET
+
+
+class Tiles(NamedTuple):
+    """Some tiles, each (B,)."""
+
+    ids: Tensor  # int64, which tile of the region
+    x: Tensor  # centre, pixels
+    y: Tensor
+    start: Tensor  # int64, first pair
+    end: Tensor  # int64, one past the last pair
+
+    def take(self, rows: Tensor) -> Tiles:
+        return Tiles(*(values.index_select(0, rows) for values in self))
+
+
+class Chunk(NamedTuple):
+    """What the backward pass keeps of one chunk of one block."""
+
+    tiles: Tiles
+    rows: Tensor | None  # [B] which tiles of the block are left; None while all are
+    first: int  # place in each tile's list
+    size: int  # S
+    before: Tensor  # [B, 64] transmittance before the chunk; 0 where the pixel is finished
+
+
+class Frame:
+    """The tiles of one region, longest list first, and their pairs."""
+
+    def __init__(self, footprints: Footprints, region: Region, dtype: torch.dtype, compiled: bool):
+        tiles = self.list = footprints.tiles(region)
+        lengths = tiles.offsets[1:] - tiles.offsets[:-1]
+        self.width, self.height, self.tiles = footprints.width, footprints.height, lengths.numel()
+        self.occupied = int((lengths > 0).sum())
+        ids = torch.sort(lengths, descending=True, stable=True).indices[: self.occupied]
+        x, y = (centre.to(dtype) for centre in tiles.centres(ids))
+        self.sorted = Tiles(ids, x, y, tiles.offsets[ids], tiles.offsets[ids + 1])
+        self.pairs_count = tiles.gaussians.numel()
+        self.gaussians = F.pad(tiles.gaussians, (0, 1), value=tiles.order.numel())  # the last pair is padding
+        pairs = _BLOCK_PAIRS_COMPILED if compiled else _BLOCK_PAIRS
+        pairs = _BLOCK_PAIRS_GPU if lengths.is_cuda else pairs * torch.get_num_threads()
+        self.block = max(1, min(pairs // CHUNK, self.occupied))  # tiles
+        self.capacity = pairs
+
+    def chunk_size(self, tiles: int, longest: int) -> int:
+        """Gaussians to blend at once: more where few tiles are left, no more than their lists hold."""
+        size = min(self.capacity // max(tiles, 1), longest + CHUNK - 1, _LONGEST_CHUNK)
+        return max(size // CHUNK, 1) * CHUNK
+
+    def inside(self, tiles: Tiles) -> Tensor:
+        """1 for the pixels of tiles (B,) that are in the image, (B, 64)."""
+        axis = torch.arange(TILE, device=tiles.x.device) - (TILE // 2)
+        columns = tiles.x[:, None] + axis < self.width
+        rows = tiles.y[:, None] + axis < self.height
+        return (rows[:, :, None] & columns[:, None, :]).view(-1, PIXELS).to(tiles.x.dtype)
+
+    def pairs(self, tiles: Tiles, first: int, size: int) -> Tensor:
+        """Places in the pair list of S Gaussians for each tile, (B * S,); one past all pairs where a list has ended."""
+        place = tiles.start[:, None] + torch.arange(first, first + size, device=tiles.start.device)
+        return place.masked_fill_(place >= tiles.end[:, None], self.pairs_count).view(-1)
+
+
+class Inputs(NamedTuple):
+    """What is blended."""
+
+    table: Tensor  # [M + 1, 11 + D]
+    channels: int
+    may_clamp: bool  # some opacity exceeds ALPHA_MAX
+    quality: Quality
+    basis: Tensor  # [6, 64]
+    fused: Kernels | None  # the compiled chunk kernels
+    limits: tuple[Tensor, Tensor]  # the thresholds of ``quality``, as compiled kernels take them
+
+    @classmethod
+    def of(cls, means2d, cov2d, det, opacities, colors, options: BlendOptions) -> Inputs:
+        channels, quality = colors.shape[1], options.quality
+        fused = None
+        if options.compiled and colors.dtype == torch.float32 and colors.device.type == "cpu":
+            fused = kernels(channels)
+        limits = (colors.new_tensor(quality.alpha_min), colors.new_tensor(quality.transmittance_min))
+        table = table_of(means2d, cov2d, det, opacities, colors)
+        return cls(table, channels, bool((opacities > ALPHA_MAX).any()), quality, basis_of(means2d), fused, limits)
