@@ -77,7 +77,7 @@ def load(path: str | Path, scene: str | None = None) -> Gaussians:
 
 
 def example_room() -> Gaussians:
-    """A small scene to try things on: one of the built-in rooms, trained from 70 of its photos.
+    """A small scene to try things on: a built-in room that the refiner that ships was not trained on.
 
     Returns:
         The scene, float32 on the CPU, in metres with z up.

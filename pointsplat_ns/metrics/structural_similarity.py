@@ -1,7 +1,8 @@
-"""The map of structural similarity that both the metric and the training loss average.
+"""SSIM for the loss of a training, which computes it at every step.
 
-One definition for all of the package, that of pytorch-msssim, so of Splatfacto. pytorch-msssim itself blurs the five
-maps one after the other, which takes about twice as long on a CPU.
+The definition is that of pytorch-msssim, so of Splatfacto, and of :func:`pointsplat_ns.ssim`, which is kornia's. Both
+blur the five maps that it needs one after the other, which takes about twice as long on a CPU; here they are blurred
+together. Tests hold the three equal.
 """
 
 from __future__ import annotations
@@ -20,31 +21,25 @@ C1, C2 = 0.01**2, 0.03**2
 """The two constants of Wang et al. 2004 for a data range of 1."""
 
 
-def ssim_map(image: Tensor, other: Tensor) -> Tensor:
-    """Structural similarity (Wang et al. 2004, eq. 13) around each pixel.
+def mean_ssim(image: Tensor, other: Tensor) -> Tensor:
+    """Mean structural similarity (Wang et al. 2004, eq. 13) of two images.
 
-    An 11 x 11 Gaussian window of sigma 1.5, population moments, and only pixels whose window lies inside the image.
-    The five maps that need blurring go through one separable convolution together. A side shorter than the window is
-    not blurred along, as in pytorch-msssim.
+    An 11 x 11 Gaussian window of sigma 1.5, population moments, and only pixels whose window lies inside the image. A
+    side shorter than the window is not blurred along, as in pytorch-msssim.
 
     Args:
         image: (B, C, H, W), in [0, 1].
         other: the same shape.
 
     Returns:
-        (B, C, H - 10, W - 10), in [-1, 1]; 1 where both are alike. Differentiable.
+        A scalar in [-1, 1]; 1 where both are alike. Differentiable.
     """
     maps = torch.cat([image, other, image * image, other * other, image * other], dim=1)
     mean, other_mean, square, other_square, product = _blur(maps).chunk(5, dim=1)
     mean_product, mean_square, other_mean_square = mean * other_mean, mean * mean, other_mean * other_mean
     contrast = (2 * (product - mean_product) + C2) / (square - mean_square + other_square - other_mean_square + C2)
     luminance = (2 * mean_product + C1) / (mean_square + other_mean_square + C1)
-    return luminance * contrast
-
-
-def mean_ssim(image: Tensor, other: Tensor) -> Tensor:
-    """Mean of :func:`ssim_map`, a scalar: what Splatfacto's loss calls on images (B, C, H, W), however small."""
-    return ssim_map(image, other).mean()
+    return (luminance * contrast).mean()
 
 
 def _blur(maps: Tensor) -> Tensor:

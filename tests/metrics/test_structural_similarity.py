@@ -6,6 +6,7 @@ import pytest
 import torch
 from pytorch_msssim import SSIM
 
+from pointsplat_ns.metrics import ssim
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 
 
@@ -26,6 +27,13 @@ def test_value_and_gradient_are_pytorch_msssims(size, batch):
     torch.testing.assert_close(value, expected, atol=1e-5, rtol=0)
     (gradient,), (other_gradient,) = (torch.autograd.grad(v, image) for v in (value, expected))
     assert (gradient - other_gradient).abs().max() <= 1e-4 * other_gradient.abs().max()
+
+
+def test_it_is_the_ssim_that_is_reported():
+    image, other = images(1, 3, 40, 33)
+    reported = ssim(*(x.detach()[0].permute(1, 2, 0) for x in (image, other)))
+    # kornia keeps its window in float32, as above
+    torch.testing.assert_close(mean_ssim(image, other).detach(), reported, atol=1e-5, rtol=0)
 
 
 def test_gradients_agree_with_float64_differences():
