@@ -27,7 +27,12 @@ import pointsplat_ns as ps
 from pointsplat_ns.api import EXAMPLE
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    EXAMPLE.with_name("README.md"),
+    *sorted((ROOT / "docs").glob("*.md")),
+]
 BENCHMARKS = ROOT / "benchmarks"
 
 NS_PROGRAMS = ("ns-train", "ns-eval", "ns-export", "ns-viewer")
