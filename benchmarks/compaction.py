@@ -14,11 +14,10 @@ from __future__ import annotations
 import json
 import math
 import resource
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from statistics import fmean
 from typing import Annotated
@@ -28,65 +27,36 @@ import tyro
 from held_out import COLUMNS, Scene, compare, load, lpips_or_none
 from rich.console import Console
 from rich.table import Table
+from splat_transform import NAME, SplatTransform
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import read_ply, write_ply
+from pointsplat_ns.io import write_ply
 from pointsplat_ns.metrics import psnr
 from pointsplat_ns.metrics.lpips import Lpips
-from pointsplat_ns.pruning import METHODS, SCORES, compact
+from pointsplat_ns.pruning import METHODS, prune
 
-RIVAL = "splat-transform"
+NEED_NO_VIEWS = tuple(name for name, method in METHODS.items() if not method.needs_views)
 SWEEP = tuple(round(0.1 * i, 1) for i in range(1, 10))
 
 
-class Rival:
-    """``splat-transform --decimate`` on the CPU, where it can be had; ``missing`` says why it cannot."""
-
-    def __init__(self, program: str | None):
-        self.command = [program] if program else ["npx", "--no-install", RIVAL]
-        self.version = self.missing = ""
-        try:
-            found = subprocess.run([*self.command, "--version"], capture_output=True, text=True, timeout=120)
-        except (OSError, subprocess.TimeoutExpired) as error:
-            self.missing = f"{self.command[0]}: {error.__class__.__name__}"
-            return
-        words = (found.stdout + found.stderr).split()
-        self.version = next((word for word in words if word[:1] == "v" and "." in word), "")
-        if found.returncode != 0 or not self.version:
-            self.missing = f"{' '.join(self.command)} ended with {found.returncode}; is Node's package installed?"
-
-    def decimate(self, source: Path, count: int) -> tuple[Gaussians, float]:
-        """The scene in ``source`` at ``count``, and seconds with reading and writing."""
-        target = source.with_name(f"{source.stem}_{count}.ply")
-        start = time.perf_counter()
-        args = [*self.command, "-w", "-g", "cpu", str(source), "--decimate", str(count), str(target)]
-        done = subprocess.run(args, capture_output=True, text=True)
-        seconds = time.perf_counter() - start
-        if not target.is_file():
-            raise RuntimeError(f"{' '.join(args)}: {(done.stderr or done.stdout).strip()[-200:]}")
-        made = read_ply(target)
-        target.unlink()
-        return made, seconds
-
-
 def rows_of(
-    scene: Scene, keeps: tuple[float, ...], methods: tuple[str, ...], rival: Rival, lpips: Lpips | None
+    scene: Scene, keeps: tuple[float, ...], methods: tuple[str, ...], peer: SplatTransform, lpips: Lpips | None
 ) -> Iterator[dict]:
     """One row for each budget and method."""
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "dense.ply"
-        if not rival.missing:
+        if not peer.missing:
             write_ply(scene.dense, source)
         for keep in keeps:
             count = max(1, round(keep * len(scene.dense)))
             for method in methods:
                 start = time.perf_counter()
-                made = compact(scene.dense, count, method)
+                small = prune(scene.dense, count, method)
                 seconds = time.perf_counter() - start
-                yield _row(scene, keep, method, made, seconds, lpips)
-            if not rival.missing:
-                made, seconds = rival.decimate(source, count)
-                yield _row(scene, keep, f"{RIVAL} {rival.version}", made, seconds, lpips)
+                yield _row(scene, keep, method, small, seconds, lpips)
+            if not peer.missing:
+                small, seconds = peer.decimate(source, count)
+                yield _row(scene, keep, peer.label, small, seconds, lpips)
 
 
 def sweep_rows(scene: Scene, keeps: tuple[float, ...], lpips: Lpips | None) -> Iterator[dict]:
@@ -95,14 +65,14 @@ def sweep_rows(scene: Scene, keeps: tuple[float, ...], lpips: Lpips | None) -> I
         for method in ("paper", "authors"):
             for weight in SWEEP:
                 start = time.perf_counter()
-                made = compact(scene.dense, keep, method, opacity_weight=weight)
+                small = prune(scene.dense, keep, method, opacity_weight=weight)
                 seconds = time.perf_counter() - start
-                yield _row(scene, keep, f"{method} {weight}", made, seconds, lpips)
+                yield _row(scene, keep, f"{method} {weight}", small, seconds, lpips)
 
 
-def _row(scene: Scene, keep: float, method: str, made: Gaussians, seconds: float, lpips: Lpips | None) -> dict:
-    metrics = compare(scene, made, lpips)
-    return {"scene": scene.name, "keep": keep, "method": method, "count": len(made), "seconds": seconds, **metrics}
+def _row(scene: Scene, keep: float, method: str, small: Gaussians, seconds: float, lpips: Lpips | None) -> dict:
+    metrics = compare(scene, small, lpips)
+    return {"scene": scene.name, "keep": keep, "method": method, "count": len(small), "seconds": seconds, **metrics}
 
 
 def averages(rows: list[dict]) -> list[dict]:
@@ -114,8 +84,8 @@ def averages(rows: list[dict]) -> list[dict]:
     for (keep, method), group in grouped.items():
         mean = {"scene": "average", "keep": keep, "method": method}
         for name in group[0].keys() - mean.keys():
-            known = [row[name] for row in group if row[name] is not None]
-            mean[name] = fmean(known) if known else None
+            values = [row[name] for row in group if row[name] is not None]
+            mean[name] = fmean(values) if values else None
         result.append(mean)
     return result
 
@@ -162,8 +132,10 @@ def speed(gaussians: int) -> None:
     """Time of every score (median of 5) and of merging to a tenth, with the peak of the process's memory."""
     scene = synthetic(gaussians)
     print(f"{gaussians:,} Gaussians of SH degree 3 on {torch.get_num_threads()} threads")
-    for name, score in SCORES.items():
-        times = []
+    for name in NEED_NO_VIEWS:
+        score, times = METHODS[name].score, []
+        if score is None:
+            continue
         for _ in range(5):
             start = time.perf_counter()
             score(scene)
@@ -171,9 +143,10 @@ def speed(gaussians: int) -> None:
         print(f"  {name:12s} {sorted(times)[2]:7.3f} s")
     before = _peak_gigabytes()
     start = time.perf_counter()
-    made = compact(scene, max(1, gaussians // 10), "merge")
+    merged = prune(scene, max(1, gaussians // 10), "merge")
     seconds = time.perf_counter() - start
-    print(f"  merge to {len(made):,} {seconds:.1f} s, peak memory {_peak_gigabytes():.2f} GB ({before:.2f} GB before)")
+    peak = f"peak memory {_peak_gigabytes():.2f} GB ({before:.2f} GB before)"
+    print(f"  merge to {len(merged):,} {seconds:.1f} s, {peak}")
 
 
 def _peak_gigabytes() -> float:
@@ -185,7 +158,7 @@ def _peak_gigabytes() -> float:
 def main(
     scenes: tyro.conf.Positional[tuple[Path, ...]] = (),
     keep: tuple[float, ...] = (0.5, 0.3, 0.1, 0.03),
-    methods: tuple[str, ...] = METHODS,
+    methods: tuple[str, ...] = NEED_NO_VIEWS,
     views: int = 8,
     splat_transform: str | None = None,
     lpips: bool = True,
@@ -214,17 +187,12 @@ def main(
     if not scenes:
         raise SystemExit("no scene named; expected runs or PLY files, or --speed")
     network = lpips_or_none(lpips)
-    rival = Rival(splat_transform) if not sweep else None
+    peer = SplatTransform(splat_transform) if not sweep else None
     rows: list[dict] = []
     console = Console(width=None if sys.stdout.isatty() else 150)
     for path in scenes:
         scene = load(path, views)
-        made: Callable[[], Iterator[dict]] = (
-            (lambda s=scene: sweep_rows(s, keep, network))
-            if rival is None
-            else (lambda s=scene: rows_of(s, keep, methods, rival, network))
-        )
-        found = list(made())
+        found = list(sweep_rows(scene, keep, network) if peer is None else rows_of(scene, keep, methods, peer, network))
         against = f", dense against photos {_dense_psnr(scene):.2f} dB" if scene.photos else ""
         print(f"{scene.name}: {len(scene.dense):,} Gaussians, {len(scene.renders)} views{against}")
         console.print(table(found))
@@ -232,8 +200,8 @@ def main(
     mean = averages(rows)
     if len(scenes) > 1:
         console.print(table(mean))
-    if rival is not None and rival.missing:
-        print(f"{RIVAL}: - ({rival.missing})")
+    if peer is not None and peer.missing:
+        print(f"{NAME}: - ({peer.missing})")
     if json_path is not None:
         json_path.write_text(json.dumps({"rows": rows, "averages": mean}, indent=1), "utf-8")
 

@@ -48,7 +48,7 @@ def load(path: Path, count: int) -> Scene:
         name, views = path.stem, sample_views(dense, count)
     else:
         name, views, photos = photos_of(path, "test", count)
-    renders = [render(dense, views[i]) for i in range(len(views))]
+    renders = [render(dense, view) for view in views]
     return Scene(name, dense, views, renders, photos)
 
 
@@ -57,10 +57,12 @@ def photos_of(path: Path, split: Literal["train", "test"], count: int) -> tuple[
     undistorted."""
     from pointsplat_ns.geometry.cameras import viewmats_from_opengl
     from pointsplat_ns.io import scene_name
+
+    run, poses = open_run(path), dataset_views(path, split)  # which imports nerfstudio in the order that it can
+
     from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
     from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
-    run = open_run(path)
     scene = TrainedScene(scene_name(run), run, MemoryCache(0))
     frames = scene.train_frames if split == "train" else scene.eval_frames
     total = len(frames)
@@ -70,7 +72,7 @@ def photos_of(path: Path, split: Literal["train", "test"], count: int) -> tuple[
     photos = [photo.float() / 255 if photo.dtype == torch.uint8 else photo.float() for photo in photos]
     height, width = photos[0].shape[:2]
     views = dataclasses.replace(
-        dataset_views(path, split),
+        poses,
         viewmats=torch.cat([viewmats_from_opengl(camera.camera_to_worlds) for camera, _ in shown]),
         Ks=torch.cat([camera.get_intrinsics_matrices() for camera, _ in shown]),
         width=width,
@@ -80,12 +82,12 @@ def photos_of(path: Path, split: Literal["train", "test"], count: int) -> tuple[
 
 
 @torch.no_grad()
-def compare(scene: Scene, made: Gaussians, lpips: Lpips | None) -> dict[str, float | None]:
+def compare(scene: Scene, small: Gaussians, lpips: Lpips | None) -> dict[str, float | None]:
     """Mean metrics over the views, against the dense scene's renders (``dense_*``) and the photos (``photo_*``)."""
     values: dict[str, list[float]] = {}
-    for i, render in enumerate(scene.renders):
-        image = render(made, scene.views[i])
-        targets = {"dense": render} | ({"photo": scene.photos[i]} if scene.photos else {})
+    for i, dense_render in enumerate(scene.renders):
+        image = render(small, scene.views[i])
+        targets = {"dense": dense_render} | ({"photo": scene.photos[i]} if scene.photos else {})
         for against, target in targets.items():
             values.setdefault(f"{against}_psnr", []).append(min(float(psnr(image, target)), MOST_PSNR))
             values.setdefault(f"{against}_ssim", []).append(float(ssim(image, target)))

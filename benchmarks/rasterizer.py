@@ -11,17 +11,17 @@ CPU seconds of one thread, ours and the C++ peer's.
 from __future__ import annotations
 
 import itertools
-import json
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 import tyro
 from measure import BACKWARD_FMAS, FORWARD_FMAS, count_pairs, floor_costs, now, peak_extra_bytes, timed, use_cpu_time
-from report import console, plot, print_tables, summary
+from options import Options, write_json
+from report import Result, console, plot, print_tables, summary
 from scenes import Scene, room_scene, trained_scenes
 from torch import Tensor
 from yardstick import EXACT_EXTENT, Yardstick, load_yardstick
@@ -64,7 +64,7 @@ KEPT_HITS_MAX = 4 * 10**8
 
 
 @dataclass
-class Args:
+class Args(Options):
     """Time the rasterizer beside a C++ peer, a measured floor, the plain reference and gsplat."""
 
     scenes: tuple[Path, ...] = ()
@@ -89,38 +89,6 @@ class Args:
     """Seconds a case may take before it is content with fewer rounds."""
     cpu_time: bool = False
     """Count CPU seconds of one thread in place of wall time: steadier still on a busy machine. Sets --threads 1."""
-    threads: int | None = None
-    """Threads of torch; its own choice by default. The C++ peer always has one."""
-    device: str = "cpu"
-    """Where our own code runs."""
-    json: Path | None = None
-    """Write all figures here."""
-    plot: Path | None = None
-    """Draw time against needed pairs here."""
-
-
-@dataclass
-class Result:
-    """What was measured of one case: seconds by name, counts, bytes."""
-
-    scene: str
-    family: str
-    width: int
-    height: int
-    gaussians: int
-    seconds: dict[str, float]
-    pairs: dict[str, int]
-    memory: dict[str, int | None]
-    errors: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def pixels(self) -> int:
-        return self.width * self.height
-
-    def both(self, name: str) -> float | None:
-        """Seconds of forward and backward together, of a variant or a peer."""
-        ahead, back = self.seconds.get(f"{name} forward"), self.seconds.get(f"{name} backward")
-        return ahead + back if ahead is not None and back is not None else None
 
 
 class Case:
@@ -359,19 +327,12 @@ def main(args: Args) -> None:
     for i, (scene, (width, height)) in enumerate(cases, 1):
         with console.status(f"case {i} of {len(cases)}: {scene.name} at {width}x{height}"):
             results.append(run_case(Case(scene, width, height, device), args, floor, module, with_gsplat))
-        if args.json:  # after each case: an interrupted run leaves what it measured
-            _write_json(args, floor, results)
+        settings = {"cpu_time": args.cpu_time, "fastest": args.fastest, "seconds_each": floor}
+        write_json(args, settings, [vars(result) for result in results])
         console.print(f"{i}/{len(cases)} {summary(results[-1], args.variants[0])}")
     print_tables(results, args.variants, floor, device, "CPU" if args.cpu_time else "wall")
     if args.plot:
         plot(results, args.variants[0], args.plot)
-
-
-def _write_json(args: Args, floor: dict[str, float], results: list[Result]) -> None:
-    content: dict[str, Any] = {"torch": torch.__version__, "device": args.device, "threads": torch.get_num_threads()}
-    content |= {"cpu_time": args.cpu_time, "fastest": args.fastest, "seconds_each": floor}
-    content["cases"] = [vars(result) for result in results]
-    args.json.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

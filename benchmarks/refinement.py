@@ -20,6 +20,7 @@ from typing import Annotated, Literal
 import tyro
 
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.nerfstudio_plugin.commands import train_refiner_command
 
 TIMESTAMP = "benchmark"
 """Names the runs, so that what is finished is found again."""
@@ -107,17 +108,20 @@ def train_command(
     extra: list[str],
 ) -> str:
     """The command line of one training."""
-    words = ["ns-train", "pointsplat", "--vis", "tensorboard", "--timestamp", TIMESTAMP]
-    words += ["--output-dir", str(output), "--experiment-name", name, "--max-num-iterations", str(steps)]
-    words += ["--steps-per-eval-image", "0", "--data", str(scenes)]
-    if eval_scenes:
-        words += ["--pipeline.datamanager.eval-scenes", *eval_scenes]
-    words += ["--pipeline.datamanager.supervision", "dense", "--pipeline.datamanager.seed", str(seed)]
-    words += ["--pipeline.model.score", start, "--pipeline.model.encoder", encoder, "--pipeline.model.size", size]
-    words += ["--pipeline.model.pruned-folder", str(output / "pruned"), "--pipeline.model.keep", f"{keeps[0]:g}"]
+    options: dict[str, object] = {
+        "steps-per-eval-image": 0,
+        "pipeline.datamanager.supervision": "dense",
+        "pipeline.datamanager.seed": seed,
+        "pipeline.model.by": start,
+        "pipeline.model.encoder": encoder,
+        "pipeline.model.size": size,
+        "pipeline.model.pruned-folder": output / "pruned",
+        "pipeline.model.keep": keeps[0],
+    }
     if keeps[1:]:
-        words += ["--pipeline.model.more-keeps", *(f"{keep:g}" for keep in keeps[1:])]
-    return shlex.join([*words, *extra])
+        options["pipeline.model.more-keeps"] = keeps[1:]
+    command = train_refiner_command(scenes, output, name, steps, TIMESTAMP, eval_scenes, options)
+    return shlex.join([*shlex.split(command), *extra])
 
 
 def _train_one(output: Path, name: str, command: str, steps: int, threads: int | None) -> None:
@@ -126,7 +130,7 @@ def _train_one(output: Path, name: str, command: str, steps: int, threads: int |
     Raises:
         PointSplatError: if it fails, or was done by another command.
     """
-    from pointsplat_ns.cli.running import finished, run
+    from pointsplat_ns.nerfstudio_plugin.running import finished, run
 
     logs = output / "logs"
     note = logs / f"{name}.command"

@@ -47,13 +47,13 @@ def read_files(files: Sequence[Path]) -> tuple[list[dict], dict[str, Any]]:
     settings: dict[str, Any] | None = None
     for path in files:
         try:
-            known = json.loads(path.read_text("utf-8"))
-            found = known["rows"]
-            settings = known["settings"] if settings is None else settings
+            content = json.loads(path.read_text("utf-8"))
+            found = content["rows"]
+            settings = content["settings"] if settings is None else settings
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise PointSplatError(f"{path}: not a file of rows ({error}); expected what evaluate wrote") from error
-        if known["settings"] != settings:
-            raise PointSplatError(f"{path}: made with {known['settings']}, {files[0]} with {settings}")
+        if content["settings"] != settings:
+            raise PointSplatError(f"{path}: made with {content['settings']}, {files[0]} with {settings}")
         for row in found:
             rows[tuple(row[name] for name in ("scene", "keep", "start", "variant", "seed"))] = row
     if not rows:
@@ -159,12 +159,12 @@ def parse_groups(groups: Sequence[str], table: Table) -> dict[str, list[str]]:
     for group in groups:
         name, equals, scenes = group.partition("=")
         wanted = [scene for scene in scenes.split(",") if scene]
-        known = [scene for scene in wanted if scene in table.scenes]
-        if not equals or not known:
+        present = [scene for scene in wanted if scene in table.scenes]
+        if not equals or not present:
             raise PointSplatError(f"--groups {group}: no such scene; expected NAME=SCENE,... of {table.scenes}")
-        if len(known) < len(wanted):
-            print(f"{name}: not in the files: {', '.join(s for s in wanted if s not in known)}")
-        result[name] = known
+        if len(present) < len(wanted):
+            print(f"{name}: not in the files: {', '.join(s for s in wanted if s not in present)}")
+        result[name] = present
     return result
 
 
@@ -182,7 +182,7 @@ def judge(table: Table, groups: dict[str, list[str]]) -> list[tuple[str, str]]:
             continue
         verdict = ("met by " if gain.mean >= wanted else "MISSED by ") + f"{abs(gain.mean - wanted):.2f} dB"
         lines.append(
-            (what, f"{verdict}: {_told(gain, len(scenes))}; against dense renders {_told(dense, len(scenes))}")
+            (what, f"{verdict}: {_text(gain, len(scenes))}; against dense renders {_text(dense, len(scenes))}")
         )
     for start in table.starts:
         budgets: dict[str, float | None] = {f"at {100 * k:g} %": k for k in table.keeps} | {"over all shares": None}
@@ -248,7 +248,7 @@ def _nowhere(table: Table, scenes: list[str], variant: str, against: str) -> str
     return f"{head}{verdict} (worst {worst:+.2f} dB: {where}{fell})"
 
 
-def _told(found: Spread | None, scenes: int) -> str:
+def _text(found: Spread | None, scenes: int) -> str:
     if found is None:
         return "no data"
     seeds = f"{len(found.per_seed)} seed{'s' if len(found.per_seed) > 1 else ''}"
@@ -297,8 +297,8 @@ def _cells(table: Table, scenes: list[str], keep: float, start: str, variant: st
     found = [(spread(table.values(scenes, keep, start, variant, metric)), digits) for _, metric, digits in COLUMNS]
     cells = [_number(value, digits) for value, digits in found[:6]]
     cells += ["-" if value is None else f"{value.mean:,.{digits}f}" for value, digits in found[6:]]
-    known = found[-1][0]
-    return [*cells, f"{known.scenes if known else 0}/{len(scenes)}"]
+    counts = found[-1][0]
+    return [*cells, f"{counts.scenes if counts else 0}/{len(scenes)}"]
 
 
 def gain_table(table: Table, groups: dict[str, list[str]]) -> list[list[str]]:

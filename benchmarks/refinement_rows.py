@@ -16,12 +16,12 @@ from typing import Any
 import torch
 from held_out import COLUMNS, REFERENCES, Scene, compare, load, photos_of
 
-from pointsplat_ns.compression.budget_search import Closeness, DenseReference
+from pointsplat_ns.compression.closeness import Closeness, DenseReference
 from pointsplat_ns.compression.compact import as_far_as_it_helps, helps
 from pointsplat_ns.compression.fine_tune import fine_tune
-from pointsplat_ns.compression.prune import COMPARED_SIDE, COMPARED_VIEWS
-from pointsplat_ns.compression.refined_run import open_refined_run, prune_options
+from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, open_refiner_run
 from pointsplat_ns.compression.view_sampling import sample_views
+from pointsplat_ns.compression.view_source import COMPARED_SIDE, COMPARED_VIEWS
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import open_run
@@ -29,9 +29,10 @@ from pointsplat_ns.io.files import replacing
 from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.pruning import compact
+from pointsplat_ns.pruning import PruneSettings
+from pointsplat_ns.pruning.scores import DEFAULT_OPACITY_WEIGHT
 from pointsplat_ns.rasterizer import render
-from pointsplat_ns.refiner import Refiner, read_metadata
+from pointsplat_ns.refiner import read_metadata
 
 REFINER = "refiner.safetensors"
 """In the folder of every training that reached its end."""
@@ -54,8 +55,7 @@ class Trained:
     steps: int
     supervision: str
     trained_on: frozenset[str]
-    options: dict[str, Any]  # of pruning
-    refiner: Refiner
+    refiner: TrainedRefiner
 
     @property
     def label(self) -> str:
@@ -70,23 +70,22 @@ def find_refiners(folder: Path) -> list[Trained]:
     """
     found: dict[tuple, Trained] = {}
     for file in sorted(folder.rglob(REFINER)):
-        opened = open_refined_run(file.parent, need_scenes=False)
+        run, refiner = open_refiner_run(file.parent, need_data=False), load_refiner(file.parent, "cpu")
         scenes = str(read_metadata(file).get("scenes", ""))
-        made = Trained(
+        trained = Trained(
             folder=file.parent,
-            start=opened.run.model_fields["score"],
-            encoder=opened.run.model_fields["encoder"],
-            seed=int(opened.run.datamanager_fields.get("seed", 0)),
+            start=refiner.settings.by,
+            encoder=run.model_fields["encoder"],
+            seed=int(run.datamanager_fields.get("seed", 0)),
             digest=hashlib.sha256(file.read_bytes()).hexdigest()[:12],
-            steps=opened.run.step + 1,
-            supervision=str(opened.run.datamanager_fields.get("supervision", "photos")),
+            steps=run.step + 1,
+            supervision=str(run.datamanager_fields.get("supervision", "photos")),
             trained_on=frozenset(name.strip() for name in scenes.split(",") if name.strip()),
-            options=opened.prune_options,
-            refiner=opened.refiner,
+            refiner=refiner,
         )
-        other = found.setdefault((made.start, made.encoder, made.seed), made)
-        if other is not made:
-            raise PointSplatError(f"{made.folder} and {other.folder}: both are {made.label}; name one of them")
+        other = found.setdefault((trained.start, trained.encoder, trained.seed), trained)
+        if other is not trained:
+            raise PointSplatError(f"{trained.folder} and {other.folder}: both are {trained.label}; name one of them")
     return list(found.values())
 
 
@@ -104,10 +103,10 @@ class Rows:
     def __init__(self, path: Path, settings: dict[str, Any]):
         self.path, self.settings, self.rows = path, settings, []
         if path.exists():
-            known = json.loads(path.read_text("utf-8"))
-            if known["settings"] != settings:
-                raise PointSplatError(f"{path}: made with {known['settings']}, not {settings}; name another file")
-            self.rows = known["rows"]
+            content = json.loads(path.read_text("utf-8"))
+            if content["settings"] != settings:
+                raise PointSplatError(f"{path}: made with {content['settings']}, not {settings}; name another file")
+            self.rows = content["rows"]
 
     def has(self, key: dict[str, Any]) -> bool:
         """Whether a row with these values is there."""
@@ -213,9 +212,9 @@ class Judge:
         if self.rule is None or selected.before is None or not _sound(refined, selected.scene):
             return selected.scene, 0.0, 0.0
         start = time.perf_counter()
-        made, strength, after = as_far_as_it_helps(self.rule, selected.before, selected.scene, refined)
+        best, strength, after = as_far_as_it_helps(self.rule, selected.before, selected.scene, refined)
         kept = helps(selected.before, after)
-        return made if kept else selected.scene, strength if kept else 0.0, time.perf_counter() - start
+        return best if kept else selected.scene, strength if kept else 0.0, time.perf_counter() - start
 
     def _fine_tuned(self, scene: Gaussians, steps: int, photos: bool) -> tuple[Gaussians, float]:
         """Fine-tuned at training poses, no more of them than steps, and seconds with rendering what is wanted."""
@@ -237,8 +236,8 @@ class Judge:
 
         return scene_name(open_run(self.path))
 
-    def _add(self, key: dict, made: Gaussians, select: float, repair: float, values: dict[str, Any]) -> None:
-        sizes = {"count": len(made), "megabytes": made.megabytes, "select_seconds": select, "seconds": repair}
+    def _add(self, key: dict, scene: Gaussians, select: float, repair: float, values: dict[str, Any]) -> None:
+        sizes = {"count": len(scene), "megabytes": scene.megabytes, "select_seconds": select, "seconds": repair}
         self.rows.add(key | sizes | values)
         seed = "" if key["seed"] is None else f" seed {key['seed']}"
         found = "".join(
@@ -259,12 +258,12 @@ class Judge:
             (f"dense, {len(self.scene.dense):,} Gaussians", self.scene.renders[index]),
         ]
         for start, selected in chosen.items():
-            made = [(start, selected.scene)]
+            shown = [(start, selected.scene)]
             duals = [t for t in self.refiners if (t.start, t.encoder) == (start, "dual")]
             if duals:
                 trained = min(duals, key=lambda t: t.seed)
-                made.append((f"{start} + dual, seed {trained.seed}", selected.refined(trained)[0]))
-            panels += [(f"{name}, {len(g):,} Gaussians", render(g, self.scene.views[index])) for name, g in made]
+                shown.append((f"{start} + dual, seed {trained.seed}", selected.refined(trained)[0]))
+            panels += [(f"{name}, {len(g):,} Gaussians", render(g, self.scene.views[index])) for name, g in shown]
         captions = [panels[0][0]] + [f"{text}, {float(psnr(image, photo)):.1f} dB" for text, image in panels[1:]]
         _write_panels(path, f"{self.name}, {path.stem.rsplit('_', 1)[1]} % kept", captions, [i for _, i in panels])
 
@@ -282,22 +281,25 @@ class Selected:
         self._refined: dict[str, tuple[Gaussians, float]] = {}
 
     @cached_property
-    def _made(self) -> tuple[Gaussians, float]:
-        options = prune_options(self._keep, self._start, 0.3)
+    def _pruned(self) -> tuple[Gaussians, float]:
+        settings = PruneSettings(self._keep, self._start)
         for trained in self._judge.refiners:
-            if trained.start == self._start and trained.options | {"keep": options["keep"]} != options:
-                raise PointSplatError(f"{trained.folder}: trained on scenes pruned by {trained.options}, not {options}")
+            weight = trained.refiner.settings.opacity_weight
+            if trained.start == self._start and weight not in (None, DEFAULT_OPACITY_WEIGHT):
+                raise PointSplatError(
+                    f"{trained.folder}: trained on scenes pruned by {trained.refiner.settings}, not {settings}"
+                )
         dense = self._judge.scene.dense
         begin = time.perf_counter()
-        return compact(dense, **options), time.perf_counter() - begin
+        return settings.prune(dense), time.perf_counter() - begin
 
     @property
     def scene(self) -> Gaussians:
-        return self._made[0]
+        return self._pruned[0]
 
     @property
     def seconds(self) -> float:
-        return self._made[1]
+        return self._pruned[1]
 
     @cached_property
     def before(self) -> Closeness | None:
@@ -308,16 +310,16 @@ class Selected:
     def refined(self, trained: Trained) -> tuple[Gaussians, float]:
         """The scene refined, and seconds with serialization."""
         if trained.digest not in self._refined:
-            self._made  # noqa: B018  (not part of the seconds)
+            scene = self.scene  # pruning is not part of the seconds
             begin = time.perf_counter()
-            made = trained.refiner(self.scene)
-            self._refined[trained.digest] = made, time.perf_counter() - begin
+            refined = trained.refiner(scene)
+            self._refined[trained.digest] = refined, time.perf_counter() - begin
         return self._refined[trained.digest]
 
 
-def compare_all(judge: Judge, made: Gaussians) -> dict[str, Any]:
+def compare_all(judge: Judge, small: Gaussians) -> dict[str, Any]:
     """Against photos and dense renders."""
-    return compare(judge.scene, made, judge.lpips)
+    return compare(judge.scene, small, judge.lpips)
 
 
 def _write_panels(path: Path, title: str, captions: list[str], images: list[torch.Tensor]) -> None:

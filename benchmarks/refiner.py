@@ -12,7 +12,6 @@ threads run on a busy machine: threads that wait spin, and can cost a hundredfol
 
 from __future__ import annotations
 
-import json
 import os
 import statistics
 import sys
@@ -27,6 +26,7 @@ os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # before torch: its profiler co
 import torch
 import tyro
 from measure import now, peak_extra_bytes
+from options import Options, write_json
 from report import console, slope
 from rich.table import Table
 from scenes import room
@@ -56,7 +56,7 @@ PART_OF: dict[type[nn.Module], str] = {
 
 
 @dataclass
-class Args:
+class Args(Options):
     """Time the refiner by size and number of Gaussians."""
 
     sizes: tuple[str, ...] = tuple(PRESETS)
@@ -71,14 +71,6 @@ class Args:
     """Rounds at most; medians are reported."""
     budget: float = 4.0
     """Seconds after which a figure is content with the rounds that it has."""
-    threads: int | None = None
-    """Threads of torch; its own choice by default."""
-    device: str = "cpu"
-    """Where it runs."""
-    json: Path | None = None
-    """Write all figures here."""
-    plot: Path | None = None
-    """Draw time and memory against the number of Gaussians here."""
 
 
 @dataclass
@@ -357,10 +349,7 @@ def main(args: Args) -> None:
             results.append(run_case(size, count, train, args))
         r = results[-1]
         console.print(f"{i}/{len(cases)} {size}, {count:,} Gaussians: {r.inference:.3f} s")
-        if args.json:  # after each case: an interrupted run leaves what it measured
-            content = {"torch": torch.__version__, "device": args.device, "threads": torch.get_num_threads()}
-            content["cases"] = [{**vars(r), "efficiency": r.efficiency} for r in results]
-            args.json.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
+        write_json(args, {}, [{**vars(r), "efficiency": r.efficiency} for r in results])
     print_tables(results, args)
     if args.plot:
         plot(results, args.plot)

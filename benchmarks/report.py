@@ -4,19 +4,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from rich.console import Console
 from rich.table import Table
 
-if TYPE_CHECKING:
-    from rasterizer import Result
-
 console = Console(width=None if Console().is_terminal else 200)
 
 STAGES = ("projection", "colours", "binning", "blending", "blending backward", "projection backward")
+
+
+@dataclass
+class Result:
+    """What was measured of one case: seconds by name, counts, bytes."""
+
+    scene: str
+    family: str
+    width: int
+    height: int
+    gaussians: int
+    seconds: dict[str, float]
+    pairs: dict[str, int]
+    memory: dict[str, int | None]
+    errors: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def pixels(self) -> int:
+        return self.width * self.height
+
+    def both(self, name: str) -> float | None:
+        """Seconds of forward and backward together, of a variant or a peer."""
+        ahead, back = self.seconds.get(f"{name} forward"), self.seconds.get(f"{name} backward")
+        return ahead + back if ahead is not None and back is not None else None
 
 
 def summary(result: Result, base: str) -> str:

@@ -82,13 +82,12 @@ def trained_scenes(path: Path, views: Path | None, index: int | None) -> list[Sc
     if path.suffix.lower() == ".ply":
         name, (viewmats, focal) = path.stem, _views_of(path, views)
     else:
-        run = open_run(path)
-        name, (viewmats, focal) = scene_name(run), _cameras_of(run)
+        name, (viewmats, focal) = scene_name(open_run(path)), _cameras_of(path)
     index = len(viewmats) // 2 if index is None else index
     if not 0 <= index < len(viewmats):
         raise SceneError(f"{path}: view {index} asked for; expected 0 to {len(viewmats) - 1}")
     dense = dense[dense.usable() & dense.quats.any(1)]  # the yardstick knows no zero quaternions
-    variants = {"dense": dense, f"{KEEP:.0%}": prune(dense, KEEP).scene}
+    variants = {"dense": dense, f"{KEEP:.0%}": prune(dense, KEEP, "paper")}
     return [
         Scene(f"{name} {kind}", f"{name} {kind}", _activated(scene), viewmats[index], focal)
         for kind, scene in variants.items()
@@ -113,12 +112,8 @@ def _views_of(path: Path, views: Path | None) -> tuple[Tensor, float]:
     return viewmats, focal
 
 
-def _cameras_of(run) -> tuple[Tensor, float]:
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import dataparser_of
+def _cameras_of(path: Path) -> tuple[Tensor, float]:
+    from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 
-    cameras = dataparser_of(run).get_dataparser_outputs(split="test").cameras
-    to_world = torch.eye(4).repeat(len(cameras), 1, 1)
-    to_world[:, :3] = cameras.camera_to_worlds
-    to_world[:, :3, 1:3] *= -1  # OpenGL axes to OpenCV axes
-    viewmats = torch.linalg.inv(to_world.double()).float()
-    return viewmats, float(cameras.fx[0] / cameras.width[0])
+    views = dataset_views(path, "test")
+    return views.viewmats.float(), float(views.Ks[0, 0, 0] / views.width)
