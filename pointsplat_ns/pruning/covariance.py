@@ -10,6 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pointsplat_ns.geometry.quaternions import rotation_matrices
+
 TINY = 1e-300
 """Keeps quotients of what may be zero finite; the smallest normal float64 is 2e-308."""
 
@@ -20,23 +22,11 @@ THINNEST = 11.5
 """Axes shorter than exp(-this) (1e-5) of the longest are taken as that: float64 still tells them from zero."""
 
 
-def rotations(quats: Tensor) -> Tensor:
-    """Rotation matrices (N, 3, 3) of wxyz quaternions (N, 4) of any length; zero is the identity."""
-    length = quats.norm(dim=1, keepdim=True)
-    w, x, y, z = torch.where(length > 0, quats / length.clamp_min(TINY), quats.new_tensor([1.0, 0, 0, 0])).unbind(1)
-    rows = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    ]
-    return torch.stack(rows, dim=1).view(-1, 3, 3)
-
-
 def covariances(log_scales: Tensor, quats: Tensor) -> Tensor:
     """Covariances (N, 6) of Gaussians with log-scales (N, 3), +-Inf allowed, and quaternions (N, 4), float64."""
     logs = log_scales.clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
     logs = torch.maximum(logs, logs.amax(dim=1, keepdim=True) - THINNEST)
-    axes = rotations(quats) * logs.exp()[:, None]
+    axes = rotation_matrices(quats) * logs.exp()[:, None]
     return pack(axes @ axes.transpose(1, 2))
 
 

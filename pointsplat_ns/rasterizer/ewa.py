@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from pointsplat_ns.geometry.quaternions import rotation_components
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, COMPENSATION_MIN, FRUSTUM_MARGIN
 from pointsplat_ns.rasterizer.spherical_harmonics import unit_rows
 
@@ -57,16 +58,6 @@ class Lens(NamedTuple):
 
 def _ordered(low: float, high: float) -> tuple[float, float]:
     return (low, high) if low <= high else (high, low)  # the other way round where a focal length mirrors
-
-
-def rotation_rows(quats: Tensor) -> Tensor:
-    """Rotation matrices (3, 3, M) of unit quaternions (4, M), wxyz; zero gives the identity."""
-    w, x, y, z = quats
-    x2, y2, z2 = 2 * quats[1:]
-    xx, yy, zz, xy, xz, yz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2
-    wx, wy, wz = w * x2, w * y2, w * z2
-    rows = [1 - (yy + zz), xy - wz, xz + wy, xy + wz, 1 - (xx + zz), yz - wx, xz - wy, yz + wx, 1 - (xx + yy)]
-    return torch.stack(rows).view(3, 3, -1)
 
 
 def _rotation_backward(quats: Tensor, a: Tensor, grad_a: Tensor, b: Tensor, grad_b: Tensor) -> Tensor:
@@ -130,7 +121,7 @@ def _shape(slopes: Tensor, rz: Tensor, quats: Tensor, scales: Tensor, view: Tens
     tx, ty = slopes[0].clamp(*lens.clamp_x()), slopes[1].clamp(*lens.clamp_y())
     a = torch.addcmul(view[0, :, None], tx, view[2, :, None], value=-1)
     b = torch.addcmul(view[1, :, None], ty, view[2, :, None], value=-1)
-    rotation = rotation_rows(quats)
+    rotation = rotation_components(quats)
     turned_a, turned_b = _times(rotation, a), _times(rotation, b)
     reach = scales * rz
     return _Shape(a, b, rotation, turned_a, turned_b, turned_a * reach * lens.fx, turned_b * reach * lens.fy)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.quaternions import rotation_matrices, zero_as_identity
 from pointsplat_ns.rasterizer.spherical_harmonics import C0, sh_basis
 
 GAINS = (0.7, 1.4)
@@ -35,9 +36,7 @@ class Transform:
     @cached_property
     def matrix(self) -> Tensor:
         """Orthogonal (3, 3) float64 that positions are multiplied by."""
-        from kornia.geometry.conversions import quaternion_to_rotation_matrix
-
-        return quaternion_to_rotation_matrix(self.quat.double()) * (-1.0 if self.mirrored else 1.0)
+        return rotation_matrices(self.quat.double()[None])[0] * (-1.0 if self.mirrored else 1.0)
 
     def apply(self, scene: Gaussians) -> Gaussians:
         """The transformed scene."""
@@ -77,12 +76,9 @@ class Transform:
             rest.append(torch.einsum("ij,njc->nic", sh_matrix(matrix, degree).to(like), band))
             first += size
         turn = Quaternion(quat.to(like).expand(len(scene), 4))
-        # A zero quaternion stands for the identity.
-        identity = like.new_tensor([1.0, 0.0, 0.0, 0.0])
-        quats = torch.where((scene.quats == 0).all(dim=1, keepdim=True), identity, scene.quats)
         return scene.replace(
             means=scene.means @ matrix.T.to(like),
-            quats=(turn * Quaternion(quats)).data,
+            quats=(turn * Quaternion(zero_as_identity(scene.quats))).data,
             features_rest=torch.cat(rest, dim=1) if rest else scene.features_rest,
         )
 

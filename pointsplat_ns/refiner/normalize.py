@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.quaternions import zero_as_identity
 from pointsplat_ns.refiner.sparse_ops import permute
 
 TRIM = 0.01
@@ -141,14 +142,12 @@ def canonical_quats(quats: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         unit quaternions [N, 4] and signed lengths [N, 1], with ``quats = unit * length`` but for zero.
     """
+    quats = zero_as_identity(quats)
     largest = quats.abs().amax(dim=1, keepdim=True).detach()
-    zero = largest == 0
-    identity = torch.zeros_like(quats)
-    identity[:, 0] = 1
-    scaled = torch.where(zero, identity, quats / torch.where(zero, torch.ones_like(largest), largest))
+    scaled = quats / largest
     length = scaled.norm(dim=1, keepdim=True)
     first = (scaled != 0).to(torch.uint8).argmax(dim=1, keepdim=True)
     sign = torch.where(scaled.gather(1, first) < 0, -1.0, 1.0).to(quats.dtype)
     top = torch.finfo(quats.dtype).max
-    signed = (sign * length * torch.where(zero, torch.ones_like(largest), largest)).clamp(-top, top)
+    signed = (sign * length * largest).clamp(-top, top)
     return scaled * sign / length, signed

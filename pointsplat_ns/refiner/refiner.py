@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.quaternions import zero_as_identity
 from pointsplat_ns.refiner.config import RefinerConfig
 from pointsplat_ns.refiner.encoder import make_encoder
 from pointsplat_ns.refiner.heads import ResidualHeads
@@ -120,9 +121,6 @@ class Refiner(nn.Module):
     ) -> Gaussians:
         moved = (residuals["means"].double() * structure.cube.extent).to(scene.dtype)
         turned = residuals["quats"].to(scene.dtype) * features.quat_scale
-        identity = torch.zeros_like(scene.quats)
-        identity[:, 0] = 1
-        quats = torch.where((scene.quats == 0).all(dim=1, keepdim=True), identity, scene.quats)
         rest = scene.features_rest
         if "features_rest" in residuals:
             wanted = residuals["features_rest"].view(len(scene), -1, 3)[:, : rest.shape[1]]
@@ -130,7 +128,7 @@ class Refiner(nn.Module):
         return Gaussians(
             means=scene.means + moved,
             scales=scene.scales + residuals["scales"].to(scene.dtype),
-            quats=quats + turned,
+            quats=zero_as_identity(scene.quats) + turned,
             opacities=scene.opacities + residuals["opacities"].to(scene.dtype),
             features_dc=scene.features_dc + residuals["features_dc"].to(scene.dtype),
             features_rest=rest,
