@@ -24,7 +24,7 @@ def test_rotation_matrices_are_those_of_scipy_whatever_the_length(length, dtype,
 def test_both_layouts_hold_the_same_matrices():
     unit = torch.nn.functional.normalize(random_quats(), dim=1)
     found = rotation_components(unit.T.contiguous()).permute(2, 0, 1)
-    torch.testing.assert_close(found, rotation_matrices(unit), rtol=0, atol=1e-15)
+    torch.testing.assert_close(found, rotation_matrices(unit), rtol=0, atol=1e-14)  # it normalises once more
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
