@@ -37,7 +37,7 @@ def sh_degree_of(num_rest: int) -> int:
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Gaussians:
     """A scene of N Gaussians, on one device and of one floating dtype, in Splatfacto's own parametrisation.
 
@@ -130,6 +130,9 @@ class Gaussians:
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    def __repr__(self) -> str:
+        return f"Gaussians({len(self):,}, SH degree {self.sh_degree}, {self.dtype}, {self.device})"
 
     def __getitem__(self, index: int | slice | list[int] | Tensor) -> Gaussians:
         """The scene of some Gaussians: by slice, boolean mask (N,), list or tensor of indices (K,), or one integer."""
