@@ -1,6 +1,5 @@
 """The thresholds of 3D Gaussian rasterization, as the field uses them (3DGS, gsplat)."""
 
-import math
 from dataclasses import dataclass
 
 ALPHA_MIN = 1.0 / 255.0
@@ -27,9 +26,6 @@ TILE = 8
 
 CHUNK = 16
 """Gaussians blended at once for each tile, before the saturated tiles are dropped."""
-
-LOG_ALPHA_MIN = math.log(ALPHA_MIN)
-LOG_ALPHA_MAX = math.log(ALPHA_MAX)
 
 
 @dataclass(frozen=True)

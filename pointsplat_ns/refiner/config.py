@@ -24,6 +24,10 @@ class RefinerConfigError(PointSplatError, ValueError):
     """A refiner configuration that describes no network."""
 
 
+_FORMER_GAINS = ("scales_gain", "quats_gain", "opacities_gain", "features_dc_gain", "features_rest_gain")
+"""Settings that files of refiners hold and that no longer exist: factors on residuals, never other than 1."""
+
+
 @dataclass
 class RefinerConfig:
     """Everything that shapes a refiner.
@@ -87,16 +91,6 @@ class RefinerConfig:
     """Linear layers of each output head."""
     means_reach: float = 0.05
     """Farthest that a mean may move along an axis, as a share of the scene's extent (1.0 in the published code)."""
-    scales_gain: float = 1.0
-    """Factor on the residual of the log-scales."""
-    quats_gain: float = 1.0
-    """Factor on the residual of the unit quaternions."""
-    opacities_gain: float = 1.0
-    """Factor on the residual of the opacity logits."""
-    features_dc_gain: float = 1.0
-    """Factor on the residual of the constant SH coefficient."""
-    features_rest_gain: float = 1.0
-    """Factor on the residual of the other SH coefficients."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -162,6 +156,10 @@ class RefinerConfig:
         Raises:
             RefinerConfigError: if a field is unknown or the fields contradict one another.
         """
+        values = dict(values)
+        for name in _FORMER_GAINS:
+            gain = values.pop(name, 1.0)
+            _require(gain == 1.0, f"{name} is {gain!r}; expected 1.0, as residuals are no longer multiplied by factors")
         known = {field.name for field in dataclasses.fields(cls)}
         unknown = sorted(set(values) - known)
         _require(not unknown, f"unknown refiner settings {', '.join(unknown)}; a newer version may have written them")

@@ -24,7 +24,6 @@ class ResidualHeads(nn.Module):
         sizes = {"means": 3, "scales": 3, "quats": 4, "opacities": 1, "features_dc": 3}
         if config.num_rest:
             sizes["features_rest"] = 3 * config.num_rest
-        self.gains = {name: getattr(config, f"{name}_gain") for name in sizes if name != "means"}
         self.mlps = nn.ModuleDict({name: _head(in_channels, config, size) for name, size in sizes.items()})
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
@@ -38,7 +37,7 @@ class ResidualHeads(nn.Module):
         out = {}
         for name, mlp in self.mlps.items():
             residual = mlp(x)
-            out[name] = residual.tanh() * self.means_reach if name == "means" else residual * self.gains[name]
+            out[name] = residual.tanh() * self.means_reach if name == "means" else residual
         return out
 
 

@@ -19,39 +19,15 @@ LEVELS_AT_ONCE = 4
 """Halvings that one look-up takes along the Hilbert curve: its table is 48 x 8^4 numbers, which a cache holds."""
 
 
-def z_order(coords: Tensor, bits: int) -> Tensor:
-    """Position along the z-order (Morton) curve: the bits of the three axes, interleaved.
-
-    Args:
-        coords: integer coordinates, each at least 0 and below ``2**bits``.  # [N, 3] int64
-        bits: bits per axis, at most 20.
-
-    Returns:
-        codes in ``[0, 8**bits)``.  # [N] int64
-    """
-    return curve_codes(coords, bits, ("z",))[0]
-
-
-def hilbert(coords: Tensor, bits: int) -> Tensor:
-    """Position along the Hilbert curve, whose consecutive cells always share a face.
-
-    Args:
-        coords: integer coordinates, each at least 0 and below ``2**bits``.  # [N, 3] int64
-        bits: bits per axis, at most 20.
-
-    Returns:
-        codes in ``[0, 8**bits)``.  # [N] int64
-    """
-    return curve_codes(coords, bits, ("hilbert",))[0]
-
-
 def curve_codes(coords: Tensor, bits: int, curves: Sequence[str]) -> list[Tensor]:
     """Codes along named curves.
 
     Args:
         coords: integer coordinates, each at least 0 and below ``2**bits``.  # [N, 3] int64
         bits: bits per axis, at most 20.
-        curves: ``z``, ``hilbert``, or either with ``-trans``: the same curve with x and y exchanged.
+        curves: ``z`` for the z-order (Morton) curve, which interleaves the bits of the three axes; ``hilbert`` for the
+            Hilbert curve, whose consecutive cells always share a face; or either with ``-trans``: the same curve with x
+            and y exchanged.
 
     Returns:
         per curve, codes in ``[0, 8**bits)``.  # [N] int64

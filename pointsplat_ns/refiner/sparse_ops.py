@@ -15,7 +15,9 @@ from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.refiner.rows import rows_at_a_time
 
-Pairs = list[tuple[Tensor, Tensor]]
+KernelMap = list[tuple[Tensor, Tensor]]
+"""Which cells each offset of a kernel brings together, from ``structure.neighbour_pairs``: for each offset in one half
+of the kernel, cells (i, j) with j at i + offset, (P,) int64 each."""
 
 
 class _Permute(Function):
@@ -67,11 +69,11 @@ def segment_max(
 
 class _SubmanifoldConv(Function):
     @staticmethod
-    def forward(ctx, x: Tensor, weight: Tensor, pairs: Pairs) -> Tensor:
+    def forward(ctx, x: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tensor:
         ctx.save_for_backward(x, weight)
-        ctx.pairs = pairs
+        ctx.kernel_map = kernel_map
         out = x @ weight[13]
-        for k, i, j in _parts(pairs, x):
+        for k, i, j in _parts(kernel_map, x):
             out.index_add_(0, i, x.index_select(0, j) @ weight[14 + k])
             out.index_add_(0, j, x.index_select(0, i) @ weight[12 - k])
         return out
@@ -85,7 +87,7 @@ class _SubmanifoldConv(Function):
         grad_weight = torch.zeros_like(weight) if need_weight else None
         if need_weight:
             torch.mm(x.T, grad, out=grad_weight[13])
-        for k, i, j in _parts(ctx.pairs, x):
+        for k, i, j in _parts(ctx.kernel_map, x):
             grad_i, grad_j = grad.index_select(0, i), grad.index_select(0, j)
             if need_weight:
                 grad_weight[14 + k].addmm_(x.index_select(0, j).T, grad_i)
@@ -96,9 +98,9 @@ class _SubmanifoldConv(Function):
         return grad_x, grad_weight, None
 
 
-def _parts(pairs: Pairs, x: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
+def _parts(kernel_map: KernelMap, x: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
     """Offset and indices of all pairs; on a CPU as many at a time as its cache holds rows of."""
-    for k, (i, j) in enumerate(pairs):
+    for k, (i, j) in enumerate(kernel_map):
         rows = rows_at_a_time(x.shape[1]) if x.device.type == "cpu" else max(1, len(i))
         for part_i, part_j in zip(i.split(rows), j.split(rows), strict=True):
             if len(part_i):
@@ -108,11 +110,11 @@ def _parts(pairs: Pairs, x: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
 def submanifold_conv(
     x: Tensor,  # [M, Cin] one row per occupied cell
     weight: Tensor,  # [27, Cin, Cout] taps in the order of (dx, dy, dz) from (-1, -1, -1), dz fastest
-    pairs: Pairs,  # from structure.neighbour_pairs
+    kernel_map: KernelMap,
 ) -> Tensor:
     """3x3x3 convolution on the occupied cells alone: ``out[p] = sum_d x[p + d] @ weight[d]`` over
     existing ``p + d``. Only those are multiplied; each tap holds one [P, C] gather at a time. # [M, Cout]"""
-    return _SubmanifoldConv.apply(x, weight, pairs)
+    return _SubmanifoldConv.apply(x, weight, kernel_map)
 
 
 def segment_mean(

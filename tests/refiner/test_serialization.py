@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pointsplat_ns.refiner.config import CURVES
-from pointsplat_ns.refiner.serialization import curve_codes, hilbert, z_order
+from pointsplat_ns.refiner.serialization import curve_codes
 
 
 def full_grid(side: int) -> torch.Tensor:
@@ -27,13 +27,8 @@ def test_consecutive_cells_of_the_hilbert_curve_share_a_face(curve, bits):
 
 
 def test_z_order_interleaves_bits_with_x_first():
-    assert z_order(torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [3, 3, 3]]), 2).tolist() == [
-        4,
-        2,
-        1,
-        32,
-        63,
-    ]
+    coords = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [3, 3, 3]])
+    assert curve_codes(coords, 2, ["z"])[0].tolist() == [4, 2, 1, 32, 63]
 
 
 @pytest.mark.parametrize("bits", [16, 20])
@@ -43,7 +38,7 @@ def test_z_order_equals_python_interleaving_at_full_width(bits):
     expected = [
         sum(((int(c) >> b) & 1) << (3 * b + 2 - a) for b in range(bits) for a, c in enumerate(row)) for row in coords
     ]
-    assert z_order(coords, bits).tolist() == expected
+    assert curve_codes(coords, bits, ["z"])[0].tolist() == expected
 
 
 @pytest.mark.parametrize("curve", CURVES)
@@ -60,8 +55,10 @@ def test_coarse_cells_are_prefixes_so_that_one_sort_serves_all_grids(curve, drop
 
 def test_trans_exchanges_x_and_y():
     coords = full_grid(8)
-    assert torch.equal(curve_codes(coords, 3, ["hilbert-trans"])[0], hilbert(coords[:, [1, 0, 2]], 3))
-    assert not torch.equal(curve_codes(coords, 3, ["hilbert-trans"])[0], hilbert(coords, 3))
+    assert torch.equal(
+        curve_codes(coords, 3, ["hilbert-trans"])[0], curve_codes(coords[:, [1, 0, 2]], 3, ["hilbert"])[0]
+    )
+    assert not torch.equal(curve_codes(coords, 3, ["hilbert-trans"])[0], curve_codes(coords, 3, ["hilbert"])[0])
 
 
 def test_unknown_curves_and_widths_are_refused():
@@ -72,7 +69,7 @@ def test_unknown_curves_and_widths_are_refused():
 
 
 def test_empty_input_gives_no_codes():
-    assert hilbert(torch.empty(0, 3, dtype=torch.long), 16).shape == (0,)
+    assert curve_codes(torch.empty(0, 3, dtype=torch.long), 16, ["hilbert"])[0].shape == (0,)
 
 
 def skilling(point: list[int], bits: int) -> int:
@@ -99,7 +96,7 @@ def skilling(point: list[int], bits: int) -> int:
 @pytest.mark.parametrize("bits", [1, 2, 5, 16, 19, 20])
 def test_hilbert_tables_give_the_codes_of_the_published_algorithm(bits):
     coords = torch.randint(0, 2**bits, (200, 3), generator=torch.Generator().manual_seed(2))
-    assert hilbert(coords, bits).tolist() == [skilling(point, bits) for point in coords.tolist()]
+    assert curve_codes(coords, bits, ["hilbert"])[0].tolist() == [skilling(point, bits) for point in coords.tolist()]
 
 
 def test_curves_computed_together_are_those_computed_alone():

@@ -1,0 +1,167 @@
+"""What would replace a pair of Gaussians, and what the pictures would lose by it.
+
+The pair's replacement has the common mass (opacity times area of the shadow), centre, covariance and colour of both.
+Its cost is the change of the picture expected from three sides: near a surface a picture is a blend, sum(a G c) /
+sum(a G), so a change of one Gaussian shows in proportion to its contrast with what surrounds it and in inverse
+proportion to how much else covers the same place; where little does, the unknown background shows too.
+
+Shapes: n Gaussians left, E pairs (i, j).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.pruning.covariance import TINY, flat_area, flatten, normals, outer, overlap, plane, shadow
+
+OPAQUE = 0.99
+"""Largest opacity that a merge gives; what mass is left over becomes area."""
+
+GROWTH = 0.6
+"""Power of the mass beyond :data:`OPAQUE` by which the area grows: 0 would open holes, 1 smears edges."""
+
+MOST_SURPLUS = 4.0
+"""Bound of that mass over what the area holds. Two Gaussians seldom reach 2; points without area would be infinite."""
+
+LOCAL_CONTRAST = 0.01
+"""Contrast assumed with the surroundings beside the one measured, colour units of [0, 1] a channel."""
+
+BACKGROUND_CONTRAST = 0.3
+"""Contrast assumed with whatever is far behind, which shows where few Gaussians overlap."""
+
+FACE_ON, *SIDEWAYS = 0, 1, 2
+"""Directions that pairs are judged from; depth between members shows from the side only."""
+
+CHUNK = 1 << 17
+"""Pairs worked on at once: about 100 MB."""
+
+
+@dataclass
+class Remaining:
+    """Gaussians at some round, float64 but for the SH."""
+
+    means: Tensor  # [n, 3]
+    cov: Tensor  # [n, 6]
+    alphas: Tensor  # [n]
+    colours: Tensor  # [n, C] on principal axes
+    sh: Tensor  # [n, (d+1)^2 * 3]
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def keep(self, mask: Tensor) -> None:
+        self.means, self.cov, self.alphas = self.means[mask], self.cov[mask], self.alphas[mask]
+        self.colours, self.sh = self.colours[mask], self.sh[mask]
+
+
+@dataclass
+class Moments:
+    """Moments of pairs, whatever they are seen from."""
+
+    weight: Tensor  # [E] share of i in the mass
+    apart: Tensor  # [E, 3] from j to i
+    means: Tensor  # [E, 3]
+    cov: Tensor  # [E, 6]
+    axes: tuple[Tensor, Tensor, Tensor]  # [E, 3] orthonormal, the last near the thinnest axis
+
+
+@dataclass
+class Replacements:
+    """Pairs (i, j) and the Gaussian that would replace each; shadows are seen along one direction."""
+
+    means: Tensor  # [E, 3]
+    cov: Tensor  # [E, 6]
+    alphas: Tensor  # [E]
+    weight: Tensor  # [E] share of i in the mass
+    areas: tuple[Tensor, Tensor, Tensor]  # [E] shadows of i, j and the merged
+    overlaps: tuple[Tensor, Tensor, Tensor]  # [E] of i with j, i with the merged, j with the merged
+
+
+def moments_of(state: Remaining, i: Tensor, j: Tensor) -> Moments:
+    """Moments of the mass of Gaussians ``i`` (E,) and ``j`` (E,) together."""
+    mi, mj = (state.alphas[x] * shadow(state.cov[x]) for x in (i, j))
+    total = mi + mj
+    wi = torch.where(total > TINY, mi / total.clamp_min(TINY), 0.5)
+    wj = 1 - wi
+    apart = state.means[i] - state.means[j]
+    means = wi[:, None] * state.means[i] + wj[:, None] * state.means[j]
+    cov = wi[:, None] * state.cov[i] + wj[:, None] * state.cov[j] + (wi * wj)[:, None] * outer(apart)
+    normal = normals(cov)
+    return Moments(wi, apart, means, cov, (*plane(normal), normal))
+
+
+def replacements_of(state: Remaining, i: Tensor, j: Tensor, joined: Moments, view: int = FACE_ON) -> Replacements:
+    """What would replace the pairs, seen along its thinnest axis or one of the two across it, with opacity such that
+    the mass is that of both less what is covered twice."""
+    ai, aj = state.alphas[i], state.alphas[j]
+    wi, wj = joined.weight, 1 - joined.weight
+    apart, means, cov, axes = joined.apart, joined.means, joined.cov, joined.axes
+    e1, e2 = axes[view], axes[(view + 1) % 3]
+    si, sj, sk = (flatten(c, e1, e2) for c in (state.cov[i], state.cov[j], cov))
+    u, v = (apart * e1).sum(1), (apart * e2).sum(1)
+    pi, pj, pk = flat_area(si), flat_area(sj), flat_area(sk)
+    oij = overlap(si, sj, u, v)
+    alphas = (ai * pi + aj * pj - ai * aj * oij).clamp_min(0) / pk.clamp_min(TINY)
+    growth = (alphas / OPAQUE).clamp(1, MOST_SURPLUS) ** GROWTH
+    sk, pk, cov = sk * growth[:, None], pk * growth, cov * growth[:, None]
+    oik, ojk = overlap(si, sk, wj * u, wj * v), overlap(sj, sk, wi * u, wi * v)
+    return Replacements(means, cov, alphas.clamp_max(OPAQUE), wi, (pi, pj, pk), (oij, oik, ojk))
+
+
+def picture_change(
+    pairs: Replacements, ai: Tensor, aj: Tensor, ii: Tensor | float, jj: Tensor | float, ij: Tensor | float
+) -> Tensor:
+    """Integral over the plane of |f_i a_i G_i + f_j a_j G_j - f_k a_k G_k|^2, (E,), for features f of which the scalar
+    products are given and f_k is the mean by mass."""
+    wi, wj, ak = pairs.weight, 1 - pairs.weight, pairs.alphas
+    (pi, pj, pk), (oij, oik, ojk) = pairs.areas, pairs.overlaps
+    ik, jk = wi * ii + wj * ij, wj * jj + wi * ij
+    kk = wi * ik + wj * jk
+    alone = ai * ai * ii * pi + aj * aj * jj * pj + ak * ak * kk * pk
+    across = ai * aj * ij * oij - ai * ak * ik * oik - aj * ak * jk * ojk
+    return (alone / 2 + 2 * across).clamp_min(0)
+
+
+def costs_of(state: Remaining, first: Tensor, second: Tensor) -> Tensor:
+    """Expected change by each merge of the pictures from three sides, (E,) float32, squared colour units times area."""
+    # Pass 1, at each Gaussian and from each side: how much covers it (itself included), and the mean colour of that.
+    views = (FACE_ON, *SIDEWAYS)
+    covers = [state.alphas / 2 for _ in views]
+    arounds = [cover[:, None] * state.colours for cover in covers]
+    kept = []
+    for i, j in zip(first.split(CHUNK), second.split(CHUNK), strict=True):
+        joined = moments_of(state, i, j)
+        seen = [replacements_of(state, i, j, joined, view) for view in views]
+        for pairs, cover, around in zip(seen, covers, arounds, strict=True):
+            (pi, pj, _), (oij, _, _) = pairs.areas, pairs.overlaps
+            on_i = state.alphas[j] * oij / pi.clamp_min(TINY)
+            on_j = state.alphas[i] * oij / pj.clamp_min(TINY)
+            cover.index_add_(0, i, on_i).index_add_(0, j, on_j)
+            around.index_add_(0, i, on_i[:, None] * state.colours[j]).index_add_(0, j, on_j[:, None] * state.colours[i])
+        none = joined.means[:0]
+        kept.append([dataclasses.replace(pairs, means=none, cov=none) for pairs in seen])  # to save memory
+    for cover, around in zip(covers, arounds, strict=True):
+        around /= cover[:, None].clamp_min(TINY)
+    # Pass 2: the change of colour against the surroundings, and of coverage against the background.
+    costs = []
+    for i, j, seen in zip(first.split(CHUNK), second.split(CHUNK), kept, strict=True):
+        sides = zip(seen, covers, arounds, strict=True)
+        costs.append(sum(_cost_seen(state, i, j, pairs, cover, around) for pairs, cover, around in sides).float())
+    return torch.cat(costs)
+
+
+def _cost_seen(state: Remaining, i: Tensor, j: Tensor, pairs: Replacements, cover: Tensor, around: Tensor) -> Tensor:
+    """:func:`costs_of` from one side, given what covers each Gaussian (n,) and its mean colour (n, C)."""
+    wi, wj = pairs.weight, 1 - pairs.weight
+    here = wi[:, None] * around[i] + wj[:, None] * around[j]
+    fi, fj = state.colours[i] - here, state.colours[j] - here
+    ii, jj, ij = ((x * y).sum(1) + 3 * LOCAL_CONTRAST**2 for x, y in ((fi, fi), (fj, fj), (fi, fj)))
+    ai, aj, one = state.alphas[i], state.alphas[j], torch.ones_like(ii)
+    covered = wi * cover[i] + wj * cover[j]
+    through = 3 * BACKGROUND_CONTRAST**2 * torch.exp(-4 * covered)
+    cost = picture_change(pairs, ai, aj, ii, jj, ij) / covered.clamp_min(0.5) ** 2
+    return cost + through * picture_change(pairs, ai, aj, one, one, one)
