@@ -147,6 +147,27 @@ def small_config(data: Path, output_dir: Path, steps: int, **model):
     return config
 
 
+def fast_config(data: Path, output_dir: Path, steps: int = 10, **model):
+    """The method at a size for tests, at rates for the few steps that they take."""
+    config = small_config(data, output_dir, steps, **model)
+    for group in config.optimizers.values():
+        group["optimizer"].lr *= 10
+    return config
+
+
+def pipeline_of(data: Path, eval_scenes: tuple[str, ...] = (), test_mode: str = "test", **model):
+    """The pipeline of :func:`fast_config`, in evaluation mode."""
+    config = fast_config(data, Path("unused"), **model)
+    config.pipeline.datamanager.eval_scenes = eval_scenes
+    return config.pipeline.setup(device="cpu", test_mode=test_mode).eval()
+
+
+def run_of(folder: Path, name: str) -> Path:
+    """The one run of a splatfacto-cpu experiment."""
+    (path,) = (folder / name / "splatfacto-cpu").iterdir()
+    return path
+
+
 def without_data(runs: Path, folder: Path) -> Path:
     """A copy of runs, whose data is where nobody finds it: below ``gone_from_here``."""
     shutil.copytree(runs, folder)

@@ -33,16 +33,18 @@ def means_over_ranks(values: dict[str, Tensor], names: Sequence[str]) -> dict[st
         values: scalars on this process's device. Names beyond ``names`` are left out.
         names: the same in every process.
     """
-    known = [name for name in names if name in values]
+    present = [name for name in names if name in values]
     if world_size() == 1:
-        return {name: values[name].detach() for name in known}
+        return {name: values[name].detach() for name in present}
     device = next(iter(values.values())).device
     table = torch.zeros(2, len(names), dtype=torch.float64, device=device)  # sums and counts
     for column, name in enumerate(names):
         if name in values:
             table[0, column], table[1, column] = values[name].detach().double(), 1.0
     dist.all_reduce(table)
-    return {name: (table[0, names.index(name)] / table[1, names.index(name)]).to(values[name].dtype) for name in known}
+    return {
+        name: (table[0, names.index(name)] / table[1, names.index(name)]).to(values[name].dtype) for name in present
+    }
 
 
 def any_rank(flag: bool, device: torch.device | str) -> bool:

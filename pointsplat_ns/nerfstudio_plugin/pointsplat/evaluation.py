@@ -108,7 +108,7 @@ def evaluate_scene(
 
 
 def summarize(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
-    """What ``ns-eval`` writes: valid JSON, with None for what is not finite or not known."""
+    """What ``ns-eval`` writes: valid JSON, with None for what is not finite or could not be computed."""
     unseen = [r for r in reports if not r.seen_in_training]
     seen = [r for r in reports if r.seen_in_training]
     judged = unseen or reports

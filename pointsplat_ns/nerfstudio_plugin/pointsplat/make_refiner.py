@@ -42,8 +42,8 @@ class MadeRefiner:
 
 
 def make_refiner(
-    output: Path,
-    weights: Path | None = None,
+    output: str | Path,
+    weights: str | Path | None = None,
     size: Literal["tiny", "small", "full"] = "tiny",
     steps: int = 700,
     rooms: int | None = None,
@@ -67,7 +67,15 @@ def make_refiner(
     Raises:
         DataError: if there are not so many rooms, or no steps.
         PointSplatError: if a command fails.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> ps.make_refiner("outputs/mine", steps=0)
+        Traceback (most recent call last):
+        ...
+        pointsplat_ns.errors.DataError: --steps 0: expected at least 1
     """
+    output = Path(output)
     if rooms is not None and not 1 <= rooms <= len(TRAIN_SEEDS):
         raise DataError(f"--rooms {rooms}: expected 1 to {len(TRAIN_SEEDS)}")
     if steps < 1:
@@ -94,7 +102,7 @@ def make_refiner(
         "scenes": [f"room{seed}" for seed in train_seeds],
         "unseen": {variant: results["average_unseen"][variant] for variant in VARIANTS},
     }
-    target = weights or output
+    target = Path(weights or output)
     refiner = read_refiner(trained / REFINER_NAME)
     save_refiner(refiner, target / REFINER_NAME, about)
     command = refiner_command(Path("scenes"), Path("refiners"), name, TIMESTAMP, size, steps, seed)

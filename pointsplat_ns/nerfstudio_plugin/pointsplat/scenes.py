@@ -55,14 +55,14 @@ def dataparser_of(run: Run) -> DataParser:
     """
     from nerfstudio.configs.dataparser_configs import all_dataparsers
 
-    known = {f"{type(c).__module__}.{type(c).__qualname__}": type(c) for c in all_dataparsers.values()}
+    classes = {f"{type(c).__module__}.{type(c).__qualname__}": type(c) for c in all_dataparsers.values()}
     name = _FORMER_DATAPARSERS.get(run.dataparser_class, run.dataparser_class)
-    if name not in known:
+    if name not in classes:
         raise SceneError(
             f"{run.config_path}: trained with the dataparser {run.dataparser_class or 'of another kind'}, which is not "
             "installed here; install the plugin that provides it"
         )
-    config = known[name]()
+    config = classes[name]()
     fields = {f.name for f in dataclasses.fields(config)}
     for field_name, value in run.dataparser_fields.items():
         if field_name not in fields:

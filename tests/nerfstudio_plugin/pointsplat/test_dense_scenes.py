@@ -10,10 +10,9 @@ import pytest
 import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
-from making import without_data
+from making import box_room, without_data
 from pointsplat_ns.compression.view_sampling import sample_views
 from pointsplat_ns.errors import DataError, SceneError
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.io.discovery import find_plys
@@ -24,22 +23,6 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import PlyScene, Sa
 from pointsplat_ns.rasterizer import render
 
 POSES = SampledPoses(train=6, test=3, width=32, height=24, seed=1)
-
-
-def box_room(seed: int, count: int = 900) -> Gaussians:
-    """A closed box of coloured Gaussians, 4 x 3 x 2 scene units: free inside, covered all around."""
-    generator = torch.Generator().manual_seed(seed)
-    means = torch.rand(count, 3, generator=generator) * 2 - 1
-    axis = torch.arange(count) % 3
-    means[torch.arange(count), axis] = torch.sign(means[torch.arange(count), axis])
-    return Gaussians(
-        means=means * torch.tensor([2.0, 1.5, 1.0]),
-        scales=torch.full((count, 3), 0.15).log(),
-        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        opacities=torch.full((count, 1), 4.0),
-        features_dc=torch.randn(count, 3, generator=generator),
-        features_rest=torch.zeros(count, 3, 3),
-    )
 
 
 @pytest.fixture(scope="module")

@@ -15,26 +15,10 @@ import pytest
 import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
+from making import box_room
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES, pointsplat_config
-
-
-def box_room(seed: int, count: int = 900) -> Gaussians:
-    """A closed box of coloured Gaussians, 4 x 3 x 2 scene units: free inside, covered all around."""
-    generator = torch.Generator().manual_seed(seed)
-    means = torch.rand(count, 3, generator=generator) * 2 - 1
-    rows, axis = torch.arange(count), torch.arange(count) % 3
-    means[rows, axis] = torch.sign(means[rows, axis])
-    return Gaussians(
-        means=means * torch.tensor([2.0, 1.5, 1.0]),
-        scales=torch.full((count, 3), 0.12).log(),
-        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        opacities=torch.full((count, 1), 4.0),
-        features_dc=torch.sin(2 * means + torch.randn(3, generator=generator)),
-        features_rest=torch.zeros(count, 3, 3),
-    )
 
 
 def config_of(data: Path, output_dir: Path, steps: int):
@@ -55,7 +39,7 @@ def rooms(tmp_path_factory) -> Path:
     """A folder of three PLY files and nothing else."""
     folder = tmp_path_factory.mktemp("rooms")
     for seed in range(3):
-        write_ply(box_room(seed), folder / f"room{seed}.ply")
+        write_ply(box_room(seed, size=0.12, smooth=True), folder / f"room{seed}.ply")
     return folder
 
 
@@ -83,7 +67,7 @@ def test_a_folder_of_ply_files_trains_the_refiner(trained, no_lpips):
         assert block["reference"] == "dense renders" and block["views"] == 1
         assert block["seen_in_training"] == (name != "room2")
         assert block["dense"]["psnr"] is None or block["dense"]["psnr"] > 100, "it is the reference: float32 noise"
-        # dB; 16 steps give the known scenes 1.5 or more
+        # dB; 16 steps give the training scenes 1.5 or more
         assert block["refined"]["psnr"] > block["pruned"]["psnr"] + (0.5 if name != "room2" else 0.0)
 
 
@@ -143,14 +127,14 @@ def test_pruned_scenes_are_kept_within_the_bound_and_made_again_alike(rooms):
     config.pipeline.datamanager.cache_gigabytes = 0.05
     pipeline = config.pipeline.setup(device="cpu", test_mode="test")
     kept = pipeline.model
-    made = [kept.pruned_scene(index) for index in range(3)]
+    first = [kept.pruned_scene(index) for index in range(3)]
     again = [none_kept.pruned_scene(index) for index in (0, 1, 2, 0)]
-    assert all(kept.pruned_scene(index) is made[index] for index in range(3))
+    assert all(kept.pruned_scene(index) is first[index] for index in range(3))
     assert again[3] is not again[0] and none_kept.pruned_scene(0) is again[3], "the latest is there in any case"
-    for one, other in ((again[3], again[0]), (again[1], made[1])):
+    for one, other in ((again[3], again[0]), (again[1], first[1])):
         assert all(torch.equal(a, b) for (_, a), (_, b) in zip(one.pruned.items(), other.pruned.items(), strict=True))
-    structures = made[0].structure
-    smallest = structures.order.numel() * 8 + sum(v.numel() * 4 for _, v in made[0].pruned.items())
+    structures = first[0].structure
+    smallest = structures.order.numel() * 8 + sum(v.numel() * 4 for _, v in first[0].pruned.items())
     assert pipeline.datamanager.cache.num_bytes > 3 * smallest, "neighbour tables count, too"
 
 
@@ -162,10 +146,10 @@ def test_an_interrupted_training_has_the_losses_of_an_unbroken_one(
     rooms, run_training, tmp_path, stop, accumulate, schedule
 ):
     def config(name, steps):
-        made = config_of(rooms, tmp_path / name, steps)
-        made.gradient_accumulation_steps, made.schedule = {"all": accumulate}, schedule
-        made.steps_per_save, made.save_only_latest_checkpoint = stop, False
-        return made
+        changed = config_of(rooms, tmp_path / name, steps)
+        changed.gradient_accumulation_steps, changed.schedule = {"all": accumulate}, schedule
+        changed.steps_per_save, changed.save_only_latest_checkpoint = stop, False
+        return changed
 
     whole, losses = run_training(config("whole", 8))
     assert len(set(losses)) == 8
@@ -322,10 +306,10 @@ def test_a_gradient_scaler_deals_with_its_own_overflows_and_changes_nothing_else
 @pytest.mark.parametrize(("stop", "accumulate"), [(4, 3), (4, 1)])
 def test_an_interrupted_training_skips_as_an_unbroken_one(rooms, run_training, tmp_path, stop, accumulate):
     def config(name, steps):
-        made = config_of(rooms, tmp_path / name, steps)
-        made.gradient_accumulation_steps = {"all": accumulate}
-        made.steps_per_save, made.save_only_latest_checkpoint = stop, False
-        return made
+        changed = config_of(rooms, tmp_path / name, steps)
+        changed.gradient_accumulation_steps = {"all": accumulate}
+        changed.steps_per_save, changed.save_only_latest_checkpoint = stop, False
+        return changed
 
     with broken("nan", {1, 4, 6}):  # of three updates over three steps, two are the mean of fewer
         whole, losses = run_training(config("whole", 8))
@@ -344,11 +328,11 @@ def test_an_interrupted_training_skips_as_an_unbroken_one(rooms, run_training, t
 def test_after_too_many_skipped_steps_training_stops_and_names_the_scenes(rooms, run_training, tmp_path):
     config = config_of(rooms, tmp_path, 50)
     config.max_skipped_steps = 3
-    told = (
+    message = (
         r"training stopped at step 3: losses or gradients were not finite in 4 steps, which were skipped "
         r"\(room\d: 2, room\d: 1, room\d: 1\); .*lower the learning rates; .*--load-dir .*--max-skipped-steps than 3"
     )
-    with broken("nan", set(range(50))), pytest.raises(SceneError, match=told) as caught:
+    with broken("nan", set(range(50))), pytest.raises(SceneError, match=message) as caught:
         run_training(config)
     assert "\n" not in str(caught.value)
     saved = torch.load(config.get_checkpoint_dir() / "step-000000003.ckpt", weights_only=True)

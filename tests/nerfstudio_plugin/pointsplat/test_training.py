@@ -1,0 +1,132 @@
+"""Training with nerfstudio's trainer: checkpoints, resuming, learning rates."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from unittest import mock
+
+import pytest
+import torch
+
+import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
+from making import fast_config, pipeline_of
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES
+from pointsplat_ns.nerfstudio_plugin.pointsplat.results import REFINER_NAME
+from pointsplat_ns.refiner import read_refiner
+from pointsplat_ns.refiner.weights import read_metadata
+
+
+def view_loss(model, manager, index: int) -> float:
+    with torch.no_grad():
+        _, losses, _ = model.losses(index, [f for f in manager.scenes[index].train_frames])
+    return float(losses["l1"])
+
+
+def test_training_lowers_the_loss_on_all_views(trained, trained_walls):
+    _, trainer, _ = trained
+    untrained = pipeline_of(trained_walls)
+    model = trainer.pipeline.eval().model
+    assert view_loss(model, trainer.pipeline.datamanager, 0) < 0.9 * view_loss(
+        untrained.model, untrained.datamanager, 0
+    )
+
+
+def test_the_held_out_scene_is_never_trained_on(trained):
+    _, trainer, used = trained
+    assert {index for training, index in used if training} == {0}
+    assert len([1 for training, _ in used if training]) == 10
+    assert trainer.pipeline.model.shown == 1
+
+
+def test_the_checkpoint_holds_the_network_and_nothing_else(trained):
+    config, trainer, _ = trained
+    (path,) = config.get_checkpoint_dir().iterdir()
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    refiner = trainer.pipeline.model.refiner
+    names = {f"_model.refiner.{name}" for name in refiner.state_dict()}
+    assert set(state["pipeline"]) == names | {"_model.device_indicator_param", "_extra_state"}
+    assert [name.split("/")[0] for name in state["pipeline"]["_extra_state"]["trained_on"]] == ["wall-a"]
+    assert all(torch.equal(state["pipeline"][f"_model.refiner.{n}"], v) for n, v in refiner.state_dict().items())
+    parameters = sum(p.numel() for p in refiner.parameters())
+    assert path.stat().st_size < 4 * 3 * parameters + 500_000, "three floats a parameter: itself and Adam's two"
+    assert set(state["optimizers"]) == set(RATES)
+    trained_numbers = {p for g in trainer.optimizers.optimizers.values() for s in g.param_groups for p in s["params"]}
+    assert trained_numbers == set(refiner.parameters()), "every parameter has a learning rate"
+
+
+def test_the_network_is_saved_by_itself_at_the_end(trained):
+    config, trainer, _ = trained
+    path = config.get_base_dir() / REFINER_NAME
+    loaded = read_refiner(path).state_dict()
+    expected = trainer.pipeline.model.refiner.state_dict()
+    assert loaded.keys() == expected.keys() and all(torch.equal(loaded[n], v) for n, v in expected.items())
+    assert read_metadata(path) == {
+        "step": "9",
+        "scenes": "wall-a",
+        "keep": "0.5",
+        "by": "paper",
+        "opacity_weight": None,
+    }
+    assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000009.ckpt"]
+
+
+def test_an_evaluation_while_training_is_logged(trained):
+    _, trainer, _ = trained
+    trainer.pipeline.train()
+    metrics, images = trainer.pipeline.get_eval_image_metrics_and_images(step=4)
+    assert {"psnr_pruned", "psnr_refined", "ssim_refined", "num_rays"} <= metrics.keys()
+    assert images["photo_pruned_refined"].shape == (48, 3 * 64, 3)
+    assert trainer.pipeline.training and trainer.pipeline.model.training, "training goes on as it was"
+
+
+def test_a_resumed_training_ends_where_an_unbroken_one_does(trained_walls, run_training, tmp_path):
+    config = fast_config(trained_walls, tmp_path / "whole", steps=6)
+    config.steps_per_save, config.save_only_latest_checkpoint = 3, False
+    whole, losses = run_training(config)
+    rest = fast_config(trained_walls, tmp_path / "rest", steps=2)
+    rest.load_dir, rest.load_step = config.get_checkpoint_dir(), 3  # after steps 0 to 3
+    resumed, last_losses = run_training(rest)
+    assert resumed._start_step == 4 and last_losses == losses[4:]
+    for name, value in whole.pipeline.model.refiner.state_dict().items():
+        assert torch.equal(resumed.pipeline.model.refiner.state_dict()[name], value), name
+    rates = [t.optimizers.optimizers["encoder"].param_groups[0]["lr"] for t in (whole, resumed)]
+    assert rates[0] == rates[1]
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 2000])
+def test_learning_rates_rise_fall_and_never_rise_again(steps):
+    config = fast_config(Path("unused"), Path("unused"), steps=steps)
+    schedule = config.optimizers["encoder"]["scheduler"]
+    with mock.patch.object(config, "_target", lambda fitted, **_: fitted):
+        fitted = config.setup().optimizers["encoder"]["scheduler"]
+    assert schedule.max_steps == 0, "the config itself, which is saved, is left alone"
+    parameter = torch.nn.Parameter(torch.zeros(1))
+    optimizer = torch.optim.SGD([parameter], lr=1.0)
+    scheduler = fitted.setup().get_scheduler(optimizer, 1.0)
+    rates = []
+    for _ in range(steps + 1):
+        rates.append(optimizer.param_groups[0]["lr"])
+        optimizer.step(), scheduler.step()
+    peak = max(range(len(rates)), key=rates.__getitem__)
+    assert rates[peak] == 1.0 and peak == max(1, round(0.05 * steps))
+    assert all(a >= b for a, b in zip(rates[peak:], rates[peak + 1 :], strict=False))
+    assert rates[-1] == pytest.approx(0.02) or steps == 1
+
+
+def test_a_training_that_cannot_start_leaves_no_folder(trained_walls, tmp_path):
+    config = fast_config(trained_walls, tmp_path / "outputs")
+    config.pipeline.datamanager.eval_scenes = ("no_such_scene",)
+    (tmp_path / "outputs" / "of another run").mkdir(parents=True)
+    config.save_config()
+    with pytest.raises(SceneError, match="no_such_scene"):
+        config.setup(local_rank=0, world_size=1).setup()
+    assert [path.name for path in (tmp_path / "outputs").iterdir()] == ["of another run"]
+
+
+def test_the_saved_config_trains_again(trained, run_training, tmp_path):
+    config = copy.deepcopy(trained[0])
+    config.output_dir, config.max_num_iterations = tmp_path, 1
+    _, losses = run_training(config)
+    assert len(losses) == 1
