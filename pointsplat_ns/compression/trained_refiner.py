@@ -76,8 +76,8 @@ def load_refiner(path: Path | str | None = None, device: torch.device | str | No
     Example:
         >>> import pointsplat_ns as ps
         >>> refiner = ps.load_refiner()
-        >>> len(refiner(ps.prune(ps.example_room(), keep=1000)))
-        1000
+        >>> len(refiner(ps.prune(ps.example_room()[::10], keep=500)))
+        500
     """
     if device is None:
         device = "cuda" if torch.cuda.is_available() else "cpu"
