@@ -14,8 +14,9 @@ from torch import Tensor, nn
 
 from pointsplat_ns.refiner.config import RefinerConfig
 from pointsplat_ns.refiner.encoder import make_norm
-from pointsplat_ns.refiner.rows import add_by_rows, add_rows, by_rows, rows_at_a_time
-from pointsplat_ns.refiner.sparse_ops import permute, segment_max, segment_mean, submanifold_conv
+from pointsplat_ns.refiner.patches import Order, add_by_patches, by_patches
+from pointsplat_ns.refiner.rows import by_rows, rows_at_a_time
+from pointsplat_ns.refiner.sparse_ops import segment_max, segment_mean, submanifold_conv
 from pointsplat_ns.refiner.structure import Level, Structure
 
 
@@ -46,8 +47,8 @@ class SubmanifoldConv(nn.Module):
 class PatchAttention(nn.Module):
     """Multi-head attention within patches of K points that are consecutive along a curve.
 
-    A last patch of fewer points is filled up with the points before it, which keep the result of
-    their own patch; with at most K points in all there is one patch, and this is plain attention.
+    How a number of points that is no multiple of K is cut into patches is said in
+    :mod:`~pointsplat_ns.refiner.patches`; with at most K points in all this is plain attention.
     """
 
     def __init__(self, channels: int, heads: int, patch: int):
@@ -56,44 +57,16 @@ class PatchAttention(nn.Module):
         self.qkv = nn.Linear(channels, 3 * channels)
         self.proj = nn.Linear(channels, channels)
 
-    def forward(
-        self, x: Tensor, order: tuple[Tensor, Tensor] | None, norm: nn.Module | None = None, add: bool = False
-    ) -> Tensor:
-        """``[M, C] -> [M, C]``: attention among the rows of ``norm(x)``.
+    def forward(self, x: Tensor, order: Order | None = None) -> Tensor:
+        """``[M, C] -> [M, C]``; ``order`` along a curve, None for memory order."""
+        return by_patches(self._attend, x, self.qkv.out_features, self.patch, order)
 
-        Args:
-            x: features.  # [M, C]
-            order: a curve's order and inverse, None for memory order.
-            norm: applied row by row before.
-            add: add the result to ``x`` in place, without gradients, and return that.
-        """
-        size = min(self.patch, len(x))
-        full = len(x) // size * size
-        rows = rows_at_a_time(self.qkv.out_features, size)
-
-        def attend(part: Tensor) -> Tensor:
-            return self._attend(part if norm is None else norm(part), size)
-
-        if add:
-            along = None if order is None else order[0]
-            # Read before they change: the last patch borrows points of the one before.
-            last = x[len(x) - size :] if along is None else x.index_select(0, along[len(x) - size :])
-            last = attend(last)[full - len(x) :] if full < len(x) else None
-            add_by_rows(attend, x, rows, along, full)
-            if last is not None:
-                add_rows(x, last, along, full)
-            return x
-        if order is not None:
-            x = permute(x, *order)
-        out = by_rows(attend, x[:full], rows)
-        if full < len(x):
-            out = torch.cat([out, attend(x[len(x) - size :])[full - len(x) :]])
-        return out if order is None else permute(out, order[1], order[0])
-
-    def _attend(self, x: Tensor, size: int) -> Tensor:
-        """``[P * size, C] -> [P * size, C]``: each run of ``size`` rows by itself."""
-        channels = x.shape[1]
+    def _attend(self, x: Tensor) -> Tensor:
+        """``[P * K, C] -> [P * K, C]``: the points of each patch to one another."""
+        points, channels = x.shape
+        size = min(self.patch, points)
         q, k, v = self.qkv(x).view(-1, size, 3, self.heads, channels // self.heads).permute(2, 0, 3, 1, 4)
+        # (P, H, K, C / H) each
         return self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(-1, channels))
 
 
@@ -108,23 +81,32 @@ class Block(nn.Module):
         self.norm1 = nn.LayerNorm(channels)
         self.attention = PatchAttention(channels, heads, config.patch)
         self.norm2 = nn.LayerNorm(channels)
-        hidden = channels * config.mlp_ratio
-        self.mlp = nn.Sequential(nn.Linear(channels, hidden), nn.GELU(), nn.Linear(hidden, channels))
+        self.hidden = channels * config.mlp_ratio
+        self.mlp = nn.Sequential(nn.Linear(channels, self.hidden), nn.GELU(), nn.Linear(self.hidden, channels))
 
-    def forward(self, x: Tensor, level: Level, order: tuple[Tensor, Tensor] | None) -> Tensor:
-        """``[M, C] -> [M, C]``."""
-        x = self.conv(x, level, self.conv_out).add_(x)
-        rows = rows_at_a_time(self.mlp[0].out_features)
-        if not torch.is_grad_enabled() and not self.training:
-            x = self.attention(x, order, self.norm1, add=True)
-            return add_by_rows(self._mlp, x, rows)
-        x = self._drop(self.attention(x, order, self.norm1)).add_(x)
-        return self._drop(by_rows(self._mlp, x, rows)).add_(x)
+    def forward(self, x: Tensor, level: Level, order: Order | None) -> Tensor:
+        """``[M, C] -> [M, C]``; ``order`` along the curve that the patches follow, None for memory order."""
+        x = self.conv(x, level, then=self.conv_out).add_(x)
+        x = self._add(x, lambda part: self.attention(self.norm1(part)), 3 * x.shape[1], self.attention.patch, order)
+        x = self._add(x, lambda part: self.mlp(self.norm2(part)), self.hidden)
+        return x
 
-    def _mlp(self, x: Tensor) -> Tensor:
-        return self.mlp(self.norm2(x))
+    def _add(
+        self,
+        x: Tensor,
+        branch: Callable[[Tensor], Tensor],
+        width: int,
+        patch: int = 1,
+        order: Order | None = None,
+    ) -> Tensor:
+        """``x + drop(branch(x))``, in place where neither gradients nor dropping need ``x`` itself; ``width`` is that
+        of the branch's widest layer, ``patch`` and ``order`` say which points it brings together."""
+        if torch.is_grad_enabled() or self.training:
+            return self._drop(by_patches(branch, x, width, patch, order)).add_(x)
+        return add_by_patches(branch, x, width, patch, order)
 
     def _drop(self, x: Tensor) -> Tensor:
+        """In training, rows at random are set to zero and the others scaled up, so that the mean stays."""
         if not self.training or self.drop_path == 0:
             return x
         keep = 1 - self.drop_path

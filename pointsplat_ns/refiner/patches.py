@@ -1,0 +1,65 @@
+"""A function of patches of points, a few patches at a time; see :mod:`~pointsplat_ns.refiner.rows` for why.
+
+A patch is K points that are consecutive along a curve. A last patch of fewer points is filled up with the points before
+it, which keep the result of their own patch; with at most K points in all there is one patch. With K = 1 a patch is a
+point, and the function one of single rows.
+
+Shapes: N points, C channels, P patches of K points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.refiner.rows import add_by_rows, add_rows, by_rows, rows_at_a_time
+from pointsplat_ns.refiner.sparse_ops import permute
+
+Order = tuple[Tensor, Tensor]
+"""The order of points along a curve and its inverse, (N,) int64 each."""
+
+
+def by_patches(
+    function: Callable[[Tensor], Tensor],  # [P * K, C] -> [P * K, C], each patch by itself
+    x: Tensor,  # [N, C]
+    width: int,  # of the widest tensor that the function makes
+    patch: int = 1,
+    order: Order | None = None,  # None: the order in memory
+) -> Tensor:
+    """``function(x)``. # [N, C]"""
+    patch, full = _whole_patches(len(x), patch)
+    if order is not None:
+        x = permute(x, *order)
+    whole = x if full == len(x) else x[:full]  # a slice of everything would cost a copy in the backward pass
+    out = by_rows(function, whole, rows_at_a_time(width, patch))
+    if full < len(x):
+        out = torch.cat([out, function(x[len(x) - patch :])[full - len(x) :]])
+    return out if order is None else permute(out, order[1], order[0])
+
+
+def add_by_patches(
+    function: Callable[[Tensor], Tensor],  # [P * K, C] -> [P * K, C], each patch by itself
+    x: Tensor,  # [N, C]
+    width: int,  # of the widest tensor that the function makes
+    patch: int = 1,
+    order: Order | None = None,  # None: the order in memory
+) -> Tensor:
+    """``x + function(x)`` in place of ``x``, without gradients: nothing of the size of ``x`` is allocated. # [N, C]"""
+    patch, full = _whole_patches(len(x), patch)
+    along = None if order is None else order[0]
+    last = None
+    if full < len(x):  # read before it changes: the last patch borrows points of the one before
+        borrowing = x[len(x) - patch :] if along is None else x.index_select(0, along[len(x) - patch :])
+        last = function(borrowing)[full - len(x) :]
+    add_by_rows(function, x, rows_at_a_time(width, patch), along, full)
+    if last is not None:
+        add_rows(x, last, along, full)
+    return x
+
+
+def _whole_patches(n: int, patch: int) -> tuple[int, int]:
+    """Points of a patch where there are ``n`` in all, and points in whole patches."""
+    patch = max(1, min(patch, n))
+    return patch, n // patch * patch
