@@ -60,7 +60,7 @@ ps.save(result.scene, {str(tmp_path / "small.ply")!r})
 """
     imported = {name.split(".")[0] for name in modules_after(code)}
     assert "torch" in imported
-    assert imported & {"nerfstudio", "gsplat", "kornia", "torchvision", "matplotlib", "method_configs", "tyro"} == set()
+    assert imported & {"nerfstudio", "gsplat", "torchvision", "matplotlib", "method_configs", "tyro"} == set()
 
 
 def test_dir_lists_the_public_names_without_importing_them():

@@ -169,6 +169,8 @@ def _second_moments(seen: Projected, colors: Tensor, views: Views) -> Tensor:
 
 def _jacobian(outputs: Tensor, means: Tensor, stds: Tensor, ids: Tensor) -> Tensor:
     """Derivatives of (M, F) by the means and standard deviations of the same Gaussians, (M, F, 6) float64."""
+    if not outputs.requires_grad:  # colours of SH degree 0 depend on neither
+        return outputs.new_zeros(*outputs.shape, 6, dtype=torch.float64)
     rows = []
     for column in outputs.unbind(1):
         grads = torch.autograd.grad(column.sum(), (means, stds), retain_graph=True, materialize_grads=True)

@@ -77,6 +77,11 @@ def test_a_size_that_only_fits_without_bands_is_no_reason_to_refuse(sh, scene, v
     assert len(pruned(faint, views, size, "opacity", sh=sh).scene) == 1
 
 
+@pytest.mark.parametrize("by", sorted(name for name, method in METHODS.items() if method.needs_views))
+def test_a_scene_without_directional_bands_can_be_looked_at(by, scene, views):
+    assert len(pruned(scene, views, 0.25, by, sh="0").scene) == 100
+
+
 def test_an_auto_budget_is_measured_against_the_scene_with_all_its_bands(scene, views):
     result = pruned(scene, views, WithinPsnr(22.0), "coverage", sh="0")
     assert result.scene.sh_degree == 0 and DenseReference(scene, views).psnr(result.scene)[0] >= 22
