@@ -23,6 +23,8 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from pointsplat_ns.api import compact, example_room, load, lpips, prune, refine
     from pointsplat_ns.compression.compact import Compacted
+    from pointsplat_ns.compression.distributions import plot_distributions
+    from pointsplat_ns.compression.pictures import plot_comparison
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
     from pointsplat_ns.compression.view_sampling import sample_views
     from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
@@ -30,12 +32,17 @@ if TYPE_CHECKING:
     from pointsplat_ns.io.scene import save
     from pointsplat_ns.metrics import psnr, ssim
     from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner import make_refiner
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.report import report
     from pointsplat_ns.rasterizer import rasterization, render
+    from pointsplat_ns.rooms import write_room
     from pointsplat_ns.views import View, Views
 
 _PUBLIC = {
     "pointsplat_ns.api": ("compact", "example_room", "load", "lpips", "prune", "refine"),
     "pointsplat_ns.compression.compact": ("Compacted",),
+    "pointsplat_ns.compression.distributions": ("plot_distributions",),
+    "pointsplat_ns.compression.pictures": ("plot_comparison",),
     "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner"),
     "pointsplat_ns.compression.view_sampling": ("sample_views",),
     "pointsplat_ns.errors": ("BudgetError", "DataError", "PointSplatError", "SceneError"),
@@ -43,7 +50,10 @@ _PUBLIC = {
     "pointsplat_ns.io.scene": ("save",),
     "pointsplat_ns.metrics": ("psnr", "ssim"),
     "pointsplat_ns.nerfstudio_plugin.dataset_views": ("dataset_views",),
+    "pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner": ("make_refiner",),
+    "pointsplat_ns.nerfstudio_plugin.pointsplat.report": ("report",),
     "pointsplat_ns.rasterizer": ("rasterization", "render"),
+    "pointsplat_ns.rooms": ("write_room",),
     "pointsplat_ns.views": ("View", "Views"),
 }
 """Public names by the module that defines them."""
@@ -66,14 +76,19 @@ __all__ = [
     "load",
     "load_refiner",
     "lpips",
+    "make_refiner",
+    "plot_comparison",
+    "plot_distributions",
     "prune",
     "psnr",
     "rasterization",
     "refine",
     "render",
+    "report",
     "sample_views",
     "save",
     "ssim",
+    "write_room",
 ]
 
 

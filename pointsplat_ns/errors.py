@@ -1,22 +1,60 @@
 """Errors that a user can act on.
 
-Everything that can be wrong with a file, a folder or a flag raises a subclass of
-:class:`PointSplatError`; its text is one line that names the file, what was found, what was
-expected and what to do. The command line prints that line and exits with status 1.
+Everything that can be wrong with a file, a folder or a flag raises a subclass of :class:`PointSplatError`. Its text is
+one line that names the file, what was found, what was expected and what to do. The command line prints that line and
+exits with status 1.
 """
 
 
 class PointSplatError(Exception):
-    """Base of all errors caused by input rather than by a bug."""
+    """Base of all errors caused by input rather than by a bug.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> try:
+        ...     ps.prune(ps.example_room(), by="magic")
+        ... except ps.PointSplatError as error:
+        ...     print(error)
+        no method is called 'magic'; expected one of merge, coverage, paper, authors, opacity, volume, log-volume, \
+area, random, lightgaussian, pup
+    """
 
 
 class SceneError(PointSplatError):
-    """A scene (PLY, checkpoint, run folder or tensors) that cannot be used as it is."""
+    """A scene (PLY, checkpoint, run folder or tensors) that cannot be used as it is.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> try:
+        ...     ps.load("nowhere.ply")
+        ... except ps.SceneError as error:
+        ...     print(error)
+        nowhere.ply: no such file; expected a 3DGS .ply, a Splatfacto .ckpt, or a Splatfacto run (its folder or \
+config.yml)
+    """
 
 
 class DataError(PointSplatError):
-    """A dataset folder that is incomplete or inconsistent."""
+    """Photos, poses or views that are missing, incomplete or inconsistent.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> try:
+        ...     ps.sample_views(ps.example_room()[:0], 12)
+        ... except ps.DataError as error:
+        ...     print(error)
+        nothing of the scene can be seen, so there is no place to look from
+    """
 
 
 class BudgetError(PointSplatError, ValueError):
-    """A keep ratio or count that no scene can satisfy."""
+    """A keep ratio, count, size or PSNR that no scene can satisfy.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> try:
+        ...     ps.prune(ps.example_room(), keep=10**9)
+        ... except ps.BudgetError as error:
+        ...     print(error)
+        keep is 1000000000 Gaussians; expected 1 to 62845, the number in the scene
+    """

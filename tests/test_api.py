@@ -20,7 +20,7 @@ from making import ball, same
 from pointsplat_ns import api
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression.prune import SH_CHOICES
-from pointsplat_ns.pruning import METHODS
+from pointsplat_ns.pruning import METHODS, resolve_keep
 
 TEN_LINES = """
 import pointsplat_ns as ps
@@ -49,7 +49,7 @@ def ten_lines(tmp_path_factory) -> dict:
 
 
 def test_the_ten_lines_make_a_scene_of_a_tenth(ten_lines):
-    tenth = round(0.1 * len(ten_lines["scene"]))
+    tenth = resolve_keep(len(ten_lines["scene"]), "10%")
     assert len(ten_lines["small"]) == len(ten_lines["refined"]) == len(ten_lines["result"].scene) == tenth
 
 

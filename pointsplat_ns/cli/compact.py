@@ -50,7 +50,6 @@ def compact(
         force: overwrite files that exist.
     """
     import pointsplat_ns as ps
-    from pointsplat_ns.compression.pictures import plot_comparison
     from pointsplat_ns.compression.prune import check_options
     from pointsplat_ns.io import read_scene
 
@@ -66,4 +65,4 @@ def compact(
     print_result(what, len(dense), result.scene, result.seconds, None if dry_run else output)
     print_distributions(dense, result.scene)
     if picture is not None:
-        print(plot_comparison(dense, result, picture))
+        print(ps.plot_comparison(dense, result, picture))

@@ -87,7 +87,6 @@ def train_and_judge(
         refiner_steps: training steps of the refiner.
         photos: of each room: how many, their width and height in pixels.
     """
-    from pointsplat_ns.cli.report import show_report
     from pointsplat_ns.nerfstudio_plugin.commands import (
         REFINER_METHOD,
         SCENE_METHOD,
@@ -96,6 +95,7 @@ def train_and_judge(
         train_refiner_command,
         train_scene_command,
     )
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.report import show_report
     from pointsplat_ns.nerfstudio_plugin.pointsplat.results import read_evaluation
     from pointsplat_ns.nerfstudio_plugin.running import finished, run
     from pointsplat_ns.rooms import write_room

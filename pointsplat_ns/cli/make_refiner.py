@@ -31,10 +31,10 @@ def make_refiner(
         workers: scenes trained side by side, on one thread each; by default as many as there are cores.
         seed: of the network's initial weights and of the order of scenes and views.
     """
-    from pointsplat_ns.cli.report import show_report
-    from pointsplat_ns.nerfstudio_plugin.pointsplat import make_refiner as recipe
+    import pointsplat_ns as ps
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.report import show_report
 
-    made = recipe.make_refiner(output, weights, size, steps, rooms, workers, seed)
+    made = ps.make_refiner(output, weights, size, steps, rooms, workers, seed)
     show_report(made.results)
     print(f"{made.weights}: the refiner, {made.weights.stat().st_size / 1e6:.1f} MB")
     print(f"{made.card}: what it was made of, and what it does")

@@ -50,7 +50,6 @@ def prune(
         force: overwrite files that exist.
     """
     import pointsplat_ns as ps
-    from pointsplat_ns.compression.distributions import plot_distributions
     from pointsplat_ns.compression.prune import check_options
     from pointsplat_ns.io import read_scene
 
@@ -68,5 +67,5 @@ def prune(
     print_result("kept", len(dense), small, seconds, None if dry_run else output)
     print_distributions(dense, small)
     if plot is not None:
-        plot_distributions({"before": dense, "after": small}, plot)
+        ps.plot_distributions({"before": dense, "after": small}, plot)
         print(f"{plot}: opacity and volume, before and after")

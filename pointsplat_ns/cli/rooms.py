@@ -24,7 +24,7 @@ def rooms(
         width: of a photo, pixels.
         height: of a photo, pixels.
     """
-    from pointsplat_ns.rooms import write_room
+    import pointsplat_ns as ps
 
     for seed in seeds:
-        print(write_room(output / f"room{seed}", seed, frames, width, height))
+        print(ps.write_room(output / f"room{seed}", seed, frames, width, height))

@@ -41,6 +41,16 @@ def plot_distributions(scenes: dict[str, Gaussians], path: Path | str) -> None:
 
     Raises:
         SceneError: if ``path`` cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> room = ps.example_room()
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     picture = Path(folder) / "kept.png"
+        ...     ps.plot_distributions({"before": room, "after": ps.prune(room, 0.1, by="opacity")}, picture)
+        ...     picture.is_file()
+        True
     """
     from matplotlib.figure import Figure
 

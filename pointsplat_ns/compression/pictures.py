@@ -33,6 +33,15 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> st
 
     Raises:
         SceneError: if it cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> room = ps.example_room()
+        >>> result = ps.compact(room, keep=500, views=ps.sample_views(room, 2, width=64, height=48))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     print(ps.plot_comparison(room, result, f"{folder}/shown.png").endswith("side by side"))
+        True
     """
     if result.reference is None:
         return f"{path}: not drawn, as there is no view to draw"

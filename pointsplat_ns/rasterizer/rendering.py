@@ -149,6 +149,17 @@ def rasterization(
     Raises:
         ValueError: if a shape or option does not fit.
         PointSplatError: if gsplat is asked for and cannot be used.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> room = ps.example_room()
+        >>> views = ps.sample_views(room, 2, width=64, height=48)
+        >>> renders, alphas, meta = ps.rasterization(
+        ...     room.means, room.quats, room.stds, room.alphas, room.sh,
+        ...     views.viewmats.float(), views.Ks.float(), width=64, height=48, sh_degree=room.sh_degree,
+        ... )
+        >>> tuple(renders.shape), tuple(alphas.shape)
+        ((2, 48, 64, 3), (2, 48, 64, 1))
     """
     if backend != "torch" and use_gsplat(backend, means.device):
         from gsplat.rendering import rasterization as gsplat_rasterization

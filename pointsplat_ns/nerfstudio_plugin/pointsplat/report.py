@@ -1,0 +1,100 @@
+"""An evaluation of a refiner as a table for a person. nerfstudio is not imported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pointsplat_ns.nerfstudio_plugin.pointsplat.results import VARIANTS, read_evaluation
+
+if TYPE_CHECKING:
+    pass
+
+PHOTOS = "photos"
+"""What an evaluation that does not say was compared with."""
+
+NAMES = {PHOTOS: "held-out photos", "dense renders": "the dense scenes' own renders"}
+"""What is compared with, in words."""
+
+
+def report(evaluation: str | Path) -> None:
+    """Print what ``ns-eval`` wrote of a ``pointsplat`` run: dense, pruned and refined scenes side by side.
+
+    PSNR is in dB, fps one over the median time of a frame, and megabytes are 10^6 bytes of float32 parameters.
+
+    Args:
+        evaluation: the JSON file.
+
+    Raises:
+        DataError: if it is something else.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> ps.report("evaluation.json")
+        Traceback (most recent call last):
+        ...
+        pointsplat_ns.errors.DataError: evaluation.json: cannot be read (No such file or directory); expected what \
+ns-eval wrote
+    """
+    show_report(read_evaluation(Path(evaluation)))
+
+
+def show_report(results: dict[str, Any]) -> None:
+    """Print an evaluation: a table for each thing compared with, and why LPIPS is missing if it is."""
+    from rich.console import Console
+
+    for table in report_tables(results):
+        Console().print(table)
+    if "lpips_note" in results:
+        print(f"no LPIPS: {results['lpips_note']}")
+
+
+def report_tables(results: dict[str, Any]) -> list:
+    """A rich table for what was compared with photos, and one for what was compared with dense renders; no average
+    mixes the two."""
+    other = results.get("against_dense_renders")
+    parts = [results] if other is None else [results, other]
+    return [_table(results, part) for part in parts]
+
+
+def _table(results: dict[str, Any], part: dict[str, Any]):
+    """One row for each scene and variant of a part, then its averages; "seen" is whether it was trained on."""
+    from rich.table import Table
+
+    settings = results.get("settings", {})
+    reference = part.get("reference", PHOTOS)
+    title = f"keep {settings.get('keep')}, by {settings.get('by')}, refiner {settings.get('size')}"
+    table = Table(title=f"{title}; compared with {NAMES.get(reference, reference)}")
+    table.add_column("scene")
+    table.add_column("seen")
+    table.add_column("variant")
+    for name in ("PSNR dB", "SSIM", "LPIPS", "splats", "MB", "fps"):
+        table.add_column(name, justify="right")
+    blocks = [
+        (name, "yes" if scene["seen_in_training"] else "never", scene)
+        for name, scene in results["scenes"].items()
+        if scene.get("reference", PHOTOS) == reference
+    ]
+    if len(blocks) > 1:
+        averages = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
+        blocks += [("average", seen, part[key]) for seen, key in averages if key in part]
+    for title, seen, block in blocks:
+        for i, row in enumerate(VARIANTS):
+            values = block[row]
+            table.add_row(
+                title if i == 0 else "",
+                seen if i == 0 else "",
+                row,
+                _number(values["psnr"], 2),
+                _number(values["ssim"], 3),
+                _number(values["lpips"], 3),
+                _number(values["gaussians"], 0),
+                _number(values["megabytes"], 2),
+                _number(values["fps"], 1),
+                end_section=i == len(VARIANTS) - 1,
+            )
+    return table
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:,.{digits}f}"
