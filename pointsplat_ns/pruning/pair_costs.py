@@ -149,8 +149,10 @@ def costs_of(state: Remaining, first: Tensor, second: Tensor) -> Tensor:
     # Pass 2: the change of colour against the surroundings, and of coverage against the background.
     costs = []
     for i, j, seen in zip(first.split(CHUNK), second.split(CHUNK), kept, strict=True):
-        sides = zip(seen, covers, arounds, strict=True)
-        costs.append(sum(_cost_seen(state, i, j, pairs, cover, around) for pairs, cover, around in sides).float())
+        cost = torch.zeros_like(seen[0].weight)
+        for pairs, cover, around in zip(seen, covers, arounds, strict=True):
+            cost += _cost_seen(state, i, j, pairs, cover, around)
+        costs.append(cost.float())
     return torch.cat(costs)
 
 

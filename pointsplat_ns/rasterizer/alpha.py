@@ -39,7 +39,7 @@ def alphas_(log2_alpha: Tensor, alpha_min: float | Tensor, may_clamp: bool = Tru
         alpha = alpha.clamp_(max=ALPHA_MAX)
     if isinstance(alpha_min, Tensor):  # of compiled code, which would be compiled anew for every number
         return torch.where(alpha > alpha_min, alpha, 0.0)
-    return F.threshold_(alpha, alpha_min, 0.0)
+    return F.threshold(alpha, alpha_min, 0.0, inplace=True)
 
 
 def is_clamped(alpha: Tensor) -> Tensor:

@@ -252,10 +252,11 @@ class _Summed:
     """Hands on the sum of what it is called with, at the last of so many calls."""
 
     def __init__(self, receiver: Callable[[Tensor], None], calls: int):
-        self.receiver, self.left, self.total = receiver, calls, None
+        self.receiver, self.left = receiver, calls
+        self.total: Tensor | None = None
 
     def __call__(self, values: Tensor) -> None:
-        self.total = values if self.total is None else self.total + values
+        total = self.total = values if self.total is None else self.total + values
         self.left -= 1
         if self.left == 0:
-            self.receiver(self.total)
+            self.receiver(total)

@@ -218,7 +218,7 @@ def rasterization(
     def keep_absgrad(values: Tensor) -> None:
         if not packed:
             values = values.new_zeros(cameras * n, 2).index_copy_(0, dense_ids, values).view(cameras, n, 2)
-        meta_means2d.absgrad = values
+        setattr(meta_means2d, "absgrad", values)  # noqa: B010 - where gsplat puts it, on the tensor itself
 
     image, through = blend(
         means2d, cov2d, det, alphas, torch.cat(channels, dim=-1), footprints,

@@ -21,7 +21,8 @@ def _check_degree(degree: int) -> None:
         raise ValueError(f"SH degree is {degree}; expected 0 to 3")
 
 
-def _basis_rows(x: Tensor, y: Tensor, z: Tensor, degree: int) -> list[Tensor]:
+def _basis_rows(unit: Tensor, degree: int) -> list[Tensor]:
+    x, y, z = unit
     rows = [torch.full_like(x, C0)]
     if degree >= 1:
         rows += [-C1 * y, C1 * z, -C1 * x]
@@ -48,8 +49,9 @@ def _basis_rows(x: Tensor, y: Tensor, z: Tensor, degree: int) -> list[Tensor]:
     return rows
 
 
-def _basis_backward(x: Tensor, y: Tensor, z: Tensor, grad: Tensor, degree: int) -> Tensor:
+def _basis_backward(unit: Tensor, grad: Tensor, degree: int) -> Tensor:
     """Gradient (3, M) by the unit direction, from the gradients ((degree + 1)^2, M) of the basis."""
+    x, y, z = unit
     gx, gy, gz = -C1 * grad[3], -C1 * grad[1], C1 * grad[2]
     if degree >= 2:
         a, b, c, d, e = C2[0] * grad[4], C2[0] * grad[5], 2 * C2[1] * grad[6], C2[0] * grad[7], 2 * C2[2] * grad[8]
@@ -100,7 +102,7 @@ class _Color(torch.autograd.Function):
     def forward(ctx, directions, coefficients, ids, degree):
         used = (degree + 1) ** 2
         unit, inverse_length = unit_rows(directions.T.contiguous())
-        basis = torch.stack(_basis_rows(*unit, degree)).T.contiguous()
+        basis = torch.stack(_basis_rows(unit, degree)).T.contiguous()
         color = directions.new_empty(directions.shape[0], 3)
         for part in _blocks(color.shape[0], color.device.type == "cpu"):
             chosen = coefficients.index_select(0, ids[part])[:, :used]
@@ -127,7 +129,7 @@ class _Color(torch.autograd.Function):
                 grad_coefficients[:, :used].index_copy_(0, ids[part], rows)
         grad_directions = None
         if grad_basis is not None:
-            grad_unit = _basis_backward(*unit, grad_basis.T.contiguous(), ctx.degree)
+            grad_unit = _basis_backward(unit, grad_basis.T.contiguous(), ctx.degree)
             across = grad_unit - unit * (unit * grad_unit).sum(0)
             grad_directions = (across * inverse_length).T.contiguous()
         return grad_directions, grad_coefficients, None, None
@@ -175,4 +177,4 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
         ValueError: if the degree is not 0 to 3.
     """
     _check_degree(degree)
-    return torch.stack(_basis_rows(*directions.unbind(-1), degree), dim=-1)
+    return torch.stack(_basis_rows(directions.movedim(-1, 0), degree), dim=-1)

@@ -17,13 +17,15 @@ class BatchNorm(nn.BatchNorm1d):
     momentum to take over: otherwise a short training is evaluated with what they started from.
     """
 
+    MOMENTUM = 0.01
+
     def __init__(self, channels: int):
-        super().__init__(channels, eps=1e-3, momentum=0.01)
+        super().__init__(channels, eps=1e-3, momentum=self.MOMENTUM)
 
     def forward(self, x: Tensor) -> Tensor:
         use_batch = self.training and x.shape[0] > 1
-        momentum = self.momentum
-        if use_batch:
+        momentum = self.MOMENTUM
+        if use_batch and self.num_batches_tracked is not None:
             self.num_batches_tracked.add_(1)
             momentum = max(momentum, 1.0 / float(self.num_batches_tracked))
         return nn.functional.batch_norm(

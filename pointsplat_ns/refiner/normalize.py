@@ -61,7 +61,7 @@ class UnitCube:
         """Log-scales in units of the cube, in float64. # [N, 3]"""
         return scales.double() - self.extent.log()
 
-    def to(self, device: torch.device) -> UnitCube:
+    def to(self, device: torch.device | str) -> UnitCube:
         return UnitCube(self.centre.to(device), self.extent.to(device))
 
 

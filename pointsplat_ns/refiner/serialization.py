@@ -88,7 +88,8 @@ def _hilbert_states() -> tuple[Tensor, Tensor]:
     mirrored, and the parity that the Gray code carries down. Source: J. Skilling, "Programming the
     Hilbert curve", AIP Conference Proceedings 707 (2004).
     """
-    states = {((0, 1, 2), (0, 0, 0), 0): 0}
+    State = tuple[tuple[int, ...], tuple[int, ...], int]
+    states: dict[State, int] = {((0, 1, 2), (0, 0, 0), 0): 0}
     digits, following = [], []
     for axes, mirrors, parity in (queue := list(states)):
         for octant in range(8):

@@ -85,14 +85,14 @@ class _SubmanifoldConv(Function):
         need_x, need_weight = ctx.needs_input_grad[:2]
         grad_x = grad @ weight[13].T if need_x else None
         grad_weight = torch.zeros_like(weight) if need_weight else None
-        if need_weight:
+        if grad_weight is not None:
             torch.mm(x.T, grad, out=grad_weight[13])
         for k, i, j in _parts(ctx.kernel_map, x):
             grad_i, grad_j = grad.index_select(0, i), grad.index_select(0, j)
-            if need_weight:
+            if grad_weight is not None:
                 grad_weight[14 + k].addmm_(x.index_select(0, j).T, grad_i)
                 grad_weight[12 - k].addmm_(x.index_select(0, i).T, grad_j)
-            if need_x:
+            if grad_x is not None:
                 grad_x.index_add_(0, j, grad_i @ weight[14 + k].T)
                 grad_x.index_add_(0, i, grad_j @ weight[12 - k].T)
         return grad_x, grad_weight, None

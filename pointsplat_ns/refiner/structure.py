@@ -116,7 +116,7 @@ def build_structure(scene: Gaussians, config: RefinerConfig) -> Structure:
     for i, s in enumerate(shifts):
         cell_of, cell_first = _runs(depths, s)
         cells = fine.index_select(0, first.index_select(0, cell_first)) >> s
-        cluster, next_first = (None, None) if i + 1 == len(shifts) else _runs(depths, shifts[i + 1])
+        cluster, next_first = _runs(depths, shifts[i + 1]) if i + 1 < len(shifts) else (None, None)
         levels.append(
             Level(
                 size=len(first),
@@ -127,7 +127,7 @@ def build_structure(scene: Gaussians, config: RefinerConfig) -> Structure:
                 cluster=cluster,
             )
         )
-        if cluster is not None:
+        if cluster is not None and next_first is not None:
             first, depths = first.index_select(0, next_first), depths.index_select(0, next_first)
             orders = [_coarser_pair(along, cluster, len(first)) for along, _ in orders]
     return Structure(cube, order, _invert(order), levels, cells_per_side, structure_key(config))
@@ -185,8 +185,8 @@ def _search(keys: Tensor, side: int) -> tuple[Tensor, Tensor]:
         found.append(numbered.index_select(0, at).add_(dz * m))
         partners.append(index.index_select(0, place.index_select(0, at)))
         place, target = place.add_(hit), target.add_(1)
-    found, order = torch.cat(found).sort()  # into memory order
-    return found, torch.cat(partners).index_select(0, order)
+    in_memory, order = torch.cat(found).sort()
+    return in_memory, torch.cat(partners).index_select(0, order)
 
 
 def _canonical_order(scene: Gaussians, codes: Tensor) -> tuple[Tensor, Tensor]:

@@ -83,6 +83,13 @@ def test_the_hessian_is_the_sum_over_pixels_of_outer_products(mode, case):
     assert wanted.abs().amax(dim=(1, 2)).min() > 0 or case == "behind a wall"
 
 
+def test_the_hessian_of_colours_that_do_not_depend_on_the_direction_is_the_sum_over_pixels_too():
+    scene = make(degree=0)
+    wanted, found = hessians_by_definition(scene, views()[[1]]), sensitivity(scene, views()[[1]])
+    # 1e-10 of the largest entry: both sum some thousand terms in float64, in another order
+    assert (found - wanted).abs().max() <= 1e-10 * wanted.abs().max()
+
+
 def test_the_pup_score_is_the_logarithm_of_the_determinant_of_the_sum_over_views():
     scene = make(5)
     wanted = torch.linalg.slogdet(hessians_by_definition(scene, views())).logabsdet
