@@ -93,7 +93,7 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3) -> int:
 
 
 def _that_fit(n: int, megabytes: float, sh_degree: int) -> int:
-    """How many of ``n`` Gaussians fit into a PLY of so many megabytes."""
+    """How many of ``n`` Gaussians fit into a PLY of a size in megabytes."""
     if not 0 < megabytes < math.inf:
         raise BudgetError(f"keep is {megabytes:g}MB; {WANTED}")
     if n < 1:

@@ -38,7 +38,7 @@ COLOUR_AXES = 8
 
 @dataclass(frozen=True, eq=False)
 class Merged:
-    """What a merging made."""
+    """The result of merging."""
 
     scene: Gaussians
     """K Gaussians in the order of their first members. Those merged with nothing are bit for bit as they were."""

@@ -50,7 +50,7 @@ def lightgaussian_score(
     """
     if not (0 <= beta < math.inf):
         raise ScoreError(f"beta is {beta}; expected 0 or more")
-    _need(views)
+    _need_a_view(views)
     usable = scene.usable()
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
 
@@ -58,7 +58,7 @@ def lightgaussian_score(
         return torch.where(block.alpha > 0, block.before, 0.0).sum(-1, keepdim=True)
 
     with torch.no_grad():
-        for index in _each(views, progress):
+        for index in _indices(views, progress):
             seen = _project(scene.means, scene.stds, scene, views, index)
             through = sum_over_pixels(seen, views.width, views.height, 1, passed)[:, 0]
             total.index_add_(0, seen.ids, (seen.opacities * through).double())
@@ -97,9 +97,9 @@ def pup_score(scene: Gaussians, views: Views, progress: Callable[[float], None] 
 def sensitivity(scene: Gaussians, views: Views, progress: Callable[[float], None] | None = None) -> Tensor:
     """The 6 x 6 Hessian blocks of :func:`pup_score`, (N, 6, 6) float64: mean x, y, z, then the standard
     deviations, per scene unit squared."""
-    _need(views)
+    _need_a_view(views)
     total = torch.zeros(len(scene), 6, 6, dtype=torch.float64, device=scene.device)
-    for index in _each(views, progress):
+    for index in _indices(views, progress):
         means, stds = (value.detach().requires_grad_() for value in (scene.means, scene.stds))
         with torch.enable_grad():
             seen = _project(means, stds, scene, views, index)
@@ -192,13 +192,13 @@ def _project(means: Tensor, stds: Tensor, scene: Gaussians, views: Views, index:
     )
 
 
-def _need(views: Views) -> None:
+def _need_a_view(views: Views) -> None:
     if len(views) == 0:
         raise DataError("no view to score from; expected at least one pose")
 
 
-def _each(views: Views, progress: Callable[[float], None] | None) -> Iterator[int]:
-    """The indices of the views; says after each what share of them is done."""
+def _indices(views: Views, progress: Callable[[float], None] | None) -> Iterator[int]:
+    """The indices of the views; calls ``progress`` after each with the share done."""
     for index in range(len(views)):
         yield index
         if progress is not None:

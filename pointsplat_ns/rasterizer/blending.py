@@ -209,7 +209,7 @@ def blend(
     Args:
         footprints: of the same Gaussians.
         options: an image whose lists of pairs would take more than ``options.memory_budget`` bytes
-            is drawn in several regions, one after the other, and their lists are made again for the
+            is drawn in several regions, one after the other, and their lists are computed again for the
             backward pass.
         absgrad_of: called in the backward pass with the sums over pixels of the absolute gradients
             of means2d, (M, 2).
@@ -249,7 +249,7 @@ def blend(
 
 
 class _Summed:
-    """Hands on the sum of what it is called with, at the last of so many calls."""
+    """Adds up what it is called with, and calls ``receiver`` with the sum at the last of ``calls`` calls."""
 
     def __init__(self, receiver: Callable[[Tensor], None], calls: int):
         self.receiver, self.left = receiver, calls

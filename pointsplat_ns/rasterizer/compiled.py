@@ -95,14 +95,14 @@ def blend_chunk_backward(
 
 @functools.cache
 def kernels(channels: int) -> Kernels | None:
-    """Kernels for float32 on a CPU and so many channels, made at the first call; if that fails, None and a warning."""
+    """Kernels for float32 on a CPU and a number of channels, compiled at the first call; if that fails, None and a warning."""
     try:
-        made = Kernels(
+        compiled = Kernels(
             torch.compile(blend_chunk, dynamic=True, fullgraph=True),
             torch.compile(blend_chunk_backward, dynamic=True, fullgraph=True),
         )
         with torch.no_grad():
-            _check(made, channels)
+            _check(compiled, channels)
     except Exception as error:  # noqa: BLE001 - whatever the compiler meets, eager works
         reason = str(error).strip().splitlines()
         warnings.warn(
@@ -111,11 +111,11 @@ def kernels(channels: int) -> Kernels | None:
             stacklevel=2,
         )
         return None
-    return made
+    return compiled
 
 
-def _check(made: Kernels, channels: int) -> None:
-    """Compile for a block of tiles and compare with eager, so that a miscompilation cannot pass."""
+def _check(compiled: Kernels, channels: int) -> None:
+    """Compile for a block of tiles and compare with the same functions uncompiled, so that a miscompilation cannot pass."""
     b, pixels = 2 * SMALLEST + 1, TILE * TILE
     generator = torch.Generator().manual_seed(0)
 
@@ -127,8 +127,8 @@ def _check(made: Kernels, channels: int) -> None:
     limits = torch.tensor(0.01), torch.tensor(0.1)
     forward = rows, basis, random(b, pixels), random(b, channels, pixels), random(b, pixels), *limits
     backward = rows, basis, random(b, pixels), random(b, pixels), random(b, channels, pixels), *limits
-    pairs = [(made.forward, blend_chunk, forward), (made.backward, blend_chunk_backward, backward)]
-    for compiled, eager, arguments in pairs:
-        for got, wanted in zip(compiled(*arguments), eager(*arguments), strict=True):
+    cases = [(compiled.forward, blend_chunk, forward), (compiled.backward, blend_chunk_backward, backward)]
+    for kernel, plain, arguments in cases:
+        for got, wanted in zip(kernel(*arguments), plain(*arguments), strict=True):
             if (got - wanted).abs().gt(1e-4).float().mean() > 1e-3:  # a threshold may fall either way
-                raise RuntimeError("the compiled kernel does not agree with the eager one")
+                raise RuntimeError("the compiled kernel does not agree with the function it was compiled from")

@@ -14,7 +14,7 @@ def render(scene: Gaussians, views: View | Views) -> Tensor:
     """What a scene looks like from one view or several, over the views' background. Differentiable in the scene.
 
     Args:
-        scene: N Gaussians, on any device; the picture is made there.
+        scene: N Gaussians, on any device; the picture is rendered there.
         views: a :class:`~pointsplat_ns.View`, or :class:`~pointsplat_ns.Views`, whose pictures are then drawn one after
             the other.
 

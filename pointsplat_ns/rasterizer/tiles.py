@@ -5,7 +5,7 @@ centres: for each row of tiles the ellipse's extent in x over that row is known 
 the tiles it covers are an interval.
 
 An image is one region of tiles, or several where its pairs would not fit a budget of memory. A tile's
-list does not depend on the region it is made in.
+list does not depend on the region that it is part of.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ HALF_KERNEL = [
 """The 13 offsets of a 3x3x3 kernel that come after the centre; the other 13 are their negatives."""
 
 TABLE_PER_CELL = 128
-"""Neighbours are looked up in a table of the whole grid where that has at most so many entries, of 4 bytes, for each
+"""Neighbours are looked up in a table of the whole grid where that has at most this many entries, of 4 bytes, for each
 occupied cell, and searched for otherwise: three to eight times slower, at any size of the grid."""
 
 TABLE_LIMIT = 2**26
@@ -212,7 +212,7 @@ def _canonical_order(scene: Gaussians, codes: Tensor) -> tuple[Tensor, Tensor]:
 
 def _adaptive_shift(depths: Tensor) -> int:
     """Bits to drop per axis of the finest codes, so that about one or two positions share a cell."""
-    cells = torch.bincount(depths, minlength=65).flip(0).cumsum(0).flip(0).tolist()  # of at least so many bits
+    cells = torch.bincount(depths, minlength=65).flip(0).cumsum(0).flip(0).tolist()  # of at least that many bits
     for shift in range(FINE_BITS, 0, -1):
         if cells[3 * shift + 1] >= ADAPTIVE_OCCUPANCY * cells[1]:
             return shift

@@ -28,7 +28,7 @@ def save_refiner(refiner: Refiner, path: str | Path, metadata: dict[str, Any] | 
 
     Args:
         refiner: on any device, of any floating type.
-        path: file to write or replace; its folder is made.
+        path: file to write or replace; its folder is created if missing.
         metadata: anything JSON can hold: data, command, steps, results.
     """
     from safetensors.torch import save_file

@@ -178,7 +178,7 @@ def test_without_a_compiler_or_a_cache_the_eager_path_is_used_and_one_line_says_
     environment = {**os.environ, "TORCHINDUCTOR_CACHE_DIR": str(tmp_path), **broken}
     ran = subprocess.run([sys.executable, "-c", PROBE], env=environment, capture_output=True, text=True, timeout=300)
     assert ran.returncode == 0, ran.stderr
-    made, count, message = ran.stdout.strip().splitlines()[-1].split("|", 2)
-    assert (made, count) == ("NONE", "1")
+    state, count, message = ran.stdout.strip().splitlines()[-1].split("|", 2)
+    assert (state, count) == ("NONE", "1")
     assert "stays eager" in message
     assert len(message) < 300

@@ -58,7 +58,7 @@ def test_the_refiner_gives_the_same_scene_and_gradients_whatever_goes_at_once(si
         for mlp in refiner.heads.mlps.values():
             mlp[-1].weight.normal_(std=0.1)
     scene = scene.to(torch.float64)
-    made, grads = [], []
+    scenes, grads = [], []
     for cells in (2**30, 2**13):
         monkeypatch.setattr(rows_module, "CELLS", cells)
         refiner.zero_grad()
@@ -66,8 +66,8 @@ def test_the_refiner_gives_the_same_scene_and_gradients_whatever_goes_at_once(si
         refined = refiner.train()(scene)
         sum(value.square().sum() for value in refined.tensors()).backward()
         with torch.no_grad():
-            made.append([*refined.tensors(), *refiner.eval()(scene).tensors()])
+            scenes.append([*refined.tensors(), *refiner.eval()(scene).tensors()])
         grads.append([p.grad.clone() for p in refiner.parameters()])
     # float64: only the order of sums differs; gradients sum 700 rows of values up to some hundred
-    assert all(torch.allclose(a, b, rtol=1e-9, atol=1e-10) for a, b in zip(*made, strict=True))
+    assert all(torch.allclose(a, b, rtol=1e-9, atol=1e-10) for a, b in zip(*scenes, strict=True))
     assert all(torch.allclose(a, b, rtol=1e-7, atol=1e-7) for a, b in zip(*grads, strict=True))

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -35,7 +35,7 @@ from pointsplat_ns.geometry.neighbours import nearest
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
-from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.nerfstudio_plugin.rasterizer_options import RasterizerOptions
 
 LONE_POINT_SCALE = 0.01
 """Standard deviation, in scene units, of a seed that has no other point to take its size from."""
@@ -66,17 +66,10 @@ class LpipsMetric:
 
 
 @dataclass
-class SplatfactoCpuModelConfig(SplatfactoModelConfig):
+class SplatfactoCpuModelConfig(RasterizerOptions, SplatfactoModelConfig):
     """Splatfacto's config, and the choice of a rasterizer"""
 
     _target: type = field(default_factory=lambda: SplatfactoCpuModel)
-    backend: Literal["auto", "torch", "gsplat"] = "auto"
-    """What draws: torch runs everywhere; gsplat needs CUDA; auto takes gsplat where its kernels are there."""
-    compiled: bool = False
-    """Blend with kernels made by torch.compile: faster on a CPU with a C++ compiler, after a minute of compiling at the
-    first step (once; the result is kept on disk). Where that fails a warning says why, and training goes on without."""
-    quality: Literal["exact", "balanced", "fast"] = "exact"
-    """What training may give up for speed (see the README for how much); evaluation is always exact."""
 
 
 class SplatfactoCpuModel(SplatfactoModel):
@@ -254,7 +247,8 @@ class SplatfactoCpuModel(SplatfactoModel):
             degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
         else:
             colors, degree = torch.sigmoid(params["features_dc"]), None
-        return self._rasterization(
+        return self.config.rasterize(
+            training=self.training,
             means=params["means"],
             quats=params["quats"],
             scales=torch.exp(params["scales"]),
@@ -270,16 +264,6 @@ class SplatfactoCpuModel(SplatfactoModel):
             absgrad=self.strategy.absgrad,
             rasterize_mode=self.config.rasterize_mode,
         )
-
-    def _rasterization(self, **arguments):
-        """Rasterize as the config has it."""
-        config = self.config
-        return rasterization(**arguments, backend=config.backend, compiled=config.compiled, quality=self._quality)
-
-    @property
-    def _quality(self) -> Literal["exact", "balanced", "fast"]:
-        """Evaluation is always exact."""
-        return self.config.quality if self.training else "exact"
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
