@@ -138,8 +138,8 @@ class Case:
         marks.append(now())
         colors = sh_to_color(seen.directions, self.tensors[4].index_select(0, seen.ids), 3)
         marks.append(now())
-        made = [seen.means2d, seen.cov2d, seen.det, seen.opacities, colors]
-        leaves = [t.detach().requires_grad_() for t in made]
+        inputs = [seen.means2d, seen.cov2d, seen.det, seen.opacities, colors]
+        leaves = [t.detach().requires_grad_() for t in inputs]
         marks.append(now())
         footprints = self.footprints_of(seen)
         marks.append(now())
@@ -147,7 +147,7 @@ class Case:
         marks.append(now())
         grads = torch.autograd.grad(drawn, leaves, (self.grad_image[None], -self.grad_alphas[None]))
         marks.append(now())
-        torch.autograd.grad(made, self.tensors, grads)
+        torch.autograd.grad(inputs, self.tensors, grads)
         marks.append(now())
         footprints.tiles(footprints.whole)
         marks.append(now())

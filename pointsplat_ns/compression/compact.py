@@ -18,8 +18,8 @@ from pointsplat_ns.pruning import Keep, method_named, need_usable
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.views import Views
 
-WORTH = 0.1
-"""Refinement that brings less than this, dB, is left out: which side of zero so little is on depends on the views."""
+MIN_GAIN = 0.1
+"""Refinement that gains less than this, dB of PSNR, is left out: the sign of so small a gain depends on the views."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +82,10 @@ def compact_scene(
 
     The smaller scene and the refined one are rendered from some poses and compared with the dense scene's own renders
     by the mean squared error over all pixels of all views. On a scene unlike those that it was trained on, a refiner
-    moves the right way but too far: half of the residuals are tried, too, and the share at the bottom of the parabola
-    through the errors at 0, 1/2 and 1, which is where the least error is if pictures change in proportion. The best is
-    kept if it is :data:`WORTH` it. A wanted PSNR (``auto``) is met before refinement, so that it holds in any case.
+    moves the right way but too far. So half of the residuals are tried, too, and the share at the bottom of the
+    parabola through the errors at 0, 1/2 and 1: there the error is least if renders change in proportion. The best is
+    kept if it gains at least :data:`MIN_GAIN`. A PSNR that is asked for (``auto``) is met before refinement, so that it
+    holds in any case.
 
     Args:
         dense: N Gaussians.
@@ -215,8 +216,8 @@ def bottom_of_parabola(at_zero: float, at_half: float, at_one: float) -> float:
 
 
 def helps(before: Closeness, after: Closeness) -> bool:
-    """Whether refinement is worth keeping, see :data:`WORTH`."""
-    return after.psnr >= before.psnr + WORTH and math.isfinite(before.psnr)
+    """Whether refinement is worth keeping, see :data:`MIN_GAIN`."""
+    return after.psnr >= before.psnr + MIN_GAIN and math.isfinite(before.psnr)
 
 
 def _verdict(before: Closeness, after: Closeness, strength: float) -> str:
@@ -232,7 +233,7 @@ def _verdict(before: Closeness, after: Closeness, strength: float) -> str:
         return f"refinement{share}: {figures}"
     if after.errors == before.errors:
         return f"refinement left out: it changes nothing, {before.psnr:.2f} dB in {_views(count)}"
-    why = "it does not help" if after.psnr <= before.psnr else f"it brings less than {WORTH:g} dB"
+    why = "it does not help" if after.psnr <= before.psnr else f"it brings less than {MIN_GAIN:g} dB"
     return f"refinement left out, {why}: {figures}"
 
 

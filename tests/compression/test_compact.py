@@ -11,7 +11,7 @@ import torch
 import pointsplat_ns.compression.compact as compact_module
 from making import ball, same
 from pointsplat_ns.compression.closeness import DenseReference
-from pointsplat_ns.compression.compact import WORTH, Compacted, at_strength, bottom_of_parabola, compact_scene
+from pointsplat_ns.compression.compact import MIN_GAIN, Compacted, at_strength, bottom_of_parabola, compact_scene
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.compression.view_sampling import sample_views
@@ -122,11 +122,11 @@ def test_a_refiner_that_goes_too_far_is_taken_part_of_the_way(scene, views):
 
 
 def test_what_brings_next_to_nothing_is_left_out(scene, views, monkeypatch):
-    for worth, accepted in ((WORTH, False), (0.001, True)):
-        monkeypatch.setattr(compact_module, "WORTH", worth)
+    for worth, accepted in ((MIN_GAIN, False), (0.001, True)):
+        monkeypatch.setattr(compact_module, "MIN_GAIN", worth)
         result = compacted(scene, trained(tiny_refiner("scales", 0.002)), views)
         assert result.accepted == accepted
-        assert result.before.psnr < result.after.psnr < result.before.psnr + WORTH
+        assert result.before.psnr < result.after.psnr < result.before.psnr + MIN_GAIN
     monkeypatch.undo()
     result = compacted(scene, trained(tiny_refiner("scales", 0.002)), views)
     assert result.verdict.startswith("refinement left out, it brings less than 0.1 dB: ")
