@@ -95,7 +95,7 @@ def blend_chunk_backward(
 
 @functools.cache
 def kernels(channels: int) -> Kernels | None:
-    """Kernels for float32 on a CPU and a number of channels, compiled at the first call; if that fails, None and a warning."""
+    """Kernels for float32 on a CPU, compiled at the first call for a number of channels; None and a warning if it fails."""
     try:
         compiled = Kernels(
             torch.compile(blend_chunk, dynamic=True, fullgraph=True),
@@ -115,7 +115,7 @@ def kernels(channels: int) -> Kernels | None:
 
 
 def _check(compiled: Kernels, channels: int) -> None:
-    """Compile for a block of tiles and compare with the same functions uncompiled, so that a miscompilation cannot pass."""
+    """Compile for a block of tiles and compare with the functions as they are, so that no miscompilation passes."""
     b, pixels = 2 * SMALLEST + 1, TILE * TILE
     generator = torch.Generator().manual_seed(0)
 

@@ -163,9 +163,9 @@ warnings.simplefilter("ignore")
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     from pointsplat_ns.rasterizer.compiled import kernels
-    made = kernels(3)
+    compiled = kernels(3)
 ours = [str(w.message) for w in caught if "stays eager" in str(w.message)]
-print("NONE" if made is None else "MADE", len(ours), ours[0] if ours else "", sep="|")
+print("NONE" if compiled is None else "MADE", len(ours), ours[0] if ours else "", sep="|")
 """
 
 
