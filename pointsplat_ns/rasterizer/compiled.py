@@ -95,7 +95,7 @@ def blend_chunk_backward(
 
 @functools.cache
 def kernels(channels: int) -> Kernels | None:
-    """Kernels for float32 on a CPU, compiled at the first call for a number of channels; None and a warning if it fails."""
+    """Kernels for float32 on a CPU, compiled at the first call for these channels; None and a warning if that fails."""
     try:
         compiled = Kernels(
             torch.compile(blend_chunk, dynamic=True, fullgraph=True),
