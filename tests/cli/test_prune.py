@@ -13,12 +13,11 @@ import pytest
 import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
-from making import same
+from making import normal_scene, same
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.trained_refiner import open_refiner_run, scenes_of_run
 from pointsplat_ns.compression.view_source import COMPARED_VIEWS
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning import METHODS, prune, select
@@ -26,16 +25,9 @@ from pointsplat_ns.pruning import METHODS, prune, select
 SEED = 5
 
 
-def random_scene(n: int = 80, degree: int = 3) -> Gaussians:
-    generator = torch.Generator().manual_seed(SEED)
-    sizes = {"means": 3, "scales": 3, "quats": 4, "opacities": 1, "features_dc": 3}
-    values = {name: torch.randn((n, size), generator=generator) for name, size in sizes.items()}
-    return Gaussians(**values, features_rest=torch.randn((n, (degree + 1) ** 2 - 1, 3), generator=generator))
-
-
 @pytest.fixture()
 def ply(tmp_path) -> Path:
-    write_ply(random_scene(), tmp_path / "scene.ply")
+    write_ply(normal_scene(80, seed=SEED), tmp_path / "scene.ply")
     return tmp_path / "scene.ply"
 
 
@@ -122,7 +114,7 @@ def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
     for by in ("paper", "authors", "log-volume"):
         said = refusal(capsys, output, "prune", ply, "--by", by, "--opacity-weight", "2")
         assert "opacity_weight is 2.0; expected 0 to 1" in said
-    write_ply(random_scene(3).map(lambda value: value * torch.nan), tmp_path / "nothing.ply")
+    write_ply(normal_scene(3, seed=SEED).map(lambda value: value * torch.nan), tmp_path / "nothing.ply")
     assert "holds no Gaussians" in refusal(capsys, output, "prune", tmp_path / "nothing.ply")
 
 
@@ -325,8 +317,8 @@ def test_export_knows_the_scenes_of_a_run_by_the_names_that_its_training_gave_th
     shutil.copytree(trained_walls / "wall-b", tmp_path / "both" / "wall-b")
     for folder in ("both", "plys"):
         for i, name in enumerate(("wall-b.ply", "deep/point cloud.ply")):
-            write_ply(random_scene(30 + i), tmp_path / folder / name)
-    write_ply(random_scene(20), tmp_path / "plys.ply")
+            write_ply(normal_scene(30 + i, seed=SEED), tmp_path / folder / name)
+    write_ply(normal_scene(20, seed=SEED), tmp_path / "plys.ply")
     for data in ("both", "plys", "plys.ply"):
         if supervision == "photos" and data != "both":
             continue
@@ -345,7 +337,7 @@ def test_export_knows_the_scenes_of_a_run_by_the_names_that_its_training_gave_th
 
 
 def test_export_says_that_the_scenes_of_a_run_are_gone(make_refined_run, tmp_path, capsys):
-    write_ply(random_scene(30), tmp_path / "plys" / "a.ply")
+    write_ply(normal_scene(30, seed=SEED), tmp_path / "plys" / "a.ply")
     folder = make_refined_run(tmp_path / "refined", tmp_path / "plys")
     (tmp_path / "plys" / "a.ply").unlink()
     (tmp_path / "plys" / "cloud.ply").write_text("ply\n")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from making import normal_scene
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import METHODS, Megabytes, PruneSettings, WithinPsnr, ply_bytes, prune, score_of, select
@@ -15,12 +16,6 @@ SCORES = [name for name, method in METHODS.items() if method.score and not metho
 WITHOUT_VIEWS = [name for name, method in METHODS.items() if not method.needs_views]
 WITH_VIEWS = [name for name, method in METHODS.items() if method.needs_views]
 WITHOUT_OPACITY_WEIGHT = [name for name, method in METHODS.items() if not method.weighs_opacity]
-
-
-def make(n=60, degree=1, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    shapes = [(n, 3), (n, 3), (n, 4), (n, 1), (n, 3), (n, (degree + 1) ** 2 - 1, 3)]
-    return Gaussians(*(torch.randn(shape, generator=generator) for shape in shapes))
 
 
 def views(count: int = 2) -> Views:
@@ -59,7 +54,7 @@ def test_every_method_says_in_one_clause_what_it_is(by):
 
 @pytest.mark.parametrize("by", SCORES)
 def test_a_score_keeps_the_gaussians_it_ranks_highest(by):
-    scene = make()
+    scene = normal_scene(60, 1)
     chosen = scene[select(score_of(scene, METHODS[by]), 18)]
     for a, b in zip(prune(scene, 0.3, by).tensors(), chosen.tensors(), strict=True):
         assert torch.equal(a, b)
@@ -67,14 +62,14 @@ def test_a_score_keeps_the_gaussians_it_ranks_highest(by):
 
 @pytest.mark.parametrize("by", WITH_VIEWS)
 def test_a_score_that_looks_from_views_keeps_the_gaussians_it_ranks_highest(by):
-    scene = make()
+    scene = normal_scene(60, 1)
     wanted = select(METHODS[by].score(scene, views()), 18)
     assert torch.equal(kept(scene, 0.3, by, views=views()), wanted)
 
 
 @pytest.mark.parametrize("by", WITH_VIEWS)
 def test_views_may_be_made_when_they_are_due(by):
-    scene = make()
+    scene = normal_scene(60, 1)
     assert torch.equal(kept(scene, 0.3, by, views=views), kept(scene, 0.3, by, views=views()))
 
 
@@ -83,50 +78,50 @@ def test_views_are_not_made_for_a_method_that_needs_none(by):
     def never():
         raise AssertionError("views were made")
 
-    assert len(prune(make(), 0.3, by, views=never)) == 18
+    assert len(prune(normal_scene(60, 1), 0.3, by, views=never)) == 18
 
 
 @pytest.mark.parametrize("by", WITH_VIEWS)
 def test_a_method_that_needs_views_says_that_there_are_none(by):
     with pytest.raises(DataError, match=f"{by} looks at the scene from poses; expected views"):
-        prune(make(), 0.3, by)
+        prune(normal_scene(60, 1), 0.3, by)
 
 
 @pytest.mark.parametrize("by", ["merge", *WITH_VIEWS])
 def test_progress_rises_to_one(by):
     shares = []
-    prune(make(), 0.3, by, views=views(), progress=shares.append)
+    prune(normal_scene(60, 1), 0.3, by, views=views(), progress=shares.append)
     assert shares and shares == sorted(shares) and shares[-1] == 1.0
 
 
 @pytest.mark.parametrize(("keep", "count"), [(0.3, 18), (7, 7), (1, 1), (1.0, 60)])
 def test_merging_makes_exactly_as_many_as_asked(keep, count):
-    assert len(prune(make(), keep)) == count
+    assert len(prune(normal_scene(60, 1), keep)) == count
 
 
 @pytest.mark.parametrize("by", WITHOUT_VIEWS)
 @pytest.mark.parametrize(("keep", "count"), [("10%", 6), ("0.3", 18), ("7", 7), ("1.0", 60), ("100MB", 60)])
 def test_a_budget_may_be_written_as_on_the_command_line(by, keep, count):
-    assert len(prune(make(), keep, by)) == count
+    assert len(prune(normal_scene(60, 1), keep, by)) == count
 
 
 @pytest.mark.parametrize("by", WITHOUT_VIEWS)
 @pytest.mark.parametrize("keep", [0, 0.0, 1.5, math.nan, 61, -1, "0%", "many", "61"])
 def test_a_budget_out_of_range_is_refused(by, keep):
     with pytest.raises(BudgetError, match="keep is"):
-        prune(make(), keep, by)
+        prune(normal_scene(60, 1), keep, by)
 
 
 @pytest.mark.parametrize("keep", ["auto", "auto:35", WithinPsnr(35.0)])
 def test_a_budget_that_needs_renders_is_refused(keep):
     with pytest.raises(BudgetError, match="keep is auto, which is found by rendering"):
-        prune(make(), keep)
+        prune(normal_scene(60, 1), keep)
 
 
 @pytest.mark.parametrize("by", WITHOUT_VIEWS)
 def test_a_scene_with_nothing_to_draw_is_refused(by):
     with pytest.raises(SceneError, match="none of the 60 Gaussians can be drawn"):
-        prune(make().map(lambda value: value * math.nan), 5, by)
+        prune(normal_scene(60, 1).map(lambda value: value * math.nan), 5, by)
 
 
 @pytest.mark.parametrize("by", WITHOUT_VIEWS)
@@ -139,13 +134,13 @@ def test_an_unknown_method_is_said_with_those_there_are():
     with pytest.raises(
         PointSplatError, match="no method is called 'best'; expected one of merge, coverage, paper, auth"
     ):
-        prune(make(), 0.5, "best")
+        prune(normal_scene(60, 1), 0.5, "best")
 
 
 @pytest.mark.parametrize("by", SCORES)
 @pytest.mark.parametrize(("keep", "k"), [(0.3, 15), (1, 1), (1.0, 50), (37, 37)])
 def test_a_score_keeps_exactly_k_bit_for_bit_and_in_order(by, keep, k):
-    scene = make(50)
+    scene = normal_scene(50, 1)
     scene.quats[:, 0] = -0.0
     scene.opacities[::7] = math.inf
     pruned, indices, scores = prune(scene, keep, by), kept(scene, keep, by), score_of(scene, METHODS[by])
@@ -157,19 +152,19 @@ def test_a_score_keeps_exactly_k_bit_for_bit_and_in_order(by, keep, k):
 
 
 def test_a_smaller_budget_keeps_a_subset_of_a_larger_one():
-    scene = make(200)
+    scene = normal_scene(200, 1)
     sets = [set(kept(scene, keep).tolist()) for keep in (0.1, 0.3, 0.5)]
     assert sets[0] < sets[1] < sets[2]
 
 
 def test_pruning_does_not_depend_on_scale_or_units():
-    scene = make(200)
+    scene = normal_scene(200, 1)
     metres = scene.replace(means=scene.means * 1000, scales=scene.scales.double().add(math.log(1000)).float())
     assert kept(scene, 0.3).tolist() == kept(metres, 0.3).tolist()
 
 
 def test_the_opacity_weight_reaches_the_score():
-    scene = make(50)
+    scene = normal_scene(50, 1)
     most_opaque = scene.opacities[:, 0].topk(10).indices.sort().values
     assert torch.equal(kept(scene, 10, opacity_weight=1.0), most_opaque)
 
@@ -177,26 +172,26 @@ def test_the_opacity_weight_reaches_the_score():
 @pytest.mark.parametrize("by", WITHOUT_OPACITY_WEIGHT)
 def test_an_opacity_weight_is_refused_by_methods_that_do_not_weigh_it(by):
     with pytest.raises(PointSplatError, match=f"{by} does not weigh opacity; .* one of paper, authors, log-volume$"):
-        prune(make(), 0.3, by, views=views(), opacity_weight=0.5)
+        prune(normal_scene(60, 1), 0.3, by, views=views(), opacity_weight=0.5)
 
 
 def test_a_scene_in_a_graph_stays_in_it():
-    scene = make().map(lambda value: value.requires_grad_())
+    scene = normal_scene(60, 1).map(lambda value: value.requires_grad_())
     prune(scene, 5, "paper").means.sum().backward()
     assert scene.means.grad.sum() == 15  # 5 rows of 3 ones
 
 
 def test_a_size_keeps_what_fits_at_the_degree_of_the_scene():
-    assert len(prune(make(50, degree=1), Megabytes(ply_bytes(20, 1) / 1e6), "paper")) == 20
+    assert len(prune(normal_scene(50, 1), Megabytes(ply_bytes(20, 1) / 1e6), "paper")) == 20
 
 
 @pytest.mark.parametrize(("keep", "count"), [(0.3, 18), (1.0, 60), (1, 1), (7, 7), (7.0, 7)])
 def test_settings_prune_to_a_ratio_or_a_count(keep, count):
-    assert len(PruneSettings(keep).prune(make())) == count
+    assert len(PruneSettings(keep).prune(normal_scene(60, 1))) == count
 
 
 def test_settings_prune_as_prune_does():
-    scene = make()
+    scene = normal_scene(60, 1)
     settings = PruneSettings(0.3, "authors", opacity_weight=0.9)
     for a, b in zip(
         settings.prune(scene).tensors(), prune(scene, 0.3, "authors", opacity_weight=0.9).tensors(), strict=True

@@ -6,17 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from making import normal_scene
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import METHODS, prune
 from pointsplat_ns.pruning.scores import paper_score
 
 SCORES = {name: method.score for name, method in METHODS.items() if method.score and not method.needs_views}
-
-
-def make(n=50, degree=1, seed=0, dtype=torch.float32):
-    generator = torch.Generator().manual_seed(seed)
-    shapes = [(n, 3), (n, 3), (n, 4), (n, 1), (n, 3), (n, (degree + 1) ** 2 - 1, 3)]
-    return Gaussians(*(torch.randn(shape, generator=generator, dtype=dtype) for shape in shapes))
 
 
 def equation_3(scene, weight):
@@ -33,27 +28,27 @@ def equation_3(scene, weight):
 @pytest.mark.parametrize("weight", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_paper_score_is_equation_3(weight, dtype):
-    scene = make(dtype=dtype)
+    scene = normal_scene(50, 1, dtype=dtype)
     scene = scene.replace(scales=3 * scene.scales - 4)
     # 1e-12: both are computed in at least float64, over 50 terms
     assert torch.allclose(paper_score(scene, weight), equation_3(scene, weight), rtol=1e-12, atol=1e-12)
 
 
 def test_the_papers_weight_is_the_default():
-    assert torch.equal(paper_score(make()), paper_score(make(), 0.3))
+    assert torch.equal(paper_score(normal_scene(50, 1)), paper_score(normal_scene(50, 1), 0.3))
 
 
 def test_a_ball_outranks_a_pancake_of_smaller_volume():
     # The product of the logarithms, which is no volume, would rank them the other way around.
     scales = torch.log(torch.tensor([[0.1, 0.1, 1e-5], [0.01, 0.01, 0.01], [0.02, 0.02, 0.02]]))
-    scene = make(3).replace(scales=scales, opacities=torch.zeros(3, 1))
+    scene = normal_scene(3, 1).replace(scales=scales, opacities=torch.zeros(3, 1))
     score = paper_score(scene)
     assert score[2] > score[1] > score[0]
 
 
 @pytest.mark.parametrize("shift", [-80.0, 80.0, -1e4, 1e4])
 def test_log_scales_far_out_neither_overflow_nor_change_the_score(shift):
-    scene = make(dtype=torch.float64)
+    scene = normal_scene(50, 1, dtype=torch.float64)
     # Powers of two keep the shifted log-scales exact enough: 1e4 leaves 12 digits of each, hence 1e-8.
     moved = paper_score(scene.replace(scales=scene.scales + shift))
     assert moved.isfinite().all() and torch.allclose(moved, paper_score(scene), atol=1e-8)
@@ -62,14 +57,14 @@ def test_log_scales_far_out_neither_overflow_nor_change_the_score(shift):
 def test_a_spread_beyond_any_exponent_is_finite_and_finds_the_giant():
     scales = torch.full((4, 3), -80.0)
     scales[2] = 80.0
-    score = paper_score(make(4).replace(scales=scales, opacities=torch.zeros(4, 1)))
+    score = paper_score(normal_scene(4, 1).replace(scales=scales, opacities=torch.zeros(4, 1)))
     assert score.isfinite().all() and int(score.argmax()) == 2
 
 
 @pytest.mark.parametrize("case", ["one", "same", "flat"])
 def test_without_variance_every_score_is_zero(case):
     n = 1 if case == "one" else 6
-    scene = make(1)[[0] * n]
+    scene = normal_scene(1, 1)[[0] * n]
     if case == "flat":
         scene = scene.replace(scales=torch.full((n, 3), -math.inf))
     assert paper_score(scene).tolist() == [0.0] * n
@@ -77,7 +72,7 @@ def test_without_variance_every_score_is_zero(case):
 
 def test_infinite_logits_are_opacity_1_and_0():
     logits = torch.tensor([[math.inf], [-math.inf], [0.0], [40.0]])
-    score = paper_score(make(4).replace(opacities=logits, scales=torch.zeros(4, 3)), 1.0)
+    score = paper_score(normal_scene(4, 1).replace(opacities=logits, scales=torch.zeros(4, 3)), 1.0)
     assert score.isfinite().all()
     assert score[0] >= score[3] > score[2] > score[1] and score[2] == pytest.approx(
         float((score[0] + score[1]) / 2), abs=0.5
@@ -87,13 +82,13 @@ def test_infinite_logits_are_opacity_1_and_0():
 def test_flat_gaussians_have_no_volume():
     scales = torch.zeros(3, 3)
     scales[1, 2] = -math.inf
-    score = paper_score(make(3).replace(scales=scales, opacities=torch.zeros(3, 1)))
+    score = paper_score(normal_scene(3, 1).replace(scales=scales, opacities=torch.zeros(3, 1)))
     assert score.isfinite().all() and int(score.argmin()) == 1
 
 
 @pytest.mark.parametrize("name", sorted(SCORES))
 def test_unusable_gaussians_score_nan_and_leave_the_others_alone(name):
-    scene = make(6)
+    scene = normal_scene(6, 1)
     spoiled = scene.replace(means=scene.means.clone(), scales=scene.scales.clone())
     spoiled.means[1, 0], spoiled.scales[4, 2] = math.nan, math.inf
     score = SCORES[name](spoiled)
@@ -104,14 +99,14 @@ def test_unusable_gaussians_score_nan_and_leave_the_others_alone(name):
 
 @pytest.mark.parametrize("name", sorted(SCORES))
 def test_every_score_is_float64_and_takes_an_empty_scene(name):
-    assert SCORES[name](make(5)).dtype == torch.float64 and SCORES[name](make(5)).shape == (5,)
+    assert SCORES[name](normal_scene(5, 1)).dtype == torch.float64 and SCORES[name](normal_scene(5, 1)).shape == (5,)
     assert SCORES[name](Gaussians.empty()).shape == (0,)
-    only_bad = make(2).map(lambda value: value * math.nan)
+    only_bad = normal_scene(2, 1).map(lambda value: value * math.nan)
     assert SCORES[name](only_bad).isnan().all()
 
 
 def test_opacity_and_volume_rank_as_alpha_and_the_volume_do():
-    scene = make(dtype=torch.float64)
+    scene = normal_scene(50, 1, dtype=torch.float64)
     assert torch.equal(SCORES["opacity"](scene).argsort(), scene.alphas.argsort())
     assert torch.equal(SCORES["volume"](scene).argsort(), scene.stds.prod(dim=1).argsort())
     volume = 4 / 3 * math.pi * scene.stds.prod(dim=1)
@@ -119,7 +114,7 @@ def test_opacity_and_volume_rank_as_alpha_and_the_volume_do():
 
 
 def test_random_is_the_same_for_one_seed_and_another_for_the_next():
-    scene = make()
+    scene = normal_scene(50, 1)
     assert torch.equal(SCORES["random"](scene, seed=3), SCORES["random"](scene, seed=3))
     assert not torch.equal(SCORES["random"](scene, seed=3), SCORES["random"](scene, seed=4))
 
@@ -127,7 +122,7 @@ def test_random_is_the_same_for_one_seed_and_another_for_the_next():
 @pytest.mark.parametrize("weight", [-0.1, 1.1, math.nan])
 def test_a_weight_outside_its_range_is_said(weight):
     with pytest.raises(ValueError, match="expected 0 to 1"):
-        paper_score(make(), weight)
+        paper_score(normal_scene(50, 1), weight)
 
 
 def z(x):
@@ -136,7 +131,7 @@ def z(x):
 
 @pytest.mark.parametrize("weight", [0.0, 0.3, 1.0])
 def test_authors_is_the_formula_of_the_released_code(weight):
-    scene = make()
+    scene = normal_scene(50, 1)
     logits, scales = (x.double().numpy().astype(np.longdouble) for x in (scene.opacities[:, 0], scene.scales))
     product = np.longdouble(4 / 3 * math.pi) * np.prod(scales + np.longdouble(1e-6), axis=1)
     wanted = torch.from_numpy((weight * z(logits) + (1 - weight) * z(product)).astype(np.float64))
@@ -146,20 +141,20 @@ def test_authors_is_the_formula_of_the_released_code(weight):
 
 def test_authors_ranks_a_pancake_above_a_ball_as_eq_3_does_not():
     scales = torch.log(torch.tensor([[0.1, 0.1, 1e-5], [0.01, 0.01, 0.01]]))
-    scene = make(2).replace(scales=scales, opacities=torch.zeros(2, 1))
+    scene = normal_scene(2, 1).replace(scales=scales, opacities=torch.zeros(2, 1))
     volume, product = SCORES["paper"](scene), SCORES["authors"](scene)
     assert volume[1] > volume[0] and product[0] > product[1]
 
 
 def test_log_volume_is_eq_3_with_the_logarithm():
-    scene = make()
+    scene = normal_scene(50, 1)
     alphas = 1 / (1 + np.exp(-scene.opacities[:, 0].double().numpy()))
     wanted = 0.3 * z(alphas) + 0.7 * z(scene.scales.double().sum(1).numpy())
     assert np.allclose(SCORES["log-volume"](scene), wanted, rtol=1e-12, atol=1e-12)
 
 
 def test_area_is_alpha_times_the_two_largest_axes():
-    scene = make(dtype=torch.float64)
+    scene = normal_scene(50, 1, dtype=torch.float64)
     largest = scene.stds.sort(dim=1, descending=True).values
     # 1e-12: a handful of roundings in float64
     assert torch.allclose(SCORES["area"](scene).exp(), scene.alphas * largest[:, 0] * largest[:, 1], rtol=1e-12)
@@ -168,7 +163,7 @@ def test_area_is_alpha_times_the_two_largest_axes():
 @pytest.mark.parametrize("name", sorted(SCORES))
 @pytest.mark.parametrize("case", ["huge", "tiny", "mixed", "infinite logits", "flat", "flat and clear", "far"])
 def test_no_score_of_what_can_be_drawn_is_nan(name, case):
-    scene = make(40)
+    scene = normal_scene(40, 1)
     infinite = torch.tensor([math.inf, -math.inf]).repeat(20)[:, None]
     flat = scene.scales.clone()
     flat[::3, 1] = -math.inf
@@ -189,7 +184,7 @@ def test_no_score_of_what_can_be_drawn_is_nan(name, case):
 
 @pytest.mark.parametrize("name", sorted(set(SCORES) - {"random"}))
 def test_float32_and_float64_rank_alike(name):
-    scene = make(300)
+    scene = normal_scene(300, 1)
     single, double = SCORES[name](scene), SCORES[name](scene.to(torch.float64))
     # Both are computed in float64 from the same values, positions in a grid of 2^20 cells included.
     assert torch.allclose(single, double, rtol=1e-9, atol=1e-12)
@@ -197,7 +192,7 @@ def test_float32_and_float64_rank_alike(name):
 
 @pytest.mark.parametrize("name", ["paper", "authors", "opacity", "area", "log-volume"])
 def test_infinite_logits_keep_their_rank(name):
-    scene = make(9)
+    scene = normal_scene(9, 1)
     logits = torch.linspace(-3, 3, 9)[:, None]
     logits[0], logits[-1] = -math.inf, math.inf
     score = SCORES[name](scene.replace(opacities=logits, scales=torch.zeros(9, 3)))
@@ -206,7 +201,7 @@ def test_infinite_logits_keep_their_rank(name):
 
 @pytest.mark.parametrize("name", sorted(set(SCORES) - {"opacity", "random"}))
 def test_a_single_giant_is_found_and_leaves_the_others_apart(name):
-    scene = make(60)
+    scene = normal_scene(60, 1)
     scene = scene.replace(scales=scene.scales.clone(), opacities=torch.zeros(60, 1))
     scene.scales[17] = 80.0
     score = SCORES[name](scene)
@@ -217,11 +212,11 @@ def test_a_single_giant_is_found_and_leaves_the_others_apart(name):
 
 @pytest.mark.parametrize("name", sorted(set(SCORES) - {"random"}))
 def test_of_equal_gaussians_at_one_place_any_will_do(name):
-    scene = make(1)[[0] * 30]
+    scene = normal_scene(1, 1)[[0] * 30]
     assert SCORES[name](scene).isfinite().all() and len(prune(scene, 10, name)) == 10
 
 
 @pytest.mark.parametrize("name", [name for name, method in METHODS.items() if method.weighs_opacity])
 def test_every_weighted_score_says_a_weight_outside_its_range(name):
     with pytest.raises(ValueError, match="expected 0 to 1"):
-        SCORES[name](make(), opacity_weight=1.5)
+        SCORES[name](normal_scene(50, 1), opacity_weight=1.5)

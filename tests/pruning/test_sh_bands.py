@@ -5,20 +5,15 @@ import math
 import pytest
 import torch
 
+from making import normal_scene
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import band_energies, cut_sh, energy_lost
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
 
-def make(n=20, degree=3, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    shapes = [(n, 3), (n, 3), (n, 4), (n, 1), (n, 3), (n, (degree + 1) ** 2 - 1, 3)]
-    return Gaussians(*(torch.randn(shape, generator=generator) for shape in shapes))
-
-
 def test_energies_are_mean_squares_over_the_sphere():
-    scene = make().to(torch.float64)
+    scene = normal_scene(20).to(torch.float64)
     generator = torch.Generator().manual_seed(1)
     directions = torch.randn(200_000, 3, generator=generator, dtype=torch.float64)
     basis = sh_basis(directions / directions.norm(dim=1, keepdim=True), 3)
@@ -32,7 +27,7 @@ def test_energies_are_mean_squares_over_the_sphere():
 
 
 def test_lost_shares_add_up():
-    scene = make()
+    scene = normal_scene(20)
     energies = band_energies(scene)
     lost = [energy_lost(scene, degree) for degree in range(4)]
     assert lost[0] == pytest.approx(1.0) and lost[3] == 0.0
@@ -42,7 +37,7 @@ def test_lost_shares_add_up():
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_cutting_leaves_the_rest_bit_for_bit(degree):
-    scene = make()
+    scene = normal_scene(20)
     cut = cut_sh(scene, degree)
     assert cut.sh_degree == degree
     assert torch.equal(cut.features_rest, scene.features_rest[:, : (degree + 1) ** 2 - 1])
@@ -50,19 +45,19 @@ def test_cutting_leaves_the_rest_bit_for_bit(degree):
 
 
 def test_a_lower_degree_than_there_is_changes_nothing():
-    assert cut_sh(make(degree=1), 3).sh_degree == 1 and energy_lost(make(degree=1), 2) == 0.0
+    assert cut_sh(normal_scene(20, 1), 3).sh_degree == 1 and energy_lost(normal_scene(20, 1), 2) == 0.0
 
 
 @pytest.mark.parametrize("case", ["empty", "no colour", "invisible", "nan", "huge scales", "degree 0"])
 def test_where_there_is_nothing_to_lose_nothing_is_lost(case):
-    scene = make()
+    scene = normal_scene(20)
     scene = {
         "empty": lambda: Gaussians.empty(3),
         "no colour": lambda: scene.replace(features_rest=torch.zeros_like(scene.features_rest)),
         "invisible": lambda: scene.replace(opacities=torch.full_like(scene.opacities, -math.inf)),
         "nan": lambda: scene.map(lambda value: value * math.nan),
         "huge scales": lambda: scene.replace(scales=torch.full_like(scene.scales, 1e4)),
-        "degree 0": lambda: make(degree=0),
+        "degree 0": lambda: normal_scene(20, 0),
     }[case]()
     lost = energy_lost(scene, 0)
     assert lost == pytest.approx(1.0) if case == "huge scales" else lost == 0.0
@@ -72,4 +67,4 @@ def test_where_there_is_nothing_to_lose_nothing_is_lost(case):
 def test_a_degree_that_is_none_is_said(degree):
     for function in (cut_sh, energy_lost):
         with pytest.raises(BudgetError, match=f"SH degree is {degree}; expected 0 to 3"):
-            function(make(), degree)
+            function(normal_scene(20), degree)

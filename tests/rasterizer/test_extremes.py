@@ -3,36 +3,19 @@
 Input is rounded to float32 first, so that what is compared is the arithmetic, not what float32 can hold.
 """
 
+import functools
 import math
 
 import pytest
 import torch
 
+from making import camera_askew, splats_in_view
 from pointsplat_ns.rasterizer import rasterization, rasterize_reference
 
 F64 = torch.float64
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 
-
-def make_scene(n=50, seed=11):
-    g = torch.Generator().manual_seed(seed)
-
-    def randn(*shape):
-        return torch.randn(*shape, generator=g, dtype=F64)
-
-    means = randn(n, 3) * torch.tensor([1.0, 1.0, 0.5], dtype=F64) + torch.tensor([0, 0, 3.0], dtype=F64)
-    scales = torch.exp(0.8 * randn(n, 3) - 2.5)
-    opacities = torch.rand(n, generator=g, dtype=F64)
-    return [means, randn(n, 4), scales, opacities, randn(n, 16, 3) * 0.3]
-
-
-def make_camera(cx=20.0, cy=13.0, focal=40.0):
-    K = torch.tensor([[focal, 0, cx], [0, 1.05 * focal, cy], [0, 0, 1]], dtype=F64)
-    c, s = math.cos(0.2), math.sin(0.2)
-    view = torch.eye(4, dtype=F64)
-    view[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=F64)
-    view[:3, 3] = torch.tensor([0.1, -0.1, 0.2], dtype=F64)
-    return view, K
+make_scene = functools.partial(splats_in_view, seed=11, scale=-2.5)
 
 
 def draw(scene, view, K, size, dtype, near=0.01, mode="classic", sh_degree=3, slow=False):
@@ -144,13 +127,13 @@ CASES = {
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 @pytest.mark.parametrize("case", CASES)
 def test_degenerate_gaussians(case, mode):
-    scene = make_scene()
+    scene = make_scene(50)
     CASES[case](scene)
     if mode == "antialiased" and any(word in case for word in ("lines", "points", "needles")):
         scene[3][:] = 40.0  # the compensation is at or near its lower bound of 0.005
     check(
         scene,
-        make_camera(),
+        camera_askew(),
         mode=mode,
         reference=case != "log-scales from -80 to 20",
     )
@@ -158,8 +141,8 @@ def test_degenerate_gaussians(case, mode):
 
 
 def test_gaussians_at_and_across_the_camera_plane():
-    scene = make_scene()
-    view, K = make_camera()
+    scene = make_scene(50)
+    view, K = camera_askew()
     centre = torch.linalg.solve(view[:3, :3], -view[:3, 3])
     scene[0][0] = centre  # depth and view vector exactly zero
     scene[0][1:9] = centre + (scene[0][1:9] - centre) * 1e-3
@@ -170,8 +153,8 @@ def test_gaussians_at_and_across_the_camera_plane():
 
 
 def test_camera_inside_gaussians():
-    scene = make_scene()
-    view, K = make_camera()
+    scene = make_scene(50)
+    view, K = camera_askew()
     scene[2][:] = scene[2] / scene[2].amax(-1, keepdim=True) * 20.0
     scene[3][:] = 0.2
     check(scene, (view, K))
@@ -179,15 +162,15 @@ def test_camera_inside_gaussians():
 
 @pytest.mark.parametrize("logit", [-40.0, 40.0, -math.inf, math.inf])
 def test_extreme_opacity_logits_through_the_sigmoid(logit):
-    scene = make_scene()
+    scene = make_scene(50)
     logits = torch.logit(scene[3])
     logits[::3] = logit
     scene[3] = torch.sigmoid(logits)
     if logit > 0:
         assert (scene[3][::3] == 1).all()
-    check(scene, make_camera())
+    check(scene, camera_askew())
     single = logits.float().requires_grad_()
-    view, K = make_camera()
+    view, K = camera_askew()
     rest = [t.float() for t in scene]
     image, _, _ = rasterization(
         *rest[:3], torch.sigmoid(single), rest[4], view[None].float(), K[None].float(), 37, 29, sh_degree=1
@@ -198,8 +181,8 @@ def test_extreme_opacity_logits_through_the_sigmoid(logit):
 
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
 def test_scenes_of_any_size(factor):
-    scene = make_scene()
-    view, K = make_camera()
+    scene = make_scene(50)
+    view, K = camera_askew()
     plain, plain_grads = draw(scene, view, K, (37, 29), F64)
     view[:3, 3] *= factor
     scaled = [scene[0] * factor, scene[1], scene[2] * factor, *scene[3:]]
@@ -211,8 +194,8 @@ def test_scenes_of_any_size(factor):
 
 
 def test_a_scene_a_million_units_from_the_origin():
-    scene = make_scene()
-    view, K = make_camera()
+    scene = make_scene(50)
+    view, K = camera_askew()
     shift = torch.tensor([1e6, -7e5, 4e5], dtype=F64)
     scene[0] = scene[0] * 64 + shift
     scene[2] = scene[2] * 64
@@ -223,8 +206,8 @@ def test_a_scene_a_million_units_from_the_origin():
 
 
 def test_float64_cameras_beside_float32_gaussians_place_the_camera_exactly():
-    scene = make_scene()
-    view, K = make_camera()
+    scene = make_scene(50)
+    view, K = camera_askew()
     shift = torch.tensor([1e6, -7e5, 4e5], dtype=F64)
     scene[0] = (scene[0] * 64 + shift).float().double()
     scene[2] = scene[2] * 64
@@ -240,8 +223,8 @@ def test_float64_cameras_beside_float32_gaussians_place_the_camera_exactly():
 
 @pytest.mark.parametrize("focal", [1.0, 1e5])
 def test_extreme_focal_lengths(focal):
-    scene = make_scene()
-    view, K = make_camera(focal=focal)
+    scene = make_scene(50)
+    view, K = camera_askew(focal=focal)
     if focal == 1.0:
         scene[2] *= 10  # a degree and more per pixel: smaller is below a pixel
         check(scene, (view, K))
@@ -261,16 +244,16 @@ def test_any_image_size(size):
     scene = make_scene(30)
     w, h = size
     scene[2] *= 4
-    view, K = make_camera(cx=w / 2, cy=h / 2, focal=max(20.0, 0.6 * max(size)))
+    view, K = camera_askew(cx=w / 2, cy=h / 2, focal=max(20.0, 0.6 * max(size)))
     check(scene, (view, K), size)
 
 
 @pytest.mark.parametrize("cx,cy", [(-60.0, 13.0), (90.0, 80.0), (20.0, -500.0)])
 def test_principal_point_outside_the_image(cx, cy):
-    scene = make_scene()
+    scene = make_scene(50)
     scene[2] *= 3
     scene[0][:, :2] -= (torch.tensor([cx, cy], dtype=F64) - torch.tensor([18.0, 14.0])) / 40.0 * 3.0
-    check(scene, make_camera(cx, cy))
+    check(scene, camera_askew(cx=cx, cy=cy))
 
 
 @pytest.mark.parametrize("n,culled", [(0, False), (1, False), (1, True), (20, True)])
@@ -283,7 +266,7 @@ def test_few_or_no_gaussians(n, culled, dtype):
         scene[0][0] = torch.tensor([0, 0, 3.0], dtype=F64)
     if culled:
         scene[0][:, 2] = -scene[0][:, 2].abs() - 1
-    view, K = make_camera()
+    view, K = camera_askew()
     leaves = [t.to(dtype).requires_grad_() for t in scene]
     for mode in ("RGB", "RGB+ED"):
         for packed in (False, True):
@@ -309,10 +292,10 @@ BAD = [
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 @pytest.mark.parametrize("sh_degree", [None, 0, 3])
 def test_what_has_no_meaning_is_skipped_and_counted_with_a_zero_gradient(dtype, sh_degree):
-    scene = [t.to(dtype) for t in make_scene()]
+    scene = [t.to(dtype) for t in make_scene(50)]
     if sh_degree is None:
         scene[4] = scene[4][:, :5, 0]
-    view, K = (t.to(dtype)[None] for t in make_camera())
+    view, K = (t.to(dtype)[None] for t in camera_askew())
     scene[3] = scene[3].clamp_min(0.1)
     scene[0][:, :2] *= 0.2  # all in sight
     clean, clean_alpha, meta = rasterization(*[t[len(BAD) :] for t in scene], view, K, 37, 29, sh_degree=sh_degree)
@@ -333,9 +316,9 @@ def test_what_has_no_meaning_is_skipped_and_counted_with_a_zero_gradient(dtype, 
 
 
 def test_a_bad_colour_out_of_sight_is_not_looked_at():
-    scene = make_scene()
+    scene = make_scene(50)
     scene[0][0, 2], scene[4][0] = -5.0, math.nan
-    view, K = make_camera()
+    view, K = camera_askew()
     image, _, meta = rasterization(*scene, view[None], K[None], 37, 29, sh_degree=3)
     assert image.isfinite().all() and meta["skipped"] == 0
 
@@ -344,9 +327,9 @@ def test_a_bad_colour_out_of_sight_is_not_looked_at():
 def test_half_precision_input_gives_a_picture_close_to_float32(dtype, tolerance):
     # A position is held to 2^-11 (float16) or 2^-8 (bfloat16) of itself: at x / z = 0.5 that is 0.02 and 0.15 of the
     # 20 pixels from the centre; an edge of a Gaussian a few pixels wide changes by a share of that.
-    scene = make_scene()
+    scene = make_scene(50)
     scene[2][::2, 1] = 1e-9  # float16 holds this as zero: the axis is lost, a flat Gaussian is left
-    view, K = (t.float()[None] for t in make_camera())
+    view, K = (t.float()[None] for t in camera_askew())
     want, _, _ = rasterization(*[t.float() for t in scene], view, K, 37, 29, sh_degree=3)
     half = [t.to(dtype).requires_grad_() for t in scene]
     got, _, meta = rasterization(*half, view.to(dtype).float(), K, 37, 29, sh_degree=3)
@@ -359,9 +342,9 @@ def test_half_precision_input_gives_a_picture_close_to_float32(dtype, tolerance)
 
 
 def test_non_contiguous_and_expanded_tensors():
-    scene = [t.float() for t in make_scene()]
+    scene = [t.float() for t in make_scene(50)]
     scene[1][:], scene[3][:] = scene[1][0], 0.7
-    view, K = (t.float()[None] for t in make_camera())
+    view, K = (t.float()[None] for t in camera_askew())
 
     def run(tensors):
         leaves = [t.requires_grad_() for t in tensors]
@@ -383,10 +366,10 @@ def test_non_contiguous_and_expanded_tensors():
 
 def test_twenty_thousand_coincident_gaussians():
     # all at one place, each 10 pixels large: the picture of the first few, the rest is behind them
-    scene = [t[:1].expand(20_000, *t.shape[1:]).float() for t in make_scene()]
+    scene = [t[:1].expand(20_000, *t.shape[1:]).float() for t in make_scene(50)]
     scene[0] = torch.tensor([0, 0, 3.0]).expand(20_000, 3)
     scene[3] = torch.full((20_000,), 0.5)
-    view, K = (t.float()[None] for t in make_camera())
+    view, K = (t.float()[None] for t in camera_askew())
 
     def run(n):
         leaves = [t[:n].clone().requires_grad_() for t in scene]
@@ -413,8 +396,8 @@ def test_twenty_thousand_coincident_gaussians():
     ],
 )
 def test_a_camera_without_meaning_says_so(change, message):
-    view, K = make_camera()
+    view, K = camera_askew()
     for name, (row, column, value) in change.items():
         dict(K=K, view=view)[name][row, column] = value
     with pytest.raises(ValueError, match=message):
-        rasterization(*make_scene(), view[None], K[None], 37, 29, sh_degree=0)
+        rasterization(*make_scene(50), view[None], K[None], 37, 29, sh_degree=0)

@@ -1,10 +1,9 @@
 """Projection and colours against gsplat's own plain-torch formulas, in float64, with gradients."""
 
-import math
-
 import pytest
 import torch
 
+from making import camera_askew
 from pointsplat_ns.rasterizer.projection import project
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color, unit_rows
 
@@ -24,15 +23,6 @@ def make_scene(n=60, seed=3, scale=-2.5):
         torch.exp(0.8 * randn(n, 3) + scale),
         0.1 + 0.9 * torch.rand(n, generator=g).to(F64),
     ]
-
-
-def make_camera(cx=20.0, cy=13.0):
-    K = torch.tensor([[40.0, 0, cx], [0, 42.0, cy], [0, 0, 1]], dtype=F64)
-    c, s = math.cos(0.2), math.sin(0.2)
-    view = torch.eye(4, dtype=F64)
-    view[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=F64)
-    view[:3, 3] = torch.tensor([0.1, -0.1, 0.2], dtype=F64)
-    return view, K, 37, 29
 
 
 def gsplat_formulas():
@@ -56,7 +46,7 @@ def test_projection_and_its_gradients_are_gsplats(antialiased, cx, cy):
     theirs = gsplat_formulas()
     scene = [t.requires_grad_() for t in make_scene(scale=-1.0)]
     means, quats, scales, opacities = scene
-    view, K, w, h = make_camera(cx, cy)
+    view, K, w, h = *camera_askew(cx=cx, cy=cy), 37, 29
     view.requires_grad_()
     seen = project(*scene, view, K, w, h, antialiased=antialiased)
     assert len(seen.ids) > 15
@@ -118,7 +108,7 @@ def test_projection_gradcheck(antialiased):
     scene[0][:, :2] *= 0.2
     scene[0][0, 0] = 3.0  # where the frustum clamp binds
     scene[2][0] *= 8
-    view, K, w, h = make_camera()
+    view, K, w, h = *camera_askew(), 37, 29
 
     def outputs(*inputs):
         seen = project(*inputs, K, w, h, antialiased=antialiased)
@@ -141,7 +131,7 @@ def test_colour_gradcheck():
 def test_compensation_stops_at_its_lower_bound_with_no_gradient_of_its_own():
     means = torch.tensor([[0.0, 0, 3]], dtype=F64)
     quats = torch.tensor([[1.0, 0, 0, 0]], dtype=F64)
-    view, K, w, h = make_camera()
+    view, K, w, h = *camera_askew(), 37, 29
     for size, bound in ((1e-30, True), (1e-4, True), (0.1, False)):
         for dtype in (torch.float32, F64):
             scales = torch.full((1, 3), size, dtype=dtype, requires_grad=True)
@@ -169,7 +159,7 @@ def test_unit_rows_neither_overflow_nor_lose_the_zero_vector(dtype):
 
 def test_a_mirroring_focal_length_mirrors_the_image():
     scene = make_scene(scale=-1.0)
-    view, K, w, h = make_camera(cx=18.5)
+    view, K, w, h = *camera_askew(cx=18.5), 37, 29
     mirrored = torch.diag(torch.tensor([-1.0, 1, 1], dtype=F64)) @ K
     mirrored[0, 2] = w - K[0, 2]
     one, other = project(*scene, view, K, w, h), project(*scene, view, mirrored, w, h)

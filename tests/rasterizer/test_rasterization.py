@@ -1,36 +1,14 @@
 """The fast rasterizer against the per-pixel reference, in value and gradient."""
 
-import math
-
 import pytest
 import torch
 
+from making import camera_askew, splats_in_view
 from pointsplat_ns.rasterizer import rasterization, rasterize_reference
 from pointsplat_ns.rasterizer.projection import project
 from pointsplat_ns.rasterizer.tiles import Footprints
 
 F64 = torch.float64
-
-
-def make_scene(n, seed=0, dtype=F64, scale=-3.0, spread=0.8, opacity=1.0):
-    g = torch.Generator().manual_seed(seed)
-
-    def randn(*shape):
-        return torch.randn(*shape, generator=g, dtype=F64)
-
-    means = randn(n, 3) * torch.tensor([1.0, 1.0, 0.5], dtype=F64) + torch.tensor([0, 0, 3.0], dtype=F64)
-    scales = torch.exp(randn(n, 3) * spread + scale)
-    opacities = torch.rand(n, generator=g, dtype=F64) * opacity
-    return [t.to(dtype) for t in (means, randn(n, 4), scales, opacities, randn(n, 16, 3) * 0.3)]
-
-
-def make_camera(width=37, height=29, dtype=F64, angle=0.2, cx=20.0, cy=13.0):
-    K = torch.tensor([[40.0, 0, cx], [0, 42.0, cy], [0, 0, 1]], dtype=dtype)
-    view = torch.eye(4, dtype=dtype)
-    c, s = math.cos(angle), math.sin(angle)
-    view[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=dtype)
-    view[:3, 3] = torch.tensor([0.1, -0.1, 0.2], dtype=dtype)
-    return view, K, width, height
 
 
 def leaves(tensors):
@@ -57,8 +35,8 @@ def both(scene, camera, mode="classic", sh_degree=3):
     ],
 )
 def test_image_and_gradients_equal_the_reference_in_float64(mode, n, scale, opacity, size):
-    scene = leaves(make_scene(n, seed=n, scale=scale, opacity=opacity))
-    view, K, w, h = make_camera(*size)
+    scene = leaves(splats_in_view(n, seed=n, scale=scale, opacity=opacity))
+    view, K, w, h = *camera_askew(), *size
     view.requires_grad_()
     fast, slow = both(scene, (view, K, w, h), mode)
     g = torch.Generator().manual_seed(1)
@@ -76,16 +54,16 @@ def test_image_and_gradients_equal_the_reference_in_float64(mode, n, scale, opac
 
 @pytest.mark.parametrize("cx,cy", [(-30.0, 13.0), (60.0, 40.0)])
 def test_principal_point_outside_the_image_moves_the_frustum_clamp(cx, cy):
-    fast, slow = both(make_scene(100, seed=3, scale=-1.5), make_camera(cx=cx, cy=cy))
+    fast, slow = both(splats_in_view(100, seed=3, scale=-1.5), (*camera_askew(cx=cx, cy=cy), 37, 29))
     assert slow[1].max() > 0.1
     assert (fast[0] - slow[0]).abs().max() < 1e-10
 
 
 def test_gradcheck():
-    scene = make_scene(4, seed=5, scale=0.3, spread=0.3)
+    scene = splats_in_view(4, seed=5, scale=0.3, spread=0.3)
     scene[3] = 0.3 + 0.5 * scene[3]
     scene = leaves(scene)
-    view, K, w, h = make_camera(6, 5, cx=3.0, cy=2.5)
+    view, K, w, h = *camera_askew(cx=3.0, cy=2.5), 6, 5
     K = K * torch.tensor([[0.15], [0.15], [1.0]], dtype=F64)
     K[0, 2], K[1, 2] = 3.0, 2.5
     background = torch.rand(1, 3, dtype=F64, requires_grad=True)
@@ -103,8 +81,8 @@ def test_gradcheck():
 
 
 def test_many_channels_and_per_camera_colors_render_like_three():
-    means, quats, scales, opacities, sh = make_scene(80)
-    view, K, w, h = make_camera()
+    means, quats, scales, opacities, sh = splats_in_view(80)
+    view, K, w, h = *camera_askew(), 37, 29
     colors = torch.cat([sh[:, :, 0], sh[:, :, 1]], dim=1)[:, :11]
     image, _, _ = rasterization(means, quats, scales, opacities, colors, view[None], K[None], w, h)
     for d in range(11):
@@ -115,8 +93,8 @@ def test_many_channels_and_per_camera_colors_render_like_three():
 
 
 def test_batched_cameras_equal_one_at_a_time_packed_or_not():
-    scene = make_scene(120, seed=8)
-    cameras = [make_camera(angle=a) for a in (-0.3, 0.2, 3.0)]  # the last looks away
+    scene = splats_in_view(120, seed=8)
+    cameras = [camera_askew(angle=a) for a in (-0.3, 0.2, 3.0)]  # the last looks away
     views, Ks = torch.stack([c[0] for c in cameras]), torch.stack([c[1] for c in cameras])
     w, h = 37, 29
     for packed in (False, True):
@@ -132,8 +110,8 @@ def test_batched_cameras_equal_one_at_a_time_packed_or_not():
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_absgrad_is_the_sum_over_pixels_of_absolute_gradients(packed):
-    scene = leaves(make_scene(30, seed=2, scale=-2.0))
-    view, K, w, h = make_camera(11, 10, cx=5.0, cy=5.0)
+    scene = leaves(splats_in_view(30, seed=2, scale=-2.0))
+    view, K, w, h = *camera_askew(cx=5.0, cy=5.0), 11, 10
     image, _, meta = rasterization(*scene, view[None], K[None], w, h, sh_degree=0, absgrad=True, packed=packed)
     meta["means2d"].retain_grad()
     g = torch.Generator().manual_seed(0)
@@ -152,8 +130,8 @@ def test_absgrad_is_the_sum_over_pixels_of_absolute_gradients(packed):
 
 
 def test_render_modes_agree():
-    scene = make_scene(60)
-    view, K, w, h = make_camera()
+    scene = splats_in_view(60)
+    view, K, w, h = *camera_askew(), 37, 29
 
     def render(mode):
         return rasterization(*scene, view[None], K[None], w, h, sh_degree=0, render_mode=mode)
@@ -167,8 +145,8 @@ def test_render_modes_agree():
 
 
 def test_background_shows_where_nothing_is():
-    scene = make_scene(5, scale=-4.0)
-    view, K, w, h = make_camera()
+    scene = splats_in_view(5, scale=-4.0)
+    view, K, w, h = *camera_askew(), 37, 29
     background = torch.tensor([[0.2, 0.5, 0.9]], dtype=F64)
     image, alpha, _ = rasterization(*scene, view[None], K[None], w, h, sh_degree=0, backgrounds=background)
     empty = alpha[0, ..., 0] == 0
@@ -178,13 +156,13 @@ def test_background_shows_where_nothing_is():
 
 @pytest.mark.parametrize("case", ["none", "behind", "transparent"])
 def test_nothing_to_draw_gives_black_and_zero_gradients(case):
-    scene = leaves(make_scene(0 if case == "none" else 7))
+    scene = leaves(splats_in_view(0 if case == "none" else 7))
     means, quats, scales, opacities, sh = scene
     if case == "behind":
         means = means * torch.tensor([1, 1, -1.0], dtype=F64)
     if case == "transparent":
         opacities = opacities * 1e-4
-    view, K, w, h = make_camera()
+    view, K, w, h = *camera_askew(), 37, 29
     for mode in ("RGB", "RGB+ED"):
         image, alpha, _ = rasterization(
             means, quats, scales, opacities, sh, view[None], K[None], w, h, sh_degree=3, render_mode=mode
@@ -195,8 +173,8 @@ def test_nothing_to_draw_gives_black_and_zero_gradients(case):
 
 
 def test_tiles_hold_every_pair_that_draws_and_few_others():
-    scene = make_scene(200, seed=9, scale=-2.5, spread=1.5)
-    view, K, w, h = make_camera(61, 43, cx=30.0, cy=20.0)
+    scene = splats_in_view(200, seed=9, scale=-2.5, spread=1.5)
+    view, K, w, h = *camera_askew(cx=30.0, cy=20.0), 61, 43
     seen = project(*scene[:4], view, K, w, h)
     footprints = Footprints(
         seen.means2d, seen.cov2d, seen.det, seen.opacities, seen.depths, torch.zeros_like(seen.ids), 1, w, h
@@ -232,7 +210,7 @@ def test_tiles_hold_every_pair_that_draws_and_few_others():
     ],
 )
 def test_wrong_arguments_say_what_was_got_and_wanted(change, message):
-    view, K, _, _ = make_camera(dtype=torch.float32)
+    view, K = camera_askew(torch.float32)
     args = dict(
         means=torch.tensor([[0.0, 0, 3]] * 3), quats=torch.ones(3, 4), scales=torch.ones(3, 3),
         opacities=torch.ones(3), colors=torch.ones(3, 3), viewmats=view[None], Ks=K[None], width=8, height=8,

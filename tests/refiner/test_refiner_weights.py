@@ -2,8 +2,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from making import normal_scene
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.refiner import Refiner, WeightsError, preset, read_metadata, read_refiner, save_refiner
 from pointsplat_ns.refiner.weights import FORMAT
 
@@ -17,22 +17,17 @@ def trained(**changes) -> Refiner:
     return refiner
 
 
-def scene(n: int = 50) -> Gaussians:
-    g = torch.Generator().manual_seed(0)
-    return Gaussians(*(torch.randn(n, *t, generator=g) for t in ((3,), (3,), (4,), (1,), (3,), (15, 3))))
-
-
 @pytest.mark.parametrize("norm", ["scene", "batch", "layer"])
 def test_a_refiner_survives_a_round_trip_to_the_bit(tmp_path, norm):
     refiner = trained(norm=norm).train()
-    refiner(scene())  # moves running statistics
+    refiner(normal_scene(50))  # moves running statistics
     path = tmp_path / "new folder" / "refiner.safetensors"
     metadata = {"steps": 10, "command": "train --x 'y'", "psnr": [1.5, None]}
     save_refiner(refiner, path, metadata)
     loaded = read_refiner(path)
     assert loaded.config == refiner.config and not loaded.training
     assert read_metadata(path) == metadata
-    for a, b in zip(refiner.eval()(scene()).tensors(), loaded(scene()).tensors(), strict=True):
+    for a, b in zip(refiner.eval()(normal_scene(50)).tensors(), loaded(normal_scene(50)).tensors(), strict=True):
         assert torch.equal(a, b)
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
