@@ -133,6 +133,54 @@ def camera_askew(
     return view, K
 
 
+def scene_to_refine(n: int = 200, sh_degree: int = 3, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:
+    """Small blobs, uniform in a cube of side 4.
+
+    Args:
+        n: how many Gaussians.
+        sh_degree: of SH.
+        seed: the same seed gives the same scene.
+        dtype: of the parameters; all are drawn in float64.
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    def randn(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64).to(dtype)
+
+    means = torch.rand(n, 3, generator=generator, dtype=torch.float64).to(dtype) * 4
+    rest = (sh_degree + 1) ** 2 - 1
+    return Gaussians(means, randn(n, 3) - 4, randn(n, 4), randn(n, 1) * 2, randn(n, 3), randn(n, rest, 3) * 0.1)
+
+
+def small_refiner(trained: bool = True, seed: int = 0, **changes):
+    """A refiner of two stages in evaluation mode; ``trained`` moves the zero layers, so that residuals are not zero."""
+    from pointsplat_ns.refiner import Refiner, preset
+
+    smallest = {
+        "strides": (2,),
+        "enc_channels": (16, 16),
+        "enc_depths": (1, 1),
+        "enc_heads": (2, 2),
+        "dec_channels": (16,),
+        "dec_depths": (1,),
+        "dec_heads": (2,),
+        "patch": 32,
+        "head_width": 16,
+    }
+    torch.manual_seed(seed)
+    refiner = Refiner(preset("tiny", **{**smallest, **changes})).eval()
+    return move_zero_layers(refiner) if trained else refiner
+
+
+@torch.no_grad()
+def move_zero_layers(refiner):
+    """The refiner, the last layers of whose heads, zero before training, are now random."""
+    for mlp in refiner.heads.mlps.values():
+        mlp[-1].weight.normal_(std=0.1)
+        mlp[-1].bias.normal_(std=0.1)
+    return refiner
+
+
 def small_config(data: Path, output_dir: Path, steps: int, **model):
     """The method as registered, at a size for tests; no LPIPS in the loss, so that nothing is downloaded."""
     from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
@@ -152,6 +200,14 @@ def fast_config(data: Path, output_dir: Path, steps: int = 10, **model):
     config = small_config(data, output_dir, steps, **model)
     for group in config.optimizers.values():
         group["optimizer"].lr *= 10
+    return config
+
+
+def dense_config(data: Path, output_dir: Path, steps: int):
+    """The method at a size for tests, which renders a few tiny pictures of scenes without photos."""
+    config = small_config(data, output_dir, steps, keep=0.4)
+    config.steps_per_eval_image = 3
+    config.pipeline.datamanager.sampled_poses, config.pipeline.datamanager.sampled_size = 6, (48, 36)
     return config
 
 

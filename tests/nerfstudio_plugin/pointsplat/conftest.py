@@ -13,7 +13,8 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.utils.eval_utils import eval_setup
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
-from making import fast_config
+from making import box_room, fast_config
+from pointsplat_ns.io import write_ply
 
 
 @pytest.fixture(scope="session")
@@ -60,3 +61,12 @@ def lens_run(wall_scene, wall_config, run_training, tmp_path_factory) -> Path:
     config.pipeline.model.num_random, config.pipeline.model.random_scale = 300, 2.0
     run_training(config)
     return config.get_base_dir()
+
+
+@pytest.fixture(scope="session")
+def three_rooms(tmp_path_factory) -> Path:
+    """A folder of three PLY files and nothing else."""
+    folder = tmp_path_factory.mktemp("three_rooms")
+    for seed in range(3):
+        write_ply(box_room(seed, size=0.12, smooth=True), folder / f"room{seed}.ply")
+    return folder

@@ -1,0 +1,110 @@
+"""What the rasterizer takes: values without meaning are skipped or refused; any precision and memory layout will do."""
+
+import math
+
+import pytest
+import torch
+
+from making import camera_askew, splats_in_view
+from pointsplat_ns.rasterizer import rasterization
+
+F64 = torch.float64
+NAMES = ("means", "quats", "scales", "opacities", "colors")
+
+BAD = [
+    ("means", math.nan), ("means", math.inf), ("means", -math.inf), ("quats", math.nan), ("quats", math.inf),
+    ("scales", math.nan), ("scales", math.inf), ("scales", -0.1), ("opacities", math.nan), ("opacities", math.inf),
+    ("opacities", -0.5), ("colors", math.nan), ("colors", math.inf), ("colors", -math.inf),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("sh_degree", [None, 0, 3])
+def test_what_has_no_meaning_is_skipped_and_counted_with_a_zero_gradient(dtype, sh_degree):
+    scene = [t.to(dtype) for t in splats_in_view(50, 11, scale=-2.5)]
+    if sh_degree is None:
+        scene[4] = scene[4][:, :5, 0]
+    view, K = (t.to(dtype)[None] for t in camera_askew())
+    scene[3] = scene[3].clamp_min(0.1)
+    scene[0][:, :2] *= 0.2  # all in sight
+    clean, clean_alpha, meta = rasterization(*[t[len(BAD) :] for t in scene], view, K, 37, 29, sh_degree=sh_degree)
+    assert meta["skipped"] == 0
+    for row, (name, value) in enumerate(BAD):
+        scene[NAMES.index(name)][row].view(-1)[0] = value
+    leaves = [t.clone().requires_grad_() for t in (*scene, view)]
+    image, alpha, meta = rasterization(*leaves, K, 37, 29, sh_degree=sh_degree, render_mode="RGB+ED")
+    assert meta["skipped"] == len(BAD)
+    tolerance = 1e-12 if dtype == F64 else 1e-5  # another order of the same sums
+    assert (image[..., :-1] - clean).abs().max() < tolerance and (alpha - clean_alpha).abs().max() < tolerance
+    *grads, grad_view = torch.autograd.grad(image.sum() + alpha.sum(), leaves)
+    assert grad_view.isfinite().all() and grad_view.any()
+    for name, grad in zip(NAMES, grads, strict=True):
+        assert grad.isfinite().all(), name
+        assert not grad[: len(BAD)].any(), name
+        assert grad[len(BAD) :].any() or (sh_degree in (None, 0) and name == "quats"), name
+
+
+def test_a_bad_colour_out_of_sight_is_not_looked_at():
+    scene = splats_in_view(50, 11, scale=-2.5)
+    scene[0][0, 2], scene[4][0] = -5.0, math.nan
+    view, K = camera_askew()
+    image, _, meta = rasterization(*scene, view[None], K[None], 37, 29, sh_degree=3)
+    assert image.isfinite().all() and meta["skipped"] == 0
+
+
+@pytest.mark.parametrize("dtype,tolerance", [(torch.float16, 0.02), (torch.bfloat16, 0.15)])
+def test_half_precision_input_gives_a_picture_close_to_float32(dtype, tolerance):
+    # A position is held to 2^-11 (float16) or 2^-8 (bfloat16) of itself: at x / z = 0.5 that is 0.02 and 0.15 of the
+    # 20 pixels from the centre; an edge of a Gaussian a few pixels wide changes by a share of that.
+    scene = splats_in_view(50, 11, scale=-2.5)
+    scene[2][::2, 1] = 1e-9  # float16 holds this as zero: the axis is lost, a flat Gaussian is left
+    view, K = (t.float()[None] for t in camera_askew())
+    want, _, _ = rasterization(*[t.float() for t in scene], view, K, 37, 29, sh_degree=3)
+    half = [t.to(dtype).requires_grad_() for t in scene]
+    got, _, meta = rasterization(*half, view.to(dtype).float(), K, 37, 29, sh_degree=3)
+    assert got.dtype == torch.float32 and meta["skipped"] == 0
+    assert (got - want).abs().mean() < tolerance
+    exact, _, _ = rasterization(*[t.detach().float() for t in half], view.to(dtype).float(), K, 37, 29, sh_degree=3)
+    assert torch.equal(got, exact)  # nothing is computed in half precision
+    for grad, leaf in zip(torch.autograd.grad(got.mean(), half), half, strict=True):
+        assert grad.dtype == leaf.dtype == dtype and grad.isfinite().all() and grad.any()
+
+
+def test_non_contiguous_and_expanded_tensors():
+    scene = [t.float() for t in splats_in_view(50, 11, scale=-2.5)]
+    scene[1][:], scene[3][:] = scene[1][0], 0.7
+    view, K = (t.float()[None] for t in camera_askew())
+
+    def run(tensors):
+        leaves = [t.requires_grad_() for t in tensors]
+        image, _, _ = rasterization(*leaves, view, K, 37, 29, sh_degree=2)
+        return image, torch.autograd.grad(image.sum(), leaves)
+
+    strided = [
+        scene[0].T.contiguous().T, scene[1][:1].expand(50, 4), scene[2].repeat(1, 2)[:, ::2],
+        scene[3][:1].expand(50), scene[4].permute(2, 1, 0).contiguous().permute(2, 1, 0),
+    ]  # fmt: skip
+    strided[2] = torch.stack([scene[2], scene[2]], -1)[..., 0]
+    assert not any(t.is_contiguous() for t in strided)
+    image, grads = run([t.clone() for t in scene])
+    got, got_grads = run([t.detach() for t in strided])
+    assert (image - got).abs().max() < 1e-6  # a matrix product may sum strided rows in another order
+    for want, grad in zip(grads, got_grads, strict=True):
+        assert (want - grad).norm() <= 1e-4 * want.norm()
+
+
+@pytest.mark.parametrize(
+    "change,message",
+    [
+        (dict(K=(0, 0, 0.0)), "fx 0.0.*focal lengths not 0"),
+        (dict(K=(1, 2, math.nan)), "cy nan"),
+        (dict(view=(0, 3, math.inf)), "viewmat is .*inf.*expected finite"),
+        (dict(view=(slice(0, 3), slice(0, 3), 0.0)), "viewmat is .*a rotation"),
+    ],
+)
+def test_a_camera_without_meaning_says_so(change, message):
+    view, K = camera_askew()
+    for name, (row, column, value) in change.items():
+        dict(K=K, view=view)[name][row, column] = value
+    with pytest.raises(ValueError, match=message):
+        rasterization(*splats_in_view(50, 11, scale=-2.5), view[None], K[None], 37, 29, sh_degree=0)
