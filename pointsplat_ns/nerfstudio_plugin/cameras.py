@@ -11,14 +11,14 @@ from pointsplat_ns.views import RasterizeMode, Views
 
 
 def cameras_of_views(views: Views) -> Cameras:
-    """Views as nerfstudio's cameras (C,), float32 on the CPU: camera to world, with OpenGL axes."""
+    """Views as nerfstudio cameras (C,), float32 on the CPU. Their poses are camera-to-world, in OpenGL axes."""
     poses, Ks = viewmats_to_opengl(views.viewmats.double().cpu()).float(), views.Ks.float().cpu()
     fx, fy, cx, cy = (Ks[:, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     return Cameras(poses, fx, fy, cx, cy, views.width, views.height, camera_type=CameraType.PERSPECTIVE)
 
 
 def views_of_cameras(cameras: Cameras, background: Tensor, rasterize_mode: RasterizeMode = "classic") -> Views:
-    """nerfstudio's cameras (C,) as pinhole views on their device; lens distortion is left out.
+    """nerfstudio cameras (C,) as pinhole views on their device. Lens distortion is ignored.
 
     Raises:
         DataError: if the cameras have images of several sizes.

@@ -1,4 +1,4 @@
-"""The ``ns-*`` command lines of trainings and evaluations, as a person would type them. nerfstudio is not imported."""
+"""The ``ns-train`` and ``ns-eval`` command lines that this package runs. nerfstudio is not imported."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from typing import Any
 SCENE_METHOD, REFINER_METHOD = "splatfacto-cpu", "pointsplat"
 
 Options = Mapping[str, Any]
-"""Values by the name of an option without its dashes; a tuple or list is several words."""
+"""Option name without its dashes -> value. A tuple or list becomes several words."""
 
 
 def train_scene_command(
     data: Path, output: Path, name: str, steps: int, timestamp: str, seed_points: int, options: Options | None = None
 ) -> str:
-    """Trains a Splatfacto scene of a folder in the Replica layout.
+    """The command that trains a Splatfacto scene from a folder in the Replica layout.
 
     Args:
         data: the folder with photos, depth images and poses.
-        output: folder for all runs; this one is in NAME/splatfacto-cpu/TIMESTAMP, see :func:`run_folder`.
-        name: of the scene.
-        steps: of the training.
-        timestamp: names the run.
-        seed_points: the scene starts from so many points of the depth images.
-        options: further ones of ``ns-train splatfacto-cpu``.
+        output: folder for all runs; this one goes to NAME/splatfacto-cpu/TIMESTAMP, see :func:`run_folder`.
+        name: name of the scene.
+        steps: training steps.
+        timestamp: name of the run's folder.
+        seed_points: number of points, taken from the depth images, that the scene starts from.
+        options: further options of ``ns-train splatfacto-cpu``.
     """
     words = _train_words(SCENE_METHOD, output, name, steps, timestamp, options)
     return shlex.join([*words, "--data", str(data), "replica-data", "--num-seed-points", str(seed_points)])
@@ -40,16 +40,16 @@ def train_refiner_command(
     eval_scenes: tuple[str, ...] = (),
     options: Options | None = None,
 ) -> str:
-    """Trains a refiner on all scenes below a folder.
+    """The command that trains a refiner on all scenes below a folder.
 
     Args:
-        scenes: folder above the trained scenes.
-        output: folder for all runs; this one is in NAME/pointsplat/TIMESTAMP, see :func:`run_folder`.
-        name: of the training.
-        steps: of the training.
-        timestamp: names the run.
+        scenes: folder that contains the trained scenes.
+        output: folder for all runs; this one goes to NAME/pointsplat/TIMESTAMP, see :func:`run_folder`.
+        name: name of the training.
+        steps: training steps.
+        timestamp: name of the run's folder.
         eval_scenes: names of scenes never to train on.
-        options: further ones of ``ns-train pointsplat``.
+        options: further options of ``ns-train pointsplat``.
     """
     held_out = {"pipeline.datamanager.eval-scenes": eval_scenes} if eval_scenes else {}
     options = {"data": scenes, **held_out, **(options or {})}
@@ -57,19 +57,19 @@ def train_refiner_command(
 
 
 def evaluate_command(run: Path, evaluation: Path, pictures: Path) -> str:
-    """Judges a run in the held-out views of its scenes.
+    """The command that evaluates a run on the held-out views of its scenes.
 
     Args:
-        run: its folder.
-        evaluation: the JSON file to write.
-        pictures: folder for pictures of all views.
+        run: folder of the run.
+        evaluation: JSON file to write.
+        pictures: folder for images of all views.
     """
     words = ["ns-eval", "--load-config", str(run / "config.yml"), "--output-path", str(evaluation)]
     return shlex.join([*words, "--render-output-path", str(pictures)])
 
 
 def run_folder(output: Path, name: str, method: str, timestamp: str) -> Path:
-    """Where nerfstudio puts a run."""
+    """The folder in which nerfstudio saves a run."""
     return output / name / method / timestamp
 
 

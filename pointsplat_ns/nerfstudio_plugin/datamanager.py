@@ -1,7 +1,7 @@
-"""A nerfstudio datamanager that reads photos when they are due.
+"""A nerfstudio datamanager that reads each photo when a step needs it.
 
-nerfstudio's own full-image datamanager decodes every photo at the first step, keeps all of them and, past 500 photos,
-pins their memory, which raises where there is no CUDA.
+nerfstudio's own full-image datamanager decodes every photo at the first step and keeps all of them. Above 500 photos it
+pins their memory, which raises without CUDA.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache, free_memor
 
 @dataclass
 class LazyImageDatamanagerConfig(FullImageDatamanagerConfig):
-    """nerfstudio's full-image datamanager, with photos read when they are due."""
+    """nerfstudio's full-image datamanager, with photos read when they are needed"""
 
     _target: type = field(default_factory=lambda: LazyImageDatamanager)
     cache_images: Literal["cpu", "gpu"] = "cpu"
     """Has no effect here: decoded photos stay in main memory, within cache_gigabytes."""
     cache_images_type: Literal["uint8", "float32"] = "uint8"
-    """The image type returned from manager, caching images in uint8 saves memory"""
+    """Type of the images in the cache and of those returned; uint8 takes a quarter of the memory."""
     cache_gigabytes: float | None = None
-    """Memory for decoded photos; by default a quarter of what is free. What does not fit is read again."""
+    """Memory for decoded photos; by default a quarter of the free memory. Photos that do not fit are read again."""
 
 
 class LazyImageDatamanager(FullImageDatamanager):
-    """Full images and cameras in nerfstudio's order and for nerfstudio's seeds, decoded when they are due."""
+    """Full images and cameras, in the order that nerfstudio's datamanager gives for the same seed, decoded lazily."""
 
     config: LazyImageDatamanagerConfig
 
@@ -61,11 +61,11 @@ class LazyImageDatamanager(FullImageDatamanager):
     def _load_images(
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
     ) -> list[dict[str, torch.Tensor]]:
-        """Every photo of a split at once, in main memory, for code that asks nerfstudio's datamanager for that."""
+        """Every photo of a split at once, in main memory, for nerfstudio code that asks for all of them."""
         return [data for _, data in (self.train_frames if split == "train" else self.eval_frames)]
 
     @property
-    def fixed_indices_eval_dataloader(self) -> _EvalLoader:  # type: ignore[override]  # a list that need not fit
+    def fixed_indices_eval_dataloader(self) -> _EvalLoader:  # type: ignore[override]  # nerfstudio's is a list
         """Every held-out frame in order, decoded one after the other."""
         return _EvalLoader(self.eval_frames, self.device)
 
@@ -75,7 +75,7 @@ class LazyImageDatamanager(FullImageDatamanager):
         return int(cameras.height[0]) * int(cameras.width[0])
 
     def next_train(self, step: int) -> Frame:
-        """The next training frame, every one once before any twice."""
+        """The next training frame; each frame is used once before any is repeated."""
         index = self.train_unseen_cameras.pop(0)
         if not self.train_unseen_cameras:
             self.train_unseen_cameras = self.sample_train_cameras()
@@ -86,7 +86,7 @@ class LazyImageDatamanager(FullImageDatamanager):
         return camera, data
 
     def next_eval_image(self, step: int) -> Frame:
-        """A held-out frame at random, every one once before any twice."""
+        """A random held-out frame; each frame is used once before any is repeated."""
         index = self.eval_unseen_cameras.pop(random.randint(0, len(self.eval_unseen_cameras) - 1))
         if not self.eval_unseen_cameras:
             self.eval_unseen_cameras = list(range(len(self.eval_dataset)))

@@ -18,14 +18,14 @@ def dataset_views(path: Path | str, split: Literal["train", "test"] = "train") -
 
     Args:
         path: the run's folder, ``config.yml`` or checkpoint.
-        split: which photos' poses: those trained on, or those held out.
+        split: "train" for the poses of the training photos, "test" for those of the held-out photos.
 
     Returns:
-        C views on the CPU, over the background that the run is evaluated over.
+        C views on the CPU, with the background colour that the run is evaluated with.
 
     Raises:
-        SceneError: if it is no run or its data is gone.
-        DataError: if the poses are not usable, or none is in that split.
+        SceneError: if ``path`` is not a run, or the run's data is missing.
+        DataError: if the poses are not usable, or the split has none.
 
     Example:
         >>> import pointsplat_ns as ps

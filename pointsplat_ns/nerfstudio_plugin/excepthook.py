@@ -1,4 +1,4 @@
-"""What the plugin changes in the process that loads it; each change is narrow and safe to make twice."""
+"""Errors of this package in one line, also in nerfstudio's commands."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pointsplat_ns.errors import PointSplatError
 
 
 class _OneLineHook:
-    """Prints a :class:`PointSplatError` in one line; any other exception goes to the hook that was there before."""
+    """Prints a :class:`PointSplatError` in one line; passes any other exception on to the previous hook."""
 
     def __init__(self, before: Callable[..., object]):
         self._before = before
@@ -23,9 +23,10 @@ class _OneLineHook:
 
 
 def errors_in_one_line() -> None:
-    """Let an uncaught :class:`PointSplatError` end the program with its one line and exit status 1.
+    """Print an uncaught :class:`PointSplatError` in one line, without its traceback. The exit status is 1.
 
-    nerfstudio's commands catch nothing, so that a missing photo would print a page of traceback.
+    nerfstudio's commands catch nothing, so a missing photo would print a page of traceback. Calling this again changes
+    nothing.
     """
     if not isinstance(sys.excepthook, _OneLineHook):
         sys.excepthook = _OneLineHook(sys.excepthook)

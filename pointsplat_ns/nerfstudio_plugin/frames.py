@@ -1,6 +1,6 @@
-"""Posed photos, loaded when they are asked for and undistorted as nerfstudio does it.
+"""Posed photos, loaded lazily and undistorted as nerfstudio does it.
 
-A photo is decoded when it is due, a few steps ahead and by a thread, and kept as long as a bounded cache has room.
+Threads decode photos a few steps ahead. A cache of bounded size keeps the decoded ones.
 """
 
 from __future__ import annotations
@@ -23,18 +23,19 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.memory_cache import CacheKey, MemoryCache, free_memory_share
 
 LOOK_AHEAD = 4
-"""Photos decoded ahead of the one in use: enough to hide a decode behind a step, few enough to cost no memory."""
+"""Photos decoded ahead of the one in use: enough to hide decoding behind a training step, few enough to need little
+memory."""
 
 Frame = tuple[Cameras, dict[str, Any]]
-"""A camera of shape (1,), and what nerfstudio calls its data: the photo and what belongs to it."""
+"""A camera of shape (1,), and what nerfstudio calls its data: a dictionary with the photo, its mask and its index."""
 
 
 @dataclass(frozen=True)
 class PhotoKey(CacheKey[Frame]):
-    """Names a decoded photo in a cache that several scenes share."""
+    """Key of a decoded photo in a cache that several scenes share."""
 
     owner: object
-    """Of one :class:`Frames` alone."""
+    """Belongs to one :class:`Frames` object only."""
     index: int
 
 
@@ -51,7 +52,7 @@ class Frames:
         dataset: a nerfstudio dataset; its cameras are read and never changed.
         image_type: as nerfstudio's ``cache_images_type``.
         cache: where decoded photos are kept; by default a cache of a quarter of the free memory.
-        max_workers: threads that decode ahead.
+        max_workers: number of threads that decode ahead.
 
     Raises:
         DataError: when a photo or mask is missing, broken or of another size than its camera.
@@ -94,7 +95,7 @@ class Frames:
             yield self[index]
 
     def prefetch(self, indices: Iterable[int]) -> None:
-        """Start decoding photos that will be asked for soon. What goes wrong is raised when they are."""
+        """Start decoding photos that will be needed soon. An error is raised when the photo is asked for."""
         for index in indices:
             with self._lock:
                 if index in self._loading or self.cache.get(PhotoKey(self._owner, index)) is not None:
@@ -143,7 +144,7 @@ def _bytes_of(data: dict[str, Any]) -> int:
 
 
 def _undistorted(camera: Cameras, data: dict[str, Any]) -> Frame:
-    """A pinhole camera and what it sees, from a camera of shape (1,) and its photo."""
+    """The pinhole camera and the undistorted photo of a camera of shape (1,) and its photo."""
     distortion = camera.distortion_params
     if distortion is None or not torch.any(distortion):
         return camera, data

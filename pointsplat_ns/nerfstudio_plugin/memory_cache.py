@@ -1,4 +1,4 @@
-"""Values kept in memory up to a number of bytes: photos, dense and pruned scenes, renders."""
+"""An in-memory cache of bounded size for photos, dense and pruned scenes, and renders."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 from cachetools import LRUCache
 
 FALLBACK_BYTES = 1 << 30
-"""Size of a cache where the machine's free memory cannot be read."""
+"""Size of a cache if the machine's free memory cannot be read."""
 
 Value = TypeVar("Value")
 
@@ -24,9 +24,9 @@ def free_memory_share(share: float = 0.25) -> int:
 
 
 class CacheKey(Generic[Value]):
-    """What names a value in a :class:`MemoryCache`, and says its type.
+    """Base class of the keys of a :class:`MemoryCache`; its parameter is the type of the value.
 
-    Each kind of value has a key class of its own, a frozen dataclass, so that no two kinds can be mixed up::
+    Each kind of value has a key class of its own, a frozen dataclass, so that two kinds cannot be confused::
 
         @dataclass(frozen=True)
         class PhotoKey(CacheKey[Photo]):
@@ -41,12 +41,12 @@ class _Entry(NamedTuple):
 
 
 class MemoryCache:
-    """Values of any kinds up to a number of bytes, the longest unused dropped first.
+    """A least-recently-used cache, bounded in bytes, for values of several kinds.
 
-    Safe to share among threads. A value is handed out as it was put in, not copied: do not write to it.
+    Safe to share among threads. Values are not copied: do not write to them.
 
     Args:
-        max_bytes: bound on the sum of the sizes of what is kept; 0 keeps nothing.
+        max_bytes: bound on the total size of the values; 0 keeps nothing.
     """
 
     def __init__(self, max_bytes: int):
@@ -56,22 +56,22 @@ class MemoryCache:
 
     @property
     def num_bytes(self) -> int:
-        """Size of what is kept."""
+        """Total size of the values, bytes."""
         return int(self._entries.currsize)
 
     def get(self, key: CacheKey[Value]) -> Value | None:
-        """What is kept under ``key``, which then counts as just used; None if nothing is."""
+        """The value of ``key``, which then counts as just used; None if there is none."""
         with self._lock:
             entry = self._entries.get(key)
         return None if entry is None else entry.value
 
     def put(self, key: CacheKey[Value], value: Value, num_bytes: int) -> None:
-        """Keep a value, and drop the longest unused ones until the bound holds.
+        """Store a value, and drop the least recently used ones until the bound holds.
 
         Args:
-            key: replaces what was kept under it.
+            key: key of the value; an earlier value of the same key is replaced.
             value: not None.
-            num_bytes: the size of the value. One larger than the whole cache is not kept.
+            num_bytes: size of the value. A value larger than the whole cache is not stored.
         """
         with self._lock:
             self._entries.pop(key, None)

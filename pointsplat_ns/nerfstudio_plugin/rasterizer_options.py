@@ -1,4 +1,4 @@
-"""How the models of this plugin draw: the options that the rasterizer obeys."""
+"""The options of the rasterizer that both models of this plugin share."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from pointsplat_ns.rasterizer import rasterization
 
 @dataclass
 class RasterizerOptions:
-    """What draws, and how fast"""
+    """Choice of the rasterizer and its speed"""
 
     backend: Literal["auto", "torch", "gsplat"] = "auto"
-    """What draws: torch runs everywhere; gsplat needs CUDA; auto takes gsplat where its kernels are there."""
+    """Rasterizer: torch runs everywhere, gsplat needs CUDA, auto takes gsplat if its CUDA kernels are available."""
     compiled: bool = False
-    """Blend with kernels made by torch.compile: faster on a CPU with a C++ compiler, after a minute of compiling at the
-    first step (once; the result is kept on disk). Where that fails a warning says why, and training goes on without."""
+    """Blend with kernels made by torch.compile. Faster on a CPU with a C++ compiler, after a minute of compiling at the
+    first step (once: the kernels are kept on disk). If compiling fails, a warning says why and training continues
+    without it."""
     quality: Literal["exact", "balanced", "fast"] = "exact"
-    """What training may give up for speed (docs/rasterizer.md says how much); evaluation is always exact."""
+    """Accuracy that training gives up for speed (measured in docs/rasterizer.md). Evaluation is always exact."""
 
     def rasterize(self, training: bool, **arguments) -> tuple[Tensor, Tensor, dict]:
-        """:func:`~pointsplat_ns.rasterizer.rasterization` by these options; exact outside of training."""
+        """:func:`~pointsplat_ns.rasterizer.rasterization` with these options; exact outside of training."""
         quality = self.quality if training else "exact"
         return rasterization(**arguments, backend=self.backend, compiled=self.compiled, quality=quality)

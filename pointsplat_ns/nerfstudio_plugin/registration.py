@@ -1,4 +1,4 @@
-"""How this package enters nerfstudio without being able to break it."""
+"""Registration with nerfstudio that cannot break nerfstudio's own commands."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import Any
 
 
 def load_specification(name: str, build: Callable[[], Any]) -> Any:
-    """A specification for nerfstudio's registry, or one line saying why there is none.
+    """A specification for nerfstudio's registry, or one line that says why there is none.
 
-    nerfstudio loads entry points unguarded, so that one failing import would end every ``ns-*`` command of the
-    user. What is not a specification it names in a warning and skips.
+    nerfstudio does not guard the loading of entry points: one failing import would end every ``ns-*`` command. It does
+    skip whatever is not a specification, and prints it in a warning.
 
     Args:
-        name: of the method or dataparser, as the user types it.
-        build: imports what the specification needs and makes it.
+        name: name of the method or dataparser, as the user types it.
+        build: imports what the specification needs and returns it.
     """
     try:
         return build()
-    except Exception as error:  # any failure here would otherwise be every command's
+    except Exception as error:  # any error here would end every ns-* command
         return f"{name} of pointsplat-ns, which failed to load ({type(error).__name__}: {error})"

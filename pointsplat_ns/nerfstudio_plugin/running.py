@@ -1,4 +1,4 @@
-"""Running command lines one after the other, so that what an interrupted one finished is not done again."""
+"""Runs command lines in other processes, and tells which trainings have finished."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.nerfstudio_plugin.third_party_warnings import PYTHONWARNINGS
 
 SHORT_SPIN = {"GOMP_SPINCOUNT": "20000"}
-"""OpenMP threads that wait spin for some microseconds, then sleep. By default they spin on, which on a busy machine
-holds up the thread that they wait for; threads that sleep at once (OMP_WAIT_POLICY=PASSIVE) wake too late."""
+"""Lets waiting OpenMP threads spin for some microseconds, then sleep. By default they keep spinning, which on a busy
+machine slows the thread that they wait for. Threads that sleep at once (OMP_WAIT_POLICY=PASSIVE) wake too late."""
 
 
 def finished(run: Path, steps: int) -> bool:
-    """Whether a run's training reached its last step; what an interrupted one left is removed."""
+    """Whether the training in a run's folder reached its last step. The folder of an interrupted one is removed."""
     try:
         if open_run(run, need_data=False).step == steps - 1:
             return True
@@ -30,15 +30,15 @@ def finished(run: Path, steps: int) -> bool:
 
 
 def run(command: str, log: Path | None = None, threads: int | None = None) -> None:
-    """Run a command of this Python's environment, shown as one would type it.
+    """Print a command and run it, with the program from this Python's environment.
 
     Args:
         command: the command line.
-        log: a file for what it says; by default that is shown here.
-        threads: that torch may use in it; by default as many as it likes.
+        log: file for the command's output; by default the output is shown here.
+        threads: number of threads that torch may use in it; by default torch decides.
 
     Raises:
-        PointSplatError: if it fails.
+        PointSplatError: if the command fails.
     """
     print(f"\n$ {command}", flush=True)
     program, *arguments = shlex.split(command)

@@ -1,8 +1,8 @@
-"""Warnings of nerfstudio and torch that every command would print and that its user can do nothing about.
+"""Warnings of nerfstudio and torch that every command would print and that the user can do nothing about.
 
-Each is named by its text, its category and the module that it is raised for, so that no other is lost. One,
-:data:`JIT_SCRIPT`, comes before nerfstudio loads any plugin: nothing here can quiet it in a ``ns-*`` command. Who
-starts such a command can, with :data:`PYTHONWARNINGS`.
+Each is identified by its text, its category and its module, so that no other warning is hidden. :data:`JIT_SCRIPT` is
+raised before nerfstudio loads any plugin, so nothing here can silence it in a ``ns-*`` command. :data:`PYTHONWARNINGS`
+in the command's environment can.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ class KnownWarning:
     """A warning that is expected of another package."""
 
     text: str
-    """How its message begins."""
+    """The beginning of its message."""
     category: type[Warning]
     module: str
-    """For which it is raised, in full."""
+    """Full name of the module that it is reported for."""
 
     def ignore(self) -> None:
-        """Ignore this warning and no other. Doing it again changes nothing."""
+        """Ignore this warning and no other. Calling this again changes nothing."""
         warnings.filterwarnings("ignore", re.escape(self.text), self.category, re.escape(self.module) + r"\Z")
 
 
@@ -50,14 +50,14 @@ NERFSTUDIO = (
         UserWarning,
         "nerfstudio.utils.writer",
     ),
-    # The standard deviation over a single held-out photo, which is then reported as unknown.
+    # The standard deviation over a single held-out photo, which the evaluation then reports as None.
     KnownWarning("std_mean(): degrees of freedom is <= 0", UserWarning, "nerfstudio.pipelines.base_pipeline"),
 )
-"""All of them are raised for modules of nerfstudio, so that ignoring them touches no other program."""
+"""All are reported for modules of nerfstudio, so that ignoring them affects no other code."""
 
 
 def quiet_nerfstudio() -> None:
-    """Ignore :data:`NERFSTUDIO`'s warnings from now on in this process."""
+    """Ignore the warnings in :data:`NERFSTUDIO` from now on in this process."""
     for warning in NERFSTUDIO:
         warning.ignore()
 
@@ -65,10 +65,10 @@ def quiet_nerfstudio() -> None:
 def import_nerfstudio() -> None:
     """Import the first modules of nerfstudio without the warnings that come with it.
 
-    For code that is not run by nerfstudio, before it imports any module that needs it. nerfstudio loads plugins while
-    it is itself half imported; after this, all may be imported in any order.
+    Call it in code that nerfstudio does not run itself, before importing any module that needs nerfstudio. nerfstudio
+    loads plugins while it is itself only half imported; after this call its modules can be imported in any order.
     """
     quiet_nerfstudio()
-    with warnings.catch_warnings():  # torch's own module, so for this import alone
+    with warnings.catch_warnings():  # raised for a module of torch: ignored during this import only
         JIT_SCRIPT.ignore()
         importlib.import_module("nerfstudio.cameras.camera_utils")

@@ -31,25 +31,25 @@ RATES = {
     "features_rest": 3e-5,
 }
 """Adam's peak learning rate for each part of the network. The published 1e-5 to 3e-5 suit a long training of the full
-network. Merged scenes need little repair: trained on two rooms for 300 steps, a third one gained 0.4 dB at 1e-4 and 0.1
-at 2e-4, and lost at 3e-4 and above (400 steps), although the two gained more the higher the rate. After the paper's
-score, which leaves much to repair, 1e-3 learns faster."""
+network. Merged scenes need little repair, and high rates overfit: after 300 steps on two rooms, a third room gained
+0.4 dB at 1e-4 and 0.1 dB at 2e-4. At 3e-4 and above (400 steps) it lost, although the two training rooms gained more at
+higher rates. Scenes pruned by the paper's score need more repair; there 1e-3 learns faster."""
 
 PAPER_RATES = dict.fromkeys(RATES, 1e-5)
-"""The paper's: 1e-5 throughout, divided by 10 (``schedule="step"``) at :data:`STEP_AT` of the steps."""
+"""The paper's rates: 1e-5 for all parts, divided by 10 (``schedule="step"``) at :data:`STEP_AT` of the steps."""
 
 AUTHORS_RATES = {
     **dict.fromkeys(RATES, 3e-5),
     **dict.fromkeys(("means", "scales", "quats"), 1e-5),
     "features_rest": 1e-6,
 }
-"""Those of the authors' released code, with its cosine."""
+"""The rates of the authors' released code, which uses the cosine schedule."""
 
 STEP_AT, STEP_FACTOR = 0.6, 0.1
-"""Where the step schedule divides the rates by ten, as a share of the steps: 6,000 of 10,000 in the paper."""
+"""The step schedule multiplies the rates by STEP_FACTOR at this share of the steps: 6,000 of 10,000 in the paper."""
 
 WARM_UP = 0.05
-"""Share of the steps over which the rates rise to their peak, before the cosine."""
+"""Share of the steps over which the rates rise to their peak, before the cosine decay."""
 
 
 @dataclass
@@ -58,32 +58,31 @@ class PointSplatTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: PointSplatTrainer)
     rates: Literal["fast", "paper", "authors"] = "fast"
-    """Learning rates of the parts of the network: those that teach a small network in a few hundred steps, the paper's
-    (1e-5), or those of the authors' code (1e-6 to 3e-5). What was set by hand is left as it is."""
+    """Learning rates of the parts of the network: fast trains a small network in a few hundred steps, paper is 1e-5,
+    authors is the released code's 1e-6 to 3e-5. Rates set by hand are not changed."""
     rate_factor: float = 1.0
-    """Multiplies all learning rates. The fast ones suit merged scenes and few rooms; with ten rooms and more, three
-    times as much learns faster and still carries over, and ten times as much after the paper's score."""
+    """Multiplies all learning rates. 1 suits merged scenes and few rooms. With ten rooms or more, 3 learns faster and
+    still generalises; so does 10 on scenes pruned by the paper's score."""
     schedule: Literal["cosine", "step"] = "cosine"
     """How the rates fall: along a cosine after a short warm-up, or to a tenth at 60 % of the steps."""
     gradient_accumulation_steps: dict[str, int] = field(default_factory=dict)
     """Steps, each on one scene, whose gradients are averaged before an update: ``all 4``, or by part of the network."""
     max_skipped_steps: int = 10
-    """Steps that may be left out because a loss or a gradient is not finite (a broken photo or scene, rates too high),
-    in all, before training stops and names the scenes. Counted in all and not in a row: nothing changes at such a step,
-    so what is broken is as broken when its turn comes again, and between the turns of one broken scene the others
-    would start the count anew for ever."""
+    """Total number of steps that may be skipped because a loss or a gradient is not finite (a broken photo or scene,
+    rates too high), before training stops and names the scenes. It is a total, not a number of steps in a row: a scene
+    that is broken fails each time its turn comes, and the steps on other scenes in between would reset the count."""
 
-    # nerfstudio's setting of text-to-NeRF methods is no option here.
+    # A setting of nerfstudio's text-to-NeRF methods: hidden on the command line.
     prompt: Suppress[Fixed[str | None]] = None
 
     def setup(self, **kwargs) -> Trainer:
-        """The trainer, for a copy of this config whose rates are those asked for and whose schedules end with the run.
+        """Build the trainer with a copy of this config whose rates are set and whose schedules end with the run.
 
-        A resumed run ends ``max_num_iterations`` after the step that it resumes from, and its schedules with it: what
-        was stopped at 500 of 2,000 steps and is resumed for 1,500 goes on exactly as it would have.
+        A resumed run, and its schedules, end ``max_num_iterations`` after the step that it resumes from: a run stopped
+        at 500 of 2,000 steps and resumed for 1,500 continues exactly as if it had not been stopped.
 
         Raises:
-            PointSplatError: if the rates are multiplied by something else than a finite number above 0.
+            PointSplatError: if ``rate_factor`` is not a finite number above 0.
         """
         if not 0 < self.rate_factor < math.inf:  # NaN fails too
             raise PointSplatError(f"--rate-factor {self.rate_factor:g}: expected a finite number above 0")
@@ -103,12 +102,12 @@ class PointSplatTrainerConfig(TrainerConfig):
                     )
                     continue
                 schedule.warm_up_end = max(1, round(WARM_UP * steps))
-                schedule.max_steps = max(steps, schedule.warm_up_end + 1)  # the cosine divides by what is between
+                schedule.max_steps = max(steps, schedule.warm_up_end + 1)  # the cosine divides by the difference
         return self._target(config, **kwargs)
 
 
 def _steps_done(config: TrainerConfig) -> int:
-    """Steps behind the checkpoint that a run is to resume from, by its name; 0 for a new run."""
+    """Training steps in the checkpoint that a run resumes from, by the checkpoint's name; 0 for a new run."""
     if config.load_dir is None:
         return 0 if config.load_checkpoint is None else _step_of(config.load_checkpoint) + 1
     if config.load_step is not None:
@@ -122,7 +121,7 @@ def _step_of(checkpoint: Path) -> int:
 
 
 def pointsplat_config() -> TrainerConfig:
-    """The ``pointsplat`` method: 2,000 steps, which two CPU cores do in less than an hour on small scenes."""
+    """The ``pointsplat`` method: 2,000 steps, which take two CPU cores less than an hour on small scenes."""
     return PointSplatTrainerConfig(
         method_name="pointsplat",
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),

@@ -1,4 +1,4 @@
-"""What each step of a training gets: one scene, and some of its training photos."""
+"""The datamanager of refiner training: each step gets one scene and some of its training photos."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ class ScenesDataManagerConfig(DataManagerConfig):
     data: Path | None = None
     """A trained Splatfacto run, a 3DGS .ply, or a folder above several (the newest run of each experiment is taken)."""
     supervision: Supervision = "auto"
-    """What renders of the refined scene are compared with in training: photos, or the dense scene's own renders, from
-    the dataset's poses or, where there is no dataset, from poses sampled in free space. auto is photos for trained
-    runs, and dense for PLY files."""
+    """Training targets for renders of the refined scene. photos: the photos of trained runs. dense: renders of the
+    dense scene from the dataset's poses, or without a dataset from poses sampled in free space. auto: photos for
+    trained runs, dense for PLY files."""
     sampled_poses: int = 40
-    """Poses sampled to train on in a scene that has no dataset (a fifth as many again are held out)."""
+    """Number of training poses sampled in a scene without a dataset. A fifth of this number is held out in addition."""
     sampled_size: tuple[int, int] = (320, 240)
-    """Width and height in pixels of pictures from sampled poses."""
+    """Width and height, in pixels, of renders from sampled poses."""
     eval_scenes: tuple[str, ...] = ()
-    """Names of scenes never to train on, to see how the refiner does on scenes that it does not know."""
+    """Names of scenes never to train on, to evaluate the refiner on unseen scenes."""
     images_per_step: int = 2
     """Training photos of one scene rendered at each step (the paper: 2)."""
     cache_gigabytes: float | None = None
-    """Memory for decoded photos, dense and pruned scenes and their renders; by default a quarter of what is free. What
-    does not fit is made again when it is due."""
+    """Memory for decoded photos, dense and pruned scenes and renders; by default a quarter of the free memory. What
+    does not fit is computed again when needed."""
     seed: int = 0
-    """Chooses the order of scenes and photos."""
+    """Determines the order of scenes and photos."""
 
-    # What nerfstudio gives every data manager and this one does not look at is no option of the command line.
+    # Settings of every nerfstudio datamanager that have no effect here: hidden on the command line.
     masks_on_gpu: Suppress[Fixed[bool]] = False
     images_on_gpu: Suppress[Fixed[bool]] = False
 
@@ -56,9 +56,9 @@ class ScenesDataManagerConfig(DataManagerConfig):
 class ScenesDataManager(DataManager):
     """Hands out, at each step, one scene and some of its training photos.
 
-    What a step gets depends on the seed and the step alone, so that a resumed training goes on as if
-    it had never stopped. Of W processes, process R takes the places R, W + R, 2 W + R... of one sequence:
-    together they see what one process sees in W times the steps.
+    The scene and photos of a step depend only on the seed and the step, so that a resumed training continues as if it
+    had not been stopped. Of W processes, process R takes the places R, W + R, 2 W + R... of one sequence: together
+    they see what one process sees in W times the steps.
 
     Raises:
         SceneError: if ``data`` holds no trained run, or ``eval_scenes`` names one that is not there.
@@ -120,22 +120,23 @@ class ScenesDataManager(DataManager):
         return None if self.test_mode == "inference" else self.scenes[self.shown].eval_frames.dataset
 
     def setup_train(self) -> None:
-        """Nothing to set up: photos are read when they are due."""
+        """Nothing to set up: photos are read when they are needed."""
 
     def setup_eval(self) -> None:
-        """Nothing to set up: photos are read when they are due."""
+        """Nothing to set up: photos are read when they are needed."""
 
     def training_frames(self, scene: int) -> Any:
-        """What a scene is learned from: its photos, or the dense scene's own renders."""
+        """The training targets of a scene: its photos, or the dense scene's own renders."""
         scene_at = self.scenes[scene]
         return scene_at.train_frames if self.supervision == "photos" else scene_at.rendered_train
 
     def place(self, step: int) -> int:
-        """Where this process is in the sequence of scenes at a step of its own."""
+        """The place of this process in the common sequence of scenes, at one of its steps."""
         return step * self.world_size + self.local_rank
 
     def _choice(self, step: int) -> tuple[int, list[int]]:
-        """Scene and photos of a step: each scene once before any twice, photos at random without repetition."""
+        """Scene and photos of a step. Each scene comes once before any is repeated; photos are drawn at random without
+        repetition within the step."""
         step = self.place(step)
         epoch, place = divmod(step, len(self.train_indices))
         order = random.Random(f"{self.config.seed} scenes {epoch}").sample(self.train_indices, len(self.train_indices))
@@ -145,7 +146,7 @@ class ScenesDataManager(DataManager):
         return scene, chosen.sample(range(count), min(self.config.images_per_step, count))
 
     def next_train(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
-        """Index of a training scene, and some of its training photos with their cameras, on the device."""
+        """Index of a training scene, and some of its training photos with their cameras, on this process's device."""
         scene, photos = self._choice(step)
         targets = self.training_frames(scene)
         frames = [to_device(targets[i], self.device) for i in photos]
@@ -169,7 +170,7 @@ class ScenesDataManager(DataManager):
         return self.next_eval(step)
 
     def held_out(self, scene: int) -> Iterator[tuple[Cameras, dict[str, Any]]]:
-        """Every held-out photo of a scene with its camera, on the device."""
+        """Every held-out photo of a scene with its camera, on this process's device."""
         return (to_device(frame, self.device) for frame in self.scenes[scene].eval_frames)
 
     def get_train_rays_per_batch(self) -> int:
@@ -182,7 +183,7 @@ class ScenesDataManager(DataManager):
         return self.get_train_rays_per_batch() // self.config.images_per_step
 
     def get_datapath(self) -> Path:
-        """What ``--data`` named."""
+        """The path given by ``--data``."""
         assert self.config.data is not None
         return self.config.data
 

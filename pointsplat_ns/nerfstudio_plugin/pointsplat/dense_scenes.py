@@ -1,7 +1,7 @@
-"""Dense scenes as their own references: what they show from some poses stands in for photos.
+"""Dense scenes whose own renders take the place of photos.
 
-The poses are those of the scene's dataset, or ones sampled in the free space of a scene that comes without any, so
-that a folder of PLY files is a training set.
+They are rendered from the poses of the scene's dataset, or without a dataset from poses sampled in free space. A folder
+of PLY files can thus be a training set.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from pointsplat_ns.views import RasterizeMode
 Split = Literal["train", "test"]
 
 _FINGERPRINT_BYTES = 1 << 16
-"""Read at either end of a PLY to tell it from others: enough for thousands of numbers."""
+"""Bytes read at each end of a PLY file for its fingerprint."""
 
 
 @dataclass(frozen=True)
 class DenseKey(CacheKey[Gaussians]):
-    """Names the Gaussians of a scene in a cache that several scenes share."""
+    """Key of a scene's Gaussians in a cache that several scenes share."""
 
     scene: str
 
 
 @dataclass(frozen=True)
 class RenderKey(CacheKey[tuple[Cameras, dict[str, Any]]]):
-    """Names a render of a scene in a cache that several scenes share."""
+    """Key of a scene's render in a cache that several scenes share."""
 
     scene: str
     split: Split
@@ -52,7 +52,7 @@ class RenderKey(CacheKey[tuple[Cameras, dict[str, Any]]]):
 
 @dataclass(frozen=True)
 class SampledPoses:
-    """How many poses, of what image size, are sampled in a scene that comes without any."""
+    """Numbers of poses to sample in a scene without a dataset, and their image size in pixels."""
 
     train: int = 40
     test: int = 8
@@ -62,18 +62,18 @@ class SampledPoses:
 
 
 class DenseScene:
-    """One scene, its Gaussians read when they are due, and what it shows from some poses.
+    """A dense scene: its Gaussians, read when they are needed, and its own renders from some poses.
 
     Args:
         name: unique among the scenes in use.
         source: the file that holds the Gaussians.
-        cache: for Gaussians and pictures, shared among scenes.
-        poses: how to sample poses where there are none.
-        device: where pictures are drawn.
+        cache: for Gaussians and renders, shared among scenes.
+        poses: how to sample poses if there is no dataset.
+        device: where renders are computed.
     """
 
     has_photos = False
-    """Whether ``train_frames`` and ``eval_frames`` are photos; they are the scene's own renders otherwise."""
+    """Whether ``train_frames`` and ``eval_frames`` are photos; otherwise they are the scene's own renders."""
 
     def __init__(
         self,
@@ -89,31 +89,31 @@ class DenseScene:
 
     @property
     def identity(self) -> str:
-        """What a training remembers of the scene: the same wherever its folder is moved, and another for another
-        training of a scene of that name."""
+        """Text by which a checkpoint records that the network was trained on this scene. It stays the same if the
+        folder is moved, and changes if the scene is trained again."""
         raise NotImplementedError
 
     @cached_property
     def content(self) -> str:
-        """SHA-256 of the file that holds the Gaussians: what is made of them and kept on disk is found by it."""
+        """SHA-256 of the file that holds the Gaussians. Pruned scenes on disk are found by it."""
         return content_hash(self.source)
 
     @property
     def rasterize_mode(self) -> RasterizeMode:
-        """How the scene is drawn."""
+        """Rasterize mode that the scene is rendered with."""
         return "classic"
 
     @property
     def background(self) -> Tensor:
-        """Colour (3,) in [0, 1] that the scene is drawn over."""
+        """Background colour (3,) in [0, 1]."""
         return torch.tensor(BACKGROUND)
 
     def read_dense(self) -> Gaussians:
-        """The Gaussians, read anew, on the CPU."""
+        """Read the Gaussians from the file, onto the CPU."""
         raise NotImplementedError
 
     def dense(self, keep: bool) -> Gaussians:
-        """The Gaussians, from the cache if they are there; ``keep`` puts them there, as long as there is room."""
+        """The Gaussians, from the cache or the file. ``keep`` puts them into the cache if there is room."""
         dense = self.cache.get(DenseKey(self.name))
         if dense is None:
             dense = self.read_dense()
@@ -122,10 +122,10 @@ class DenseScene:
         return dense
 
     def cameras(self, split: Split) -> Cameras:
-        """Pinhole cameras (C,) sampled in free space; none is in both splits.
+        """Pinhole cameras (C,) sampled in free space, different ones for each split.
 
         Raises:
-            DataError: if the scene has nothing to look at, or no free place was found.
+            DataError: if nothing of the scene is visible, or no free position is found.
         """
         poses = self._poses
         seed = random.Random(f"{poses.seed} poses {split}").getrandbits(31)
@@ -134,47 +134,47 @@ class DenseScene:
 
     @cached_property
     def rendered_train(self) -> RenderedFrames:
-        """What the dense scene shows from the training poses, in 8 bits as photos are."""
+        """Renders of the dense scene from the training poses, in 8 bits as photos are."""
         return RenderedFrames(self, "train", "uint8")
 
     @cached_property
     def rendered_eval(self) -> RenderedFrames:
-        """What the dense scene shows from the held-out poses, not rounded."""
+        """Renders of the dense scene from the held-out poses, not rounded."""
         return RenderedFrames(self, "test", "float32")
 
     @property
     def train_frames(self) -> Any:
-        """Training pictures: photos where the scene has them."""
+        """Training images: photos if the scene has them, else its own renders."""
         return self.rendered_train
 
     @property
     def eval_frames(self) -> Any:
-        """Held-out pictures: photos where the scene has them."""
+        """Held-out images: photos if the scene has them, else its own renders."""
         return self.rendered_eval
 
     @torch.no_grad()
     def picture(self, camera: Cameras) -> Tensor:
-        """What the dense scene shows a camera of shape (1,): (H, W, 3) in [0, 1], at exact quality, on the CPU.
+        """A render of the dense scene from a camera of shape (1,): (H, W, 3) in [0, 1], at exact quality, on the CPU.
 
-        Lenses are left out: the picture is that of the pinhole camera with the same intrinsics.
+        Lens distortion is ignored: the camera is taken as a pinhole with the same intrinsics.
         """
         views = views_of_cameras(camera, self.background, self.rasterize_mode)
         return render(self.dense(keep=True).to(self._device), views[0]).cpu()
 
 
 class PlyScene(DenseScene):
-    """A 3DGS PLY and nothing else: no photos, no poses.
+    """A 3DGS PLY without photos or poses.
 
-    A PLY says nothing of its training, so its identity is its name and a fingerprint of its content.
+    A PLY does not say how it was trained, so its identity is its name and a fingerprint of its content.
     """
 
     def read_dense(self) -> Gaussians:
-        """As the file has them."""
+        """Read the Gaussians from the file, onto the CPU."""
         return read_ply(self.source)
 
     @cached_property
     def identity(self) -> str:
-        """The name, and a fingerprint of the file's size and of what is at its ends."""
+        """The name, and a fingerprint of the file's size and of the bytes at both ends."""
         size = self.source.stat().st_size
         with self.source.open("rb") as stream:
             content = stream.read(_FINGERPRINT_BYTES)
@@ -184,14 +184,14 @@ class PlyScene(DenseScene):
 
 
 class RenderedFrames(Sequence[tuple[Cameras, dict[str, Any]]]):
-    """Pictures that a dense scene gives of itself, drawn when they are asked for and kept while the cache has room.
+    """Renders of a dense scene, computed when they are needed and kept while the cache has room.
 
-    ``frames[i]`` is ``(camera, data)`` as that of :class:`~pointsplat_ns.nerfstudio_plugin.frames.Frames`.
+    ``frames[i]`` is ``(camera, data)`` as in :class:`~pointsplat_ns.nerfstudio_plugin.frames.Frames`.
 
     Args:
-        scene: what is drawn.
-        split: whose cameras they are drawn from.
-        image_type: pictures in [0, 255] and rounded, or in [0, 1].
+        scene: the scene to render.
+        split: the split whose cameras are used.
+        image_type: images rounded to integers in [0, 255], or floats in [0, 1].
     """
 
     def __init__(self, scene: DenseScene, split: Split, image_type: Literal["uint8", "float32"]):
@@ -220,7 +220,7 @@ class RenderedFrames(Sequence[tuple[Cameras, dict[str, Any]]]):
         return (self[index] for index in range(len(self)))
 
     def prefetch(self, indices: Iterable[int]) -> None:
-        """Nothing: to draw takes the processor that the step at hand needs."""
+        """Does nothing: rendering ahead would slow the current step."""
 
     @property
     def dataset(self) -> RenderedDataset:
@@ -229,7 +229,7 @@ class RenderedFrames(Sequence[tuple[Cameras, dict[str, Any]]]):
 
 
 class RenderedDataset:
-    """What nerfstudio reads of a dataset, of pictures that a scene gives of itself."""
+    """Renders of a scene, with the part of a dataset's interface that nerfstudio's viewer uses."""
 
     def __init__(self, frames: RenderedFrames):
         self._frames, self.cameras = frames, frames.cameras

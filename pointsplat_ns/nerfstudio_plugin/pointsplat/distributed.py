@@ -1,7 +1,7 @@
-"""Several processes that train one network: how what each of them found becomes one.
+"""Training one network in several processes: losses, gradients, batch norm and reports over all of them.
 
-Everything here is the identity in a process that is alone. The processes are those of ``torch.distributed``, whose
-backend is nccl among GPUs and gloo among CPUs.
+In a single process every function here changes nothing. The processes are those of ``torch.distributed``, with the
+backend nccl on GPUs and gloo on CPUs.
 """
 
 from __future__ import annotations
@@ -17,21 +17,24 @@ from pointsplat_ns.refiner.encoder import BatchNorm
 
 
 def world_size() -> int:
-    """How many processes train together."""
+    """Number of processes that train together."""
     return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
 
 
 def rank() -> int:
-    """Which of them this one is, over all machines."""
+    """Index of this process among all machines' processes."""
     return dist.get_rank() if world_size() > 1 else 0
 
 
 def means_over_ranks(values: dict[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
-    """Mean of each named scalar over the processes that have it; no gradient.
+    """Mean of each named scalar over the processes that have it, without gradient.
 
     Args:
-        values: scalars on this process's device. Names beyond ``names`` are left out.
+        values: this process's scalars by name, on its device. Only those in ``names`` are used.
         names: the same in every process.
+
+    Returns:
+        The means of the names that this process has.
     """
     present = [name for name in names if name in values]
     if world_size() == 1:
@@ -48,7 +51,7 @@ def means_over_ranks(values: dict[str, Tensor], names: Sequence[str]) -> dict[st
 
 
 def any_rank(flag: bool, device: torch.device | str) -> bool:
-    """Whether it is so in any process. All must ask, each with its own device."""
+    """Whether ``flag`` is set in any process. All processes must call this, each with its own device."""
     if world_size() == 1:
         return flag
     count = torch.tensor([float(flag)], device=device)
@@ -57,12 +60,12 @@ def any_rank(flag: bool, device: torch.device | str) -> bool:
 
 
 def with_value(local: Tensor, value: Tensor) -> Tensor:
-    """A scalar of the given value whose gradient is that of ``local``."""
+    """A scalar with the value of ``value`` and the gradient of ``local``."""
     return local + (value - local).detach()
 
 
 def gathered(items: list[Any]) -> list[Any]:
-    """The items of all processes, by rank; in every process."""
+    """The items of all processes, in the order of their ranks; the same list in every process."""
     if world_size() == 1:
         return items
     parts: list[Any] = [None] * world_size()
@@ -72,7 +75,7 @@ def gathered(items: list[Any]) -> list[Any]:
 
 @torch.no_grad()
 def share_state(module: nn.Module) -> None:
-    """Give every process the parameters and buffers of the first."""
+    """Copy the parameters and buffers of the first process to all others."""
     if world_size() > 1:
         for value in (*module.parameters(), *module.buffers()):
             dist.broadcast(value, 0)
@@ -80,9 +83,9 @@ def share_state(module: nn.Module) -> None:
 
 @torch.no_grad()
 def average_gradients(parameters: Iterable[nn.Parameter], steps: int = 1) -> None:
-    """Divide gradients that were added up over steps by their number, and take the mean over processes.
+    """Divide gradients that were summed over ``steps`` by that number, and average them over processes.
 
-    In several processes, a parameter that has a gradient in none of them gets zeros.
+    With several processes, a parameter without a gradient in any of them gets a gradient of zeros.
     """
     parameters = list(parameters)
     share = 1.0 / (steps * world_size())
@@ -100,7 +103,7 @@ def average_gradients(parameters: Iterable[nn.Parameter], steps: int = 1) -> Non
 
 
 class SyncedBatchNorm(BatchNorm):
-    """Batch norm over the points that all processes have at hand: ``[N, C] -> [N, C]``.
+    """Batch norm with statistics over the points of all processes: ``[N, C] -> [N, C]``.
 
     torch's own synchronised batch norm needs a GPU.
     """
@@ -117,7 +120,7 @@ class SyncedBatchNorm(BatchNorm):
 
         sums = all_reduce(torch.cat([x.sum(0), x.new_full((1,), len(x))]))
         count = sums[-1].detach()
-        if float(count) < 2:  # no variance: the running statistics serve
+        if float(count) < 2:  # no variance: use the running statistics
             mean, variance = self.running_mean, self.running_var
         else:
             mean = sums[:-1] / count
@@ -134,7 +137,7 @@ class SyncedBatchNorm(BatchNorm):
 
 
 def synchronise_batch_norm(module: nn.Module) -> None:
-    """Make every batch norm within a module one over all processes; its parameters and statistics stay."""
+    """Turn every batch norm in a module into a :class:`SyncedBatchNorm`, with the same parameters and statistics."""
     for part in module.modules():
         if type(part) is BatchNorm:
             part.__class__ = SyncedBatchNorm

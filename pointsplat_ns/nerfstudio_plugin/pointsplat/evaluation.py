@@ -1,4 +1,4 @@
-"""Variants of a scene against its held-out photos, side by side."""
+"""Evaluation: variants of a scene (dense, pruned, refined) compared with its held-out photos."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ METRICS = ("psnr", "ssim", "lpips")
 
 @dataclass
 class SceneReport:
-    """How the variants of one scene did; metrics are means over its held-out photos."""
+    """Metrics of the variants of one scene, as means over its held-out photos."""
 
     name: str
     views: int
     variants: dict[str, dict[str, Any]]
-    """By variant: psnr (dB), ssim, lpips (None if it cannot be had), gaussians, megabytes, fps."""
+    """By variant: psnr (dB), ssim, lpips (None if it cannot be computed), gaussians, megabytes, fps."""
     per_view: dict[str, dict[str, list[float]]]
-    """By variant and metric: one value a photo."""
+    """By variant and metric: one value per photo."""
     seen_in_training: bool = True
     seconds: dict[str, float] = field(default_factory=dict)
     last_picture: Tensor | None = None
@@ -54,17 +54,17 @@ def evaluate_scene(
     picture_folder: Path | None = None,
     progress: bool = False,
 ) -> SceneReport:
-    """Render each variant at each photo's camera and compare.
+    """Render each variant from each photo's camera and compare the render with the photo.
 
     Args:
-        model: draws; in evaluation mode.
-        scene: says how it is drawn.
-        variants: by name, on the model's device.
+        model: renders the variants; must be in evaluation mode.
+        scene: gives the background and the rasterize mode.
+        variants: the scene's variants by name, on the model's device.
         frames: cameras of shape (1,) and their photos.
-        count: how many frames there are, for the bar.
-        lpips: one view whose LPIPS it cannot compute leaves the scene without any.
-        picture_folder: where to write a picture of every view, if anywhere.
-        progress: show a bar.
+        count: number of frames, for the progress bar.
+        lpips: computes LPIPS. If it fails for one view, the scene has no LPIPS.
+        picture_folder: folder for an image of every view; None writes none.
+        progress: show a progress bar.
 
     Raises:
         DataError: if there is no photo.
@@ -97,7 +97,7 @@ def evaluate_scene(
             "dataparser's split"
         )
     if any(len(per_view["lpips"]) < views for per_view in values.values()):
-        for per_view in values.values():  # no mean of the other views would be comparable
+        for per_view in values.values():  # a mean over fewer views would not be comparable
             per_view["lpips"] = []
     rows = {}
     for name, gaussians in variants.items():
@@ -108,7 +108,7 @@ def evaluate_scene(
 
 
 def summarize(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
-    """What ``ns-eval`` writes: valid JSON, with None for what is not finite or could not be computed."""
+    """The results that ``ns-eval`` writes as JSON, with None for values that are not finite or not computed."""
     unseen = [r for r in reports if not r.seen_in_training]
     seen = [r for r in reports if r.seen_in_training]
     judged = unseen or reports
@@ -134,12 +134,12 @@ def summarize(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
 
 
 def summarize_by_reference(reports: list[SceneReport], has_photos: list[bool], with_std: bool) -> dict[str, Any]:
-    """:func:`summarize`, where no mean mixes what was compared with photos and what was compared with the dense
-    scene's own renders.
+    """As :func:`summarize`, with separate means for scenes compared with photos and scenes compared with renders of the
+    dense scene.
 
     Args:
-        reports: of all scenes.
-        has_photos: of each of them, whether it was compared with photos.
+        reports: reports of all scenes.
+        has_photos: for each scene, whether it was compared with photos.
         with_std: add the standard deviation of the refined scenes' metrics over photos.
     """
     names = {True: "photos", False: "dense renders"}
@@ -161,7 +161,7 @@ def summarize_by_reference(reports: list[SceneReport], has_photos: list[bool], w
 
 
 def only_finite(values: dict[str, Any]) -> dict[str, float]:
-    """What nerfstudio's writers can log."""
+    """The finite floats among the values, which nerfstudio's writers can log."""
     return {name: v for name, v in values.items() if isinstance(v, float) and math.isfinite(v)}
 
 
@@ -174,7 +174,7 @@ def _average(reports: list[SceneReport]) -> dict[str, dict[str, float | None]]:
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    """Mean of numbers; None if there is none, one is unknown, or the mean is not finite."""
+    """Mean of the values; None if there are none, one of them is None, or the mean is not finite."""
     numbers = [v for v in values if v is not None]
     return _finite(sum(numbers) / len(numbers)) if numbers and len(numbers) == len(values) else None
 

@@ -1,4 +1,4 @@
-"""What the refiner is trained to lower: how much renders differ from photos."""
+"""The training loss of the refiner, between renders and photos."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, cached_lpips
 
 PIXEL_LOSSES: dict[str, Callable[[Tensor], Tensor]] = {
     "l1": lambda difference: difference.abs().mean(),
-    # 1e-12 (120 dB) keeps the slope of the root finite where nothing differs.
+    # 1e-12 (120 dB) keeps the gradient of the root finite for identical images.
     "rmse": lambda difference: (difference.square().mean() + 1e-12).sqrt(),
 }
-"""What a picture's difference (H, W, 3) costs, by the name of the loss."""
+"""Pixel losses by name, as functions of the difference (H, W, 3) of two images."""
 
 LOSSES = (*PIXEL_LOSSES, "lpips")
-"""Names of all parts that a loss may have."""
+"""Names of all terms that the loss may have."""
 
 
 class PhotoLoss:
-    """A loss of pixels, and a weighted LPIPS where it can be had.
+    """A pixel loss plus weighted LPIPS. If LPIPS cannot be computed, the pixel loss alone.
 
     Args:
         pixel_loss: one of :data:`PIXEL_LOSSES`.
-        lpips_weight: of LPIPS beside the pixels; 0 leaves it out.
-        lpips_net: its network; "auto" is VGG on CUDA and AlexNet elsewhere.
+        lpips_weight: weight of LPIPS; 0 leaves it out.
+        lpips_net: network of LPIPS; "auto" is VGG on CUDA and AlexNet elsewhere.
     """
 
     def __init__(self, pixel_loss: str, lpips_weight: float, lpips_net: Literal["auto", "alex", "vgg"]):
         self._pixel_loss, self._weight, self._net = pixel_loss, lpips_weight, lpips_net
         self.no_lpips_reason: str | None = None
-        """Why the loss goes without LPIPS from some step on; None while it does not."""
+        """Why LPIPS is left out of the loss; None while it is part of it."""
 
     def __call__(self, pairs: list[tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
-        """The parts of the loss, whose sum it is.
+        """The terms of the loss; the loss is their sum.
 
         Args:
             pairs: renders and photos, each (H, W, 3) in [0, 1].
 
         Returns:
-            Means over the pairs, by name: the pixel loss, and ``lpips``, weighted.
+            Means over the pairs, by name: the pixel loss and the weighted ``lpips``.
         """
         pixel_loss = PIXEL_LOSSES[self._pixel_loss]
         losses = {self._pixel_loss: torch.stack([pixel_loss(render - photo) for render, photo in pairs]).mean()}
@@ -62,8 +62,8 @@ class PhotoLoss:
         return losses
 
     def _lpips(self, device: torch.device) -> Lpips | None:
-        """LPIPS, unless it has no weight or could not be had before: a loss is not to change in the course of a
-        training."""
+        """LPIPS; None if its weight is 0 or it could not be computed before. After a failure it stays left out, so that
+        the loss does not change back during training."""
         if self._weight == 0 or self.no_lpips_reason is not None:
             return None
         net: Literal["alex", "vgg"]

@@ -1,4 +1,4 @@
-"""The refiner that ships, from nothing: rooms, a trained scene of each, a training, an evaluation and a card."""
+"""Makes the refiner that ships, from scratch: rooms, scenes trained on them, refiner training, evaluation, card."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from pointsplat_ns.refiner import read_refiner, save_refiner
 from pointsplat_ns.rooms import write_room
 
 TIMESTAMP = "recipe"
-"""Names the runs, so that what is finished is found again."""
+"""Folder name of the runs, the same in each call, so that finished ones are found again."""
 
 
 @dataclass(frozen=True)
 class MadeRefiner:
-    """What :func:`make_refiner` made."""
+    """The results of :func:`make_refiner`."""
 
     weights: Path
     card: Path
-    """What the weights were made of, and what they do."""
+    """Model card: training data, command, results."""
     pictures: Path
-    """Folder of pictures: photo, dense, pruned and refined side by side."""
+    """Folder of images: photo, dense, pruned and refined side by side."""
     results: dict[str, Any]
-    """Of the evaluation."""
+    """Results of the evaluation."""
 
 
 def make_refiner(
@@ -50,22 +50,21 @@ def make_refiner(
     workers: int | None = None,
     seed: int = 0,
 ) -> MadeRefiner:
-    """Make rooms, train a scene of each, train a refiner on them, and judge it on rooms that it never saw.
+    """Generate rooms, train a scene of each, train a refiner on them, and evaluate it on rooms it was not trained on.
 
-    The commands are printed and run as a person would type them. What an interrupted call has finished is not done
-    again.
+    The commands that it runs are printed. After an interruption, a second call continues with what is not finished.
 
     Args:
-        output: folder for everything that is made.
+        output: folder for all results.
         weights: folder for refiner.safetensors and CARD.md; by default the output folder.
-        size: of the network.
-        steps: of its training.
-        rooms: train on the first so many rooms only; by default on all.
-        workers: scenes trained side by side, on one thread each; by default as many as there are cores.
-        seed: of the network's initial weights and of the order of scenes and views.
+        size: size of the network.
+        steps: training steps of the network.
+        rooms: number of rooms to train on; by default all.
+        workers: number of scenes trained at the same time, on one thread each; by default one per core.
+        seed: seed of the network's initial weights and of the order of scenes and views.
 
     Raises:
-        DataError: if there are not so many rooms, or no steps.
+        DataError: if ``rooms`` or ``steps`` is out of range.
         PointSplatError: if a command fails.
 
     Example:
@@ -113,7 +112,7 @@ def make_refiner(
 
 
 def _make_scenes(output: Path, seeds: tuple[int, ...], workers: int) -> None:
-    """Rooms with photos, and a trained scene of each, ``workers`` at a time with one thread each."""
+    """Generate the rooms and train a scene of each, ``workers`` at a time with one thread each."""
 
     def make(seed: int) -> None:
         settings = scene_settings(seed)

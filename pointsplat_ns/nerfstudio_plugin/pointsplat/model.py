@@ -43,39 +43,38 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     keep: float = 0.3
     """Gaussians to keep: a ratio in (0, 1], or a count if above 1."""
     more_keeps: tuple[float, ...] = ()
-    """Further amounts to keep, as ``keep``: each training step draws one of them all, so that one network learns to
-    repair scenes of many budgets. Evaluation takes ``keep``."""
+    """Further values of keep. Each training step draws one of all values at random, so that one network learns to
+    repair scenes of several budgets. Evaluation uses keep."""
     augment: bool = False
-    """Train on each scene turned, mirrored and repainted at random, so that the network learns neither which way is up
-    nor the colours of the training scenes. The pictures it is compared with stay as they are; the price is that
-    a scene's neighbour tables are computed at each step."""
+    """Rotate, mirror and recolour each training scene at random, so that the network learns neither the up direction
+    nor the colours of the training scenes. The target images do not change. A scene's neighbour tables are then
+    computed anew at each step."""
     pruned_folder: Path | None = None
-    """Folder for pruned scenes, which other trainings on the same scenes then need not make again."""
+    """Folder for pruned scenes. Other trainings on the same scenes read them from there."""
     by: str = "merge"
-    """How they are chosen: merge puts one Gaussian in the place of neighbours; a score leaves Gaussians out: coverage,
-    paper (eq. 3), authors, opacity, volume, log-volume, area or random."""
+    """Pruning method. merge replaces neighbours by one Gaussian each. The others keep the Gaussians with the highest
+    score: coverage, paper (eq. 3), authors, opacity, volume, log-volume, area or random."""
     opacity_weight: float | None = None
     """Lambda of paper, authors and log-volume: the weight of opacity against volume; by default the paper's 0.3."""
     size: Literal["tiny", "small", "full"] = "small"
-    """Size of the network: full is the paper's and wants a GPU; small and tiny are for a CPU."""
+    """Size of the network: full is the paper's and needs a GPU; small and tiny are for a CPU."""
     encoder: Literal["dual", "concat"] = "dual"
     """dual is the paper's dual-branch encoder; concat feeds one concatenated vector, as SplatFormer does."""
     use_appearance: bool = True
-    """Gate the geometry by what a Gaussian looks like (the paper's Table 4); dual encoder only."""
+    """Gate the geometry branch by the appearance branch (the paper's Table 4); dual encoder only."""
     use_position: bool = True
     """Add the positional term delta to both branches (the paper's Table 4); dual encoder only."""
     norm: Literal["scene", "batch", "layer"] = "scene"
-    """Normalisation outside the attention blocks: scene takes statistics of the scene at hand, in evaluation too; batch
-    is the published one, which evaluates with running averages over the training scenes; layer is by Gaussian."""
+    """Normalisation outside the attention blocks. scene: statistics of the current scene, also in evaluation. batch:
+    the published one, with running averages over the training scenes in evaluation. layer: per Gaussian."""
     pixel_loss: Literal["l1", "rmse"] = "l1"
-    """What the loss compares pixels by: their mean difference, or the root of the mean squared one, which PSNR is
-    measured by."""
+    """Pixel loss: mean absolute difference, or root mean squared difference, which determines the PSNR."""
     lpips_weight: float = 0.1
-    """Weight of LPIPS in the loss, beside that of pixels."""
+    """Weight of LPIPS in the loss; the pixel loss has weight 1."""
     lpips_net: Literal["auto", "alex", "vgg"] = "auto"
-    """Network of the training loss's LPIPS; auto is vgg on CUDA and alex, thirty times cheaper, elsewhere."""
+    """Network of LPIPS in the training loss. auto is vgg on CUDA, and elsewhere alex, which is thirty times cheaper."""
 
-    # What nerfstudio gives every model and this one does not look at is no option of the command line.
+    # Settings of every nerfstudio model that have no effect here: hidden on the command line.
     enable_collider: Suppress[Fixed[bool]] = False
     collider_params: Suppress[Fixed[dict[str, float] | None]] = None
     loss_coefficients: Suppress[Fixed[dict[str, float]]] = field(default_factory=dict)
@@ -83,18 +82,18 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     prompt: Suppress[Fixed[str | None]] = None
 
     sh_degree: ClassVar[int] = 3
-    """What ``ns-export`` looks at: above 0 colours are SH coefficients. A scene may have any degree."""
+    """Read by ``ns-export``: above 0, colours are SH coefficients. A scene may have any degree."""
 
     def prune_settings(self, keep: float | None = None) -> PruneSettings:
-        """How scenes are pruned, at the config's own ``keep`` by default.
+        """How scenes are pruned; ``keep`` is the config's own by default.
 
         Raises:
-            PointSplatError: if no scene could be pruned so.
+            PointSplatError: if the settings fit no scene.
         """
         return PruneSettings(self.keep if keep is None else keep, self.by, self.opacity_weight)
 
     def network_options(self) -> dict[str, Any]:
-        """Changes to the preset of the network's size."""
+        """The options of the network that the preset of its size does not decide."""
         return {
             "encoder": self.encoder,
             "use_appearance": self.use_appearance,
@@ -103,10 +102,10 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
         }
 
     def check(self) -> None:
-        """Refuse what no scene could be trained with, and options that would have no effect.
+        """Refuse settings that fit no scene, and options that would have no effect.
 
         Raises:
-            PointSplatError: if there is such an option.
+            PointSplatError: if there is one.
         """
         for keep in (self.keep, *self.more_keeps):
             self.prune_settings(keep)
@@ -128,39 +127,39 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
 
 
 class PointSplatModel(SplatfactoModel):
-    """See the module. The pipeline hands over the scenes with :meth:`attach` before anything is drawn."""
+    """The model described in the module's docstring. The pipeline passes in the scenes by :meth:`attach`."""
 
     config: PointSplatModelConfig  # type: ignore[assignment]  # Splatfacto's options would have no effect here
 
     def populate_modules(self) -> None:
-        """Build the network; nothing of a scene is a parameter.
+        """Build the network. The Gaussians of scenes are not parameters of the model.
 
         Raises:
-            PointSplatError: if the config asks for what cannot be, or its settings describe no network.
+            PointSplatError: if the config is not valid.
         """
         self.config.check()
         self.refiner = Refiner(preset(self.config.size, **self.config.network_options()))
         self.crop_box: OrientedBox | None = None
         self.scenes: list[DenseScene] = []
         self.shown = 0
-        """Which scene the viewer and the exporter get."""
+        """Index of the scene that the viewer and the exporter get."""
         self.loss = PhotoLoss(self.config.pixel_loss, self.config.lpips_weight, self.config.lpips_net)
         self._pruned = self._pruned_within(MemoryCache(0))
         self._refined: tuple[int, Gaussians] | None = None
 
     def attach(self, scenes: list[DenseScene], shown: int, cache: MemoryCache) -> None:
-        """Take the scenes to work on, which of them is the model's own to the viewer and the exporter, and where pruned
-        scenes are kept."""
+        """Set the scenes, the index of the one that the viewer and the exporter get, and the cache for pruned
+        scenes."""
         self.scenes, self.shown, self._pruned = scenes, shown, self._pruned_within(cache)
 
     def _pruned_within(self, cache: MemoryCache) -> PrunedScenes:
         return PrunedScenes(cache, self.config.pruned_folder, self.refiner.prepare)
 
     def load_state_dict(self, dict, **kwargs):  # type: ignore[override]
-        """The network's weights; Splatfacto's own method would look for Gaussians.
+        """Load the network's weights. Splatfacto's own method would look for Gaussians.
 
         Raises:
-            SceneError: if they are those of another network. nerfstudio would go on with the part that fits.
+            SceneError: if the weights are those of another network. nerfstudio would load the part that fits.
         """
         self._refined = None
         try:
@@ -181,40 +180,40 @@ class PointSplatModel(SplatfactoModel):
         return self.refiner.parameter_groups()
 
     def pruned_scene(self, index: int, dense: Gaussians | None = None, keep: float | None = None) -> PrunedScene:
-        """A scene, pruned and serialized.
+        """A pruned scene and its neighbour tables.
 
         Args:
-            index: of the scene.
+            index: index of the scene.
             dense: its Gaussians, if they have been read already.
-            keep: the config's by default.
+            keep: amount to keep; by default the config's.
 
         Raises:
-            PointSplatError: if this scene cannot be pruned so.
+            PointSplatError: if the settings do not fit this scene.
         """
         return self._pruned.get(self.scenes[index], self.config.prune_settings(keep), self.device, dense)
 
     def refine(self, index: int) -> Gaussians:
-        """The refined scene; differentiable in training, computed once for the same weights in evaluation."""
+        """The refined scene; differentiable in training, cached in evaluation."""
         if self.training:
             self._refined = None
-            seen = self.pruned_scene(index, keep=self._drawn_keep())
+            scene = self.pruned_scene(index, keep=self._drawn_keep())
             if not self.config.augment:
-                return self.refiner(seen.pruned, seen.structure)
+                return self.refiner(scene.pruned, scene.structure)
             transform = random_transform()
-            return transform.undo(self.refiner(transform.apply(seen.pruned)))
+            return transform.undo(self.refiner(transform.apply(scene.pruned)))
         if self._refined is None or self._refined[0] != index:
-            seen = self.pruned_scene(index)
+            scene = self.pruned_scene(index)
             with torch.no_grad():
-                self._refined = index, self.refiner(seen.pruned, seen.structure)
+                self._refined = index, self.refiner(scene.pruned, scene.structure)
         return self._refined[1]
 
     def _drawn_keep(self) -> float | None:
-        """The budget of a training step: one of several, at random."""
+        """The budget of a training step, drawn at random if there are several; None is the config's ``keep``."""
         keeps = (self.config.keep, *self.config.more_keeps)
         return keeps[int(torch.randint(len(keeps), ()))] if len(keeps) > 1 else None
 
     def timed_refine(self, index: int) -> tuple[Gaussians, float]:
-        """As :meth:`refine` in evaluation, computed anew, and the seconds that it took."""
+        """As :meth:`refine` in evaluation, but not from the cache, and the seconds that it took."""
         self.pruned_scene(index)
         self._refined = None
         start = time.perf_counter()
@@ -224,13 +223,16 @@ class PointSplatModel(SplatfactoModel):
         return refined, time.perf_counter() - start
 
     def draw(self, gaussians: Gaussians, scene: DenseScene, camera: Cameras) -> dict[str, Tensor]:
-        """Render a scene as its run was rendered.
+        """Render a scene with its background and rasterize mode.
 
         Args:
+            gaussians: what to render, on the model's device.
+            scene: gives the background and the rasterize mode.
             camera: of shape (1,), on the model's device.
 
         Returns:
-            ``rgb`` (H, W, 3) in [0, 1], ``accumulation`` (H, W, 1), ``depth`` (H, W, 1) in scene units, ``background``.
+            ``rgb`` (H, W, 3) in [0, 1], ``accumulation`` (H, W, 1), ``background`` (H, W, 3), and in evaluation
+            ``depth`` (H, W, 1) in scene units.
         """
         width, height = int(camera.width.item()), int(camera.height.item())
         image, alpha, _ = self.config.rasterize(
@@ -260,7 +262,7 @@ class PointSplatModel(SplatfactoModel):
         return outputs
 
     def get_outputs(self, camera: RayBundle | Cameras) -> dict[str, Any]:
-        """The shown scene, refined, from one camera; cropped where the viewer asks for it."""
+        """The shown scene, refined, from one camera; inside the viewer's crop box if there is one."""
         if not isinstance(camera, Cameras):
             return {}
         gaussians = self.gaussians
@@ -271,9 +273,13 @@ class PointSplatModel(SplatfactoModel):
     def losses(self, index: int, frames: list[tuple[Cameras, dict]]) -> tuple[dict, dict[str, Tensor], dict]:
         """Refine a scene and compare its renders with photos.
 
+        Args:
+            index: index of the scene.
+            frames: cameras of shape (1,) and their photos.
+
         Returns:
-            Outputs of the last photo's camera, the losses (of pixels and weighted LPIPS, averaged over the photos), and
-            metrics to log. A loss may be NaN or infinite: the trainer then skips the step.
+            Outputs of the last photo's camera; the losses (pixel loss and weighted LPIPS, averaged over the photos);
+            and metrics to log. A loss may be NaN or infinite: the trainer then skips the step.
         """
         refined, scene = self.refine(index), self.scenes[index]
         outputs: dict[str, Tensor] = {}
@@ -286,12 +292,12 @@ class PointSplatModel(SplatfactoModel):
         return outputs, self.loss(pairs), {"psnr": quality, "gaussian_count": len(refined)}
 
     def photo_of(self, data: dict[str, Any], background: Tensor) -> Tensor:
-        """A photo (H, W, 3) in [0, 1], over ``background`` where it has an alpha channel."""
+        """A photo (H, W, 3) in [0, 1], composited over ``background`` if it has an alpha channel."""
         image = data["image"]
         image = image.float() / 255 if image.dtype == torch.uint8 else image
         return self.composite_with_background(image.to(self.device), background)
 
-    # What nerfstudio's viewer and exporter read of a Splatfacto model.
+    # The attributes of a Splatfacto model that nerfstudio's viewer and exporter read.
 
     @property
     def gaussians(self) -> Gaussians:
@@ -305,7 +311,7 @@ class PointSplatModel(SplatfactoModel):
 
     @property
     def colors(self) -> Tensor:
-        """Colours of the shown scene seen from nowhere in particular, (N, 3)."""
+        """Colours (N, 3) of the shown scene by the constant SH coefficients alone."""
         return SH2RGB(self.gaussians.features_dc)
 
     @property

@@ -1,4 +1,4 @@
-"""The PointSplat pipeline: training across scenes, and an evaluation that compares dense, pruned and refined."""
+"""The PointSplat pipeline: training over many scenes, and an evaluation of dense, pruned and refined scenes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class PointSplatPipelineConfig(VanillaPipelineConfig):
 
 
 class PointSplatPipeline(VanillaPipeline):
-    """One step: one scene, pruned and refined, rendered from some of its training cameras.
+    """Each step prunes and refines one scene and renders it from some of its training cameras.
 
     Raises:
         SceneError: if ``--data`` holds no scene, or ``world_size`` processes are not connected.
@@ -66,7 +66,7 @@ class PointSplatPipeline(VanillaPipeline):
                 "ns-train --machine.num-devices, on GPUs, or join them with torch.distributed"
             )
         if world_size > 1 and torch.device(device).type == "cuda":
-            torch.cuda.set_device(local_rank)  # what is gathered travels by the current device
+            torch.cuda.set_device(local_rank)  # nccl gathers objects through the current device
         self.config, self.test_mode, self.world_size = config, test_mode, world_size
         self.datamanager = config.datamanager.setup(
             device=device, test_mode=test_mode, world_size=world_size, local_rank=distributed.rank()
@@ -81,14 +81,14 @@ class PointSplatPipeline(VanillaPipeline):
         scenes, indices = self.datamanager.scenes, self.datamanager.train_indices
         trained_on = [scenes[i].identity for i in indices] if test_mode == "val" else []
         self.training_state = TrainingState(self.model.get_param_groups(), trained_on)
-        """What the training has done so far; a checkpoint holds it."""
+        """State of the training that checkpoints hold beside weights and optimisers."""
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What a checkpoint says beside the weights; torch asks for it."""
+        """The training state, for torch's ``state_dict``."""
         return self.training_state.to_dict()
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take up what a checkpoint says beside the weights, and say so if scenes have gone since."""
+        """Load the training state of a checkpoint; logs which of its scenes are missing now."""
         scenes = self.datamanager.scenes
         self.training_state.load(state, [scene.name for scene in scenes])
         gone = set(state["trained_on"]) - {scene.identity for scene in scenes}
@@ -97,20 +97,20 @@ class PointSplatPipeline(VanillaPipeline):
 
     @property
     def model(self) -> PointSplatModel:
-        """The model; never wrapped."""
+        """The model, which is never wrapped for distributed training."""
         return self._model  # type: ignore[return-value]
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict, dict]:
         """Losses of one scene at some of its training photos.
 
-        Random numbers (the order of serialization curves, dropped paths) depend on the seed and the place of the
-        scene in the sequence alone, as the choice of scene and photos does: a resumed training goes on as if it had
-        never stopped. Several processes take turns in that sequence; the values of their losses and metrics are the
-        mean over processes, the gradients each process's own.
+        Random numbers (the order of serialization curves, dropped paths) depend only on the seed and on the scene's
+        place in the sequence, as does the choice of scene and photos. So a resumed training continues as if it had not
+        been stopped. Several processes take turns in that sequence. The values of their losses and metrics are means
+        over processes; the gradients are each process's own.
 
         Returns:
-            Outputs of the last photo's camera; losses; and metrics, among which ``faults`` has the losses of this
-            process that are not finite, in words.
+            Outputs of the last photo's camera; losses; and metrics. The metric ``faults`` is a list of texts, one for
+            each loss of this process that is not finite.
         """
         place = self.datamanager.place(step)
         torch.manual_seed(random.Random(f"{self.config.datamanager.seed} network {place}").getrandbits(63))
@@ -135,7 +135,7 @@ class PointSplatPipeline(VanillaPipeline):
 
     @torch.no_grad()
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict, dict]:
-        """One held-out photo: metrics, and a picture of photo, pruned and refined side by side."""
+        """Metrics at one held-out photo, and an image of photo, pruned and refined side by side."""
         training = self.training
         self.eval()
         index, frames = self.datamanager.next_eval_image(step)
@@ -153,20 +153,20 @@ class PointSplatPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """Dense, pruned and refined scenes over all held-out photos of all scenes.
+        """Metrics of dense, pruned and refined scenes over all held-out photos of all scenes.
 
         Args:
-            step: given by the trainer, whose log takes numbers alone: only those are returned then.
-            output_path: folder for pictures of photo, dense, pruned and refined side by side.
+            step: given by the trainer, whose log takes only finite numbers: only those are then returned.
+            output_path: folder for images of photo, dense, pruned and refined side by side.
             get_std: add the standard deviation of the refined scenes' metrics over photos.
 
         Returns:
-            ``psnr``, ``ssim`` and ``lpips`` of the refined scenes (of those never trained on, if there are any),
-            ``average``, ``average_unseen`` and ``average_seen`` (over scenes, by variant), and ``scenes``. What
-            cannot be computed is None, and ``lpips_note`` says why LPIPS is missing. ``reference`` says what renders
-            were compared with, here and in each scene: ``photos``, or ``dense renders`` where a scene has no photos
-            (the dense scene is then the reference, and has no PSNR). Where there are both, the figures above are those
-            against photos, and ``against_dense_renders`` holds the others.
+            ``psnr``, ``ssim`` and ``lpips`` of the refined scenes (only of those not trained on, if there are any);
+            ``average``, ``average_unseen`` and ``average_seen`` (over scenes, by variant); and ``scenes``. Values that
+            cannot be computed are None, and ``lpips_note`` says why LPIPS is missing. ``reference``, here and in each
+            scene, says what renders were compared with: ``photos``, or ``dense renders`` if a scene has no photos (its
+            dense variant then has no PSNR). If there are scenes of both kinds, the values above are those of scenes
+            with photos, and ``against_dense_renders`` holds those of the others.
         """
         training = self.training
         self.eval()
@@ -200,7 +200,7 @@ class PointSplatPipeline(VanillaPipeline):
         return summary if step is None else only_finite(summary)
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
-        """Saves the network by itself at the end of training, for use without the scenes that it was trained on."""
+        """Saves the network alone at the end of training, for use without the training scenes."""
 
         def save(step: int) -> None:
             trainer = attributes.trainer

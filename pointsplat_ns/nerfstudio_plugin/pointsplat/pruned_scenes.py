@@ -1,4 +1,4 @@
-"""Scenes that are pruned once: kept in memory while there is room, and on disk where there is a folder for them."""
+"""Pruned scenes, each computed once: kept in memory while there is room, and on disk if a folder is given."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from pointsplat_ns.refiner import Structure
 
 @dataclass(frozen=True, eq=False)
 class PrunedScene:
-    """What training and evaluation need of a scene, computed once."""
+    """A pruned scene and what the network needs beside it."""
 
     dense_count: int
     pruned: Gaussians
@@ -32,23 +32,23 @@ class PrunedScene:
     structure: Structure | None
     """The neighbour tables of the pruned scene; None if it is empty."""
     seconds: float
-    """That pruning took, without reading."""
+    """Duration of pruning, without reading the scene."""
 
 
 @dataclass(frozen=True)
 class PrunedKey(CacheKey[PrunedScene]):
-    """Names a pruned scene in a cache that several scenes share."""
+    """Key of a pruned scene in a cache that several scenes share."""
 
     scene: str
     settings: PruneSettings
 
 
 class PrunedScenes:
-    """Prunes scenes, and finds again what was pruned.
+    """Prunes scenes, or takes them from memory or disk if they have been pruned before.
 
     Args:
-        cache: where pruned scenes are kept; the latest one is kept in any case.
-        folder: where they are kept on disk, found again by the content of the dense scene's file; None for nowhere.
+        cache: keeps pruned scenes in memory. The latest one is kept even if the cache has no room for it.
+        folder: keeps pruned scenes on disk, by the content of the dense scene's file; None keeps none.
         prepare: computes the neighbour tables that the network needs.
     """
 
@@ -63,30 +63,30 @@ class PrunedScenes:
         device: torch.device | str,
         dense: Gaussians | None = None,
     ) -> PrunedScene:
-        """A scene, pruned and serialized.
+        """A pruned scene and its neighbour tables.
 
         Args:
-            scene: what to prune.
-            settings: how.
-            device: where the network is.
+            scene: the scene to prune.
+            settings: how to prune it.
+            device: device of the network.
             dense: the scene's Gaussians, if they have been read already.
 
         Raises:
-            PointSplatError: if this scene cannot be pruned so; the text names it.
+            PointSplatError: if the settings do not fit this scene; the message names it.
         """
         key = PrunedKey(scene.name, settings)
         if self._latest is None or self._latest[0] != key:
-            found = self._cache.get(key)
-            if found is None:
-                found = self._make(scene, settings, device, dense)
-                self._cache.put(key, found, sum(tensor.nbytes for tensor in tensors_in(found)))
-            self._latest = key, found
+            pruned = self._cache.get(key)
+            if pruned is None:
+                pruned = self._make(scene, settings, device, dense)
+                self._cache.put(key, pruned, sum(tensor.nbytes for tensor in tensors_in(pruned)))
+            self._latest = key, pruned
         return self._latest[1]
 
     def _make(
         self, scene: DenseScene, settings: PruneSettings, device: torch.device | str, dense: Gaussians | None
     ) -> PrunedScene:
-        """A scene from the folder, or pruned now and put there."""
+        """Read a pruned scene from the folder, or prune the scene now and save it there."""
         stored = None if self._folder is None else stored_path(self._folder, scene.name, scene.content, settings)
         if stored is not None and stored.is_file():
             pruned, dense_count, seconds = read_pruned(stored)
@@ -106,7 +106,7 @@ class PrunedScenes:
 
 
 def tensors_in(value: Any) -> Iterator[Tensor]:
-    """Every tensor held by a dataclass, tuple or list, however deep."""
+    """Every tensor in a dataclass, tuple or list, at any depth."""
     if isinstance(value, Tensor):
         yield value
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):

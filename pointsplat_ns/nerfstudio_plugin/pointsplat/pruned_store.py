@@ -1,4 +1,4 @@
-"""Pruned scenes on disk, so that trainings on the same scenes need not prune them again."""
+"""Files of pruned scenes, so that further trainings on the same scenes need not prune them again."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from pointsplat_ns.io.files import one_line, replacing
 from pointsplat_ns.pruning import PruneSettings
 
 FORMAT = "pointsplat-pruned/1"
-"""Changes whenever a method of pruning does, so that no file of an older one is taken."""
+"""Must change whenever the result of a pruning method changes, so that older files are not used."""
 
 
 def stored_path(folder: Path, name: str, content: str, settings: PruneSettings) -> Path:
-    """Where a scene that is pruned in some way belongs.
+    """The path of a pruned scene's file.
 
     Args:
-        folder: of all pruned scenes.
-        name: of the scene, for a person who looks into the folder.
-        content: SHA-256 of the file that the dense scene is read from. A scene that is trained again has another,
-            whatever its run is called.
-        settings: how it is pruned.
+        folder: folder of all pruned scenes.
+        name: name of the scene, for people who look into the folder.
+        content: SHA-256 of the file that the dense scene is read from. A scene that is trained again has another one,
+            even under the same name.
+        settings: how the scene is pruned.
     """
     described = json.dumps([FORMAT, content, dataclasses.asdict(settings)], sort_keys=True)
     readable = re.sub(r"[^\w.+-]+", "-", name).strip("-.") or "scene"
@@ -33,7 +33,7 @@ def stored_path(folder: Path, name: str, content: str, settings: PruneSettings) 
 
 
 def write_pruned(path: Path, pruned: Gaussians, dense_count: int, seconds: float) -> None:
-    """Writes a pruned scene, the number of Gaussians that it was made of, and the seconds that this took."""
+    """Write a pruned scene, the number of Gaussians of the dense scene, and the seconds that pruning took."""
     from safetensors.torch import save_file
 
     header = {"format": FORMAT, "dense_count": str(dense_count), "seconds": repr(seconds)}
@@ -42,7 +42,7 @@ def write_pruned(path: Path, pruned: Gaussians, dense_count: int, seconds: float
 
 
 def read_pruned(path: Path) -> tuple[Gaussians, int, float]:
-    """What :func:`write_pruned` wrote: the scene on the CPU, the dense count and the seconds.
+    """Read a file of :func:`write_pruned`: the scene on the CPU, the dense count and the seconds.
 
     Raises:
         SceneError: if the file is damaged or of another kind.

@@ -1,4 +1,4 @@
-"""What the refiner that ships was trained on: rooms that differ, and scenes trained of them in many ways."""
+"""The training data of the refiner that ships: different rooms, and scenes trained on them with varied settings."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from pointsplat_ns.nerfstudio_plugin.commands import train_refiner_command, trai
 from pointsplat_ns.rooms.camera_path import STYLES
 
 TRAIN_SEEDS = tuple(range(100, 116))
-"""Rooms that the refiner learns from."""
+"""Seeds of the rooms that the refiner is trained on."""
 
 UNSEEN_SEEDS = (50, 51, 52, 53)
-"""Rooms that it is judged by: never trained on, and nothing was chosen by looking at them."""
+"""Seeds of the rooms that the refiner is evaluated on. It is not trained on them, and no setting was chosen by their
+results."""
 
 KEEP = 0.1
-"""Share that scenes are merged to in training."""
+"""Share of the Gaussians that scenes are merged to in training."""
 
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """How one room is captured, and how a Splatfacto scene is trained of it.
+    """How one room is captured, and how a Splatfacto scene is trained on it.
 
-    What the room is (layout, size, furniture, textures, lights) follows from ``seed`` as well, see
+    The room itself (layout, size, furniture, textures, lights) also depends on ``seed``, see
     :func:`~pointsplat_ns.rooms.room.make_room`.
     """
 
@@ -47,7 +48,7 @@ class SceneSettings:
         return f"room{self.seed}"
 
     def train_command(self, data: Path, output: Path, timestamp: str) -> str:
-        """The ``ns-train`` command of the scene."""
+        """The ``ns-train`` command that trains the scene."""
         options = {
             "pipeline.model.densify-grad-thresh": f"{self.densify_grad_thresh:.2g}",
             "pipeline.model.cull-alpha-thresh": self.cull_alpha_thresh,
@@ -58,7 +59,7 @@ class SceneSettings:
 
 
 def scene_settings(seed: int) -> SceneSettings:
-    """The settings that belong to a room's seed; the same seed gives the same settings."""
+    """The settings drawn for a room's seed; the same seed gives the same settings."""
     rng = np.random.default_rng([seed, 22])
 
     def log_uniform(low: float, high: float) -> float:
@@ -81,7 +82,7 @@ def scene_settings(seed: int) -> SceneSettings:
 
 
 def refiner_command(scenes: Path, output: Path, name: str, timestamp: str, size: str, steps: int, seed: int) -> str:
-    """The ``ns-train`` command of the refiner."""
+    """The ``ns-train`` command that trains the refiner."""
     options = {
         "pipeline.datamanager.supervision": "dense",
         "pipeline.datamanager.seed": seed,
@@ -100,10 +101,10 @@ def card_text(about: dict[str, Any], results: dict[str, Any], command: str, para
     """A model card in Markdown.
 
     Args:
-        about: what the weights' metadata says.
-        results: of ``ns-eval``.
-        command: that trained the refiner.
-        parameters: of the network.
+        about: metadata of the weights.
+        results: results of ``ns-eval``.
+        command: the command that trained the refiner.
+        parameters: number of the network's parameters.
     """
     rows = []
     for name, scene in results["scenes"].items():

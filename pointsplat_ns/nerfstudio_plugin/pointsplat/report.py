@@ -1,4 +1,4 @@
-"""An evaluation of a refiner as a table for a person. nerfstudio is not imported."""
+"""Prints the evaluation of a refiner as a table. nerfstudio is not imported."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ if TYPE_CHECKING:
     pass
 
 PHOTOS = "photos"
-"""What an evaluation that does not say was compared with."""
+"""The reference of evaluations that name none."""
 
 NAMES = {PHOTOS: "held-out photos", "dense renders": "the dense scenes' own renders"}
-"""What is compared with, in words."""
+"""Texts for the table, by reference."""
 
 
 def report(evaluation: str | Path) -> None:
-    """Print what ``ns-eval`` wrote of a ``pointsplat`` run: dense, pruned and refined scenes side by side.
+    """Print the results that ``ns-eval`` wrote for a ``pointsplat`` run: dense, pruned and refined scenes side by side.
 
-    PSNR is in dB, fps one over the median time of a frame, and megabytes are 10^6 bytes of float32 parameters.
+    PSNR is in dB, fps is one over the median time of a frame, and megabytes are 10^6 bytes of float32 parameters.
 
     Args:
         evaluation: the JSON file.
 
     Raises:
-        DataError: if it is something else.
+        DataError: if the file is missing or is not such an evaluation.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -40,7 +40,7 @@ ns-eval wrote
 
 
 def show_report(results: dict[str, Any]) -> None:
-    """Print an evaluation: a table for each thing compared with, and why LPIPS is missing if it is."""
+    """Print an evaluation: one table per reference, and the reason if LPIPS is missing."""
     from rich.console import Console
 
     for table in report_tables(results):
@@ -50,15 +50,15 @@ def show_report(results: dict[str, Any]) -> None:
 
 
 def report_tables(results: dict[str, Any]) -> list:
-    """A rich table for what was compared with photos, and one for what was compared with dense renders; no average
-    mixes the two."""
+    """A rich table for the scenes compared with photos, and one for those compared with dense renders. No average mixes
+    the two."""
     other = results.get("against_dense_renders")
     parts = [results] if other is None else [results, other]
     return [_table(results, part) for part in parts]
 
 
 def _table(results: dict[str, Any], part: dict[str, Any]):
-    """One row for each scene and variant of a part, then its averages; "seen" is whether it was trained on."""
+    """One row for each scene and variant of a part, then the averages; "seen" says whether the scene was trained on."""
     from rich.table import Table
 
     settings = results.get("settings", {})

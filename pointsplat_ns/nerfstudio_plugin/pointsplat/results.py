@@ -1,4 +1,4 @@
-"""What a training of the refiner and its evaluation leave behind. nerfstudio is not imported."""
+"""Files that a training of the refiner and its evaluation write. nerfstudio is not imported."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 from pointsplat_ns.errors import DataError
 
 REFINER_NAME = "refiner.safetensors"
-"""The trained network, in the run's folder: what ``pointsplat compact --refiner`` takes."""
+"""File of the trained network in the run's folder, for ``pointsplat compact --refiner``."""
 
 VARIANTS = ("dense", "pruned", "refined")
-"""What an evaluation compares of each scene."""
+"""The variants of each scene that an evaluation compares."""
 
 
 def read_evaluation(path: Path) -> dict[str, Any]:
-    """The results in a file that ``ns-eval`` wrote of a pointsplat run.
+    """The results in a file that ``ns-eval`` wrote for a pointsplat run.
 
     Raises:
-        DataError: if it is something else.
+        DataError: if the file is missing or is not such an evaluation.
     """
     try:
         results = json.loads(path.read_text("utf-8"))["results"]

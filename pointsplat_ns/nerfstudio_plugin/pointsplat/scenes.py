@@ -1,8 +1,8 @@
-"""Trained scenes with their posed photos, one or many, that the refiner is trained and evaluated on.
+"""The trained scenes, with their posed photos, that the refiner is trained and evaluated on.
 
-A trained run knows its data, its dataparser and its frame, so the run is all that a person names:
-``--data`` takes one run, or any folder above several. Photos are not needed where the dense scene's own
-renders are what the refiner learns from: ``--data`` may then name PLY files, too.
+A trained run names its data, its dataparser and its coordinate frame. So ``--data`` takes just a run, or any folder
+above several. If the training targets are renders of the dense scenes, photos are not needed, and ``--data`` may also
+name PLY files.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, 
 from pointsplat_ns.views import RasterizeMode
 
 VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
-"""What Splatfacto evaluates over where it trained with random backgrounds."""
+"""Evaluation background of scenes trained with random backgrounds: the viewer's colour, as in Splatfacto."""
 
 _NO_SEEDS = ("load_seed_points", "load_3D_points")
-"""Settings of dataparsers that gather seed points, which a trained scene has no use for."""
+"""Dataparser settings that load seed points; a trained scene does not need them."""
 
 
 _FORMER_DATAPARSERS = {
@@ -41,14 +41,14 @@ _FORMER_DATAPARSERS = {
         "pointsplat_ns.nerfstudio_plugin.replica.dataparser.ReplicaDataParserConfig"
     ),
 }
-"""What runs of earlier versions call a dataparser, and what it is called today."""
+"""Dataparser names in runs of earlier versions -> current names."""
 
 
 def dataparser_of(run: Run) -> DataParser:
-    """The dataparser that a run was trained with, set up as it was then.
+    """The dataparser that a run was trained with, with the same settings.
 
-    Only classes that nerfstudio or an installed plugin registers are used; the run's file names one,
-    it does not get to import anything.
+    Only classes that nerfstudio or an installed plugin registers are used: the name in the run's file is looked up
+    among them and is never imported.
 
     Raises:
         SceneError: if the dataparser is not installed or does not know a setting.
@@ -70,22 +70,22 @@ def dataparser_of(run: Run) -> DataParser:
                 f"{run.config_path}: its dataparser has no setting {field_name!r}; install the version it had"
             )
         if isinstance(value, Tagged):
-            continue  # an object: the default stands
+            continue  # a Python object: keep the default
         setattr(config, field_name, False if field_name in _NO_SEEDS else value)
     config.data = run.data
     return config.setup()
 
 
 class TrainedScene(DenseScene):
-    """One trained run: its Gaussians and, when asked for, its posed photos.
+    """One trained run: its Gaussians and its posed photos, both read when they are needed.
 
     Args:
         name: unique among the scenes in use.
-        run: where everything is.
+        run: paths and settings of the run.
         cache: for decoded photos, Gaussians and renders, shared among scenes.
-        poses: how to sample poses if the data is gone.
-        device: where the dense scene's own renders are drawn.
-        has_photos: whether the run's data is at hand.
+        poses: how to sample poses if the run's data is missing.
+        device: where the dense scene's own renders are computed.
+        has_photos: whether the run's data was found.
     """
 
     def __init__(
@@ -103,26 +103,26 @@ class TrainedScene(DenseScene):
 
     @property
     def identity(self) -> str:
-        """EXPERIMENT/METHOD/TIME, step: a scene that is trained again has another time, and is another scene.
+        """EXPERIMENT/METHOD/TIME and the step. A scene that is trained again has another time, and so another identity.
 
-        Not by content: a scene that replaces one of the same name, time and step is held to be known to the network,
-        for it shows the same place.
+        The content does not count: a scene that replaces one of the same name, time and step is taken to show the same
+        place, so the network has been trained on it.
         """
         run = self.run
         return f"{self.name}/{run.method_name}/{run.timestamp} step {run.step}"
 
     def read_dense(self) -> Gaussians:
-        """The Gaussians as trained, read anew each time: a dense scene is too big to keep many of."""
+        """Read the Gaussians from the checkpoint, onto the CPU."""
         return read_checkpoint(self.run.checkpoint)
 
     @property
     def rasterize_mode(self) -> RasterizeMode:
-        """How the run rendered, and how it is rendered from then on."""
+        """The run's rasterize mode."""
         return self.run.rasterize_mode
 
     @property
     def background(self) -> torch.Tensor:
-        """Colour (3,) that the run is evaluated over."""
+        """Background colour (3,), in [0, 1], that the run is evaluated with."""
         color = self.run.model_fields.get("background_color")
         return get_color(color) if color in ("black", "white") else torch.tensor(VIEWER_BACKGROUND)
 
@@ -131,10 +131,10 @@ class TrainedScene(DenseScene):
         return dataparser_of(self.run)
 
     def _outputs(self, split: str) -> DataparserOutputs:
-        """What the dataparser says of the photos of a split.
+        """The dataparser's outputs for a split.
 
         Raises:
-            DataError: if their frame is not the one that the Gaussians are in.
+            DataError: if their coordinate frame is not that of the Gaussians.
         """
         outputs = self._dataparser.get_dataparser_outputs(split=split)
         moved = (outputs.dataparser_transform[:3] - self.run.transform).abs().max()
@@ -153,16 +153,16 @@ class TrainedScene(DenseScene):
 
     @cached_property
     def train_frames(self) -> Any:
-        """Training photos at the resolution that the run was trained at; the scene's own renders without data."""
+        """Training photos at the run's training resolution, or without data the scene's own renders."""
         return self._frames("train") if self.has_photos else self.rendered_train
 
     @cached_property
     def eval_frames(self) -> Any:
-        """Held-out photos at the resolution that the run was trained at; the scene's own renders without data."""
+        """Held-out photos at the run's training resolution, or without data the scene's own renders."""
         return self._frames("test") if self.has_photos else self.rendered_eval
 
     def cameras(self, split: Split) -> Cameras:
-        """The dataset's cameras, or sampled ones if the data is gone."""
+        """The dataset's cameras, or sampled ones if the data is missing."""
         if not self.has_photos:
             return super().cameras(split)
         return (self.train_frames if split == "train" else self.eval_frames).dataset.cameras
@@ -176,14 +176,17 @@ def find_scenes(
     device: torch.device | str = "cpu",
     need_data: bool = True,
 ) -> tuple[Literal["photos", "dense"], list[DenseScene]]:
-    """The scenes that ``--data`` names, and what they are learned from.
+    """The scenes that ``--data`` names, and the kind of their training targets.
 
     Args:
         folder: a run, a PLY file, or any folder above several.
-        supervision: ``photos`` takes the runs, whose data must be at hand; ``dense`` takes the runs, whose data may be
-            gone, and the PLY files; ``auto`` is ``photos`` if there is a run, ``dense`` otherwise.
-        cache, poses, device: for the scenes.
-        need_data: whether photos will be looked at.
+        supervision: ``photos`` takes the runs, whose data must be found; ``dense`` takes the runs, with or without
+            their data, and the PLY files; ``auto`` is ``photos`` if there is a run, ``dense`` otherwise.
+        cache, poses, device: passed to the scenes.
+        need_data: whether photos will be needed.
+
+    Returns:
+        ``photos`` or ``dense``, and the scenes.
 
     Raises:
         SceneError: if there is no scene, or a run's data is needed and not found.

@@ -1,4 +1,4 @@
-"""nerfstudio's trainer, for one network over many scenes and perhaps several processes."""
+"""nerfstudio's trainer, for one network trained on many scenes, in one or several processes."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ ALL = "all"
 
 
 class AveragingOptimizers(Optimizers):
-    """nerfstudio's optimisers, which step along the mean of the gradients over accumulated steps and processes.
+    """nerfstudio's optimisers, with gradients averaged over accumulated steps and over processes.
 
-    nerfstudio adds gradients up; their norm, and what clipping makes of it, would then depend on how many there are.
+    nerfstudio sums accumulated gradients. Their norm, which clipping depends on, would then grow with their number.
 
     Args:
         config, param_groups: as nerfstudio's.
-        counted: steps whose gradients have gathered, by group; the trainer keeps it up to date.
+        counted: number of accumulated steps by group; the trainer keeps it up to date.
     """
 
     def __init__(self, config: dict[str, Any], param_groups: dict[str, list[nn.Parameter]], counted: Mapping[str, int]):
@@ -47,14 +47,14 @@ class AveragingOptimizers(Optimizers):
 
 
 class PointSplatTrainer(SplatfactoCpuTrainer):
-    """nerfstudio's trainer, with averaged gradients, which leaves out steps that are not finite.
+    """nerfstudio's trainer, with averaged gradients, that skips steps whose loss or gradients are not finite.
 
-    A step at which a loss or a gradient is NaN or infinite, in any process, changes neither parameters nor the
-    optimisers' state nor running statistics, in all processes alike: with synchronised batch norm one process's NaN is
-    every process's. It is logged with its scene and counted, and left out of the mean of accumulated gradients. The
-    learning-rate schedule goes on: it counts the steps of the run.
+    If a loss or a gradient is NaN or infinite in any process, all processes skip the step: it changes neither
+    parameters nor the optimisers' state nor running statistics. (With synchronised batch norm a NaN in one process
+    spreads to all.) The step is logged with its scene, counted, and left out of the mean of accumulated gradients. The
+    learning-rate schedule still advances, as it counts the steps of the run.
 
-    A checkpoint between two updates holds what has gathered.
+    A checkpoint between two updates holds the gradients accumulated so far.
     """
 
     config: PointSplatTrainerConfig
@@ -69,8 +69,8 @@ class PointSplatTrainer(SplatfactoCpuTrainer):
         """The optimisers.
 
         Raises:
-            PointSplatError: if gradients are to gather over no step, or in a part that the network does not have, or
-                the steps that may be skipped are fewer than none.
+            PointSplatError: if ``gradient_accumulation_steps`` names an unknown part of the network or a number below
+                1, or ``max_skipped_steps`` is negative.
         """
         groups = self.pipeline.get_param_groups()
         for name, steps in self.config.gradient_accumulation_steps.items():
@@ -84,9 +84,9 @@ class PointSplatTrainer(SplatfactoCpuTrainer):
         return AveragingOptimizers(self.config.optimizers.copy(), groups, self.pipeline.training_state.counted)
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
-        """As nerfstudio's, but for steps that are not finite.
+        """As nerfstudio's, but skips a step whose loss or gradients are not finite.
 
-        With a gradient scaler (``--mixed-precision``) a gradient that overflows is the scaler's to deal with.
+        With a gradient scaler (``--mixed-precision``), the scaler handles gradients that overflow.
 
         Raises:
             SceneError: if more than ``max_skipped_steps`` have been skipped; a checkpoint is saved first.
@@ -118,7 +118,7 @@ class PointSplatTrainer(SplatfactoCpuTrainer):
         return loss, losses, metrics
 
     def _faults_of_gradients(self) -> list[str]:
-        """The parts of the network that have a gradient which is not finite, in words."""
+        """One text for each part of the network with a gradient that is not finite."""
         faults = []
         for name, parameters in self.optimizers.parameters.items():
             largest = [p.grad.abs().amax() for p in parameters if p.grad is not None]
@@ -128,32 +128,32 @@ class PointSplatTrainer(SplatfactoCpuTrainer):
 
     @torch.no_grad()
     def _forget(self, statistics: list[tuple[Tensor, Tensor]]) -> None:
-        """Undo what a step has done so far."""
+        """Undo a step: clear the gradients and restore the running statistics."""
         self.optimizers.zero_grad_all()
         for buffer, before in statistics:
             buffer.copy_(before)
 
     def _count(self, step: int, scene: str, faults: list[str]) -> None:
-        """Count and log the scenes, of all processes, at which a step is left out."""
-        found = distributed.gathered([(scene, "; ".join(faults))] if faults else [])
+        """Count and log the scenes, of all processes, that made a step be skipped."""
+        faulty = distributed.gathered([(scene, "; ".join(faults))] if faults else [])
         skipped = self.pipeline.training_state.skipped
-        for name, text in found:
+        for name, text in faulty:
             skipped[name] += 1
             if distributed.rank() == 0:
                 total, most = skipped.total(), self.config.max_skipped_steps
                 CONSOLE.log(f"step {step} is skipped: {name}: {text} ({total} skipped so far; more than {most} stop)")
 
     def _update(self, step: int, due: list[str]) -> None:
-        """Step the optimisers of the parts of the network that are due, and all schedules."""
+        """Step the optimisers of the parts of the network that are due for an update, and all schedules."""
         scale = self.grad_scaler.get_scale()
         if due:
             self.optimizers.optimizer_scaler_step_some(self.grad_scaler, due)
             self.grad_scaler.update()
-        if scale <= self.grad_scaler.get_scale():  # as nerfstudio: not where the scaler left the update out
+        if scale <= self.grad_scaler.get_scale():  # as in nerfstudio: not if the scaler skipped the update
             self.optimizers.scheduler_step_all(step)
 
     def _stop(self, step: int) -> None:
-        """Save a checkpoint and say why training ends."""
+        """Save a checkpoint and end training with an error that names the scenes."""
         self.save_checkpoint(step)
         skipped = self.pipeline.training_state.skipped
         scenes = ", ".join(f"{name}: {count}" for name, count in skipped.most_common())
@@ -165,7 +165,7 @@ class PointSplatTrainer(SplatfactoCpuTrainer):
         )
 
     def save_checkpoint(self, step: int) -> None:
-        """As nerfstudio's; called in all processes, written by the first."""
+        """As nerfstudio's; all processes call it, the first one writes."""
         for name in self.pipeline.training_state.waiting:
-            average_gradients(self.optimizers.parameters[name])  # over processes: what they have gathered becomes one
+            average_gradients(self.optimizers.parameters[name])  # over processes, so that all hold the same
         super().save_checkpoint(step)

@@ -1,4 +1,4 @@
-"""What a training remembers beside weights and optimisers, and its checkpoints hold."""
+"""The state of a training that checkpoints hold beside weights and optimisers."""
 
 from __future__ import annotations
 
@@ -14,31 +14,33 @@ Gradients = list[tuple[nn.Parameter, Tensor]]
 
 
 class TrainingState:
-    """Which scenes a network has been trained on, which steps were skipped, and gradients that wait for their update.
+    """The scenes that a network has been trained on, the skipped steps, and accumulated gradients.
 
     Args:
         parts: the network's parameters, by part.
-        trained_on: identities of the scenes that it is trained on from now on.
+        trained_on: identities of the scenes that this training uses.
     """
 
     def __init__(self, parts: Mapping[str, list[nn.Parameter]], trained_on: Iterable[str] = ()):
         self._parts = parts
         self.trained_on = set(trained_on)
-        """Identities of the scenes that the network has been trained on, resumed trainings included."""
+        """Identities of the scenes that the network has been trained on, also before it was resumed."""
         self.skipped: Counter[str] = Counter()
-        """Steps that were left out because a loss or a gradient was not finite, by scene, over all processes."""
+        """Number of steps skipped because a loss or a gradient was not finite, by scene, over all processes."""
         self.counted: dict[str, int] = {}
-        """Steps whose gradients have gathered for the next update, by part."""
+        """Number of steps accumulated for the next update, by part."""
         self.waiting: list[str] = []
-        """Parts whose gradients wait for their update, after the latest step."""
+        """Parts with accumulated gradients that were not due for an update at the latest step."""
 
     def set_gradients_aside(self, step: int, every: Mapping[str, int]) -> Gradients:
-        """What earlier steps have gathered for an update, at the beginning of a step; the network is left without
-        gradients.
+        """At the beginning of a step: take the gradients that earlier steps accumulated off the parameters.
 
         Args:
-            step: that begins.
-            every: steps from one update to the next, by part.
+            step: the step that begins.
+            every: number of steps from one update to the next, by part.
+
+        Returns:
+            The accumulated gradients. The parameters are left without any.
         """
         gathered: Gradients = []
         for name, parameters in self._parts.items():
@@ -54,16 +56,16 @@ class TrainingState:
 
     @torch.no_grad()
     def gather(self, gathered: Gradients, step: int, every: Mapping[str, int], skipped: bool) -> list[str]:
-        """Add what was set aside to the gradients of a step that ends.
+        """At the end of a step: add the accumulated gradients to those of the step.
 
         Args:
-            gathered: from :meth:`set_gradients_aside`.
-            step: that ends.
-            every: as there.
-            skipped: whether the step was left out, and has no gradients.
+            gathered: the result of :meth:`set_gradients_aside`.
+            step: the step that ends.
+            every: number of steps from one update to the next, by part.
+            skipped: whether the step was skipped and has no gradients.
 
         Returns:
-            The parts that are due to be updated.
+            The parts that are due for an update.
         """
         for parameter, gradient in gathered:
             parameter.grad = gradient if parameter.grad is None else parameter.grad.add_(gradient)
@@ -73,7 +75,7 @@ class TrainingState:
         return [name for name in self._parts if name not in self.waiting and self.counted[name]]
 
     def to_dict(self) -> dict[str, Any]:
-        """What a checkpoint holds."""
+        """The state as a dictionary, for a checkpoint."""
         state: dict[str, Any] = {"trained_on": sorted(self.trained_on), "skipped": dict(self.skipped)}
         if self.waiting:
             state["gradients"] = {name: [p.grad for p in self._parts[name]] for name in self.waiting}
@@ -81,11 +83,11 @@ class TrainingState:
         return state
 
     def load(self, state: Mapping[str, Any], scenes: Iterable[str]) -> None:
-        """Take up what a checkpoint holds; those of earlier versions lack all but ``trained_on``.
+        """Load the state of a checkpoint. Checkpoints of earlier versions have only ``trained_on``.
 
         Args:
-            state: from :meth:`to_dict`.
-            scenes: names of the scenes that there are; skipped steps of others are forgotten.
+            state: the result of :meth:`to_dict`.
+            scenes: names of the present scenes; the counts of skipped steps of others are dropped.
         """
         for name, gradients in state.get("gradients", {}).items():
             for parameter, gradient in zip(self._parts[name], gradients, strict=True):

@@ -1,1 +1,1 @@
-"""Captures in the layout that NICE-SLAM gave to Replica, and the rooms that are written like them."""
+"""Captures in NICE-SLAM's Replica layout, which the synthetic rooms are written in, too."""

@@ -21,14 +21,14 @@ from pointsplat_ns.nerfstudio_plugin.replica.layout import ReplicaScene, load_re
 
 @dataclass
 class ReplicaDataParserConfig(DataParserConfig):
-    """Posed photos, with or without depth images, in the layout that NICE-SLAM gave to Replica"""
+    """Posed photos, with or without depth images, in NICE-SLAM's Replica layout"""
 
     _target: type = field(default_factory=lambda: ReplicaDataParser)
     """target class to instantiate"""
     data: Path = Path("data/replica/office0")
     """Scene folder, with traj.txt and results/; cam_params.json in it or in the folder above."""
     frame_stride: int = 1
-    """Use every n-th frame, by order of number. Frames of eval_frames or eval_list are kept regardless."""
+    """Use every n-th frame, in the order of their numbers. Frames of eval_frames or eval_list are always used."""
     eval_every: int = 10
     """Hold out every n-th of the used frames for evaluation, the first one included."""
     eval_frames: tuple[int, ...] = ()
@@ -44,8 +44,8 @@ class ReplicaDataParserConfig(DataParserConfig):
     depth_unit_scale_factor: float | None = None
     """Scene units per count of the depth images. Default: 1 / scale of cam_params.json."""
     pixel_centers: Literal["auto", "integer", "half"] = "auto"
-    """What cx, cy count from: integer, the first pixel's centre (Replica's own 599.5 of 1200); half, the picture's
-    corner; auto, half where they are exactly half the size and integer elsewhere."""
+    """Origin of cx and cy. integer: the centre of the first pixel (Replica's own 599.5 of 1200). half: the corner of
+    the image. auto: half if cx and cy are exactly half the image size, integer otherwise."""
 
 
 @dataclass
@@ -161,10 +161,10 @@ class ReplicaDataParser(DataParser):
 
 
 def read_eval_list(path: Path) -> list[int]:
-    """Frame numbers from a text file: ``120``, ``frame000120`` or ``results/frame000120.jpg`` a line.
+    """Frame numbers from a text file with one ``120``, ``frame000120`` or ``results/frame000120.jpg`` per line.
 
     Raises:
-        DataError: No such file, no frame in it, or a line that names none.
+        DataError: The file is missing or empty, or a line is not a frame.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()

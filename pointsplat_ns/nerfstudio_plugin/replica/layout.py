@@ -1,4 +1,4 @@
-"""The NICE-SLAM Replica layout: what is on disk, read and checked.
+"""Reads and checks scenes in NICE-SLAM's Replica layout.
 
 A scene folder holds ``traj.txt`` (one camera-to-world per line, 16 numbers, row by row, OpenCV
 axes: x right, y down, z forward), ``results/frame*.jpg|png`` and, optionally,
@@ -24,11 +24,11 @@ from pointsplat_ns.errors import DataError
 logger = logging.getLogger(__name__)
 
 MAX_ROTATION_DRIFT = 1e-2
-"""Largest accepted entry of |R^T R - 1|. Real files print few digits (1e-7 to 1e-4 of drift, which is
-removed); beyond one percent the matrix holds a scale or a shear and is not a camera pose."""
+"""Largest accepted entry of |R^T R - I|. Real files print few digits, which causes a drift of 1e-7 to 1e-4; it is
+removed. Beyond one percent the matrix holds a scale or a shear and is not a camera pose."""
 
 UNKNOWN_DEPTH = (0, 65535)
-"""Raw 16-bit depths that say "nothing measured": empty and saturated."""
+"""Raw 16-bit depths that mean "not measured": empty and saturated."""
 
 PixelCenters = Literal["auto", "integer", "half"]
 
@@ -39,7 +39,7 @@ _LAYOUT_HINT = "a scene folder holds traj.txt and results/frame*.jpg"
 
 @dataclass(frozen=True)
 class PinholeParams:
-    """Intrinsics as ``cam_params.json`` states them (no pixel-centre correction applied).
+    """Intrinsics as in ``cam_params.json``, without a pixel-centre correction.
 
     Attributes:
         width, height: Image size in pixels.
@@ -58,14 +58,12 @@ class PinholeParams:
     path: Path
 
     def principal_point(self, centers: PixelCenters = "auto") -> tuple[float, float]:
-        """Principal point with the centre of the top left pixel at (0.5, 0.5), as rasterizers draw.
+        """Principal point in pixels, with the centre of the top left pixel at (0.5, 0.5), as in rasterizers.
 
-        The layout's own tools shoot rays through integer coordinates: the centre of the first
-        pixel is 0, and the middle of a picture 1200 wide is 599.5, which is what Replica's file says
-        (``integer``: half a pixel is added). Files whose principal point is exactly half the size
-        (320 of 640) count from the corner, where the middle of the picture is w / 2 (``half``: taken
-        as it is). ``auto`` tells the two apart by that: exactly (w / 2, h / 2) is ``half``, anything
-        else, a calibration's 318.7 included, is ``integer``, OpenCV's convention.
+        There are two conventions. ``integer``: the centre of the first pixel is 0, so the middle of an image 1200 wide
+        is 599.5, as in Replica's own file and in OpenCV; half a pixel is added. ``half``: coordinates start at the
+        corner of the image, whose middle is then w / 2; nothing is added. ``auto`` chooses ``half`` if the principal
+        point is exactly (w / 2, h / 2), and ``integer`` otherwise.
         """
         if centers == "auto":
             centers = "half" if (self.cx, self.cy) == (self.width / 2, self.height / 2) else "integer"
@@ -82,7 +80,7 @@ class ReplicaScene:
         params: Intrinsics and depth scale.
         numbers: Frame numbers from the file names, ascending.
         photos: One photo per number.
-        depths: One depth image per number, or None where the scene has no depth at all.
+        depths: One depth image per number, or None if the scene has no depth.
         poses: float64 (F, 4, 4) camera-to-world, OpenCV axes, rotations exactly orthonormal.
     """
 
@@ -108,16 +106,16 @@ class ReplicaScene:
 
 
 def load_replica(folder: Path, check_sizes: bool = True) -> ReplicaScene:
-    """Reads and checks a scene; opens picture headers, decodes no picture.
+    """Reads and checks a scene. Image headers are read, but no image is decoded.
 
-    Frames whose pose is not finite (lost tracking) are dropped and reported by one warning.
+    Frames whose pose is not finite (lost tracking) are dropped, with one warning.
 
     Args:
         folder: The scene folder.
         check_sizes: Compare every photo's size, read from its header, with ``cam_params.json``.
 
     Raises:
-        DataError: A file is missing, unreadable or inconsistent; the text names it.
+        DataError: A file is missing, unreadable or inconsistent; the message names it.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -176,7 +174,7 @@ def load_replica(folder: Path, check_sizes: bool = True) -> ReplicaScene:
 
 
 def read_cam_params(folder: Path) -> PinholeParams:
-    """Reads ``cam_params.json`` from the scene folder, else from the folder above it.
+    """Reads ``cam_params.json`` from the scene folder or the folder above it.
 
     Raises:
         DataError: Not found in either place, not JSON, or a number missing or out of range.
@@ -223,7 +221,7 @@ def read_trajectory(path: Path) -> np.ndarray:
     Blank lines are ignored.
 
     Raises:
-        DataError: No such file, or a line that is not 16 numbers (its line number is given).
+        DataError: The file is missing, or a line is not 16 numbers (the message gives its line number).
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -251,7 +249,7 @@ def read_photo(path: Path, params: PinholeParams) -> np.ndarray:
     """Decodes one photo: uint8 (H, W, 3), sRGB.
 
     Raises:
-        DataError: Missing, broken, or of another size than ``params``.
+        DataError: The file is missing or broken, or its size differs from ``params``.
     """
     image = _open_image(path)
     _check_size(path, image.size, params)
@@ -262,7 +260,7 @@ def read_depth(path: Path, params: PinholeParams) -> np.ndarray:
     """Decodes one depth image: float32 (H, W), scene units along the optical axis, 0 where unknown.
 
     Raises:
-        DataError: Missing, broken, not 16 bit, or of another size than ``params``.
+        DataError: The file is missing or broken, not 16 bit, or its size differs from ``params``.
     """
     image = _open_image(path)
     _check_size(path, image.size, params)
@@ -301,7 +299,7 @@ def _check_size(path: Path, size: tuple[int, int], params: PinholeParams) -> Non
 
 
 def _numbered(folder: Path, pattern: re.Pattern, wanted: str) -> dict[int, Path]:
-    """The files of a folder whose name matches, by the number in the name."""
+    """The files of a folder whose names match, by the number in the name."""
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder; expected {wanted} in it")
     found: dict[int, Path] = {}
@@ -321,7 +319,7 @@ def _sibling_name(path: Path, stem: str, suffix: str) -> str:
 
 
 def _missing_hint(numbers: list[int], poses: int) -> str:
-    """Names the photos that are missing from an otherwise gapless numbering, if that explains the count."""
+    """Names the photos that are missing in the numbering, if that explains the difference in count."""
     last = max(numbers[0] + poses - 1, numbers[-1])
     if len(numbers) >= poses or last - numbers[0] + 1 != poses:
         return ""
@@ -335,7 +333,7 @@ def _some(items: list[str], limit: int = 5) -> str:
 
 
 def _rigid(poses: np.ndarray, lines: list[int], path: Path) -> np.ndarray:
-    """Poses with the nearest rotation (polar factor, by SVD) in place of a slightly drifted one.
+    """Poses with each rotation replaced by the nearest orthonormal one (polar factor, by SVD).
 
     Raises:
         DataError: The last row is not (0, 0, 0, 1), the drift is too large, or the axes are mirrored.

@@ -7,18 +7,18 @@ from pointsplat_ns.nerfstudio_plugin.replica.layout import ReplicaScene, read_de
 from pointsplat_ns.system.progress import tracked
 
 MAX_FRAMES = 200
-"""Depth images read at most: neighbours in a video of 2,000 frames see the same surfaces."""
+"""Maximum number of depth images read: neighbouring frames of a video see the same surfaces."""
 
 SAMPLES_PER_POINT = 40
-"""Pixels unprojected per point wanted: enough that a voxel seen at all is averaged over several."""
+"""Pixels unprojected per point wanted: enough to average several in most voxels."""
 
 EDGE = 0.05
-"""A pixel whose depth differs from a neighbour's by more than this share lies on an outline, where
-sensors and resampling invent points between two surfaces. A plane steps that far from one pixel to
+"""A pixel whose depth differs from a neighbour's by more than this share is taken to lie on an outline, where
+sensors and resampling produce points between two surfaces. On a plane, depth changes this much from one pixel to
 the next only at grazing angles (over 85 degrees for usual lenses)."""
 
 WORTH_A_BAR = 20
-"""Depth images from which on a progress bar is shown: fewer take about a second."""
+"""Least number of depth images for a progress bar: fewer take about a second."""
 
 
 def fuse_depth(
@@ -30,9 +30,9 @@ def fuse_depth(
     """Unprojects the depth images of a scene and thins them to about ``num_points`` points.
 
     Reads at most :data:`MAX_FRAMES` frames, evenly spaced, one at a time, and keeps at most
-    ``num_points * SAMPLES_PER_POINT`` pixels of all of them, so time and memory do not grow with the
-    length of the capture. One point per occupied voxel, the mean of its pixels; the voxel is as
-    large as needed to leave no more than ``num_points``. Deterministic.
+    ``num_points * SAMPLES_PER_POINT`` pixels in total, so time and memory do not grow with the
+    length of the capture. Each occupied voxel gives one point, the mean of its pixels. The voxel size
+    is chosen so that no more than ``num_points`` are left. Deterministic.
 
     Args:
         scene: The frames to use (pass training frames only), with depth.
@@ -41,7 +41,7 @@ def fuse_depth(
         progress: Show a progress bar.
 
     Returns:
-        xyz float32 (P, 3) in scene units and rgb uint8 (P, 3), P <= ``num_points``; P = 0 where no
+        xyz float32 (P, 3) in scene units and rgb uint8 (P, 3), P <= ``num_points``; P = 0 if no
         pixel has a depth.
 
     Raises:
@@ -59,7 +59,8 @@ def fuse_depth(
     for order, index in enumerate(tracked(chosen, "Seed points from depth", len(chosen), shown)):
         depth = read_depth(depths[index], params)
         valid = _inner(depth)
-        # The grid's offset walks over the step x step cell from frame to frame, in strides prime to it.
+        # The offset of the sampling grid moves through the step x step cell from frame to frame; step + 1 is coprime
+        # to step * step, so that it visits every place.
         offset = (order * (step + 1)) % (step * step)
         v, u = np.mgrid[offset // step : params.height : step, offset % step : params.width : step]
         v, u = v[valid[v, u]], u[valid[v, u]]
@@ -87,7 +88,7 @@ def voxel_thin(xyz: np.ndarray, rgb: np.ndarray, num_points: int) -> tuple[np.nd
         num_points: Upper bound on the result.
 
     Returns:
-        float32 (P, 3), uint8 (P, 3), in the order of the voxels. The input itself where it is
+        float32 (P, 3), uint8 (P, 3), in the order of the voxels. The input itself if it is
         already small enough.
     """
     if len(xyz) <= num_points:
@@ -96,7 +97,7 @@ def voxel_thin(xyz: np.ndarray, rgb: np.ndarray, num_points: int) -> tuple[np.nd
     extent = max(float((xyz.max(axis=0) - low).max()), 1e-12)
     finest, coarsest = extent / 2**20, extent * 1.001  # 20 bits an axis fit an int64 key
     keys = _voxel_keys(xyz, low, coarsest)
-    # Occupied voxels fall with the size: bisect its logarithm to 1 % of size, 2 % of count.
+    # The number of occupied voxels falls with their size: bisect the size on a log scale, to 1 %.
     while coarsest / finest > 1.01:
         size = float(np.sqrt(finest * coarsest))
         trial = _voxel_keys(xyz, low, size)
@@ -121,7 +122,7 @@ def _voxel_keys(xyz: np.ndarray, low: np.ndarray, size: float) -> np.ndarray:
 
 
 def _inner(depth: np.ndarray) -> np.ndarray:
-    """bool (H, W): depth measured here and in the four neighbours, and continuous with them."""
+    """bool (H, W): depth is measured here and in the four neighbours, and is continuous with theirs."""
     measured = depth > 0
     inner = measured.copy()
     for axis in (0, 1):

@@ -1,4 +1,4 @@
-"""The ``splatfacto-cpu`` method: how a Splatfacto scene is trained where there may be no GPU."""
+"""The ``splatfacto-cpu`` method: trains Splatfacto scenes, with or without a GPU."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuMo
 from pointsplat_ns.system.memory import keep_freed_memory
 
 SPLATFACTO_STEPS = 30_000
-"""The length of training for which nerfstudio chose Splatfacto's schedules."""
+"""Training steps that Splatfacto's schedules were chosen for."""
 
 
 class SplatfactoCpuTrainer(Trainer):
-    """nerfstudio's trainer, which leaves nothing behind when its input cannot be used, and reuses a CPU's memory."""
+    """nerfstudio's trainer. It removes the run folder if the input cannot be used, and reuses freed memory on a CPU."""
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """As nerfstudio's.
 
         Raises:
-            PointSplatError: if the data cannot be used. The run folder, in which ``ns-train`` has then written
-                nothing but the config, is removed first.
+            PointSplatError: if the data cannot be used. The run folder, which then holds only the config, is removed
+                first.
         """
         if torch.device(self.device).type == "cpu":
             keep_freed_memory()
@@ -60,20 +60,20 @@ class SplatfactoCpuTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: SplatfactoCpuTrainer)
     scale_schedules: bool = True
-    """Shorten Splatfacto's schedules (resolution, SH degree, densification, learning rates) in proportion where the
-    run is shorter than the 30,000 steps they were made for. What was set by hand is left as it is."""
+    """Shorten Splatfacto's schedules (resolution, SH degree, densification, learning rates) in proportion if the run is
+    shorter than 30,000 steps. Options set by hand are not changed."""
 
     def setup(self, **kwargs) -> Trainer:
-        """The trainer, for a copy of this config with fitted schedules."""
+        """Build the trainer with a copy of this config whose schedules are fitted."""
         return self._target(fitted_schedules(self) if self.scale_schedules else self, **kwargs)
 
 
 def fitted_schedules(config: TrainerConfig) -> TrainerConfig:
     """A copy of a config with Splatfacto's 30,000-step schedules shortened to its ``max_num_iterations``.
 
-    Model settings are changed where they are still Splatfacto's defaults, learning-rate schedules where they still
-    end at 30,000. Intervals that wait for gradients to gather (``refine_every``) shrink only below 7,000 steps and
-    not below 25; the opacity reset counts in them and follows.
+    Model settings are changed only if they have Splatfacto's default values, learning-rate schedules only if they end
+    at 30,000. ``refine_every``, over which gradients are gathered, shrinks only below 7,000 steps and never below 25.
+    The interval of the opacity reset is a multiple of it.
     """
     share = min(1.0, config.max_num_iterations / SPLATFACTO_STEPS)
     config = copy.deepcopy(config)
@@ -123,9 +123,9 @@ def _optimizers() -> dict[str, dict[str, Any]]:
 def splatfacto_cpu_config() -> TrainerConfig:
     """The ``splatfacto-cpu`` method.
 
-    7,000 steps, the shorter of the two lengths that 3DGS reports, take a CPU about an hour on small photos. Training
-    logs to tensorboard and ends by itself; a viewer would share its cores (``--vis viewer`` opens one, and
-    ``ns-viewer`` shows the result). One held-out image is evaluated at times, all of them by ``ns-eval``.
+    It trains 7,000 steps, the shorter of the two lengths in the 3DGS paper: about an hour on a CPU with small photos.
+    It logs to tensorboard by default, as a viewer would compete for the CPU (``--vis viewer`` opens one; ``ns-viewer``
+    shows the result). Every 500 steps one held-out image is evaluated; ``ns-eval`` evaluates all of them.
     """
     return SplatfactoCpuTrainerConfig(
         method_name="splatfacto-cpu",

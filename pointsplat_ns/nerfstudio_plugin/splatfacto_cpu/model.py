@@ -1,8 +1,8 @@
 """Splatfacto on any torch device: nerfstudio's model with our rasterizer in place of gsplat's CUDA kernels.
 
-Config, densification, checkpoint keys, cropping, camera optimiser and bilateral grid are nerfstudio's own. What needs
-CUDA or a network is replaced: the seed of the scene, the call of the rasterizer, and LPIPS; and SSIM by the same in
-fewer operations.
+Config, densification, checkpoint keys, cropping, camera optimiser and bilateral grid are nerfstudio's own. Replaced is
+what needs CUDA or a download (the initialisation from seed points, the call of the rasterizer, LPIPS), and SSIM, by an
+implementation of the same formula in fewer operations.
 """
 
 from __future__ import annotations
@@ -38,47 +38,47 @@ from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.nerfstudio_plugin.rasterizer_options import RasterizerOptions
 
 LONE_POINT_SCALE = 0.01
-"""Standard deviation, in scene units, of a seed that has no other point to take its size from."""
+"""Standard deviation, in scene units, of the first Gaussian of a scene with a single seed point."""
 
 HALF_LEVEL = 0.5 / 255
-"""Half a step of an 8-bit colour: the nearest to 0 and 1 that a seed's colour logit goes, so that it stays finite."""
+"""Half a step of an 8-bit colour. Seed colours keep this distance from 0 and 1, so that their logits are finite."""
 
 
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
-"""What a scene trained over random backgrounds is shown over: the viewer's own colour, as in Splatfacto."""
+"""Evaluation background of scenes trained with random backgrounds: the viewer's colour, as in Splatfacto."""
 
 
 class LpipsMetric:
-    """LPIPS as nerfstudio calls its metrics. Not a module: its weights are no part of a scene's checkpoint."""
+    """LPIPS, called like nerfstudio's metrics. Not a module, so that checkpoints do not hold its weights."""
 
     def __init__(self) -> None:
         self._lpips = ReportedLpips("alex")
 
     @property
     def reason(self) -> str | None:
-        """Why a value was missing, once one was."""
+        """Why LPIPS could not be computed; None if it could, so far."""
         return self._lpips.reason
 
     def __call__(self, image: Tensor, other: Tensor) -> Tensor:
-        """LPIPS of two (1, 3, H, W) images in [0, 1]; NaN, with ``reason`` set, where it cannot be computed."""
+        """LPIPS of two (1, 3, H, W) images in [0, 1]; NaN, with ``reason`` set, if it cannot be computed."""
         value = self._lpips(image.permute(0, 2, 3, 1), other.permute(0, 2, 3, 1))
         return image.new_tensor(math.nan) if value is None else value.mean()
 
 
 @dataclass
 class SplatfactoCpuModelConfig(RasterizerOptions, SplatfactoModelConfig):
-    """Splatfacto's config, and the choice of a rasterizer"""
+    """Splatfacto's config and the options of the rasterizer"""
 
     _target: type = field(default_factory=lambda: SplatfactoCpuModel)
 
 
 class SplatfactoCpuModel(SplatfactoModel):
-    """Splatfacto without a need for CUDA or a network.
+    """Splatfacto that needs neither CUDA nor a network connection.
 
     Args:
         config: as Splatfacto's.
         seed_points: positions (N, 3) in scene units and colours (N, 3) from 0 to 255. Rows that are not finite are
-            dropped and counted; with none left the scene starts from random points, as Splatfacto's does.
+            dropped, with a log line. If none is left, the scene starts from random points, as in Splatfacto.
     """
 
     config: SplatfactoCpuModelConfig
@@ -86,7 +86,7 @@ class SplatfactoCpuModel(SplatfactoModel):
     def populate_modules(self) -> None:
         """Build what Splatfacto builds, without CUDA and without weights for LPIPS.
 
-        Splatfacto's own method, which mixes all of it, is not called: it puts seed points on CUDA and downloads LPIPS.
+        Splatfacto's own method is not called: it puts seed points on CUDA and downloads LPIPS.
         """
         config = self.config
         self.seed_points = None if config.random_init else _finite_seeds(self.seed_points)
@@ -147,23 +147,23 @@ class SplatfactoCpuModel(SplatfactoModel):
         }
         return torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in values.items()})
 
-    def load_state_dict(self, dict: Mapping[str, Any], **kwargs):  # type: ignore[override]  # nerfstudio narrows torch's too
-        """As Splatfacto's, and without the LPIPS weights that nerfstudio's own checkpoints carry along."""
+    def load_state_dict(self, dict: Mapping[str, Any], **kwargs):  # type: ignore[override]  # as nerfstudio's
+        """As Splatfacto's, but ignores the LPIPS weights in nerfstudio's own checkpoints."""
         return super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Splatfacto's callbacks, once the optimisers hold this model's parameters."""
+        """Splatfacto's callbacks. The optimisers are first given this model's parameters."""
         if training_callback_attributes.optimizers is not None:
             self._adopt_optimizers(training_callback_attributes.optimizers)
         return super().get_training_callbacks(training_callback_attributes)
 
     def _adopt_optimizers(self, optimizers: Optimizers) -> None:
-        """Point the optimisers at the parameters that loading a checkpoint has made anew.
+        """Let the optimisers step this model's parameters.
 
-        nerfstudio builds the optimisers first; a resumed Splatfacto would go on stepping parameters that nothing
-        draws any more.
+        nerfstudio builds the optimisers before it loads a checkpoint, and loading replaces the parameters. A resumed
+        Splatfacto would otherwise optimise parameters that are no longer rendered.
         """
         for name, parameter in self.gauss_params.items():
             optimizer = optimizers.optimizers.get(name)
@@ -176,14 +176,15 @@ class SplatfactoCpuModel(SplatfactoModel):
                 optimizers.parameters[name] = [parameter]
 
     def get_outputs(self, camera: Cameras | RayBundle) -> dict[str, Any]:
-        """Draw one camera.
+        """Render one camera.
 
         Args:
             camera: of shape (1,), on the model's device.
 
         Returns:
-            ``rgb`` (H, W, 3) in [0, 1], ``accumulation`` (H, W, 1), ``background`` (3,), or (H, W, 3) in evaluation,
-            and ``depth`` (H, W, 1), in scene units along the viewing axis, or None while training without it.
+            ``rgb`` (H, W, 3) in [0, 1]; ``accumulation`` (H, W, 1); ``background``, (3,) in training and (H, W, 3) in
+            evaluation; and ``depth`` (H, W, 1), in scene units along the viewing axis, or None in training unless
+            ``output_depth_during_training`` is set.
         """
         if not isinstance(camera, Cameras):
             return {}
@@ -218,7 +219,7 @@ class SplatfactoCpuModel(SplatfactoModel):
         }
 
     def _visible_parameters(self) -> dict[str, Tensor] | None:
-        """The parameters inside the crop box in evaluation, or all; None if the box is empty."""
+        """All parameters, or in evaluation those inside the crop box; None if the box is empty."""
         params = dict(self.gauss_params.items())
         if self.crop_box is None or self.training:
             return params
@@ -226,7 +227,7 @@ class SplatfactoCpuModel(SplatfactoModel):
         return {name: value[inside] for name, value in params.items()} if inside.any() else None
 
     def _drawn_size(self, camera: Cameras) -> tuple[Tensor, int, int]:
-        """Intrinsics (1, 3, 3), width and height in pixels at the resolution of this step."""
+        """Intrinsics (1, 3, 3), width and height, in pixels at the resolution of this step."""
         factor = self._get_downscale_factor()
         intrinsics = camera.get_intrinsics_matrices().to(self.device).clone()
         intrinsics[:, :2] /= factor
@@ -241,7 +242,7 @@ class SplatfactoCpuModel(SplatfactoModel):
         height: int,
         with_depth: bool,
     ) -> tuple[Tensor, Tensor, dict]:
-        """Image (1, H, W, 3 or 4), opacity (1, H, W, 1) and what densification needs."""
+        """Image (1, H, W, 3 or 4), alpha (1, H, W, 1), and the info dictionary that densification needs."""
         if self.config.sh_degree > 0:
             colors = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
             degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
@@ -268,28 +269,28 @@ class SplatfactoCpuModel(SplatfactoModel):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """As Splatfacto's, without LPIPS where it cannot be had (``self.lpips.reason`` then says why)."""
+        """As Splatfacto's, without LPIPS if it cannot be computed (``self.lpips.reason`` then says why)."""
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         return {k: v for k, v in metrics.items() if "lpips" not in k or math.isfinite(v)}, images
 
 
 def _random_seeds(config: SplatfactoModelConfig) -> tuple[Tensor, Tensor]:
-    """Positions (N, 3) in a cube around the origin, without colours, as Splatfacto starts where it has no points."""
+    """Positions (N, 3) in a cube around the origin, and no colours (0, 3), as Splatfacto starts without seed points."""
     return (torch.rand(config.num_random, 3) - 0.5) * config.random_scale, torch.zeros(0, 3)
 
 
 def _distance_to_others(points: Tensor, k: int) -> Tensor:
-    """Mean distance (N, 1) from each point (N, 3) to the ``k`` nearest at another place, float32 and positive.
+    """Mean distance (N, 1) from each point (N, 3) to its ``k`` nearest other positions, float32 and positive.
 
-    Points at one place count once, so that no distance is zero. Where there are fewer than ``k`` other places, the
-    farthest counts for those that are missing; a lone place has ``LONE_POINT_SCALE``.
+    Points at the same position count once, so that no distance is zero. With fewer than ``k`` other positions, the
+    distance to the farthest is repeated; with none, the result is ``LONE_POINT_SCALE``.
     """
     places, place_of = torch.unique(points, dim=0, return_inverse=True)
     if len(places) < 2:
         return torch.full((len(points), 1), LONE_POINT_SCALE)
     distances = nearest(places, k + 1)[0][:, 1:]
     missing = distances[:, -1:].expand(-1, k - distances.shape[1])
-    # Distinct places can still be closer than float32 can square.
+    # Distinct positions can be so close that the distance is zero in float32.
     distances = torch.cat([distances, missing], dim=1).clamp(min=torch.finfo(torch.float32).tiny).float()
     return distances.mean(dim=1, keepdim=True)[place_of]
 
@@ -313,18 +314,18 @@ def _finite_seeds(seeds: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor] 
 
 @dataclass
 class SplatfactoCpuPipelineConfig(VanillaPipelineConfig):
-    """nerfstudio's pipeline, whose evaluation is always valid JSON"""
+    """nerfstudio's pipeline, with an evaluation that is always valid JSON"""
 
     _target: type = field(default_factory=lambda: SplatfactoCpuPipeline)
 
     def setup(self, **kwargs) -> Any:
-        """The pipeline. nerfstudio's trainer and its ``ns-*`` commands read the checkpoint right after this."""
+        """Build the pipeline, and let torch read nerfstudio's checkpoints, which happens right after this."""
         allow_splatfacto_checkpoints()
         return super().setup(**kwargs)
 
 
 class SplatfactoCpuPipeline(VanillaPipeline):
-    """nerfstudio's pipeline; what cannot be computed is null in its evaluation, and never NaN."""
+    """nerfstudio's pipeline. A metric that cannot be computed is null in its evaluation, never NaN."""
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
@@ -332,10 +333,10 @@ class SplatfactoCpuPipeline(VanillaPipeline):
         """Mean metrics over the held-out frames.
 
         Args:
-            step: given by the trainer, whose log takes numbers alone: what is not finite is then left out. Without
-                it, as in ``ns-eval``, that is None, and ``lpips_note`` says why LPIPS is missing.
-            output_path: folder for the rendered images, if they are wanted.
-            get_std: add the standard deviation of every metric; that of a single image is None.
+            step: given by the trainer, whose log takes only finite numbers: other metrics are then left out. Without
+                it, as in ``ns-eval``, they are None, and ``lpips_note`` says why LPIPS is missing.
+            output_path: folder for the rendered images; None writes none.
+            get_std: add the standard deviation of every metric; for a single image it is None.
 
         Raises:
             DataError: if no frame is held out.
@@ -345,7 +346,7 @@ class SplatfactoCpuPipeline(VanillaPipeline):
                 f"{self.datamanager.get_datapath()}: no frame is held out, so there is nothing to evaluate on; "
                 "expected at least one: change the dataparser's split"
             )
-        self.model.lpips = lpips = LpipsMetric()  # whose reason is that of this evaluation alone
+        self.model.lpips = lpips = LpipsMetric()  # a new one, so that its reason is of this evaluation
         metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
         if step is not None:
             return {name: value for name, value in metrics.items() if math.isfinite(value)}
