@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 import torch
 
-import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 from making import normal_scene, same
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression.closeness import DenseReference

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 import torch
 
-import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 import pointsplat_ns as ps
 from making import REPOSITORY, ball, same
 from pointsplat_ns.compression import trained_refiner
