@@ -13,22 +13,22 @@ from pointsplat_ns.pruning.sh_bands import cut_sh
 from pointsplat_ns.views import Views
 
 SH_PSNR = 40.0
-"""PSNR in dB that renders must reach against the whole scene's when SH bands are left out. Of an ``auto`` budget of
-35 dB an unrelated error of this size takes 1.2 dB."""
+"""PSNR in dB that renders without some SH bands must reach against renders with all bands. An independent error of this
+size lowers the PSNR of an ``auto`` budget of 35 dB by 1.2 dB."""
 
 PRECISION = 1.05
-"""The count found is at most this factor above one that was seen to fail."""
+"""The search stops when the count is at most this factor above a count that failed."""
 
 
 @dataclass(frozen=True, eq=False)
 class FoundBudget:
-    """What the search found."""
+    """The result of the search."""
 
     scene: Gaussians
     psnr: float
-    """Of ``scene`` over all pixels of all views, dB; inf where nothing differs."""
+    """PSNR of ``scene`` over all pixels of all views, dB; inf if nothing differs."""
     worst: float
-    """Of the worst view, dB."""
+    """PSNR of the worst view, dB."""
     tried: dict[int, float] = field(default_factory=dict)
     """PSNR in dB by count, for every count tried."""
 
@@ -40,24 +40,22 @@ def smallest_within(
     psnr: float,
     progress: Callable[[float], None] | None = None,
 ) -> FoundBudget:
-    """The smallest scene that a method makes whose renders reach ``psnr`` against those of the dense scene.
+    """Search for the smallest scene of a method whose renders reach ``psnr`` against those of the dense scene.
 
-    The PSNR is that of the mean squared error over all pixels of all views, so bad views weigh more
-    than their number. The count is searched for between one and all: where two counts around the wanted
-    PSNR are known, the line through them (PSNR over the logarithm of the count, nearly straight in
-    practice) says which to try next, and half-way is tried where that does not close in. What is
-    returned was rendered and found good enough; where quality does not rise with the count
-    everywhere, a smaller one may exist.
+    The PSNR is that of the mean squared error over all pixels of all views, so bad views count more. The count is
+    searched for between 1 and N. With one count that fails and one that suffices, the next one is found by linear
+    interpolation of the PSNR over the logarithm of the count, which is nearly a straight line in practice. The result
+    has been rendered and reaches ``psnr``. If quality does not always rise with the count, a smaller one may exist.
 
     Args:
         dense: N Gaussians.
         make: from a count K to a scene of K Gaussians.
-        views: where to look from.
-        psnr: wanted, dB.
+        views: views that renders are compared in.
+        psnr: PSNR to reach, dB.
         progress: called with the share done, in [0, 1].
 
     Raises:
-        BudgetError: if ``psnr`` is no positive number, or not even all N Gaussians reach it.
+        BudgetError: if ``psnr`` is not a positive number, if there is no view, or if not even all N Gaussians reach it.
     """
     if not 0 < psnr < math.inf:
         raise BudgetError(f"the wanted PSNR is {psnr} dB; expected a positive number, such as 35")
@@ -78,15 +76,15 @@ def smallest_within(
     guess = max(1, round(0.3 * n))
     widest = math.log(max(n, 2))
     while True:
-        found = attempt(guess)
-        if found.psnr >= psnr:
-            high, best = guess, found
+        trial = attempt(guess)
+        if trial.psnr >= psnr:
+            high, best = guess, trial
         else:
             low = guess
         if progress is not None:
             progress(1 - max(0.0, math.log(high / max(low, 1)) - math.log(PRECISION)) / widest)
         if low == n:
-            raise BudgetError(f"all {n} Gaussians reach {found.psnr:.1f} dB, not {psnr:g} dB; ask for less")
+            raise BudgetError(f"all {n} Gaussians reach {trial.psnr:.1f} dB, not {psnr:g} dB; ask for less")
         if best is None:
             guess = min(n, 2 * guess)
         elif high <= max(low, 0) * PRECISION or high - low <= 1:
@@ -101,14 +99,14 @@ def _next_guess(low: int, high: int, tried: dict[int, float], psnr: float) -> in
     share = 0.5
     if low in tried and math.isfinite(tried[high]) and math.isfinite(tried[low]):
         share = (psnr - tried[low]) / (tried[high] - tried[low])
-        share = min(0.85, max(0.15, share + 0.03))  # a little above: to end on a good one
+        share = min(0.85, max(0.15, share + 0.03))  # a little more, so that the last try is likely to suffice
     elif low == 0:
-        share = 1 - math.log(4) / max(above - below, math.log(4))  # a quarter of what is good enough
+        share = 1 - math.log(4) / max(above - below, math.log(4))  # a quarter of the count that suffices
     return min(high - 1, max(low + 1, round(math.exp(below + share * (above - below)))))
 
 
 def needed_sh_degree(dense: Gaussians, views: Views, psnr: float = SH_PSNR) -> tuple[int, float]:
-    """The lowest SH degree whose renders reach ``psnr`` (dB) against those of the whole scene, and what they reach."""
+    """The lowest SH degree whose renders reach ``psnr`` (dB) against those of the whole scene, and the PSNR reached."""
     reference = DenseReference(dense, views)
     for degree in range(dense.sh_degree):
         overall, _ = reference.psnr(cut_sh(dense, degree))

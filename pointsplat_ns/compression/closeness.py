@@ -1,4 +1,4 @@
-"""How close the renders of a smaller scene come to the dense scene's own. No photos are needed."""
+"""Compares renders of a smaller scene with renders of the dense scene. No photos are needed."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from pointsplat_ns.views import Views
 
 @dataclass(frozen=True)
 class Closeness:
-    """How close a scene's renders come to those of the dense scene."""
+    """Errors of a scene's renders against those of the dense scene."""
 
     errors: tuple[float, ...]
     """Mean squared error of each view."""
     ssim: float | None
-    """Mean over views; None where views are smaller than SSIM's window."""
+    """Mean over views; None if views are smaller than SSIM's window."""
 
     @property
     def error(self) -> float:
@@ -31,21 +31,21 @@ class Closeness:
 
     @property
     def psnr(self) -> float:
-        """Over all pixels of all views, dB; inf where nothing differs."""
+        """PSNR over all pixels of all views, dB; inf if nothing differs."""
         return _psnr(self.error)
 
     @property
     def worst(self) -> float:
-        """Of the worst view, dB."""
+        """PSNR of the worst view, dB."""
         return _psnr(max(self.errors))
 
 
 class DenseReference:
-    """Renders of the dense scene, and how close another scene comes to them.
+    """Renders of the dense scene that other scenes are compared with.
 
     Args:
-        dense: the scene that is its own reference.
-        views: where to look from.
+        dense: the dense scene.
+        views: views to render.
     """
 
     @torch.no_grad()
@@ -84,5 +84,5 @@ def _error(image: Tensor, target: Tensor) -> float:
 
 
 def _psnr(mse: float) -> float:
-    """Of a mean squared error, dB: inf for none, NaN for NaN."""
+    """PSNR, in dB, of a mean squared error: inf for 0, NaN for NaN."""
     return math.inf if mse == 0 else -10 * math.log10(mse) if mse > 0 else math.nan

@@ -1,4 +1,4 @@
-"""Prune, refine, check: a scene is made smaller and refined as far as that brings it closer to what it was."""
+"""Prune a scene, refine it, and keep the refinement as far as it brings renders closer to the dense scene's."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.views import Views
 
 MIN_GAIN = 0.1
-"""Refinement that gains less than this, dB of PSNR, is left out: the sign of so small a gain depends on the views."""
+"""Least gain of PSNR, in dB, for which refinement is kept: the sign of a smaller gain depends on the views."""
 
 
 @dataclass(frozen=True, eq=False)
 class Compacted:
-    """A smaller scene, and whether refining it helped. What :func:`pointsplat_ns.compact` gives.
+    """The result of :func:`pointsplat_ns.compact`: a smaller scene, and whether refining it helped.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -34,38 +34,38 @@ class Compacted:
     """
 
     scene: Gaussians
-    """``refined`` if that was accepted, ``pruned`` if not."""
+    """``refined`` if it was accepted, else ``pruned``."""
     pruned: Gaussians
-    """Before refinement."""
+    """The scene before refinement."""
     refined: Gaussians
-    """After it, at ``strength``."""
+    """The scene after refinement at ``strength``."""
     strength: float
-    """The share of the refiner's residuals in ``refined``, in (0, 1]: the best that was found, 1 if none helps."""
+    """Share of the refiner's residuals in ``refined``, in (0, 1]: the best one tried, or 1 if none helps."""
     accepted: bool
-    """Whether refinement is in ``scene``."""
+    """Whether ``scene`` is the refined one."""
     verdict: str
-    """One line for a person: what refinement brought, or why it was left out."""
+    """One line of text: what refinement gained, or why it was left out."""
     notes: tuple[str, ...]
-    """Lines for a person: SH bands dropped, PSNR reached, where views came from."""
+    """Lines of text: SH bands dropped, PSNR reached, where views came from."""
     reference: DenseReference | None
-    """The dense scene's renders that both were compared with; None where there is no view to compare in."""
+    """Renders of the dense scene that both were compared with; None if there are no views."""
     before: Closeness | None
-    """How close ``pruned`` comes to them."""
+    """Errors of ``pruned`` against the reference."""
     after: Closeness | None
-    """How close ``refined`` comes to them; None where it was not compared."""
+    """Errors of ``refined`` against the reference; None if it was not compared."""
     seconds: float
-    """What all of it took."""
+    """Total duration."""
 
     @property
     def psnr(self) -> float | None:
-        """Of ``scene`` against the dense scene's renders, over all pixels of all views, dB; None where nothing was
+        """PSNR of ``scene`` against the dense scene's renders, over all pixels of all views, dB; None if nothing was
         compared."""
         close = self.after if self.accepted else self.before
         return None if close is None else close.psnr
 
     @property
     def views(self) -> Views | None:
-        """Where renders were compared."""
+        """The views that renders were compared in."""
         return None if self.reference is None else self.reference.views
 
 
@@ -78,28 +78,28 @@ def compact_scene(
     views: ViewSource | None = None,
     progress: Progress = silent,
 ) -> Compacted:
-    """Make a scene smaller and refine it, if that helps.
+    """Make a scene smaller, and refine it if that helps.
 
-    The smaller scene and the refined one are rendered from some poses and compared with the dense scene's own renders
-    by the mean squared error over all pixels of all views. On a scene unlike those that it was trained on, a refiner
-    moves the right way but too far. So half of the residuals are tried, too, and the share at the bottom of the
-    parabola through the errors at 0, 1/2 and 1: there the error is least if renders change in proportion. The best is
-    kept if it gains at least :data:`MIN_GAIN`. A PSNR that is asked for (``auto``) is met before refinement, so that it
-    holds in any case.
+    The pruned and the refined scene are rendered and compared with renders of the dense scene, by the mean squared
+    error over all pixels of all views. On scenes unlike its training scenes, a refiner's residuals tend to have the
+    right direction but to be too large. So half of the residuals are tried as well, and the share at the minimum of the
+    parabola through the errors at 0, 1/2 and 1, where the error is least if renders change linearly with the residuals.
+    The best is kept if it gains at least :data:`MIN_GAIN`. A requested PSNR (``auto``) is reached before refinement, so
+    that it holds in any case.
 
     Args:
         dense: N Gaussians.
-        refiner: on the device that it is to run and its scenes are to be rendered on.
-        keep: ratio, count, size or PSNR; by default what the refiner was trained with.
-        by: a method of :data:`~pointsplat_ns.pruning.METHODS`; by default the one that the refiner was trained with.
+        refiner: its device is also used for rendering.
+        keep: ratio, count, size or PSNR; by default the refiner's training setting.
+        by: a method of :data:`~pointsplat_ns.pruning.METHODS`; by default the refiner's training setting.
         sh: as for :func:`~pointsplat_ns.compression.prune.prune_scene`.
-        views: where to look from; by default poses sampled in free space.
-        progress: called with what is being done and the share done of it, in [0, 1].
+        views: views that renders are compared in; by default sampled in free space.
+        progress: called with the name of the current task and the share of it that is done, in [0, 1].
 
     Raises:
         BudgetError, SceneError, PointSplatError: as :func:`~pointsplat_ns.compression.prune.prune_scene`.
         SceneError: if the SH degree exceeds the refiner's.
-        DataError: if the budget or ``sh`` needs views and none can be had.
+        DataError: if the budget or ``sh`` needs views and there are none.
     """
     start = time.perf_counter()
     settings = refiner.settings
@@ -135,7 +135,7 @@ def compact_scene(
 
 
 def _need_sh_degree(dense: Gaussians, sh: str, refiner: TrainedRefiner) -> None:
-    """Refuse, before anything takes long, a scene whose SH the refiner cannot read."""
+    """Refuse, before the long computations, a scene whose SH degree exceeds the refiner's."""
     limit = refiner.network.config.sh_degree
     if dense.sh_degree > limit and (sh == "all" or (sh.isdigit() and int(sh) > limit)):
         raise SceneError(
@@ -145,8 +145,8 @@ def _need_sh_degree(dense: Gaussians, sh: str, refiner: TrainedRefiner) -> None:
 
 
 def at_strength(before: Gaussians, after: Gaussians, strength: float) -> Gaussians:
-    """The scene that is ``strength``, in [0, 1], of the way from one to another, in the parameters as they are stored;
-    a parameter that is infinite in one of them stays as in ``before``."""
+    """The linear interpolation between two scenes, at ``strength`` in [0, 1], of the parameters as stored (log-scales,
+    logits). A value that is infinite in one of them stays as in ``before``."""
     if strength == 1:
         return after
     mixed = (a.lerp(b, strength) for a, b in zip(before.tensors(), after.tensors(), strict=True))
@@ -161,14 +161,13 @@ def as_far_as_it_helps(
     refined: Gaussians,
     progress: Progress = silent,
 ) -> tuple[Gaussians, float, Closeness]:
-    """The scene at the best share of a refiner's residuals, that share and how close it comes; at full strength if
-    none helps.
+    """The scene at the best share of a refiner's residuals, that share, and its errors; at full strength if none helps.
 
     Args:
         reference: the dense scene's renders.
-        before: how close ``pruned`` comes to them.
-        pruned, refined: before and after refinement.
-        progress: called with what is being done and the share done of it, in [0, 1].
+        before: errors of ``pruned`` against them.
+        pruned, refined: the scenes before and after refinement.
+        progress: called with the name of the current task and the share of it that is done, in [0, 1].
     """
     device = reference.renders[0].device
     tried = _try_strengths(reference, before, pruned.to(device), refined.to(device), progress)
@@ -180,7 +179,7 @@ def as_far_as_it_helps(
 def _try_strengths(
     reference: DenseReference, before: Closeness, pruned: Gaussians, refined: Gaussians, progress: Progress
 ) -> dict[float, Closeness]:
-    """Closeness by strength; that of 1 is always there."""
+    """Errors by the strength tried; 1 is always among them."""
     tried: dict[float, Closeness] = {}
 
     def attempt(strength: float) -> None:
@@ -193,14 +192,14 @@ def _try_strengths(
     if tried[1.0].errors != before.errors:
         attempt(0.5)
         bottom = bottom_of_parabola(before.error, tried[0.5].error, tried[1.0].error)
-        if 0.05 < bottom < 0.95 and abs(bottom - 0.5) > 0.05:  # nearer ones differ by next to nothing
+        if 0.05 < bottom < 0.95 and abs(bottom - 0.5) > 0.05:  # closer ones hardly differ from those tried
             attempt(bottom)
     progress("comparing renders", 1.0)
     return tried
 
 
 def bottom_of_parabola(at_zero: float, at_half: float, at_one: float) -> float:
-    """Where in [0, 1] the parabola through three values is least; NaN if a value is not finite.
+    """The position in [0, 1] where the parabola through values at 0, 1/2 and 1 is least; NaN if one is not finite.
 
     Example:
         >>> round(bottom_of_parabola(0.3**2, 0.2**2, 0.7**2), 6)
@@ -221,7 +220,7 @@ def helps(before: Closeness, after: Closeness) -> bool:
 
 
 def _verdict(before: Closeness, after: Closeness, strength: float) -> str:
-    """What refinement brought, as a line for a person."""
+    """One line of text: what refinement gained, or why it was left out."""
     count = len(before.errors)
     better = sum(new < old for new, old in zip(after.errors, before.errors, strict=True))
     figures = f"{before.psnr:.2f} -> {after.psnr:.2f} dB against the dense scene's renders in {_views(count)}"

@@ -1,4 +1,4 @@
-"""What a scene is made of, before and after: opacities and sizes, as numbers and as a picture."""
+"""Distributions of opacity and size in a scene, as quantiles and as a plot."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def _quantiles(values: Tensor) -> list[float]:
 
 
 def plot_distributions(scenes: dict[str, Gaussians], path: Path | str) -> None:
-    """Draw the distributions of opacity (left) and of the volume's logarithm (right), as the paper's Figure 4.
+    """Plot the distributions of opacity (left) and of the logarithm of the volume (right), as the paper's Figure 4.
 
     Args:
-        scenes: by the name in the legend, such as "before" and "after".
-        path: the PNG to write.
+        scenes: name in the legend, such as "before" and "after" -> scene.
+        path: the PNG file to write.
 
     Raises:
         SceneError: if ``path`` cannot be written.

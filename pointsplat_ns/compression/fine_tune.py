@@ -1,4 +1,4 @@
-"""Optimising the Gaussians that were kept, for one scene: the recovery step of the image-driven baselines."""
+"""Optimises the Gaussians of one pruned scene: the recovery step of the image-driven baselines."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views
 
 RATES = {
-    "means": 1.6e-6,  # times the extent of the scene: where 3DGS's schedule ends, the scene being trained already
+    "means": 1.6e-6,  # times the extent of the scene: the final rate of 3DGS, as the scene has been trained
     "scales": 5e-3,
     "quats": 1e-3,
     "opacities": 2.5e-2,
     "features_dc": 2.5e-3,
     "features_rest": 2.5e-3 / 20,
 }
-"""Rates of Adam, those of 3DGS."""
+"""Learning rates of Adam, as in 3DGS."""
 
 SSIM_WEIGHT = 0.2
-"""Of 1 - SSIM in the loss, beside L1; 3DGS's."""
+"""Weight of 1 - SSIM in the loss, as in 3DGS; L1 has the rest."""
 
 
 def fine_tune(
@@ -37,22 +37,23 @@ def fine_tune(
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> Gaussians:
-    """Optimise the parameters of a scene so that its renders come closer to target images. The count stays.
+    """Optimise the parameters of a scene so that its renders match target images. The count does not change.
 
-    Each step renders one view and takes one step of Adam on 0.8 L1 + 0.2 (1 - SSIM); every view comes once
-    before any comes twice. Parameters that are not finite (an opacity of 1, a flat axis) stay as they are.
+    Each step renders one view and takes one step of Adam on 0.8 L1 + 0.2 (1 - SSIM). Each view comes once before any
+    is repeated. Values that are not finite (the logit of opacity 1, the log-scale of a flat axis) do not change.
 
     Args:
         scene: K Gaussians.
-        views: poses.
-        targets: the dense scene, whose own renders are then the targets, or one image (H, W, 3) in [0, 1] a view.
-        steps: of optimisation.
-        rates: of Adam by name of the parameter, that of the means per extent of the scene; :data:`RATES` by default.
-        seed: of the order of the views.
+        views: C views.
+        targets: the dense scene, whose renders are then the targets; or C images (H, W, 3) in [0, 1], one per view.
+        steps: number of optimisation steps.
+        rates: learning rates by parameter name, which replace those in :data:`RATES`; that of the means is multiplied
+            by the extent of the scene.
+        seed: seed of the order of the views.
         progress: called with the share done, in [0, 1].
 
     Returns:
-        K Gaussians; ``scene`` is left as it is.
+        K Gaussians; ``scene`` is not changed.
 
     Raises:
         DataError: if there is no view, or the images do not fit the views.
@@ -82,7 +83,7 @@ def fine_tune(
         _loss(image, target_images[index]).backward()
         for name, value in parameters.items():
             if value.grad is not None:
-                value.grad[fixed[name]] = 0.0  # and what is not finite has no finite gradient
+                value.grad[fixed[name]] = 0.0  # values that are not finite do not change
         optimizer.step()
         if progress is not None:
             progress((step + 1) / steps)

@@ -1,4 +1,4 @@
-"""Pictures of scenes side by side, with captions."""
+"""Images of scenes side by side, with captions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.rasterizer import render
 
 SHOWN_VIEWS = 3
-"""Views in the picture, spread over those compared."""
+"""Number of views in the image, spread over those compared."""
 
 
 @torch.no_grad()
@@ -24,15 +24,15 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> st
     """Draw some of the views compared: dense, before and after refinement, side by side.
 
     Args:
-        dense: the scene that ``result`` was made of.
-        result: of :func:`pointsplat_ns.compact`.
-        path: the PNG to write.
+        dense: the scene that was compacted.
+        result: the result of :func:`pointsplat_ns.compact`.
+        path: the PNG file to write.
 
     Returns:
-        A line that says what the picture shows, or why there is none.
+        A line of text that says what the image shows, or why there is none.
 
     Raises:
-        SceneError: if it cannot be written.
+        SceneError: if the file cannot be written.
 
     Example:
         >>> import tempfile
@@ -68,12 +68,12 @@ def side_by_side(rows: list[list[ArrayLike]], titles: list[str], path: Path | st
     """Draw a grid of images of one size, a title above each column.
 
     Args:
-        rows: images (H, W, 3) in [0, 1], as many in each row as there are titles.
-        titles: of the columns.
-        path: the PNG to write.
+        rows: images (H, W, 3) in [0, 1], one per column in each row.
+        titles: titles of the columns.
+        path: the PNG file to write.
 
     Raises:
-        SceneError: if it cannot be written.
+        SceneError: if the file cannot be written.
     """
     from matplotlib.figure import Figure
 

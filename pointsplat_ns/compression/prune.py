@@ -1,7 +1,7 @@
-"""From what a person asks of a smaller scene to that scene: SH bands, then the count, by any method, then fine-tuning.
+"""Pruning with all options: first SH bands, then the count by any method and budget, then fine-tuning.
 
-Views are asked for only where they are needed: by a budget in dB, ``auto`` SH, a method that looks at the scene, or
-fine-tuning.
+Views are only looked up or sampled if they are needed: for a budget in dB, ``auto`` SH, a method that scores by views,
+or fine-tuning.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from pointsplat_ns.pruning.methods import check_opacity_weight
 from pointsplat_ns.system.progress import Progress, silent
 
 SCORED_VIEWS = 40
-"""Views that a method that looks at the scene, or fine-tuning, uses at most; the datasets here have up to 2,000."""
+"""Maximum number of views for fine-tuning and for methods that score by views. Datasets may have thousands."""
 
 SH_CHOICES = ("all", "auto", "0", "1", "2", "3")
-"""What may be asked of the SH bands."""
+"""Values of the option ``sh``."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pruned:
-    """A smaller scene and what was found on the way."""
+    """A smaller scene, with notes on how it was made."""
 
     scene: Gaussians
     notes: tuple[str, ...]
-    """Lines for a person: SH bands dropped, PSNR reached, where views came from."""
+    """Lines of text: SH bands dropped, PSNR reached, where views came from."""
 
 
 def prune_scene(
@@ -67,14 +67,14 @@ def prune_scene(
         sh: "all" keeps the SH bands, a digit cuts them to that degree, "auto" to the lowest degree whose renders
             reach :data:`~pointsplat_ns.compression.budget_search.SH_PSNR` against those of ``dense``.
         opacity_weight: lambda of the methods that weigh opacity; by default the paper's.
-        views: where to look from; by default poses sampled in free space.
-        fine_tune_steps: steps of optimising what was kept against the dense scene's own renders.
-        progress: called with what is being done and the share done of it, in [0, 1].
+        views: source of views, if they are needed; by default poses sampled in free space.
+        fine_tune_steps: steps of optimising the result against renders of ``dense``.
+        progress: called with the name of the current task and the share of it that is done, in [0, 1].
 
     Raises:
-        BudgetError: if no such scene can be made.
+        BudgetError: if the budget cannot be met.
         SceneError: if no Gaussian of the scene can be drawn.
-        DataError: if views are needed and cannot be had.
+        DataError: if views are needed and there are none.
         PointSplatError: if there is no such method, or an option does not fit it.
     """
     keep = check_options(keep, by, sh, opacity_weight, fine_tune_steps)
@@ -88,31 +88,31 @@ def prune_scene(
     if isinstance(keep, WithinPsnr):
         make = _pruner(full, by, views, opacity_weight, report)
         compared = views.compared()
-        found = smallest_within(dense, make, compared, keep.value, functools.partial(progress, "trying counts"))
-        scene = found.scene
+        search = smallest_within(dense, make, compared, keep.value, functools.partial(progress, "trying counts"))
+        scene = search.scene
         notes.append(
-            f"renders reach {found.psnr:.1f} dB against the dense scene's, {found.worst:.1f} dB in the worst of "
-            f"{len(compared)} views; {len(found.tried)} counts tried"
+            f"renders reach {search.psnr:.1f} dB against the dense scene's, {search.worst:.1f} dB in the worst of "
+            f"{len(compared)} views; {len(search.tried)} counts tried"
         )
     else:
         scene = prune(full, keep, by, functools.partial(views.views, SCORED_VIEWS), opacity_weight, report)
     if fine_tune_steps:
-        seen = views.views(SCORED_VIEWS)
-        scene = fine_tune(scene, seen, dense, fine_tune_steps, progress=functools.partial(progress, "fine-tuning"))
-        notes.append(f"fine-tuned {fine_tune_steps} steps against the dense scene's renders in {len(seen)} views")
+        tuned = views.views(SCORED_VIEWS)
+        scene = fine_tune(scene, tuned, dense, fine_tune_steps, progress=functools.partial(progress, "fine-tuning"))
+        notes.append(f"fine-tuned {fine_tune_steps} steps against the dense scene's renders in {len(tuned)} views")
     return Pruned(scene, (*notes, views.origin) if views.origin else tuple(notes))
 
 
 def check_options(
     keep: Keep | str, by: str, sh: str = "all", opacity_weight: float | None = None, fine_tune_steps: int = 0
 ) -> Keep:
-    """Refuse, before a scene is read, options of :func:`prune_scene` that fit no scene.
+    """Check the options of :func:`prune_scene` that do not depend on the scene, before a scene is read.
 
     Returns:
         ``keep``, parsed if it is text.
 
     Raises:
-        BudgetError: if ``keep`` is no budget.
+        BudgetError: if ``keep`` is not a budget.
         PointSplatError: if there is no such method, or an option does not fit it.
     """
     check_opacity_weight(method_named(by), opacity_weight)
@@ -127,7 +127,7 @@ def check_options(
 
 
 def _lowest_degree(dense: Gaussians, sh: str) -> int:
-    """The lowest SH degree that the smaller scene may have: what fits into a size depends on it."""
+    """The lowest SH degree that the result may have, on which the number of Gaussians that fit a file size depends."""
     return dense.sh_degree if sh == "all" else 0 if sh == "auto" else min(int(sh), dense.sh_degree)
 
 
@@ -138,7 +138,7 @@ def _pruner(
     opacity_weight: float | None,
     progress: Callable[[float], None],
 ) -> Callable[[int], Gaussians]:
-    """From a count to a scene of as many Gaussians. Scores are computed once, for all counts."""
+    """A function from a count to a scene of that many Gaussians. Scores are computed once, for all counts."""
     method = method_named(by)
     if method.score is None:
         return lambda count: prune(scene, count, by)
@@ -148,7 +148,7 @@ def _pruner(
 
 
 def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress, notes: list[str]) -> Gaussians:
-    """The scene with the SH bands that are asked for."""
+    """The scene with the SH bands that ``sh`` keeps; adds a line to ``notes``."""
     if sh == "all":
         return dense
     reached = ""

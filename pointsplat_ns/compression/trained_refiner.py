@@ -1,6 +1,6 @@
-"""A refiner and the kind of scene that it was trained to see: the one that ships, a file of weights, or a run.
+"""Loads trained refiners with their pruning settings: the one that ships, a file of weights, or a run.
 
-Everything is opened without nerfstudio and without running a run's ``config.yml``.
+Everything is read without nerfstudio and without executing a run's ``config.yml``.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from pointsplat_ns.refiner import Refiner, WeightsError, preset, read_metadata, 
 from pointsplat_ns.refiner.weights import PRETRAINED
 
 METHOD = "pointsplat"
-"""nerfstudio's name of the method that trains refiners."""
+"""Name, in nerfstudio, of the method that trains refiners."""
 
 DEFAULTS = {"keep": 0.1, "by": "merge"}
-"""How a file of weights that does not say was trained."""
+"""Pruning settings of files of weights whose metadata has none."""
 
 _PREFIX = "_model.refiner."
 
 
 @dataclass(frozen=True, eq=False)
 class TrainedRefiner:
-    """A network that repairs scenes, and how the scenes that it was trained on were pruned.
+    """A trained network that refines pruned scenes, with the pruning settings of its training scenes.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -57,7 +57,7 @@ class TrainedRefiner:
 
     @property
     def device(self) -> torch.device:
-        """Where the network is."""
+        """Device of the network."""
         return next(self.network.parameters()).device
 
 
@@ -67,11 +67,11 @@ def load_refiner(path: Path | str | None = None, device: torch.device | str | No
     Args:
         path: a ``.safetensors`` file, or a ``pointsplat`` run (its folder, ``config.yml`` or checkpoint); by default
             the refiner that ships (``pointsplat_ns/refiner/pretrained/CARD.md`` says what it was trained on).
-        device: where it is to run; by default on CUDA where there is some, else on the CPU.
+        device: where to run it; by default CUDA if available, else the CPU.
 
     Raises:
         WeightsError: if the file is missing, damaged or of another kind.
-        SceneError: if it is no such run.
+        SceneError: if ``path`` is not such a run.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -104,7 +104,7 @@ def open_refiner_run(path: Path | str, need_data: bool) -> Run:
     """The ``pointsplat`` run at a path.
 
     Raises:
-        SceneError: if it is another kind of run, or is damaged.
+        SceneError: if there is no run, or it is damaged or of another kind.
     """
     run = open_run(path, need_data)
     if run.method_name != METHOD:
@@ -113,25 +113,28 @@ def open_refiner_run(path: Path | str, need_data: bool) -> Run:
 
 
 def scenes_of_run(run: Run) -> tuple[dict[str, Path], str]:
-    """The checkpoints and PLY files of the dense scenes that a ``pointsplat`` run was trained on, by the names that the
-    training gave them; and which of them is the run's own to viewers and exporters.
+    """The files of the dense scenes that a ``pointsplat`` run was trained on, and the scene that viewers and exporters
+    get.
 
     Args:
         run: opened with its data.
 
+    Returns:
+        Checkpoints and PLY files by the names that the training gave the scenes, and the name of the shown scene.
+
     Raises:
-        SceneError: if there are none any more.
+        SceneError: if the scenes are no longer there.
     """
     runs, plys, nothing = find_runs_and_plys(run.data, run.datamanager_fields.get("supervision", "auto"))
-    scenes = {name: found.checkpoint for name, found in runs.items()} | plys
+    scenes = {name: scene.checkpoint for name, scene in runs.items()} | plys
     if not scenes:
         raise SceneError(f"{run.config_path}: {nothing or f'{run.data}: no Gaussians in it'}; put its scenes back")
     return scenes, shown_scene(list(scenes), run.datamanager_fields.get("eval_scenes") or ())
 
 
 def settings_from(saved: Mapping[str, Any]) -> PruneSettings:
-    """How scenes were pruned, as a run's model settings or a file's metadata have it. ``by`` was once called ``score``,
-    and a weight was once saved with methods that have none.
+    """Pruning settings from a run's model settings or a file's metadata. Earlier versions called ``by`` ``score``, and
+    saved an opacity weight also for methods that have none.
 
     Raises:
         KeyError: if a setting is missing.
@@ -144,10 +147,11 @@ def settings_from(saved: Mapping[str, Any]) -> PruneSettings:
 
 
 def network_options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Changes to a size's preset that a model's settings ask for. A run from before a setting has its default.
+    """The network options in a run's model settings, as changes to the preset of its size. Settings that a run of an
+    earlier version lacks have their defaults.
 
     Raises:
-        KeyError: if the encoder is not named.
+        KeyError: if the setting ``encoder`` is missing.
     """
     defaults = {"use_appearance": True, "use_position": True, "norm": "scene"}
     return {"encoder": settings["encoder"], **{name: settings.get(name, value) for name, value in defaults.items()}}
@@ -172,9 +176,9 @@ def _read_run(run: Run) -> tuple[Refiner, PruneSettings]:
 
 
 def _settings_of_file(path: Path) -> PruneSettings:
-    """How scenes were pruned, as the metadata of a file of weights has it."""
+    """Pruning settings from the metadata of a file of weights."""
     metadata = read_metadata(path)
-    if "score" in metadata:  # as files of version 1 call it
+    if "score" in metadata:  # the name in files of version 1
         metadata = {"by": metadata["score"], **metadata}
     try:
         return settings_from({**DEFAULTS, **metadata})

@@ -1,4 +1,4 @@
-"""Views of a scene that comes without cameras: poses in its free space."""
+"""Samples views in the free space of a scene that comes without cameras."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.views import Views
 
 FIELD_OF_VIEW = 70.0
-"""Across the longer side of the image, degrees: that of a phone's main camera."""
+"""Field of view across the longer side of the image, degrees: that of a phone's main camera."""
 
 BACKGROUND = (0.0, 0.0, 0.0)
 
 _PROBE_SIDE = 32
-"""Longer side of the depth image by which a camera position is judged, pixels."""
+"""Longer side, in pixels, of the depth image that tests a camera position."""
 
 _TOO_NEAR = 0.05
 """Distance, as a share of the diagonal of the content's box, below which a surface is too near to the camera."""
 
 _NEAR_PIXELS = 0.05
-"""Share of the pixels that may show a surface that is too near."""
+"""Largest allowed share of pixels that show a surface that is too near."""
 
 _COVERED = 0.7
-"""Mean accumulated alpha that the image must have: it shows something nearly everywhere."""
+"""Least mean alpha of the image: it must show something nearly everywhere."""
 
 _BOX_SIZES = (0.7, 1.0, 1.0, 1.5, 2.5, 4.0)
-"""Sizes, relative to the content's box, of the boxes that camera positions are drawn from, one after the other: first
-inside, as in a room, then around, as about an object."""
+"""Sizes, relative to the content's box, of the boxes that camera positions are drawn from, in this order: first inside,
+as in a room, then outside, as around an object."""
 
 
 def content_box(scene: Gaussians) -> tuple[Tensor, Tensor]:
     """Corners (3,), (3,) of the box that holds 90 % of the scene's opacity along each axis, float64.
 
     Raises:
-        DataError: if nothing of the scene can be seen.
+        DataError: if nothing of the scene is visible.
     """
     means, alphas = scene.means.double(), scene.alphas.double()
     seen = scene.usable() & (alphas > 0)
@@ -58,12 +58,12 @@ def content_box(scene: Gaussians) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def sample_views(scene: Gaussians, count: int, width: int = 320, height: int = 240, seed: int = 0) -> Views:
-    """Sample cameras that stand in free space and look at the content of a scene.
+    """Sample cameras in free space that look at the content of a scene.
 
-    A camera position is drawn at random in the box that holds 90 % of the scene's opacity, and a target among the
-    Gaussians with probability proportional to opacity times area. The camera is kept if a small depth image from there
-    shows free space: nearly all of it is covered, and nearly nothing of it is very near. Where there is no such
-    position inside, larger boxes are tried. The z axis is taken to point up.
+    A camera position is drawn at random from the box that holds 90 % of the scene's opacity along each axis, and a
+    target among the Gaussians with probability proportional to opacity times area. The camera is kept if a small depth
+    image from there shows free space: nearly all of it is covered, and hardly any surface is very near. If too few
+    positions are found, larger boxes are tried. The z axis is taken to point up.
 
     Args:
         scene: N Gaussians.
@@ -77,7 +77,7 @@ def sample_views(scene: Gaussians, count: int, width: int = 320, height: int = 2
         ``Ks`` (count, 3, 3) in pixels, float64. Fewer where the search finds fewer.
 
     Raises:
-        DataError: if ``count`` or the size is not positive, the scene has nothing to look at, or no free position was
+        DataError: if ``count`` or the size is not positive, nothing of the scene is visible, or no free position is
             found.
 
     Example:
@@ -93,7 +93,7 @@ def sample_views(scene: Gaussians, count: int, width: int = 320, height: int = 2
         raise DataError(f"views of {width} x {height} pixels asked for; expected at least 1 x 1")
     low, high = content_box(scene)
     diagonal = float((high - low).norm())
-    if diagonal == 0:  # one Gaussian, or all at one place: as large as they are
+    if diagonal == 0:  # one Gaussian, or all at one position: take their size
         diagonal = float(scene.stds[scene.usable()].double().amax()) * 4
         diagonal = diagonal if diagonal > 0 else 1.0
     generator = torch.Generator().manual_seed(seed)
@@ -149,13 +149,13 @@ def _views(viewmats: Tensor, width: int, height: int) -> Views:
 
 
 def _not_giant(weights: Tensor) -> float:
-    """The 99th percentile: beyond it a Gaussian is no more worth looking at for being larger."""
+    """The 99th percentile of the weights, to which larger ones are clamped."""
     ranked = weights[weights > -math.inf].sort().values
     return float(ranked[int(0.99 * (len(ranked) - 1))])
 
 
 def _is_free(scene: Gaussians, views: Views, index: int, near: float) -> bool:
-    """Whether a camera stands in free space: its image is covered, with nearly nothing nearer than ``near``."""
+    """Whether a camera is in free space: its image is covered, with hardly any surface nearer than ``near``."""
     small = views[[index]].resized(_PROBE_SIDE)
     image, alpha, _ = rasterization(
         scene.means,

@@ -1,4 +1,4 @@
-"""Where a scene is looked at from: views that are given, the poses of its dataset, or poses sampled in free space."""
+"""The source of a scene's views: given views, the poses of its dataset, or poses sampled in free space."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.views import RasterizeMode, Views
 
 COMPARED_VIEWS, COMPARED_SIDE = 12, 400
-"""Number of views that renders are compared in, and their longer side in pixels. A comparison draws all of them."""
+"""Maximum number of views that renders are compared in, and maximum of their longer side in pixels."""
 
 
 class ViewSource:
-    """Views of a scene, found when they are first needed: a budget in Gaussians needs none.
+    """Views of a scene, looked up or sampled when they are first needed (a budget in Gaussians needs none).
 
     Args:
-        scene: what the views show.
-        given: views to use; the other arguments are then ignored.
-        run: the file or folder that the scene was read from. If that is a run whose data is at hand, its training
-            poses are used.
-        dataset_views: reads the poses of a run's dataset.
+        scene: the scene that the views are for.
+        given: views to use; ``run`` and ``dataset_views`` are then ignored.
+        run: the file or folder that the scene was read from. If it is a run whose data is found, its training poses
+            are used.
+        dataset_views: function that reads the poses of a run's dataset.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class ViewSource:
     ):
         self._scene, self._given, self._run, self._dataset_views = scene, given, run, dataset_views
         self.origin = ""
-        """Where views came from, in words, once there are some."""
+        """Text that says where views came from; empty until there are some."""
         self._missing = ""
         self._rasterize_mode: RasterizeMode = "classic"
 
@@ -48,7 +48,7 @@ class ViewSource:
         try:
             self._rasterize_mode = open_run(self._run, need_data=False).rasterize_mode
         except SceneError:
-            return None  # a checkpoint that stands alone
+            return None  # a checkpoint outside a run
         try:
             return self._dataset_views(self._run)
         except (SceneError, DataError) as error:
@@ -56,11 +56,11 @@ class ViewSource:
             return None
 
     def views(self, count: int) -> Views:
-        """At most ``count`` of the given views or of the dataset's training poses, or ``count`` sampled ones, with the
+        """At most ``count`` views: given ones, those of the dataset's training poses, or sampled ones, which get the
         run's rasterize mode.
 
         Raises:
-            DataError: if there are none and none can be sampled.
+            DataError: if the given views are empty, or none can be sampled.
         """
         if self._given is not None:
             if len(self._given) == 0:
@@ -75,5 +75,5 @@ class ViewSource:
         return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
 
     def compared(self) -> Views:
-        """The views that renders are compared in: at most 12, at most 400 pixels wide or high."""
+        """The views that renders are compared in: at most 12, with a longer side of at most 400 pixels."""
         return self.views(COMPARED_VIEWS).resized(COMPARED_SIDE)
