@@ -1,4 +1,4 @@
-"""Making a scene smaller from its own attributes: methods, budgets, SH bands."""
+"""Making a scene smaller: pruning methods, budgets, SH bands."""
 
 from pointsplat_ns.pruning.budget import AUTO_PSNR, Keep, Megabytes, WithinPsnr, parse_keep, ply_bytes, resolve_keep
 from pointsplat_ns.pruning.methods import METHODS, Method, PruneSettings, method_named, need_usable, prune, score_of

@@ -15,13 +15,13 @@ WANTED = (
 )
 
 AUTO_PSNR = 35.0
-"""PSNR in dB, against the dense scene's own renders, that ``auto`` stands for. Of a scene that matches its photos at
-30 dB an unrelated error of this size takes 1.2 dB, of one that matches them at 25 dB, 0.4 dB."""
+"""PSNR in dB, against the dense scene's own renders, that ``auto`` means. An independent error of this size lowers the
+PSNR against photos from 30 dB by 1.2 dB, and from 25 dB by 0.4 dB."""
 
 
 @dataclass(frozen=True)
 class Megabytes:
-    """A budget: the PLY written is at most this big, in units of 10^6 bytes."""
+    """A budget: the largest size of the PLY file, in units of 10^6 bytes."""
 
     value: float
 
@@ -50,21 +50,21 @@ def ply_bytes(count: int, sh_degree: int) -> int:
 def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3) -> int:
     """The number of Gaussians that a budget means for a scene of ``n``.
 
-    The type decides: a float is a ratio and an int is a count, so ``1.0`` keeps everything and ``1``
-    keeps one Gaussian. A ratio is rounded to the nearest count, a half up, and keeps at least one. A
-    size is a limit: it keeps as many as fit, and everything if everything fits.
+    The type decides: a float is a ratio and an int is a count, so ``1.0`` keeps everything and ``1`` keeps one
+    Gaussian. A ratio gives the nearest count (a half is rounded up), and at least one. A size gives as many Gaussians
+    as fit into the file.
 
     Args:
         n: number of Gaussians in the scene.
         keep: float ratio in (0, 1], int count in 1..n, :class:`Megabytes`, or any of them as :func:`parse_keep` reads
             it.
-        sh_degree: of the scene that will be written; it matters to a size alone.
+        sh_degree: SH degree of the scene that will be written; only a size depends on it.
 
     Returns:
         The count, in 1..n.
 
     Raises:
-        BudgetError: if ``keep`` is out of its range, NaN or no number, if it needs renders to be resolved
+        BudgetError: if ``keep`` is out of range, NaN or not a number, if it can only be resolved by rendering
             (:class:`WithinPsnr`), or if the scene is empty.
 
     Example:
@@ -93,7 +93,7 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3) -> int:
 
 
 def _that_fit(n: int, megabytes: float, sh_degree: int) -> int:
-    """How many of ``n`` Gaussians fit into a PLY of a size in megabytes."""
+    """How many of ``n`` Gaussians fit into a PLY file of ``megabytes``."""
     if not 0 < megabytes < math.inf:
         raise BudgetError(f"keep is {megabytes:g}MB; {WANTED}")
     if n < 1:
@@ -101,7 +101,7 @@ def _that_fit(n: int, megabytes: float, sh_degree: int) -> int:
     limit = math.floor(megabytes * 1e6)
     each = ply_bytes(1, sh_degree) - ply_bytes(0, sh_degree)
     count = min(n, max(0, (limit - ply_bytes(0, sh_degree)) // each))
-    while count > 0 and ply_bytes(count, sh_degree) > limit:  # the count's own digits in the header
+    while count > 0 and ply_bytes(count, sh_degree) > limit:  # the header holds the count's digits
         count -= 1
     if count < 1:
         least = ply_bytes(1, sh_degree)
@@ -113,11 +113,11 @@ def _that_fit(n: int, megabytes: float, sh_degree: int) -> int:
 
 
 def parse_keep(text: str) -> Keep:
-    """A budget as a person types it: ``0.3`` and ``30%`` are ratios, ``50000`` is a count, ``12MB`` is a size,
-    ``auto`` and ``auto:35`` the PSNR (dB) that renders must reach against the dense scene's own.
+    """Parse a budget: ``0.3`` and ``30%`` are ratios, ``50000`` is a count, ``12MB`` is a size, ``auto`` and
+    ``auto:35`` are the PSNR (dB) that renders must reach against the dense scene's own.
 
     Raises:
-        BudgetError: if it is none of these. The range of a ratio, count or size is for :func:`resolve_keep` to judge.
+        BudgetError: if it is none of these. The range of a ratio, count or size is checked by :func:`resolve_keep`.
 
     Example:
         >>> parse_keep("30%"), parse_keep("50000"), parse_keep("1"), parse_keep("1.0"), parse_keep("12MB")

@@ -1,8 +1,8 @@
-"""Covariances of Gaussians and their flat overlaps, many at a time.
+"""Covariances of Gaussians, their projections onto planes, and the overlaps of these, in batches.
 
-A symmetric 3 x 3 matrix is stored as its six numbers (xx, xy, xz, yy, yz, zz): half the memory, and the
-adjugate is six lines. What the eye sees of a Gaussian is its shadow on a plane, so sizes here are areas, not
-volumes; all areas are in units of 2 pi times squared scene units.
+A symmetric 3 x 3 matrix is stored as its six numbers (xx, xy, xz, yy, yz, zz). What is seen of a Gaussian is its
+projection onto a plane, here called its shadow. So sizes are areas, not volumes, in units of 2 pi times squared scene
+units.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from torch import Tensor
 from pointsplat_ns.geometry.quaternions import rotation_matrices
 
 TINY = 1e-300
-"""Keeps quotients of what may be zero finite; the smallest normal float64 is 2e-308."""
+"""Lower bound of denominators, which keeps quotients finite; the smallest normal float64 is 2e-308."""
 
 LOG_SCALE_LIMIT = 40.0
 """Log-scales are clamped to +-this: products of four standard deviations and their squares stay in float64."""
 
 THINNEST = 11.5
-"""Axes shorter than exp(-this) (1e-5) of the longest are taken as that: float64 still tells them from zero."""
+"""Axes shorter than exp(-this) (1e-5) of the longest are set to that length, which float64 still tells from zero."""
 
 
 def covariances(log_scales: Tensor, quats: Tensor) -> Tensor:
@@ -62,17 +62,17 @@ def form(six: Tensor, u: Tensor, v: Tensor) -> Tensor:
 
 
 def shadow(six: Tensor) -> Tensor:
-    """Area of the shadow, root of the mean square over all directions, (N,): sqrt of a third of the sum of the
-    squared products of two standard deviations."""
+    """Area of the shadow, as root mean square over all directions, (N,): the square root of a third of the sum of the
+    squared products of each two standard deviations."""
     sides = adjugate(six)
     return ((sides[:, 0] + sides[:, 3] + sides[:, 5]).clamp_min(0) / 3).sqrt()
 
 
 def normals(six: Tensor) -> Tensor:
-    """Unit vectors (N, 3) near the thinnest axis; any axis where none is thinnest.
+    """Unit vectors (N, 3) near the thinnest axis; any axis if there is no thinnest one.
 
-    The adjugate is largest along the thinnest axis, and squaring it three times makes that the only one that
-    counts (power iteration).
+    The thinnest axis is the dominant eigenvector of the adjugate. Squaring the matrix three times makes it dominate
+    (power iteration).
     """
     matrix = unpack(adjugate(six))
     for _ in range(3):
@@ -85,7 +85,7 @@ def normals(six: Tensor) -> Tensor:
 
 
 def plane(normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Two unit vectors (N, 3) that span the plane across each unit normal (Duff et al. 2017, JCGT 6(1))."""
+    """Two unit vectors (N, 3) that span the plane perpendicular to each unit normal (Duff et al. 2017, JCGT 6(1))."""
     x, y, z = normal.unbind(1)
     sign = torch.where(z >= 0, 1.0, -1.0).to(normal)
     a = -1 / (sign + z)
@@ -109,8 +109,8 @@ def flat_area(flat: Tensor) -> Tensor:
 def overlap(first: Tensor, second: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """Integral over the plane of the product of two shadows of peak 1 whose centres are (u, v) apart, (N,).
 
-    The product of two Gaussians is a Gaussian: its integral is the product of the areas over that of the summed
-    covariance, times what the distance leaves.
+    The product of two Gaussians is a Gaussian. Its integral is the product of their areas, divided by the area of the
+    summed covariance, times exp(-d^2 / 2) with d the Mahalanobis distance of the centres under that covariance.
     """
     both = first + second
     area = flat_area(both).clamp_min(TINY)

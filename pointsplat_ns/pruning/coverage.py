@@ -1,9 +1,9 @@
-"""A score that balances what a Gaussian contributes with what its surroundings would be left with.
+"""A score that keeps the same share of mass in every neighbourhood of a scene.
 
-A score over all of a scene empties the regions whose Gaussians are small or faint: each of them is worth
-little, together they are a wall. Here Gaussians compete with their neighbours alone. Neighbourhoods are
-runs of a few Gaussians along a space-filling curve, so that they are small where the scene is dense and
-large where it is sparse, and every one keeps the same share of its own mass: no region is emptied.
+A score over the whole scene empties regions whose Gaussians are small or faint, even if many of them together form a
+surface. Here Gaussians compete only with their neighbours. A neighbourhood is a run of a few Gaussians along a
+space-filling curve, so it is small where the scene is dense and large where it is sparse. Each keeps the same share of
+its mass, so that no region is emptied.
 """
 
 from __future__ import annotations
@@ -19,35 +19,34 @@ from pointsplat_ns.geometry.morton import interleave, spread_bits
 from pointsplat_ns.pruning.scores import log_area
 
 RUN = 12
-"""Gaussians of a neighbourhood. Measured on three scenes from 8 to 512: fewer are better at 50 % and worse at 10 %,
-where a run has then no Gaussian of its own to keep; 12 to 32 differ little."""
+"""Number of Gaussians in a neighbourhood. Measured on three scenes from 8 to 512: fewer are better when 50 % are kept,
+and worse at 10 %, where some runs then keep no Gaussian; 12 to 32 differ little."""
 
 OFFSETS = (0.0, 0.137, -0.0713, 0.0529, -0.1811)
-"""The curve is laid five times, its cells moved by these shares of the grid, and the shares averaged, so that the
-borders of one curve's runs lie within another's: at 50 % a dB more than with one curve on two of three scenes, nothing
-on the third. Nothing about the numbers but that they are no simple fractions."""
+"""Scores are averaged over five curves, each shifted by one of these shares of the grid, so that the borders between
+runs lie at different places. At 50 % this gains one dB over a single curve on two of three scenes, and nothing on the
+third. The numbers are arbitrary, but not simple fractions."""
 
 AREA_EXPONENT = 0.5
-"""Mass is alpha times area to this power: the geometric mean of the two axes that are seen. Area itself (1) keeps blobs
-and loses detail; 0.25 to 0.65 differ little."""
+"""Mass is alpha times area to this power: the geometric mean of the two largest axes. Area itself (1) keeps blobs and
+loses detail; 0.25 to 0.65 differ little."""
 
 _BITS = 20
-"""Bits of the grid an axis: 60 of the 63 in a key."""
+"""Bits of the grid per axis: 60 of the 63 in a key."""
 
 _RUNS_AT_ONCE = 2**12
-"""Runs worked on together: what they need then stays in the cache."""
+"""Number of runs processed together, small enough for the processor's cache."""
 
 _SAMPLE = 2**14
-"""Positions from which the extent is found, evenly spread over the order of the scene."""
+"""Number of positions that the scene's extent is estimated from, evenly spread over the order of the scene."""
 
 
 def coverage_score(scene: Gaussians) -> Tensor:
-    """Share of the mass of its neighbourhood that a Gaussian and its lesser neighbours make up, (N,) float64 in (0, 1].
+    """Share of a neighbourhood's mass held by a Gaussian and its neighbours of less mass, (N,) float64 in (0, 1].
 
-    In a neighbourhood of masses m_1 >= m_2 >= ... the i-th scores ``1 - (m_1 + ... + m_(i-1)) / (m_1 + ...)``:
-    a threshold keeps in each the fewest Gaussians that hold a given share of its mass, and the best of
-    each scores 1 before any other. The score is the mean over five ways to cut the scene into
-    neighbourhoods of twelve.
+    In a neighbourhood of masses m_1 >= m_2 >= ... the i-th scores ``1 - (m_1 + ... + m_(i-1)) / (m_1 + ...)``. So a
+    threshold keeps, in each neighbourhood, the fewest Gaussians that hold a given share of its mass; the largest scores
+    1. The score is the mean over five ways to divide the scene into neighbourhoods of twelve.
 
     Args:
         scene: N Gaussians.
@@ -61,7 +60,7 @@ def coverage_score(scene: Gaussians) -> Tensor:
     if len(part) == 0:
         return torch.full_like(usable, math.nan, dtype=torch.float64)
     mass = F.logsigmoid(part.opacities[:, 0].double()) + AREA_EXPONENT * log_area(part)
-    mass = mass.float()  # logarithms: seven digits of them are enough to compare neighbours by, and half to move
+    mass = mass.float()  # float32 is enough to compare logarithms of masses, and half the memory
     cells = unit_cells(part.means)
     scores = torch.zeros_like(mass)
     for i, offset in enumerate(OFFSETS):
@@ -73,8 +72,8 @@ def coverage_score(scene: Gaussians) -> Tensor:
 
 
 def unit_cells(means: Tensor) -> Tensor:
-    """Positions (N, 3) in a cube of side 1/2 about 1/2 that holds most of them; float32, those far out clamped to
-    [0, 1]. A few Gaussians far away, which nearly every scene has, do not coarsen the grid of the others."""
+    """Positions (N, 3), float32, scaled so that most lie in a cube of side 1/2 around 1/2; those far outside are
+    clamped to [0, 1]. So the few distant Gaussians of most scenes do not coarsen the grid of the others."""
     some = means[:: max(1, len(means) // _SAMPLE)].double()
     n = len(some)
     ranked = some.sort(dim=0).values
@@ -85,23 +84,23 @@ def unit_cells(means: Tensor) -> Tensor:
 
 
 def curve_keys(cells: Tensor, offset: float = 0.0) -> Tensor:
-    """Places (N,) int64 on the Morton curve of points (N, 3) in the unit cube, after a move by ``offset``."""
+    """Morton codes (N,) int64 of points (N, 3) in the unit cube, shifted by ``offset`` along each axis."""
     grid = (cells.T + offset).clamp_(0, 1).mul_(2**_BITS - 1).long()
     return interleave(*(spread_bits(axis) for axis in grid))
 
 
 def mass_shares(log_mass: Tensor, run: int, first: int = 0) -> Tensor:
-    """For each item of a sequence, the share of the mass of its run that it and the lesser items of it make up.
+    """For each item of a sequence, the share of its run's mass that it and the run's smaller items hold.
 
-    Of two equal items the earlier counts as the greater.
+    Of two equal items the earlier counts as the larger.
 
     Args:
         log_mass: (N,) logarithms of the masses; -Inf is no mass.
-        run: items of a run.
-        first: where the first whole run begins; what is before is a run of its own, and so is what is left at the end.
+        run: number of items in a run.
+        first: where the first whole run begins; the items before it form a run, and so do those left at the end.
 
     Returns:
-        (N,) in [0, 1]; 0 for items without mass, but in a run that has none at all they count as equal.
+        (N,) in [0, 1]; 0 for items without mass. In a run without any mass, all items count as equal.
     """
     n, before = len(log_mass), -first % run
     padded = F.pad(log_mass, (before, -(n + before) % run), value=math.nan).view(-1, run)

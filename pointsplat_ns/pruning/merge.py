@@ -1,8 +1,8 @@
-"""Merging: fewer Gaussians that look the same, from the 3D attributes of the scene alone.
+"""Merging: replaces a scene by fewer Gaussians that look the same, from the scene's 3D attributes alone.
 
-Neighbours are replaced in pairs, over a few rounds, by one Gaussian with their common mass (opacity times
-area of the shadow), centre, covariance and colour. What a pair costs is the change of the picture that it is
-expected to make: see :mod:`~pointsplat_ns.pruning.pair_costs`.
+Over a few rounds, pairs of neighbours are replaced by one Gaussian with their common mass (opacity times the area of
+the projection), centre, covariance and colour. The cost of a pair is the expected change of rendered images, see
+:mod:`~pointsplat_ns.pruning.pair_costs`.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from pointsplat_ns.pruning.pair_costs import CHUNK, OPAQUE, Remaining, costs_of,
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
 
 NEIGHBOURS = 8
-"""Nearest centres that a Gaussian may be merged with."""
+"""Number of nearest centres that a Gaussian may be merged with."""
 
 SHARE_PER_ROUND = 0.4
-"""Of the Gaussians left, how many may vanish in one round. Fewer is greedier and measured worse: the cost of
-a pair does not know what its members had already lost, and even thinning keeps losses small everywhere."""
+"""Share of the remaining Gaussians that may be merged away in one round. Smaller shares are greedier and measured
+worse: the cost of a pair does not include earlier losses of its members, and even thinning keeps losses small."""
 
 DEEPENING = 0.25
-"""Power of the number of members by which the optical depth of a finished Gaussian grows. The mass of pairs is kept,
-but each merge spreads it further, and the more were merged, the more shows through. The power is measured."""
+"""The optical depth of a merged Gaussian is multiplied by its number of members to this power. Merging keeps the mass
+but spreads it over a larger area, so that more of the background shows through. The power was found by measurement."""
 
 COLOUR_AXES = 8
-"""Principal axes of the colours (all SH bands) that costs are computed with: nearly all of their variance."""
+"""Number of principal axes of the colours (all SH bands) used for costs; they hold nearly all of the variance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,26 +41,27 @@ class Merged:
     """The result of merging."""
 
     scene: Gaussians
-    """K Gaussians in the order of their first members. Those merged with nothing are bit for bit as they were."""
-    assignment: Tensor  # [N] int64, the merged Gaussian that each of the dense scene is part of; -1 if dropped
+    """K Gaussians in the order of their first members. Those not merged with any other are unchanged to the bit."""
+    assignment: Tensor  # [N] int64, index in ``scene`` of the Gaussian that each was merged into; -1 if dropped
 
 
 @torch.no_grad()
 def merge(scene: Gaussians, k: int, progress: Callable[[float], None] | None = None) -> Merged:
     """Replace a scene by ``k`` Gaussians that look the same.
 
-    Gaussians too faint to be drawn go first; the others are merged in pairs, cheapest first.
+    Gaussians too faint to be drawn are dropped first; the others are merged in pairs, cheapest first.
 
     Args:
-        scene: N Gaussians. Those with NaN, or Inf where it has no meaning, are never part of the result.
-        k: how many to make; N gives the scene itself.
+        scene: N Gaussians. Those that are not :meth:`~pointsplat_ns.gaussians.Gaussians.usable` are dropped, unless
+            ``k`` is N.
+        k: number of Gaussians in the result; N returns the scene itself.
         progress: called with the share done, in [0, 1].
 
     Returns:
-        Exactly ``k`` Gaussians, the same ones for the same input.
+        Exactly ``k`` Gaussians. Deterministic.
 
     Raises:
-        BudgetError: if ``k`` is not in 1..N, or is more than can be drawn.
+        BudgetError: if ``k`` is not in 1..N, or fewer than ``k`` Gaussians can be drawn.
     """
     n = len(scene)
     if not 1 <= k <= n:
@@ -71,9 +72,9 @@ def merge(scene: Gaussians, k: int, progress: Callable[[float], None] | None = N
         return Merged(scene, torch.arange(n, device=scene.device))
     members = _visible(scene, k)
     part = scene[members].to(device="cpu")
-    owner = torch.arange(len(part))  # in part, of each of part's Gaussians: the one that it is merged into
+    owner = torch.arange(len(part))  # [len(part)] index in part of the Gaussian that each is merged into
     state = _start(part)
-    alive = owner.clone()  # in part, of each of state's
+    alive = owner.clone()  # [len(state)] index in part of each remaining Gaussian
     whole = max(len(part) - k, 1)
     while len(state) > k:
         first, second = _cheapest(state, k)
@@ -101,7 +102,7 @@ def merge(scene: Gaussians, k: int, progress: Callable[[float], None] | None = N
 
 
 def _visible(scene: Gaussians, k: int) -> Tensor:
-    """Indices, ascending, of what can be drawn; if that is fewer than ``k``, the most opaque others too."""
+    """Ascending indices of the visible Gaussians; if they are fewer than ``k``, also of the most opaque others."""
     usable = scene.usable()
     if int(usable.sum()) < k:
         raise BudgetError(f"cannot keep {k} Gaussians: {int(usable.sum())} of {len(scene)} have finite parameters")
@@ -116,7 +117,7 @@ def _visible(scene: Gaussians, k: int) -> Tensor:
 
 def _start(scene: Gaussians) -> Remaining:
     sh = scene.sh.reshape(len(scene), -1)
-    # Band l of the SH adds its squares to the mean square over directions as the constant band does (Parseval).
+    # By Parseval, the coefficients of every band contribute to the mean square over directions as the constant does.
     centred = sh.double() * SH_C0
     centred = centred - centred.mean(dim=0)
     axes = torch.linalg.eigh(centred.T @ centred).eigenvectors[:, -COLOUR_AXES:]
@@ -130,8 +131,8 @@ def _start(scene: Gaussians) -> Remaining:
 
 
 def _neighbours(means: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs (i, j), i < j, each once, of every centre with its nearest; and a walk (n,) through all centres in the
-    order of the tree's leaves."""
+    """Distinct pairs (i, j), i < j, of every centre with its nearest ones; and all centres (n,) in the order of the
+    search tree's leaves."""
     n = len(means)
     _, near, walk = nearest_and_walk(means, NEIGHBOURS + 1)
     one, other = torch.arange(n).repeat_interleave(near.shape[1]), near.reshape(-1)
@@ -146,7 +147,7 @@ def _cheapest(state: Remaining, k: int) -> tuple[Tensor, Tensor]:
     n = len(state)
     first, second, walk = _neighbours(state.means)
     chosen, costs = _match(first, second, n, state)
-    if len(chosen) < n / 10:  # the nearest of many coincident centres are all the same few
+    if len(chosen) < n / 10:  # many coincident centres have the same few nearest
         first, second = torch.cat([first, walk[:-1]]), torch.cat([second, walk[1:]])
         chosen, costs = _match(first, second, n, state)
     count = max(1, min(n - k, int(n * SHARE_PER_ROUND)))
@@ -155,8 +156,8 @@ def _cheapest(state: Remaining, k: int) -> tuple[Tensor, Tensor]:
 
 
 def _match(first: Tensor, second: Tensor, n: int, state: Remaining, passes: int = 6) -> tuple[Tensor, Tensor]:
-    """Indices of disjoint pairs, those that are the cheapest for both members, then the same among what is left;
-    and the costs of all pairs (E,)."""
+    """Indices of disjoint pairs, and the costs of all pairs (E,). Each pass takes the pairs that are the cheapest for
+    both of their members, among the Gaussians still free."""
     costs = costs_of(state, first, second)
     rank = torch.empty(len(costs), dtype=torch.long)
     rank[costs.sort(stable=True).indices] = torch.arange(len(costs))
@@ -177,7 +178,7 @@ def _match(first: Tensor, second: Tensor, n: int, state: Remaining, passes: int 
 
 
 def _replace(state: Remaining, first: Tensor, second: Tensor) -> None:
-    """Put each pair's replacement in the place of its first member."""
+    """Overwrite the first member of each pair by the pair's replacement."""
     for i, j in zip(first.split(CHUNK), second.split(CHUNK), strict=True):
         pairs = replacements_of(state, i, j, moments_of(state, i, j))
         state.means[i], state.cov[i], state.alphas[i] = pairs.means, pairs.cov, pairs.alphas
@@ -193,7 +194,7 @@ def _deepened(alphas: Tensor, sizes: Tensor) -> Tensor:
 
 
 def _as_gaussians(state: Remaining, like: Gaussians) -> Gaussians:
-    """The state in the scene's own parametrisation and dtype."""
+    """The state as a scene, in the dtype of ``like``."""
     from scipy.spatial.transform import Rotation
 
     variances, axes = torch.linalg.eigh(unpack(state.cov))

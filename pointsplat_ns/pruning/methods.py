@@ -1,4 +1,4 @@
-"""The registry of pruning methods, and the one way through it: from a scene and a budget to a smaller scene."""
+"""The registry of pruning methods, and :func:`prune`, which applies any of them."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from pointsplat_ns.views import Views
 
 @dataclass(frozen=True)
 class Method:
-    """How a scene may be made smaller."""
+    """A pruning method."""
 
     name: str
     summary: str
-    """One clause for a person."""
+    """Description in one clause."""
     score: Callable[..., Tensor] | None
-    """From a scene (and views, if it needs them) to the scores (N,) that decide what stays; None for merging."""
+    """Function from a scene (and views, if needed) to scores (N,), of which the highest are kept; None for merging."""
     needs_views: bool = False
-    """Whether the score looks at the scene from poses."""
+    """Whether the score needs views."""
     weighs_opacity: bool = False
     """Whether the score takes ``opacity_weight``."""
 
@@ -63,10 +63,10 @@ METHODS: dict[str, Method] = {
 
 
 def method_named(by: str) -> Method:
-    """The method of a name.
+    """The method called ``by``.
 
     Raises:
-        PointSplatError: if there is none.
+        PointSplatError: if there is no such method.
     """
     if by not in METHODS:
         raise PointSplatError(f"no method is called {by!r}; expected one of {', '.join(METHODS)}")
@@ -75,10 +75,10 @@ def method_named(by: str) -> Method:
 
 @dataclass(frozen=True)
 class PruneSettings:
-    """How a scene is to be pruned, where that is decided once for many scenes.
+    """Pruning settings that apply to many scenes, as in training.
 
     Raises:
-        PointSplatError: if there is no such method, it needs views, or it does not weigh opacity and is given a weight.
+        PointSplatError: if there is no such method, it needs views, or it has no opacity weight but is given one.
         BudgetError: if ``keep`` is neither a ratio nor a count.
     """
 
@@ -103,7 +103,7 @@ class PruneSettings:
         check_opacity_weight(method, self.opacity_weight)
 
     def prune(self, scene: Gaussians) -> Gaussians:
-        """A scene pruned so; see :func:`prune`."""
+        """Prune a scene with these settings; see :func:`prune`."""
         return prune(scene, self.keep, self.by, opacity_weight=self.opacity_weight)
 
 
@@ -115,24 +115,24 @@ def prune(
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Gaussians:
-    """A scene of fewer Gaussians.
+    """Prune a scene to a number of Gaussians.
 
     Args:
         scene: N Gaussians.
         keep: ratio, count or size (see :func:`~pointsplat_ns.pruning.budget.resolve_keep`).
-        by: one of :data:`METHODS`. A score keeps Gaussians bit for bit as they were, in their old order.
-        views: where methods that look at the scene look from, or what gives it when it is due.
+        by: one of :data:`METHODS`. Methods with a score keep Gaussians unchanged, in their original order.
+        views: views for methods that need them, or a function that returns them.
         opacity_weight: lambda of the methods that weigh opacity; by default the paper's.
         progress: called with the share done, in [0, 1].
 
     Returns:
-        Exactly the resolved number of Gaussians.
+        Exactly the number of Gaussians that ``keep`` resolves to.
 
     Raises:
-        BudgetError: if no such number can be kept.
+        BudgetError: if ``keep`` does not fit the scene.
         SceneError: if no Gaussian of the scene can be drawn.
         DataError: if the method needs views and there are none.
-        PointSplatError: if there is no such method, or it does not weigh opacity and is given a weight.
+        PointSplatError: if there is no such method, or it has no opacity weight but is given one.
     """
     method = method_named(by)
     check_opacity_weight(method, opacity_weight)
@@ -151,7 +151,7 @@ def score_of(
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Tensor:
-    """Scores (N,) float64 of a scene by a method that has a score; arguments as those of :func:`prune`."""
+    """Scores (N,) float64 of a scene by a method that has a score; arguments as for :func:`prune`."""
     assert method.score is not None, f"{method.name} has no score"
     if method.needs_views:
         if views is None:
@@ -163,10 +163,10 @@ def score_of(
 
 
 def check_opacity_weight(method: Method, opacity_weight: float | None) -> None:
-    """Refuse a weight that a method would not look at.
+    """Refuse an opacity weight that a method does not use.
 
     Raises:
-        PointSplatError: if it is given and the method does not weigh opacity.
+        PointSplatError: if a weight is given and the method has none.
     """
     if opacity_weight is not None and not method.weighs_opacity:
         weighing = ", ".join(other.name for other in METHODS.values() if other.weighs_opacity)
@@ -177,10 +177,10 @@ def check_opacity_weight(method: Method, opacity_weight: float | None) -> None:
 
 
 def need_usable(scene: Gaussians) -> None:
-    """Make sure that a scene has something to keep.
+    """Refuse a scene of which no Gaussian can be drawn.
 
     Raises:
-        SceneError: if no Gaussian of it can be drawn.
+        SceneError: if all have NaN or infinite values.
     """
     if not bool(scene.usable().any()):
         raise SceneError(f"none of the {len(scene)} Gaussians can be drawn: all have NaN or infinite values")

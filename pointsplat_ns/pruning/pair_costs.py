@@ -1,11 +1,11 @@
-"""What would replace a pair of Gaussians, and what the pictures would lose by it.
+"""The replacement of a pair of Gaussians, and the expected change of rendered images.
 
-The pair's replacement has the common mass (opacity times area of the shadow), centre, covariance and colour of both.
-Its cost is the change of the picture expected from three sides: near a surface a picture is a blend, sum(a G c) /
-sum(a G), so a change of one Gaussian shows in proportion to its contrast with what surrounds it and in inverse
-proportion to how much else covers the same place; where little does, the unknown background shows too.
+The replacement has the common mass (opacity times the area of the projection), centre, covariance and colour of both.
+The cost is the change expected in images from three directions. Near a surface an image is a blend, sum(a G c) /
+sum(a G). So a change of one Gaussian counts in proportion to its colour contrast with its surroundings, and less the
+more others cover the same place. Where few do, the unknown background shows through and counts as well.
 
-Shapes: n Gaussians left, E pairs (i, j).
+Shapes: n Gaussians left, E pairs (i, j). The projection of a Gaussian onto a plane is called its shadow.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ from torch import Tensor
 from pointsplat_ns.pruning.covariance import TINY, flat_area, flatten, normals, outer, overlap, plane, shadow
 
 OPAQUE = 0.99
-"""Largest opacity that a merge gives; what mass is left over becomes area."""
+"""Largest opacity of a replacement. If the mass needs more, the area grows."""
 
 GROWTH = 0.6
-"""Power of the mass beyond :data:`OPAQUE` by which the area grows: 0 would open holes, 1 smears edges."""
+"""The area grows with the ratio of needed opacity to :data:`OPAQUE`, to this power: 0 opens holes, 1 smears edges."""
 
 MOST_SURPLUS = 4.0
-"""Bound of that mass over what the area holds. Two Gaussians seldom reach 2; points without area would be infinite."""
+"""Upper bound of that ratio. Two Gaussians seldom reach 2; for points without area it would be infinite."""
 
 LOCAL_CONTRAST = 0.01
-"""Contrast assumed with the surroundings beside the one measured, colour units of [0, 1] a channel."""
+"""Contrast with the surroundings assumed in addition to the measured one, per colour channel in [0, 1]."""
 
 BACKGROUND_CONTRAST = 0.3
-"""Contrast assumed with whatever is far behind, which shows where few Gaussians overlap."""
+"""Contrast assumed with the far background, which shows where few Gaussians overlap."""
 
 FACE_ON, *SIDEWAYS = 0, 1, 2
-"""Directions that pairs are judged from; depth between members shows from the side only."""
+"""Directions that pairs are seen from. A distance in depth between the members shows only from the sides."""
 
 CHUNK = 1 << 17
-"""Pairs worked on at once: about 100 MB."""
+"""Number of pairs processed at once: about 100 MB."""
 
 
 @dataclass
 class Remaining:
-    """Gaussians at some round, float64 but for the SH."""
+    """The Gaussians that remain after some rounds; float64, except for the SH."""
 
     means: Tensor  # [n, 3]
     cov: Tensor  # [n, 6]
@@ -60,7 +60,7 @@ class Remaining:
 
 @dataclass
 class Moments:
-    """Moments of pairs, whatever they are seen from."""
+    """Moments of pairs, independent of the direction that they are seen from."""
 
     weight: Tensor  # [E] share of i in the mass
     apart: Tensor  # [E, 3] from j to i
@@ -71,7 +71,7 @@ class Moments:
 
 @dataclass
 class Replacements:
-    """Pairs (i, j) and the Gaussian that would replace each; shadows are seen along one direction."""
+    """The replacements of pairs (i, j), with areas and overlaps of shadows along one direction."""
 
     means: Tensor  # [E, 3]
     cov: Tensor  # [E, 6]
@@ -82,7 +82,7 @@ class Replacements:
 
 
 def moments_of(state: Remaining, i: Tensor, j: Tensor) -> Moments:
-    """Moments of the mass of Gaussians ``i`` (E,) and ``j`` (E,) together."""
+    """Moments of the common mass of Gaussians ``i`` (E,) and ``j`` (E,)."""
     mi, mj = (state.alphas[x] * shadow(state.cov[x]) for x in (i, j))
     total = mi + mj
     wi = torch.where(total > TINY, mi / total.clamp_min(TINY), 0.5)
@@ -95,8 +95,8 @@ def moments_of(state: Remaining, i: Tensor, j: Tensor) -> Moments:
 
 
 def replacements_of(state: Remaining, i: Tensor, j: Tensor, joined: Moments, view: int = FACE_ON) -> Replacements:
-    """What would replace the pairs, seen along its thinnest axis or one of the two across it, with opacity such that
-    the mass is that of both less what is covered twice."""
+    """The replacements of the pairs, seen along their thinnest axis or one of the two perpendicular to it. The opacity
+    is such that the mass is that of both members minus their overlap."""
     ai, aj = state.alphas[i], state.alphas[j]
     wi, wj = joined.weight, 1 - joined.weight
     apart, means, cov, axes = joined.apart, joined.means, joined.cov, joined.axes
@@ -115,8 +115,8 @@ def replacements_of(state: Remaining, i: Tensor, j: Tensor, joined: Moments, vie
 def picture_change(
     pairs: Replacements, ai: Tensor, aj: Tensor, ii: Tensor | float, jj: Tensor | float, ij: Tensor | float
 ) -> Tensor:
-    """Integral over the plane of |f_i a_i G_i + f_j a_j G_j - f_k a_k G_k|^2, (E,), for features f of which the scalar
-    products are given and f_k is the mean by mass."""
+    """Integral over the plane of |f_i a_i G_i + f_j a_j G_j - f_k a_k G_k|^2, (E,). ``ii``, ``jj`` and ``ij`` are the
+    scalar products of the features f_i and f_j; f_k is their mean weighted by mass."""
     wi, wj, ak = pairs.weight, 1 - pairs.weight, pairs.alphas
     (pi, pj, pk), (oij, oik, ojk) = pairs.areas, pairs.overlaps
     ik, jk = wi * ii + wj * ij, wj * jj + wi * ij
@@ -127,7 +127,7 @@ def picture_change(
 
 
 def costs_of(state: Remaining, first: Tensor, second: Tensor) -> Tensor:
-    """Expected change by each merge of the pictures from three sides, (E,) float32, squared colour units times area."""
+    """Expected change of images from three directions by each merge, (E,) float32, squared colour units times area."""
     # Pass 1, at each Gaussian and from each side: how much covers it (itself included), and the mean colour of that.
     views = (FACE_ON, *SIDEWAYS)
     covers = [state.alphas / 2 for _ in views]
@@ -157,7 +157,7 @@ def costs_of(state: Remaining, first: Tensor, second: Tensor) -> Tensor:
 
 
 def _cost_seen(state: Remaining, i: Tensor, j: Tensor, pairs: Replacements, cover: Tensor, around: Tensor) -> Tensor:
-    """:func:`costs_of` from one side, given what covers each Gaussian (n,) and its mean colour (n, C)."""
+    """:func:`costs_of` from one direction, given how much covers each Gaussian (n,) and its mean colour (n, C)."""
     wi, wj = pairs.weight, 1 - pairs.weight
     here = wi[:, None] * around[i] + wj[:, None] * around[j]
     fi, fj = state.colours[i] - here, state.colours[j] - here

@@ -1,8 +1,8 @@
 """Scores of Gaussians by their own attributes: the higher, the more worth keeping.
 
-Every score is a function of the scene and options of its own, and gives (N,) float64 on the scene's
-device. Gaussians that cannot be drawn score NaN and take no part in the statistics of the others.
-Everything is computed from logarithms and logits in float64: nothing overflows, whatever the scene.
+Every score is a function of the scene, with options of its own, and returns (N,) float64 on the scene's device.
+Gaussians that cannot be drawn score NaN and are left out of the statistics of the others. Scores are computed from
+logarithms and logits in float64, so that nothing overflows.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 
 DEFAULT_OPACITY_WEIGHT = 0.3
-"""Lambda of the paper's eq. 3, the same for every data set."""
+"""Lambda of the paper's eq. 3, which uses the same value for every data set."""
 
 
 class ScoreError(PointSplatError, ValueError):
@@ -26,10 +26,9 @@ class ScoreError(PointSplatError, ValueError):
 
 
 def zscore(values: Tensor) -> Tensor:
-    """``(values - mean) / std`` in float64, (N,); zero where all values are the same.
+    """``(values - mean) / std`` in float64, (N,); zero if all values are the same.
 
-    The standard deviation is that of the N values themselves (divided by N); N - 1 would scale all
-    scores alike and change no ranking.
+    The standard deviation divides by N; N - 1 would scale all scores alike and change no ranking.
     """
     values = values.double()
     if values.numel() == 0 or values.max() == values.min():
@@ -64,11 +63,11 @@ def paper_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIGHT
 
 
 def authors_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIGHT) -> Tensor:
-    """The score of the paper's released code, which is another than eq. 3.
+    """The score of the paper's released code, which differs from eq. 3.
 
     ``opacity_weight * z(logit) + (1 - opacity_weight) * z(4/3 pi product of (log-scale + 1e-6))``: the raw
-    logit in place of alpha, and a product of logarithms in place of the volume. An infinite value stands
-    where the largest (smallest) finite one does, so that it spoils neither mean nor deviation.
+    logit in place of alpha, and a product of logarithms in place of the volume. Infinite values are replaced by the
+    largest (smallest) finite one, so that mean and deviation stay finite.
 
     Raises:
         ScoreError: if ``opacity_weight`` is not in [0, 1].
@@ -82,7 +81,7 @@ def authors_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIG
 
 
 def log_volume_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIGHT) -> Tensor:
-    """Eq. 3 with the logarithm of the volume in place of the volume: a few giants then no longer set the scale.
+    """Eq. 3 with the logarithm of the volume in place of the volume, so that a few giants do not dominate the z-score.
 
     ``opacity_weight * z(alpha) + (1 - opacity_weight) * z(log(4/3 pi sx sy sz))``.
 
@@ -98,29 +97,29 @@ def log_volume_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_W
 
 
 def opacity_score(scene: Gaussians) -> Tensor:
-    """Opacity alone: the logit, which ranks as alpha does and does not saturate, (N,) float64."""
+    """Opacity alone: the logit, which ranks like alpha but does not saturate, (N,) float64."""
     return _only_usable(scene, scene.opacities[:, 0].double())
 
 
 def volume_score(scene: Gaussians) -> Tensor:
-    """Volume alone: its logarithm, which ranks as the volume does and does not overflow, (N,) float64."""
+    """Volume alone: its logarithm, which ranks like the volume but does not overflow, (N,) float64."""
     return _only_usable(scene, log_volume(scene))
 
 
 def log_area(scene: Gaussians) -> Tensor:
-    """Natural logarithm of the product of the two largest standard deviations, square scene units, (N,) float64:
-    of what is seen of a Gaussian from its broad side, but for a factor."""
+    """Natural logarithm of the product of the two largest standard deviations, squared scene units, (N,) float64. Up to
+    a factor, this is the area seen from the broad side."""
     scales = scene.scales.double()
     return scales.sum(dim=1) - scales.amin(dim=1) if bool(scales.isfinite().all()) else scales.topk(2).values.sum(1)
 
 
 def area_score(scene: Gaussians) -> Tensor:
-    """Opacity times what is seen: log(alpha * area of the two largest axes), (N,) float64."""
+    """Opacity times area: log(alpha * product of the two largest standard deviations), (N,) float64."""
     return _only_usable(scene, F.logsigmoid(scene.opacities[:, 0].double()) + log_area(scene))
 
 
 def random_score(scene: Gaussians, seed: int = 0) -> Tensor:
-    """Uniform in [0, 1), the same for one seed on every device, (N,) float64: the baseline to beat."""
+    """Uniform in [0, 1), the same for a seed on every device, (N,) float64: a baseline."""
     generator = torch.Generator().manual_seed(seed)
     return _only_usable(scene, torch.rand(len(scene), generator=generator, dtype=torch.float64).to(scene.device))
 
@@ -153,7 +152,7 @@ def _volumes(scene: Gaussians) -> Tensor:
 
 
 def _within_finite(values: Tensor) -> Tensor:
-    """``values`` with each infinite one put where the largest (smallest) finite one is; +-1 where none is finite."""
+    """``values`` with infinite ones replaced by the largest (smallest) finite one, or by +-1 if none is finite."""
     finite = values[values.isfinite()]
     if len(finite) == values.numel():
         return values

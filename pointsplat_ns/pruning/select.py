@@ -1,4 +1,4 @@
-"""Keeping exactly K Gaussians by their scores, always the same ones."""
+"""Deterministic selection of exactly K Gaussians by their scores."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pointsplat_ns.errors import BudgetError
 def select(scores: Tensor, k: int) -> Tensor:
     """Indices of the ``k`` highest scores.
 
-    Equal scores go to the lower index first; NaN comes after every number.
+    Of equal scores, the lower index is taken first; NaN ranks below every number.
 
     Args:
         scores: (N,), any floating type; +-Inf allowed.
-        k: how many, 0 to N.
+        k: number of indices, 0 to N.
 
     Returns:
         Indices (k,) int64, ascending.
@@ -33,7 +33,7 @@ def select(scores: Tensor, k: int) -> Tensor:
     elif k >= numbers:
         chosen = number | _first(~number, k - numbers)
     else:
-        # The k-th highest score splits the scene: all above it stay, and the first of those equal to it.
+        # Keep all above the k-th highest score, and the first of those equal to it.
         threshold = scores[number].kthvalue(numbers - k + 1).values
         above = scores > threshold
         chosen = above | _first(scores == threshold, k - int(above.sum()))

@@ -1,10 +1,10 @@
-"""Spherical harmonics that a scene does not need.
+"""Cutting the bands of spherical harmonics, and the energy that is lost by it.
 
-The basis is orthonormal on the sphere: the mean square, over all directions, of what a coefficient adds to
-a colour is its square divided by 4 pi, and leaving coefficients out is the best that can be done with
-those that stay. So the energy lost is known without rendering. How much of it is seen is not: a scene
-is seen from some directions only, and real ones were measured up to 9 dB away from what the energy
-predicts. Which degree to keep is therefore decided by rendering, outside this package.
+The basis is orthonormal on the sphere: the mean square, over all directions, of a coefficient's contribution to a
+colour is its square divided by 4 pi, and dropping coefficients is the best approximation by the others. So the energy
+lost is known without rendering. The visible error is not: a scene is only seen from some directions, and errors of real
+scenes were up to 9 dB away from what the energy predicts. So :mod:`~pointsplat_ns.compression.budget_search` renders to
+decide which degree to keep.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def band_energies(scene: Gaussians) -> list[float]:
     """Mean square of what each SH band adds to the colours: one number for each degree from 1 to the scene's.
 
     The mean is over all directions, over the channels, and over the Gaussians weighted by alpha times area.
-    Gaussians that cannot be drawn take no part; the clamp of colours at black is not taken into account.
+    Gaussians that cannot be drawn are left out; the clamping of colours at 0 is ignored.
     """
     weights = area_score(scene)
     seen = weights > -math.inf  # NaN fails too
@@ -34,10 +34,10 @@ def band_energies(scene: Gaussians) -> list[float]:
 
 
 def energy_lost(scene: Gaussians, degree: int) -> float:
-    """Share of the change of colour with the direction that is lost when a scene is cut to an SH degree.
+    """Share of the view-dependent energy (:func:`band_energies`) that is lost if a scene is cut to an SH degree.
 
     Returns:
-        In [0, 1]; 0 where there is nothing to lose.
+        In [0, 1]; 0 if there is none to lose.
 
     Raises:
         BudgetError: if the degree is not 0 to 3.
@@ -49,7 +49,7 @@ def energy_lost(scene: Gaussians, degree: int) -> float:
 
 
 def cut_sh(scene: Gaussians, degree: int) -> Gaussians:
-    """The scene without SH bands above ``degree``; what stays is bit for bit as it was.
+    """The scene without SH bands above ``degree``; all other values are unchanged.
 
     Raises:
         BudgetError: if the degree is not 0 to 3.

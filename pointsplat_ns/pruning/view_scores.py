@@ -1,6 +1,6 @@
-"""Scores that look at a scene through its cameras: the image-driven baselines of the paper's Table 1.
+"""Scores from views of a scene: the image-driven baselines of the paper's Table 1.
 
-Both need poses and no photos. They are exact sums over every pixel of every view.
+Both need poses but no photos. They are exact sums over every pixel of every view.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LIGHTGAUSSIAN_BETA = 0.1
 """Exponent of the normalised volume (LightGaussian, section 3.2)."""
 
 LIGHTGAUSSIAN_LARGEST = 0.9
-"""The volume that normalises: that of the Gaussian at this place among all, the largest first."""
+"""Rank of the normalising volume, as a share of all Gaussians sorted by descending volume."""
 
 
 def lightgaussian_score(
@@ -33,11 +33,11 @@ def lightgaussian_score(
 
     ``sum over all pixels of 1(hit) * opacity * T``, times ``min(V / V_90, 1) ** beta``: T is the
     transmittance in front of the Gaussian at that pixel, V its volume, and V_90 the volume at 90 % of
-    all volumes in descending order. Their released code leaves T and the clamp at 1 out.
+    all volumes in descending order. The authors' released code leaves out T and the clamp at 1.
 
     Args:
         scene: N Gaussians.
-        views: poses to look from.
+        views: at least one view.
         beta: exponent of the volume, at least 0.
         progress: called with the share done, in [0, 1].
 
@@ -66,7 +66,7 @@ def lightgaussian_score(
             logs = log_volume(scene)
             ranked = logs[usable].sort(descending=True).values
             relative = logs - ranked[min(int(LIGHTGAUSSIAN_LARGEST * len(ranked)), len(ranked) - 1)]
-            # -Inf - -Inf: a flat Gaussian among flat ones is as large as they are
+            # -Inf - -Inf is NaN: a flat Gaussian among flat ones has a relative volume of 1
             total *= torch.exp(beta * relative.nan_to_num(nan=0.0, posinf=0.0).clamp_max(0.0))
     return torch.where(usable, total, math.nan)
 
@@ -76,16 +76,16 @@ def pup_score(scene: Gaussians, views: Views, progress: Callable[[float], None] 
 
     ``log det H`` with ``H = sum over views, pixels and channels of g g^T``, the Gauss-Newton Hessian of the
     squared error of the picture, where g is the gradient of a pixel's channel by the mean (3) and the
-    standard deviations (3) of the Gaussian. Exact, with the change of colour with the direction of
-    view included; what is clamped at black or at the maximum of alpha has no gradient.
+    standard deviations (3) of the Gaussian. It is exact and includes the change of colour with the viewing
+    direction; values clamped at black or at the maximum of alpha have no gradient.
 
     Args:
         scene: N Gaussians.
-        views: poses to look from; their size decides how fine the sensitivity is.
+        views: at least one view; the image size decides how fine the sensitivity is.
         progress: called with the share done, in [0, 1].
 
     Returns:
-        Scores (N,), float64: -Inf where the views do not determine all six (so where no view sees the
+        Scores (N,), float64: -Inf where the views do not determine all six parameters (as where no view sees the
         Gaussian), NaN where it cannot be drawn.
 
     Raises:
@@ -126,7 +126,7 @@ def log_determinant(blocks: Tensor) -> Tensor:
     root = torch.where(ok[:, None], diagonal, 1.0).sqrt()
     unit = torch.where(ok[:, None, None], blocks, torch.eye(blocks.shape[-1]).to(blocks))
     values = torch.linalg.eigvalsh(unit / root[:, :, None] / root[:, None, :])
-    # Below the rounding of the blocks themselves an eigenvalue is not told from zero.
+    # An eigenvalue below the rounding error of the block counts as zero.
     ok &= values[:, 0] > 16 * torch.finfo(blocks.dtype).eps
     result = values.clamp_min(torch.finfo(blocks.dtype).tiny).log().sum(-1) + 2 * root.log().sum(-1)
     return torch.where(ok, result, -math.inf)
