@@ -31,23 +31,23 @@ def compact(
 ) -> None:
     """Make any scene smaller and repair it with a trained refiner. No photos are needed.
 
-    The smaller scene, with and without refinement, is rendered beside the dense one from the poses of the run's dataset
-    where it is at hand, else from free places within the scene. Refinement is taken as far as it comes closer to the
-    dense scene, and left out where it does not help.
+    Renders of the smaller scene, with and without refinement, are compared with renders of the dense scene, from the
+    poses of the run's dataset if it is found, else from poses sampled in free space. Refinement is applied as far as it
+    brings renders closer to the dense scene's, and left out if it does not help.
 
     Args:
         scene: a 3DGS .ply, a Splatfacto checkpoint, or a run (its folder or config.yml).
         output: the .ply to write; by default beside the scene: room_compact.ply for room.ply, compact.ply in the folder
             of a run.
-        keep: how much, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is met before refinement, so that
-            refinement can only do better. By default what the refiner was trained with.
+        keep: how much, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before refinement. By default
+            what the refiner was trained with.
         refiner: a trained pointsplat run (its folder or config.yml), or a .safetensors file; by default the refiner
             that ships. --using is the same.
         by: the method of prune; by default the one that the refiner was trained with.
         sh: SH bands to keep, as for prune: all, up to a degree, or auto.
-        picture: a .png to draw some views in: dense, before and after refinement, side by side.
-        dry_run: find and say everything, but write no scene.
-        force: overwrite files that exist.
+        picture: a .png file for images of some views: dense, before and after refinement, side by side.
+        dry_run: compute and print everything, but write no scene.
+        force: overwrite existing files.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.compression.prune import check_options

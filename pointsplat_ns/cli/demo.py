@@ -1,4 +1,4 @@
-"""``pointsplat demo``: a scene made small at once, then the whole method on rooms that the package makes itself."""
+"""``pointsplat demo``: compacts the scene that ships, then trains scenes and a refiner on synthetic rooms."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ UNSEEN = "room2"
 """The room that the refiner is not trained on."""
 
 TIMESTAMP = "demo"
-"""Names the runs, so that what is finished is found again."""
+"""Folder name of the runs, the same in each call, so that finished ones are found again."""
 
 TRAINING_MINUTES = 15
-"""What training takes on two cores, as `docs/benchmarks.md` has it measured."""
+"""Duration of training on two cores, see `docs/benchmarks.md`."""
 
 
 def demo(
@@ -27,14 +27,13 @@ def demo(
     height: int = 192,
     fresh: bool = False,
 ) -> None:
-    """Make the scene that ships small and picture it, which takes a minute. Then go on to train, which may be stopped:
-    train small scenes, prune them, train the refiner, evaluate it on a room that it never saw, and export.
+    """Compact the scene that ships and draw it before and after, which takes a minute. Then continue with training,
+    which may be stopped: train small scenes, prune them, train the refiner, evaluate it on an unseen room, and export.
 
-    Runs the same commands that a person would type, and prints them. What an interrupted demo has
-    finished is not done again.
+    The commands that it runs are printed. After an interruption, a second call continues with what is not finished.
 
     Args:
-        output: folder for everything that is made.
+        output: folder for all results.
         keep: share of the Gaussians to keep.
         scene_steps: training steps of each room.
         refiner_steps: training steps of the refiner.
@@ -56,10 +55,10 @@ def demo(
 
 
 def compact_example(output: Path, keep: float) -> None:
-    """The scene that ships, made small with the refiner that ships, and a picture of both.
+    """Compact the scene that ships with the refiner that ships, and draw both.
 
     Args:
-        output: folder for the scene, the smaller one and the picture.
+        output: folder for the scene, the smaller one and the image.
         keep: share of the Gaussians to keep.
     """
     import pointsplat_ns as ps
@@ -78,14 +77,14 @@ def compact_example(output: Path, keep: float) -> None:
 def train_and_judge(
     output: Path, keep: float, scene_steps: int, refiner_steps: int, photos: tuple[int, int, int]
 ) -> None:
-    """Train a scene of each of three rooms and a refiner on two of them; judge it on the third, and export that.
+    """Train a scene of each of three rooms and a refiner on two of them; evaluate it on the third, and export that one.
 
     Args:
-        output: folder for everything that is made.
+        output: folder for all results.
         keep: share of the Gaussians to keep.
         scene_steps: training steps of each room.
         refiner_steps: training steps of the refiner.
-        photos: of each room: how many, their width and height in pixels.
+        photos: number of photos of each room, their width and height in pixels.
     """
     from pointsplat_ns.nerfstudio_plugin.commands import (
         REFINER_METHOD,
@@ -133,13 +132,13 @@ def train_and_judge(
 
 
 def before_after(views: list[Path], scene: dict, path: Path, rows: int = 3) -> None:
-    """A captioned picture of some views, each photo, dense, pruned and refined side by side.
+    """Draw some views with captions: photo, dense, pruned and refined side by side.
 
     Args:
-        views: pictures of ``ns-eval``, four images wide.
-        scene: that scene's part of the evaluation.
-        path: the PNG to write.
-        rows: how many views to show, spread over all.
+        views: images written by ``ns-eval``, each with the four side by side.
+        scene: the scene's part of the evaluation.
+        path: the PNG file to write.
+        rows: number of views, spread over all.
     """
     from matplotlib.image import imread
     from numpy import array_split

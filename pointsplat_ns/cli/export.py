@@ -23,7 +23,7 @@ def export(
         run: the run's folder, config.yml or checkpoint.
         output: the .ply to write.
         scene: which scene of a pointsplat run; by default the first that it was not trained on, or the first.
-        force: overwrite a file that exists.
+        force: overwrite an existing file.
     """
     import pointsplat_ns as ps
 

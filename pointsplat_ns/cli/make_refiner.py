@@ -1,4 +1,4 @@
-"""``pointsplat make-refiner``: the refiner that ships, from nothing."""
+"""``pointsplat make-refiner``: makes the refiner that ships, from scratch."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ def make_refiner(
     workers: int | None = None,
     seed: int = 0,
 ) -> None:
-    """Train a refiner from nothing: make rooms, train a scene of each, learn to repair them, judge it on unseen rooms.
+    """Train a refiner from scratch: generate rooms, train a scene of each, train the network, evaluate on unseen rooms.
 
-    This is how the refiner that `pointsplat compact` uses was made. No data, no photos and no GPU are needed; two idle
-    cores take less than an hour. What an interrupted command has finished is not done again.
+    The refiner that `pointsplat compact` uses was made by this command. It needs no data, no photos and no GPU; two
+    idle cores take less than an hour. After an interruption, a second call continues with what is not finished.
 
     Args:
-        output: folder for everything that is made.
+        output: folder for all results.
         weights: folder for refiner.safetensors and CARD.md; by default the output folder.
-        size: of the network.
-        steps: of its training.
-        rooms: train on the first so many rooms only; by default on all.
-        workers: scenes trained side by side, on one thread each; by default as many as there are cores.
-        seed: of the network's initial weights and of the order of scenes and views.
+        size: size of the network.
+        steps: training steps of the network.
+        rooms: number of rooms to train on; by default all.
+        workers: number of scenes trained at the same time, on one thread each; by default one per core.
+        seed: seed of the network's initial weights and of the order of scenes and views.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.nerfstudio_plugin.pointsplat.report import show_report
 
-    made = ps.make_refiner(output, weights, size, steps, rooms, workers, seed)
-    show_report(made.results)
-    print(f"{made.weights}: the refiner, {made.weights.stat().st_size / 1e6:.1f} MB")
-    print(f"{made.card}: what it was made of, and what it does")
-    print(f"{made.pictures}: photo, dense, pruned and refined side by side")
+    result = ps.make_refiner(output, weights, size, steps, rooms, workers, seed)
+    show_report(result.results)
+    print(f"{result.weights}: the refiner, {result.weights.stat().st_size / 1e6:.1f} MB")
+    print(f"{result.card}: what it was made of, and what it does")
+    print(f"{result.pictures}: photo, dense, pruned and refined side by side")

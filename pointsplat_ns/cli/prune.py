@@ -30,8 +30,8 @@ def prune(
 ) -> None:
     """Make a scene smaller: keep the Gaussians that matter, or merge them, from the scene alone.
 
-    Poses, where something has to be rendered, are those of the run's dataset where it is at hand; a bare .ply is looked
-    at from free places within it.
+    If something has to be rendered, the poses are those of the run's dataset if it is found; for a .ply they are
+    sampled in free space.
 
     Args:
         scene: a 3DGS .ply, a Splatfacto checkpoint, or a run (its folder or config.yml).
@@ -41,13 +41,13 @@ def prune(
             smallest scene whose renders reach 35 dB PSNR against those of the dense scene (auto alone means 35).
         by: merge replaces neighbours by one Gaussian each and is by far the best; every other method keeps Gaussians as
             they are: coverage (empties no region), paper (eq. 3), authors (the formula of its released code), opacity,
-            volume, log-volume, area, random; lightgaussian and pup look at the scene from poses.
+            volume, log-volume, area, random; lightgaussian and pup score by views of the scene.
         opacity_weight: lambda of paper, authors and log-volume: the weight of opacity; by default the paper's 0.3.
         sh: SH bands to keep: all, up to a degree, or auto, those without which renders stay within 40 dB.
-        fine_tune: steps of optimising what was kept against the dense scene's own renders.
-        plot: a .png to draw the distributions of opacity and volume in, before and after.
-        dry_run: find and say everything, but write no scene.
-        force: overwrite files that exist.
+        fine_tune: steps of optimising the result against the dense scene's own renders.
+        plot: a .png file for a plot of the distributions of opacity and volume, before and after.
+        dry_run: compute and print everything, but write no scene.
+        force: overwrite existing files.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.compression.prune import check_options

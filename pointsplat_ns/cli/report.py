@@ -1,4 +1,4 @@
-"""``pointsplat report``: what ``ns-eval`` wrote, as a table."""
+"""``pointsplat report``: prints the results of ``ns-eval`` as a table."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import tyro
 
 
 def report(evaluation: tyro.conf.Positional[Path]) -> None:
-    """Show what ns-eval wrote of a pointsplat run as a table.
+    """Print the results that ns-eval wrote for a pointsplat run as a table.
 
     Args:
-        evaluation: the JSON file.
+        evaluation: the JSON file of ns-eval.
     """
     import pointsplat_ns as ps
 

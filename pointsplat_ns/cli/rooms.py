@@ -1,4 +1,4 @@
-"""``pointsplat rooms``: data to try things on."""
+"""``pointsplat rooms``: generates synthetic rooms as data sets."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ def rooms(
     width: int = 320,
     height: int = 240,
 ) -> None:
-    """Make furnished rooms with photos, depth images and poses, in the Replica layout.
+    """Generate furnished rooms with photos, depth images and poses, in the Replica layout.
 
     Args:
-        output: folder to make the scenes room0, room1... in, named by their seeds.
-        seeds: one room each; the same seed is the same room.
-        frames: photos a room.
-        width: of a photo, pixels.
-        height: of a photo, pixels.
+        output: folder for the scenes room0, room1..., named by their seeds.
+        seeds: one room for each seed; the same seed gives the same room.
+        frames: photos per room.
+        width: width of a photo, pixels.
+        height: height of a photo, pixels.
     """
     import pointsplat_ns as ps
 

@@ -1,4 +1,4 @@
-"""What the commands that make a smaller scene share: arguments, where the result goes, what is printed of it."""
+"""Arguments, output paths and printed results that ``prune`` and ``compact`` share."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Bands = Literal["all", "auto", "0", "1", "2", "3"]
 
 
 def output_beside(scene: Path, suffix: str) -> Path:
-    """Where the result goes if the user does not say.
+    """The default path of the result.
 
     Args:
         scene: the file or folder that is read.
-        suffix: names the result.
+        suffix: last part of the result's name.
 
     Returns:
-        For a file, one beside it: ``room_pruned.ply`` for ``room.ply``. For a run, one in its folder: ``pruned.ply``;
-        never among its checkpoints, as nerfstudio takes every file there for one.
+        For a file, a path beside it: ``room_pruned.ply`` for ``room.ply``. For a run, a path in its folder:
+        ``pruned.ply``; never in its checkpoint folder, as nerfstudio takes every file there for a checkpoint.
     """
     if scene.is_dir():
         return scene / f"{suffix}.ply"
@@ -36,16 +36,15 @@ def output_beside(scene: Path, suffix: str) -> Path:
 
 
 def check_outputs(scene: Path | None, picture: Path | None, force: bool) -> None:
-    """Refuse, before anything takes minutes, files that could not be written in the end.
+    """Check output paths before the long computations.
 
     Args:
-        scene: the .ply to write, if one is.
-        picture: the .png to write, if one is.
-        force: whether files that exist may be overwritten.
+        scene: the .ply file to write; None for none.
+        picture: the .png file to write; None for none.
+        force: whether existing files may be overwritten.
 
     Raises:
-        SceneError: if a name has another ending, is that of a folder, or is that of a file that must not be
-            overwritten.
+        SceneError: if a path has another suffix, is a folder, or is a file that must not be overwritten.
     """
     from pointsplat_ns.errors import SceneError
 
@@ -61,7 +60,7 @@ def check_outputs(scene: Path | None, picture: Path | None, force: bool) -> None
 
 
 def print_result(what: str, before: int, scene: Gaussians, seconds: float, where: Path | None) -> None:
-    """Print a line on the result; ``where`` is None in a dry run."""
+    """Print one line with counts, file size and time; ``where`` is None in a dry run."""
     from pointsplat_ns.pruning import ply_bytes
 
     share = f" ({100 * len(scene) / before:.1f} %)" if before else ""
