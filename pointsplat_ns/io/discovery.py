@@ -1,4 +1,4 @@
-"""Folders as sets of scenes: trained runs, PLY files, or both."""
+"""Finds the scenes below a folder: trained runs, PLY files, or both."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from pointsplat_ns.io.ply_header import read_header
 from pointsplat_ns.io.runs import CONFIG_NAME, Run, open_run, scene_name
 
 Supervision = Literal["auto", "photos", "dense"]
-"""What a training compares renders with: a run's photos, or renders of the scene before it was pruned."""
+"""Training targets: a run's photos, or renders of the scene before it was pruned."""
 
 
 def find_runs_and_plys(
     folder: Path, supervision: Supervision
 ) -> tuple[dict[str, Run], dict[str, Path], SceneError | None]:
-    """The runs and the PLY files at or below ``folder`` that a training takes, by the names that it gives them.
+    """The runs and PLY files at or below ``folder`` that a training uses, by their scene names.
 
     Args:
         folder: a run, a PLY file, or any folder above several.
-        supervision: ``photos`` takes runs, ``dense`` both, ``auto`` runs, or PLY files where there is no run.
+        supervision: ``photos`` takes runs, ``dense`` takes both, ``auto`` takes runs, or PLY files if there is no run.
 
     Returns:
-        Runs, whose data is not looked for; PLY files; and why there is no run, if looking for one failed.
+        Runs, whose data is not looked for; PLY files; and the error if no run was found.
     """
     runs: list[Run] = []
     why_no_run: SceneError | None = None
@@ -37,22 +37,22 @@ def find_runs_and_plys(
     except SceneError as error:
         why_no_run = error
     named = dict(zip(scene_names(runs), runs, strict=True))
-    found = find_plys(folder) if supervision == "dense" or (supervision == "auto" and not runs) else []
-    return named, {f"{name}.ply" if name in named else name: path for name, path in found}, why_no_run
+    plys = find_plys(folder) if supervision == "dense" or (supervision == "auto" and not runs) else []
+    return named, {f"{name}.ply" if name in named else name: path for name, path in plys}, why_no_run
 
 
 def find_runs(folder: Path | str, need_data: bool = True) -> list[Run]:
     """Every Gaussian scene trained below ``folder``: the newest run of each experiment that has a
     complete checkpoint, sorted by experiment name.
 
-    Below a folder, runs of other methods and runs without a complete checkpoint are passed over.
+    Below a folder, runs of other methods and runs without a complete checkpoint are skipped.
 
     Args:
-        folder: a run, or any folder above some.
+        folder: a run, or any folder above several.
         need_data: as for :func:`open_run`.
 
     Raises:
-        SceneError: if there is none, if ``folder`` is itself a run of another method, or if the data of one is
+        SceneError: if there is no such run, if ``folder`` is itself a run of another method, or if the data of a run is
             needed and not found.
     """
     folder = Path(folder)
@@ -92,7 +92,7 @@ def find_runs(folder: Path | str, need_data: bool = True) -> list[Run]:
 def find_plys(folder: Path) -> list[tuple[str, Path]]:
     """Name and path of every 3DGS PLY at or below ``folder``, sorted by path.
 
-    What lies in the folder of a nerfstudio run, and PLY files that hold no Gaussians, are passed over.
+    Files in the folder of a nerfstudio run and PLY files without Gaussians are skipped.
     """
     if folder.is_file():
         paths = [folder] if folder.suffix.lower() == ".ply" else []
@@ -105,27 +105,27 @@ def find_plys(folder: Path) -> list[tuple[str, Path]]:
                 continue
             inner[:] = sorted(name for name in inner if not name.startswith("."))
             paths += [Path(place) / name for name in files if name.lower().endswith(".ply")]
-    found, names = [], []
+    plys, names = [], []
     for path in sorted(paths):
         if not _holds_gaussians(path):
             logger.warning("passed over %s: no Gaussians in it", path)
             continue
         parts = path.relative_to(root).with_suffix("").parts
         names.append(file_stem("-".join(parts)))
-        found.append(path)
-    return list(zip(distinct(names), found, strict=True))
+        plys.append(path)
+    return list(zip(distinct(names), plys, strict=True))
 
 
 def distinct(names: Iterable[str]) -> list[str]:
-    """The names, with ``-2``, ``-3``... added where two would be the same."""
-    found: list[str] = []
+    """The names, with ``-2``, ``-3``... appended to repeated ones."""
+    unique: list[str] = []
     for base in names:
         name, count = base, 1
-        while name in found:
+        while name in unique:
             count += 1
             name = f"{base}-{count}"
-        found.append(name)
-    return found
+        unique.append(name)
+    return unique
 
 
 def scene_names(runs: list[Run]) -> list[str]:
@@ -134,33 +134,32 @@ def scene_names(runs: list[Run]) -> list[str]:
 
 
 def shown_scene(names: list[str], eval_scenes: Iterable[str]) -> str:
-    """Which of several scenes the viewer and the exporters get: the first that is held out of training, or the
-    first."""
+    """The scene that the viewer and the exporters get: the first one held out of training, or else the first."""
     held_out = set(eval_scenes)
     return next((name for name in names if name in held_out), names[0])
 
 
 def _run_folders(folder: Path) -> list[Path]:
-    """Folders below ``folder`` that hold a ``config.yml``, sorted; nothing is looked for inside one."""
-    found = []
+    """Folders below ``folder`` that hold a ``config.yml``, sorted; folders inside these are not searched."""
+    folders = []
     for place, inner, files in os.walk(folder):
         if CONFIG_NAME in files:
-            found.append(Path(place))
+            folders.append(Path(place))
             inner.clear()
         inner[:] = sorted(name for name in inner if not name.startswith("."))
-    return found
+    return folders
 
 
 def _experiment_folder(run: Run) -> Path:
-    """What runs of one experiment have in common: the folder EXPERIMENT of EXPERIMENT/METHOD/TIMESTAMP.
-    A run that was moved out of that layout stands for itself."""
+    """The folder that all runs of an experiment share: EXPERIMENT of EXPERIMENT/METHOD/TIMESTAMP. For a run that was
+    moved out of that layout, its own folder."""
     place = run.folder.resolve()
     as_laid_out = (place.parent.name, place.name) == (run.method_name, run.timestamp)
     return place.parents[1] if as_laid_out else place
 
 
 def _when(run: Run) -> tuple[float, int]:
-    """Sorts runs by age: nerfstudio's own timestamp, the checkpoint's where the user chose another name."""
+    """Sort key of a run's age: nerfstudio's timestamp, or the checkpoint's file time if the timestamp was renamed."""
     try:
         return datetime.strptime(run.timestamp, "%Y-%m-%d_%H%M%S").timestamp(), run.step
     except ValueError:

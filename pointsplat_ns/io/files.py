@@ -1,4 +1,4 @@
-"""What every reader and writer does with a path."""
+"""Helpers of all readers and writers: checks, hashes, atomic writes."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def require_file(path: Path | str, what: str) -> Path:
 
     Args:
         path: the file.
-        what: what it should be, for the error ("a 3DGS PLY file").
+        what: the expected kind of file, for the error ("a 3DGS PLY file").
 
     Raises:
-        SceneError: if there is nothing, or a folder or a pipe, at ``path``.
+        SceneError: if there is no file at ``path``, or a folder or a pipe.
     """
     path = Path(path)
     if not path.exists():
@@ -35,10 +35,10 @@ def require_file(path: Path | str, what: str) -> Path:
 
 
 def content_hash(path: Path | str) -> str:
-    """SHA-256 of a file's bytes, as 64 hexadecimal digits: the same file gives the same text, whatever its name.
+    """SHA-256 of a file's bytes, as 64 hexadecimal digits.
 
     Args:
-        path: the file; read in pieces, so that its size does not matter.
+        path: the file; it is read in pieces, so that it need not fit into memory.
 
     Raises:
         SceneError: if there is no such file, or it cannot be read.
@@ -55,21 +55,22 @@ def content_hash(path: Path | str) -> str:
 
 
 def one_line(error: BaseException, limit: int = 160) -> str:
-    """The first line of an exception's text, at most ``limit`` characters; its type where it has none."""
+    """The first line of an exception's text, at most ``limit`` characters; the name of its type if it has no text."""
     lines = str(error).strip().splitlines()
     text = lines[0].strip() if lines else type(error).__name__
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
 def file_stem(text: str) -> str:
-    """The letters, digits and ``_ . + -`` of ``text``, as a scene's name that is fit for a file; "scene" if there are
-    none."""
+    """``text`` as a file name: other characters than letters, digits and ``_ . + -`` become ``-``; "scene" if nothing
+    is left."""
     return re.sub(r"[^\w.+-]+", "-", text).strip("-.") or "scene"
 
 
 @contextmanager
 def replacing(path: Path | str) -> Iterator[Path]:
-    """A path beside ``path`` to write to; it becomes ``path`` when the block ends well, else it is removed.
+    """A temporary path beside ``path`` to write to. It replaces ``path`` when the block ends without an error, else it
+    is removed.
 
     Missing parent folders are created.
 
@@ -92,10 +93,10 @@ def replacing(path: Path | str) -> Iterator[Path]:
 
 
 def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:
-    """``scene`` without the Gaussians that cannot be drawn; says on the log how many those were.
+    """``scene`` without the Gaussians that cannot be drawn, whose number is logged.
 
-    Opacity logits of +-Inf and log-scales of -Inf have a meaning and stay
-    (see :meth:`~pointsplat_ns.gaussians.Gaussians.usable`).
+    Opacity logits of +-Inf and log-scales of -Inf are valid (see
+    :meth:`~pointsplat_ns.gaussians.Gaussians.usable`).
     """
     usable = scene.usable()
     dropped = len(scene) - int(usable.sum())

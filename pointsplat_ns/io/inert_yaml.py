@@ -1,9 +1,8 @@
-"""Reads nerfstudio's ``config.yml`` without running it.
+"""Reads nerfstudio's ``config.yml`` without executing it.
 
-nerfstudio saves its configuration as a YAML of pickled Python objects; the ordinary way to load one
-imports and calls whatever the file names. Here a tag such as ``!!python/object:pkg.Class`` becomes an
-inert :class:`Tagged` value, paths become :class:`pathlib.Path` and tuples become tuples. Nothing is
-imported, nothing is called.
+nerfstudio saves its configuration as YAML with Python objects. The usual loader imports and calls whatever the file
+names. Here a tag such as ``!!python/object:pkg.Class`` becomes a :class:`Tagged` value, paths become
+:class:`pathlib.Path` and tuples become tuples. Nothing is imported or called.
 """
 
 from __future__ import annotations
@@ -23,21 +22,21 @@ MAX_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class Tagged:
-    """A value that the file says to build with Python code, left unbuilt."""
+    """A Python object in the file, which is not built."""
 
     tag: str
-    """What would have been built: the dotted name of a class or function."""
+    """Dotted name of its class or function."""
     value: Any
     """The plain fields or arguments; None for a bare name."""
 
     @property
     def fields(self) -> dict[str, Any]:
-        """The value as a dictionary of fields; empty where it is something else."""
+        """The value if it is a dictionary of fields, else an empty one."""
         return self.value if isinstance(self.value, dict) else {}
 
 
 class _Loader(yaml.SafeLoader):
-    """``SafeLoader`` that also knows YAML's Python tags, as inert values."""
+    """``SafeLoader`` that also accepts YAML's Python tags, as :class:`Tagged` values."""
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         """Refuse merge keys: nested ones grow exponentially, and nerfstudio writes none."""
@@ -48,7 +47,7 @@ class _Loader(yaml.SafeLoader):
 def read_config(path: Path | str) -> Tagged:
     """Read a ``config.yml``.
 
-    Aliases share one value and so cannot be used to fill the memory.
+    Aliases share one value, so they cannot fill the memory.
 
     Returns:
         The configuration object at the root of the file.

@@ -2,7 +2,7 @@
 
 One ``vertex`` per Gaussian with the properties ``x y z nx ny nz f_dc_0..2 f_rest_0..(3K-1) opacity
 scale_0..2 rot_0..3``, in Splatfacto's own parametrisation. ``f_rest`` is channel-major: all K
-coefficients of red, then green, then blue. Normals carry nothing and are written as zeros.
+coefficients of red, then green, then blue. Normals are not used; they are written as zeros.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pointsplat_ns.io.files import keep_usable, one_line, replacing, require_fil
 from pointsplat_ns.io.ply_header import Element, Header, read_header
 
 CHUNK_ROWS = 16384
-"""Rows taken apart at a time, about 4 MB: they stay in the processor's cache until all their columns are copied."""
+"""Rows copied at a time, about 4 MB: small enough for the processor's cache."""
 
 _MEANS = ["x", "y", "z"]
 _NORMALS = ["nx", "ny", "nz"]
@@ -35,8 +35,8 @@ def read_ply(path: Path | str) -> Gaussians:
     """Read a 3DGS PLY: binary of either byte order, or ASCII; properties in any order and of any type.
 
     The SH degree follows from the number of ``f_rest`` properties. Other properties and elements are
-    ignored. Gaussians with NaN, or with Inf where it has no meaning, are dropped and counted on the
-    log; all-zero rows stay (a zero quaternion is the identity).
+    ignored. Gaussians that cannot be drawn (NaN, or Inf where it is not valid) are dropped, and their number
+    is logged; all-zero rows are kept (a zero quaternion is the identity).
 
     Args:
         path: the file.
@@ -70,9 +70,8 @@ def read_ply(path: Path | str) -> Gaussians:
 def write_ply(scene: Gaussians, path: Path | str) -> None:
     """Write ``scene`` as a 3DGS PLY: binary little endian, float32, the reference's property order.
 
-    A float32 scene that :func:`read_ply` reads back is the same to the bit. Gaussians with NaN, or
-    with Inf where it has no meaning, are left out and counted on the log. The file appears whole
-    or not at all.
+    :func:`read_ply` reads a float32 scene back unchanged to the bit. Gaussians that cannot be drawn (NaN, or Inf
+    where it is not valid) are left out, and their number is logged. The write is atomic.
 
     Raises:
         SceneError: if ``path`` cannot be written.
@@ -102,8 +101,8 @@ def _rest_names(count: int) -> list[str]:
 
 
 class _GaussiansAlone(io.FileIO):
-    """A PLY file as plyfile is to see it: with a header that has been checked and that ends with the Gaussians, so
-    that neither comments in other encodings nor what follows the Gaussians can be in the way."""
+    """A PLY file as plyfile reads it, with its header replaced by a checked one that ends with the Gaussians. So
+    comments in other encodings and elements after the Gaussians cannot cause errors."""
 
     def __init__(self, path: Path, header: Header):
         super().__init__(path)
@@ -117,10 +116,10 @@ class _GaussiansAlone(io.FileIO):
 
 def _gaussian_element(header: Header, path: Path) -> Element:
     """The element that holds the Gaussians, its declared count checked against the bytes in the file."""
-    found = {element.name: element for element in header.elements}
-    vertex = found.get("vertex")
+    elements = {element.name: element for element in header.elements}
+    vertex = elements.get("vertex")
     if vertex is None:
-        raise SceneError(f"{path}: PLY has no element 'vertex' (found {', '.join(found) or 'none'})")
+        raise SceneError(f"{path}: PLY has no element 'vertex' (found {', '.join(elements) or 'none'})")
     if vertex.lists:
         raise SceneError(f"{path}: vertex property {vertex.lists[0]!r} is a list; expected a number per Gaussian")
     before = header.before("vertex")
@@ -139,7 +138,7 @@ def _gaussian_element(header: Header, path: Path) -> Element:
 
 
 def _least_bytes(element: Element, header: Header) -> int:
-    """Bytes that an element takes at least: exact in binary; a digit and a separator a number in ASCII."""
+    """Least number of bytes of an element: exact in binary; one digit and one separator per number in ASCII."""
     if header.order:
         return element.count * element.row_bytes
     # The last line of a file needs no newline.
@@ -147,7 +146,7 @@ def _least_bytes(element: Element, header: Header) -> int:
 
 
 def _num_rest(vertex: Element, path: Path) -> int:
-    """How many SH coefficients a Gaussian has beside the constant one, all properties being there."""
+    """Number of SH coefficients per channel beyond the constant one; checks that all properties are present."""
     present = {name for name, _ in vertex.properties}
     if "packed_position" in present:
         raise SceneError(f"{path}: a compressed PLY (property 'packed_position'); export it uncompressed")
@@ -169,7 +168,7 @@ def _num_rest(vertex: Element, path: Path) -> int:
 
 
 def _scene(rows: np.ndarray, k: int) -> Gaussians:
-    """The scene of structured rows (N,) with ``k`` coefficients of each channel beyond the constant one."""
+    """The scene in structured rows (N,), with ``k`` coefficients per channel beyond the constant one."""
     from numpy.lib.recfunctions import structured_to_unstructured
 
     columns = {

@@ -1,7 +1,7 @@
-"""The header of a PLY file, read with bounds and checked against the file's size.
+"""Parses the header of a PLY file, of limited length.
 
-A header is a promise about what follows. Here it is parsed before anything is allocated for it, so
-that a damaged or hostile one (a count of 10^15, a header without an end) costs nothing.
+It is parsed before anything is allocated for the data, so that a damaged or hostile header (a count of 10^15, a header
+without an end) does no harm. :mod:`~pointsplat_ns.io.ply` checks its counts against the size of the file.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Element:
     name: str
     count: int
     properties: tuple[tuple[str, str], ...]
-    """``(name, type)`` in the file's order. A type is a PLY name that numpy knows too (``float32``), that of a list
+    """``(name, type)`` in the file's order. A type is a name that PLY and numpy share (``float32``), or for a list
     ``list uint8 int32``."""
 
     @property
@@ -63,7 +63,7 @@ class Header:
         return self.elements[: [element.name for element in self.elements].index(name)]
 
     def up_to(self, name: str) -> bytes:
-        """A header in ASCII without comments that ends with the element called ``name``."""
+        """The header as ASCII bytes, without comments, up to the element called ``name``."""
         form = next(form for form, order in _ORDERS.items() if order == self.order)
         lines = ["ply", f"format {form} 1.0"]
         for element in self.elements[: len(self.before(name)) + 1]:
@@ -76,7 +76,7 @@ def read_header(stream: BinaryIO, path: Path) -> Header:
     """Parse the header at the start of ``stream``, which is left at an unspecified position.
 
     Raises:
-        SceneError: if it is no PLY header, has no end, or declares something that PLY does not know.
+        SceneError: if it is not a PLY header, has no end, or has a line that is not valid PLY.
     """
     text, size = _header_text(stream, path)
     order: str | None = None

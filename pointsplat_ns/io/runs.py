@@ -1,8 +1,8 @@
-"""Trained nerfstudio runs: where the scene, its photos and its frame are.
+"""Opens trained nerfstudio runs: checkpoint, settings, data folder and coordinate frame.
 
-nerfstudio lays a run out as ``outputs/EXPERIMENT/METHOD/TIMESTAMP`` with ``config.yml``,
+nerfstudio saves a run in ``outputs/EXPERIMENT/METHOD/TIMESTAMP``, with ``config.yml``,
 ``dataparser_transforms.json`` and ``nerfstudio_models/step-*.ckpt``. Everything is read without
-importing nerfstudio and without running what ``config.yml`` names.
+importing nerfstudio and without executing ``config.yml``.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ TRANSFORMS_NAME = "dataparser_transforms.json"
 CHECKPOINT_FOLDER = "nerfstudio_models"
 
 _SPLATFACTO_FIELDS = {"sh_degree", "densify_grad_thresh", "rasterize_mode"}
-"""Model settings that only Splatfacto and what derives from it have."""
+"""Model settings that only Splatfacto and methods derived from it have."""
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A trained nerfstudio run. Settings are as ``config.yml`` has them; nested objects in them are
+    """A trained nerfstudio run. Settings are those of ``config.yml``; objects nested in them are
     :class:`~pointsplat_ns.io.inert_yaml.Tagged`."""
 
     folder: Path
@@ -45,8 +45,8 @@ class Run:
     """As configured; empty or "unnamed" where the user gave none."""
     timestamp: str
     data: Path
-    """What the run was trained on: found on this machine if :func:`open_run` was asked to find it,
-    as configured otherwise."""
+    """Training data of the run: a path that exists if :func:`open_run` was called with ``need_data``, else the
+    configured path."""
     dataparser_class: str
     """Dotted name of the dataparser's configuration class."""
     dataparser_fields: dict[str, Any]
@@ -61,13 +61,13 @@ class Run:
     @property
     def is_gaussian_scene(self) -> bool:
         """Whether the checkpoint holds one Gaussian scene: Splatfacto or a method derived from it."""
-        if self.method_name == "pointsplat":  # a refiner for many scenes, whatever its settings are called
+        if self.method_name == "pointsplat":  # a refiner for many scenes
             return False
         return self.method_name.startswith("splatfacto") or self.model_fields.keys() >= _SPLATFACTO_FIELDS
 
     @property
     def rasterize_mode(self) -> Literal["classic", "antialiased"]:
-        """How the run rendered, and how its scene is to be drawn."""
+        """Rasterize mode that the run was trained with."""
         return "antialiased" if self.model_fields.get("rasterize_mode") == "antialiased" else "classic"
 
 
@@ -80,7 +80,7 @@ def open_run(path: Path | str, need_data: bool = True) -> Run:
             folder, then from the run's folder and every folder above it.
 
     Raises:
-        SceneError: if it is no run, has no complete checkpoint, or its data is needed and not found.
+        SceneError: if ``path`` is not a run, has no complete checkpoint, or its data is needed and not found.
     """
     path = Path(path)
     if not path.exists():
@@ -96,7 +96,7 @@ def open_run(path: Path | str, need_data: bool = True) -> Run:
     pipeline = _tagged(root, "pipeline", config_path)
     datamanager = _tagged(pipeline, "datamanager", config_path)
     model = _tagged(pipeline, "model", config_path)
-    # Some methods keep their data elsewhere than in a dataparser; they are runs, if not Gaussian scenes.
+    # Runs of some other methods have no dataparser.
     dataparser = datamanager.fields.get("dataparser")
     dataparser = dataparser if isinstance(dataparser, Tagged) else Tagged("", {})
     checkpoint, step = _checkpoint(folder, root.fields.get("relative_model_dir"), chosen)
@@ -127,7 +127,7 @@ def open_run(path: Path | str, need_data: bool = True) -> Run:
 
 
 def scene_name(run: Run) -> str:
-    """A short name for the scene, fit for a file: the experiment's, or its data's if it has none."""
+    """A short name for the scene that can be a file name: the experiment's, or the data folder's if it has none."""
     name = run.experiment_name if run.experiment_name not in ("", "unnamed") else ""
     data = run.data.parent if run.data.suffix else run.data
     name = name or data.name or run.folder.name
@@ -142,7 +142,7 @@ def _tagged(parent: Tagged, name: str, path: Path) -> Tagged:
 
 
 def _settings(config: Tagged, *without: str) -> dict[str, Any]:
-    """Fields of a configuration object but for its ``_target`` and those named."""
+    """Fields of a configuration object, except those that begin with ``_`` and those in ``without``."""
     return {key: value for key, value in config.fields.items() if not str(key).startswith("_") and key not in without}
 
 
@@ -162,14 +162,14 @@ def _checkpoint(folder: Path, configured: Any, chosen: Path | None) -> tuple[Pat
         if is_complete(steps[step]):
             return steps[step], step
         logger.warning("%s: not a complete checkpoint; trying an older one", steps[step])
-    found = f"{len(steps)} incomplete" if steps else "none"
+    checkpoints = f"{len(steps)} incomplete" if steps else "none"
     raise SceneError(
-        f"{folder}: no complete checkpoint in {place.name} ({found}); let the training reach its first save"
+        f"{folder}: no complete checkpoint in {place.name} ({checkpoints}); let the training reach its first save"
     )
 
 
 def _find_data(data: Path, folder: Path, config_path: Path) -> Path:
-    """Where the configured data is on this machine."""
+    """The configured data's path on this machine."""
     data = data.expanduser()
     if data.is_absolute():
         tried = [data]
@@ -187,7 +187,7 @@ def _find_data(data: Path, folder: Path, config_path: Path) -> Path:
 
 
 def _transforms(path: Path) -> tuple[Tensor, float]:
-    """The dataparser's transform (3, 4) and scale; the identity and 1 where the run saved none."""
+    """The dataparser's transform (3, 4) and scale; the identity and 1 if the run saved none."""
     if not path.is_file():
         return torch.eye(4)[:3], 1.0
     try:

@@ -1,8 +1,8 @@
 """Lets torch load Splatfacto checkpoints with ``weights_only=True``.
 
-torch 2.6 and later unpickle nothing but tensors and plain values unless told otherwise, while every
-Splatfacto checkpoint holds a numpy float64 scalar in the state of its schedulers. What is registered
-here rebuilds such a scalar from its bytes; none of it can run code from the file.
+By default torch 2.6 and later unpickle only tensors and plain values, but every Splatfacto checkpoint holds a numpy
+float64 scalar in the state of its schedulers. The functions registered here rebuild such a scalar from its bytes; they
+cannot run code from the file.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ import torch
 def allow_splatfacto_checkpoints() -> None:
     """Register numpy's float64 scalar with torch's ``weights_only`` loader.
 
-    Calling it again changes nothing. Where torch has no such register (before 2.4), it does nothing:
-    ``torch.load`` there defaults to ``weights_only=False``.
+    Calling it again changes nothing. Before torch 2.4, which has no such register, it does nothing.
     """
     add = getattr(torch.serialization, "add_safe_globals", None)
     if add is None:
@@ -27,7 +26,7 @@ def allow_splatfacto_checkpoints() -> None:
     scalar = importlib.import_module(f"numpy.{'_core' if hasattr(np, '_core') else 'core'}.multiarray").scalar
     allowed: list[Any] = [np.dtype, type(np.dtype(np.float64))]
     if _torch_version() >= (2, 6):
-        # A checkpoint may come from the other major version of numpy, so both names stand for this function.
+        # A checkpoint may come from the other major version of numpy, so register the function under both names.
         allowed += [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
     else:
         allowed.append(scalar)

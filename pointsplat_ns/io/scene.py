@@ -1,4 +1,4 @@
-"""One way in and one way out for a scene, whatever its format."""
+"""Reads and writes scenes of all supported formats."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def read_scene(path: Path | str) -> Gaussians:
         path: a ``.ply``, a ``.ckpt``, a ``config.yml`` or a run's folder. The photos of a run are not needed.
 
     Returns:
-        The scene, float32 on the CPU. Log-scales and logits are as the file has them.
+        The scene, float32 on the CPU. Log-scales and logits are those of the file.
 
     Raises:
-        SceneError: if it is none of these, or damaged.
+        SceneError: if the path is none of these, or the file is damaged.
 
     Example:
         >>> import tempfile
@@ -52,16 +52,16 @@ def read_scene(path: Path | str) -> Gaussians:
 def save(scene: Gaussians, path: Path | str) -> None:
     """Write a scene as a 3DGS PLY, which viewers of Gaussian scenes and :func:`pointsplat_ns.load` read.
 
-    A float32 scene comes back the same to the bit. Gaussians with NaN, or with Inf where it has no meaning, are left
-    out and counted on the log. The file appears whole or not at all, in place of what had its name.
+    A float32 scene is read back unchanged to the bit. Gaussians that cannot be drawn (NaN, or Inf where it is not
+    valid) are left out, and their number is logged. The write is atomic and replaces an existing file.
 
     Args:
-        scene: N Gaussians of SH degree d, on any device and of any floating dtype; written as float32, 56 + 12 K bytes
-            each plus 12 for normals that say nothing, where K = (d+1)^2 - 1.
-        path: a name that ends in ``.ply``. Missing folders are made.
+        scene: N Gaussians of SH degree d, on any device and of any floating dtype. Each takes 68 + 12 K bytes as
+            float32, with K = (d+1)^2 - 1 and 12 bytes of unused normals.
+        path: a path that ends in ``.ply``. Missing folders are created.
 
     Raises:
-        SceneError: if the name asks for another format, is a folder's, or cannot be written.
+        SceneError: if the path has another suffix, is a folder, or cannot be written.
 
     Example:
         >>> import tempfile

@@ -16,8 +16,8 @@ from pointsplat_ns.io.files import keep_usable, one_line, require_file
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 
 PREFIXES = ("_model.gauss_params.", "_model.module.gauss_params.", "_model.", "_model.module.")
-"""Where in ``pipeline`` the parameters are: today's key names, then those before nerfstudio 1.0; each
-also as distributed training wraps it."""
+"""Prefixes of the parameters' keys in ``pipeline``: current, then those before nerfstudio 1.0, each also with the
+wrapper of distributed training."""
 
 NAMES = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
 
@@ -27,7 +27,7 @@ def read_checkpoint(path: Path | str) -> Gaussians:
 
     Loads with ``weights_only=True``: a checkpoint cannot run code. At SH degree 0, where Splatfacto
     stores colours as logits, they are converted to SH coefficients of the same colour. Gaussians
-    with NaN, or with Inf where it has no meaning, are dropped and counted on the log.
+    that cannot be drawn (NaN, or Inf where it is not valid) are dropped, and their number is logged.
 
     Args:
         path: a ``.ckpt`` file.
@@ -42,8 +42,8 @@ def read_checkpoint(path: Path | str) -> Gaussians:
     state = _pipeline_state(_load(path), path)
     prefix = next((p for p in PREFIXES if f"{p}means" in state), None)
     if prefix is None:
-        found = sorted(str(key) for key in state)
-        shown = ", ".join(found[:4]) + (f" and {len(found) - 4} more" if len(found) > 4 else "")
+        keys = sorted(str(key) for key in state)
+        shown = ", ".join(keys[:4]) + (f" and {len(keys) - 4} more" if len(keys) > 4 else "")
         raise SceneError(
             f"{path}: a checkpoint of another method; found the keys {shown or 'none'}; "
             f"expected {PREFIXES[0]}means, as Splatfacto saves"
@@ -60,12 +60,12 @@ def read_checkpoint(path: Path | str) -> Gaussians:
 
 
 def is_complete(path: Path) -> bool:
-    """Whether a checkpoint's archive is whole: its directory, which ends the file, is there."""
+    """Whether a checkpoint's archive is complete, that is, has the directory at its end."""
     return path.is_file() and zipfile.is_zipfile(path)
 
 
 def _load(path: Path) -> Any:
-    """Everything in a checkpoint, its tensors mapped from the file rather than read."""
+    """Load a checkpoint, with its tensors memory-mapped if it is an archive."""
     expected = "expected a checkpoint that Splatfacto saved"
     if path.stat().st_size == 0:
         raise SceneError(f"{path}: the file is empty; {expected}")
