@@ -1,1 +1,1 @@
-"""Rotations, camera axes and space-filling curves: what several parts compute with and none of them owns."""
+"""Geometry that several parts use: rotations, camera axes, nearest neighbours, space-filling curves."""

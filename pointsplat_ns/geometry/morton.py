@@ -6,10 +6,10 @@ from torch import Tensor
 
 
 def spread_bits(x: Tensor) -> Tensor:
-    """Moves bit k of every integer to bit 3k, for k below 21, by halving the distance still to go five times.
+    """Move bit k of every integer to bit 3k, for k below 21, in five steps of half the distance each.
 
     Args:
-        x: int64 of any shape; bits from 21 on are left out.
+        x: int64 of any shape; bits from 21 on are dropped.
     """
     x = x & 0x1FFFFF
     for shift, mask in (
@@ -25,5 +25,5 @@ def spread_bits(x: Tensor) -> Tensor:
 
 
 def interleave(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    """The Morton code of three coordinates whose bits are spread, x foremost."""
+    """The Morton code of three coordinates whose bits are spread; x has the highest bit."""
     return (x << 2).bitwise_or_(y << 1).bitwise_or_(z)

@@ -13,7 +13,7 @@ def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
     Args:
         points: (N, D), finite, any floating type and device.
-        k: how many of them, the point itself included, at least 1.
+        k: number of neighbours, including the point itself, at least 1.
 
     Returns:
         Distances (N, K) float64 and indices (N, K) int64, on the CPU, with K = min(k, N).
@@ -28,8 +28,8 @@ def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
 
 def nearest_and_walk(points: Tensor, k: int) -> tuple[Tensor, Tensor, Tensor]:
-    """As :func:`nearest`, and a walk through all points, (N,) int64, that follows the leaves of the search tree: points
-    next to one another in it are near one another in space, even where more than k points coincide."""
+    """As :func:`nearest`, and the indices of all points, (N,) int64, in the order of the search tree's leaves. Points
+    next to each other in that order are close in space, even where more than k points coincide."""
     from scipy.spatial import cKDTree
 
     n = len(points)

@@ -1,4 +1,4 @@
-"""Quaternions, wxyz: their rotation matrices, and what the zero quaternion stands for."""
+"""Quaternions (wxyz): rotation matrices, and the zero quaternion as the identity."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotation matrices of quaternions of any length.
 
     Args:
-        quats: (N, 4) wxyz, finite; zero, and what is so short that its squares underflow, is the identity.
+        quats: (N, 4) wxyz, finite; zero is the identity, and so are quaternions so short that their squares underflow.
 
     Returns:
         (N, 3, 3), of the same dtype.

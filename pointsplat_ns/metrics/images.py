@@ -1,8 +1,7 @@
 """Image metrics: PSNR and SSIM (LPIPS, which needs weights, is in :mod:`pointsplat_ns.metrics.lpips`).
 
-Images are (H, W, 3) or (B, H, W, 3), in [0, 1]; values are taken as they are, not clamped. Each metric
-gives a scalar for one image and (B,) for a batch, one value an image, so that averaging is the
-caller's choice.
+Images are (H, W, 3) or (B, H, W, 3), in [0, 1]; values are not clamped. Each metric returns a scalar for one image and
+(B,) for a batch, one value per image.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ def per_image(values: Tensor, like: Tensor) -> Tensor:
 def psnr(pred: Tensor, target: Tensor) -> Tensor:
     """Peak signal-to-noise ratio in dB, ``-10 log10(mean squared error)``, data range 1.
 
-    Identical images give ``inf``, which JSON cannot hold: a writer makes it null.
+    Identical images give ``inf``.
 
     Args:
         pred: (H, W, 3) or (B, H, W, 3), in [0, 1].
@@ -69,10 +68,10 @@ def ssim(pred: Tensor, target: Tensor) -> Tensor:
     """Structural similarity (Wang et al. 2004), data range 1.
 
     11 x 11 Gaussian window of sigma 1.5, population moments, averaged over the channels and over the
-    pixels whose whole window lies inside the image, as in the original publication. This is what
-    pytorch-msssim computes, so what Splatfacto reports. Others fill in the border and average over it
-    too: torchmetrics by reflection, the original 3DGS code with zeros. Their values
-    differ a little and should not be compared with these.
+    pixels whose whole window lies inside the image, as in the original publication. pytorch-msssim, and
+    so Splatfacto, computes the same. Others pad the image and average over the border, too: torchmetrics
+    by reflection, the original 3DGS code with zeros. Their values differ a little and should not be
+    compared with these.
 
     Args:
         pred: (H, W, 3) or (B, H, W, 3), in [0, 1], at least 11 pixels a side.
@@ -97,6 +96,6 @@ def ssim(pred: Tensor, target: Tensor) -> Tensor:
             f"images of {a.shape[3]} x {a.shape[2]} pixels are smaller than SSIM's window; "
             f"expected at least {SSIM_WINDOW} x {SSIM_WINDOW}"
         )
-    # eps=0: the two constants of the definition keep the denominator positive by themselves.
+    # eps=0: the two constants of the definition already keep the denominator positive.
     values = kornia.metrics.ssim(a.contiguous(), b.contiguous(), SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid")
     return per_image(values.mean(dim=(1, 2, 3)), pred)

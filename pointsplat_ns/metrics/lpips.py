@@ -1,9 +1,9 @@
 """LPIPS: perceptual distance of images (Zhang et al. 2018, "The Unreasonable Effectiveness of Deep
 Features as a Perceptual Metric").
 
-The convolutions are those of torchvision's AlexNet or VGG16; the linear weights on top are those that
-come with torchmetrics. Where the convolutions' weights cannot be had, :func:`load_lpips` says why, and
-everything else goes on without LPIPS.
+The convolutions are those of torchvision's AlexNet or VGG16; the linear weights on top come with
+torchmetrics. If the convolutions' weights are not available, :func:`load_lpips` says why, and everything
+else works without LPIPS.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ WEIGHTS_VARIABLE = "POINTSPLAT_LPIPS_WEIGHTS"
 """Environment variable: a folder with backbones under one of their usual names, or one file."""
 
 DOWNLOAD_TIMEOUT_S = 15.0
-"""Silence of a server after which a download is given up."""
+"""Seconds without an answer after which a download is given up."""
 
 RETRY_AFTER_S = 600.0
-"""How long :func:`cached_lpips` takes a failure for granted: a download that times out at every evaluation step would
-cost more than the step."""
+"""Seconds for which :func:`cached_lpips` remembers a failure: a download that times out at every evaluation step would
+take longer than the step."""
 
 _NORM_EPS = 1e-8
-"""Inside the square root of a feature's length, as torchmetrics has it: keeps the gradient finite at 0."""
+"""Added inside the square root of a feature's length, as in torchmetrics: keeps the gradient finite at 0."""
 
 
 class LpipsUnavailable(PointSplatError):
-    """The weights that LPIPS needs cannot be had; the text says why, in one line."""
+    """The weights of LPIPS are not available; the message says why, in one line."""
 
 
 @dataclass(frozen=True)
 class _Backbone:
-    """What LPIPS takes from one of torchvision's networks."""
+    """The parts of a torchvision network that LPIPS uses."""
 
     taps: tuple[int, ...]  # layers of ``features``, each a ReLU, whose output is compared
     channels: tuple[int, ...]  # of those outputs
@@ -82,8 +82,8 @@ def empty_features(net: Net) -> nn.Sequential:
 
 
 class Lpips(nn.Module):
-    """The distance itself. Always frozen: its weights are non-persistent buffers, so they follow a
-    parent module to its device but are not among its parameters nor in its checkpoints.
+    """The LPIPS network. It is frozen: its weights are non-persistent buffers, which move to a device
+    with a parent module but are neither among its parameters nor in its checkpoints.
 
     Args:
         net: which backbone.
@@ -168,7 +168,7 @@ def load_lpips(net: Net = "alex", backbone: Path | str | None = None, download: 
         download: whether the network may be used.
 
     Raises:
-        LpipsUnavailable: if no weights can be had; one line with the reason.
+        LpipsUnavailable: if the weights are not available.
 
     Example:
         >>> load_lpips("alex", backbone="alexnet_features.pth")  # doctest: +SKIP
@@ -190,17 +190,17 @@ def load_lpips(net: Net = "alex", backbone: Path | str | None = None, download: 
 def cached_lpips(net: Net, device: torch.device | str) -> Lpips:
     """LPIPS on a device, loaded at the first call and the same object afterwards.
 
-    A failure is remembered as well, for ``RETRY_AFTER_S`` seconds or until another file is found or
-    the environment variable changes: weights that appear are seen at the next call, and a download that
-    timed out is not tried again at every step. What must not change in its course, a training loss for
-    one, keeps the answer of its first call.
+    A failure is remembered as well, for ``RETRY_AFTER_S`` seconds or until another file is found or the environment
+    variable changes. So a download that timed out is not tried again at every step, and weights that appear are used at
+    the next call. A caller whose result must not change over time, such as a training loss, has to remember a failure
+    itself.
 
     Args:
         net: as for :func:`load_lpips`, which says where the weights come from.
-        device: where the images are that it will compare.
+        device: device of the images.
 
     Raises:
-        LpipsUnavailable: if no weights can be had; one line with the reason.
+        LpipsUnavailable: if the weights are not available.
     """
     place = (net, str(torch.device(device)), os.environ.get(WEIGHTS_VARIABLE), torch.hub.get_dir())
     with _cache_lock:
@@ -220,9 +220,9 @@ def cached_lpips(net: Net, device: torch.device | str) -> Lpips:
 
 
 class ReportedLpips:
-    """LPIPS for a report that goes on without it.
+    """LPIPS for reports, which returns None instead of raising if LPIPS is not available.
 
-    Not a module: its weights are no part of what a model saves.
+    Not a module, so that checkpoints of a model do not hold its weights.
 
     Args:
         net: as for :func:`load_lpips`.
@@ -231,7 +231,7 @@ class ReportedLpips:
     def __init__(self, net: Net = "alex"):
         self.net = net
         self.reason: str | None = None
-        """Why a value is missing, the latest reason if there are several; None while none is missing."""
+        """The latest reason for a missing value; None while none is missing."""
 
     def __call__(self, pred: Tensor, target: Tensor) -> Tensor | None:
         """LPIPS as :meth:`Lpips.forward` gives it; None, with ``reason`` set, where it cannot be computed."""
@@ -259,17 +259,17 @@ def _local_file(net: Net) -> Path | None:
         if not place.exists():
             raise LpipsUnavailable(f"{place}: no such file or folder, though {WEIGHTS_VARIABLE} names it")
         if place.is_dir():
-            found = next((place / name for name in _BACKBONES[net].files if (place / name).is_file()), None)
-            if found is not None:
-                return found
+            file = next((place / name for name in _BACKBONES[net].files if (place / name).is_file()), None)
+            if file is not None:
+                return file
         elif not any(place.name in other.files for key, other in _BACKBONES.items() if key != net):
-            return place  # but for a file that its name says is the other network's
+            return place  # unless its name is that of the other network's file
     cached = _hub_file(net)
     return cached if cached.is_file() else None
 
 
 def _hub_file(net: Net) -> Path:
-    """Where torchvision's download belongs."""
+    """The file in torch hub's cache that torchvision downloads to."""
     return Path(torch.hub.get_dir()) / "checkpoints" / _BACKBONES[net].files[-1]
 
 
@@ -295,7 +295,7 @@ def _expect(state: Mapping[str, Tensor], key: str, shape: tuple[int, ...]) -> Te
 
 
 def _linear_file(net: Net) -> Path:
-    """The linear weights inside the installed torchmetrics, found without the cost of importing it."""
+    """The file of linear weights in the installed torchmetrics, which is not imported as that is slow."""
     spec = importlib.util.find_spec("torchmetrics")
     if spec is None or not spec.submodule_search_locations:
         raise LpipsUnavailable("torchmetrics, which carries LPIPS's linear weights, is not installed")
@@ -303,7 +303,7 @@ def _linear_file(net: Net) -> Path:
 
 
 def _download(net: Net, target: Path, allowed: bool) -> None:
-    """torchvision's download into torch hub's cache; whole and of the right hash, or not at all."""
+    """Download torchvision's file into torch hub's cache, atomically."""
     remedy = f"set {WEIGHTS_VARIABLE} to a folder with {' or '.join(_BACKBONES[net].files)}"
     if not allowed:
         raise LpipsUnavailable(f"{target}: LPIPS's {net} backbone is not there; {remedy}")

@@ -1,8 +1,8 @@
-"""SSIM for the loss of a training, which computes it at every step.
+"""A fast SSIM for training losses.
 
-The definition is that of pytorch-msssim, so of Splatfacto, and of :func:`pointsplat_ns.ssim`, which is kornia's. Both
-blur the five maps that it needs one after the other, which takes about twice as long on a CPU; here they are blurred
-together. Tests hold the three equal.
+It is defined as in pytorch-msssim, which Splatfacto uses, and in :func:`pointsplat_ns.ssim`, which uses kornia. Both
+blur the five maps one after the other; blurring them together takes about half the time on a CPU. Tests check that all
+three agree.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def mean_ssim(image: Tensor, other: Tensor) -> Tensor:
         other: the same shape.
 
     Returns:
-        A scalar in [-1, 1]; 1 where both are alike. Differentiable.
+        A scalar in [-1, 1]; 1 for identical images. Differentiable.
     """
     maps = torch.cat([image, other, image * image, other * other, image * other], dim=1)
     mean, other_mean, square, other_square, product = _blur(maps).chunk(5, dim=1)

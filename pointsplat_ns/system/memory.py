@@ -1,4 +1,4 @@
-"""How this process gets its memory from the system."""
+"""Memory allocation of this process."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of mallopt(3)
 
 
 def keep_freed_memory() -> bool:
-    """Let memory that is freed serve what is allocated next, instead of going back to the system at once.
+    """Let the process reuse freed memory instead of returning it to the system.
 
-    By default glibc maps every block above 32 MB afresh, and the system then clears it page by page. In a training on
-    a CPU, whose steps free and allocate the same large tensors over and over, that can take more time than the
-    arithmetic. The process keeps what it once had until it ends. Elsewhere than on Linux with glibc nothing happens.
+    By default glibc maps a new block for every allocation above 32 MB, and the system then clears it page by page. When
+    training on a CPU, each step frees and allocates the same large tensors, and this can take more time than the
+    arithmetic. The price: the process never returns memory until it ends. Without Linux and glibc, nothing is changed.
 
     Returns:
-        Whether it is so from now on.
+        Whether the setting was made.
     """
     if not sys.platform.startswith("linux"):
         return False

@@ -1,4 +1,4 @@
-"""How far long work has come: one bar for all of it."""
+"""Progress bars."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 Progress = Callable[[str, float], None]
-"""Called with what is being done and the share done of it, in [0, 1]."""
+"""Called with the name of the current task and the share of it that is done, in [0, 1]."""
 
 T = TypeVar("T")
 
 
 def silent(what: str, share: float) -> None:
-    """Progress that nobody wants to see."""
+    """Progress that is not shown."""
 
 
 @contextmanager
 def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
-    """A bar in the terminal or notebook, with an estimate of the time left, that leaves nothing behind.
+    """A bar in the terminal or notebook, with an estimate of the time left; it is erased at the end.
 
     Args:
-        progress: True shows it (on standard error, where that is a terminal), False does not; a function is handed
-            through.
+        progress: True shows a bar (on standard error, if that is a terminal), False shows none; a function is returned
+            as it is.
     """
     if callable(progress):
         yield progress
@@ -52,7 +52,7 @@ def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
 
 
 def tracked(items: Iterable[T], what: str, total: int, progress: bool | Progress = True) -> Iterator[T]:
-    """The items, with a bar that says how many of ``total`` are done."""
+    """Iterate over the items, with a bar that shows how many of ``total`` are done."""
     with progress_bar(progress) as show:
         report = functools.partial(show, what)
         report(0.0)
