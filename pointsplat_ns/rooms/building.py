@@ -1,4 +1,4 @@
-"""What a room is made of: solids with materials, and lights."""
+"""The parts of a room: solids with materials, and lights."""
 
 import math
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ class Material:
         paint: Its colour, linear light.
         gloss: Strength of the highlight, 0 for a matte surface.
         shininess: Blinn-Phong exponent.
-        emission: Radiance of a shining surface as a multiple of ``paint``; 0 for the others.
+        emission: Radiance of a light-emitting surface as a multiple of ``paint``; 0 for the others.
     """
 
     paint: Painter
@@ -34,7 +34,7 @@ Surfaces = Material | dict[int, Material]
 
 @dataclass(frozen=True)
 class Light:
-    """A rectangle that shines on the side of its normal, or a ball's middle that shines all around.
+    """A rectangle that emits light on the side of its normal, or a point that emits in all directions.
 
     Attributes:
         center, edge_u, edge_v: Middle and half edges, world (edges are zero for a point).
@@ -51,7 +51,7 @@ class Light:
 
 @dataclass(frozen=True)
 class RoomSpec:
-    """What a seed decided about a room.
+    """The description of a room, drawn from a seed.
 
     Attributes:
         seed: The seed.
@@ -72,7 +72,7 @@ class RoomSpec:
 
 @dataclass
 class Frame:
-    """A place to build at: origin on the floor and rotation about z."""
+    """The local frame of a piece of furniture: origin on the floor and rotation about z."""
 
     x: float
     y: float

@@ -1,4 +1,4 @@
-"""Where a person with a camera would walk through a room: free of furniture, seeing all of it."""
+"""Camera paths through a room, as of a person with a camera: clear of furniture, and with all of the room in view."""
 
 import math
 
@@ -22,14 +22,14 @@ _STOPS = 6  # places of the style "stops"
 
 
 def capture_path(room: Room, frames: int, seed: int, style: str = "rounds") -> Tensor:
-    """Poses along two rounds through a room.
+    """Camera poses on a walk through a room, in one of the :data:`STYLES`.
 
     Height and pitch vary on the way. Every position keeps at least :data:`CLEARANCE` from all surfaces.
 
     Args:
         room: the room.
         frames: number of poses, F.
-        seed: decides where the walk starts, its direction and its swing.
+        seed: decides the start of the walk, its direction and the phases of height and pitch.
         style: one of :data:`STYLES`.
 
     Returns:
@@ -87,7 +87,7 @@ def _free_cells(room: Room, top: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     ys = np.arange(-depth / 2 + CELL / 2, depth / 2, CELL)
     grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
     free = np.ones(len(grid), dtype=bool)
-    # The 6 cm on top of the clearance pay for heights between those tried and places between cells.
+    # The additional 6 cm allow for heights between those tested and positions between cells.
     for z in np.arange(_LOWEST, top + 0.099, 0.1):
         points = torch.tensor(np.concatenate([grid, np.full((len(grid), 1), z)], axis=1), dtype=torch.float32)
         free &= (clearance(room, points) > CLEARANCE + 0.06).numpy()
@@ -153,7 +153,7 @@ def _walk(cells: np.ndarray, stops: list[int]) -> np.ndarray:
 
 
 def _eased(values: np.ndarray, sigma: float) -> np.ndarray:
-    """Gaussian smoothing over ``sigma`` frames: no sudden turn where the way passes the middle closely."""
+    """Gaussian smoothing over ``sigma`` frames, against sudden turns where the path passes close to the middle."""
     from scipy.ndimage import gaussian_filter1d
 
     return gaussian_filter1d(values, sigma, mode="nearest")

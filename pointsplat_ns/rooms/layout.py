@@ -29,12 +29,12 @@ OPENINGS = (DOOR, WINDOW)
 Wall = tuple[Frame, float]
 """The middle of a wall's foot, and its length in metres."""
 Taken = list[tuple[float, float, float]]
-"""What stands or opens along a wall: from, to, and the lowest height that is free above or below it, metres."""
+"""Occupied parts of a wall: from, to, and the height from which (for an opening: up to which) it is free, metres."""
 Floor = list[tuple[float, float, float, float]]
 """Rectangles of the floor that are taken: x0, x1, y0, y1 in metres."""
 
 Piece = Callable[[Builder, Frame, Palette, Vec], Light | None]
-"""Builds a piece of furniture of a width, depth and height; gives the light of a lamp."""
+"""Builds a piece of furniture of a width, depth and height; returns the light if it is a lamp."""
 
 SIZES: dict[Piece, Vec] = {
     bed: (1.5, 2.0, 0.95),
@@ -55,7 +55,7 @@ ROOMS: dict[str, list[Piece]] = {
     "study": [desk, bookshelf, bookshelf, sofa, plant, floor_lamp, dresser],
     "dining": [dresser, bookshelf, plant, tv_bench, floor_lamp, wardrobe],
 }
-"""What is set out along the walls of each kind of room, in this order, as far as there is space."""
+"""Furniture along the walls of each kind of room, placed in this order as far as there is space."""
 
 
 def sample_room(seed: int) -> RoomSpec:
@@ -187,7 +187,7 @@ def _against_wall(
     floor: Floor,
     rng: np.random.Generator,
 ) -> Light | None:
-    """Tries places along the walls until the piece stands clear of all others; gives up after some."""
+    """Tries random places along the walls until the piece is clear of all others; None after 60 failures."""
     w, d, h = (float(v * rng.uniform(0.92, 1.1)) for v in SIZES[piece])
     reach = d + (0.6 if piece is desk else 0.0)
     for _ in range(60):

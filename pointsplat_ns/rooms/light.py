@@ -1,8 +1,8 @@
-"""Textures and light of a room, computed once and looked up by every picture.
+"""Textures and light of a room, computed once and looked up by every render.
 
 Colours go into mip-mapped texel grids, one per chart. Light that does not depend on the viewer
 (direct light with soft shadows from area lights, and several bounces between surfaces) goes into a
-coarser grid, together with how much of each light a point sees, which the highlights need.
+coarser grid, together with the visible share of each light, which the highlights need.
 """
 
 import math
@@ -77,7 +77,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class BakedRoom:
-    """A room ready to be pictured.
+    """A room with textures and light, ready to be rendered.
 
     Attributes:
         spec: The room.

@@ -1,4 +1,4 @@
-"""A room: what its seed decided about it, with its textures and light."""
+"""A synthetic room: its description, and its textures and light."""
 
 from dataclasses import dataclass
 from functools import cached_property

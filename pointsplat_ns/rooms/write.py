@@ -1,4 +1,4 @@
-"""Rooms as data sets on disk, as if somebody had captured them."""
+"""Writes rooms as data sets, like captures of real rooms."""
 
 import json
 import os
@@ -26,16 +26,16 @@ def write_room(
     progress: bool | Progress = True,
     style: str = "rounds",
 ) -> Path:
-    """Write photos, depth images and poses of a room in the Replica layout: whole, or not at all.
+    """Write photos, depth images and poses of a room in the Replica layout, atomically.
 
     Args:
-        folder: the scene folder to make; its parents are made too.
-        seed: which room.
-        frames: photos to take, at least 2.
-        width: of a photo, pixels, at least 8.
-        height: of a photo, pixels, at least 8.
-        progress: True shows a bar; a function is called with what is being done and the share done of it.
-        style: how the camera is led, see :func:`~pointsplat_ns.rooms.camera_path.capture_path`.
+        folder: the scene folder to create, with its parents.
+        seed: seed of the room.
+        frames: number of photos, at least 2.
+        width: width of a photo, pixels, at least 8.
+        height: height of a photo, pixels, at least 8.
+        progress: True shows a bar; a function is called with the name of the task and the share of it that is done.
+        style: style of the camera path, see :func:`~pointsplat_ns.rooms.camera_path.capture_path`.
 
     Returns:
         ``folder``.
