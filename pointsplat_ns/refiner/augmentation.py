@@ -1,7 +1,7 @@
-"""The same scene, turned, mirrored and repainted: what a refiner should repair alike.
+"""Data augmentation: rotations, reflections and colour changes of scenes.
 
-A :class:`Transform` is undone without loss, so that a refiner trained on ``undo(refiner(apply(scene)))`` sees endless
-variants of a scene while the pictures it is compared with stay as they are.
+A :class:`Transform` can be undone. So a refiner trained on ``undo(refiner(apply(scene)))`` sees many variants of a
+scene, while the target images do not change.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from pointsplat_ns.geometry.quaternions import rotation_matrices, zero_as_identi
 from pointsplat_ns.rasterizer.spherical_harmonics import C0, sh_basis
 
 GAINS = (0.7, 1.4)
-"""Least and greatest factor on a colour channel."""
+"""Range of the factors on colour channels."""
 
 UPRIGHT = 0.5
-"""Share of random rotations that leave the vertical vertical: most scenes have z up, files from elsewhere any axis."""
+"""Share of random rotations that are about the z axis only. Most scenes have z up, but files may have any axis up."""
 
 
 @dataclass(frozen=True, eq=False)
 class Transform:
-    """Turns a scene about the origin, mirrors it through the origin if ``mirrored``, and multiplies and exchanges its
+    """Rotates a scene about the origin, reflects it through the origin if ``mirrored``, and scales and permutes its
     colour channels."""
 
     quat: Tensor  # [4] wxyz, unit
@@ -48,7 +48,7 @@ class Transform:
         )
 
     def undo(self, scene: Gaussians) -> Gaussians:
-        """The scene that :meth:`apply` makes this one of."""
+        """The inverse of :meth:`apply`."""
         gains, middle = self._color(scene)
         back = self.channels.argsort()
         moved = self._moved(scene, self.matrix.T, self.quat * self.quat.new_tensor([1.0, -1.0, -1.0, -1.0]))
@@ -58,14 +58,14 @@ class Transform:
         )
 
     def _color(self, scene: Gaussians) -> tuple[Tensor, Tensor]:
-        """Factors on SH coefficients and what is added to the constant ones. Colours are 0.5 + C0 dc, so that a
-        factor on them moves the 0.5, too."""
+        """Factors on SH coefficients, and the offset added to the constant ones. Colours are 0.5 + C0 dc, so a factor
+        on colours changes the 0.5, too."""
         gains = self.gains.to(scene.means)
         return gains, 0.5 * (gains - 1.0) / C0
 
     def _moved(self, scene: Gaussians, matrix: Tensor, quat: Tensor) -> Gaussians:
-        """Positions, rotations and directional colours, turned. A covariance does not know a mirroring through the
-        origin, which leaves the rotation alone."""
+        """The scene with positions, rotations and SH bands rotated. A reflection through the origin leaves covariances,
+        and so the rotations of Gaussians, unchanged."""
         from kornia.geometry.quaternion import Quaternion
 
         like = scene.means
@@ -108,14 +108,14 @@ def _directions() -> tuple[Tensor, Tensor]:
 
 
 def sh_matrix(matrix: Tensor, degree: int) -> Tensor:
-    """What turns the coefficients of one SH band as ``matrix`` turns directions.
+    """The matrix that rotates the coefficients of one SH band, for a rotation of directions by ``matrix``.
 
-    The coefficients ``c'`` of the turned function satisfy ``Y(d) c' = Y(matrix^T d) c`` for every direction ``d``;
-    solved by least squares over fixed directions, which a band satisfies exactly.
+    The coefficients ``c'`` of the rotated function satisfy ``Y(d) c' = Y(matrix^T d) c`` for every direction ``d``.
+    They are found by least squares over fixed directions; the solution is exact, as rotations preserve bands.
 
     Args:
         matrix: (3, 3) float64, orthogonal.
-        degree: of the band, 1 to 3.
+        degree: degree of the band, 1 to 3.
 
     Returns:
         (2 degree + 1, 2 degree + 1) float64, orthogonal.

@@ -1,7 +1,7 @@
-"""Sizes and switches of the refiner.
+"""Configuration of the refiner.
 
-One dataclass says everything that shapes the network, and three presets name the sizes in use:
-``full`` (the published one, for a GPU), ``small`` and ``tiny`` (for a CPU). All share all code.
+One dataclass holds all settings of the network. There are three presets: ``full`` (the published one, for a GPU),
+``small`` and ``tiny`` (for a CPU).
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ FINE_BITS = 16
 
 
 class RefinerConfigError(PointSplatError, ValueError):
-    """A refiner configuration that describes no network."""
+    """A refiner configuration that is not valid."""
 
 
 _FORMER_GAINS = ("scales_gain", "quats_gain", "opacities_gain", "features_dc_gain", "features_rest_gain")
-"""Settings that files of refiners hold and that no longer exist: factors on residuals, never other than 1."""
+"""Settings in older files that no longer exist: factors on residuals, which were always 1."""
 
 
 @dataclass
 class RefinerConfig:
-    """Everything that shapes a refiner.
+    """All settings of a refiner's network.
 
     The defaults are the sizes of the preset ``full``. Tuples of the encoder have one entry per
     stage; ``strides`` and the tuples of the decoder have one entry fewer, finest first.
@@ -51,7 +51,7 @@ class RefinerConfig:
     """Channels of each encoder branch."""
     unit_gate: bool = False
     """Multiply the softmax gate by its number of channels, so that gates average 1 and not 1/32. The next layer could
-    learn the same factor; starting with it trains visibly faster."""
+    learn this factor, but training is faster if it is there from the start."""
     color_hidden: int = 32
     """Hidden channels of the MLP that reduces the SH coefficients beyond the constant one."""
     color_dim: int = 8
@@ -59,7 +59,7 @@ class RefinerConfig:
     grid: int | None = 384
     """Cells along the unit cube at the finest level (at most 512); None adapts the cell to the spacing of the scene."""
     strides: tuple[int, ...] = (1, 2, 2, 2)
-    """Cell growth from stage to stage, powers of two; 1 only merges what shares a cell."""
+    """Growth of the cells from stage to stage, powers of two; 1 only merges points that share a cell."""
     enc_channels: tuple[int, ...] = (64, 96, 128, 256, 512)
     """Channels of each encoder stage."""
     enc_depths: tuple[int, ...] = (2, 2, 2, 4, 2)
@@ -73,7 +73,7 @@ class RefinerConfig:
     dec_heads: tuple[int, ...] = (4, 4, 4, 4)
     """Attention heads in each decoder stage, finest first."""
     patch: int = 1024
-    """Points that attend to one another."""
+    """Number of points in an attention patch."""
     mlp_ratio: int = 4
     """Hidden width of a block's MLP over its channels."""
     drop_path: float = 0.3
@@ -82,15 +82,15 @@ class RefinerConfig:
     """Serialization curves; block i of a stage uses curve i (shuffled in training). Memory is laid out by the first."""
     norm: Literal["scene", "batch", "layer"] = "scene"
     """Normalisation outside the attention blocks. ``scene`` takes each channel's mean and variance over the points of
-    the scene at hand, in training and in evaluation. In training that is what the published ``batch`` does, as a step
-    sees one scene; but ``batch`` evaluates with running averages over scenes, which fit none of them. ``layer``
-    normalises each point by itself."""
+    the current scene, in training and in evaluation. In training the published ``batch`` does the same, as a step sees
+    one scene; but in evaluation it uses running averages over scenes, which fit no single scene. ``layer`` normalises
+    each point by itself."""
     head_width: int = 128
     """Hidden width of the output heads."""
     head_depth: int = 4
     """Linear layers of each output head."""
     means_reach: float = 0.05
-    """Farthest that a mean may move along an axis, as a share of the scene's extent (1.0 in the published code)."""
+    """Largest move of a mean along an axis, as a share of the scene's extent (1.0 in the published code)."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -105,8 +105,8 @@ class RefinerConfig:
         sizes.update({"dec_channels": stages - 1, "dec_depths": stages - 1, "dec_heads": stages - 1})
         _require(stages >= 1, "enc_channels is empty; expected one entry per stage")
         for name, size in sizes.items():
-            found = len(getattr(self, name))
-            _require(found == size, f"{name} has {found} entries; expected {size} for {stages} encoder stages")
+            entries = len(getattr(self, name))
+            _require(entries == size, f"{name} has {entries} entries; expected {size} for {stages} encoder stages")
         for part in ("enc", "dec"):
             channels, heads = getattr(self, f"{part}_channels"), getattr(self, f"{part}_heads")
             for c, h in zip(channels, heads, strict=True):
@@ -160,8 +160,8 @@ class RefinerConfig:
         for name in _FORMER_GAINS:
             gain = values.pop(name, 1.0)
             _require(gain == 1.0, f"{name} is {gain!r}; expected 1.0, as residuals are no longer multiplied by factors")
-        known = {field.name for field in dataclasses.fields(cls)}
-        unknown = sorted(set(values) - known)
+        fields = {field.name for field in dataclasses.fields(cls)}
+        unknown = sorted(set(values) - fields)
         _require(not unknown, f"unknown refiner settings {', '.join(unknown)}; a newer version may have written them")
         try:
             return cls(**values)
@@ -226,4 +226,4 @@ PRESETS: dict[str, dict[str, Any]] = {
         "head_width": 64,
     },
 }
-"""What each size changes of the defaults of :class:`RefinerConfig`."""
+"""Values of each size that differ from the defaults of :class:`RefinerConfig`."""

@@ -12,9 +12,9 @@ from pointsplat_ns.refiner.normalize import Features
 class BatchNorm(nn.BatchNorm1d):
     """Batch norm over points: ``[N, C] -> [N, C]``.
 
-    Differs from torch's in two ways. A single point has no variance, so the running statistics
-    serve. And the running statistics are plain averages until enough steps have passed for the
-    momentum to take over: otherwise a short training is evaluated with what they started from.
+    Differs from torch's in two ways. For a single point, which has no variance, the running statistics
+    are used. And at first the running statistics are plain averages, until the momentum exceeds one over the
+    number of steps: otherwise their initial values would still count after a short training.
     """
 
     MOMENTUM = 0.01
@@ -34,10 +34,10 @@ class BatchNorm(nn.BatchNorm1d):
 
 
 class SceneNorm(nn.Module):
-    """Normalises each channel over the points of the scene at hand: ``[N, C] -> [N, C]``.
+    """Normalises each channel over the points of the current scene: ``[N, C] -> [N, C]``.
 
-    Batch norm as it trains, with no running statistics to evaluate with. A single point, which has
-    no variance, is its own mean.
+    As batch norm in training, but also in evaluation: there are no running statistics. A single point, which has no
+    variance, is its own mean.
     """
 
     def __init__(self, channels: int):

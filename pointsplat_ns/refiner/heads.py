@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from pointsplat_ns.refiner.config import RefinerConfig
 
 CPU_ROWS = 4096
-"""Rows that a CPU takes through all heads at a time, so that hidden layers stay in its cache (a quarter faster)."""
+"""Rows that a CPU computes at a time, so that hidden layers fit into its cache (a quarter faster)."""
 
 
 class ResidualHeads(nn.Module):

@@ -1,9 +1,8 @@
-"""The unit cube that every scene is brought into, and the features that the network reads there.
+"""Normalises a scene to the unit cube, and computes the network's input features.
 
-Positions are centred and divided by one extent, so that the aspect is kept; log-scales are shifted
-by the logarithm of that extent. The network therefore sees the same numbers whatever the unit and
-the place of a scene. What is clamped here is clamped for the network's eyes only: residuals are
-added to the untouched parameters.
+Positions are centred and divided by one extent, so that the aspect ratio is kept; log-scales are shifted by the
+logarithm of that extent. So the input does not depend on the scene's unit and position. Only the input is clamped:
+residuals are added to the original parameters.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ from pointsplat_ns.geometry.quaternions import zero_as_identity
 from pointsplat_ns.refiner.sparse_ops import permute
 
 TRIM = 0.01
-"""Share of the positions set aside at either end of each axis when the core of a scene is measured."""
+"""Share of the positions at each end of each axis that are not part of the scene's core."""
 
 TRIM_FROM = 8
-"""Fewest Gaussians of which any is set aside: below, an outlier cannot be told from a scene."""
+"""Least number of Gaussians for which positions are trimmed: of fewer, an outlier cannot be recognised."""
 
 MARGIN = 0.5
 """How far the box may reach beyond the core, as a share of the core's longest side."""
@@ -54,7 +53,7 @@ class UnitCube:
     extent: Tensor  # [] side of the cube, scene units, above 0
 
     def positions(self, means: Tensor) -> Tensor:
-        """Positions within [-0.5, 0.5], in float64; what lies outside is put on the nearest face. # [N, 3]"""
+        """Positions in [-0.5, 0.5], float64; those outside the cube are clamped to it. # [N, 3]"""
         return ((means.double() - self.centre) / self.extent).clamp(-0.5, 0.5)
 
     def log_scales(self, scales: Tensor) -> Tensor:
@@ -91,7 +90,7 @@ def unit_cube(means: Tensor) -> UnitCube:
 
 @dataclass(frozen=True)
 class Features:
-    """What the network reads of N Gaussians: finite, of order 1, the same for q and -q."""
+    """The network's input for N Gaussians: finite, of order 1, the same for quaternions q and -q."""
 
     positions: Tensor  # [N, 3] unit cube, centred at 0
     quats: Tensor  # [N, 4] unit wxyz, first non-zero component positive
@@ -132,9 +131,9 @@ def gaussian_features(scene: Gaussians, cube: UnitCube, num_rest: int, dtype: to
 def canonical_quats(quats: Tensor) -> tuple[Tensor, Tensor]:
     """Unit quaternions of one sign, and what they were divided by.
 
-    A quaternion and its negative are one rotation; the one whose first non-zero component is
-    positive stands for both. Zero stands for the identity, with a divisor of 1. Components are
-    scaled by the largest before they are squared, so that neither 1e-30 nor 1e30 is lost.
+    A quaternion and its negative are the same rotation; the one whose first non-zero component is positive is taken.
+    Zero becomes the identity, with a length of 1. Components are divided by the largest before they are squared, so
+    that neither 1e-30 underflows nor 1e30 overflows.
 
     Args:
         quats: finite wxyz of any length.  # [N, 4]

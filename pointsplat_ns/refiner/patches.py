@@ -1,8 +1,8 @@
-"""A function of patches of points, a few patches at a time; see :mod:`~pointsplat_ns.refiner.rows` for why.
+"""Applies a function to patches of points, a few patches at a time; see :mod:`~pointsplat_ns.refiner.rows` for why.
 
 A patch is K points that are consecutive along a curve. A last patch of fewer points is filled up with the points before
-it, which keep the result of their own patch; with at most K points in all there is one patch. With K = 1 a patch is a
-point, and the function one of single rows.
+it, which keep the result of their own patch. With at most K points in all there is one patch. With K = 1 each patch is
+a single point.
 
 Shapes: N points, C channels, P patches of K points.
 """
@@ -60,6 +60,6 @@ def add_by_patches(
 
 
 def _whole_patches(n: int, patch: int) -> tuple[int, int]:
-    """Points of a patch where there are ``n`` in all, and points in whole patches."""
+    """Number of points in a patch if there are ``n`` in all, and number of points in whole patches."""
     patch = max(1, min(patch, n))
     return patch, n // patch * patch

@@ -47,8 +47,8 @@ class SubmanifoldConv(nn.Module):
 class PatchAttention(nn.Module):
     """Multi-head attention within patches of K points that are consecutive along a curve.
 
-    How a number of points that is no multiple of K is cut into patches is said in
-    :mod:`~pointsplat_ns.refiner.patches`; with at most K points in all this is plain attention.
+    :mod:`~pointsplat_ns.refiner.patches` describes the last patch if the number of points is not a multiple of K. With
+    at most K points in all, this is plain attention.
     """
 
     def __init__(self, channels: int, heads: int, patch: int):
@@ -71,7 +71,7 @@ class PatchAttention(nn.Module):
 
 
 class Block(nn.Module):
-    """Convolution as positional encoding, attention, MLP: each added to what came in."""
+    """Convolution as positional encoding, attention, MLP: each with a residual connection."""
 
     def __init__(self, channels: int, heads: int, config: RefinerConfig, drop_path: float):
         super().__init__()
@@ -99,14 +99,14 @@ class Block(nn.Module):
         patch: int = 1,
         order: Order | None = None,
     ) -> Tensor:
-        """``x + drop(branch(x))``, in place where neither gradients nor dropping need ``x`` itself; ``width`` is that
-        of the branch's widest layer, ``patch`` and ``order`` say which points it brings together."""
+        """``x + drop(branch(x))``, in place if neither gradients nor dropping need ``x``. ``width`` is that of the
+        branch's widest layer; ``patch`` and ``order`` define the patches."""
         if torch.is_grad_enabled() or self.training:
             return self._drop(by_patches(branch, x, width, patch, order)).add_(x)
         return add_by_patches(branch, x, width, patch, order)
 
     def _drop(self, x: Tensor) -> Tensor:
-        """In training, rows at random are set to zero and the others scaled up, so that the mean stays."""
+        """In training, random rows are set to zero and the others scaled up, so that the expected value is kept."""
         if not self.training or self.drop_path == 0:
             return x
         keep = 1 - self.drop_path
@@ -155,7 +155,7 @@ class Unpool(nn.Module):
 
 
 class PointTransformer(nn.Module):
-    """Encoder stages from fine to coarse, decoder stages back, with skips between equals."""
+    """Encoder stages from fine to coarse, decoder stages back, with skip connections between equal levels."""
 
     def __init__(self, in_channels: int, config: RefinerConfig):
         super().__init__()
@@ -194,7 +194,7 @@ class PointTransformer(nn.Module):
         return x
 
     def _curves(self) -> list[int]:
-        """Which curve each block of a stage follows: shuffled in training, as configured otherwise."""
+        """Indices of the curves for the blocks of a stage: shuffled in training, else in the configured order."""
         if not self.training:
             return list(range(self.num_curves))
         return torch.randperm(self.num_curves).tolist()

@@ -1,4 +1,4 @@
-"""The refiner: a scene in, the same scene with every parameter repaired out (paper eq. 4 to 7)."""
+"""The refiner: a network that repairs all parameters of a pruned scene (paper eq. 4 to 7)."""
 
 from __future__ import annotations
 
@@ -20,18 +20,17 @@ from pointsplat_ns.refiner.structure import Structure, build_structure, structur
 
 
 class Refiner(nn.Module):
-    """Adds to every parameter of a scene a residual that one feed-forward network computes.
+    """Adds a residual, computed by one feed-forward network, to every parameter of a scene.
 
-    Untrained, all residuals are zero and the scene comes out as it went in, to the bit. The one
-    exception is a zero quaternion, which comes out as the identity that it stands for.
+    In an untrained network all residuals are zero and the scene is unchanged to the bit, except that zero quaternions
+    become the identity.
 
-    Gaussians that cannot be drawn (``usable()`` of the container: NaN, or infinite where that means
-    nothing) come out as they went in, and the others as if those were not there. In evaluation a
-    Gaussian comes out as it went in, too, if the network's arithmetic would make it one of those;
-    in training such a value passes, so that the loss shows it.
+    Gaussians that cannot be drawn (see :meth:`~pointsplat_ns.gaussians.Gaussians.usable`) are returned unchanged and do
+    not affect the others. In evaluation a Gaussian is also returned unchanged if its refined values could not be drawn.
+    In training such values are returned, so that they show in the loss.
 
-    Residuals do not depend on the scene's unit and place, on the order of its Gaussians (in
-    evaluation; exact duplicates are interchangeable) or on the signs of its quaternions.
+    Residuals do not depend on the scene's unit and position, on the order of its Gaussians (in evaluation; exact
+    duplicates are interchangeable) or on the signs of its quaternions.
 
     Example:
         >>> from pointsplat_ns.refiner import Refiner, preset
@@ -48,10 +47,9 @@ class Refiner(nn.Module):
         self.heads = ResidualHeads(config.backbone_dim + config.encoded_dim, config)
 
     def prepare(self, scene: Gaussians) -> Structure | None:
-        """What the network needs to know of a scene's positions, on the scene's device.
+        """The neighbour tables of a scene, which depend on its positions, on the scene's device.
 
-        Build it once per scene and hand it to :meth:`forward` at every step. None for a scene of no
-        Gaussians that can be drawn.
+        Build them once per scene and pass them to :meth:`forward` at every step. None if no Gaussian can be drawn.
 
         Raises:
             SceneError: if the SH degree exceeds the network's.
@@ -68,11 +66,11 @@ class Refiner(nn.Module):
         return dataclasses.replace(build_structure(scene[usable], self.config), usable=usable)
 
     def forward(self, scene: Gaussians, structure: Structure | None = None) -> Gaussians:
-        """The refined scene, in the space, dtype and order of the given one.
+        """The refined scene, in the frame, dtype and order of the given one.
 
         Args:
-            scene: Gaussians of an SH degree up to the configuration's.
-            structure: of these positions, from :meth:`prepare`; built here if missing.
+            scene: N Gaussians of an SH degree up to the configuration's.
+            structure: the result of :meth:`prepare` for these positions; built here if None.
 
         Raises:
             SceneError: if the scene cannot be refined (see :meth:`prepare`).
@@ -100,7 +98,7 @@ class Refiner(nn.Module):
         return _put_back(refined[sound], sound, scene)
 
     def residuals(self, features: Features, structure: Structure) -> dict[str, Tensor]:
-        """The network proper: residuals by attribute, in network units and scene order. # {name: [N, size]}"""
+        """Residuals by attribute, in the network's units and the scene's order. # {name: [N, size]}"""
         encoded = self.encoder(features.permute(structure.order, structure.inverse))
         residuals = self.heads(torch.cat([self.backbone(encoded, structure), encoded], dim=1))
         return {name: permute(value, structure.inverse, structure.order) for name, value in residuals.items()}

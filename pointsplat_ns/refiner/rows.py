@@ -1,7 +1,7 @@
-"""Row by row, a few thousand rows at a time, so that what lies between two layers never leaves a CPU's cache.
+"""Applies row-wise functions to a few thousand rows at a time, so that intermediate results fit into a CPU's cache.
 
-A fresh tensor of tens of megabytes costs more than the matrix product that fills it: the system hands out every
-page of it anew. Tensors of a few megabytes are handed from one use to the next.
+Allocating a tensor of tens of megabytes takes longer than the matrix product that fills it, as the system provides each
+of its pages anew. The memory of tensors of a few megabytes is reused.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 CELLS = 2**20
-"""Numbers that the widest tensor of one go may hold on a CPU: 4 MB in float32."""
+"""Largest number of elements of the widest tensor in one call on a CPU: 4 MB in float32."""
 
 
 def rows_at_a_time(width: int, multiple: int = 1) -> int:
-    """Rows of ``width`` numbers that a CPU takes in one go: a multiple of ``multiple``, and at least that."""
+    """Number of rows of ``width`` elements that a CPU computes in one call: a positive multiple of ``multiple``."""
     return max(1, CELLS // (width * multiple)) * multiple
 
 
@@ -64,7 +64,7 @@ def add_rows(
     order: Tensor | None,  # [N] a permutation, or None
     start: int,
 ) -> None:
-    """Adds ``part`` in place to as many rows of ``x``, from place ``start`` along ``order`` on."""
+    """Add ``part`` in place to R rows of ``x``: those from ``start`` on along ``order``."""
     if order is None:
         x[start : start + len(part)] += part
     else:

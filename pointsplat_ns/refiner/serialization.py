@@ -16,7 +16,7 @@ from torch import Tensor
 from pointsplat_ns.geometry.morton import interleave, spread_bits
 
 LEVELS_AT_ONCE = 4
-"""Halvings that one look-up takes along the Hilbert curve: its table is 48 x 8^4 numbers, which a cache holds."""
+"""Levels of the Hilbert curve per table look-up: the table has 48 x 8^4 entries, which fit into the cache."""
 
 
 def curve_codes(coords: Tensor, bits: int, curves: Sequence[str]) -> list[Tensor]:
@@ -84,9 +84,9 @@ def _hilbert_states() -> tuple[Tensor, Tensor]:
     """The Hilbert curve as an automaton: digit and next state by state and octant, from state 0 on. # [48, 8] int64
 
     At each bit, a mirror or an exchange of axes applies to all lower bits, according to the octant,
-    and the octant is Gray-coded. A state is what has piled up: which axis each one reads, whether
-    mirrored, and the parity that the Gray code carries down. Source: J. Skilling, "Programming the
-    Hilbert curve", AIP Conference Proceedings 707 (2004).
+    and the octant is Gray-coded. A state is the composition of these so far: the source of each axis, whether it
+    is mirrored, and the parity of the Gray code. Source: J. Skilling, "Programming the Hilbert curve", AIP
+    Conference Proceedings 707 (2004).
     """
     State = tuple[tuple[int, ...], tuple[int, ...], int]
     states: dict[State, int] = {((0, 1, 2), (0, 0, 0), 0): 0}

@@ -1,7 +1,7 @@
-"""The three sparse operations of the network, each with its own backward.
+"""The sparse operations of the network: permutation, maximum and mean per cluster, submanifold convolution.
 
-Autograd's own backward of a gather accumulates row by row; where the indices are a permutation or
-the targets are distinct, that is a gather too. Nothing here allocates more than a few times [N, C].
+The first, second and fourth have a backward of their own. Autograd's backward of a gather accumulates row by row; for a
+permutation or distinct targets a gather is enough. Nothing here allocates more than a few times [N, C].
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from torch.autograd.function import once_differentiable
 from pointsplat_ns.refiner.rows import rows_at_a_time
 
 KernelMap = list[tuple[Tensor, Tensor]]
-"""Which cells each offset of a kernel brings together, from ``structure.neighbour_pairs``: for each offset in one half
-of the kernel, cells (i, j) with j at i + offset, (P,) int64 each."""
+"""Pairs of neighbouring cells, from ``structure.neighbour_pairs``: for each offset in one half of the kernel, the cells
+(i, j) with j at i + offset, (P,) int64 each."""
 
 
 class _Permute(Function):
@@ -63,7 +63,7 @@ def segment_max(
     cluster: Tensor,  # [N] int64 in [0, size), each value at least once
     size: int,
 ) -> Tensor:
-    """Maximum over the rows of each cluster; the gradient of a tie is shared out evenly. # [size, C]"""
+    """Maximum over the rows of each cluster; the gradient of a tie is divided evenly. # [size, C]"""
     return _SegmentMax.apply(x, cluster, size)
 
 
@@ -99,7 +99,7 @@ class _SubmanifoldConv(Function):
 
 
 def _parts(kernel_map: KernelMap, x: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """Offset and indices of all pairs; on a CPU as many at a time as its cache holds rows of."""
+    """Offset and indices of all pairs; on a CPU as many at a time as fit into its cache."""
     for k, (i, j) in enumerate(kernel_map):
         rows = rows_at_a_time(x.shape[1]) if x.device.type == "cpu" else max(1, len(i))
         for part_i, part_j in zip(i.split(rows), j.split(rows), strict=True):

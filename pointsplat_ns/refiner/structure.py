@@ -1,7 +1,7 @@
-"""Everything that the network derives from positions alone: built once per scene, used at every step.
+"""Neighbour tables and curve orders of a scene: derived from positions alone, built once, used at every step.
 
-Points are laid out in memory along the first curve of the configuration, so that the points of a
-cell are consecutive at every level and a gather of neighbours stays near in memory.
+Points are stored along the first curve of the configuration, so that the points of a cell are consecutive at every
+level, and neighbours are close in memory.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from pointsplat_ns.refiner.normalize import UnitCube, unit_cube
 from pointsplat_ns.refiner.serialization import curve_codes
 
 FIXED_GRID_BITS = 7
-"""With a fixed grid, each cell is split into 2^7 per axis for the finest code: 512 cells fill 16 bits."""
+"""With a fixed grid, the finest code splits each cell into 2^7 per axis: a grid of 512 then needs 16 bits."""
 
 ADAPTIVE_OCCUPANCY = 0.6
-"""An adapted grid is the coarsest whose occupied cells number at least this share of the distinct positions:
-one or two points a cell, with neighbours in the adjoining ones."""
+"""An adapted grid is the coarsest one with at least this many occupied cells per distinct position: one or two points
+per cell, with neighbours in the adjacent cells."""
 
 HALF_KERNEL = [
     (dx, dy, dz)
@@ -34,11 +34,11 @@ HALF_KERNEL = [
 """The 13 offsets of a 3x3x3 kernel that come after the centre; the other 13 are their negatives."""
 
 TABLE_PER_CELL = 128
-"""Neighbours are looked up in a table of the whole grid where that has at most this many entries, of 4 bytes, for each
-occupied cell, and searched for otherwise: three to eight times slower, at any size of the grid."""
+"""Neighbours are looked up in a table of the whole grid if it has at most this many entries (of 4 bytes) per occupied
+cell. Otherwise they are searched for, which works for any grid but is three to eight times slower."""
 
 TABLE_LIMIT = 2**26
-"""Most entries of that table: 256 MB."""
+"""Maximum number of entries of that table: 256 MB."""
 
 
 @dataclass(frozen=True)
@@ -147,22 +147,22 @@ def neighbour_pairs(cells: Tensor) -> list[tuple[Tensor, Tensor]]:
     side = int(cells.max()) + 3  # two empty cells after the last along each axis, so that no offset wraps around
     keys = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
     if side**3 <= min(TABLE_PER_CELL * m, TABLE_LIMIT):
-        found, j = _look_up(keys, side)
+        numbered, j = _look_up(keys, side)
     else:
-        found, j = _search(keys, side)
-    counts = torch.bincount(found // m, minlength=len(HALF_KERNEL)).tolist()
-    return list(zip((found % m).split(counts), j.split(counts), strict=True))
+        numbered, j = _search(keys, side)
+    counts = torch.bincount(numbered // m, minlength=len(HALF_KERNEL)).tolist()
+    return list(zip((numbered % m).split(counts), j.split(counts), strict=True))
 
 
 def _look_up(keys: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """Pairs by a table of the whole grid: number of the offset times M plus i, increasing, and j. # [P], [P]"""
+    """Pairs by a table of the whole grid: index of the offset times M plus i, increasing, and j. # [P], [P]"""
     table = torch.zeros(side**3, dtype=torch.int32, device=keys.device)
     table[keys] = torch.arange(1, len(keys) + 1, dtype=torch.int32, device=keys.device)
     steps = [[(dx * side + dy) * side + dz] for dx, dy, dz in HALF_KERNEL]
     target = keys.to(torch.int32) + torch.tensor(steps, dtype=torch.int32, device=keys.device)
     partner = table.index_select(0, target.flatten())
-    found = partner.nonzero()[:, 0]
-    return found, partner.index_select(0, found).long() - 1
+    numbered = partner.nonzero()[:, 0]
+    return numbered, partner.index_select(0, numbered).long() - 1
 
 
 def _search(keys: Tensor, side: int) -> tuple[Tensor, Tensor]:
@@ -190,9 +190,9 @@ def _search(keys: Tensor, side: int) -> tuple[Tensor, Tensor]:
 
 
 def _canonical_order(scene: Gaussians, codes: Tensor) -> tuple[Tensor, Tensor]:
-    """Indices of the scene sorted by code, ties by the parameters, and the bits of each code down to the highest in
-    which it differs from the one before: a cell of ``s`` bits less per axis begins where there are more than
-    ``3 * s``. # [N], [N]"""
+    """Indices of the scene sorted by code, with ties sorted by the parameters; and for each code the position, from 1,
+    of the highest bit in which it differs from the code before. With ``s`` bits dropped per axis, a new cell begins
+    where this exceeds ``3 * s``. # [N], [N]"""
     codes, order = codes.sort(stable=True)
     depths = torch.frexp((codes[1:] ^ codes[:-1]).double()).exponent
     depths = torch.cat([depths.new_full((1,), 64), depths])

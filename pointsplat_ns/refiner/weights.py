@@ -1,4 +1,4 @@
-"""Refiners on disk: safetensors, with the configuration and free metadata in the header."""
+"""Saves and reads refiners: safetensors files, with configuration and metadata in the header."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from pointsplat_ns.refiner.refiner import Refiner
 FORMAT = "pointsplat-refiner/1"
 
 PRETRAINED = Path(__file__).parent / "pretrained" / "refiner.safetensors"
-"""The refiner that ships; ``CARD.md`` beside it says what it was trained on and what it reaches."""
+"""The refiner that ships; ``CARD.md`` beside it describes its training and results."""
 
 
 class WeightsError(PointSplatError):
-    """A file that holds no usable refiner."""
+    """A file that does not hold a usable refiner."""
 
 
 def save_refiner(refiner: Refiner, path: str | Path, metadata: dict[str, Any] | None = None) -> None:
-    """Writes a refiner's configuration, parameters and running statistics.
+    """Write a refiner's configuration, parameters and running statistics.
 
     Args:
         refiner: on any device, of any floating type.
@@ -44,7 +44,7 @@ def save_refiner(refiner: Refiner, path: str | Path, metadata: dict[str, Any] | 
 
 
 def read_refiner(path: str | Path, device: torch.device | str = "cpu") -> Refiner:
-    """The refiner of a file, in evaluation mode.
+    """Read a refiner from a file; it is in evaluation mode.
 
     Raises:
         WeightsError: if the file is missing, damaged, of another kind, or its tensors do not fit.
@@ -72,7 +72,7 @@ def read_refiner(path: str | Path, device: torch.device | str = "cpu") -> Refine
 
 
 def read_metadata(path: str | Path) -> dict[str, Any]:
-    """What was given to :func:`save_refiner` as metadata.
+    """The metadata that was given to :func:`save_refiner`.
 
     Raises:
         WeightsError: if the file is missing, damaged or of another kind.
