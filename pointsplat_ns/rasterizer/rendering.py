@@ -185,10 +185,10 @@ def rasterization(
     skipped = count_meaningless(means, quats, scales, opacities)
     channels = []
     if render_mode.startswith("RGB"):
-        looks = [_finite_colors(s, colors, c, per_camera, sh_degree) for c, s in enumerate(seen)]
-        seen = [look[0] for look in looks]
-        channels.append(_cat([look[1] for look in looks]))
-        skipped += torch.cat([look[2] for look in looks]).unique().numel()
+        colored = [_finite_colors(s, colors, c, per_camera, sh_degree) for c, s in enumerate(seen)]
+        seen = [projected for projected, _, _ in colored]
+        channels.append(_cat([values for _, values, _ in colored]))
+        skipped += torch.cat([bad for _, _, bad in colored]).unique().numel()
     camera_ids = torch.cat([torch.full_like(s.ids, c) for c, s in enumerate(seen)])
     gaussian_ids = torch.cat([s.ids for s in seen])
     dense_ids = camera_ids * n + gaussian_ids
