@@ -14,7 +14,6 @@ from torch import Tensor
 from pointsplat_ns.compression.compact import Compacted, compact_scene
 from pointsplat_ns.compression.prune import check_options, prune_scene
 from pointsplat_ns.compression.trained_refiner import (
-    METHOD,
     TrainedRefiner,
     load_refiner,
     open_refiner_run,
@@ -23,7 +22,7 @@ from pointsplat_ns.compression.trained_refiner import (
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.runs import open_run
+from pointsplat_ns.io.runs import REFINER_METHOD, open_run
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning import Keep
@@ -262,7 +261,7 @@ def _read(scene: Source, views: Views | str | Path | None) -> tuple[Gaussians, V
 
 def _is_refiner_run(path: str | Path) -> bool:
     try:
-        return Path(path).suffix.lower() != ".ply" and open_run(path, need_data=False).method_name == METHOD
+        return Path(path).suffix.lower() != ".ply" and open_run(path, need_data=False).method_name == REFINER_METHOD
     except SceneError:
         return False  # a scene that stands alone, or nothing that can be read: who reads it says which
 

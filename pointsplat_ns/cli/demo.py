@@ -86,8 +86,8 @@ def train_and_judge(
         refiner_steps: training steps of the refiner.
         photos: number of photos of each room, their width and height in pixels.
     """
+    from pointsplat_ns.io.runs import REFINER_METHOD
     from pointsplat_ns.nerfstudio_plugin.commands import (
-        REFINER_METHOD,
         SCENE_METHOD,
         evaluate_command,
         run_folder,

@@ -16,14 +16,11 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.discovery import find_runs_and_plys, shown_scene
 from pointsplat_ns.io.files import one_line
-from pointsplat_ns.io.runs import Run, open_run
+from pointsplat_ns.io.runs import REFINER_METHOD, Run, open_run
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.pruning import PruneSettings, method_named
 from pointsplat_ns.refiner import Refiner, WeightsError, preset, read_metadata, read_refiner
 from pointsplat_ns.refiner.weights import PRETRAINED
-
-METHOD = "pointsplat"
-"""Name, in nerfstudio, of the method that trains refiners."""
 
 DEFAULTS = {"keep": 0.1, "by": "merge"}
 """Pruning settings of files of weights whose metadata has none."""
@@ -107,8 +104,8 @@ def open_refiner_run(path: Path | str, need_data: bool) -> Run:
         SceneError: if there is no run, or it is damaged or of another kind.
     """
     run = open_run(path, need_data)
-    if run.method_name != METHOD:
-        raise SceneError(f"{path}: a run of the method {run.method_name or 'unknown'}; expected a {METHOD} run")
+    if run.method_name != REFINER_METHOD:
+        raise SceneError(f"{path}: a run of the method {run.method_name or 'unknown'}; expected a {REFINER_METHOD} run")
     return run
 
 
@@ -166,12 +163,14 @@ def _read_run(run: Run) -> tuple[Refiner, PruneSettings]:
         state = torch.load(run.checkpoint, map_location="cpu", weights_only=True, mmap=True)["pipeline"]
         network.load_state_dict({k[len(_PREFIX) :]: v for k, v in state.items() if k.startswith(_PREFIX)})
     except KeyError as error:
-        raise SceneError(f"{run.config_path}: lacks {error}; expected a {METHOD} run of this version") from error
+        raise SceneError(
+            f"{run.config_path}: lacks {error}; expected a {REFINER_METHOD} run of this version"
+        ) from error
     except PointSplatError as error:
         raise SceneError(f"{run.config_path}: {error}") from error
     except Exception as error:  # a damaged archive can raise nearly anything
         text = " ".join(str(error).split())[:160]
-        raise SceneError(f"{run.checkpoint}: not a usable {METHOD} checkpoint ({text})") from error
+        raise SceneError(f"{run.checkpoint}: not a usable {REFINER_METHOD} checkpoint ({text})") from error
     return network, settings
 
 

@@ -26,6 +26,9 @@ CONFIG_NAME = "config.yml"
 TRANSFORMS_NAME = "dataparser_transforms.json"
 CHECKPOINT_FOLDER = "nerfstudio_models"
 
+REFINER_METHOD = "pointsplat"
+"""nerfstudio's name of the method that trains refiners."""
+
 _SPLATFACTO_FIELDS = {"sh_degree", "densify_grad_thresh", "rasterize_mode"}
 """Model settings that only Splatfacto and methods derived from it have."""
 
@@ -61,7 +64,7 @@ class Run:
     @property
     def is_gaussian_scene(self) -> bool:
         """Whether the checkpoint holds one Gaussian scene: Splatfacto or a method derived from it."""
-        if self.method_name == "pointsplat":  # a refiner for many scenes
+        if self.method_name == REFINER_METHOD:  # a refiner for many scenes
             return False
         return self.method_name.startswith("splatfacto") or self.model_fields.keys() >= _SPLATFACTO_FIELDS
 
@@ -146,18 +149,23 @@ def _settings(config: Tagged, *without: str) -> dict[str, Any]:
     return {key: value for key, value in config.fields.items() if not str(key).startswith("_") and key not in without}
 
 
+def step_of(checkpoint: Path) -> int | None:
+    """The training step in a checkpoint's name, ``step-N.ckpt``; None if the name is another."""
+    match = re.fullmatch(r"step-(\d{1,18})\.ckpt", checkpoint.name)
+    return int(match[1]) if match else None
+
+
 def _checkpoint(folder: Path, configured: Any, chosen: Path | None) -> tuple[Path, int]:
     """The checkpoint to use and its step."""
     if chosen is not None:
-        match = re.fullmatch(r"step-(\d{1,18})", chosen.stem)
-        return chosen, int(match[1]) if match else 0
+        return chosen, step_of(chosen) or 0
     inside = folder / configured if isinstance(configured, Path) and not configured.is_absolute() else None
     place = inside if inside is not None and inside.is_dir() else folder / CHECKPOINT_FOLDER
     steps = {}
     for file in place.glob("step-*.ckpt"):
-        match = re.fullmatch(r"step-(\d{1,18})\.ckpt", file.name)
-        if match:
-            steps[int(match[1])] = file
+        step = step_of(file)
+        if step is not None:
+            steps[step] = file
     for step in sorted(steps, reverse=True):
         if is_complete(steps[step]):
             return steps[step], step

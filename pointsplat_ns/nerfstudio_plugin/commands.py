@@ -7,7 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-SCENE_METHOD, REFINER_METHOD = "splatfacto-cpu", "pointsplat"
+from pointsplat_ns.io.runs import REFINER_METHOD
+
+SCENE_METHOD = "splatfacto-cpu"
+"""nerfstudio's name of the method that trains scenes."""
 
 Options = Mapping[str, Any]
 """Option name without its dashes -> value. A tuple or list becomes several words."""

@@ -9,6 +9,9 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer import rasterization
 
+VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
+"""Evaluation background of scenes trained with random backgrounds: the viewer's colour, as in Splatfacto."""
+
 
 @dataclass
 class RasterizerOptions:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -17,6 +16,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.io.runs import REFINER_METHOD, step_of
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 
@@ -109,21 +109,22 @@ class PointSplatTrainerConfig(TrainerConfig):
 def _steps_done(config: TrainerConfig) -> int:
     """Training steps in the checkpoint that a run resumes from, by the checkpoint's name; 0 for a new run."""
     if config.load_dir is None:
-        return 0 if config.load_checkpoint is None else _step_of(config.load_checkpoint) + 1
+        return 0 if config.load_checkpoint is None else _step_after(config.load_checkpoint)
     if config.load_step is not None:
         return config.load_step + 1
-    return max((_step_of(path) for path in config.load_dir.glob("step-*.ckpt")), default=-1) + 1
+    return max((_step_after(path) for path in config.load_dir.glob("step-*.ckpt")), default=0)
 
 
-def _step_of(checkpoint: Path) -> int:
-    match = re.fullmatch(r"step-(\d{1,18})", checkpoint.stem)
-    return int(match[1]) if match else -1
+def _step_after(checkpoint: Path) -> int:
+    """The step that follows a checkpoint's; 0 if its name does not say which that is."""
+    step = step_of(checkpoint)
+    return 0 if step is None else step + 1
 
 
 def pointsplat_config() -> TrainerConfig:
     """The ``pointsplat`` method: 2,000 steps, which take two CPU cores less than an hour on small scenes."""
     return PointSplatTrainerConfig(
-        method_name="pointsplat",
+        method_name=REFINER_METHOD,
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         max_num_iterations=2000,
         steps_per_save=500,

@@ -10,7 +10,8 @@ from typing import Any, Literal
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.nerfstudio_plugin.commands import REFINER_METHOD, SCENE_METHOD, evaluate_command, run_folder
+from pointsplat_ns.io.runs import REFINER_METHOD
+from pointsplat_ns.nerfstudio_plugin.commands import SCENE_METHOD, evaluate_command, run_folder
 from pointsplat_ns.nerfstudio_plugin.pointsplat.recipe import (
     KEEP,
     TRAIN_SEEDS,

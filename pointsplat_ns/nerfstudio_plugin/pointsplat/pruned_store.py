@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import re
 from pathlib import Path
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import one_line, replacing
+from pointsplat_ns.io.files import file_stem, one_line, replacing
 from pointsplat_ns.pruning import PruneSettings
 
 FORMAT = "pointsplat-pruned/1"
@@ -28,8 +27,7 @@ def stored_path(folder: Path, name: str, content: str, settings: PruneSettings) 
         settings: how the scene is pruned.
     """
     described = json.dumps([FORMAT, content, dataclasses.asdict(settings)], sort_keys=True)
-    readable = re.sub(r"[^\w.+-]+", "-", name).strip("-.") or "scene"
-    return folder / f"{readable}-{hashlib.sha256(described.encode()).hexdigest()[:16]}.safetensors"
+    return folder / f"{file_stem(name)}-{hashlib.sha256(described.encode()).hexdigest()[:16]}.safetensors"
 
 
 def write_pruned(path: Path, pruned: Gaussians, dense_count: int, seconds: float) -> None:

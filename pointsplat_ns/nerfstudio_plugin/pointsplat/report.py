@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pointsplat_ns.nerfstudio_plugin.pointsplat.results import VARIANTS, read_evaluation
-
-if TYPE_CHECKING:
-    pass
 
 PHOTOS = "photos"
 """The reference of evaluations that name none."""

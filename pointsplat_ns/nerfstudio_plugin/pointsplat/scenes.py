@@ -27,10 +27,8 @@ from pointsplat_ns.io.splatfacto import read_checkpoint
 from pointsplat_ns.nerfstudio_plugin.frames import Frames
 from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, PlyScene, SampledPoses, Split
+from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND
 from pointsplat_ns.views import RasterizeMode
-
-VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
-"""Evaluation background of scenes trained with random backgrounds: the viewer's colour, as in Splatfacto."""
 
 _NO_SEEDS = ("load_seed_points", "load_3D_points")
 """Dataparser settings that load seed points; a trained scene does not need them."""

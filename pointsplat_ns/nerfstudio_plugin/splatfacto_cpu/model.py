@@ -35,17 +35,13 @@ from pointsplat_ns.geometry.neighbours import nearest
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
-from pointsplat_ns.nerfstudio_plugin.rasterizer_options import RasterizerOptions
+from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND, RasterizerOptions
 
 LONE_POINT_SCALE = 0.01
 """Standard deviation, in scene units, of the first Gaussian of a scene with a single seed point."""
 
 HALF_LEVEL = 0.5 / 255
 """Half a step of an 8-bit colour. Seed colours keep this distance from 0 and 1, so that their logits are finite."""
-
-
-VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
-"""Evaluation background of scenes trained with random backgrounds: the viewer's colour, as in Splatfacto."""
 
 
 class LpipsMetric:
@@ -103,7 +99,7 @@ class SplatfactoCpuModel(SplatfactoModel):
         self.step = 0
         self.crop_box: OrientedBox | None = None
         self.background_color = (
-            torch.tensor(VISER_BACKGROUND)
+            torch.tensor(VIEWER_BACKGROUND)
             if config.background_color == "random"
             else get_color(config.background_color)
         )
