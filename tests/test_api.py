@@ -11,6 +11,7 @@ import logging
 import math
 import shutil
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
@@ -19,6 +20,7 @@ import pointsplat_ns as ps
 from making import ball, same
 from pointsplat_ns import api
 from pointsplat_ns.cli import main
+from pointsplat_ns.cli.scene_options import Bands
 from pointsplat_ns.compression.prune import SH_CHOICES
 from pointsplat_ns.pruning import METHODS, resolve_keep
 
@@ -117,6 +119,10 @@ def test_every_public_function_documents_its_arguments_and_has_types(name):
 @pytest.mark.parametrize("name", METHODS)
 def test_the_docstring_of_prune_names_every_method(name):
     assert f'"{name}"' in ps.prune.__doc__
+
+
+def test_the_command_line_has_the_same_choices_of_bands():
+    assert get_args(Bands) == SH_CHOICES
 
 
 @pytest.mark.parametrize("choice", SH_CHOICES)
