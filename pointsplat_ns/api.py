@@ -11,7 +11,7 @@ from typing import Literal
 
 from torch import Tensor
 
-from pointsplat_ns.compression.compact import Compacted, compact_scene
+from pointsplat_ns.compression.compact import Compacted, compact_scene, resolve_options
 from pointsplat_ns.compression.prune import check_options, prune_scene
 from pointsplat_ns.compression.trained_refiner import (
     TrainedRefiner,
@@ -206,8 +206,7 @@ def compact(
         (True, True)
     """
     refiner = refiner or load_refiner()
-    settings = refiner.settings
-    check_options(settings.keep if keep is None else keep, by or settings.by, sh)  # before the scene is read
+    resolve_options(refiner, keep, by, sh)  # before the scene is read
     dense, source = _read(scene, views)
     with progress_bar(progress) as report:
         result = compact_scene(dense, refiner, keep, by, sh, source, report)

@@ -50,13 +50,13 @@ def compact(
         force: overwrite existing files.
     """
     import pointsplat_ns as ps
-    from pointsplat_ns.compression.prune import check_options
+    from pointsplat_ns.compression.compact import resolve_options
     from pointsplat_ns.io import read_scene
 
     output = output or output_beside(scene, "compact")
     check_outputs(None if dry_run else output, picture, force)
     trained = ps.load_refiner(refiner)
-    check_options(trained.settings.keep if keep is None else keep, by or trained.settings.by, sh)
+    resolve_options(trained, keep, by, sh)
     dense = read_scene(scene)
     result = ps.compact(dense, keep, trained, by=by, sh=sh, views=scene, progress=True)
     if not dry_run:

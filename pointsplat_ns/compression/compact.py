@@ -102,10 +102,8 @@ def compact_scene(
         DataError: if the budget or ``sh`` needs views and there are none.
     """
     start = time.perf_counter()
-    settings = refiner.settings
-    by = settings.by if by is None else by
-    keep = check_options(settings.keep if keep is None else keep, by, sh)
-    weight = settings.opacity_weight if method_named(by).weighs_opacity else None
+    keep, by = resolve_options(refiner, keep, by, sh)
+    weight = refiner.settings.opacity_weight if method_named(by).weighs_opacity else None
     need_usable(dense)
     _need_sh_degree(dense, sh, refiner)
     views = views or ViewSource(dense)
@@ -132,6 +130,19 @@ def compact_scene(
         notes = (*notes, views.origin)
     scene, seconds = refined if accepted else pruned, time.perf_counter() - start
     return Compacted(scene, pruned, refined, strength, accepted, verdict, notes, reference, before, after, seconds)
+
+
+def resolve_options(refiner: TrainedRefiner, keep: Keep | str | None, by: str | None, sh: str) -> tuple[Keep, str]:
+    """Check the options of :func:`compact_scene` that do not depend on the scene, before a scene is read.
+
+    Returns:
+        ``keep``, parsed if it is text, and ``by``; those that the refiner was trained with if they are None.
+
+    Raises:
+        BudgetError, PointSplatError: as :func:`~pointsplat_ns.compression.prune.check_options`.
+    """
+    by = refiner.settings.by if by is None else by
+    return check_options(refiner.settings.keep if keep is None else keep, by, sh), by
 
 
 def _need_sh_degree(dense: Gaussians, sh: str, refiner: TrainedRefiner) -> None:

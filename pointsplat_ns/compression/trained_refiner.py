@@ -22,8 +22,9 @@ from pointsplat_ns.pruning import PruneSettings, method_named
 from pointsplat_ns.refiner import Refiner, WeightsError, preset, read_metadata, read_refiner
 from pointsplat_ns.refiner.weights import PRETRAINED
 
-DEFAULTS = {"keep": 0.1, "by": "merge"}
-"""Pruning settings of files of weights whose metadata has none."""
+DEFAULTS = {"keep": 0.1, "score": "merge"}
+"""Pruning settings of files of weights whose metadata has none; named as in the earliest files, so that any name of the
+method in the metadata takes precedence (see :func:`settings_from`)."""
 
 _PREFIX = "_model.refiner."
 
@@ -177,8 +178,6 @@ def _read_run(run: Run) -> tuple[Refiner, PruneSettings]:
 def _settings_of_file(path: Path) -> PruneSettings:
     """Pruning settings from the metadata of a file of weights."""
     metadata = read_metadata(path)
-    if "score" in metadata:  # the name in files of version 1
-        metadata = {"by": metadata["score"], **metadata}
     try:
         return settings_from({**DEFAULTS, **metadata})
     except (PointSplatError, KeyError, TypeError, ValueError) as error:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-import tyro
-
+from making import parsed_by_ns_train
 from pointsplat_ns.nerfstudio_plugin.commands import (
     evaluate_command,
     run_folder,
@@ -15,19 +14,8 @@ from pointsplat_ns.nerfstudio_plugin.commands import (
 )
 
 
-def parsed(command: str):
-    """What ns-train makes of a command line."""
-    from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
-
-    import method_configs.methods  # noqa: F401  (completes nerfstudio's imports in the order that it can)
-
-    program, *words = shlex.split(command)
-    assert program == "ns-train"
-    return tyro.cli(AnnotatedBaseConfigUnion, args=words)
-
-
 def test_the_command_of_a_scene_says_what_was_asked_for():
-    config = parsed(train_scene_command(Path("my rooms/a"), Path("my scenes"), "a", 30, "now", 500))
+    config = parsed_by_ns_train(train_scene_command(Path("my rooms/a"), Path("my scenes"), "a", 30, "now", 500))
     assert (config.method_name, config.max_num_iterations, config.data) == ("splatfacto-cpu", 30, Path("my rooms/a"))
     assert config.pipeline.datamanager.dataparser.num_seed_points == 500
     assert config.get_base_dir() == run_folder(Path("my scenes"), "a", "splatfacto-cpu", "now")
@@ -36,7 +24,7 @@ def test_the_command_of_a_scene_says_what_was_asked_for():
 def test_the_command_of_a_refiner_says_what_was_asked_for():
     options = {"pipeline.model.more-keeps": (0.25, 40.0), "pipeline.model.augment": True, "rate-factor": 2.5}
     command = train_refiner_command(Path("my scenes"), Path("out"), "r", 30, "now", ("a", "b"), options)
-    config = parsed(command)
+    config = parsed_by_ns_train(command)
     assert (config.method_name, config.max_num_iterations, config.rate_factor) == ("pointsplat", 30, 2.5)
     assert config.pipeline.datamanager.eval_scenes == ("a", "b") and config.data == Path("my scenes")
     assert config.pipeline.model.more_keeps == (0.25, 40.0) and config.pipeline.model.augment is True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import shutil
 from pathlib import Path
 
@@ -230,3 +231,17 @@ def without_data(runs: Path, folder: Path) -> Path:
     for config in folder.rglob("config.yml"):
         config.write_text(config.read_text().replace("- replica", "- gone_from_here"))
     return folder
+
+
+def parsed_by_ns_train(command: str):
+    """The config that ns-train makes of a command line."""
+    import tyro
+
+    from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstudio
+
+    import_nerfstudio()
+    from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+
+    program, *words = shlex.split(command)
+    assert program == "ns-train"
+    return tyro.cli(AnnotatedBaseConfigUnion, args=words)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 
 import pytest
 import torch
 
+from making import parsed_by_ns_train
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.pointsplat.recipe import (
     KEEP,
@@ -19,16 +19,6 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.recipe import (
 )
 from pointsplat_ns.rooms.camera_path import STYLES, capture_path
 from pointsplat_ns.rooms.room import make_room
-
-
-def parsed(command: str):
-    """What ns-train makes of a command line."""
-    import tyro
-    from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
-
-    program, *words = shlex.split(command)
-    assert program == "ns-train"
-    return tyro.cli(AnnotatedBaseConfigUnion, args=words)
 
 
 def test_unseen_rooms_are_not_trained_on():
@@ -47,7 +37,7 @@ def test_settings_follow_from_the_seed_and_differ_between_seeds():
 
 def test_the_scene_command_says_what_the_settings_say():
     settings = scene_settings(TRAIN_SEEDS[0])
-    config = parsed(settings.train_command(Path("rooms/a b"), Path("scenes"), "recipe"))
+    config = parsed_by_ns_train(settings.train_command(Path("rooms/a b"), Path("scenes"), "recipe"))
     model = config.pipeline.model
     assert config.method_name == "splatfacto-cpu" and config.experiment_name == settings.name
     assert config.max_num_iterations == settings.steps
@@ -60,7 +50,7 @@ def test_the_scene_command_says_what_the_settings_say():
 
 
 def test_the_refiner_command_holds_the_unseen_rooms_out():
-    config = parsed(refiner_command(Path("o/scenes"), Path("o/refiners"), "name", "recipe", "tiny", 70, 3))
+    config = parsed_by_ns_train(refiner_command(Path("o/scenes"), Path("o/refiners"), "name", "recipe", "tiny", 70, 3))
     manager, model = config.pipeline.datamanager, config.pipeline.model
     assert config.method_name == "pointsplat" and config.max_num_iterations == 70
     assert manager.eval_scenes == tuple(f"room{seed}" for seed in UNSEEN_SEEDS)
