@@ -7,8 +7,10 @@ the projection), centre, covariance and colour. The cost of a pair is the expect
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -45,7 +47,6 @@ class Merged:
     assignment: Tensor  # [N] int64, index in ``scene`` of the Gaussian that each was merged into; -1 if dropped
 
 
-@torch.no_grad()
 def merge(scene: Gaussians, k: int, progress: Callable[[float], None] | None = None) -> Merged:
     """Replace a scene by ``k`` Gaussians that look the same.
 
@@ -63,42 +64,79 @@ def merge(scene: Gaussians, k: int, progress: Callable[[float], None] | None = N
     Raises:
         BudgetError: if ``k`` is not in 1..N, or fewer than ``k`` Gaussians can be drawn.
     """
+    return next(merge_levels(scene, [k], progress))
+
+
+def merge_levels(
+    scene: Gaussians, counts: Sequence[int], progress: Callable[[float], None] | None = None
+) -> Iterator[Merged]:
+    """Replace a scene by fewer and fewer Gaussians in one pass.
+
+    Each level is merged from the one before: Gaussians that are one in a level are one in all that follow.
+
+    Args:
+        scene: N Gaussians, see :func:`merge`.
+        counts: number of Gaussians of each level, in 1..N, descending without repetition.
+        progress: called with the share done of all levels, in [0, 1].
+
+    Yields:
+        A level for each count, as soon as it is reached.
+
+    Raises:
+        BudgetError: if a count is not in 1..N, the counts do not descend, or the first is more than can be drawn.
+    """
     n = len(scene)
-    if not 1 <= k <= n:
-        raise BudgetError(f"cannot merge {n} Gaussians into {k}; expected 1 to {n}")
-    report = progress or (lambda share: None)
-    if k == n:
+    for k in counts:
+        if not 1 <= k <= n:
+            raise BudgetError(f"cannot merge {n} Gaussians into {k}; expected 1 to {n}")
+    if any(fewer >= more for more, fewer in itertools.pairwise(counts)):
+        raise BudgetError(f"levels of {', '.join(map(str, counts))} Gaussians; expected descending counts")
+    return _levels(scene, counts, progress or (lambda share: None))
+
+
+@torch.no_grad()
+def _levels(scene: Gaussians, counts: Sequence[int], report: Callable[[float], None]) -> Iterator[Merged]:
+    n = len(scene)
+    if n in counts:
+        yield Merged(scene, torch.arange(n, device=scene.device))
+        counts = counts[1:]
+    if not counts:
         report(1.0)
-        return Merged(scene, torch.arange(n, device=scene.device))
-    members = _visible(scene, k)
+        return
+    members = _visible(scene, counts[0])
     part = scene[members].to(device="cpu")
     owner = torch.arange(len(part))  # [len(part)] index in part of the Gaussian that each is merged into
     state = _start(part)
     alive = owner.clone()  # [len(state)] index in part of each remaining Gaussian
-    whole = max(len(part) - k, 1)
-    while len(state) > k:
-        first, second = _cheapest(state, k)
-        _replace(state, first, second)
-        owner[alive[second]] = alive[first]
-        left = torch.ones(len(state), dtype=torch.bool)
-        left[second] = False
-        alive = alive[left]
-        state.keep(left)
-        report(1 - (len(state) - k) / whole)
-    while bool((owner[owner] != owner).any()):
-        owner = owner[owner]
-    place = torch.full((len(part),), -1)
-    place[alive] = torch.arange(len(alive))
-    sizes = torch.bincount(place[owner], minlength=k)
-    state.alphas = _deepened(state.alphas, sizes)
-    replaced = _as_gaussians(state, part)
-    kept = part[alive]
-    pairs = zip(kept.tensors(), replaced.tensors(), strict=True)
-    merged = Gaussians(*(torch.where((sizes == 1).view(-1, *[1] * (a.dim() - 1)), a, b) for a, b in pairs))
-    assignment = torch.full((n,), -1, device=scene.device)
-    assignment[members] = place[owner].to(scene.device)
+    whole = max(len(part) - counts[-1], 1)
+    for k in counts:
+        while len(state) > k:
+            first, second = _cheapest(state, k)
+            _replace(state, first, second)
+            owner[alive[second]] = alive[first]
+            left = torch.ones(len(state), dtype=torch.bool)
+            left[second] = False
+            alive = alive[left]
+            state.keep(left)
+            report(1 - (len(state) - counts[-1]) / whole)
+        while bool((owner[owner] != owner).any()):
+            owner = owner[owner]
+        place = torch.full((len(part),), -1)
+        place[alive] = torch.arange(len(alive))
+        assignment = torch.full((n,), -1, device=scene.device)
+        assignment[members] = place[owner].to(scene.device)
+        merged = _merged(state, part, alive, torch.bincount(place[owner], minlength=k))
+        yield Merged(merged.to(scene.device), assignment)
     report(1.0)
-    return Merged(merged.to(scene.device), assignment)
+
+
+def _merged(state: Remaining, part: Gaussians, alive: Tensor, sizes: Tensor) -> Gaussians:
+    """The remaining Gaussians, of ``sizes`` (n,) members each, as a scene; those of one member as in ``part``, where
+    they are ``alive`` (n,)."""
+    deepened = dataclasses.replace(state, alphas=_deepened(state.alphas, sizes))
+    replaced, kept = _as_gaussians(deepened, part), part[alive]
+    pairs = zip(kept.tensors(), replaced.tensors(), strict=True)
+    return Gaussians(*(torch.where((sizes == 1).view(-1, *[1] * (a.dim() - 1)), a, b) for a, b in pairs))
 
 
 def _visible(scene: Gaussians, k: int) -> Tensor:
