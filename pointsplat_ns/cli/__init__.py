@@ -37,6 +37,7 @@ def main(args: list[str] | None = None) -> None:
     from pointsplat_ns.cli.compact import compact
     from pointsplat_ns.cli.demo import demo
     from pointsplat_ns.cli.export import export
+    from pointsplat_ns.cli.lod import lod
     from pointsplat_ns.cli.make_refiner import make_refiner
     from pointsplat_ns.cli.prune import prune
     from pointsplat_ns.cli.report import report
@@ -48,6 +49,7 @@ def main(args: list[str] | None = None) -> None:
     commands: dict[str, Callable[..., None]] = {
         "prune": prune,
         "compact": compact,
+        "lod": lod,
         "export": export,
         "report": report,
         "rooms": rooms,

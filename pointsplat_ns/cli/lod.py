@@ -1,0 +1,67 @@
+"""``pointsplat lod``: levels of detail."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pointsplat_ns.cli.scene_options import Bands, Output, Scene, output_beside
+
+if TYPE_CHECKING:
+    from pointsplat_ns.compression.levels import Levels
+
+
+def lod(
+    scene: Scene,
+    levels: tuple[str, ...] = ("50%", "25%", "10%", "3%"),
+    output: Output = None,
+    sh: Bands = "all",
+    force: bool = False,
+) -> None:
+    """Make levels of detail: the scene merged to fewer and fewer Gaussians in one pass, the error of each measured.
+
+    Each level is merged from the one before, so that every Gaussian has one parent in the next coarser level. Renders
+    are compared with the dense scene's, from the poses of the run's dataset if it is found, else from poses sampled in
+    free space.
+
+    Args:
+        scene: a 3DGS .ply, a Splatfacto checkpoint, or a run (its folder or config.yml).
+        levels: how much each level keeps, in any order: ratios (0.3), percentages (30%), counts (50000) or sizes of the
+            file (12MB).
+        output: the folder for the levels (level_0.ply is the finest), their parents, the manifest lod.json and the
+            picture lod.png; by default beside the scene: room_lod for room.ply, lod in the folder of a run.
+        sh: SH bands of every level: all, up to a degree, or auto, those without which renders stay within 40 dB.
+        force: overwrite existing files.
+    """
+    import pointsplat_ns as ps
+
+    folder = output or output_beside(scene, "lod").with_suffix("")
+    made = ps.lod(scene, levels, sh=sh, folder=folder, force=force, progress=True)
+    _print_table(made, folder)
+
+
+def _print_table(made: Levels, folder: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from pointsplat_ns.pruning import ply_bytes
+
+    numbers = ("Gaussians", "share", "MB", "PSNR, dB", "worst, dB", "SSIM", "seconds")
+    table = Table(caption="PSNR (of all views, of the worst) and SSIM are against the dense scene's own renders")
+    table.add_column("", no_wrap=True)
+    for name in numbers:
+        table.add_column(name, justify="right", no_wrap=True)
+    for index, level in enumerate(made):
+        near = level.errors and level.errors.near
+        table.add_row(
+            f"level_{index}",
+            f"{len(level.scene):,}",
+            f"{100 * len(level.scene) / len(made.dense):.3g} %",
+            f"{ply_bytes(len(level.scene), level.scene.sh_degree) / 1e6:.2f}",
+            f"{near.psnr:.1f}" if near else "-",
+            f"{near.worst:.1f}" if near else "-",
+            f"{near.ssim:.3f}" if near and near.ssim is not None else "-",
+            f"{level.seconds:.1f}",
+        )
+    print(f"{folder}: {len(made)} levels of {len(made.dense):,} Gaussians")
+    Console().print(table)

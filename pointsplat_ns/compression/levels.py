@@ -1,0 +1,275 @@
+"""Levels of detail: a scene merged to fewer and fewer Gaussians in one pass, the error of each level measured.
+
+Each level is merged from the one before, so levels are nested: every Gaussian of a level is in one Gaussian of the next
+coarser level, its parent.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.compression.closeness import DenseReference
+from pointsplat_ns.compression.distributions import size_quantiles
+from pointsplat_ns.compression.level_errors import (
+    Displacement,
+    RenderErrors,
+    displacement,
+    distance_seen,
+    render_errors,
+)
+from pointsplat_ns.compression.level_folder import LevelFolder, SourceFile
+from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.errors import BudgetError, DataError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import keep_usable
+from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, need_usable, parse_keep, resolve_keep
+from pointsplat_ns.pruning.merge import merge_levels
+from pointsplat_ns.system.progress import Progress, silent
+
+DEFAULT_LEVELS = ("50%", "25%", "10%", "3%")
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """One level of detail."""
+
+    scene: Gaussians
+    """K Gaussians."""
+    parents: Tensor  # [M] int32, index in ``scene`` of the parent of each Gaussian of the level before; -1 if dropped
+    dropped: int
+    """Number of Gaussians of the dense scene that are in none of this level, as they are too faint to be drawn."""
+    displacement: Displacement
+    """How far merging moved the centres of the dense scene's Gaussians, scene units."""
+    median_size: float
+    """Median of the Gaussians' largest standard deviations, scene units."""
+    errors: RenderErrors | None
+    """Errors of its renders against the dense scene's; None if there is no view."""
+    seconds: float
+    """Duration of merging from the level before."""
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """Levels of detail of a scene. ``len``, indices and iteration give each :class:`Level`, the finest first.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> levels = ps.lod(ps.example_room()[::20], ["50%", "10%"])
+        >>> [len(level.scene) for level in levels]
+        [1572, 314]
+        >>> whole = levels.assignment(1)  # which Gaussian of the second level each of the dense scene is in
+        >>> len(whole), int(whole.max())
+        (3143, 313)
+    """
+
+    dense: Gaussians
+    """The N Gaussians that the levels were made of, with all SH bands; those that cannot be drawn are left out."""
+    levels: tuple[Level, ...]
+    """The finest first."""
+    reference: DenseReference | None
+    """Renders of the dense scene that levels were compared with; None if there are no views."""
+    distance: float | None
+    """Median depth of what the views of ``reference`` show, scene units."""
+    origin: str
+    """Where those views came from."""
+    source: SourceFile | None
+    """The file that the dense scene was read from; None if it was given as Gaussians."""
+    notes: tuple[str, ...]
+    """Lines of text: SH bands dropped, where views came from, why nothing was compared."""
+
+    @property
+    def scenes(self) -> list[Gaussians]:
+        """The scene of each level."""
+        return [level.scene for level in self]
+
+    @property
+    def errors(self) -> list[RenderErrors | None]:
+        """The errors of each level's renders."""
+        return [level.errors for level in self]
+
+    def __len__(self) -> int:
+        return len(self.levels)
+
+    def __getitem__(self, index: int) -> Level:
+        return self.levels[index]
+
+    def __iter__(self) -> Iterator[Level]:
+        return iter(self.levels)
+
+    def assignment(self, index: int) -> Tensor:
+        """Index (N,) int64, in the level at ``index``, of the Gaussian that each of ``dense`` is in; -1 if dropped."""
+        *finer, last = (level.parents.long() for level in self.levels[: range(len(self))[index] + 1])
+        for parents in reversed(finer):
+            last = _parents_of_parents(parents, last)
+        return last
+
+    def save(self, folder: str | Path, force: bool = False) -> None:
+        """Write every level, the manifest and the picture to a folder, as ``pointsplat lod`` does.
+
+        Args:
+            folder: created if it is missing.
+            force: overwrite existing files.
+
+        Raises:
+            SceneError: if the folder cannot be used, or holds a file that must not be overwritten.
+        """
+        out = LevelFolder(folder, len(self), force)
+        for level in self:
+            out.write_level(level.scene, level.parents)
+        out.write_picture(self)
+        out.write_manifest(self)
+
+
+def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
+    """The text and the budget of each level, checked as far as that is possible without the scene.
+
+    Args:
+        levels: ratios, percentages, counts and sizes as for ``keep``; a text may hold several, separated by spaces.
+
+    Raises:
+        BudgetError: if there is none, or one is not a budget or can only be found by rendering.
+    """
+    levels = levels.split() if isinstance(levels, str) else levels
+    if not levels:
+        raise BudgetError("no level is asked for; expected at least one, such as 50%")
+    parsed: list[tuple[str, Keep]] = []
+    for level in levels:
+        text = level if isinstance(level, str) else _text(level)
+        try:
+            budget = parse_keep(level) if isinstance(level, str) else level
+        except BudgetError as error:
+            raise BudgetError(f"level {text}: {error}") from error
+        if isinstance(budget, WithinPsnr):
+            raise BudgetError(
+                f"level {text}: expected a ratio (0.3), a percentage (30%), a count (50000) or a size (12MB)"
+            )
+        parsed.append((text, budget))
+    return parsed
+
+
+def _text(level: Keep) -> str:
+    if isinstance(level, WithinPsnr):
+        return f"auto:{level.value:g}"
+    return f"{level.value:g}MB" if isinstance(level, Megabytes) else repr(level)
+
+
+def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int) -> list[int]:
+    """The number of Gaussians of each level of a scene of ``n``, descending.
+
+    Raises:
+        BudgetError: if a level does not fit the scene, or two levels mean the same number.
+    """
+    texts: dict[int, str] = {}
+    for text, budget in levels:
+        try:
+            count = resolve_keep(n, budget, sh_degree)
+        except BudgetError as error:
+            raise BudgetError(f"level {text}: {error}") from error
+        if count in texts:
+            raise BudgetError(f"levels {texts[count]} and {text} both mean {count} of {n} Gaussians; leave one out")
+        texts[count] = text
+    return sorted(texts, reverse=True)
+
+
+def make_levels(
+    dense: Gaussians,
+    levels: Sequence[Keep | str] | str = DEFAULT_LEVELS,
+    sh: str = "all",
+    views: ViewSource | None = None,
+    source: SourceFile | None = None,
+    folder: str | Path | None = None,
+    force: bool = False,
+    progress: Progress = silent,
+) -> Levels:
+    """Make levels of detail in one pass, measure each, and write each as soon as it is there.
+
+    Args:
+        dense: N Gaussians. Those that cannot be drawn are left out first, and their number is logged.
+        levels: see :func:`parse_levels`; in any order.
+        sh: SH bands of every level, as for :func:`~pointsplat_ns.compression.prune.prune_scene`.
+        views: source of the views that renders are compared in; by default poses sampled in free space.
+        source: the file that ``dense`` was read from, for the manifest.
+        folder: where to write; None writes nothing.
+        force: overwrite existing files.
+        progress: called with the name of the current task and the share of it that is done, in [0, 1].
+
+    Raises:
+        BudgetError: if a level does not fit the scene, or two mean the same number of Gaussians.
+        SceneError: if no Gaussian can be drawn, or the folder cannot be written to.
+        DataError: if ``sh`` needs views and there are none.
+        PointSplatError: if there is no such ``sh``.
+    """
+    budgets = parse_levels(levels)
+    out = None if folder is None else LevelFolder(folder, len(budgets), force)
+    need_usable(dense)
+    dense = keep_usable(dense, "the dense scene")
+    views = views or ViewSource(dense)
+    progress("rendering the dense scene", 0.0)
+    cut = prune_scene(dense, 1.0, sh=sh, views=views)
+    counts = level_counts(budgets, len(dense), cut.scene.sh_degree)
+    notes, reference, distance = cut.notes, None, None
+    try:
+        reference = DenseReference(dense, views.compared())
+        distance = distance_seen(dense, reference)
+    except DataError as error:
+        notes = (*notes, f"the levels' errors are not measured: {error}")
+    if views.origin and views.origin not in notes:
+        notes = (*notes, views.origin)
+    made: list[Level] = []
+
+    def so_far() -> Levels:
+        return Levels(dense, tuple(made), reference, distance, views.origin, source, notes)
+
+    before = torch.arange(len(dense), device=dense.device)  # [N] index in the level before of the one that each is in
+    start = time.perf_counter()
+    for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging")):
+        seconds = time.perf_counter() - start
+        parents = _parents(before, merged.assignment, len(made[-1].scene) if made else len(dense))
+        if out is not None:
+            out.write_level(merged.scene, parents)
+        errors = None
+        if reference is not None:
+            what = f"measuring level {len(made)} of {len(counts) - 1}"
+            errors = render_errors(reference, merged.scene, functools.partial(progress, what))
+        made.append(
+            Level(
+                scene=merged.scene,
+                parents=parents,
+                dropped=int((merged.assignment < 0).sum()),
+                displacement=displacement(dense, merged.scene, merged.assignment),
+                median_size=size_quantiles(merged.scene)[1],
+                errors=errors,
+                seconds=seconds,
+            )
+        )
+        if out is not None:
+            out.write_manifest(so_far(), complete=False)
+        before = merged.assignment
+        start = time.perf_counter()
+    result = so_far()
+    if out is not None:
+        out.write_picture(result)
+        out.write_manifest(result)
+    return result
+
+
+def _parents(finer: Tensor, coarser: Tensor, count: int) -> Tensor:
+    """Parent (count,) int32 of each Gaussian of a level in the next one, from the assignments (N,) to both; -1 if it
+    was dropped."""
+    parents = torch.full((count,), -1, dtype=torch.int32, device=finer.device)
+    kept = finer >= 0
+    parents[finer[kept]] = coarser[kept].int()
+    return parents
+
+
+def _parents_of_parents(parents: Tensor, further: Tensor) -> Tensor:
+    """Indices (M,) two levels on; -1 where dropped."""
+    return torch.where(parents >= 0, further[parents.clamp_min(0)], -1)
