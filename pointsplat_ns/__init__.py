@@ -21,9 +21,10 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from pointsplat_ns.api import compact, example_room, load, lpips, prune, refine
+    from pointsplat_ns.api import compact, example_room, load, lod, lpips, prune, refine
     from pointsplat_ns.compression.compact import Compacted
     from pointsplat_ns.compression.distributions import plot_distributions
+    from pointsplat_ns.compression.levels import Levels
     from pointsplat_ns.compression.pictures import plot_comparison
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
     from pointsplat_ns.compression.view_sampling import sample_views
@@ -39,9 +40,10 @@ if TYPE_CHECKING:
     from pointsplat_ns.views import View, Views
 
 _PUBLIC = {
-    "pointsplat_ns.api": ("compact", "example_room", "load", "lpips", "prune", "refine"),
+    "pointsplat_ns.api": ("compact", "example_room", "load", "lod", "lpips", "prune", "refine"),
     "pointsplat_ns.compression.compact": ("Compacted",),
     "pointsplat_ns.compression.distributions": ("plot_distributions",),
+    "pointsplat_ns.compression.levels": ("Levels",),
     "pointsplat_ns.compression.pictures": ("plot_comparison",),
     "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner"),
     "pointsplat_ns.compression.view_sampling": ("sample_views",),
@@ -65,6 +67,7 @@ __all__ = [
     "Compacted",
     "DataError",
     "Gaussians",
+    "Levels",
     "PointSplatError",
     "SceneError",
     "TrainedRefiner",
@@ -75,6 +78,7 @@ __all__ = [
     "example_room",
     "load",
     "load_refiner",
+    "lod",
     "lpips",
     "make_refiner",
     "plot_comparison",

@@ -6,12 +6,15 @@ The command line is a thin layer over these: what it can do, one call here can d
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
 from torch import Tensor
 
 from pointsplat_ns.compression.compact import Compacted, compact_scene, resolve_options
+from pointsplat_ns.compression.level_folder import check_folder, source_file
+from pointsplat_ns.compression.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
 from pointsplat_ns.compression.prune import check_options, prune_scene
 from pointsplat_ns.compression.trained_refiner import (
     TrainedRefiner,
@@ -212,6 +215,58 @@ def compact(
         result = compact_scene(dense, refiner, keep, by, sh, source, report)
     _log((result.verdict, *result.notes))
     return result
+
+
+def lod(
+    scene: Source,
+    levels: Sequence[Keep | str] | str = DEFAULT_LEVELS,
+    *,
+    sh: str = "all",
+    views: Views | str | Path | None = None,
+    folder: str | Path | None = None,
+    force: bool = False,
+    progress: bool | Progress = False,
+) -> Levels:
+    """Make levels of detail: a scene merged to fewer and fewer Gaussians in one pass, the error of each measured.
+
+    Each level is merged from the one before, so levels are nested: every Gaussian has one parent in the next coarser
+    level.
+
+    Args:
+        scene: N Gaussians, or where to read them: a PLY, a checkpoint, or a Splatfacto run.
+        levels: how much each level keeps, as for :func:`prune` but for "auto"; in any order.
+        sh: SH bands of every level, as for :func:`prune`.
+        views: where renders are compared, as for :func:`prune`; at most 12 are taken.
+        folder: where to write each level as soon as it is there, a manifest and a picture; see :meth:`Levels.save`.
+        force: overwrite existing files in ``folder``.
+        progress: True shows a bar; a function is called with what is being done and the share done of it.
+
+    Returns:
+        The levels, the finest first, with exactly as many Gaussians as asked for; their errors, and the parents of
+        each Gaussian: see :class:`Levels`.
+
+    Raises:
+        BudgetError: if a level does not fit the scene, or two mean the same number of Gaussians.
+        SceneError: if no Gaussian can be drawn, or a file or the folder is not usable.
+        DataError: if ``sh`` needs views and none can be had.
+        PointSplatError: if there is no such ``sh``.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> levels = ps.lod(ps.example_room()[::20], ["50%", "25%", 100])
+        >>> [(len(level.scene), level.errors.near.psnr > 10) for level in levels]
+        [(1572, True), (786, True), (100, True)]
+    """
+    budgets = parse_levels(levels)  # this and the next before the scene is read
+    check_options(1.0, "merge", sh)
+    if folder is not None:
+        check_folder(Path(folder), len(budgets), force)
+    dense, view_source = _read(scene, views)
+    source = None if isinstance(scene, Gaussians) else source_file(scene)
+    with progress_bar(progress) as report:
+        made = make_levels(dense, levels, sh, view_source, source, folder, force, report)
+    _log(made.notes)
+    return made
 
 
 def lpips(pred: Tensor, target: Tensor, net: Literal["alex", "vgg"] = "alex") -> Tensor:
