@@ -1,0 +1,122 @@
+"""pointsplat lod: that it writes what ps.lod gives, where, and what it prints."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pointsplat_ns as ps
+from making import ball
+from pointsplat_ns.cli import main
+from pointsplat_ns.cli.lod import lod
+from pointsplat_ns.compression.levels import DEFAULT_LEVELS
+
+
+@pytest.fixture()
+def ply(tmp_path) -> Path:
+    ps.save(ball(400, opacity=1.0, bright=1.0), tmp_path / "room.ply")
+    return tmp_path / "room.ply"
+
+
+def run(*args) -> None:
+    main([str(a) for a in args])
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options"),
+    [
+        ((), {}),
+        (("--levels", "10%", "0.5", "20", "--sh", "0"), {"levels": [0.5, "10%", 20], "sh": "0"}),
+        (("--levels", "0.01MB"), {"levels": ["0.01MB"]}),
+    ],
+)
+def test_pointsplat_lod_writes_what_lod_gives_bit_for_bit(arguments, options, ply, tmp_path):
+    run("lod", ply, *arguments, "-o", tmp_path / "by_command")
+    ps.lod(ply, **options).save(tmp_path / "by_api")
+    assert contents(tmp_path / "by_command") == contents(tmp_path / "by_api")
+
+
+def test_the_command_line_has_the_same_default_levels():
+    assert inspect.signature(lod).parameters["levels"].default == DEFAULT_LEVELS
+
+
+def test_levels_are_written_beside_the_scene_and_printed(ply, capsys):
+    run("lod", ply)
+    folder = ply.with_name("room_lod")
+    manifest = json.loads((folder / "lod.json").read_text("utf-8"))
+    said = capsys.readouterr().out
+    assert f"{folder}: 4 levels of 400 Gaussians" in said and "poses sampled in free space" in said
+    rows = [line for line in said.splitlines() if "level_" in line]
+    for index, (row, level) in enumerate(zip(rows, manifest["levels"], strict=True)):
+        cells = [cell.strip() for cell in row.strip("│").split("│")]
+        assert cells[:2] == [f"level_{index}", f"{level['count']:,}"]
+        assert cells[3:7] == [
+            f"{level['bytes'] / 1e6:.2f}",
+            f"{level['psnr']:.1f}",
+            f"{level['worst_psnr']:.1f}",
+            f"{level['ssim']:.3f}",
+        ]
+    assert [level["count"] for level in manifest["levels"]] == [200, 100, 40, 12]
+    assert (folder / "lod.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_run_gets_its_levels_in_its_folder_seen_from_its_dataset(trained_walls, tmp_path, capsys):
+    (trained,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
+    shutil.copytree(trained, tmp_path / "run")
+    before = set((tmp_path / "run").rglob("*"))
+    run("lod", tmp_path / "run", "--levels", "50%")
+    folder = tmp_path / "run" / "lod"
+    assert set((tmp_path / "run").rglob("*")) - before == {folder, *folder.iterdir()}
+    manifest = json.loads((folder / "lod.json").read_text("utf-8"))
+    (checkpoint,) = (tmp_path / "run" / "nerfstudio_models").iterdir()
+    assert manifest["source"]["file"] == checkpoint.name and manifest["source"]["bytes"] == checkpoint.stat().st_size
+    assert manifest["views"]["origin"] == "poses of the dataset"
+    assert len(np.load(folder / "level_0_parents.npy")) == manifest["source"]["count"]
+
+
+def test_what_exists_is_only_overwritten_by_force(ply, capsys):
+    folder = ply.with_name("room_lod")
+    folder.mkdir()
+    (folder / "level_0.ply").write_text("precious")
+    with pytest.raises(SystemExit) as caught:
+        run("lod", ply, "--levels", "50%")
+    said = capsys.readouterr()
+    assert caught.value.code == 1 and said.out == ""
+    assert "level_0.ply: exists already" in said.err and "--force" in said.err
+    assert contents(folder) == {"level_0.ply": b"precious"}
+    run("lod", ply, "--levels", "50%", "--force")
+    assert len(ps.load(folder / "level_0.ply")) == 200
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--levels", "50%", "200"), "levels 50% and 200 both mean 200 of 400 Gaussians"),
+        (("--levels", "auto:35"), "level auto:35: expected a ratio"),
+        (("--levels", "401"), "level 401: keep is 401 Gaussians"),
+        (("-o", "levels.ply"), "levels.ply: levels are several files; expected the name of a folder"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_one_line_and_writes_nothing(arguments, message, ply, tmp_path, capsys):
+    with pytest.raises(SystemExit) as caught:
+        run("lod", ply, *arguments)
+    said = capsys.readouterr()
+    assert caught.value.code == 1 and said.out == ""
+    [line] = said.err.splitlines()
+    assert line.startswith("error: ") and message in line
+    assert [path.name for path in tmp_path.iterdir()] == ["room.ply"]
+
+
+def test_what_is_no_scene_is_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        run("lod", tmp_path / "gone.ply")
+    assert "gone.ply: no such file; expected a 3DGS .ply" in capsys.readouterr().err

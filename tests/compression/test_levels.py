@@ -1,0 +1,422 @@
+"""Levels of detail: how many Gaussians, that they are nested, and that the manifest is true."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from making import ball, normal_scene, same
+from pointsplat_ns.compression import levels as levels_module
+from pointsplat_ns.compression.closeness import DenseReference
+from pointsplat_ns.compression.level_errors import FARTHER, displacement, distance_seen, render_errors
+from pointsplat_ns.compression.level_folder import file_names
+from pointsplat_ns.pruning import ply_bytes
+from pointsplat_ns.pruning.merge import merge, merge_levels
+
+ASKED = ("50%", "25%", "10%", "3%")
+
+
+@pytest.fixture(scope="module")
+def scene() -> ps.Gaussians:
+    """A ball of which one Gaussian in ten is too faint to be drawn. Shared, so do not write to it."""
+    scene = ball(400, opacity=1.0, bright=1.0)
+    scene.opacities[::10] = -9.0
+    return scene
+
+
+@pytest.fixture(scope="module")
+def views(scene) -> ps.Views:
+    return ps.sample_views(scene, 3, 48, 36)
+
+
+@pytest.fixture(scope="module")
+def levels(scene, views) -> ps.Levels:
+    return ps.lod(scene, ASKED, views=views)
+
+
+@pytest.fixture(scope="module")
+def folder(scene, views, tmp_path_factory) -> Path:
+    """What is written while levels are made from a file."""
+    place = tmp_path_factory.mktemp("lod")
+    ps.save(scene, place / "ball.ply")
+    ps.lod(place / "ball.ply", ASKED, views=views, folder=place / "out")
+    return place / "out"
+
+
+def manifest_of(folder: Path) -> dict:
+    """The manifest, read as strictly as a browser does."""
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is no JSON")
+
+    return json.loads((folder / "lod.json").read_text("utf-8"), parse_constant=refuse)
+
+
+def test_every_level_has_exactly_as_many_gaussians_as_asked_for_the_finest_first(scene, levels):
+    assert [len(level.scene) for level in levels] == [200, 100, 40, 12]
+    assert [len(s) for s in levels.scenes] == [200, 100, 40, 12] and len(levels) == 4
+    assert all(level.scene.sh_degree == scene.sh_degree for level in levels)
+
+
+def test_levels_may_be_given_in_any_order_and_form(scene, levels, views):
+    mixed = ps.lod(scene, [12, "25%", 0.1, "200"], views=views)
+    for one, other in zip(levels, mixed, strict=True):
+        assert same(one.scene, other.scene) and torch.equal(one.parents, other.parents)
+    assert [len(level.scene) for level in ps.lod(scene, "40 3%", views=views)] == [40, 12]
+
+
+def test_a_level_by_size_fits_into_its_file(scene, views, tmp_path):
+    ps.lod(scene, ["0.02MB", "0.005MB"], views=views, folder=tmp_path / "out")
+    row = ply_bytes(1, scene.sh_degree) - ply_bytes(0, scene.sh_degree)
+    for index, limit in enumerate((20_000, 5_000)):
+        size = (tmp_path / "out" / f"level_{index}.ply").stat().st_size
+        assert size <= limit < size + row + 1  # one more, and perhaps another digit of the count, would not fit
+
+
+def test_the_first_level_is_what_prune_gives(scene, levels):
+    assert same(levels[0].scene, ps.prune(scene, "50%"))
+
+
+def test_composing_parents_gives_where_merging_put_each_gaussian(scene, levels):
+    for index, merged in enumerate(merge_levels(scene, [200, 100, 40, 12])):
+        assert torch.equal(levels.assignment(index), merged.assignment)
+        assert torch.equal(levels.assignment(index - len(levels)), merged.assignment)
+    with pytest.raises(IndexError):
+        levels.assignment(4)
+
+
+def test_levels_are_nested(levels):
+    before = levels.assignment(0)
+    for index, level in enumerate(levels):
+        assert level.parents.dtype == torch.int32
+        assert len(level.parents) == (len(levels[index - 1].scene) if index else len(levels.dense))
+        kept = level.parents[level.parents >= 0]
+        assert sorted(set(kept.tolist())) == list(range(len(level.scene))), "every Gaussian has a child"
+        if index:
+            assert len(kept) == len(level.parents), "what is in a level is in all coarser ones"
+        after = levels.assignment(index)
+        for group in range(int(before.max()) + 1):
+            assert len(after[before == group].unique()) == 1, "what is one in a level stays one"
+        before = after
+
+
+def test_gaussians_too_faint_to_be_drawn_are_dropped_and_counted(levels):
+    for index, level in enumerate(levels):
+        assert level.dropped == 40 == int((levels.assignment(index) < 0).sum())
+    assert torch.equal((levels[0].parents < 0).nonzero()[:, 0], torch.arange(0, 400, 10))
+
+
+def test_the_manifest_is_true_of_the_files(folder, scene):
+    manifest = manifest_of(folder)
+    assert (manifest["format"], manifest["version"], manifest["complete"]) == ("pointsplat-lod", 1, True)
+    source = (folder.parent / "ball.ply").read_bytes()
+    assert manifest["source"] == {
+        "file": "ball.ply",
+        "bytes": len(source),
+        "sha256": hashlib.sha256(source).hexdigest(),
+        "count": 400,
+        "sh_degree": 1,
+    }
+    named = {"lod.json", "lod.png"}
+    finer = 400
+    for level, count in zip(manifest["levels"], (200, 100, 40, 12), strict=True):
+        for facts in (level, level["parents"]):
+            content = (folder / facts["file"]).read_bytes()
+            assert (facts["bytes"], facts["sha256"]) == (len(content), hashlib.sha256(content).hexdigest())
+            named.add(facts["file"])
+        read = ps.load(folder / level["file"])
+        assert (len(read), read.sh_degree) == (level["count"], level["sh_degree"]) == (count, 1)
+        assert level["share"] == count / 400
+        assert level["median_size"] == pytest.approx(float(read.stds.amax(dim=1).quantile(0.5, interpolation="higher")))
+        parents = np.load(folder / level["parents"]["file"])
+        assert parents.shape == (finer,) and parents.dtype == np.int32 and parents.max() == count - 1
+        finer = count
+    assert {path.name for path in folder.iterdir()} == named
+    corners = {"min": scene.means.amin(dim=0).tolist(), "max": scene.means.amax(dim=0).tolist()}
+    assert manifest["bounds"]["all"] == corners
+    content = manifest["bounds"]["content"]
+    inside = ((scene.means >= torch.tensor(content["min"])) & (scene.means <= torch.tensor(content["max"]))).double()
+    assert all(0.85 < share < 0.95 for share in inside.mean(dim=0).tolist())
+
+
+def psnr(mean_square: np.ndarray | float) -> float:
+    return -10 * math.log10(mean_square)
+
+
+def test_the_errors_in_the_manifest_are_those_of_the_files(folder, scene, views):
+    manifest = manifest_of(folder)
+    assert manifest["views"]["origin"] == "given views"
+    assert [manifest["views"][key] for key in ("count", "width", "height")] == [3, 48, 36]
+    dense = [ps.render(scene, view) for view in views]
+    for level in manifest["levels"]:
+        read = ps.load(folder / level["file"])
+        images = [ps.render(read, view) for view in views]
+        gaps = np.stack([(a.double() - b.double()).numpy() for a, b in zip(images, dense, strict=True)])  # [C, H, W, 3]
+        assert level["mse"] == pytest.approx((gaps**2).mean(), rel=1e-9)
+        assert level["psnr"] == pytest.approx(psnr((gaps**2).mean()), abs=1e-6)
+        assert level["worst_psnr"] == pytest.approx(psnr((gaps**2).mean(axis=(1, 2, 3)).max()), abs=1e-6)
+        similar = [float(ps.ssim(a, b)) for a, b in zip(images, dense, strict=True)]
+        assert level["ssim"] == pytest.approx(sum(similar) / 3, abs=1e-6)
+        assert [error["times"] for error in level["psnr_farther"]] == [2, 4, 8, 16]
+        for error in level["psnr_farther"]:
+            side = error["times"]
+            whole = gaps[:, : 36 // side * side, : 48 // side * side]
+            blocks = whole.reshape(3, 36 // side, side, 48 // side, side, 3).mean(axis=(2, 4))
+            assert error["psnr"] == pytest.approx(psnr((blocks**2).mean()), abs=1e-6)
+
+
+def test_the_displacements_in_the_manifest_follow_from_the_files(folder):
+    manifest, dense = manifest_of(folder), ps.load(folder.parent / "ball.ply")
+    at = np.arange(len(dense))
+    for level in manifest["levels"]:
+        parents = np.load(folder / level["parents"]["file"])
+        at = np.where(at >= 0, parents[at], -1)
+        means = ps.load(folder / level["file"]).means.double()
+        moved = [float((dense.means[i].double() - means[k]).norm()) for i, k in enumerate(at) if k >= 0]
+        assert level["dropped"] == (at < 0).sum() == 40
+        assert level["displacement"]["rms"] == pytest.approx(np.sqrt(np.mean(np.square(moved))), rel=1e-9)
+        assert level["displacement"]["median"] == pytest.approx(np.median(moved), rel=1e-9)
+        assert level["displacement"]["p95"] == pytest.approx(np.percentile(moved, 95), rel=1e-9)
+
+
+def test_save_writes_what_is_written_on_the_way(folder, views, tmp_path):
+    ps.lod(folder.parent / "ball.ply", ASKED, views=views).save(tmp_path / "saved")
+    assert contents(tmp_path / "saved") == contents(folder)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_a_scene_given_as_gaussians_has_no_file_in_the_manifest(levels, tmp_path):
+    levels.save(tmp_path / "out")
+    source = manifest_of(tmp_path / "out")["source"]
+    assert source == {"file": None, "bytes": None, "sha256": None, "count": 400, "sh_degree": 1}
+
+
+@pytest.mark.parametrize("after", [0, 1, 2])
+def test_an_interruption_leaves_whole_files_and_a_manifest_that_is_true_of_them(
+    after, scene, views, tmp_path, monkeypatch
+):
+    measured = []
+
+    def interrupted(*args, **options):
+        if len(measured) == after:
+            raise KeyboardInterrupt
+        measured.append(render_errors(*args, **options))
+        return measured[-1]
+
+    monkeypatch.setattr(levels_module, "render_errors", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        ps.lod(scene, ASKED, views=views, folder=tmp_path / "out")
+    written = {name for index in range(after + 1) for name in file_names(index)}
+    assert set(contents(tmp_path / "out")) == written | ({"lod.json"} if after else set())
+    for index, count in enumerate((200, 100, 40)[: after + 1]):
+        assert len(ps.load(tmp_path / "out" / f"level_{index}.ply")) == count
+        assert np.load(tmp_path / "out" / f"level_{index}_parents.npy").max() == count - 1
+    if after:
+        manifest = manifest_of(tmp_path / "out")
+        assert manifest["complete"] is False
+        assert [level["count"] for level in manifest["levels"]] == [200, 100][:after]
+        assert [level["psnr"] for level in manifest["levels"]] == [errors.near.psnr for errors in measured]
+
+
+def test_an_interruption_while_overwriting_leaves_no_manifest_of_other_files(
+    folder, scene, views, tmp_path, monkeypatch
+):
+    out = tmp_path / "out"
+    ps.lod(scene, ["5%"], views=views, folder=out)
+    assert (out / "lod.json").exists() and (out / "lod.png").exists()
+
+    def interrupt(*args, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(levels_module, "render_errors", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        ps.lod(scene, ["50%"], views=views, folder=out, force=True)
+    assert set(contents(out)) == set(file_names(0))
+    assert len(ps.load(out / "level_0.ply")) == 200
+
+
+@pytest.mark.parametrize("taken", ["lod.json", "lod.png", "level_0.ply", "level_3_parents.npy"])
+def test_existing_files_are_only_overwritten_by_force(taken, scene, levels, tmp_path):
+    (tmp_path / "other.txt").write_text("mine")
+    (tmp_path / taken).write_text("precious")
+    for refused in (lambda: ps.lod("not_there.ply", ASKED, folder=tmp_path), lambda: levels.save(tmp_path)):
+        with pytest.raises(ps.SceneError, match=f"{taken}: exists already; name another folder, or .* --force"):
+            refused()
+    assert {name: text.decode() for name, text in contents(tmp_path).items()} == {
+        "other.txt": "mine",
+        taken: "precious",
+    }
+    levels.save(tmp_path, force=True)
+    assert (tmp_path / taken).read_bytes() != b"precious" and (tmp_path / "other.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("file", "is a file; expected the name of a folder"), ("small.ply", "levels are several files")],
+)
+def test_a_folder_that_cannot_be_one_is_refused_before_a_scene_is_read(name, message, tmp_path):
+    (tmp_path / "file").write_text("precious")
+    with pytest.raises(ps.SceneError, match=message):
+        ps.lod("not_there.ply", folder=tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ([], "no level is asked for"),
+        ("", "no level is asked for"),
+        (["half"], "level half: keep is 'half'"),
+        (["50%", "auto"], "level auto: expected a ratio"),
+        (["auto:35"], "level auto:35: expected a ratio"),
+    ],
+)
+def test_levels_that_fit_no_scene_are_refused_before_one_is_read(asked, message):
+    with pytest.raises(ps.BudgetError, match=message):
+        ps.lod("not_there.ply", asked)
+    with pytest.raises(ps.PointSplatError, match="sh is '4'"):
+        ps.lod("not_there.ply", sh="4")
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        (["0"], "level 0: keep is 0 Gaussians; expected 1 to 400"),
+        (["50%", "401"], "level 401: keep is 401 Gaussians"),
+        (["150%"], "level 150%: keep is 1.5"),
+        ([0.5, 1.5], r"level 1\.5: keep is 1.5"),
+        (["nan"], "level nan: keep is nan"),
+        (["0.0001MB"], "level 0.0001MB: keep is 0.0001MB, too small for one Gaussian"),
+        ([True], "level True: keep is True"),
+        (["50%", "0.5"], "levels 50% and 0.5 both mean 200 of 400 Gaussians; leave one out"),
+        (["50%", "10%", 200], "levels 50% and 200 both mean 200"),
+    ],
+)
+def test_levels_that_do_not_fit_the_scene_are_refused_and_nothing_is_written(asked, message, scene, tmp_path):
+    with pytest.raises(ps.BudgetError, match=message):
+        ps.lod(scene, asked, folder=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_level_of_all_gaussians_is_the_scene_itself(scene, views, tmp_path):
+    levels = ps.lod(scene, ["100%", "10%"], views=views, folder=tmp_path / "out")
+    assert same(levels[0].scene, scene) and same(ps.load(tmp_path / "out" / "level_0.ply"), scene)
+    assert torch.equal(levels[0].parents, torch.arange(400, dtype=torch.int32))
+    assert torch.equal(levels.assignment(1), merge(scene, 40).assignment)
+    first, second = manifest_of(tmp_path / "out")["levels"]
+    assert (first["mse"], first["psnr"], first["worst_psnr"]) == (0, None, None), "JSON has no infinity"
+    assert first["displacement"] == {"rms": 0, "median": 0, "p95": 0} and first["dropped"] == 0
+    assert second["mse"] > 0 and second["psnr"] > 0 and second["dropped"] == 40
+
+
+@pytest.mark.parametrize("asked", ["100%", "1"])
+def test_a_scene_of_one_gaussian_has_one_level(asked, tmp_path):
+    one = normal_scene(1)
+    levels = ps.lod(one, [asked], folder=tmp_path / "out")
+    assert same(levels[0].scene, one) and levels[0].parents.tolist() == [0]
+    assert manifest_of(tmp_path / "out")["levels"][0]["count"] == 1
+    with pytest.raises(ps.BudgetError, match="levels 50% and 25% both mean 1 of 1 Gaussians"):
+        ps.lod(one)
+
+
+def test_where_nothing_can_be_seen_levels_are_made_and_not_measured(scene, tmp_path):
+    faint = scene.replace(opacities=torch.full_like(scene.opacities, -7.0))
+    levels = ps.lod(faint, ["50%"], folder=tmp_path / "out")
+    assert levels.errors == [None] and levels.reference is None and len(levels[0].scene) == 200
+    assert any(note.startswith("the levels' errors are not measured: no free place") for note in levels.notes)
+    manifest = manifest_of(tmp_path / "out")
+    assert manifest["views"] is None and manifest["levels"][0]["psnr"] is None and manifest["complete"]
+    assert set(contents(tmp_path / "out")) == {*file_names(0), "lod.json"}
+
+
+def test_gaussians_that_cannot_be_drawn_are_left_out_before_all_else(scene, views, tmp_path, caplog):
+    spoiled = ps.Gaussians(*(value.clone() for value in scene.tensors()))
+    spoiled.means[5], spoiled.scales[7] = math.nan, math.inf
+    levels = ps.lod(spoiled, ["50%", "10%"], views=views, folder=tmp_path / "out")
+    assert "dropped 2 of 400" in caplog.text
+    assert len(levels.dense) == len(levels.assignment(0)) == 398
+    assert [len(ps.load(tmp_path / "out" / f"level_{i}.ply")) for i in (0, 1)] == [199, 40]
+    with pytest.raises(ps.SceneError, match="none of the 400 Gaussians can be drawn"):
+        ps.lod(scene.replace(means=scene.means * math.nan))
+
+
+def test_bands_are_cut_for_all_levels_and_the_error_is_against_all_bands(scene, views):
+    cut = ps.lod(scene, ["100%", "10%"], sh="0", views=views)
+    assert [level.scene.sh_degree for level in cut] == [0, 0] and cut.dense.sh_degree == 1
+    assert 0 < cut[0].errors.near.error < cut[1].errors.near.error
+    assert any(note.startswith("SH degree 1 cut to 0") for note in cut.notes)
+    assert same(cut[1].scene, ps.prune(scene, "10%", sh="0"))
+
+
+def test_errors_are_those_that_compact_and_auto_budgets_go_by(scene, views, levels):
+    reference = DenseReference(scene, views)
+    for level in levels:
+        assert level.errors.near == reference.closeness(level.scene)
+        assert [level.errors.view_psnr(i) for i in range(3)] == pytest.approx(
+            [float(ps.psnr(ps.render(level.scene, v).double(), ps.render(scene, v).double())) for v in views]
+        )
+
+
+def test_views_smaller_than_a_square_lack_it(scene):
+    views = ps.sample_views(scene, 1, 12, 9)
+    levels = ps.lod(scene, ["10%"], views=views)
+    assert list(levels[0].errors.farther) == [side for side in FARTHER if side <= 9]
+    assert levels[0].errors.near.ssim is None, "SSIM's window is larger, too"
+
+
+def test_the_same_scene_gives_the_same_bits(scene, views, levels):
+    again = ps.lod(scene, ASKED, views=views)
+    for one, other in zip(levels, again, strict=True):
+        assert same(one.scene, other.scene) and one.errors == other.errors and one.displacement == other.displacement
+
+
+def test_progress_may_be_watched(scene, views):
+    steps = []
+    ps.lod(scene, ["50%", "10%"], views=views, progress=lambda what, share: steps.append((what, share)))
+    assert list(dict.fromkeys(what for what, _ in steps)) == [
+        "rendering the dense scene",
+        "merging",
+        "measuring level 0 of 1",
+        "measuring level 1 of 1",
+    ]
+    assert all(0 <= share <= 1 for _, share in steps)
+
+
+def test_the_distance_is_that_of_what_is_seen():
+    rows = torch.linspace(-3, 3, 40)
+    places = torch.cartesian_prod(rows, rows)
+    n = len(places)
+    wall = ps.Gaussians(
+        means=torch.cat([places, torch.full((n, 1), 2.5)], dim=1),
+        scales=torch.tensor([0.15, 0.15, 1e-3]).log().repeat(n, 1),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+        opacities=torch.full((n, 1), 5.0),
+        features_dc=torch.zeros(n, 3),
+        features_rest=torch.zeros(n, 0, 3),
+    )
+    K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]])
+    ahead = ps.Views(torch.eye(4)[None], K[None], 64, 48, torch.zeros(3))
+    assert distance_seen(wall, DenseReference(wall, ahead)) == pytest.approx(2.5, abs=1e-4)
+    behind = ps.Views(torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))[None], K[None], 64, 48, torch.zeros(3))
+    assert distance_seen(wall, DenseReference(wall, behind)) is None
+    assert ps.lod(wall, ["50%"], views=ahead).distance == pytest.approx(2.5, abs=1e-4)
+
+
+@pytest.mark.parametrize("size", [1e-30, 1.0, 1e30])
+def test_displacements_neither_overflow_nor_vanish(size):
+    dense, level = normal_scene(4), normal_scene(2)
+    dense = dense.replace(means=torch.tensor([[0.0, 0, 0], [3, 4, 0], [0, 0, 0], [9, 9, 9]]) * size)
+    level = level.replace(means=torch.tensor([[0.0, 0, 0], [0, 0, 2]]) * size)
+    moved = displacement(dense, level, torch.tensor([0, 0, 1, -1]))
+    assert moved.rms == pytest.approx(math.sqrt(29 / 3) * size, rel=1e-6)
+    assert moved.median == pytest.approx(2 * size, rel=1e-6)
+    assert moved.p95 == pytest.approx((2 + 0.9 * 3) * size, rel=1e-6)
