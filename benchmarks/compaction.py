@@ -1,157 +1,154 @@
 """What is lost when a scene is made smaller, by every method at hand, before any refinement.
 
-    python benchmarks/compaction.py outputs/kitchen/splatfacto-cpu/TIME scene.ply --json compaction.json
+    python benchmarks/compaction.py outputs/kitchen/splatfacto-cpu/TIME scene.ply --methods merge --json compaction.json
     python benchmarks/compaction.py RUN --sweep          # lambda from 0.1 to 0.9 of the scores "paper" and "authors"
-    python benchmarks/compaction.py --speed              # 1M synthetic Gaussians: seconds and peak memory
+    python benchmarks/compaction.py --speed              # 1M synthetic Gaussians: every score, and merging
+    python benchmarks/compaction.py --scaling            # merging 100k to 10M synthetic Gaussians: time and memory
 
 Renders are compared with the dense scene's own and, for runs, with held-out photos, at the size that the run was
 trained at; a PLY is looked at from poses sampled in its free space. With Node and @playcanvas/splat-transform
-(``npm install @playcanvas/splat-transform``) its ``--decimate`` is a row too, at the same counts in the same run.
+(``npm install @playcanvas/splat-transform``) its modes are rows too, at the same counts in the same run. Every program
+runs as a process of its own that reads the same PLY and writes one; its time and peak memory are those of that process.
 """
 
 from __future__ import annotations
 
 import json
-import math
-import resource
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
-from held_out import COLUMNS, Scene, compare, load, lpips_or_none
+from compaction_tables import PAIRS, Row, averages, lead_table, leads, table
+from held_out import Scene, compare, load, lpips_or_none, name_of
+from processes import Reducer, Usage, pointsplat_prune
 from rich.console import Console
-from rich.table import Table
-from splat_transform import NAME, SplatTransform
+from scaling import print_score_times, scaling_rows, scaling_table, slope_table, slopes
+from splat_transform import NAME, peers_of
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import write_ply
+from pointsplat_ns.io import read_scene, write_ply
+from pointsplat_ns.io.files import replacing
 from pointsplat_ns.metrics import psnr
 from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.pruning import METHODS, prune
+from pointsplat_ns.system.progress import tracked
 
 NEED_NO_VIEWS = tuple(name for name, method in METHODS.items() if not method.needs_views)
 SWEEP = tuple(round(0.1 * i, 1) for i in range(1, 10))
+SPEED = (1_000_000,)
+SCALING = (100_000, 300_000, 1_000_000, 3_000_000, 10_000_000)
 
 
 def rows_of(
-    scene: Scene, keeps: tuple[float, ...], methods: tuple[str, ...], peer: SplatTransform, lpips: Lpips | None
-) -> Iterator[dict]:
-    """One row for each budget and method."""
+    scene: Scene, keeps: tuple[float, ...], inside: tuple[str, ...], programs: list[Reducer], lpips: Lpips | None
+) -> Iterator[Row]:
+    """One row for each budget and way: methods called within this process, then programs."""
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "dense.ply"
-        if not peer.missing:
+        if programs:
             write_ply(scene.dense, source)
         for keep in keeps:
-            count = max(1, round(keep * len(scene.dense)))
-            for method in methods:
-                start = time.perf_counter()
-                small = prune(scene.dense, count, method)
-                seconds = time.perf_counter() - start
-                yield _row(scene, keep, method, small, seconds, lpips)
-            if not peer.missing:
-                small, seconds = peer.decimate(source, count)
-                yield _row(scene, keep, peer.label, small, seconds, lpips)
+            count = count_of(keep, len(scene.dense))
+            for method in inside:
+                small, usage = _pruned(scene.dense, count, method)
+                yield _row(scene, keep, method, small, usage, lpips)
+            for program in programs:
+                small, usage = program.reduce(source, count)
+                yield _row(scene, keep, program.label, small, usage, lpips)
 
 
-def sweep_rows(scene: Scene, keeps: tuple[float, ...], lpips: Lpips | None) -> Iterator[dict]:
+def sweep_rows(scene: Scene, keeps: tuple[float, ...], lpips: Lpips | None) -> Iterator[Row]:
     """The paper's Table 3: the weight of opacity against that of volume."""
     for keep in keeps:
         for method in ("paper", "authors"):
             for weight in SWEEP:
-                start = time.perf_counter()
-                small = prune(scene.dense, keep, method, opacity_weight=weight)
-                seconds = time.perf_counter() - start
-                yield _row(scene, keep, f"{method} {weight}", small, seconds, lpips)
+                small, usage = _pruned(scene.dense, count_of(keep, len(scene.dense)), method, weight)
+                yield _row(scene, keep, f"{method} {weight}", small, usage, lpips)
 
 
-def _row(scene: Scene, keep: float, method: str, small: Gaussians, seconds: float, lpips: Lpips | None) -> dict:
-    metrics = compare(scene, small, lpips)
-    return {"scene": scene.name, "keep": keep, "method": method, "count": len(small), "seconds": seconds, **metrics}
+def count_of(keep: float, gaussians: int) -> int:
+    """The number that a share means; every program is given the number."""
+    return max(1, round(keep * gaussians))
 
 
-def averages(rows: list[dict]) -> list[dict]:
-    """Over scenes, for each budget and method."""
-    grouped: dict[tuple, list[dict]] = {}
-    for row in rows:
-        grouped.setdefault((row["keep"], row["method"]), []).append(row)
-    result = []
-    for (keep, method), group in grouped.items():
-        mean = {"scene": "average", "keep": keep, "method": method}
-        for name in group[0].keys() - mean.keys():
-            values = [row[name] for row in group if row[name] is not None]
-            mean[name] = fmean(values) if values else None
-        result.append(mean)
-    return result
+def _pruned(dense: Gaussians, count: int, method: str, weight: float | None = None) -> tuple[Gaussians, Usage]:
+    start, cpu_start = time.perf_counter(), time.process_time()
+    small = prune(dense, count, method, opacity_weight=weight)
+    return small, Usage(time.perf_counter() - start, time.process_time() - cpu_start, None)
 
 
-def table(rows: list[dict]) -> Table:
-    """A rich table; a dash for what cannot be had."""
-    shown = Table(title="against the dense scene's renders | against held-out photos")
-    for name in ("scene", "kept", "method", "splats", "s"):
-        shown.add_column(name, justify="left" if name in ("scene", "method") else "right")
-    for against in ("dense", "photo"):
-        for name in COLUMNS:
-            shown.add_column(f"{against} {name.upper()}", justify="right")
-    before = None
-    for row in rows:
-        key = (row["scene"], row["keep"])
-        if before not in (None, key):
-            shown.add_section()
-        numbers = [
-            "-" if row[f"{a}_{c}"] is None else f"{row[f'{a}_{c}']:.{2 if c == 'psnr' else 3}f}"
-            for a in ("dense", "photo")
-            for c in COLUMNS
-        ]
-        start = [row["scene"], f"{100 * row['keep']:g} %"] if before != key else ["", ""]
-        shown.add_row(*start, row["method"], f"{row['count']:,.0f}", f"{row['seconds']:.2f}", *numbers)
-        before = key
-    return shown
+def _row(scene: Scene, keep: float, method: str, small: Gaussians, usage: Usage, lpips: Lpips | None) -> Row:
+    about = {"scene": scene.name, "keep": keep, "method": method, "gaussians": len(scene.dense), "count": len(small)}
+    return about | vars(usage) | compare(scene, small, lpips)
 
 
-def synthetic(n: int, seed: int = 0) -> Gaussians:
-    """``n`` flat Gaussians of degree 3 on the walls of a room, of smooth colours and mixed sizes."""
-    g = torch.Generator().manual_seed(seed)
-    means = 2 * torch.rand(n, 3, generator=g) - 1
-    wall = torch.randint(0, 3, (n,), generator=g)
-    means[torch.arange(n), wall] = means[torch.arange(n), wall].sign() + 0.005 * torch.randn(n, generator=g)
-    scales = math.log(4 / math.sqrt(n)) + 0.6 * torch.randn(n, 3, generator=g)
-    scales[torch.arange(n), wall] -= 2.0
-    quats = torch.tensor([1.0, 0, 0, 0]) + 0.1 * torch.randn(n, 4, generator=g)
-    colours = torch.sin(3 * means) + 0.2 * torch.randn(n, 3, generator=g)
-    rest = 0.05 * torch.randn(n, 15, 3, generator=g)
-    return Gaussians(means, scales, quats, torch.randn(n, 1, generator=g), colours, rest)
+class Results:
+    """The rows of all scenes, in a file that is written anew after each.
+
+    Args:
+        path: the JSON file; None for none.
+        settings: what rows depend on beside the scene.
+        resume: take up the rows that the file has.
+
+    Raises:
+        SystemExit: if the file to take up cannot be read or was written with other settings.
+    """
+
+    def __init__(self, path: Path | None, settings: dict[str, Any], resume: bool):
+        self.path, self.settings = path, json.loads(json.dumps(settings))
+        self.rows: list[Row] = []
+        if resume and path is None:
+            raise SystemExit("--resume without --json; expected the file to take up")
+        if resume and path is not None and path.exists():
+            try:
+                content = json.loads(path.read_text("utf-8"))
+                self.rows, known = content["rows"], content["settings"]
+            except (OSError, ValueError, KeyError, TypeError) as error:
+                raise SystemExit(f"{path}: cannot be taken up ({error!r}); give another --json") from error
+            other = [name for name in self.settings if self.settings[name] != known.get(name)]
+            if other:
+                found = ", ".join(f"{name} {known.get(name)}, now {self.settings[name]}" for name in other)
+                raise SystemExit(f"{path}: was written with {found}; expected the same, or another --json")
+
+    def of(self, name: str, path: Path) -> list[Row]:
+        """The rows of a scene that are there, if it still has as many Gaussians."""
+        rows = [row for row in self.rows if row["scene"] == name]
+        return rows if rows and len(read_scene(path)) == rows[0]["gaussians"] else []
+
+    def add(self, name: str, rows: list[Row]) -> None:
+        """Put the rows of a scene in the place of those there are, and write."""
+        self.rows = [row for row in self.rows if row["scene"] != name] + rows
+        content = {"rows": self.rows, "averages": averages(self.rows), "leads": leads(self.rows)}
+        write_json(self.path, {"settings": self.settings} | content)
 
 
-def speed(gaussians: int) -> None:
-    """Time of every score (median of 5) and of merging to a tenth, with the peak of the process's memory."""
-    scene = synthetic(gaussians)
-    print(f"{gaussians:,} Gaussians of SH degree 3 on {torch.get_num_threads()} threads")
-    for name in NEED_NO_VIEWS:
-        score, times = METHODS[name].score, []
-        if score is None:
-            continue
-        for _ in range(5):
-            start = time.perf_counter()
-            score(scene)
-            times.append(time.perf_counter() - start)
-        print(f"  {name:12s} {sorted(times)[2]:7.3f} s")
-    before = _peak_gigabytes()
-    start = time.perf_counter()
-    merged = prune(scene, max(1, gaussians // 10), "merge")
-    seconds = time.perf_counter() - start
-    peak = f"peak memory {_peak_gigabytes():.2f} GB ({before:.2f} GB before)"
-    print(f"  merge to {len(merged):,} {seconds:.1f} s, {peak}")
+def write_json(path: Path | None, content: dict[str, Any]) -> None:
+    """Write a file whole or not at all; no path, no file."""
+    if path is not None:
+        with replacing(path) as part:
+            part.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
 
 
-def _peak_gigabytes() -> float:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1e9 if sys.platform == "darwin" else 1e6)  # bytes there, kilobytes elsewhere
+def measure_scaling(counts: tuple[int, ...], sh_degree: int, programs: list[Reducer], path: Path | None) -> None:
+    """Print what making synthetic scenes smaller takes."""
+    rows: list[Row] = []
+    for row in scaling_rows(counts, sh_degree, programs):
+        rows.append(row)
+        took = row["failed"] or f"{row['seconds']:.1f} s, {row['peak_bytes'] / 1e6:,.0f} MB"
+        print(f"{row['gaussians']:,} {row['method']}: {took}", flush=True)
+        write_json(path, {"rows": rows, "slopes": slopes(rows)})
+    console().print(scaling_table(rows), slope_table(slopes(rows)))
+
+
+def console() -> Console:
+    """Wide enough for the tables where standard output is a file."""
+    return Console(width=None if sys.stdout.isatty() else 200)
 
 
 @torch.no_grad()
@@ -160,50 +157,79 @@ def main(
     keep: tuple[float, ...] = (0.5, 0.3, 0.1, 0.03),
     methods: tuple[str, ...] = NEED_NO_VIEWS,
     views: int = 8,
-    splat_transform: str | None = None,
+    splat_transform: tuple[str, ...] = (),
+    in_process: bool = False,
     lpips: bool = True,
     sweep: bool = False,
-    speed_only: Annotated[bool, tyro.conf.arg(name="speed")] = False,
-    gaussians: int = 1_000_000,
+    speed: bool = False,
+    scaling: bool = False,
+    gaussians: tuple[int, ...] = (),
+    sh_degree: int = 3,
     json_path: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
+    resume: bool = False,
 ) -> None:
     """Print tables of what every method loses.
 
     Args:
         scenes: Splatfacto runs, judged in their held-out views, and PLY files.
         keep: shares of the Gaussians to keep.
-        methods: rows.
+        methods: rows; "merge" alone gives the table that compares it with splat-transform.
         views: at most so many views of each scene.
-        splat_transform: the program, if ``npx --no-install splat-transform`` does not find it.
+        splat_transform: programs, of any versions, each of whose modes is a row; by default the one that
+            ``npx --no-install splat-transform`` finds.
+        in_process: call our methods within this process: faster, but the seconds leave out starting, reading and
+            writing, and there is no peak memory.
         lpips: whether to compute LPIPS.
         sweep: the scores "paper" and "authors" over their lambda, in place of all methods.
-        speed_only: only measure time and memory, on synthetic Gaussians.
-        gaussians: how many of these.
-        json_path: write all rows there.
+        speed: only the times of all scores, and time and memory of merging, on synthetic Gaussians.
+        scaling: only time and memory of merging to a tenth, on synthetic Gaussians of several numbers.
+        gaussians: these numbers; by default 1 million for the speed, and 100,000 to 10 million for the scaling.
+        sh_degree: of the synthetic Gaussians.
+        json_path: write all rows there, after each scene.
+        resume: take up the rows of that file: scenes that it has are not measured again.
     """
-    if speed_only:
-        speed(gaussians)
+    peers, missing = ([], "") if sweep else peers_of(splat_transform)
+    if speed or scaling:
+        counts = gaussians or (SCALING if scaling else SPEED)
+        for n in counts if speed else ():
+            print_score_times(n, sh_degree)
+        measure_scaling(counts, sh_degree, [pointsplat_prune("merge"), *peers], json_path)
         return
+    names = [name_of(path) for path in scenes]
     if not scenes:
-        raise SystemExit("no scene named; expected runs or PLY files, or --speed")
+        raise SystemExit("no scene named; expected runs or PLY files, or --speed or --scaling")
+    if len({*names}) < len(names):
+        raise SystemExit(f"two scenes have one name: {', '.join(names)}; expected different ones")
     network = lpips_or_none(lpips)
-    peer = SplatTransform(splat_transform) if not sweep else None
-    rows: list[dict] = []
-    console = Console(width=None if sys.stdout.isatty() else 150)
-    for path in scenes:
-        scene = load(path, views)
-        found = list(sweep_rows(scene, keep, network) if peer is None else rows_of(scene, keep, methods, peer, network))
-        against = f", dense against photos {_dense_psnr(scene):.2f} dB" if scene.photos else ""
-        print(f"{scene.name}: {len(scene.dense):,} Gaussians, {len(scene.renders)} views{against}")
-        console.print(table(found))
-        rows += found
-    mean = averages(rows)
+    inside = methods if in_process else ()
+    programs = [*([] if in_process else map(pointsplat_prune, methods)), *peers]
+    ways = ["sweep"] if sweep else [*inside, *(program.label for program in programs)]
+    settings = {"keep": keep, "methods": ways, "views": views, "in_process": in_process, "lpips": network is not None}
+    results = Results(json_path, settings, resume)
+    shown: list[Row] = []
+    for name, path in zip(names, scenes, strict=True):
+        rows = results.of(name, path)
+        if rows:
+            print(f"{name}: as {json_path} has it")
+        else:
+            scene = load(path, views)
+            against = f", dense against photos {_dense_psnr(scene):.2f} dB" if scene.photos else ""
+            print(f"{name}: {len(scene.dense):,} Gaussians, {len(scene.renders)} views{against}", flush=True)
+            if sweep:
+                found, total = sweep_rows(scene, keep, network), 2 * len(SWEEP)
+            else:
+                found, total = rows_of(scene, keep, inside, programs, network), len(ways)
+            rows = list(tracked(found, name, len(keep) * total))
+            results.add(name, rows)
+        console().print(table(rows))
+        shown += rows
     if len(scenes) > 1:
-        console.print(table(mean))
-    if peer is not None and peer.missing:
-        print(f"{NAME}: - ({peer.missing})")
-    if json_path is not None:
-        json_path.write_text(json.dumps({"rows": rows, "averages": mean}, indent=1), "utf-8")
+        console().print(table(averages(shown)))
+    for column in PAIRS:
+        if (compared := lead_table(leads(shown), column)) is not None:
+            console().print(compared)
+    if missing:
+        print(f"{NAME}: - ({missing})")
 
 
 def _dense_psnr(scene: Scene) -> float:

@@ -65,9 +65,9 @@ def rows(scene: ps.Gaussians, keeps: tuple[float, ...], peer: SplatTransform | N
             result = ps.compact(scene, keep, refiner, by="merge")
             note = f"accepted at {result.strength:.0%}" if result.accepted else "left out"
             yield row("`compact`", keep, result.scene, result.seconds, note)
-            if peer is not None and not peer.missing:
-                small, seconds = peer.decimate(source, max(1, round(keep * len(scene))))
-                yield row(peer.label, keep, small, seconds)
+            for mode in peer.modes if peer is not None else ():
+                small, usage = mode.reduce(source, max(1, round(keep * len(scene))))
+                yield row(mode.label, keep, small, usage.seconds)
 
 
 def megabytes(scene: ps.Gaussians) -> float:
@@ -84,10 +84,10 @@ def markdown(title: str, found: list[Row], keeps: tuple[float, ...], cell) -> st
     return "\n".join(lines)
 
 
-def _place(method: str) -> int:
+def _place(method: str) -> tuple[int, str]:
     """Where a method stands in the tables."""
     shown = ("`prune` (merge)", "`compact`", NAME, "`prune --by coverage`", "`prune --by paper`")
-    return next(index for index, start in enumerate(shown) if method.startswith(start))
+    return next(index for index, start in enumerate(shown) if method.startswith(start)), method
 
 
 @torch.no_grad()

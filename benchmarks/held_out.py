@@ -17,8 +17,8 @@ from pointsplat_ns.io import open_run, read_scene
 from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.rasterizer import render
-from pointsplat_ns.views import Views
+from pointsplat_ns.rasterizer import rasterization, render
+from pointsplat_ns.views import View, Views
 
 COLUMNS = ("psnr", "ssim", "lpips")
 REFERENCES = ("photo", "dense")
@@ -26,6 +26,12 @@ REFERENCES = ("photo", "dense")
 
 MOST_PSNR = 100.0
 """In place of the infinite PSNR of equal pictures, so that means stay finite."""
+
+HALVES = ("dense_near_psnr", "dense_far_psnr")
+"""PSNR against the dense renders over the nearer half of the pixels (see :func:`nearer_half`), and over the others."""
+
+BRIGHTNESS = "dense_brightness"
+"""Mean of a picture less that of the dense render, in steps of 1/255: below 0 where it got darker."""
 
 
 @dataclass
@@ -37,6 +43,7 @@ class Scene:
     views: Views
     renders: list[Tensor]  # [H, W, 3] of the dense scene
     photos: list[Tensor] | None  # [H, W, 3]
+    nearer: list[Tensor]  # [H, W] bool, see :func:`nearer_half`
 
 
 @torch.no_grad()
@@ -49,7 +56,35 @@ def load(path: Path, count: int) -> Scene:
     else:
         name, views, photos = photos_of(path, "test", count)
     renders = [render(dense, view) for view in views]
-    return Scene(name, dense, views, renders, photos)
+    return Scene(name, dense, views, renders, photos, [nearer_half(dense, view) for view in views])
+
+
+def name_of(path: Path) -> str:
+    """The name of a scene in the tables: that of a run, or of a PLY's file."""
+    from pointsplat_ns.io import scene_name
+
+    return path.stem if path.suffix == ".ply" else scene_name(open_run(path))
+
+
+@torch.no_grad()
+def nearer_half(scene: Gaussians, view: View) -> Tensor:
+    """Which pixels (H, W) of a view show what is not farther than the median of the expected depths; pixels that show
+    nothing at all count as farther, and not for the median."""
+    depth, alpha, _ = rasterization(
+        means=scene.means,
+        quats=scene.quats,
+        scales=scene.stds,
+        opacities=scene.alphas,
+        colors=scene.means,  # any colours: only depths are rendered
+        viewmats=view.viewmat[None].to(scene.means),
+        Ks=view.K[None].to(scene.means),
+        width=view.width,
+        height=view.height,
+        render_mode="ED",
+        rasterize_mode=view.rasterize_mode,
+    )
+    depth, shown = depth[0, ..., 0], alpha[0, ..., 0] > 0
+    return shown & (depth <= depth[shown].median()) if bool(shown.any()) else shown
 
 
 def photos_of(path: Path, split: Literal["train", "test"], count: int) -> tuple[str, Views, list[Tensor]]:
@@ -83,18 +118,27 @@ def photos_of(path: Path, split: Literal["train", "test"], count: int) -> tuple[
 
 @torch.no_grad()
 def compare(scene: Scene, small: Gaussians, lpips: Lpips | None) -> dict[str, float | None]:
-    """Mean metrics over the views, against the dense scene's renders (``dense_*``) and the photos (``photo_*``)."""
+    """Mean metrics over the views, against the dense scene's renders (``dense_*``) and the photos (``photo_*``), with
+    the :data:`HALVES` and the :data:`BRIGHTNESS`. None where there is no photo, no LPIPS or no pixel."""
     values: dict[str, list[float]] = {}
     for i, dense_render in enumerate(scene.renders):
         image = render(small, scene.views[i])
+        for name, pixels in zip(HALVES, (scene.nearer[i], ~scene.nearer[i]), strict=True):
+            if bool(pixels.any()):
+                values.setdefault(name, []).append(_psnr(image[pixels][None], dense_render[pixels][None]))
+        values.setdefault(BRIGHTNESS, []).append(255 * float((image.double() - dense_render.double()).mean()))
         targets = {"dense": dense_render} | ({"photo": scene.photos[i]} if scene.photos else {})
         for against, target in targets.items():
-            values.setdefault(f"{against}_psnr", []).append(min(float(psnr(image, target)), MOST_PSNR))
+            values.setdefault(f"{against}_psnr", []).append(_psnr(image, target))
             values.setdefault(f"{against}_ssim", []).append(float(ssim(image, target)))
             if lpips is not None:
                 values.setdefault(f"{against}_lpips", []).append(float(lpips(image, target)))
     names = [f"{against}_{column}" for against in REFERENCES for column in COLUMNS]
-    return {name: fmean(values[name]) if name in values else None for name in names}
+    return {name: fmean(values[name]) if name in values else None for name in (*names, *HALVES, BRIGHTNESS)}
+
+
+def _psnr(image: Tensor, target: Tensor) -> float:
+    return min(float(psnr(image, target)), MOST_PSNR)
 
 
 def lpips_or_none(wanted: bool) -> Lpips | None:
