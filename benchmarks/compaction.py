@@ -148,7 +148,7 @@ def measure_scaling(counts: tuple[int, ...], sh_degree: int, programs: list[Redu
 
 def console() -> Console:
     """Wide enough for the tables where standard output is a file."""
-    return Console(width=None if sys.stdout.isatty() else 200)
+    return Console(width=None if sys.stdout.isatty() else 240)
 
 
 @torch.no_grad()
