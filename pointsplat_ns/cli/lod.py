@@ -47,7 +47,7 @@ def _print_table(made: Levels, folder: Path) -> None:
     from pointsplat_ns.pruning import ply_bytes
 
     numbers = ("Gaussians", "share", "MB", "PSNR, dB", "worst, dB", "SSIM", "seconds")
-    table = Table(caption="PSNR (of all views, of the worst) and SSIM are against the dense scene's own renders")
+    table = Table(caption="against the dense scene's own renders; worst: of the views")
     table.add_column("", no_wrap=True)
     for name in numbers:
         table.add_column(name, justify="right", no_wrap=True)

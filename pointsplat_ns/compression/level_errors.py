@@ -4,8 +4,7 @@ places of its Gaussians."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,10 +12,10 @@ from torch import Tensor
 
 from pointsplat_ns.compression.closeness import Closeness, DenseReference
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.metrics import SSIM_WINDOW, ssim
 from pointsplat_ns.rasterizer import rasterization, render
+from pointsplat_ns.views import Views
 
-FARTHER = (2, 4, 8, 16)
+FARTHER = (2, 4, 8)
 """How many times as far away errors are also measured."""
 
 _DEPTH_SIDE = 100
@@ -26,6 +25,29 @@ _CHUNK = 1 << 20
 """Gaussians at a time whose distances are computed in float64."""
 
 
+@dataclass(frozen=True, eq=False)
+class FarReference:
+    """What should be seen from so many times as far as the compared views: a scene there covers as many times fewer
+    pixels a side, and each shows the mean of a square of those of the near image."""
+
+    times: int
+    views: Views
+    """The compared views with so many times fewer pixels a side."""
+    targets: list[Tensor]
+    """The dense scene's near renders, averaged over squares of pixels."""
+
+    @torch.no_grad()
+    def psnr(self, scene: Gaussians) -> float:
+        """PSNR of a scene's renders over all pixels of all views, dB.
+
+        The dense scene itself does not reach inf: Gaussians smaller than a pixel are drawn as large as one, so its
+        renders from afar are coarser than what should be seen, and those of a level can be closer to that.
+        """
+        pairs = zip(self.views, self.targets, strict=True)
+        errors = [float((render(scene, view).double() - target).square().mean()) for view, target in pairs]
+        return Closeness(tuple(errors), None).psnr
+
+
 @dataclass(frozen=True)
 class RenderErrors:
     """Errors of a level's renders against the dense scene's own."""
@@ -33,8 +55,7 @@ class RenderErrors:
     near: Closeness
     """In the compared views."""
     farther: dict[int, float]
-    """PSNR in dB, over all pixels of all views, as seen from so many times as far (:data:`FARTHER`): of images averaged
-    over squares of so many pixels a side. Views too small for a square lack it."""
+    """PSNR, dB, by how many times as far the level is seen from: see :class:`FarReference`."""
 
     def view_psnr(self, index: int) -> float:
         """PSNR of one compared view, dB."""
@@ -52,34 +73,23 @@ class Displacement:
     """The 95th percentile."""
 
 
-@torch.no_grad()
-def render_errors(
-    reference: DenseReference, level: Gaussians, progress: Callable[[float], None] | None = None
-) -> RenderErrors:
-    """Errors of a level's renders, from near and from afar.
-
-    Args:
-        reference: renders of the dense scene.
-        level: the scene to compare.
-        progress: called with the share of the views done.
-    """
+def far_references(reference: DenseReference) -> list[FarReference]:
+    """What should be seen from each of :data:`FARTHER` for which the compared views have enough pixels."""
     views = reference.views
-    squares = [side for side in FARTHER if side <= min(views.width, views.height)]
-    errors: list[float] = []
-    similarities: list[float] = []
-    averaged: dict[int, list[float]] = {side: [] for side in squares}
-    for index, target in enumerate(reference.renders):
-        image = render(level, views[index])
-        difference = (image.double() - target.double()).permute(2, 0, 1)
-        errors.append(float(difference.square().mean()))
-        for side in squares:
-            averaged[side].append(float(torch.nn.functional.avg_pool2d(difference, side).square().mean()))
-        if min(views.width, views.height) >= SSIM_WINDOW:
-            similarities.append(float(ssim(image, target)))
-        if progress is not None:
-            progress((index + 1) / len(views))
-    near = Closeness(tuple(errors), sum(similarities) / len(similarities) if similarities else None)
-    return RenderErrors(near, {side: Closeness(tuple(values), None).psnr for side, values in averaged.items()})
+    found = []
+    for times in FARTHER:
+        if times > min(views.width, views.height):
+            continue
+        shrink = views.Ks.new_tensor([[1 / times], [1 / times], [1.0]])
+        smaller = replace(views, Ks=views.Ks * shrink, width=views.width // times, height=views.height // times)
+        targets = [_averaged(image, times) for image in reference.renders]
+        found.append(FarReference(times, smaller, targets))
+    return found
+
+
+def _averaged(image: Tensor, side: int) -> Tensor:
+    """Means (H // side, W // side, 3), float64, of squares of ``side`` pixels of an image (H, W, 3)."""
+    return torch.nn.functional.avg_pool2d(image.double().permute(2, 0, 1), side).permute(1, 2, 0)
 
 
 @torch.no_grad()

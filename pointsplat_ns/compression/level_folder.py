@@ -155,6 +155,7 @@ def _source(levels: Levels) -> dict[str, Any]:
         "sha256": file and file.sha256,
         "count": len(levels.dense),
         "sh_degree": levels.dense.sh_degree,
+        "psnr_farther": _farther(levels.farther) if levels.reference is not None else None,
     }
 
 
@@ -199,8 +200,12 @@ def _level(level: Level, whole: int) -> dict[str, Any]:
         "psnr": errors and errors.near.psnr,
         "worst_psnr": errors and errors.near.worst,
         "ssim": errors and errors.near.ssim,
-        "psnr_farther": errors and [{"times": times, "psnr": psnr} for times, psnr in errors.farther.items()],
+        "psnr_farther": errors and _farther(errors.farther),
     }
+
+
+def _farther(psnrs: dict[int, float]) -> list[dict[str, Any]]:
+    return [{"times": times, "psnr": psnr} for times, psnr in psnrs.items()]
 
 
 def _without_infinities(value: Any) -> Any:

@@ -19,10 +19,11 @@ from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.distributions import size_quantiles
 from pointsplat_ns.compression.level_errors import (
     Displacement,
+    FarReference,
     RenderErrors,
     displacement,
     distance_seen,
-    render_errors,
+    far_references,
 )
 from pointsplat_ns.compression.level_folder import LevelFolder, SourceFile
 from pointsplat_ns.compression.prune import prune_scene
@@ -76,6 +77,9 @@ class Levels:
     """The finest first."""
     reference: DenseReference | None
     """Renders of the dense scene that levels were compared with; None if there are no views."""
+    farther: dict[int, float]
+    """PSNR in dB of the dense scene itself, by how many times as far it is seen from: what levels are to be compared
+    with there."""
     distance: float | None
     """Median depth of what the views of ``reference`` show, scene units."""
     origin: str
@@ -216,17 +220,20 @@ def make_levels(
     cut = prune_scene(dense, 1.0, sh=sh, views=views)
     counts = level_counts(budgets, len(dense), cut.scene.sh_degree)
     notes, reference, distance = cut.notes, None, None
+    afar: list[FarReference] = []
     try:
         reference = DenseReference(dense, views.compared())
+        afar = far_references(reference)
         distance = distance_seen(dense, reference)
     except DataError as error:
         notes = (*notes, f"the levels' errors are not measured: {error}")
     if views.origin and views.origin not in notes:
         notes = (*notes, views.origin)
+    farther = {far.times: far.psnr(dense) for far in afar}
     made: list[Level] = []
 
     def so_far() -> Levels:
-        return Levels(dense, tuple(made), reference, distance, views.origin, source, notes)
+        return Levels(dense, tuple(made), reference, farther, distance, views.origin, source, notes)
 
     before = torch.arange(len(dense), device=dense.device)  # [N] index in the level before of the one that each is in
     start = time.perf_counter()
@@ -238,7 +245,8 @@ def make_levels(
         errors = None
         if reference is not None:
             what = f"measuring level {len(made)} of {len(counts) - 1}"
-            errors = render_errors(reference, merged.scene, functools.partial(progress, what))
+            near = reference.closeness(merged.scene, functools.partial(progress, what))
+            errors = RenderErrors(near, {far.times: far.psnr(merged.scene) for far in afar})
         made.append(
             Level(
                 scene=merged.scene,

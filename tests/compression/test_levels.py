@@ -13,9 +13,8 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, normal_scene, same
-from pointsplat_ns.compression import levels as levels_module
 from pointsplat_ns.compression.closeness import DenseReference
-from pointsplat_ns.compression.level_errors import FARTHER, displacement, distance_seen, render_errors
+from pointsplat_ns.compression.level_errors import FARTHER, displacement, distance_seen
 from pointsplat_ns.compression.level_folder import file_names
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.pruning.merge import merge, merge_levels
@@ -123,6 +122,7 @@ def test_the_manifest_is_true_of_the_files(folder, scene):
         "sha256": hashlib.sha256(source).hexdigest(),
         "count": 400,
         "sh_degree": 1,
+        "psnr_farther": manifest["source"]["psnr_farther"],  # recomputed below
     }
     named = {"lod.json", "lod.png"}
     finer = 400
@@ -164,12 +164,24 @@ def test_the_errors_in_the_manifest_are_those_of_the_files(folder, scene, views)
         assert level["worst_psnr"] == pytest.approx(psnr((gaps**2).mean(axis=(1, 2, 3)).max()), abs=1e-6)
         similar = [float(ps.ssim(a, b)) for a, b in zip(images, dense, strict=True)]
         assert level["ssim"] == pytest.approx(sum(similar) / 3, abs=1e-6)
-        assert [error["times"] for error in level["psnr_farther"]] == [2, 4, 8, 16]
-        for error in level["psnr_farther"]:
-            side = error["times"]
-            whole = gaps[:, : 36 // side * side, : 48 // side * side]
-            blocks = whole.reshape(3, 36 // side, side, 48 // side, side, 3).mean(axis=(2, 4))
-            assert error["psnr"] == pytest.approx(psnr((blocks**2).mean()), abs=1e-6)
+        assert [error["times"] for error in level["psnr_farther"]] == [2, 4, 8]
+
+
+def test_errors_from_afar_are_against_the_mean_of_the_pixels_that_one_covers_there(folder, scene, views):
+    manifest = manifest_of(folder)
+    scenes = [scene, *(ps.load(folder / level["file"]) for level in manifest["levels"])]
+    dense = np.stack([ps.render(scene, view).double().numpy() for view in views])  # [C, H, W, 3]
+    for one, facts in zip(scenes, [manifest["source"], *manifest["levels"]], strict=True):
+        assert [error["times"] for error in facts["psnr_farther"]] == [2, 4, 8]
+        for error in facts["psnr_farther"]:
+            times, rows, columns = error["times"], 36 // error["times"], 48 // error["times"]
+            whole = dense[:, : rows * times, : columns * times]
+            wanted = whole.reshape(3, rows, times, columns, times, 3).mean(axis=(2, 4))
+            Ks = views.Ks.clone()
+            Ks[:, :2] /= times
+            far = ps.Views(views.viewmats, Ks, columns, rows, views.background)
+            seen = np.stack([ps.render(one, view).double().numpy() for view in far])
+            assert error["psnr"] == pytest.approx(psnr(((seen - wanted) ** 2).mean()), abs=1e-4)
 
 
 def test_the_displacements_in_the_manifest_follow_from_the_files(folder):
@@ -198,22 +210,22 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_a_scene_given_as_gaussians_has_no_file_in_the_manifest(levels, tmp_path):
     levels.save(tmp_path / "out")
     source = manifest_of(tmp_path / "out")["source"]
-    assert source == {"file": None, "bytes": None, "sha256": None, "count": 400, "sh_degree": 1}
+    assert [source[key] for key in ("file", "bytes", "sha256", "count", "sh_degree")] == [None, None, None, 400, 1]
 
 
 @pytest.mark.parametrize("after", [0, 1, 2])
 def test_an_interruption_leaves_whole_files_and_a_manifest_that_is_true_of_them(
     after, scene, views, tmp_path, monkeypatch
 ):
-    measured = []
+    measured, closeness = [], DenseReference.closeness
 
-    def interrupted(*args, **options):
+    def interrupted(*args):
         if len(measured) == after:
             raise KeyboardInterrupt
-        measured.append(render_errors(*args, **options))
+        measured.append(closeness(*args))
         return measured[-1]
 
-    monkeypatch.setattr(levels_module, "render_errors", interrupted)
+    monkeypatch.setattr(DenseReference, "closeness", interrupted)
     with pytest.raises(KeyboardInterrupt):
         ps.lod(scene, ASKED, views=views, folder=tmp_path / "out")
     written = {name for index in range(after + 1) for name in file_names(index)}
@@ -225,7 +237,7 @@ def test_an_interruption_leaves_whole_files_and_a_manifest_that_is_true_of_them(
         manifest = manifest_of(tmp_path / "out")
         assert manifest["complete"] is False
         assert [level["count"] for level in manifest["levels"]] == [200, 100][:after]
-        assert [level["psnr"] for level in manifest["levels"]] == [errors.near.psnr for errors in measured]
+        assert [level["psnr"] for level in manifest["levels"]] == [near.psnr for near in measured]
 
 
 def test_an_interruption_while_overwriting_leaves_no_manifest_of_other_files(
@@ -238,7 +250,7 @@ def test_an_interruption_while_overwriting_leaves_no_manifest_of_other_files(
     def interrupt(*args, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(levels_module, "render_errors", interrupt)
+    monkeypatch.setattr(DenseReference, "closeness", interrupt)
     with pytest.raises(KeyboardInterrupt):
         ps.lod(scene, ["50%"], views=views, folder=out, force=True)
     assert set(contents(out)) == set(file_names(0))
@@ -334,7 +346,8 @@ def test_where_nothing_can_be_seen_levels_are_made_and_not_measured(scene, tmp_p
     assert levels.errors == [None] and levels.reference is None and len(levels[0].scene) == 200
     assert any(note.startswith("the levels' errors are not measured: no free place") for note in levels.notes)
     manifest = manifest_of(tmp_path / "out")
-    assert manifest["views"] is None and manifest["levels"][0]["psnr"] is None and manifest["complete"]
+    assert manifest["views"] is None and manifest["source"]["psnr_farther"] is None and manifest["complete"]
+    assert [manifest["levels"][0][key] for key in ("mse", "psnr", "ssim", "psnr_farther")] == [None] * 4
     assert set(contents(tmp_path / "out")) == {*file_names(0), "lod.json"}
 
 
