@@ -99,6 +99,7 @@ def prune(
     *,
     sh: str = "all",
     opacity_weight: float | None = None,
+    clean: bool = False,
     fine_tune: int = 0,
     views: Views | str | Path | None = None,
     progress: bool | Progress = False,
@@ -117,6 +118,7 @@ def prune(
         sh: SH bands to keep: "all", up to a degree ("0" to "3"), or "auto", those without which renders stay within
             40 dB.
         opacity_weight: lambda of "paper", "authors" and "log-volume", in [0, 1]; by default the paper's 0.3.
+        clean: first remove what cannot be drawn and what is seen from nowhere; ``keep`` refers to the scene as given.
         fine_tune: steps of optimising what was kept against the given scene's own renders.
         views: where to look from, if anything has to be rendered: views, or the run whose dataset has the poses. By
             default those of the run that ``scene`` names, or poses sampled in free space.
@@ -140,7 +142,7 @@ def prune(
     budget = check_options(keep, by, sh, opacity_weight, fine_tune)  # before the scene is read
     dense, source = _read(scene, views)
     with progress_bar(progress) as report:
-        pruned = prune_scene(dense, budget, by, sh, opacity_weight, source, fine_tune, report)
+        pruned = prune_scene(dense, budget, by, sh, opacity_weight, source, fine_tune, report, clean)
     _log(pruned.notes)
     return pruned.scene
 
@@ -177,6 +179,7 @@ def compact(
     *,
     by: str | None = None,
     sh: str = "all",
+    clean: bool = False,
     views: Views | str | Path | None = None,
     progress: bool | Progress = False,
 ) -> Compacted:
@@ -189,6 +192,7 @@ def compact(
         refiner: from :func:`load_refiner`; by default the one that ships.
         by: the method, as for :func:`prune`; by default the one that the refiner was trained with.
         sh: SH bands to keep, as for :func:`prune`.
+        clean: as for :func:`prune`.
         views: where renders are compared, as for :func:`prune`; at most 12 are taken.
         progress: True shows a bar; a function is called with what is being done and the share done of it.
 
@@ -212,7 +216,7 @@ def compact(
     resolve_options(refiner, keep, by, sh)  # before the scene is read
     dense, source = _read(scene, views)
     with progress_bar(progress) as report:
-        result = compact_scene(dense, refiner, keep, by, sh, source, report)
+        result = compact_scene(dense, refiner, keep, by, sh, source, report, clean)
     _log((result.verdict, *result.notes))
     return result
 

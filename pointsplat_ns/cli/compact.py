@@ -25,6 +25,7 @@ def compact(
     refiner: Annotated[Path | None, tyro.conf.arg(aliases=["--using"])] = None,
     by: str | None = None,
     sh: Bands = "all",
+    clean: bool = False,
     picture: Path | None = None,
     dry_run: bool = False,
     force: bool = False,
@@ -45,6 +46,7 @@ def compact(
             that ships. --using is the same.
         by: the method of prune; by default the one that the refiner was trained with.
         sh: SH bands to keep, as for prune: all, up to a degree, or auto.
+        clean: as for prune: first remove what cannot be drawn and what is seen from nowhere.
         picture: a .png file for images of some views: dense, before and after refinement, side by side.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
@@ -58,7 +60,7 @@ def compact(
     trained = ps.load_refiner(refiner)
     resolve_options(trained, keep, by, sh)
     dense = read_scene(scene)
-    result = ps.compact(dense, keep, trained, by=by, sh=sh, views=scene, progress=True)
+    result = ps.compact(dense, keep, trained, by=by, sh=sh, clean=clean, views=scene, progress=True)
     if not dry_run:
         ps.save(result.scene, output)
     what = "kept and refined" if result.accepted else "kept"

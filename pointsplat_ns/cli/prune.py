@@ -23,6 +23,7 @@ def prune(
     by: str = "merge",
     opacity_weight: float | None = None,
     sh: Bands = "all",
+    clean: bool = False,
     fine_tune: int = 0,
     plot: Path | None = None,
     dry_run: bool = False,
@@ -44,6 +45,7 @@ def prune(
             volume, log-volume, area, random; lightgaussian and pup score by views of the scene.
         opacity_weight: lambda of paper, authors and log-volume: the weight of opacity; by default the paper's 0.3.
         sh: SH bands to keep: all, up to a degree, or auto, those without which renders stay within 40 dB.
+        clean: first remove what cannot be drawn and what is seen from nowhere; --keep refers to the scene as read.
         fine_tune: steps of optimising the result against the dense scene's own renders.
         plot: a .png file for a plot of the distributions of opacity and volume, before and after.
         dry_run: compute and print everything, but write no scene.
@@ -59,8 +61,9 @@ def prune(
     dense = read_scene(scene)
     start = time.perf_counter()
     small = ps.prune(
-        dense, keep, by, sh=sh, opacity_weight=opacity_weight, fine_tune=fine_tune, views=scene, progress=True
-    )
+        dense, keep, by, sh=sh, opacity_weight=opacity_weight, clean=clean, fine_tune=fine_tune, views=scene,
+        progress=True,
+    )  # fmt: skip
     seconds = time.perf_counter() - start
     if not dry_run:
         ps.save(small, output)

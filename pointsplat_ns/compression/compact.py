@@ -77,6 +77,7 @@ def compact_scene(
     sh: str = "all",
     views: ViewSource | None = None,
     progress: Progress = silent,
+    clean: bool = False,
 ) -> Compacted:
     """Make a scene smaller, and refine it if that helps.
 
@@ -95,6 +96,7 @@ def compact_scene(
         sh: as for :func:`~pointsplat_ns.compression.prune.prune_scene`.
         views: views that renders are compared in; by default sampled in free space.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
+        clean: as for :func:`~pointsplat_ns.compression.prune.prune_scene`.
 
     Raises:
         BudgetError, SceneError, PointSplatError: as :func:`~pointsplat_ns.compression.prune.prune_scene`.
@@ -107,7 +109,7 @@ def compact_scene(
     need_usable(dense)
     _need_sh_degree(dense, sh, refiner)
     views = views or ViewSource(dense)
-    smaller = prune_scene(dense, keep, by, sh, weight, views, progress=progress)
+    smaller = prune_scene(dense, keep, by, sh, weight, views, progress=progress, clean=clean)
     progress("refining", 0.0)
     pruned, refined = smaller.scene, refiner(smaller.scene)
     strength, reference, before, after = 1.0, None, None, None

@@ -1,7 +1,7 @@
-"""Pruning with all options: first SH bands, then the count by any method and budget, then fine-tuning.
+"""Pruning with all options: first cleaning and SH bands, then the count by any method and budget, then fine-tuning.
 
 Views are only looked up or sampled if they are needed: for a budget in dB, ``auto`` SH, a method that scores by views,
-or fine-tuning.
+cleaning that removes anything, or fine-tuning.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pointsplat_ns.compression.budget_search import SH_PSNR, needed_sh_degree, smallest_within
+from pointsplat_ns.compression.cleaning import Cleaning, clean_scene
 from pointsplat_ns.compression.fine_tune import fine_tune
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import BudgetError, PointSplatError
@@ -57,6 +58,7 @@ def prune_scene(
     views: ViewSource | None = None,
     fine_tune_steps: int = 0,
     progress: Progress = silent,
+    clean: bool = False,
 ) -> Pruned:
     """Make a scene smaller.
 
@@ -70,6 +72,8 @@ def prune_scene(
         views: source of views, if they are needed; by default poses sampled in free space.
         fine_tune_steps: steps of optimising the result against renders of ``dense``.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
+        clean: first remove what no picture needs, see :mod:`~pointsplat_ns.compression.cleaning`. ``keep`` still refers
+            to ``dense``, and the result has exactly as many Gaussians.
 
     Raises:
         BudgetError: if the budget cannot be met.
@@ -84,9 +88,15 @@ def prune_scene(
     views = views or ViewSource(dense)
     notes: list[str] = []
     full = _with_sh(dense, sh, views, progress, notes)
+    count = 1 if isinstance(keep, WithinPsnr) else resolve_keep(len(full), keep, full.sh_degree)
+    cleaning = clean_scene(dense, count, views, progress) if clean else None
+    start = full if cleaning is None else cleaning.apply(full, count)
+    notes += () if cleaning is None else cleaning.notes
     report = functools.partial(progress, f"by {by}")
     if isinstance(keep, WithinPsnr):
-        make = _pruner(full, by, views, opacity_weight, report)
+        make = _pruner(start, by, views, opacity_weight, report)
+        if cleaning is not None:
+            make = _refilling(make, cleaning, full, len(start))
         compared = views.compared()
         search = smallest_within(dense, make, compared, keep.value, functools.partial(progress, "trying counts"))
         scene = search.scene
@@ -95,7 +105,7 @@ def prune_scene(
             f"{len(compared)} views; {len(search.tried)} counts tried"
         )
     else:
-        scene = prune(full, keep, by, functools.partial(views.views, SCORED_VIEWS), opacity_weight, report)
+        scene = prune(start, count, by, functools.partial(views.views, SCORED_VIEWS), opacity_weight, report)
     if fine_tune_steps:
         tuned = views.views(SCORED_VIEWS)
         scene = fine_tune(scene, tuned, dense, fine_tune_steps, progress=functools.partial(progress, "fine-tuning"))
@@ -145,6 +155,13 @@ def _pruner(
     progress(0.0)
     scores = score_of(scene, method, functools.partial(views.views, SCORED_VIEWS), opacity_weight, progress)
     return lambda count: scene[select(scores, count)]
+
+
+def _refilling(
+    make: Callable[[int], Gaussians], cleaning: Cleaning, full: Gaussians, most: int
+) -> Callable[[int], Gaussians]:
+    """``make`` for counts above ``most``, the number of Gaussians in the cleaned scene, too: it gets junk back then."""
+    return lambda count: make(count) if count <= most else cleaning.apply(full, count)
 
 
 def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress, notes: list[str]) -> Gaussians:

@@ -1,0 +1,229 @@
+"""Finds the Gaussians of a scene that no picture needs, so that they take nothing of a budget.
+
+Two rules. A Gaussian that cannot be drawn goes: a value is NaN or infinite, or it is fainter than the rasterizer draws.
+And one that is seen from nowhere goes: cameras stand at places in free space and look in all directions, and it gets no
+blend weight (opacity on a pixel times the transmittance in front of it) on any pixel of any image. So a large
+background that is seen stays, and so does a lamp that hangs in the air. docs/cleaning.md has the figures, and those of
+the rules that were measured and left out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.compression.closeness import DenseReference
+from pointsplat_ns.compression.view_sampling import content_box, sample_views
+from pointsplat_ns.compression.view_source import COMPARED_SIDE, ViewSource
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.rasterizer.constants import ALPHA_MIN
+from pointsplat_ns.system.progress import Progress, silent
+
+PLACES = 16
+"""Number of places that are looked around from. More places remove less and take longer."""
+
+SIDE = 32
+"""Pixels across each of the six images of a place. Time hardly depends on it, and a coarse image shows more of what is
+small: no Gaussian is drawn thinner than a pixel."""
+
+CHECKED_VIEWS = 4
+"""Maximum number of views in which renders are compared with the dense scene's."""
+
+_SEED = 17
+"""Of the places. Views to compare renders in are sampled with another seed."""
+
+_DIAGONAL = 10.0
+"""Diagonal of the content's box that a scene is scaled to before it is looked at, so that the unit of length does not
+matter. The rasterizer's near plane, 0.01, is then a thousandth of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Junk:
+    """The Gaussians of a scene that no picture needs."""
+
+    undrawable: Tensor  # [A] int64, those that are not usable first, then the faintest first
+    unseen: Tensor  # [B] int64, the faintest first
+    places: int
+    """Number of places that were looked around from; 0 if none was found, and nothing counts as unseen then."""
+
+    def __len__(self) -> int:
+        return len(self.undrawable) + len(self.unseen)
+
+
+@dataclass(frozen=True, eq=False)
+class Cleaning:
+    """Which Gaussians of a scene to leave out, and what that changes."""
+
+    junk: Junk
+    count: int
+    """Number of Gaussians in the scene as read."""
+    notes: tuple[str, ...]
+    """A line of text for each rule."""
+
+    def apply(self, scene: Gaussians, at_least: int) -> Gaussians:
+        """The scene without its junk, but never fewer than ``at_least`` Gaussians: the best of the junk stays then.
+
+        Args:
+            scene: the scene as read, perhaps with fewer SH bands.
+            at_least: in 1..N.
+        """
+        dropped = _first(self.junk, self.count - at_least)
+        return _without(scene, torch.cat([dropped.undrawable, dropped.unseen]))
+
+
+@torch.no_grad()
+def find_junk(scene: Gaussians, progress: Progress = silent) -> Junk:
+    """Find the Gaussians that cannot be drawn, and those that are seen from nowhere.
+
+    The same scene gives the same result, and so does the scene in another unit of length, but for rounding.
+
+    Args:
+        scene: N Gaussians.
+        progress: called with the name of the task and the share of it that is done, in [0, 1].
+
+    Returns:
+        Indices on the CPU. All Gaussians are junk if none can be drawn.
+    """
+    usable = scene.usable()
+    drawable = usable & (scene.alphas >= ALPHA_MIN)
+    order = torch.where(usable, scene.alphas, -1.0).sort(stable=True).indices
+    undrawable = order[~drawable[order]]
+    drawn = drawable.nonzero()[:, 0]
+    seen = ~drawable  # or of no account here
+    places = 0
+    if len(drawn):
+        part = _normalised(scene[drawn])
+        try:
+            cameras = _places(part)
+        except DataError:
+            return Junk(undrawable.cpu(), drawn[:0].cpu(), 0)
+        weights = blend_weights(part, cameras, progress)
+        places = len(cameras)
+        # An all black set of images says nothing about the scene.
+        seen[drawn] = (weights > 0) | ~(weights > 0).any()
+    return Junk(undrawable.cpu(), order[~seen[order]].cpu(), places)
+
+
+def blend_weights(scene: Gaussians, cameras: Tensor, progress: Progress = silent) -> Tensor:
+    """Blend weight of every Gaussian: opacity times transmittance, summed over the pixels of six images a place.
+
+    It is the gradient of the sum of all pixels by a Gaussian's grey value.
+
+    Args:
+        scene: N Gaussians.
+        cameras: (P, 3) positions.
+        progress: called with the name of the task and the share of it that is done, in [0, 1].
+
+    Returns:
+        (N,) float64, pixels.
+    """
+    half = SIDE / 2  # a field of view of 90 degrees
+    K = torch.tensor([[half, 0.0, half], [0.0, half, half], [0.0, 0.0, 1.0]], device=scene.device)
+    means, quats, stds, alphas = (value.detach() for value in (scene.means, scene.quats, scene.stds, scene.alphas))
+    grey = torch.ones(len(scene), 1, dtype=scene.dtype, device=scene.device, requires_grad=True)
+    total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
+    rotations = _six_directions().to(cameras)
+    for done, position in enumerate(cameras):
+        for rotation in rotations:
+            viewmat = torch.eye(4).to(cameras)
+            viewmat[:3, :3], viewmat[:3, 3] = rotation, -(rotation @ position)
+            with torch.enable_grad():
+                image, _, _ = rasterization(means, quats, stds, alphas, grey, viewmat[None], K[None], SIDE, SIDE)
+                if image.requires_grad:  # not where nothing is in front of the camera
+                    total += torch.autograd.grad(image.sum(), grey)[0][:, 0].double()
+        progress("looking for what cannot be seen", (done + 1) / len(cameras))
+    return total
+
+
+def clean_scene(dense: Gaussians, at_least: int, views: ViewSource, progress: Progress = silent) -> Cleaning:
+    """Find the junk of a scene, and measure what renders lose without it.
+
+    Args:
+        dense: N Gaussians.
+        at_least: number of Gaussians that have to remain, in 1..N.
+        views: where renders are compared. They choose nothing.
+        progress: called with the name of the task and the share of it that is done, in [0, 1].
+    """
+    junk = find_junk(dense, progress=progress)
+    dropped = _first(junk, len(dense) - at_least)
+    if len(dropped) == 0:
+        why = f"; {len(junk):,} could go, but all are asked for" if len(junk) else ""
+        return Cleaning(junk, len(dense), (f"clean: nothing removed{why}",))
+    progress("checking what cleaning changes", 0.0)
+    reference = _reference(dense, views)
+    places = f"looking around from {junk.places} places" if junk.places else "no free place to look from was found"
+    rules = (
+        (dropped.undrawable, dropped.undrawable, "that cannot be drawn"),
+        (
+            dropped.unseen,
+            torch.cat([dropped.undrawable, dropped.unseen]),
+            f"that are seen from nowhere ({places})",
+        ),
+    )
+    notes = []
+    for gone, so_far, what in rules:
+        notes.append(f"clean: {len(gone):,} of {len(dense):,} removed {what}")
+        if len(gone) and reference is not None:
+            notes[-1] += f"; renders {_closeness(reference, _without(dense, so_far))}"
+    return Cleaning(junk, len(dense), tuple(notes))
+
+
+def _reference(dense: Gaussians, views: ViewSource) -> DenseReference | None:
+    """Renders of the dense scene; None if there are no views."""
+    try:
+        return DenseReference(dense, views.views(CHECKED_VIEWS).resized(COMPARED_SIDE))
+    except DataError:
+        return None
+
+
+def _closeness(reference: DenseReference, scene: Gaussians) -> str:
+    psnr, worst = reference.psnr(scene)
+    views = f"{len(reference.views)} view{'s' if len(reference.views) != 1 else ''}"
+    if math.isinf(psnr):
+        return f"of {views} stay the same"
+    return f"reach {psnr:.1f} dB against the dense scene's, {worst:.1f} dB in the worst of {views}"
+
+
+def _first(junk: Junk, count: int) -> Junk:
+    """The first ``count`` of the junk: what cannot be drawn, then the least seen."""
+    undrawable = junk.undrawable[:count]
+    return Junk(undrawable, junk.unseen[: count - len(undrawable)], junk.places)
+
+
+def _without(scene: Gaussians, indices: Tensor) -> Gaussians:
+    """The scene without some Gaussians, the others in their order."""
+    if len(indices) == 0:
+        return scene
+    kept = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
+    kept[indices.to(scene.device)] = False
+    return scene[kept]
+
+
+def _normalised(scene: Gaussians) -> Gaussians:
+    """The scene moved and scaled so that the box of its content is around 0 with a diagonal of :data:`_DIAGONAL`."""
+    low, high = content_box(scene)
+    diagonal = float((high - low).norm())
+    if diagonal == 0:  # one Gaussian, or all at one position: take their size
+        diagonal = 4 * float(scene.stds.double().amax()) or 1.0
+    factor = _DIAGONAL / diagonal
+    means = ((scene.means.double() - 0.5 * (low + high)) * factor).to(scene.dtype)
+    return scene.replace(means=means, scales=scene.scales + math.log(factor))
+
+
+def _places(scene: Gaussians) -> Tensor:
+    """Positions (P, 3) in free space, float64."""
+    viewmats = sample_views(scene, PLACES, seed=_SEED).viewmats
+    return -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
+
+
+def _six_directions() -> Tensor:
+    """World-to-camera rotations (6, 3, 3) of the faces of a cube, OpenCV axes."""
+    forward = torch.cat([torch.eye(3), -torch.eye(3)]).double()
+    right = forward.roll(1, dims=1)
+    down = torch.linalg.cross(forward, right)
+    return torch.stack([right, down, forward], dim=1)

@@ -1,0 +1,273 @@
+"""Cleaning: planted junk goes, what is seen stays, counts are exact, and extremes change nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from making import box_room, same_bits
+from pointsplat_ns.cli import main
+from pointsplat_ns.compression import cleaning
+from pointsplat_ns.compression.cleaning import Cleaning, blend_weights, clean_scene, find_junk
+from pointsplat_ns.compression.closeness import DenseReference
+from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.view_sampling import sample_views
+from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io import read_ply, write_ply
+from pointsplat_ns.pruning import WithinPsnr, resolve_keep
+from pointsplat_ns.views import Views
+
+ROOM, PLANTED = 2500, 12
+SHIPPED_PLACES = cleaning.PLACES
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_places() -> Iterator[None]:
+    """Four places instead of sixteen, in a quarter of the time, for tests of what does not depend on their number."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cleaning, "PLACES", 4)
+        yield
+
+
+@pytest.fixture(scope="module")
+def room() -> Gaussians:
+    """Opaque walls of a dozen layers: nothing shines through. A few of their own Gaussians are behind the others."""
+    return box_room(0, ROOM, size=0.2).replace(opacities=torch.full((ROOM, 1), 9.0))
+
+
+@pytest.fixture(scope="module")
+def views(room) -> Views:
+    return sample_views(room, 3, 64, 48)
+
+
+def blobs(places: torch.Tensor, log_scales: torch.Tensor | float, logit: float) -> Gaussians:
+    """Grey Gaussians at ``places`` (N, 3), of the SH degree of the room."""
+    n = len(places)
+    return Gaussians(
+        means=places,
+        scales=torch.zeros(n, 3) + log_scales,
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+        opacities=torch.full((n, 1), logit),
+        features_dc=torch.ones(n, 3),
+        features_rest=torch.zeros(n, 3, 3),
+    )
+
+
+def behind_the_walls(n: int = PLANTED) -> torch.Tensor:
+    """Points one unit beyond the walls that face along x, (n, 3). The walls are at 2 and about 0.5 thick."""
+    side = torch.where(torch.arange(n) % 2 == 0, 1.0, -1.0)
+    spread = torch.linspace(-0.8, 0.8, n)
+    return torch.stack([3.2 * side, spread, spread.flip(0) * 0.5], dim=1)
+
+
+JUNK = {
+    "floaters": blobs(behind_the_walls(), math.log(0.05), 4.0),
+    "needles": blobs(behind_the_walls(), torch.tensor([0.01, 0.15, 0.01]).log(), 4.0),
+    "giants": blobs(behind_the_walls() * torch.tensor([4.0, 1.0, 1.0]), math.log(2.0), 4.0),
+    "haze": blobs(behind_the_walls(), math.log(0.3), -4.5),
+}
+"""What is behind the walls of the room, by kind."""
+
+STAY = {
+    "a lamp in the air": blobs(torch.tensor([[0.3, 0.2, 0.6]]), math.log(0.08), 4.0),
+    "a needle in the air": blobs(torch.tensor([[-0.4, 0.2, 0.1]]), torch.tensor([0.02, 0.6, 0.02]).log(), 4.0),
+    "a faint veil": blobs(torch.tensor([[0.0, 0.0, 0.2]]), math.log(0.5), -4.0),
+}
+"""What is seen in the room, by kind."""
+
+
+def junk_of(scene: Gaussians) -> tuple[list[int], list[int]]:
+    junk = find_junk(scene)
+    return sorted(junk.undrawable.tolist()), sorted(junk.unseen.tolist())
+
+
+def with_junk(room: Gaussians) -> Gaussians:
+    """The room, then floaters and haze behind its walls, then what cannot be drawn: one NaN and one too faint."""
+    bad = blobs(torch.tensor([[math.nan, 0.0, 0.0], [0.0, 0.0, 0.0]]), -2.0, -9.0)
+    return Gaussians.cat([room, JUNK["floaters"], JUNK["haze"], bad])
+
+
+def test_nothing_of_a_clean_room_is_touched():
+    thin = box_room(0)  # every Gaussian of its walls is seen
+    assert junk_of(thin) == ([], [])
+    result = prune_scene(thin, 0.4, "opacity", clean=True)
+    assert same_bits(result.scene, prune_scene(thin, 0.4, "opacity").scene)
+    assert result.notes == ("clean: nothing removed",)
+
+
+@pytest.mark.parametrize("kind", JUNK)
+def test_what_is_behind_walls_goes_and_no_view_changes(kind, room, views, monkeypatch):
+    monkeypatch.setattr(cleaning, "PLACES", SHIPPED_PLACES)
+    scene = Gaussians.cat([room, JUNK[kind]])
+    assert junk_of(scene) == ([], list(range(ROOM, ROOM + PLANTED)))
+    assert DenseReference(scene, views).psnr(room)[0] == math.inf  # views that chose nothing
+
+
+@pytest.mark.parametrize("kind", STAY)
+def test_what_is_seen_in_the_room_stays(kind, room):
+    undrawable, unseen = junk_of(Gaussians.cat([room, STAY[kind]]))
+    assert undrawable == [] and ROOM not in unseen
+
+
+def test_a_sky_of_giants_that_is_seen_stays(room):
+    open_room = room[room.means[:, 2] < 0.9]  # without its ceiling
+    angles = torch.arange(8) * math.pi / 4
+    sky = torch.stack([angles.cos(), angles.sin(), torch.full((8,), 1.5)], dim=1) * 20
+    scene = Gaussians.cat([open_room, blobs(sky, math.log(8.0), 4.0)])
+    gone = set(junk_of(scene)[1])
+    assert not gone & set(range(len(open_room), len(scene)))
+
+
+def test_what_cannot_be_drawn_goes_the_meaningless_first(room):
+    bad = blobs(torch.zeros(3, 3), -2.0, 0.0)
+    bad.opacities[:, 0] = torch.tensor([-7.0, -8.0, 3.0])
+    bad.scales[2, 1] = math.inf
+    junk = find_junk(Gaussians.cat([bad, room]))
+    assert junk.undrawable.tolist() == [2, 1, 0]
+
+
+def test_a_weight_is_opacity_times_transmittance_over_all_pixels():
+    """Two discs wider than an image, one behind the other: the first takes its opacity of every pixel of its face."""
+    discs = blobs(torch.tensor([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), torch.tensor([1e-4, 50.0, 50.0]).log(), 0.0)
+    one = blend_weights(discs, torch.zeros(1, 3, dtype=torch.float64))
+    half_space = blend_weights(discs[1], torch.zeros(1, 3, dtype=torch.float64))
+    assert one[0] > one[1] > 0
+    # Transmittance in front of the second is 1/2 where both are flat and wide; at the rims they differ a little.
+    torch.testing.assert_close(one[1], 0.5 * half_space[0], rtol=0.02, atol=0.0)
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+def test_the_unit_of_length_does_not_matter(factor, room):
+    scene = with_junk(room)
+    scaled = scene.replace(means=scene.means * factor, scales=scene.scales + math.log(factor))
+    assert junk_of(scaled) == junk_of(scene)
+    assert set(range(ROOM, ROOM + 2 * PLANTED)) <= set(junk_of(scene)[1])
+
+
+def test_far_from_the_origin_the_same_goes(room):
+    scene = with_junk(room)
+    far = scene.replace(means=scene.means + 1024.0)  # float32 still resolves 1e-4 there
+    assert junk_of(far) == junk_of(scene)
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        box_room(0, 1),
+        box_room(0, 30).replace(scales=torch.full((30, 3), -math.inf)),
+    ],
+    ids=["one", "all points"],
+)
+def test_where_there_is_nothing_to_compare_with_nothing_goes(scene):
+    assert junk_of(scene) == ([], [])
+
+
+def test_of_giants_without_end_those_that_show_stay():
+    undrawable, unseen = junk_of(box_room(0, 30).replace(scales=torch.full((30, 3), 80.0)))
+    assert undrawable == [] and len(unseen) < 30
+
+
+@pytest.mark.parametrize("place", [0.0, 1e30])
+def test_of_identical_ones_those_that_show_stay(place):
+    """The first of opacity 0.98 let 2 % through each; when a ten-thousandth is left the others are not drawn."""
+    stack = box_room(0, 30).replace(means=torch.full((30, 3), place), scales=torch.full((30, 3), -1.0))
+    undrawable, unseen = junk_of(stack)
+    assert undrawable == [] and len(unseen) <= 28
+
+
+def test_a_scene_of_which_nothing_can_be_drawn_is_all_junk():
+    faint = box_room(0, 10).replace(opacities=torch.full((10, 1), -20.0))
+    junk = find_junk(faint)
+    assert len(junk.undrawable) == 10 and junk.places == 0
+    assert len(Cleaning(junk, 10, ()).apply(faint, 4)) == 4
+
+
+def test_the_same_scene_gives_the_same_junk(room):
+    first, second = (find_junk(with_junk(room)) for _ in range(2))
+    assert torch.equal(first.undrawable, second.undrawable) and torch.equal(first.unseen, second.unseen)
+
+
+@pytest.mark.parametrize("by", ["merge", "opacity"])
+@pytest.mark.parametrize("keep", [1, 0.3, 0.999, 1.0])
+def test_keep_refers_to_the_scene_as_read_and_is_exact(by, keep, room, views):
+    scene = with_junk(room)[:-2] if by == "merge" else with_junk(room)
+    result = prune_scene(scene, keep, by, views=ViewSource(scene, given=views), clean=True)
+    assert len(result.scene) == resolve_keep(len(scene), keep)
+    if keep == 0.3:
+        assert int((result.scene.means[:, 0].abs() > 3).sum()) == 0
+
+
+def test_a_quality_that_takes_junk_gets_it_back(room, views):
+    scene = Gaussians.cat([room, JUNK["floaters"]])
+    source = ViewSource(scene, given=views)
+    easy = prune_scene(scene, WithinPsnr(12.0), "coverage", views=source, clean=True)
+    assert len(easy.scene) < ROOM and int((easy.scene.means[:, 0].abs() > 3).sum()) == 0
+    cleaning_of = clean_scene(scene, 1, source)
+    for count in (len(scene), len(scene) - 1, len(scene) - 5):
+        assert len(cleaning_of.apply(scene, count)) == count
+
+
+def test_a_line_for_each_rule_says_how_many_went_and_what_renders_lost(room, views):
+    scene = with_junk(room)
+    unseen = len(junk_of(scene)[1])
+    first, second = clean_scene(scene, 1, ViewSource(scene, given=views)).notes
+    assert first == f"clean: 2 of {len(scene):,} removed that cannot be drawn; renders of 3 views stay the same"
+    what = f"clean: {unseen} of {len(scene):,} removed that are seen from nowhere (looking around from 4 places)"
+    assert second.startswith(f"{what}; renders ")
+
+
+def test_the_lines_count_only_what_went(room, views):
+    scene = with_junk(room)
+    source = ViewSource(scene, given=views)
+    total = sum(map(len, junk_of(scene)))
+    assert clean_scene(scene, len(scene), source).notes == (
+        f"clean: nothing removed; {total} could go, but all are asked for",
+    )
+    first, second = clean_scene(scene, len(scene) - 3, source).notes
+    assert first.startswith("clean: 2 of ") and second.startswith("clean: 1 of ")
+
+
+def test_a_visible_loss_is_measured(room, views, monkeypatch):
+    """If the rule were wrong and took a wall, the line would say so."""
+    wall = (room.means[:, 0] > 1.9).nonzero()[:, 0]
+    found = replace(find_junk(room), unseen=wall)
+    monkeypatch.setattr(cleaning, "find_junk", lambda *args, **options: found)
+    (_, note) = clean_scene(room, 1, ViewSource(room, given=views)).notes
+    reached = float(note.split("reach ")[1].split(" dB")[0])
+    assert reached < 30
+
+
+def test_without_a_free_place_or_views_only_the_undrawable_go(monkeypatch):
+    scene = with_junk(box_room(0, 40, size=0.05))  # too few to enclose anything
+    junk = find_junk(scene)
+    assert junk.places == 0 and len(junk.unseen) == 0
+    (first, second) = clean_scene(scene, 1, ViewSource(scene)).notes
+    assert first == f"clean: 2 of {len(scene)} removed that cannot be drawn"
+    assert second.endswith("(no free place to look from was found)")
+
+
+def test_command_line_and_function_agree(room, tmp_path, capsys):
+    path = tmp_path / "room.ply"
+    write_ply(with_junk(room)[: ROOM + PLANTED], path)
+    main(["prune", str(path), "--clean", "--by", "volume", "--keep", "50%", "-o", str(tmp_path / "small.ply")])
+    assert same_bits(read_ply(tmp_path / "small.ply"), ps.prune(path, "50%", "volume", clean=True))
+    before = sorted(tmp_path.iterdir())
+    capsys.readouterr()
+    main(["prune", str(path), "--clean", "--by", "volume", "--dry-run"])
+    assert sorted(tmp_path.iterdir()) == before
+    said = capsys.readouterr()
+    assert "removed that are seen from nowhere" in " ".join((said.out + said.err).split())
+
+
+def test_compact_cleans_if_asked(room, views):
+    scene = with_junk(room)[: ROOM + PLANTED]
+    result = ps.compact(scene, 0.5, by="coverage", clean=True, views=views)
+    assert len(result.pruned) == 1256
+    assert int((result.pruned.means[:, 0].abs() > 3).sum()) == 0
+    assert any("removed that are seen from nowhere" in note for note in result.notes)
