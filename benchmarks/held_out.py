@@ -11,12 +11,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.view_sampling import sample_views
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import open_run, read_scene
 from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.rasterizer import rasterization, render
 from pointsplat_ns.views import View, Views
 

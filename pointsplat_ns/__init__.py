@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.levels import Levels
     from pointsplat_ns.compression.pictures import plot_comparison
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
-    from pointsplat_ns.compression.view_sampling import sample_views
     from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
     from pointsplat_ns.gaussians import Gaussians
     from pointsplat_ns.io.scene import save
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
     from pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner import make_refiner
     from pointsplat_ns.nerfstudio_plugin.pointsplat.report import report
+    from pointsplat_ns.pruning.view_sampling import sample_views
     from pointsplat_ns.rasterizer import rasterization, render
     from pointsplat_ns.rooms import write_room
     from pointsplat_ns.views import View, Views
@@ -46,7 +46,7 @@ _PUBLIC = {
     "pointsplat_ns.compression.levels": ("Levels",),
     "pointsplat_ns.compression.pictures": ("plot_comparison",),
     "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner"),
-    "pointsplat_ns.compression.view_sampling": ("sample_views",),
+    "pointsplat_ns.pruning.view_sampling": ("sample_views",),
     "pointsplat_ns.errors": ("BudgetError", "DataError", "PointSplatError", "SceneError"),
     "pointsplat_ns.gaussians": ("Gaussians",),
     "pointsplat_ns.io.scene": ("save",),

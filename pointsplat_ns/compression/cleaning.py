@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.compression.closeness import DenseReference
-from pointsplat_ns.compression.view_sampling import content_box, sample_views
 from pointsplat_ns.compression.view_source import COMPARED_SIDE, ViewSource
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.pruning.view_sampling import content_box, sample_views
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.progress import Progress, silent

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.view_sampling import content_box
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import content_hash, open_run, write_ply
 from pointsplat_ns.io.files import replacing
+from pointsplat_ns.pruning.view_sampling import content_box
 from pointsplat_ns.rasterizer import render
 
 if TYPE_CHECKING:

@@ -32,6 +32,7 @@ from pointsplat_ns.pruning import (
 )
 from pointsplat_ns.pruning.methods import check_opacity_weight
 from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.views import Views
 
 SCORED_VIEWS = 40
 """Maximum number of views for fine-tuning and for methods that score by views. Datasets may have thousands."""
@@ -105,7 +106,7 @@ def prune_scene(
             f"{len(compared)} views; {len(search.tried)} counts tried"
         )
     else:
-        scene = prune(start, count, by, functools.partial(views.views, SCORED_VIEWS), opacity_weight, report)
+        scene = prune(start, count, by, _seen_from(by, views), opacity_weight, report, notes.append)
     if fine_tune_steps:
         tuned = views.views(SCORED_VIEWS)
         scene = fine_tune(scene, tuned, dense, fine_tune_steps, progress=functools.partial(progress, "fine-tuning"))
@@ -151,7 +152,7 @@ def _pruner(
     """A function from a count to a scene of that many Gaussians. Scores are computed once, for all counts."""
     method = method_named(by)
     if method.score is None:
-        return lambda count: prune(scene, count, by)
+        return lambda count: prune(scene, count, by, views.given)
     progress(0.0)
     scores = score_of(scene, method, functools.partial(views.views, SCORED_VIEWS), opacity_weight, progress)
     return lambda count: scene[select(scores, count)]
@@ -162,6 +163,11 @@ def _refilling(
 ) -> Callable[[int], Gaussians]:
     """``make`` for counts above ``most``, the number of Gaussians in the cleaned scene, too: it gets junk back then."""
     return lambda count: make(count) if count <= most else cleaning.apply(full, count)
+
+
+def _seen_from(by: str, views: ViewSource) -> Views | Callable[[], Views] | None:
+    """The views that a method sees the scene from: only given ones, where it needs none."""
+    return functools.partial(views.views, SCORED_VIEWS) if method_named(by).needs_views else views.given
 
 
 def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress, notes: list[str]) -> Gaussians:

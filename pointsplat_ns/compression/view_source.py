@@ -7,10 +7,10 @@ from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 
-from pointsplat_ns.compression.view_sampling import sample_views
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import open_run
+from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.views import RasterizeMode, Views
 
 COMPARED_VIEWS, COMPARED_SIDE = 12, 400
@@ -40,6 +40,11 @@ class ViewSource:
         """Text that says where views came from; empty until there are some."""
         self._missing = ""
         self._rasterize_mode: RasterizeMode = "classic"
+
+    @property
+    def given(self) -> Views | None:
+        """The views that were given, if any."""
+        return self._given if self._given is not None and len(self._given) else None
 
     @cached_property
     def _of_dataset(self) -> Views | None:

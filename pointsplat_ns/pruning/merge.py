@@ -2,7 +2,12 @@
 
 Over a few rounds, pairs of neighbours are replaced by one Gaussian with their common mass (opacity times the area of
 the projection), centre, covariance and colour. The cost of a pair is the expected change of rendered images, see
-:mod:`~pointsplat_ns.pruning.pair_costs`.
+:mod:`~pointsplat_ns.pruning.pair_costs`, as large as it appears from where the scene is looked at, see
+:mod:`~pointsplat_ns.pruning.viewpoints`. Two numbers of the result are chosen by small renders, see
+:mod:`~pointsplat_ns.pruning.finishing`.
+
+Memory: besides the scene itself about 0.4 kB a Gaussian. SH coefficients are read twice, in pieces: for the principal
+axes of colours, and at the end for the means of members.
 """
 
 from __future__ import annotations
@@ -11,17 +16,23 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import BudgetError
-from pointsplat_ns.gaussians import SH_C0, Gaussians
-from pointsplat_ns.geometry.neighbours import nearest_and_walk
-from pointsplat_ns.pruning.covariance import TINY, covariances, unpack
-from pointsplat_ns.pruning.pair_costs import CHUNK, OPAQUE, Remaining, costs_of, moments_of, replacements_of
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.neighbours import other_neighbours
+from pointsplat_ns.pruning.covariance import TINY, unpack
+from pointsplat_ns.pruning.coverage import curve_keys, unit_cells
+from pointsplat_ns.pruning.finishing import SIDE, Finish, Reference
+from pointsplat_ns.pruning.matching import cheapest_pairs
+from pointsplat_ns.pruning.merge_state import CHUNK, OPAQUE, start
+from pointsplat_ns.pruning.pair_costs import costs_of
+from pointsplat_ns.pruning.viewpoints import UNITS, content_size, in_units, viewpoints, weights_seen
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
+from pointsplat_ns.views import Views
 
 NEIGHBOURS = 8
 """Number of nearest centres that a Gaussian may be merged with."""
@@ -30,12 +41,9 @@ SHARE_PER_ROUND = 0.4
 """Share of the remaining Gaussians that may be merged away in one round. Smaller shares are greedier and measured
 worse: the cost of a pair does not include earlier losses of its members, and even thinning keeps losses small."""
 
-DEEPENING = 0.25
-"""The optical depth of a merged Gaussian is multiplied by its number of members to this power. Merging keeps the mass
-but spreads it over a larger area, so that more of the background shows through. The power was found by measurement."""
-
-COLOUR_AXES = 8
-"""Number of principal axes of the colours (all SH bands) used for costs; they hold nearly all of the variance."""
+FEWEST_SEEN, MOST_SEEN = 2_000, 2_000_000
+"""Smallest and largest number of Gaussians of a scene that is looked at and rendered to choose the numbers of
+:class:`Finish`. Smaller ones are merged in less time than that takes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +53,13 @@ class Merged:
     scene: Gaussians
     """K Gaussians in the order of their first members. Those not merged with any other are unchanged to the bit."""
     assignment: Tensor  # [N] int64, index in ``scene`` of the Gaussian that each was merged into; -1 if dropped
+    finish: Finish
+    """The numbers chosen for this scene."""
 
 
-def merge(scene: Gaussians, k: int, progress: Callable[[float], None] | None = None) -> Merged:
+def merge(
+    scene: Gaussians, k: int, progress: Callable[[float], None] | None = None, views: Views | None = None
+) -> Merged:
     """Replace a scene by ``k`` Gaussians that look the same.
 
     Gaussians too faint to be drawn are dropped first; the others are merged in pairs, cheapest first.
@@ -57,6 +69,7 @@ def merge(scene: Gaussians, k: int, progress: Callable[[float], None] | None = N
             ``k`` is N.
         k: number of Gaussians in the result; N returns the scene itself.
         progress: called with the share done, in [0, 1].
+        views: where the scene is looked at from; by default from free places in it.
 
     Returns:
         Exactly ``k`` Gaussians. Deterministic.
@@ -64,11 +77,14 @@ def merge(scene: Gaussians, k: int, progress: Callable[[float], None] | None = N
     Raises:
         BudgetError: if ``k`` is not in 1..N, or fewer than ``k`` Gaussians can be drawn.
     """
-    return next(merge_levels(scene, [k], progress))
+    return next(merge_levels(scene, [k], progress, views))
 
 
 def merge_levels(
-    scene: Gaussians, counts: Sequence[int], progress: Callable[[float], None] | None = None
+    scene: Gaussians,
+    counts: Sequence[int],
+    progress: Callable[[float], None] | None = None,
+    views: Views | None = None,
 ) -> Iterator[Merged]:
     """Replace a scene by fewer and fewer Gaussians in one pass.
 
@@ -78,6 +94,7 @@ def merge_levels(
         scene: N Gaussians, see :func:`merge`.
         counts: number of Gaussians of each level, in 1..N, descending without repetition.
         progress: called with the share done of all levels, in [0, 1].
+        views: where the scene is looked at from; by default from free places in it.
 
     Yields:
         A level for each count, as soon as it is reached.
@@ -91,52 +108,31 @@ def merge_levels(
             raise BudgetError(f"cannot merge {n} Gaussians into {k}; expected 1 to {n}")
     if any(fewer >= more for more, fewer in itertools.pairwise(counts)):
         raise BudgetError(f"levels of {', '.join(map(str, counts))} Gaussians; expected descending counts")
-    return _levels(scene, counts, progress or (lambda share: None))
+    return _levels(scene, counts, progress or (lambda share: None), views)
 
 
 @torch.no_grad()
-def _levels(scene: Gaussians, counts: Sequence[int], report: Callable[[float], None]) -> Iterator[Merged]:
+def _levels(
+    scene: Gaussians, counts: Sequence[int], report: Callable[[float], None], views: Views | None
+) -> Iterator[Merged]:
     n = len(scene)
     if n in counts:
-        yield Merged(scene, torch.arange(n, device=scene.device))
+        report(0.0 if len(counts) > 1 else 1.0)
+        yield Merged(scene, torch.arange(n, device=scene.device), Finish())
         counts = counts[1:]
     if not counts:
-        report(1.0)
         return
-    members = _visible(scene, counts[0])
-    part = scene[members].to(device="cpu")
-    owner = torch.arange(len(part))  # [len(part)] index in part of the Gaussian that each is merged into
-    state = _start(part)
-    alive = owner.clone()  # [len(state)] index in part of each remaining Gaussian
-    whole = max(len(part) - counts[-1], 1)
+    dense = scene.to(device="cpu")
+    merging = Merging(dense, _visible(dense, counts[0]), views)
+    first, last = len(merging), counts[-1]
     for k in counts:
-        while len(state) > k:
-            first, second = _cheapest(state, k)
-            _replace(state, first, second)
-            owner[alive[second]] = alive[first]
-            left = torch.ones(len(state), dtype=torch.bool)
-            left[second] = False
-            alive = alive[left]
-            state.keep(left)
-            report(1 - (len(state) - counts[-1]) / whole)
-        while bool((owner[owner] != owner).any()):
-            owner = owner[owner]
-        place = torch.full((len(part),), -1)
-        place[alive] = torch.arange(len(alive))
-        assignment = torch.full((n,), -1, device=scene.device)
-        assignment[members] = place[owner].to(scene.device)
-        merged = _merged(state, part, alive, torch.bincount(place[owner], minlength=k))
-        yield Merged(merged.to(scene.device), assignment)
-    report(1.0)
-
-
-def _merged(state: Remaining, part: Gaussians, alive: Tensor, sizes: Tensor) -> Gaussians:
-    """The remaining Gaussians, of ``sizes`` (n,) members each, as a scene; those of one member as in ``part``, where
-    they are ``alive`` (n,)."""
-    deepened = dataclasses.replace(state, alphas=_deepened(state.alphas, sizes))
-    replaced, kept = _as_gaussians(deepened, part), part[alive]
-    pairs = zip(kept.tensors(), replaced.tensors(), strict=True)
-    return Gaussians(*(torch.where((sizes == 1).view(-1, *[1] * (a.dim() - 1)), a, b) for a, b in pairs))
+        while len(merging) > k:
+            merging.round(k)
+            report(0.95 * (first - len(merging)) / max(first - last, 1))
+        merged = merging.level()
+        if k == last:
+            report(1.0)
+        yield Merged(merged.scene.to(scene.device), merged.assignment.to(scene.device), merged.finish)
 
 
 def _visible(scene: Gaussians, k: int) -> Tensor:
@@ -153,98 +149,178 @@ def _visible(scene: Gaussians, k: int) -> Tensor:
     return seen.nonzero()[:, 0]
 
 
-def _start(scene: Gaussians) -> Remaining:
-    sh = scene.sh.reshape(len(scene), -1)
-    # By Parseval, the coefficients of every band contribute to the mean square over directions as the constant does.
-    centred = sh.double() * SH_C0
-    centred = centred - centred.mean(dim=0)
-    axes = torch.linalg.eigh(centred.T @ centred).eigenvectors[:, -COLOUR_AXES:]
-    return Remaining(
-        means=scene.means.double(),
-        cov=covariances(scene.scales.double(), scene.quats.double()),
-        alphas=scene.alphas.double(),
-        colours=centred @ axes,
-        sh=sh.clone(),
-    )
+@dataclass
+class Tree:
+    """Which Gaussians were merged, and in what shares."""
+
+    owner: Tensor  # [n] int32, the Gaussian that each is merged into, itself if it remains
+    rounds: list[tuple[Tensor, Tensor, Tensor]] = field(default_factory=list)
+    """First and second members (int32) of the pairs of each round, and the share of the first in the mass (float32)."""
+
+    def record(self, first: Tensor, second: Tensor, shares: Tensor) -> None:
+        """Note a round."""
+        self.owner[second] = first.to(torch.int32)
+        self.rounds.append((first.to(torch.int32), second.to(torch.int32), shares))
+
+    def roots(self) -> Tensor:
+        """The remaining Gaussian that each is part of, (n,) int32."""
+        while True:
+            above = self.owner[self.owner.long()]
+            if torch.equal(above, self.owner):
+                return self.owner
+            self.owner = above
+
+    def shares(self) -> Tensor:
+        """Share of each in the mass of the Gaussian that it is part of, (n,) float32: the product of its shares in all
+        rounds, from the last to the first."""
+        shares = torch.ones(len(self.owner))
+        for first, second, share in reversed(self.rounds):
+            i, j = first.long(), second.long()
+            shares[j] = shares[i] * (1 - share)
+            shares[i] *= share
+        return shares
 
 
-def _neighbours(means: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Distinct pairs (i, j), i < j, of every centre with its nearest ones; and all centres (n,) in the order of the
-    search tree's leaves."""
-    n = len(means)
-    _, near, walk = nearest_and_walk(means, NEIGHBOURS + 1)
-    one, other = torch.arange(n).repeat_interleave(near.shape[1]), near.reshape(-1)
-    key = torch.unique(torch.minimum(one, other) * n + torch.maximum(one, other))
-    first, second = key // n, key % n
-    apart = first != second
-    return first[apart], second[apart], walk
+class Merging:
+    """A scene while it is merged.
+
+    Args:
+        scene: N Gaussians on the CPU.
+        members: (n,) ascending indices of those that take part.
+        views: where the scene is looked at from; by default from free places in it.
+    """
+
+    def __init__(self, scene: Gaussians, members: Tensor, views: Views | None):
+        self.scene = scene
+        # Along a space-filling curve, neighbours are near each other in memory.
+        self.members = members[curve_keys(unit_cells(scene.means[members])).argsort(stable=True)]
+        self.centre, self.size = content_size(scene)
+        self.views = self._in_units(views) if views is not None else None
+        if self.views is None and len(members) >= FEWEST_SEEN:
+            self.views = viewpoints(in_units(scene, self.centre, self.size), SIDE, 3 * SIDE // 4)
+        self.state = start(scene, self.members, self._weights(), self.centre, self.size)
+        self.tree = Tree(torch.arange(len(self.members), dtype=torch.int32))
+        self.alive = torch.arange(len(self.members))  # [n left] index in members
+        self.reference: Reference | None = None
+        self._see()
+
+    def __len__(self) -> int:
+        return len(self.state)
+
+    def round(self, k: int) -> None:
+        """Merge some pairs, until at least ``k`` Gaussians are left."""
+        n = len(self)
+        near = other_neighbours(self.state.means, NEIGHBOURS)
+        first, second = cheapest_pairs(near, costs_of(self.state, near), max(1, min(n - k, int(n * SHARE_PER_ROUND))))
+        shares = self.state.replace_pairs(first, second)
+        self.tree.record(self.alive[first], self.alive[second], shares)
+        left = torch.ones(n, dtype=torch.bool)
+        left[second] = False
+        self.alive = self.alive[left]
+        self.state.keep(left)
+        self._see()
+
+    def level(self) -> Merged:
+        """The Gaussians that remain, as a scene."""
+        roots = self.tree.roots().long()
+        place = torch.empty(len(self.members), dtype=torch.int64)
+        order = self._in_order(roots)
+        place[self.alive[order]] = torch.arange(len(order))
+        assignment = torch.full((len(self.scene),), -1)
+        assignment[self.members] = place[roots]
+        scene, finish = self._finished(self._sh(place[roots], len(order)), order)
+        return Merged(scene, assignment, finish)
+
+    def _in_order(self, roots: Tensor) -> Tensor:
+        """Indices (n left,) of the Gaussians that remain in the order of their first members in the scene."""
+        first = torch.full((len(self.members),), len(self.scene))
+        first.scatter_reduce_(0, roots, self.members, "amin")
+        return first[self.alive].argsort()
+
+    def _weights(self) -> Tensor:
+        if self.views is None:
+            return torch.ones(len(self.members))
+        means = (self.scene.means[self.members].double() - self.centre) * (UNITS / self.size)
+        return weights_seen(means, self.views)
+
+    def _in_units(self, views: Views) -> Views:
+        """Views in units of the content."""
+        viewmats = views.viewmats.double().cpu().clone()
+        viewmats[:, :3, 3] += viewmats[:, :3, :3] @ self.centre
+        viewmats[:, :3, 3] *= UNITS / self.size
+        return dataclasses.replace(
+            views, viewmats=viewmats, Ks=views.Ks.double().cpu(), background=views.background.cpu()
+        )
+
+    def _see(self) -> None:
+        """Render what remains, once it is few enough."""
+        if self.reference is None and self.views is not None and len(self) <= MOST_SEEN:
+            if self.tree.rounds:
+                roots, places = self.tree.roots().long(), torch.empty(len(self.members), dtype=torch.int64)
+                places[self.alive] = torch.arange(len(self))
+                now = self._made(self._sh(places[roots], len(self)), torch.arange(len(self)))(Finish())
+            else:
+                now = self.scene[self.members] if len(self.members) < len(self.scene) else self.scene
+            self.reference = Reference(in_units(now, self.centre, self.size), self.views)
+
+    def _finished(self, sh: Tensor, order: Tensor) -> tuple[Gaussians, Finish]:
+        make = self._made(sh, order)
+        if self.reference is None or not bool((self.state.members > 1).any()):
+            return make(Finish()), Finish()
+        finish = self.reference.best(lambda tried: in_units(make(tried), self.centre, self.size))
+        return make(finish), finish
+
+    def _sh(self, place: Tensor, count: int) -> Tensor:
+        """SH coefficients (count, (d+1)^2 * 3): means by mass over the members, of which ``place`` (n,) says where they
+        belong."""
+        scene, shares = self.scene, self.tree.shares()
+        wide = torch.promote_types(scene.dtype, torch.float32)
+        sh = torch.zeros(count, 3 + 3 * scene.features_rest.shape[1], dtype=wide)
+        for these in torch.arange(len(place)).split(CHUNK):
+            members = self.members[these]
+            sh_of = torch.cat([scene.features_dc[members], scene.features_rest[members].flatten(1)], dim=1)
+            sh.index_add_(0, place[these], sh_of.to(wide) * shares[these, None].to(wide))
+        return sh
+
+    def _made(self, sh: Tensor, order: Tensor) -> Callable[[Finish], Gaussians]:
+        """A function from a finish to the scene of Gaussians ``order`` (K,) with these SH coefficients (K, C)."""
+        state, like = self.state, self.scene
+        sizes = state.members[order].double()
+        alone = sizes == 1
+        kept = like[self.members[self.alive[order]]]
+        scales, quats = _axes(state.cov[order])
+        means, alphas = state.means[order].to(like.dtype), state.alphas[order]
+        rest = like.features_rest.shape[1]
+        dc, others = sh[:, :3].to(like.dtype), sh[:, 3:].reshape(len(sh), rest, 3).to(like.dtype)
+
+        def choose(unmerged: Tensor, merged: Tensor) -> Tensor:
+            return torch.where(alone.view(-1, *[1] * (merged.dim() - 1)), unmerged, merged)
+
+        means, quats = choose(kept.means, means), choose(kept.quats, quats.to(like.dtype))
+        dc, others = choose(kept.features_dc, dc), choose(kept.features_rest, others)
+
+        def make(finish: Finish) -> Gaussians:
+            logits = torch.logit(deepened(alphas, sizes, finish.deepening), 1e-7)[:, None].to(like.dtype)
+            spread = (scales + finish.spread).to(like.dtype)
+            return Gaussians(means, choose(kept.scales, spread), quats, choose(kept.opacities, logits), dc, others)
+
+        return make
 
 
-def _cheapest(state: Remaining, k: int) -> tuple[Tensor, Tensor]:
-    """Disjoint pairs to merge in this round."""
-    n = len(state)
-    first, second, walk = _neighbours(state.means)
-    chosen, costs = _match(first, second, n, state)
-    if len(chosen) < n / 10:  # many coincident centres have the same few nearest
-        first, second = torch.cat([first, walk[:-1]]), torch.cat([second, walk[1:]])
-        chosen, costs = _match(first, second, n, state)
-    count = max(1, min(n - k, int(n * SHARE_PER_ROUND)))
-    chosen = chosen[costs[chosen].sort(stable=True).indices[:count]]
-    return first[chosen], second[chosen]
-
-
-def _match(first: Tensor, second: Tensor, n: int, state: Remaining, passes: int = 6) -> tuple[Tensor, Tensor]:
-    """Indices of disjoint pairs, and the costs of all pairs (E,). Each pass takes the pairs that are the cheapest for
-    both of their members, among the Gaussians still free."""
-    costs = costs_of(state, first, second)
-    rank = torch.empty(len(costs), dtype=torch.long)
-    rank[costs.sort(stable=True).indices] = torch.arange(len(costs))
-    free = torch.ones(n, dtype=torch.bool)
-    ids = torch.arange(len(costs))
-    chosen = []
-    for _ in range(passes):
-        i, j, r = first[ids], second[ids], rank[ids]
-        best = torch.full((n,), len(costs)).scatter_reduce_(0, i, r, "amin").scatter_reduce_(0, j, r, "amin")
-        mutual = (best[i] == r) & (best[j] == r)
-        chosen.append(ids[mutual])
-        free[i[mutual]] = False
-        free[j[mutual]] = False
-        ids = ids[free[i] & free[j]]
-        if len(ids) == 0:
-            break
-    return torch.cat(chosen), costs
-
-
-def _replace(state: Remaining, first: Tensor, second: Tensor) -> None:
-    """Overwrite the first member of each pair by the pair's replacement."""
-    for i, j in zip(first.split(CHUNK), second.split(CHUNK), strict=True):
-        pairs = replacements_of(state, i, j, moments_of(state, i, j))
-        state.means[i], state.cov[i], state.alphas[i] = pairs.means, pairs.cov, pairs.alphas
-        for values in (state.colours, state.sh):
-            weight = pairs.weight[:, None].to(values.dtype)
-            values[i] = weight * values[i] + (1 - weight) * values[j]
-
-
-def _deepened(alphas: Tensor, sizes: Tensor) -> Tensor:
-    """Opacities (n,) of Gaussians with ``sizes`` (n,) members: 1 - (1 - alpha)^p, where p = sizes^:data:`DEEPENING`."""
-    depth = -torch.log1p(-alphas.clamp_max(OPAQUE)) * sizes.double() ** DEEPENING
+def deepened(alphas: Tensor, sizes: Tensor, power: float) -> Tensor:
+    """Opacities (n,) of Gaussians with ``sizes`` (n,) members: 1 - (1 - alpha)^(sizes^power)."""
+    depth = -torch.log1p(-alphas.clamp_max(OPAQUE)) * sizes.double() ** power
     return (-torch.expm1(-depth)).clamp_max(ALPHA_MAX)
 
 
-def _as_gaussians(state: Remaining, like: Gaussians) -> Gaussians:
-    """The state as a scene, in the dtype of ``like``."""
+def _axes(cov: Tensor) -> tuple[Tensor, Tensor]:
+    """Log-scales (n, 3) and quaternions (n, 4) of covariances (n, 6)."""
     from scipy.spatial.transform import Rotation
 
-    variances, axes = torch.linalg.eigh(unpack(state.cov))
-    axes[:, :, 0] *= torch.linalg.det(axes).sign()[:, None]
-    quats = torch.from_numpy(Rotation.from_matrix(axes.numpy()).as_quat())[:, [3, 0, 1, 2]]
-    sh = state.sh.view(len(state), -1, 3)
-    scene = Gaussians(
-        means=state.means,
-        scales=0.5 * variances.clamp_min(TINY).log(),
-        quats=quats,
-        opacities=torch.logit(state.alphas, 1e-7)[:, None],
-        features_dc=sh[:, 0].double(),
-        features_rest=sh[:, 1:].double(),
-    )
-    return scene.to(like.dtype)
+    scales, quats = torch.empty(len(cov), 3, dtype=torch.float64), torch.empty(len(cov), 4, dtype=torch.float64)
+    for these in torch.arange(len(cov)).split(CHUNK):
+        variances, axes = torch.linalg.eigh(unpack(cov[these]))
+        axes[:, :, 0] *= torch.linalg.det(axes).sign()[:, None]
+        scales[these] = 0.5 * variances.clamp_min(TINY).log()
+        quats[these] = torch.from_numpy(Rotation.from_matrix(axes.numpy()).as_quat())[:, [3, 0, 1, 2]]
+    return scales, quats

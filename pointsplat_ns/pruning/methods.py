@@ -114,6 +114,7 @@ def prune(
     views: Views | Callable[[], Views] | None = None,
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
+    note: Callable[[str], None] | None = None,
 ) -> Gaussians:
     """Prune a scene to a number of Gaussians.
 
@@ -121,9 +122,11 @@ def prune(
         scene: N Gaussians.
         keep: ratio, count or size (see :func:`~pointsplat_ns.pruning.budget.resolve_keep`).
         by: one of :data:`METHODS`. Methods with a score keep Gaussians unchanged, in their original order.
-        views: views for methods that need them, or a function that returns them.
+        views: views for methods that need them, or a function that returns them. Merging looks from them if they are
+            given as such, and from free places in the scene otherwise.
         opacity_weight: lambda of the methods that weigh opacity; by default the paper's.
         progress: called with the share done, in [0, 1].
+        note: called with a line of text on what was chosen for this scene.
 
     Returns:
         Exactly the number of Gaussians that ``keep`` resolves to.
@@ -139,7 +142,10 @@ def prune(
     count = resolve_keep(len(scene), keep, scene.sh_degree)
     need_usable(scene)
     if method.score is None:
-        return merge(scene, count, progress=progress).scene
+        merged = merge(scene, count, progress=progress, views=views if isinstance(views, Views) else None)
+        if note is not None:
+            note(merged.finish.note)
+        return merged.scene
     return scene[select(score_of(scene, method, views, opacity_weight, progress), count)]
 
 

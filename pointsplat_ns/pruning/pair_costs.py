@@ -1,31 +1,29 @@
-"""The replacement of a pair of Gaussians, and the expected change of rendered images.
+"""The cost of replacing a pair of neighbours by one Gaussian: the expected change of rendered images.
 
-The replacement has the common mass (opacity times the area of the projection), centre, covariance and colour of both.
-The cost is the change expected in images from three directions. Near a surface an image is a blend, sum(a G c) /
-sum(a G). So a change of one Gaussian counts in proportion to its colour contrast with its surroundings, and less the
-more others cover the same place. Where few do, the unknown background shows through and counts as well.
+Near a surface an image is a blend, sum(a G c) / sum(a G). So a change of one Gaussian counts in proportion to its
+colour contrast with its surroundings, and less the more others cover the same place. Where few do, the unknown
+background shows through and counts as well. The change is an integral over the projections of three Gaussians onto a
+plane. All products of Gaussians have closed integrals.
 
-Shapes: n Gaussians left, E pairs (i, j). The projection of a Gaussian onto a plane is called its shadow.
+A pair is looked at from three perpendicular directions: along the thinnest axis of its first member, and from the
+sides. They are rounded to thirteen fixed ones, the axes and diagonals of a cube. So every Gaussian is projected once
+for each direction, not once for each of its pairs.
+
+Shapes: n Gaussians, k neighbours of each, C colour axes. The projection of a Gaussian onto a plane is called its
+shadow: three variances (uu, uv, vv).
 """
 
 from __future__ import annotations
 
-import dataclasses
+import itertools
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.pruning.covariance import TINY, flat_area, flatten, normals, outer, overlap, plane, shadow
-
-OPAQUE = 0.99
-"""Largest opacity of a replacement. If the mass needs more, the area grows."""
-
-GROWTH = 0.6
-"""The area grows with the ratio of needed opacity to :data:`OPAQUE`, to this power: 0 opens holes, 1 smears edges."""
-
-MOST_SURPLUS = 4.0
-"""Upper bound of that ratio. Two Gaussians seldom reach 2; for points without area it would be infinite."""
+from pointsplat_ns.pruning.covariance import plane
+from pointsplat_ns.pruning.merge_state import GROWTH, MOST_SURPLUS, OPAQUE, State
+from pointsplat_ns.system.threads import in_threads
 
 LOCAL_CONTRAST = 0.01
 """Contrast with the surroundings assumed in addition to the measured one, per colour channel in [0, 1]."""
@@ -33,137 +31,170 @@ LOCAL_CONTRAST = 0.01
 BACKGROUND_CONTRAST = 0.3
 """Contrast assumed with the far background, which shows where few Gaussians overlap."""
 
-FACE_ON, *SIDEWAYS = 0, 1, 2
-"""Directions that pairs are seen from. A distance in depth between the members shows only from the sides."""
+DIRECTIONS = torch.nn.functional.normalize(
+    torch.tensor([way for way in itertools.product((-1.0, 0.0, 1.0), repeat=3) if way > (0, 0, 0)], dtype=torch.float64)
+)
+"""The directions (13, 3) that pairs are seen from."""
 
-CHUNK = 1 << 17
-"""Number of pairs processed at once: about 100 MB."""
+THINNEST = 1e-5
+"""Share of a shadow's summed variances that is added to each, so that float32 tells thin shadows from lines. So widths
+are at least 0.3 % of lengths."""
+
+NARROWEST, WIDEST = 1e-6, 1e3
+"""Bounds of standard deviations in units of the scene's size: squares of products of four stay in float32."""
+
+FARTHEST = 1e3
+"""Bound of coordinates in units of the scene's size."""
+
+CHUNK = 1 << 13
+"""Number of Gaussians processed at once: small enough for a processor's cache."""
+
+TINY = 1e-30
+
+
+def _projections() -> tuple[Tensor, Tensor]:
+    """For each direction the two axes of its plane, (13, 3, 2), and the matrix that turns the six numbers of a
+    covariance into its shadow, (13, 6, 3)."""
+    axes = torch.stack(plane(DIRECTIONS), dim=2)
+    u, v = axes[..., 0], axes[..., 1]
+
+    def row(a: Tensor, b: Tensor) -> Tensor:
+        x, y, z = a.unbind(1)
+        p, q, r = b.unbind(1)
+        return torch.stack([x * p, x * q + y * p, x * r + z * p, y * q, y * r + z * q, z * r], dim=1)
+
+    return axes, torch.stack([row(u, u), row(u, v), row(v, v)], dim=2)
+
+
+def _sides() -> Tensor:
+    """(13, 3): each direction, and two that are perpendicular to it and to each other, as far as the thirteen are."""
+    across = (DIRECTIONS @ DIRECTIONS.T).abs()
+    rows = []
+    for face in range(len(DIRECTIONS)):
+        one = int(across[face].sort(stable=True).indices[0])
+        other = int((across[face] + across[one]).sort(stable=True).indices[0])
+        rows.append([face, one, other])
+    return torch.tensor(rows)
+
+
+AXES, TO_SHADOW = _projections()
+SIDES = _sides()
+
+
+def costs_of(state: State, near: Tensor) -> Tensor:
+    """Expected change of images by merging each Gaussian with each of its neighbours.
+
+    Args:
+        state: n Gaussians.
+        near: (n, k) indices of the neighbours of each.
+
+    Returns:
+        (n, k) float32: squared colour units times solid angle, with the surroundings of the first of each pair.
+    """
+    n = len(state)
+    means, cov = _scaled(state)
+    ways = torch.empty(n, 3, dtype=torch.uint8)
+    everywhere = torch.arange(n).split(CHUNK)
+
+    def choose(these: Tensor) -> None:
+        shadows = (cov[these] @ TO_SHADOW.permute(1, 0, 2).reshape(6, -1)).view(-1, len(DIRECTIONS), 3)
+        areas = shadows[..., 0] * shadows[..., 2] - shadows[..., 1] ** 2
+        ways[these] = SIDES[areas.argmax(1)].to(torch.uint8)
+
+    in_threads(choose, everywhere)
+    alphas, costs = state.alphas.float(), torch.zeros(near.shape)
+    for way in range(len(DIRECTIONS)):
+        here = (ways == way).any(1).nonzero()[:, 0]
+        if len(here) == 0:
+            continue
+        centres, shadows = (means @ AXES[way]).float(), (cov @ TO_SHADOW[way]).float()
+        spread = THINNEST * (shadows[:, 0] + shadows[:, 2]) + NARROWEST**2
+        shadows[:, 0] += spread
+        shadows[:, 2] += spread
+        seen = Seen(centres, shadows, area_of(shadows), alphas, state.colours)
+
+        def add(these: Tensor, seen: Seen = seen) -> None:
+            costs[these] += seen.costs(these, near[these])
+
+        in_threads(add, here.split(CHUNK))
+    return costs.mul_(state.weights[:, None])
+
+
+def _scaled(state: State) -> tuple[Tensor, Tensor]:
+    """Means (n, 3) and covariances (n, 6) in units of the scene's size, around its centre, within the bounds."""
+    means = ((state.means - state.centre) / state.size).clamp_(-FARTHEST, FARTHEST)
+    cov = state.cov / state.size**2
+    total = cov[:, 0] + cov[:, 3] + cov[:, 5]
+    cov *= (WIDEST**2 / total.clamp_min(WIDEST**2))[:, None]
+    return means, cov
+
+
+def area_of(shadow: Tensor) -> Tensor:
+    """Areas (...) of shadows (..., 3), in units of 2 pi: root of the determinant."""
+    return (shadow[..., 0] * shadow[..., 2] - shadow[..., 1].square()).clamp_min(TINY).sqrt()
+
+
+def overlap(first: Tensor, second: Tensor, product: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Integral over the plane of the product of two Gaussians of peak 1 whose centres are (u, v) apart, (...), in units
+    of 2 pi.
+
+    The product of two Gaussians is a Gaussian. Its integral is the product of their areas, divided by the area of the
+    summed covariance, times exp(-d^2 / 2) with d the Mahalanobis distance of the centres under that covariance.
+
+    Args:
+        first, second: shadows (..., 3).
+        product: of their areas.
+        u, v: from one centre to the other.
+    """
+    uu, uv, vv = (first + second).unbind(-1)
+    squared = (uu * vv - uv * uv).clamp_min(TINY)
+    distance = ((vv * u - 2 * uv * v) * u + uu * v * v) / squared
+    return product * squared.rsqrt() * torch.exp(-0.5 * distance.clamp_min(0))
 
 
 @dataclass
-class Remaining:
-    """The Gaussians that remain after some rounds; float64, except for the SH."""
+class Seen:
+    """All Gaussians as seen from one direction."""
 
-    means: Tensor  # [n, 3]
-    cov: Tensor  # [n, 6]
+    centres: Tensor  # [n, 2]
+    shadows: Tensor  # [n, 3]
+    areas: Tensor  # [n]
     alphas: Tensor  # [n]
-    colours: Tensor  # [n, C] on principal axes
-    sh: Tensor  # [n, (d+1)^2 * 3]
+    colours: Tensor  # [n, C]
 
-    def __len__(self) -> int:
-        return len(self.means)
-
-    def keep(self, mask: Tensor) -> None:
-        self.means, self.cov, self.alphas = self.means[mask], self.cov[mask], self.alphas[mask]
-        self.colours, self.sh = self.colours[mask], self.sh[mask]
-
-
-@dataclass
-class Moments:
-    """Moments of pairs, independent of the direction that they are seen from."""
-
-    weight: Tensor  # [E] share of i in the mass
-    apart: Tensor  # [E, 3] from j to i
-    means: Tensor  # [E, 3]
-    cov: Tensor  # [E, 6]
-    axes: tuple[Tensor, Tensor, Tensor]  # [E, 3] orthonormal, the last near the thinnest axis
-
-
-@dataclass
-class Replacements:
-    """The replacements of pairs (i, j), with areas and overlaps of shadows along one direction."""
-
-    means: Tensor  # [E, 3]
-    cov: Tensor  # [E, 6]
-    alphas: Tensor  # [E]
-    weight: Tensor  # [E] share of i in the mass
-    areas: tuple[Tensor, Tensor, Tensor]  # [E] shadows of i, j and the merged
-    overlaps: tuple[Tensor, Tensor, Tensor]  # [E] of i with j, i with the merged, j with the merged
-
-
-def moments_of(state: Remaining, i: Tensor, j: Tensor) -> Moments:
-    """Moments of the common mass of Gaussians ``i`` (E,) and ``j`` (E,)."""
-    mi, mj = (state.alphas[x] * shadow(state.cov[x]) for x in (i, j))
-    total = mi + mj
-    wi = torch.where(total > TINY, mi / total.clamp_min(TINY), 0.5)
-    wj = 1 - wi
-    apart = state.means[i] - state.means[j]
-    means = wi[:, None] * state.means[i] + wj[:, None] * state.means[j]
-    cov = wi[:, None] * state.cov[i] + wj[:, None] * state.cov[j] + (wi * wj)[:, None] * outer(apart)
-    normal = normals(cov)
-    return Moments(wi, apart, means, cov, (*plane(normal), normal))
-
-
-def replacements_of(state: Remaining, i: Tensor, j: Tensor, joined: Moments, view: int = FACE_ON) -> Replacements:
-    """The replacements of the pairs, seen along their thinnest axis or one of the two perpendicular to it. The opacity
-    is such that the mass is that of both members minus their overlap."""
-    ai, aj = state.alphas[i], state.alphas[j]
-    wi, wj = joined.weight, 1 - joined.weight
-    apart, means, cov, axes = joined.apart, joined.means, joined.cov, joined.axes
-    e1, e2 = axes[view], axes[(view + 1) % 3]
-    si, sj, sk = (flatten(c, e1, e2) for c in (state.cov[i], state.cov[j], cov))
-    u, v = (apart * e1).sum(1), (apart * e2).sum(1)
-    pi, pj, pk = flat_area(si), flat_area(sj), flat_area(sk)
-    oij = overlap(si, sj, u, v)
-    alphas = (ai * pi + aj * pj - ai * aj * oij).clamp_min(0) / pk.clamp_min(TINY)
-    growth = (alphas / OPAQUE).clamp(1, MOST_SURPLUS) ** GROWTH
-    sk, pk, cov = sk * growth[:, None], pk * growth, cov * growth[:, None]
-    oik, ojk = overlap(si, sk, wj * u, wj * v), overlap(sj, sk, wi * u, wi * v)
-    return Replacements(means, cov, alphas.clamp_max(OPAQUE), wi, (pi, pj, pk), (oij, oik, ojk))
-
-
-def picture_change(
-    pairs: Replacements, ai: Tensor, aj: Tensor, ii: Tensor | float, jj: Tensor | float, ij: Tensor | float
-) -> Tensor:
-    """Integral over the plane of |f_i a_i G_i + f_j a_j G_j - f_k a_k G_k|^2, (E,). ``ii``, ``jj`` and ``ij`` are the
-    scalar products of the features f_i and f_j; f_k is their mean weighted by mass."""
-    wi, wj, ak = pairs.weight, 1 - pairs.weight, pairs.alphas
-    (pi, pj, pk), (oij, oik, ojk) = pairs.areas, pairs.overlaps
-    ik, jk = wi * ii + wj * ij, wj * jj + wi * ij
-    kk = wi * ik + wj * jk
-    alone = ai * ai * ii * pi + aj * aj * jj * pj + ak * ak * kk * pk
-    across = ai * aj * ij * oij - ai * ak * ik * oik - aj * ak * jk * ojk
-    return (alone / 2 + 2 * across).clamp_min(0)
-
-
-def costs_of(state: Remaining, first: Tensor, second: Tensor) -> Tensor:
-    """Expected change of images from three directions by each merge, (E,) float32, squared colour units times area."""
-    # Pass 1, at each Gaussian and from each side: how much covers it (itself included), and the mean colour of that.
-    views = (FACE_ON, *SIDEWAYS)
-    covers = [state.alphas / 2 for _ in views]
-    arounds = [cover[:, None] * state.colours for cover in covers]
-    kept = []
-    for i, j in zip(first.split(CHUNK), second.split(CHUNK), strict=True):
-        joined = moments_of(state, i, j)
-        seen = [replacements_of(state, i, j, joined, view) for view in views]
-        for pairs, cover, around in zip(seen, covers, arounds, strict=True):
-            (pi, pj, _), (oij, _, _) = pairs.areas, pairs.overlaps
-            on_i = state.alphas[j] * oij / pi.clamp_min(TINY)
-            on_j = state.alphas[i] * oij / pj.clamp_min(TINY)
-            cover.index_add_(0, i, on_i).index_add_(0, j, on_j)
-            around.index_add_(0, i, on_i[:, None] * state.colours[j]).index_add_(0, j, on_j[:, None] * state.colours[i])
-        none = joined.means[:0]
-        kept.append([dataclasses.replace(pairs, means=none, cov=none) for pairs in seen])  # to save memory
-    for cover, around in zip(covers, arounds, strict=True):
-        around /= cover[:, None].clamp_min(TINY)
-    # Pass 2: the change of colour against the surroundings, and of coverage against the background.
-    costs = []
-    for i, j, seen in zip(first.split(CHUNK), second.split(CHUNK), kept, strict=True):
-        cost = torch.zeros_like(seen[0].weight)
-        for pairs, cover, around in zip(seen, covers, arounds, strict=True):
-            cost += _cost_seen(state, i, j, pairs, cover, around)
-        costs.append(cost.float())
-    return torch.cat(costs)
-
-
-def _cost_seen(state: Remaining, i: Tensor, j: Tensor, pairs: Replacements, cover: Tensor, around: Tensor) -> Tensor:
-    """:func:`costs_of` from one direction, given how much covers each Gaussian (n,) and its mean colour (n, C)."""
-    wi, wj = pairs.weight, 1 - pairs.weight
-    here = wi[:, None] * around[i] + wj[:, None] * around[j]
-    fi, fj = state.colours[i] - here, state.colours[j] - here
-    ii, jj, ij = ((x * y).sum(1) + 3 * LOCAL_CONTRAST**2 for x, y in ((fi, fi), (fj, fj), (fi, fj)))
-    ai, aj, one = state.alphas[i], state.alphas[j], torch.ones_like(ii)
-    covered = wi * cover[i] + wj * cover[j]
-    through = 3 * BACKGROUND_CONTRAST**2 * torch.exp(-4 * covered)
-    cost = picture_change(pairs, ai, aj, ii, jj, ij) / covered.clamp_min(0.5) ** 2
-    return cost + through * picture_change(pairs, ai, aj, one, one, one)
+    def costs(self, i: Tensor, j: Tensor) -> Tensor:
+        """Change of the image by each merge of Gaussians ``i`` (m,) with their neighbours ``j`` (m, k), (m, k)."""
+        si, pi, ai = self.shadows[i][:, None], self.areas[i][:, None], self.alphas[i][:, None]
+        sj, pj, aj = self.shadows[j], self.areas[j], self.alphas[j]
+        u, v = (self.centres[i][:, None] - self.centres[j]).unbind(-1)
+        oij = overlap(si, sj, pi * pj, u, v)
+        # How much covers the first, itself included, and the mean colour of that.
+        on = aj * oij / pi
+        cover = ai / 2 + on.sum(1, keepdim=True)
+        ci, cj = self.colours[i], self.colours[j]
+        around = (ai / 2 * ci + (on[:, None] @ cj)[:, 0]) / cover.clamp_min(TINY)
+        fi, fj = (ci - around)[:, None], cj - around[:, None]
+        # The replacement: common mass, centre and covariance.
+        mi, mj = ai * pi, aj * pj
+        wi = mi / (mi + mj).clamp_min(TINY)
+        wj = 1 - wi
+        within = wi * wj
+        across = torch.stack([within * u * u, within * u * v, within * v * v], dim=-1)
+        sk = wi[..., None] * si + wj[..., None] * sj + across
+        pk = area_of(sk)
+        ak = (mi + mj - ai * aj * oij).clamp_min(0) / pk
+        growth = (ak / OPAQUE).clamp(1, MOST_SURPLUS) ** GROWTH
+        sk, pk, ak = sk * growth[..., None], pk * growth, ak.clamp_max(OPAQUE)
+        oik, ojk = overlap(si, sk, pi * pk, wj * u, wj * v), overlap(sj, sk, pj * pk, wi * u, wi * v)
+        # |f_i a_i G_i + f_j a_j G_j - f_k a_k G_k|^2 over the plane, for features f: f_k is their mean by mass.
+        assumed = 3 * LOCAL_CONTRAST**2
+        ii, jj = fi.square().sum(-1) + assumed, fj.square().sum(-1) + assumed
+        ij = (fi * fj).sum(-1) + assumed
+        ik, jk = wi * ii + wj * ij, wj * jj + wi * ij
+        kk = wi * ik + wj * jk
+        gii, gjj, gkk = ai * ai * pi / 2, aj * aj * pj / 2, ak * ak * pk / 2
+        gij, gik, gjk = 2 * ai * aj * oij, 2 * ai * ak * oik, 2 * aj * ak * ojk
+        blend = ii * gii + jj * gjj + kk * gkk + ij * gij - ik * gik - jk * gjk
+        holes = gii + gjj + gkk + gij - gik - gjk
+        through = 3 * BACKGROUND_CONTRAST**2 * torch.exp(-4 * cover)
+        return blend.clamp_min(0) / cover.clamp_min(0.5).square() + through * holes.clamp_min(0)

@@ -6,8 +6,8 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from pointsplat_ns.compression.view_sampling import sample_views
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.views import Views
 
 

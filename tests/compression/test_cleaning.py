@@ -16,11 +16,11 @@ from pointsplat_ns.compression import cleaning
 from pointsplat_ns.compression.cleaning import Cleaning, blend_weights, clean_scene, find_junk
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.prune import prune_scene
-from pointsplat_ns.compression.view_sampling import sample_views
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, write_ply
 from pointsplat_ns.pruning import WithinPsnr, resolve_keep
+from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.views import Views
 
 ROOM, PLANTED = 2500, 12

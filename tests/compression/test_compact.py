@@ -14,11 +14,11 @@ from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.compact import MIN_GAIN, Compacted, at_strength, bottom_of_parabola, compact_scene
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
-from pointsplat_ns.compression.view_sampling import sample_views
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import PruneSettings, WithinPsnr, prune
+from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.refiner import Refiner, RefinerConfig
 from pointsplat_ns.views import Views
 

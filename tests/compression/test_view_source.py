@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from making import ball
-from pointsplat_ns.compression.view_sampling import sample_views
 from pointsplat_ns.compression.view_source import COMPARED_SIDE, COMPARED_VIEWS, ViewSource
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.views import Views
 
 

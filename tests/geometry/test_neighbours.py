@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from pointsplat_ns.geometry.neighbours import nearest, nearest_and_walk
+from pointsplat_ns.geometry import neighbours
+from pointsplat_ns.geometry.neighbours import nearest, other_neighbours
 
 
 def points(n, d=3, seed=0, dtype=torch.float32):
@@ -33,26 +34,44 @@ def test_of_few_points_all_are_given(n):
 
 
 def test_no_points_have_no_neighbours():
-    distances, indices, walk = nearest_and_walk(points(0), 3)
-    assert len(distances) == len(indices) == len(walk) == 0
+    distances, indices = nearest(points(0), 3)
+    assert len(distances) == len(indices) == 0
 
 
 def test_the_types_do_not_depend_on_the_number_of_points():
     for n in (0, 1, 10):
-        distances, indices, walk = nearest_and_walk(points(n), 3)
-        assert (distances.dtype, indices.dtype, walk.dtype) == (torch.float64, torch.int64, torch.int64)
+        distances, indices = nearest(points(n), 3)
+        assert (distances.dtype, indices.dtype) == (torch.float64, torch.int64)
 
 
 def test_points_in_a_graph_are_taken():
     assert nearest(points(10).requires_grad_(), 2)[1].shape == (10, 2)
 
 
-def test_the_walk_visits_every_point_once():
-    assert torch.equal(nearest_and_walk(points(1000), 2)[2].sort().values, torch.arange(1000))
+def test_other_neighbours_are_the_nearest_without_the_point_itself(monkeypatch):
+    monkeypatch.setattr(neighbours, "CHUNK", 300)  # several pieces
+    where = points(1000).double()
+    assert torch.equal(other_neighbours(where, 8).long(), nearest(where, 9)[1][:, 1:])
 
 
-def test_the_walk_stays_near():
-    where = points(2000)
-    walk = where[nearest_and_walk(where, 2)[2]]
-    step, any_two = walk.diff(dim=0).norm(dim=1).mean(), (walk - walk.flip(0)).norm(dim=1).mean()
-    assert step < any_two / 2
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_where_there_are_few_others_the_rest_is_the_point_itself(n):
+    near = other_neighbours(points(n).double(), 8)
+    others = (near != torch.arange(n)[:, None]).sum(1)
+    assert near.shape == (n, 8) and others.tolist() == [n - 1] * n
+
+
+def test_a_crowd_of_coincident_points_is_linked_all_the_way_through():
+    """Their nearest ones alone may be the same few, from which no other is reached."""
+    near = other_neighbours(torch.zeros(500, 3, dtype=torch.float64), 4)
+    reached = torch.zeros(500, dtype=torch.bool)
+    reached[0] = True
+    for _ in range(500):
+        reached[near[reached].long().flatten()] = True
+    assert bool(reached.all())
+
+
+def test_points_beside_a_crowd_keep_their_own_neighbours():
+    crowd, apart = torch.zeros(50, 3), 10 + points(100)
+    where = torch.cat([crowd, apart]).double()
+    assert torch.equal(other_neighbours(where, 4)[50:].long(), nearest(where, 5)[1][50:, 1:])

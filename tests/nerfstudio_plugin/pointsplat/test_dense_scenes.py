@@ -11,7 +11,6 @@ import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 from making import box_room, without_data
-from pointsplat_ns.compression.view_sampling import sample_views
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.io import write_ply
@@ -20,6 +19,7 @@ from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views
 from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import PlyScene, SampledPoses
+from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.rasterizer import render
 
 POSES = SampledPoses(train=6, test=3, width=32, height=24, seed=1)

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from pointsplat_ns.compression.view_sampling import content_box, look_at, sample_views
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.pruning.view_sampling import content_box, look_at, sample_views
 from pointsplat_ns.rasterizer import render
 
 

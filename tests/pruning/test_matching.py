@@ -1,0 +1,70 @@
+"""Disjoint pairs of neighbours."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from pointsplat_ns.pruning import matching
+from pointsplat_ns.pruning.matching import cheapest_pairs
+
+
+def ring(n: int) -> torch.Tensor:
+    """(n, 2) int32: the one before and the one after each, around."""
+    here = torch.arange(n)
+    return torch.stack([(here - 1) % n, (here + 1) % n], dim=1).to(torch.int32)
+
+
+def test_pairs_are_disjoint_neighbours_and_no_more_than_asked_for():
+    g = torch.Generator().manual_seed(0)
+    n = 1000
+    near = torch.randint(0, n, (n, 5), generator=g, dtype=torch.int32)
+    costs = torch.rand(n, 5, generator=g)
+    for most in (1, 50, 1000):
+        first, second = cheapest_pairs(near, costs.clone(), most)
+        both = torch.cat([first, second])
+        assert len(both.unique()) == len(both) and 1 <= len(first) <= most
+        assert all(j in near[i] or i in near[j] for i, j in zip(first.tolist(), second.tolist(), strict=True))
+
+
+def test_the_cheapest_pair_of_all_is_the_first():
+    costs = torch.full((10, 2), 1.0)
+    costs[3, 1] = costs[4, 0] = 0.1
+    first, second = cheapest_pairs(ring(10), costs, 1)
+    assert {int(first), int(second)} == {3, 4}
+
+
+def test_a_pair_costs_the_mean_of_both_views():
+    near, costs = ring(4), torch.full((4, 2), 1.0)
+    costs[0, 1], costs[1, 0] = 0.0, 1.8  # 0.9 together: still less than the others
+    assert {int(member) for member in torch.cat(cheapest_pairs(near, costs.clone(), 1))} == {0, 1}
+    costs[1, 0] = 2.2
+    assert {int(member) for member in torch.cat(cheapest_pairs(near, costs, 1))} != {0, 1}
+
+
+def test_a_pair_that_only_one_of_them_knows_is_found():
+    near = torch.tensor([[1], [2], [1]], dtype=torch.int32)
+    first, second = cheapest_pairs(near, torch.tensor([[0.1], [5.0], [5.0]]), 1)
+    assert (int(first), int(second)) == (0, 1)
+
+
+def test_equal_costs_along_a_chain_yield_many_pairs_at_once():
+    first, _ = cheapest_pairs(ring(1000), torch.ones(1000, 2), 1000)
+    assert len(first) > 300
+
+
+def test_pieces_give_the_same_as_the_whole(monkeypatch):
+    g = torch.Generator().manual_seed(1)
+    near, costs = torch.randint(0, 500, (500, 4), generator=g, dtype=torch.int32), torch.rand(500, 4, generator=g)
+    whole = cheapest_pairs(near, costs.clone(), 500)
+    monkeypatch.setattr(matching, "CHUNK", 37)
+    assert all(torch.equal(a, b) for a, b in zip(whole, cheapest_pairs(near, costs.clone(), 500), strict=True))
+
+
+def test_itself_is_no_neighbour_and_a_cost_that_is_no_number_is_no_pair():
+    alone = torch.arange(3, dtype=torch.int32)[:, None]
+    assert len(cheapest_pairs(alone, torch.zeros(3, 1), 3)[0]) == 0
+    costs = torch.tensor([[math.nan, 1.0], [1.0, math.nan], [1.0, 1.0]])
+    first, second = cheapest_pairs(ring(3), costs, 1)
+    assert {int(first), int(second)} == {0, 1}
