@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from pointsplat_ns.system.threads import in_threads
+
 PASSES = 6
 """Number of times that pairs are looked for among those still free."""
 
@@ -74,13 +76,16 @@ def _symmetric(near: Tensor, costs: Tensor) -> Tensor:
     """Costs (n, k) with each pair once: the mean of both views in the row of the smaller index, infinite in that of the
     other, and infinite for a Gaussian with itself."""
     result = torch.empty_like(costs)
-    for me in torch.arange(len(near)).split(CHUNK):
+
+    def fill(me: Tensor) -> None:
         others = near[me].long()
         back = near[others] == me[:, None, None]
         both, slot = back.any(2), back.to(torch.uint8).argmax(2)
         mean = (costs[me] + costs[others, slot]) / 2
         mine = costs[me].where(~both, mean.where(others > me[:, None], math.inf))
         result[me] = mine.where(others != me[:, None], math.inf).nan_to_num(nan=math.inf, posinf=math.inf)
+
+    in_threads(fill, torch.arange(len(near)).split(CHUNK))
     return result
 
 

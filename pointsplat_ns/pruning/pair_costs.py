@@ -46,8 +46,8 @@ NARROWEST, WIDEST = 1e-6, 1e3
 FARTHEST = 1e3
 """Bound of coordinates in units of the scene's size."""
 
-CHUNK = 1 << 13
-"""Number of Gaussians processed at once: small enough for a processor's cache."""
+CHUNK = 1 << 14
+"""Number of Gaussians processed at once: about 50 MB."""
 
 TINY = 1e-30
 
@@ -111,7 +111,7 @@ def costs_of(state: State, near: Tensor) -> Tensor:
         spread = THINNEST * (shadows[:, 0] + shadows[:, 2]) + NARROWEST**2
         shadows[:, 0] += spread
         shadows[:, 2] += spread
-        seen = Seen(centres, shadows, area_of(shadows), alphas, state.colours)
+        seen = Seen.of(centres, shadows, alphas, state.colours)
 
         def add(these: Tensor, seen: Seen = seen) -> None:
             costs[these] += seen.costs(these, near[these])
@@ -129,72 +129,85 @@ def _scaled(state: State) -> tuple[Tensor, Tensor]:
     return means, cov
 
 
-def area_of(shadow: Tensor) -> Tensor:
-    """Areas (...) of shadows (..., 3), in units of 2 pi: root of the determinant."""
-    return (shadow[..., 0] * shadow[..., 2] - shadow[..., 1].square()).clamp_min(TINY).sqrt()
+def area_of(uu: Tensor, uv: Tensor, vv: Tensor) -> Tensor:
+    """Areas of shadows with these variances, in units of 2 pi: root of the determinant."""
+    return (uu * vv).addcmul_(uv, uv, value=-1).clamp_min_(TINY).sqrt_()
 
 
-def overlap(first: Tensor, second: Tensor, product: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Integral over the plane of the product of two Gaussians of peak 1 whose centres are (u, v) apart, (...), in units
-    of 2 pi.
+def overlap(uu: Tensor, uv: Tensor, vv: Tensor, product: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Integral over the plane of the product of two Gaussians of peak 1 whose centres are (u, v) apart, in units of
+    2 pi.
 
     The product of two Gaussians is a Gaussian. Its integral is the product of their areas, divided by the area of the
     summed covariance, times exp(-d^2 / 2) with d the Mahalanobis distance of the centres under that covariance.
 
     Args:
-        first, second: shadows (..., 3).
-        product: of their areas.
+        uu, uv, vv: the summed variances.
+        product: of the areas.
         u, v: from one centre to the other.
     """
-    uu, uv, vv = (first + second).unbind(-1)
-    squared = (uu * vv - uv * uv).clamp_min(TINY)
-    distance = ((vv * u - 2 * uv * v) * u + uu * v * v) / squared
-    return product * squared.rsqrt() * torch.exp(-0.5 * distance.clamp_min(0))
+    inverse = (uu * vv).addcmul_(uv, uv, value=-1).clamp_min_(TINY).reciprocal_()
+    distance = (vv * u).addcmul_(uv, v, value=-2).mul_(u).addcmul_(uu * v, v).mul_(inverse).clamp_min_(0)
+    return distance.mul_(-0.5).exp_().mul_(inverse.sqrt_()).mul_(product)
 
 
 @dataclass
 class Seen:
     """All Gaussians as seen from one direction."""
 
-    centres: Tensor  # [n, 2]
-    shadows: Tensor  # [n, 3]
-    areas: Tensor  # [n]
-    alphas: Tensor  # [n]
+    plane: Tensor  # [n, 8] centre u, v; variances uu, uv, vv; area; opacity; squared length of the colour
     colours: Tensor  # [n, C]
+
+    @classmethod
+    def of(cls, centres: Tensor, shadows: Tensor, alphas: Tensor, colours: Tensor) -> Seen:
+        """From centres (n, 2), shadows (n, 3), opacities (n,) and colours (n, C)."""
+        columns = area_of(*shadows.unbind(1)), alphas, colours.square().sum(1)
+        return cls(torch.cat([centres, shadows, torch.stack(columns, dim=1)], dim=1), colours)
 
     def costs(self, i: Tensor, j: Tensor) -> Tensor:
         """Change of the image by each merge of Gaussians ``i`` (m,) with their neighbours ``j`` (m, k), (m, k)."""
-        si, pi, ai = self.shadows[i][:, None], self.areas[i][:, None], self.alphas[i][:, None]
-        sj, pj, aj = self.shadows[j], self.areas[j], self.alphas[j]
-        u, v = (self.centres[i][:, None] - self.centres[j]).unbind(-1)
-        oij = overlap(si, sj, pi * pj, u, v)
+        m, k = j.shape
+        flat = j.flatten()
+        ui, vi, uui, uvi, vvi, pi, ai, cci = self.plane.index_select(0, i).T.contiguous().view(8, m, 1)
+        uj, vj, uuj, uvj, vvj, pj, aj, ccj = self.plane.index_select(0, flat).T.contiguous().view(8, m, k)
+        ci, cj = self.colours.index_select(0, i), self.colours.index_select(0, flat).view(m, k, -1)
+        u, v = ui - uj, vi - vj
+        oij = overlap(uui + uuj, uvi + uvj, vvi + vvj, pi * pj, u, v)
         # How much covers the first, itself included, and the mean colour of that.
         on = aj * oij / pi
         cover = ai / 2 + on.sum(1, keepdim=True)
-        ci, cj = self.colours[i], self.colours[j]
-        around = (ai / 2 * ci + (on[:, None] @ cj)[:, 0]) / cover.clamp_min(TINY)
-        fi, fj = (ci - around)[:, None], cj - around[:, None]
+        around = torch.baddbmm((ai / 2 * ci)[:, None], on[:, None], cj)[:, 0] / cover.clamp_min(TINY)
         # The replacement: common mass, centre and covariance.
         mi, mj = ai * pi, aj * pj
-        wi = mi / (mi + mj).clamp_min(TINY)
+        wi = mi / (mi + mj).clamp_min_(TINY)
         wj = 1 - wi
-        within = wi * wj
-        across = torch.stack([within * u * u, within * u * v, within * v * v], dim=-1)
-        sk = wi[..., None] * si + wj[..., None] * sj + across
-        pk = area_of(sk)
-        ak = (mi + mj - ai * aj * oij).clamp_min(0) / pk
-        growth = (ak / OPAQUE).clamp(1, MOST_SURPLUS) ** GROWTH
-        sk, pk, ak = sk * growth[..., None], pk * growth, ak.clamp_max(OPAQUE)
-        oik, ojk = overlap(si, sk, pi * pk, wj * u, wj * v), overlap(sj, sk, pj * pk, wi * u, wi * v)
-        # |f_i a_i G_i + f_j a_j G_j - f_k a_k G_k|^2 over the plane, for features f: f_k is their mean by mass.
+        wu, wv = wi * wj * u, wi * wj * v
+        uuk = (wu * u).addcmul_(wi, uui).addcmul_(wj, uuj)
+        uvk = (wu * v).addcmul_(wi, uvi).addcmul_(wj, uvj)
+        vvk = (wv * v).addcmul_(wi, vvi).addcmul_(wj, vvj)
+        pk = area_of(uuk, uvk, vvk)
+        gij = ai * aj * oij
+        ak = (mi + mj).sub_(gij).clamp_min_(0).div_(pk)
+        if bool((ak > OPAQUE).any()):
+            growth = (ak / OPAQUE).clamp_(1, MOST_SURPLUS).pow_(GROWTH)
+            uuk, uvk, vvk, pk = uuk * growth, uvk * growth, vvk * growth, pk * growth
+            ak = ak.clamp_max_(OPAQUE)
+        oik = overlap(uui + uuk, uvi + uvk, vvi + vvk, pi * pk, wj * u, wj * v)
+        ojk = overlap(uuj + uuk, uvj + uvk, vvj + vvk, pj * pk, wi * u, wi * v)
+        # |f_i a_i G_i + f_j a_j G_j - f_k a_k G_k|^2 over the plane, for features f: f_k is their mean by mass. Products
+        # of colours less the one around are written out, so that no difference of colours is stored for each pair.
         assumed = 3 * LOCAL_CONTRAST**2
-        ii, jj = fi.square().sum(-1) + assumed, fj.square().sum(-1) + assumed
-        ij = (fi * fj).sum(-1) + assumed
-        ik, jk = wi * ii + wj * ij, wj * jj + wi * ij
-        kk = wi * ik + wj * jk
+        aa, ia = around.square().sum(1, keepdim=True), (ci * around).sum(1, keepdim=True)
+        cij, ja = (torch.stack([ci, around], dim=1) @ cj.mT).unbind(1)
+        ii = (cci - 2 * ia + aa).clamp_min_(0) + assumed
+        jj = ccj.sub(ja, alpha=2).add_(aa).clamp_min_(0).add_(assumed)
+        ij = cij.sub_(ja).add_(aa - ia + assumed)
+        ik, jk = (wi * ii).addcmul_(wj, ij), (wj * jj).addcmul_(wi, ij)
+        kk = (wi * ik).addcmul_(wj, jk)
         gii, gjj, gkk = ai * ai * pi / 2, aj * aj * pj / 2, ak * ak * pk / 2
-        gij, gik, gjk = 2 * ai * aj * oij, 2 * ai * ak * oik, 2 * aj * ak * ojk
-        blend = ii * gii + jj * gjj + kk * gkk + ij * gij - ik * gik - jk * gjk
-        holes = gii + gjj + gkk + gij - gik - gjk
+        gij, gik, gjk = 2 * gij, 2 * ai * ak * oik, 2 * aj * ak * ojk
+        blend = (jj * gjj).addcmul_(ii, gii).addcmul_(kk, gkk).addcmul_(ij, gij)
+        blend.addcmul_(ik, gik, value=-1).addcmul_(jk, gjk, value=-1).clamp_min_(0)
+        holes = (gjj + gii).add_(gkk).add_(gij).sub_(gik).sub_(gjk).clamp_min_(0)
         through = 3 * BACKGROUND_CONTRAST**2 * torch.exp(-4 * cover)
-        return blend.clamp_min(0) / cover.clamp_min(0.5).square() + through * holes.clamp_min(0)
+        return blend.div_(cover.clamp_min(0.5).square()).addcmul_(holes, through)

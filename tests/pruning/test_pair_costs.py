@@ -37,7 +37,7 @@ def seen_along_z(state: State) -> pair_costs.Seen:
     assert float(pair_costs.DIRECTIONS[way, 2].abs()) == 1.0
     centres = (state.means @ pair_costs.AXES[way]).float()
     shadows = (state.cov @ pair_costs.TO_SHADOW[way]).float()
-    return pair_costs.Seen(centres, shadows, pair_costs.area_of(shadows), state.alphas.float(), state.colours)
+    return pair_costs.Seen.of(centres, shadows, state.alphas.float(), state.colours)
 
 
 def test_the_cost_is_the_integral_that_it_claims_to_be():
@@ -142,14 +142,10 @@ def test_float32_costs_rank_pairs_as_float64_does():
         floor = pair_costs.THINNEST * (shadows[:, 0] + shadows[:, 2]) + pair_costs.NARROWEST**2
         shadows[:, 0] += floor
         shadows[:, 2] += floor
-        exact = pair_costs.Seen(
-            state.means @ pair_costs.AXES[way],
-            shadows,
-            pair_costs.area_of(shadows),
-            state.alphas,
-            state.colours.double(),
+        exact = (state.means @ pair_costs.AXES[way], shadows, state.alphas, state.colours.double())
+        a, b = (
+            pair_costs.Seen.of(*(value.to(dtype) for value in exact)).costs(i, j).double()
+            for dtype in (torch.float64, torch.float32)
         )
-        rough = pair_costs.Seen(*(value.float() for value in vars(exact).values()))
-        a, b = exact.costs(i, j), rough.costs(i, j).double()
         assert float((a - b).abs().max()) < 1e-3 * float(a.max())
     assert bool(single.isfinite().all())
