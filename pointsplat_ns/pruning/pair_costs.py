@@ -194,8 +194,8 @@ class Seen:
             ak = ak.clamp_max_(OPAQUE)
         oik = overlap(uui + uuk, uvi + uvk, vvi + vvk, pi * pk, wj * u, wj * v)
         ojk = overlap(uuj + uuk, uvj + uvk, vvj + vvk, pj * pk, wi * u, wi * v)
-        # |f_i a_i G_i + f_j a_j G_j - f_k a_k G_k|^2 over the plane, for features f: f_k is their mean by mass. Products
-        # of colours less the one around are written out, so that no difference of colours is stored for each pair.
+        # |f_i a_i G_i + f_j a_j G_j - f_k a_k G_k|^2 over the plane, for features f: f_k is their mean by mass. The
+        # products of colours less the one around are written out: no difference is stored for each pair.
         assumed = 3 * LOCAL_CONTRAST**2
         aa, ia = around.square().sum(1, keepdim=True), (ci * around).sum(1, keepdim=True)
         cij, ja = (torch.stack([ci, around], dim=1) @ cj.mT).unbind(1)
