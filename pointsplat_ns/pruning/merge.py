@@ -263,46 +263,45 @@ class Merging:
                 now = self.scene[self.members] if len(self.members) < len(self.scene) else self.scene
             self.reference = Reference(in_units(now, self.centre, self.size), self.views)
 
-    def _finished(self, sh: Tensor, order: Tensor) -> tuple[Gaussians, Finish]:
+    def _finished(self, sh: tuple[Tensor, Tensor], order: Tensor) -> tuple[Gaussians, Finish]:
         make = self._made(sh, order)
         if self.reference is None or not bool((self.state.members > 1).any()):
             return make(Finish()), Finish()
         finish = self.reference.best(lambda tried: in_units(make(tried), self.centre, self.size))
         return make(finish), finish
 
-    def _sh(self, place: Tensor, count: int) -> Tensor:
-        """SH coefficients (count, (d+1)^2 * 3): means by mass over the members, of which ``place`` (n,) says where they
-        belong."""
+    def _sh(self, place: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """SH coefficients (count, 3) and (count, (d+1)^2 - 1, 3): means by mass over the members, of which ``place``
+        (n,) says where they belong; those of a Gaussian without other members are its own, to the bit."""
         scene, shares = self.scene, self.tree.shares()
+        alone = torch.bincount(place, minlength=count) == 1
         wide = torch.promote_types(scene.dtype, torch.float32)
-        sh = torch.zeros(count, 3 + 3 * scene.features_rest.shape[1], dtype=wide)
-        for these in torch.arange(len(place)).split(CHUNK):
-            members = self.members[these]
-            sh_of = torch.cat([scene.features_dc[members], scene.features_rest[members].flatten(1)], dim=1)
-            sh.index_add_(0, place[these], sh_of.to(wide) * shares[these, None].to(wide))
-        return sh
+        means = []
+        for values in (scene.features_dc, scene.features_rest):
+            mean = torch.zeros(count, *values.shape[1:], dtype=wide)
+            for these in torch.arange(len(place)).split(CHUNK):
+                own = values[self.members[these]].to(wide)
+                mean.index_add_(0, place[these], own * shares[these].to(wide).view(-1, *[1] * (own.dim() - 1)))
+                single = alone[place[these]]
+                mean[place[these][single]] = own[single]
+            means.append(mean.to(scene.dtype))
+        return means[0], means[1]
 
-    def _made(self, sh: Tensor, order: Tensor) -> Callable[[Finish], Gaussians]:
-        """A function from a finish to the scene of Gaussians ``order`` (K,) with these SH coefficients (K, C)."""
+    def _made(self, sh: tuple[Tensor, Tensor], order: Tensor) -> Callable[[Finish], Gaussians]:
+        """A function from a finish to the scene of Gaussians ``order`` (K,) with these SH coefficients."""
         state, like = self.state, self.scene
         sizes = state.members[order].double()
-        alone = sizes == 1
-        kept = like[self.members[self.alive[order]]]
+        alone = (sizes == 1)[:, None]
+        kept = self.members[self.alive[order]]
         scales, quats = _axes(state.cov[order])
-        means, alphas = state.means[order].to(like.dtype), state.alphas[order]
-        rest = like.features_rest.shape[1]
-        dc, others = sh[:, :3].to(like.dtype), sh[:, 3:].reshape(len(sh), rest, 3).to(like.dtype)
-
-        def choose(unmerged: Tensor, merged: Tensor) -> Tensor:
-            return torch.where(alone.view(-1, *[1] * (merged.dim() - 1)), unmerged, merged)
-
-        means, quats = choose(kept.means, means), choose(kept.quats, quats.to(like.dtype))
-        dc, others = choose(kept.features_dc, dc), choose(kept.features_rest, others)
+        alphas = state.alphas[order]
+        means = torch.where(alone, like.means[kept], state.means[order].to(like.dtype))
+        quats = torch.where(alone, like.quats[kept], quats.to(like.dtype))
 
         def make(finish: Finish) -> Gaussians:
             logits = torch.logit(deepened(alphas, sizes, finish.deepening), 1e-7)[:, None].to(like.dtype)
-            spread = (scales + finish.spread).to(like.dtype)
-            return Gaussians(means, choose(kept.scales, spread), quats, choose(kept.opacities, logits), dc, others)
+            spread = torch.where(alone, like.scales[kept], (scales + finish.spread).to(like.dtype))
+            return Gaussians(means, spread, quats, torch.where(alone, like.opacities[kept], logits), *sh)
 
         return make
 

@@ -110,9 +110,13 @@ def start(scene: Gaussians, members: Tensor, weights: Tensor, centre: Tensor, si
         centre: (3,) of the scene's content.
         size: diagonal of the scene's content, scene units.
     """
+    cov = torch.empty(len(members), 6, dtype=torch.float64)
+    for these in torch.arange(len(members)).split(CHUNK):
+        own = members[these]
+        cov[these] = covariances(scene.scales[own].double(), scene.quats[own].double())
     return State(
         means=scene.means[members].double(),
-        cov=covariances(scene.scales[members].double(), scene.quats[members].double()),
+        cov=cov,
         alphas=torch.sigmoid(scene.opacities[members, 0]).double(),
         colours=_colours(scene, members),
         weights=weights.float(),
@@ -138,4 +142,7 @@ def _colours(scene: Gaussians, members: Tensor) -> Tensor:
         products += values.T @ values
     mean = total / len(members)
     axes = torch.linalg.eigh(products - len(members) * mean[:, None] * mean).eigenvectors[:, -COLOUR_AXES:]
-    return torch.cat([((coefficients(these) - mean) @ axes).float() for these in members.split(CHUNK)])
+    colours = torch.empty(len(members), axes.shape[1])
+    for these in torch.arange(len(members)).split(CHUNK):
+        colours[these] = ((coefficients(members[these]) - mean) @ axes).float()
+    return colours
