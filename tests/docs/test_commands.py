@@ -273,7 +273,8 @@ def test_readme_is_short():
 
 def test_options_named_in_text_exist(monkeypatch, capsys):
     programs = [
-        ("pointsplat", name) for name in ("prune", "compact", "lod", "export", "report", "rooms", "make-refiner", "demo")
+        ("pointsplat", name)
+        for name in ("prune", "compact", "lod", "export", "report", "rooms", "make-refiner", "demo")
     ]
     programs += [
         ("ns-train", "pointsplat"),
