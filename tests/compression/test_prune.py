@@ -171,3 +171,12 @@ def test_distributions_are_numbers_and_a_picture(scene, tmp_path):
     for i, after in enumerate((scene[:50], scene[:1], scene[:0], flat)):
         plot_distributions({"before": scene, "after": after}, tmp_path / f"{i}.png")
         assert (tmp_path / f"{i}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_merging_chose_for_the_scene_is_noted(scene):
+    assert [note for note in prune_scene(scene, 30).notes if note.startswith("merged: optical depth")]
+
+
+def test_merging_looks_from_the_views_that_are_given_and_from_no_others(scene, views):
+    given = prune_scene(scene, 30, views=ViewSource(scene, given=views)).scene
+    assert same(given, prune(scene, 30, views=views)) and not same(given, prune(scene, 30))
