@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 import torch
 
 from making import SHARED_DATA
+from pointsplat_ns.gaussians import Gaussians
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 WALL_DISTANCE = 2.0
@@ -184,3 +186,32 @@ def make_refined_run() -> Callable:
         return config.get_base_dir()
 
     return make
+
+
+@pytest.fixture(scope="session")
+def make_hollow_ball() -> Callable[..., Gaussians]:
+    """A function that makes the inside of a ball of radius 2 about (5, 0, 0), covered with opaque blobs, and an outlier
+    far away."""
+
+    def make(n: int = 1500, seed: int = 0, degree: int = 2) -> Gaussians:
+        generator = torch.Generator().manual_seed(seed)
+        place = torch.randn(n, 3, generator=generator)
+        place = 2 * place / place.norm(dim=1, keepdim=True)
+        scene = Gaussians(
+            means=place + torch.tensor([5.0, 0.0, 0.0]),
+            scales=torch.full((n, 3), math.log(0.12)) + 0.2 * torch.randn(n, 3, generator=generator),
+            quats=torch.randn(n, 4, generator=generator),
+            opacities=2 + torch.randn(n, 1, generator=generator),
+            features_dc=torch.sin(2 * place) + 0.3 * torch.randn(n, 3, generator=generator),
+            features_rest=0.03 * torch.randn(n, (degree + 1) ** 2 - 1, 3, generator=generator),
+        )
+        scene.means[0] = 1e6
+        return scene
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def hollow_ball(make_hollow_ball) -> Gaussians:
+    """Shared by all tests here, so do not write to it."""
+    return make_hollow_ball()

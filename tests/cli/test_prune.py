@@ -46,13 +46,13 @@ def run(*args) -> None:
 
 
 def refusal(capsys, output: Path, *args, warnings: int = 0) -> str:
-    """The line on stderr with which a command refuses, after so many lines of warnings; it prints nothing else and
-    writes nothing."""
+    """The line on stderr with which a command refuses, after so many lines of warnings; it prints nothing else but, if
+    merging came first, what that chose, and writes nothing."""
     before = sorted(output.parent.rglob("*")) if output.parent.is_dir() else None
     with pytest.raises(SystemExit) as caught:
         run(*args, "-o", output)
     said = capsys.readouterr()
-    assert caught.value.code == 1 and said.out == ""
+    assert caught.value.code == 1 and (said.out == "" or said.out.startswith("merged: "))
     *warned, error = said.err.splitlines()
     assert error.startswith("error: ") and len(warned) == warnings
     assert (sorted(output.parent.rglob("*")) if output.parent.is_dir() else None) == before, "partial output"
