@@ -26,6 +26,7 @@ import torch
 import tyro
 from compaction_tables import PAIRS, Row, averages, lead_table, leads, table
 from held_out import Scene, compare, load, lpips_or_none, name_of
+from options import write_whole
 from processes import Reducer, Usage, pointsplat_prune
 from rich.console import Console
 from scaling import print_score_times, scaling_rows, scaling_table, slope_table, slopes
@@ -33,7 +34,6 @@ from splat_transform import NAME, peers_of
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_scene, write_ply
-from pointsplat_ns.io.files import replacing
 from pointsplat_ns.metrics import psnr
 from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.pruning import METHODS, prune
@@ -125,14 +125,7 @@ class Results:
         """Put the rows of a scene in the place of those there are, and write."""
         self.rows = [row for row in self.rows if row["scene"] != name] + rows
         content = {"rows": self.rows, "averages": averages(self.rows), "leads": leads(self.rows)}
-        write_json(self.path, {"settings": self.settings} | content)
-
-
-def write_json(path: Path | None, content: dict[str, Any]) -> None:
-    """Write a file whole or not at all; no path, no file."""
-    if path is not None:
-        with replacing(path) as part:
-            part.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
+        write_whole(self.path, {"settings": self.settings} | content)
 
 
 def measure_scaling(counts: tuple[int, ...], sh_degree: int, programs: list[Reducer], path: Path | None) -> None:
@@ -142,7 +135,7 @@ def measure_scaling(counts: tuple[int, ...], sh_degree: int, programs: list[Redu
         rows.append(row)
         took = row["failed"] or f"{row['seconds']:.1f} s, {row['peak_bytes'] / 1e6:,.0f} MB"
         print(f"{row['gaussians']:,} {row['method']}: {took}", flush=True)
-        write_json(path, {"rows": rows, "slopes": slopes(rows)})
+        write_whole(path, {"rows": rows, "slopes": slopes(rows)})
     console().print(scaling_table(rows), slope_table(slopes(rows)))
 
 

@@ -17,7 +17,7 @@ from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning.view_sampling import sample_views
-from pointsplat_ns.rasterizer import rasterization, render
+from pointsplat_ns.rasterizer import render, render_depth
 from pointsplat_ns.views import View, Views
 
 COLUMNS = ("psnr", "ssim", "lpips")
@@ -70,20 +70,8 @@ def name_of(path: Path) -> str:
 def nearer_half(scene: Gaussians, view: View) -> Tensor:
     """Which pixels (H, W) of a view show what is not farther than the median of the expected depths; pixels that show
     nothing at all count as farther, and not for the median."""
-    depth, alpha, _ = rasterization(
-        means=scene.means,
-        quats=scene.quats,
-        scales=scene.stds,
-        opacities=scene.alphas,
-        colors=scene.means,  # any colours: only depths are rendered
-        viewmats=view.viewmat[None].to(scene.means),
-        Ks=view.K[None].to(scene.means),
-        width=view.width,
-        height=view.height,
-        render_mode="ED",
-        rasterize_mode=view.rasterize_mode,
-    )
-    depth, shown = depth[0, ..., 0], alpha[0, ..., 0] > 0
+    depth, alpha = render_depth(scene, view)
+    shown = alpha > 0
     return shown & (depth <= depth[shown].median()) if bool(shown.any()) else shown
 
 

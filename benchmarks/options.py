@@ -1,4 +1,4 @@
-"""Options that the benchmarks of the rasterizer and of the refiner share, and the file that they write."""
+"""Options that the benchmarks of the rasterizer and of the refiner share, and the file that all benchmarks write."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+
+from pointsplat_ns.io.files import replacing
 
 
 @dataclass
@@ -27,7 +29,12 @@ class Options:
 def write_json(options: Options, settings: dict[str, Any], cases: list[dict[str, Any]]) -> None:
     """Write what was measured so far, if that is asked for; called after each case, so that an interrupted run leaves
     something."""
-    if options.json is None:
-        return
     content: dict[str, Any] = {"torch": torch.__version__, "device": options.device, "threads": torch.get_num_threads()}
-    options.json.write_text(json.dumps({**content, **settings, "cases": cases}, indent=1) + "\n", "utf-8")
+    write_whole(options.json, {**content, **settings, "cases": cases})
+
+
+def write_whole(path: Path | None, content: dict[str, Any]) -> None:
+    """Write a JSON file whole or not at all; no path, no file."""
+    if path is not None:
+        with replacing(path) as part:
+            part.write_text(json.dumps(content, indent=1) + "\n", "utf-8")

@@ -15,11 +15,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.closeness import DenseReference
+from pointsplat_ns.compression.closeness import DenseReference, views_text
 from pointsplat_ns.compression.view_source import COMPARED_SIDE, ViewSource
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.view_sampling import content_box, sample_views
+from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.pruning.view_sampling import content_box, content_diagonal, sample_views
+from pointsplat_ns.pruning.viewpoints import in_units
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.progress import Progress, silent
@@ -36,10 +38,6 @@ CHECKED_VIEWS = 4
 
 _SEED = 17
 """Of the places. Views to compare renders in are sampled with another seed."""
-
-_DIAGONAL = 10.0
-"""Diagonal of the content's box that a scene is scaled to before it is looked at, so that the unit of length does not
-matter. The rasterizer's near plane, 0.01, is then a thousandth of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +181,7 @@ def _reference(dense: Gaussians, views: ViewSource) -> DenseReference | None:
 
 def _closeness(reference: DenseReference, scene: Gaussians) -> str:
     psnr, worst = reference.psnr(scene)
-    views = f"{len(reference.views)} view{'s' if len(reference.views) != 1 else ''}"
+    views = views_text(len(reference.views))
     if math.isinf(psnr):
         return f"of {views} stay the same"
     return f"reach {psnr:.1f} dB against the dense scene's, {worst:.1f} dB in the worst of {views}"
@@ -205,20 +203,14 @@ def _without(scene: Gaussians, indices: Tensor) -> Gaussians:
 
 
 def _normalised(scene: Gaussians) -> Gaussians:
-    """The scene moved and scaled so that the box of its content is around 0 with a diagonal of :data:`_DIAGONAL`."""
+    """The scene in units of its content, so that its own unit of length does not matter."""
     low, high = content_box(scene)
-    diagonal = float((high - low).norm())
-    if diagonal == 0:  # one Gaussian, or all at one position: take their size
-        diagonal = 4 * float(scene.stds.double().amax()) or 1.0
-    factor = _DIAGONAL / diagonal
-    means = ((scene.means.double() - 0.5 * (low + high)) * factor).to(scene.dtype)
-    return scene.replace(means=means, scales=scene.scales + math.log(factor))
+    return in_units(scene, 0.5 * (low + high), content_diagonal(scene, low, high))
 
 
 def _places(scene: Gaussians) -> Tensor:
     """Positions (P, 3) in free space, float64."""
-    viewmats = sample_views(scene, PLACES, seed=_SEED).viewmats
-    return -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
+    return invert_rigid(sample_views(scene, PLACES, seed=_SEED).viewmats)[:, :3, 3]
 
 
 def _six_directions() -> Tensor:

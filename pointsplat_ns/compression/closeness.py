@@ -86,3 +86,8 @@ def _error(image: Tensor, target: Tensor) -> float:
 def _psnr(mse: float) -> float:
     """PSNR, in dB, of a mean squared error: inf for 0, NaN for NaN."""
     return math.inf if mse == 0 else -10 * math.log10(mse) if mse > 0 else math.nan
+
+
+def views_text(count: int) -> str:
+    """A number of views in words: "1 view", "3 views"."""
+    return f"{count} view{'s' if count != 1 else ''}"

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 
 import torch
 
-from pointsplat_ns.compression.closeness import Closeness, DenseReference
+from pointsplat_ns.compression.closeness import Closeness, DenseReference, views_text
 from pointsplat_ns.compression.prune import check_options, prune_scene
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import Keep, method_named, need_usable
+from pointsplat_ns.pruning.finishing import top_of_parabola
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.views import Views
 
@@ -220,11 +221,7 @@ def bottom_of_parabola(at_zero: float, at_half: float, at_one: float) -> float:
     """
     if not all(map(math.isfinite, (at_zero, at_half, at_one))):
         return math.nan
-    bend = 2 * ((at_one - at_half) - (at_half - at_zero))
-    slope = (at_one - at_zero) - bend
-    if bend <= 0 or -slope >= 2 * bend:
-        return 1.0 if at_one < at_zero else 0.0
-    return max(0.0, -slope / (2 * bend))
+    return top_of_parabola((0.0, 0.5, 1.0), [-at_zero, -at_half, -at_one], beyond=0.0)
 
 
 def helps(before: Closeness, after: Closeness) -> bool:
@@ -236,7 +233,7 @@ def _verdict(before: Closeness, after: Closeness, strength: float) -> str:
     """One line of text: what refinement gained, or why it was left out."""
     count = len(before.errors)
     better = sum(new < old for new, old in zip(after.errors, before.errors, strict=True))
-    figures = f"{before.psnr:.2f} -> {after.psnr:.2f} dB against the dense scene's renders in {_views(count)}"
+    figures = f"{before.psnr:.2f} -> {after.psnr:.2f} dB against the dense scene's renders in {views_text(count)}"
     if before.ssim is not None and after.ssim is not None:
         figures += f", SSIM {before.ssim:.3f} -> {after.ssim:.3f}"
     figures += f", worst view {before.worst:.2f} -> {after.worst:.2f} dB, closer in {better} of {count}"
@@ -244,10 +241,6 @@ def _verdict(before: Closeness, after: Closeness, strength: float) -> str:
         share = "" if strength == 1 else f" at {strength:.0%} of its strength"
         return f"refinement{share}: {figures}"
     if after.errors == before.errors:
-        return f"refinement left out: it changes nothing, {before.psnr:.2f} dB in {_views(count)}"
+        return f"refinement left out: it changes nothing, {before.psnr:.2f} dB in {views_text(count)}"
     why = "it does not help" if after.psnr <= before.psnr else f"it brings less than {MIN_GAIN:g} dB"
     return f"refinement left out, {why}: {figures}"
-
-
-def _views(count: int) -> str:
-    return f"{count} view{'s' if count != 1 else ''}"

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pointsplat_ns.compression.closeness import Closeness, DenseReference
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.rasterizer import rasterization, render
+from pointsplat_ns.rasterizer import render, render_depth
 from pointsplat_ns.views import Views
 
 FARTHER = (2, 4, 8)
@@ -112,22 +112,9 @@ def displacement(dense: Gaussians, level: Gaussians, assignment: Tensor) -> Disp
 @torch.no_grad()
 def distance_seen(dense: Gaussians, reference: DenseReference) -> float | None:
     """The median depth of what the compared views show, scene units; None if they show nothing."""
-    views = reference.views.resized(_DEPTH_SIDE)
     depths = []
-    for index in range(len(views)):
-        one = views[[index]]
-        image, alpha, _ = rasterization(
-            dense.means,
-            dense.quats,
-            dense.stds,
-            dense.alphas,
-            dense.means,  # any colours: only depths are rendered
-            one.viewmats.to(dense.means),
-            one.Ks.to(dense.means),
-            one.width,
-            one.height,
-            render_mode="ED",
-        )
-        depths.append(image[0, ..., 0][alpha[0, ..., 0] > 0.5].double().cpu())
+    for view in replace(reference.views, rasterize_mode="classic").resized(_DEPTH_SIDE):
+        depth, alpha = render_depth(dense, view)
+        depths.append(depth[alpha > 0.5].double().cpu())
     seen = torch.cat(depths)
     return float(seen.median()) if len(seen) else None

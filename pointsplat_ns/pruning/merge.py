@@ -222,20 +222,24 @@ class Merging:
 
     def level(self) -> Merged:
         """The Gaussians that remain, as a scene."""
-        roots = self.tree.roots().long()
-        place = torch.empty(len(self.members), dtype=torch.int64)
-        order = self._in_order(roots)
-        place[self.alive[order]] = torch.arange(len(order))
+        order = self._in_order()
+        place = self._place(order)
         assignment = torch.full((len(self.scene),), -1)
-        assignment[self.members] = place[roots]
-        scene, finish = self._finished(self._sh(place[roots], len(order)), order)
+        assignment[self.members] = place
+        scene, finish = self._finished(self._made(order, place))
         return Merged(scene, assignment, finish)
 
-    def _in_order(self, roots: Tensor) -> Tensor:
+    def _in_order(self) -> Tensor:
         """Indices (n left,) of the Gaussians that remain in the order of their first members in the scene."""
         first = torch.full((len(self.members),), len(self.scene))
-        first.scatter_reduce_(0, roots, self.members, "amin")
+        first.scatter_reduce_(0, self.tree.roots().long(), self.members, "amin")
         return first[self.alive].argsort()
+
+    def _place(self, order: Tensor) -> Tensor:
+        """Where in ``order`` (n left,) the remaining Gaussian is that each member is part of, (n,)."""
+        place = torch.empty(len(self.members), dtype=torch.int64)
+        place[self.alive[order]] = torch.arange(len(order))
+        return place[self.tree.roots().long()]
 
     def _weights(self) -> Tensor:
         if self.views is None:
@@ -256,29 +260,27 @@ class Merging:
         """Render what remains, once it is few enough."""
         if self.reference is None and self.views is not None and len(self) <= MOST_SEEN:
             if self.tree.rounds:
-                roots, places = self.tree.roots().long(), torch.empty(len(self.members), dtype=torch.int64)
-                places[self.alive] = torch.arange(len(self))
-                now = self._made(self._sh(places[roots], len(self)), torch.arange(len(self)))(Finish())
+                order = torch.arange(len(self))
+                now = self._made(order, self._place(order))(Finish())
             else:
                 now = self.scene[self.members] if len(self.members) < len(self.scene) else self.scene
             self.reference = Reference(in_units(now, self.centre, self.size), self.views)
 
-    def _finished(self, sh: tuple[Tensor, Tensor], order: Tensor) -> tuple[Gaussians, Finish]:
-        make = self._made(sh, order)
+    def _finished(self, make: Callable[[Finish], Gaussians]) -> tuple[Gaussians, Finish]:
+        """The scene with the finish that suits it, and that."""
         if self.reference is None or not bool((self.state.members > 1).any()):
             return make(Finish()), Finish()
         finish = self.reference.best(lambda tried: in_units(make(tried), self.centre, self.size))
         return make(finish), finish
 
-    def _sh(self, place: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """SH coefficients (count, 3) and (count, (d+1)^2 - 1, 3): means by mass over the members, of which ``place``
-        (n,) says where they belong; those of a Gaussian without other members are its own, to the bit."""
+    def _sh(self, place: Tensor, alone: Tensor) -> tuple[Tensor, Tensor]:
+        """SH coefficients (K, 3) and (K, (d+1)^2 - 1, 3): means by mass over the members, of which ``place`` (n,) says
+        where they belong; those of a Gaussian ``alone`` (K,), without other members, are its own, to the bit."""
         scene, shares = self.scene, self.tree.shares()
-        alone = torch.bincount(place, minlength=count) == 1
         wide = torch.promote_types(scene.dtype, torch.float32)
         means = []
         for values in (scene.features_dc, scene.features_rest):
-            mean = torch.zeros(count, *values.shape[1:], dtype=wide)
+            mean = torch.zeros(len(alone), *values.shape[1:], dtype=wide)
             for these in torch.arange(len(place)).split(CHUNK):
                 own = values[self.members[these]].to(wide)
                 mean.index_add_(0, place[these], own * shares[these].to(wide).view(-1, *[1] * (own.dim() - 1)))
@@ -287,10 +289,12 @@ class Merging:
             means.append(mean.to(scene.dtype))
         return means[0], means[1]
 
-    def _made(self, sh: tuple[Tensor, Tensor], order: Tensor) -> Callable[[Finish], Gaussians]:
-        """A function from a finish to the scene of Gaussians ``order`` (K,) with these SH coefficients."""
+    def _made(self, order: Tensor, place: Tensor) -> Callable[[Finish], Gaussians]:
+        """A function from a finish to the scene of the remaining Gaussians ``order`` (K,); ``place`` (n,) as
+        :meth:`_place` gives it."""
         state, like = self.state, self.scene
         sizes = state.members[order].double()
+        sh = self._sh(place, sizes == 1)
         alone = (sizes == 1)[:, None]
         kept = self.members[self.alive[order]]
         scales, quats = _axes(state.cov[order])

@@ -10,7 +10,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.scores import area_score
-from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.rasterizer import render_depth
 from pointsplat_ns.views import Views
 
 FIELD_OF_VIEW = 70.0
@@ -56,6 +56,13 @@ def content_box(scene: Gaussians) -> tuple[Tensor, Tensor]:
     return low, high
 
 
+def content_diagonal(scene: Gaussians, low: Tensor, high: Tensor) -> float:
+    """Diagonal of the box with corners ``low`` (3,) and ``high`` (3,) that :func:`content_box` gives, scene units. If
+    the box is a point (one Gaussian, or all at one position), four times the largest standard deviation; 1 if that is
+    0."""
+    return float((high - low).norm()) or 4 * float(scene.stds[scene.usable()].double().amax()) or 1.0
+
+
 @torch.no_grad()
 def sample_views(scene: Gaussians, count: int, width: int = 320, height: int = 240, seed: int = 0) -> Views:
     """Sample cameras in free space that look at the content of a scene.
@@ -92,10 +99,7 @@ def sample_views(scene: Gaussians, count: int, width: int = 320, height: int = 2
     if min(width, height) < 1:
         raise DataError(f"views of {width} x {height} pixels asked for; expected at least 1 x 1")
     low, high = content_box(scene)
-    diagonal = float((high - low).norm())
-    if diagonal == 0:  # one Gaussian, or all at one position: take their size
-        diagonal = float(scene.stds[scene.usable()].double().amax()) * 4
-        diagonal = diagonal if diagonal > 0 else 1.0
+    diagonal = content_diagonal(scene, low, high)
     generator = torch.Generator().manual_seed(seed)
     weights = area_score(scene).nan_to_num(nan=-math.inf).cpu()
     chances = torch.softmax(weights.clamp_max(_not_giant(weights)), dim=0)
@@ -156,19 +160,6 @@ def _not_giant(weights: Tensor) -> float:
 
 def _is_free(scene: Gaussians, views: Views, index: int, near: float) -> bool:
     """Whether a camera is in free space: its image is covered, with hardly any surface nearer than ``near``."""
-    small = views[[index]].resized(_PROBE_SIDE)
-    image, alpha, _ = rasterization(
-        scene.means,
-        scene.quats,
-        scene.stds,
-        scene.alphas,
-        scene.means,  # any colours: only depths are rendered
-        small.viewmats.to(scene.means),
-        small.Ks.to(scene.means),
-        small.width,
-        small.height,
-        render_mode="ED",
-    )
-    depth = image[0, ..., 0]
-    too_near = (alpha[0, ..., 0] > 0.5) & (depth < near)
+    depth, alpha = render_depth(scene, views[[index]].resized(_PROBE_SIDE)[0])
+    too_near = (alpha > 0.5) & (depth < near)
     return bool(alpha.mean() >= _COVERED) and bool(too_near.float().mean() < _NEAR_PIXELS)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.pruning.view_sampling import content_box, sample_views
 from pointsplat_ns.views import Views
 
@@ -74,8 +75,7 @@ def weights_seen(means: Tensor, views: Views) -> Tensor:
         means: (N, 3) positions, in units of the content.
         views: where they are looked at from.
     """
-    viewmats = views.viewmats.double()
-    eyes = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0].to(means)
+    eyes = invert_rigid(views.viewmats.double())[:, :3, 3].to(means)
     total = torch.zeros(len(means), dtype=torch.float32)
     for eye in eyes:
         total += 1 / ((means - eye).square().sum(1) + (NEAREST * UNITS) ** 2).float()

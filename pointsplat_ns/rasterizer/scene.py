@@ -1,4 +1,4 @@
-"""Pictures of a whole scene."""
+"""Pictures and depth images of a whole scene."""
 
 from __future__ import annotations
 
@@ -49,3 +49,29 @@ def render(scene: Gaussians, views: View | Views) -> Tensor:
         rasterize_mode=views.rasterize_mode,
     )
     return (image[0] + (1 - alpha[0]) * views.background.to(image)).clamp(0, 1)
+
+
+def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
+    """How far what a view shows is, and how much of it there is.
+
+    Args:
+        scene: N Gaussians, on any device; the images are rendered there.
+        view: the camera.
+
+    Returns:
+        Expected depth (H, W) along the camera's z axis, scene units, and alpha (H, W) in [0, 1].
+    """
+    depth, alpha, _ = rasterization(
+        means=scene.means,
+        quats=scene.quats,
+        scales=scene.stds,
+        opacities=scene.alphas,
+        colors=scene.means,  # any colours: only depths are rendered
+        viewmats=view.viewmat[None].to(scene.means),
+        Ks=view.K[None].to(scene.means),
+        width=view.width,
+        height=view.height,
+        render_mode="ED",
+        rasterize_mode=view.rasterize_mode,
+    )
+    return depth[0, ..., 0], alpha[0, ..., 0]
