@@ -7,7 +7,9 @@ import shlex
 import shutil
 import subprocess
 import sys
+import threading
 from pathlib import Path
+from typing import BinaryIO
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io.runs import open_run
@@ -16,6 +18,17 @@ from pointsplat_ns.nerfstudio_plugin.third_party_warnings import PYTHONWARNINGS
 SHORT_SPIN = {"GOMP_SPINCOUNT": "20000"}
 """Lets waiting OpenMP threads spin for some microseconds, then sleep. By default they keep spinning, which on a busy
 machine slows the thread that they wait for. Threads that sleep at once (OMP_WAIT_POLICY=PASSIVE) wake too late."""
+
+
+STOP_SECONDS = 5.0
+"""Time that a command has to end after it was told to; then it is killed."""
+
+_LOOK_SECONDS = 0.2
+"""Time between looks at whether a command shall be stopped."""
+
+
+class StoppedError(Exception):
+    """Work in a thread that was stopped because the whole program is."""
 
 
 def finished(run: Path, steps: int) -> bool:
@@ -29,16 +42,21 @@ def finished(run: Path, steps: int) -> bool:
     return False
 
 
-def run(command: str, log: Path | None = None, threads: int | None = None) -> None:
+def run(command: str, log: Path | None = None, threads: int | None = None, stop: threading.Event | None = None) -> None:
     """Print a command and run it, with the program from this Python's environment.
+
+    If this is interrupted, the command is ended first.
 
     Args:
         command: the command line.
         log: file for the command's output; by default the output is shown here.
         threads: number of threads that torch may use in it; by default torch decides.
+        stop: ends the command when it is set. Only the main thread is interrupted by Ctrl-C; it can stop commands that
+            run in other threads by this.
 
     Raises:
         PointSplatError: if the command fails.
+        StoppedError: if ``stop`` is set.
     """
     print(f"\n$ {command}", flush=True)
     program, *arguments = shlex.split(command)
@@ -48,11 +66,33 @@ def run(command: str, log: Path | None = None, threads: int | None = None) -> No
         environment["OMP_NUM_THREADS"] = str(threads)
     words = [str(beside) if beside.exists() else program, *arguments]
     if log is None:
-        status, where = subprocess.run(words, env=environment).returncode, "what it said is above"
+        status, where = _status(words, environment, None, stop), "what it said is above"
     else:
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("wb") as stream:
-            status = subprocess.run(words, env=environment, stdout=stream, stderr=subprocess.STDOUT).returncode
+            status = _status(words, environment, stream, stop)
         where = f"what it said is in {log}"
     if status != 0:
         raise PointSplatError(f"{command}: ended with exit status {status}; {where}")
+
+
+def _status(
+    words: list[str], environment: dict[str, str], output: BinaryIO | None, stop: threading.Event | None
+) -> int:
+    """Run a program until it ends, and give its exit status. It does not outlive an exception here."""
+    errors = None if output is None else subprocess.STDOUT
+    with subprocess.Popen(words, env=environment, stdout=output, stderr=errors) as process:
+        try:
+            while stop is None or not stop.is_set():
+                try:
+                    return process.wait(None if stop is None else _LOOK_SECONDS)
+                except subprocess.TimeoutExpired:
+                    continue
+            raise StoppedError(shlex.join(words))
+        except BaseException:
+            process.terminate()
+            try:
+                process.wait(STOP_SECONDS)
+            except subprocess.TimeoutExpired:
+                process.kill()
+            raise

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from concurrent.futures import ThreadPoolExecutor
+import threading
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +22,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.recipe import (
     scene_settings,
 )
 from pointsplat_ns.nerfstudio_plugin.pointsplat.results import REFINER_NAME, VARIANTS, read_evaluation
-from pointsplat_ns.nerfstudio_plugin.running import finished, run
+from pointsplat_ns.nerfstudio_plugin.running import StoppedError, finished, run
 from pointsplat_ns.refiner import read_refiner, save_refiner
 from pointsplat_ns.rooms import write_room
 
@@ -113,7 +114,15 @@ def make_refiner(
 
 
 def _make_scenes(output: Path, seeds: tuple[int, ...], workers: int) -> None:
-    """Generate the rooms and train a scene of each, ``workers`` at a time with one thread each."""
+    """Generate the rooms and train a scene of each, ``workers`` at a time with one thread each.
+
+    Ctrl-C or an error in one of them stops them all.
+    """
+    stop = threading.Event()
+
+    def stop_or_go_on(what: str, share: float) -> None:
+        if stop.is_set():
+            raise StoppedError(what)
 
     def make(seed: int) -> None:
         settings = scene_settings(seed)
@@ -122,15 +131,16 @@ def _make_scenes(output: Path, seeds: tuple[int, ...], workers: int) -> None:
             return
         data = output / "rooms" / settings.name
         if not data.is_dir():
-            write_room(data, seed, settings.frames, settings.width, settings.height, False, settings.style)
+            size = (settings.width, settings.height)
+            write_room(data, seed, settings.frames, *size, progress=stop_or_go_on, style=settings.style)
         command = settings.train_command(data, output / "scenes", TIMESTAMP)
-        run(command, output / "logs" / f"{settings.name}.txt", threads=1)
+        run(command, output / "logs" / f"{settings.name}.txt", threads=1, stop=stop)
 
     with ThreadPoolExecutor(workers) as pool:
-        jobs = [pool.submit(make, seed) for seed in seeds]
         try:
-            for job in jobs:
+            for job in as_completed([pool.submit(make, seed) for seed in seeds]):
                 job.result()
         except BaseException:
+            stop.set()
             pool.shutdown(cancel_futures=True)
             raise

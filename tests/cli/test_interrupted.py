@@ -1,0 +1,108 @@
+"""Ctrl-C and SIGTERM: the command and all that it started end at once, with the usual status, and leave nothing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+MAKE_REFINER = """
+import sys
+from pathlib import Path
+from pointsplat_ns.cli import main
+from pointsplat_ns.nerfstudio_plugin.pointsplat import make_refiner, recipe
+
+here = Path(sys.argv[1])
+# As ns-train was: it writes down that it runs, and ends with status 0 when it is interrupted.
+TRAINING = '''
+import os, sys, time
+from pathlib import Path
+try:
+    (Path(sys.argv[1]) / f"{os.getpid()}.pid").touch()
+    time.sleep(600)
+except KeyboardInterrupt:
+    pass
+'''
+(here / "training.py").write_text(TRAINING)
+make_refiner.write_room = lambda data, *_, **__: data.mkdir(parents=True)
+recipe.SceneSettings.train_command = lambda *_: f"{sys.executable} {here / 'training.py'} {here}"
+main(["make-refiner", "-o", str(here / "output"), "--workers", "2"])
+"""
+
+ROOMS = """
+import sys
+from pathlib import Path
+from pointsplat_ns.cli import main
+from pointsplat_ns.rooms import write
+
+here, render = Path(sys.argv[1]), write.render_room
+def noted(*arguments):
+    (here / "0.pid").touch()
+    return render(*arguments)
+write.render_room = noted
+main(["rooms", "-o", str(here / "rooms"), "--seeds", "0", "--frames", "500", "--width", "96", "--height", "64"])
+"""
+
+
+@pytest.fixture()
+def start(tmp_path):
+    """A function that starts a script in a process group of its own and waits until ``count`` trainings run."""
+    started: list[subprocess.Popen[str]] = []
+
+    def run(script: str, count: int) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-c", script, str(tmp_path)],
+            start_new_session=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+        deadline = time.monotonic() + 120
+        while len(list(tmp_path.glob("*.pid"))) < count:
+            assert process.poll() is None, process.communicate()[1]
+            assert time.monotonic() < deadline, "nothing started"
+            time.sleep(0.05)
+        return process
+
+    yield run
+    for process in started:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def alive(pid: int) -> bool:
+    """Whether a process exists and has not ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+@pytest.mark.parametrize("whom", ["group", "main process"])
+def test_make_refiner_stops_at_once_and_takes_its_trainings_with_it(start, tmp_path, whom):
+    process = start(MAKE_REFINER, count=2)
+    (os.killpg if whom == "group" else os.kill)(process.pid, signal.SIGINT)
+    said, errors = process.communicate(timeout=30)
+    assert process.returncode == 130, errors
+    assert errors.strip().splitlines()[-1] == "interrupted"
+    trainings = [int(path.stem) for path in tmp_path.glob("*.pid")]
+    assert len(trainings) == 2 == said.count("$ "), "a further training was started"
+    assert not any(alive(pid) for pid in trainings)
+
+
+@pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_room_that_is_interrupted_leaves_nothing(start, tmp_path, number, status):
+    process = start(ROOMS, count=1)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == status, errors
+    assert "Traceback" not in errors
+    assert list((tmp_path / "rooms").iterdir()) == []
