@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import logging
+import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
+
+ABOUT = "Makes trained 3D Gaussian Splatting scenes smaller. `pointsplat --version` prints the version."
 
 
 class _PrintHandler(logging.Handler):
@@ -30,10 +36,55 @@ def _log_printed() -> Iterator[None]:
         logger.setLevel(level)
 
 
+def _end(number: int, frame: Any) -> None:
+    """Handle a signal: leave the program as Ctrl-C does, so that unfinished files are removed and workers stopped."""
+    sys.exit(128 + number)
+
+
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """Let a lost terminal (SIGHUP) and a request to end (SIGTERM) unwind the program; by default they kill it."""
+    names = [name for name in ("SIGHUP", "SIGTERM") if hasattr(signal, name)]  # Windows has no SIGHUP
+    numbers = [getattr(signal, name) for name in names]
+    if threading.current_thread() is not threading.main_thread():  # no other may set handlers
+        numbers = []
+    before = {n: signal.signal(n, _end) for n in numbers if signal.getsignal(n) is signal.SIG_DFL}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _what_failed(error: Exception) -> str:
+    """An error of the system in one line."""
+    from pointsplat_ns.io.files import one_line
+
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if isinstance(error, RecursionError):
+        return f"the input is nested too deeply ({one_line(error)})"
+    if isinstance(error, (MemoryError, RuntimeError)):
+        return f"not enough memory ({one_line(error)})"
+    return one_line(error)
+
+
+def _is_lack_of_memory(error: RuntimeError) -> bool:
+    """Whether torch could not allocate a tensor. On a CPU it has no type of its own for that."""
+    import torch
+
+    return isinstance(error, torch.cuda.OutOfMemoryError) or "can't allocate memory" in str(error)
+
+
 def main(args: list[str] | None = None) -> None:
-    """Run one subcommand. Input that cannot be used ends it with one line and exit status 1."""
+    """Run one subcommand.
+
+    Input that cannot be used, files that cannot be read or written, and a lack of memory end it with one line and exit
+    status 1; Ctrl-C ends it with 130, another signal with 128 plus its number.
+    """
     import tyro
 
+    from pointsplat_ns import __version__
     from pointsplat_ns.cli.compact import compact
     from pointsplat_ns.cli.demo import demo
     from pointsplat_ns.cli.export import export
@@ -57,10 +108,22 @@ def main(args: list[str] | None = None) -> None:
         "demo": demo,
     }
     try:
-        with _log_printed():
-            tyro.extras.subcommand_cli_from_dict(commands, prog="pointsplat", args=args)
+        with _log_printed(), _ended_by_signals():
+            if (sys.argv[1:] if args is None else args) == ["--version"]:
+                print(f"pointsplat-ns {__version__}")
+            else:
+                tyro.extras.subcommand_cli_from_dict(commands, prog="pointsplat", description=ABOUT, args=args)
+            sys.stdout.flush()  # so that a full disk or a closed pipe is noticed here
     except PointSplatError as error:
         print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except BrokenPipeError:  # of `pointsplat ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python fails again when it ends
+        sys.exit(1)
+    except (OSError, MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and not (isinstance(error, RecursionError) or _is_lack_of_memory(error)):
+            raise
+        print(f"error: {_what_failed(error)}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
