@@ -7,6 +7,7 @@ One dataclass holds all settings of the network. There are three presets: ``full
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -18,6 +19,10 @@ CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
 
 FINE_BITS = 16
 """Bits per axis of the finest position code; every grid of the network is a coarsening of it."""
+
+
+MAX_SIZE = 1 << 16
+"""No number of channels, heads, points or layers may exceed this; the published network has 1024 at most."""
 
 
 class RefinerConfigError(PointSplatError, ValueError):
@@ -100,6 +105,8 @@ class RefinerConfig:
         self._validate()
 
     def _validate(self) -> None:
+        for field in dataclasses.fields(self):
+            _check_type(field.name, str(field.type), getattr(self, field.name))
         stages = len(self.enc_channels)
         sizes = {"enc_depths": stages, "enc_heads": stages, "strides": stages - 1}
         sizes.update({"dec_channels": stages - 1, "dec_depths": stages - 1, "dec_heads": stages - 1})
@@ -110,9 +117,9 @@ class RefinerConfig:
         for part in ("enc", "dec"):
             channels, heads = getattr(self, f"{part}_channels"), getattr(self, f"{part}_heads")
             for c, h in zip(channels, heads, strict=True):
-                _require(h > 0 and c > 0 and c % h == 0, f"{part}: {c} channels do not divide into {h} heads")
+                _require(c % h == 0, f"{part}: {c} channels do not divide into {h} heads")
         for s in self.strides:
-            _require(s > 0 and s & (s - 1) == 0, f"strides holds {s}; expected powers of two")
+            _require(s & (s - 1) == 0, f"strides holds {s}; expected powers of two")
         unknown = [c for c in self.curves if c not in CURVES]
         _require(
             bool(self.curves) and not unknown, f"curves is {self.curves}; expected names out of {', '.join(CURVES)}"
@@ -128,6 +135,9 @@ class RefinerConfig:
         _require(self.grid is None or 1 <= self.grid <= 512, f"grid is {self.grid}; expected 1 to 512, or None")
         _require(self.head_depth >= 2, f"head_depth is {self.head_depth}; expected at least 2")
         _require(self.patch >= 1, f"patch is {self.patch}; expected at least 1")
+        _require(
+            0 <= self.means_reach < math.inf, f"means_reach is {self.means_reach}; expected a finite number from 0"
+        )
         _require(0 <= self.drop_path < 1, f"drop_path is {self.drop_path}; expected 0 to 1")
 
     @property
@@ -167,6 +177,32 @@ class RefinerConfig:
             return cls(**values)
         except TypeError as error:
             raise RefinerConfigError(f"refiner settings of the wrong type: {error}") from error
+
+
+def _check_type(name: str, kind: str, value: Any) -> None:
+    """Check a setting against its annotation; whole numbers also against their range, but for the SH degree's."""
+    if kind.startswith("Literal") or kind == "tuple[str, ...]":
+        texts = value if isinstance(value, tuple) else (value,)
+        _require(all(isinstance(text, str) for text in texts), f"{name} is {value!r}; expected text")
+    elif kind == "bool":
+        _require(isinstance(value, bool), f"{name} is {value!r}; expected true or false")
+    elif kind == "float":
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        _require(number, f"{name} is {value!r}; expected a number")
+    elif value is not None or "None" not in kind:
+        numbers = value if kind == "tuple[int, ...]" else (value,)
+        least = 0 if name == "sh_degree" else 1
+        whole = isinstance(numbers, tuple) and all(isinstance(n, int) and not isinstance(n, bool) for n in numbers)
+        _require(
+            whole and all(least <= n <= MAX_SIZE for n in numbers),
+            f"{name} is {_short(value)}; expected {'whole numbers' if kind != 'int' else 'a whole number'} of "
+            f"{least} to {MAX_SIZE}",
+        )
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _require(condition: bool, message: str) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.io.files import replacing
+from pointsplat_ns.io.files import one_line, replacing
 from pointsplat_ns.refiner.config import RefinerConfig, RefinerConfigError
 from pointsplat_ns.refiner.refiner import Refiner
 
@@ -17,6 +19,10 @@ FORMAT = "pointsplat-refiner/1"
 
 PRETRAINED = Path(__file__).parent / "pretrained" / "refiner.safetensors"
 """The refiner that ships; ``CARD.md`` beside it describes its training and results."""
+
+
+_FLOATS = ("F64", "F32", "F16", "BF16")
+"""Types of parameters in a file, as safetensors calls them."""
 
 
 class WeightsError(PointSplatError):
@@ -46,28 +52,32 @@ def save_refiner(refiner: Refiner, path: str | Path, metadata: dict[str, Any] | 
 def read_refiner(path: str | Path, device: torch.device | str = "cpu") -> Refiner:
     """Read a refiner from a file; it is in evaluation mode.
 
+    The file may come from anybody: its configuration, and the names, shapes and types of its tensors, are checked
+    before memory is taken for them.
+
     Raises:
         WeightsError: if the file is missing, damaged, of another kind, or its tensors do not fit.
     """
     path = Path(path)
-    header, state = _read(path)
-    try:
-        config = RefinerConfig.from_dict(json.loads(header["config"]))
-    except (RefinerConfigError, json.JSONDecodeError, KeyError, AttributeError, TypeError) as error:
-        raise WeightsError(f"{path}: configuration not understood ({error}); train or download it again") from error
-    bad = [name for name, value in state.items() if value.is_floating_point() and not value.isfinite().all()]
+    with _opened(path) as (file, header):
+        names = sorted(file.keys())
+        refiner = _hollow(header, len(names), path)
+        expected = refiner.state_dict()
+        found = {name: file.get_slice(name) for name in names}
+        wrong = [name for name in sorted({*expected, *found}) if _shape(expected, name) != _shape(found, name)]
+        if wrong:
+            raise WeightsError(
+                f"{path}: {len(wrong)} tensors do not fit, first {wrong[0]}: found {_shape(found, wrong[0])}, expected "
+                f"{_shape(expected, wrong[0])}; the file is damaged or of another version"
+            )
+        for name, tensor in found.items():
+            if (tensor.get_dtype() in _FLOATS) != expected[name].is_floating_point():
+                raise WeightsError(f"{path}: {name} is of type {tensor.get_dtype()}; the file is damaged")
+        state = {name: file.get_tensor(name) for name in names}
+    bad = [name for name, value in state.items() if not value.float().isfinite().all()]
     if bad:
         raise WeightsError(f"{path}: {bad[0]} holds NaN or Inf; expected finite weights; train or download it again")
-    refiner = Refiner(config)
-    expected = refiner.state_dict()
-    wrong = [n for n in sorted(expected.keys() | state.keys()) if _shape(expected, n) != _shape(state, n)]
-    if wrong:
-        name = wrong[0]
-        raise WeightsError(
-            f"{path}: {len(wrong)} tensors do not fit, first {name}: found {_shape(state, name)}, expected "
-            f"{_shape(expected, name)}; the file is damaged or of another version"
-        )
-    refiner.load_state_dict(state)
+    refiner.to_empty(device="cpu").load_state_dict(state)
     return refiner.to(device).eval()
 
 
@@ -77,11 +87,14 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
     Raises:
         WeightsError: if the file is missing, damaged or of another kind.
     """
-    header, _ = _read(Path(path))
-    return json.loads(header.get("metadata", "{}"))
+    path = Path(path)
+    with _opened(path) as (_, header):
+        return _json(header, "metadata", path)
 
 
-def _read(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, dict[str, str]]]:
+    """A file of weights, of which only the header has been read, and that header's texts."""
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
@@ -93,10 +106,46 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
                 raise WeightsError(
                     f"{path}: format {header.get('format')!r}; expected {FORMAT!r}, as save_refiner writes it"
                 )
-            return header, {name: file.get_tensor(name) for name in file.keys()}
+            yield file, header
     except (SafetensorError, OSError, ValueError) as error:
-        raise WeightsError(f"{path}: not a readable safetensors file ({error}); train or download it again") from error
+        raise WeightsError(
+            f"{path}: not a readable safetensors file ({one_line(error)}); train or download it again"
+        ) from error
 
 
-def _shape(state: dict[str, torch.Tensor], name: str) -> tuple[int, ...] | str:
-    return tuple(state[name].shape) if name in state else "nothing"
+def _json(header: dict[str, str], key: str, path: Path) -> dict[str, Any]:
+    """The JSON object of an entry of the header; empty if there is none."""
+    try:
+        value = json.loads(header.get(key, "{}"))
+    except (ValueError, RecursionError) as error:
+        raise WeightsError(f"{path}: {key} is not JSON ({one_line(error)}); train or download it again") from error
+    if not isinstance(value, dict):
+        raise WeightsError(
+            f"{path}: {key} is {type(value).__name__}; expected a JSON object; train or download it again"
+        )
+    return value
+
+
+def _hollow(header: dict[str, str], tensors: int, path: Path) -> Refiner:
+    """The network that a file describes, whose parameters have shapes but take no memory."""
+    if "config" not in header:
+        raise WeightsError(f"{path}: lacks the entry 'config'; expected refiner weights, as save_refiner writes them")
+    try:
+        config = RefinerConfig.from_dict(_json(header, "config", path))
+    except RefinerConfigError as error:
+        raise WeightsError(
+            f"{path}: configuration not understood ({one_line(error)}); train or download it again"
+        ) from error
+    layers = sum(config.enc_depths) + sum(config.dec_depths) + config.head_depth
+    if layers > tensors:
+        raise WeightsError(f"{path}: {tensors} tensors for {layers} layers; the file is damaged or of another version")
+    with torch.device("meta"):
+        return Refiner(config)
+
+
+def _shape(tensors: dict[str, Any], name: str) -> tuple[int, ...] | str:
+    """The shape of a tensor, or of one in a file that has not been read."""
+    if name not in tensors:
+        return "nothing"
+    tensor = tensors[name]
+    return tuple(tensor.shape if isinstance(tensor, torch.Tensor) else tensor.get_shape())

@@ -1,3 +1,7 @@
+import json
+import math
+from pathlib import Path
+
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -60,8 +64,6 @@ def test_missing_foreign_and_truncated_files_are_named(tmp_path):
 
 def rewrite(path, config=None, **tensors):
     """The file with another configuration or other tensors; a tensor of None is left out."""
-    import json
-
     from safetensors import safe_open
 
     with safe_open(path, framework="pt") as file:
@@ -85,12 +87,82 @@ def test_files_whose_contents_do_not_fit_are_refused(tmp_path):
     check("first extra: found \\(1,\\), expected nothing", extra=torch.zeros(1))
     check(f"{name} holds NaN or Inf", **{name: torch.tensor([0.0, torch.nan, 0])})
     check("unknown refiner settings flavour", config={"flavour": 1})
-    check("configuration not understood", config=[1])
+    check(f"{name} is of type I32", **{name: torch.zeros(3, dtype=torch.int32)})
+    check("config is list; expected a JSON object", config=[1])
     check("configuration not understood", config={"enc_channels": 3})
 
 
 def test_a_file_without_configuration_is_refused(tmp_path):
     path = tmp_path / "refiner.safetensors"
     save_file({"x": torch.zeros(2)}, path, metadata={"format": FORMAT})
-    with pytest.raises(WeightsError, match="configuration not understood"):
+    with pytest.raises(WeightsError, match="lacks the entry 'config'"):
         read_refiner(path)
+
+
+HUGE = [
+    {"enc_channels": [1 << 40, 48, 64]},
+    {"enc_channels": [1 << 16, 1 << 16, 1 << 16]},
+    {"enc_channels": [10**400, 48, 64]},
+    {"feature_dim": 1 << 16, "color_hidden": 1 << 16, "color_dim": 1 << 16},
+    {"head_width": 1 << 40},
+    {"head_depth": 1 << 40},
+    {"head_depth": 1 << 16},
+    {"enc_depths": [1 << 30, 1, 1]},
+    {"enc_depths": [1 << 16, 1, 1]},
+    {"mlp_ratio": 1 << 16},
+    {"patch": 1 << 40},
+]
+WRONG = [0, -1, 1.5, math.nan, math.inf, True, None, "1", [], [1], [[1]], {}, {"a": 1}, [None], "x" * 10_000]
+
+
+@pytest.fixture()
+def little_memory():
+    """Room for 2 GB more than this process has now: more than that is refused, as on a machine that has no more."""
+    resource = pytest.importorskip("resource")
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + (2 << 30), before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc")
+@pytest.mark.parametrize("changes", HUGE, ids=str)
+def test_a_configuration_that_the_file_cannot_hold_is_refused_before_memory_is_taken(changes, tmp_path, little_memory):
+    path = tmp_path / "refiner.safetensors"
+    save_refiner(trained(), path)
+    rewrite(path, config={**trained().config.to_dict(), **changes})
+    with pytest.raises(WeightsError, match="refiner.safetensors: "):
+        read_refiner(path)
+
+
+@pytest.mark.parametrize("name", sorted(trained().config.to_dict()))
+def test_settings_of_a_wrong_type_are_one_error(name, tmp_path):
+    path = tmp_path / "refiner.safetensors"
+    save_refiner(trained(), path)
+    right = trained().config.to_dict()
+    refused = 0
+    for value in WRONG:
+        rewrite(path, config={**right, name: value})
+        try:
+            assert getattr(read_refiner(path).config, name) == value, "read as something else"
+        except WeightsError as error:
+            refused += 1
+            assert any(text in str(error) for text in (name, "do not fit", "layers", "stages"))
+            assert len(str(error)) < 600 and "\n" not in str(error)
+    assert refused >= len(WRONG) - 4  # 0, 1.5 or 1 may be valid
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "{", "[" * 100_000, '{"a":' * 100_000, "9" * 5000, "null", '"keep"', "3", "\ud800"],
+    ids=lambda t: t[:9],
+)
+@pytest.mark.parametrize("key", ["config", "metadata"])
+def test_a_header_that_is_no_json_object_is_one_error(key, text, tmp_path):
+    path = tmp_path / "refiner.safetensors"
+    save_refiner(trained(), path)
+    header = {"format": FORMAT, "config": json.dumps(trained().config.to_dict()), "metadata": "{}"}
+    save_file(load_file(path), path, metadata={**header, key: text.encode("utf-8", "replace").decode()})
+    with pytest.raises(WeightsError, match=f"refiner.safetensors: {key} is "):
+        (read_refiner if key == "config" else read_metadata)(path)
