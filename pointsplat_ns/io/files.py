@@ -6,9 +6,12 @@ import hashlib
 import logging
 import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
+import stat
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -72,24 +75,76 @@ def replacing(path: Path | str) -> Iterator[Path]:
     """A temporary path beside ``path`` to write to. It replaces ``path`` when the block ends without an error, else it
     is removed.
 
-    Missing parent folders are created.
+    Missing parent folders are created. Through a symbolic link, its target is written. A file that is replaced keeps
+    its mode.
 
     Raises:
-        SceneError: if ``path`` is a folder or cannot be written.
+        SceneError: if ``path`` is a folder or a device, or cannot be written.
     """
     path = Path(path)
-    if path.is_dir():
-        raise SceneError(f"{path}: is a folder; expected the name of a file to write")
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part: Path | None = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        target = Path(os.path.realpath(path)) if path.is_symlink() else path
+        if target.is_dir():
+            raise SceneError(f"{path}: is a folder; expected the name of a file to write")
+        mode = _mode_of(target)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        part = target.with_name(_part_name(target.name))
+        if mode is not None:
+            part.touch(0o600)  # nobody else reads it before it is complete
         yield part
-        os.replace(part, path)
+        if mode is not None:
+            part.chmod(mode)
+        os.replace(part, target)
     except OSError as error:
         raise SceneError(f"{path}: cannot be written ({error.strerror or one_line(error)})") from error
     finally:
-        if part.parent.is_dir():
-            part.unlink(missing_ok=True)
+        if part is not None:
+            with suppress(OSError):  # it may never have been there; the error above says why
+                part.unlink()
+
+
+def _mode_of(path: Path) -> int | None:
+    """Permission bits of a file that is to be replaced; None if there is none.
+
+    Raises:
+        SceneError: if it is a device, a pipe or a link that leads nowhere.
+    """
+    try:
+        status = path.lstat()
+    except FileNotFoundError:
+        return None
+    if not stat.S_ISREG(status.st_mode):
+        raise SceneError(f"{path}: not a regular file; expected the name of a file to write")
+    return stat.S_IMODE(status.st_mode)
+
+
+def _part_name(name: str) -> str:
+    """A name for the unfinished file, no longer than file systems allow (255 bytes), however long ``name`` is."""
+    start = name.encode("utf-8", "surrogateescape")[:200].decode("utf-8", "ignore")
+    return f".{start}.{os.getpid()}.part"
+
+
+def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: dict[str, str]) -> None:
+    """Write a safetensors file, as :func:`replacing` does.
+
+    Args:
+        path: the file; its folder is created if missing.
+        tensors: on any device.
+        header: the file's metadata.
+
+    Raises:
+        SceneError: if ``path`` cannot be written.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import save_file
+
+    contiguous = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    with replacing(path) as part:
+        try:
+            save_file(contiguous, part, metadata=header)
+        except SafetensorError as error:  # for one, of a full disk
+            raise OSError(one_line(error)) from error
 
 
 def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.io.files import one_line, replacing
+from pointsplat_ns.io.files import one_line, write_tensors
 from pointsplat_ns.refiner.config import RefinerConfig, RefinerConfigError
 from pointsplat_ns.refiner.refiner import Refiner
 
@@ -37,16 +37,12 @@ def save_refiner(refiner: Refiner, path: str | Path, metadata: dict[str, Any] | 
         path: file to write or replace; its folder is created if missing.
         metadata: anything JSON can hold: data, command, steps, results.
     """
-    from safetensors.torch import save_file
-
     header = {
         "format": FORMAT,
         "config": json.dumps(refiner.config.to_dict()),
         "metadata": json.dumps(metadata or {}),
     }
-    state = {name: value.detach().cpu().contiguous() for name, value in refiner.state_dict().items()}
-    with replacing(path) as part:
-        save_file(state, part, metadata=header)
+    write_tensors(path, refiner.state_dict(), header)
 
 
 def read_refiner(path: str | Path, device: torch.device | str = "cpu") -> Refiner:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from making import normal_scene
@@ -44,6 +45,15 @@ def test_a_failed_save_leaves_the_old_file_and_no_rest(tmp_path, monkeypatch):
     with pytest.raises(PointSplatError, match="refiner.safetensors: cannot be written .disk full."):
         save_refiner(trained(), path)
     assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_full_disk_is_one_error(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
+
+    monkeypatch.setattr("safetensors.torch.save_file", full)
+    with pytest.raises(PointSplatError, match="refiner.safetensors: cannot be written .*No space left on device"):
+        save_refiner(trained(), tmp_path / "refiner.safetensors")
 
 
 def test_missing_foreign_and_truncated_files_are_named(tmp_path):

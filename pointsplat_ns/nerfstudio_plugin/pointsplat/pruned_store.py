@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import file_stem, one_line, replacing
+from pointsplat_ns.io.files import file_stem, one_line, write_tensors
 from pointsplat_ns.pruning import PruneSettings
 
 FORMAT = "pointsplat-pruned/1"
@@ -32,11 +32,8 @@ def stored_path(folder: Path, name: str, content: str, settings: PruneSettings) 
 
 def write_pruned(path: Path, pruned: Gaussians, dense_count: int, seconds: float) -> None:
     """Write a pruned scene, the number of Gaussians of the dense scene, and the seconds that pruning took."""
-    from safetensors.torch import save_file
-
     header = {"format": FORMAT, "dense_count": str(dense_count), "seconds": repr(seconds)}
-    with replacing(path) as part:
-        save_file({name: value.detach().cpu().contiguous() for name, value in pruned.items()}, part, metadata=header)
+    write_tensors(path, dict(pruned.items()), header)
 
 
 def read_pruned(path: Path) -> tuple[Gaussians, int, float]:
