@@ -26,5 +26,7 @@ def rooms(
     """
     import pointsplat_ns as ps
 
+    if not seeds:
+        raise ps.DataError("--seeds without a value: expected the seed of each room, such as --seeds 0 1")
     for seed in seeds:
         print(ps.write_room(output / f"room{seed}", seed, frames, width, height))

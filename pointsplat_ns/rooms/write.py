@@ -41,7 +41,8 @@ def write_room(
         ``folder``.
 
     Raises:
-        DataError: if ``folder`` exists and is not an empty folder, or there are too few frames or pixels.
+        DataError: if ``folder`` exists and is not an empty folder or cannot be written, or there are too few frames or
+            pixels.
 
     Example:
         >>> import tempfile
@@ -55,14 +56,14 @@ def write_room(
     folder = Path(folder)
     if frames < 2 or width < 8 or height < 8:
         raise DataError(f"room of {frames} frames, {width} x {height}: expected at least 2 frames of 8 x 8 pixels")
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise DataError(f"{folder}: exists and is not an empty folder; remove it or name another")
-    room = make_room(seed)
-    poses = capture_path(room, frames, seed, style)
-    K = default_intrinsics(width, height)
-    partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
+    partial = folder.with_name(f".{folder.name[:50]}.partial-{os.getpid()}")
     try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise DataError(f"{folder}: exists and is not an empty folder; remove it or name another")
         (partial / "results").mkdir(parents=True)
+        room = make_room(seed)
+        poses = capture_path(room, frames, seed, style)
+        K = default_intrinsics(width, height)
         for number in tracked(range(frames), f"Room {seed} ({room.spec.kind})", frames, progress):
             rgb, depth = render_room(room, poses[number], K, width, height)
             pixels = (rgb * 255).round().to(torch.uint8).numpy()
@@ -84,6 +85,8 @@ def write_room(
         }
         (partial / "cam_params.json").write_text(json.dumps({"camera": camera}, indent=1) + "\n", encoding="utf-8")
         os.replace(partial, folder)
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be written ({error.strerror or error})") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return folder

@@ -1,13 +1,16 @@
 """The built-in rooms: repeatable, watertight, lit, with highlights that move, and readable as Replica scenes."""
 
+import errno
 import json
 import logging
+import os
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+from pointsplat_ns.cli import main
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_depth, read_photo
 from pointsplat_ns.rooms import capture_path, default_intrinsics, make_room, render_room, write_room
@@ -244,10 +247,10 @@ def test_writing_leaves_nothing_behind_when_it_fails_and_keeps_what_is_there(tmp
     assert (target / "mine.txt").read_text() == "kept"
 
     def full(*args, **kwargs):
-        raise OSError("no space left on device")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(Image.Image, "save", full)
-    with pytest.raises(OSError, match="no space"):
+    with pytest.raises(DataError, match="other: cannot be written .No space left on device."):
         write_room(tmp_path / "other", 0, 2, 16, 12, progress=False)
     assert [p.name for p in tmp_path.iterdir()] == ["room"]
 
@@ -262,3 +265,23 @@ def test_impossible_requests_are_refused_in_one_line(tmp_path):
 def test_camera_file_states_replicas_own_convention(written):
     camera = json.loads((written / "cam_params.json").read_text())["camera"]
     assert (camera["cx"], camera["cy"], camera["scale"]) == (31.5, 23.5, 6553.5)
+
+
+@pytest.mark.parametrize("place", ["/proc/room", "/dev/null/room", "file/room", "x" * 256, "x" * 300 + "/room"])
+def test_a_place_where_no_folder_can_be_is_one_error_at_once(tmp_path, monkeypatch, place):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr("pointsplat_ns.rooms.write.make_room", None)  # the room is not made first
+    with pytest.raises(DataError, match=f"{place}: cannot be written"):
+        write_room(tmp_path / place, 0, 2, 16, 12, progress=False)
+
+
+def test_a_folder_with_the_longest_name_there_is_is_written(tmp_path):
+    folder = tmp_path / ("\u00e9" * 127)
+    assert write_room(folder, 0, 2, 16, 12, progress=False) == folder
+    assert [path.name for path in tmp_path.iterdir()] == [folder.name]
+
+
+def test_a_list_of_seeds_without_a_seed_is_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["rooms", "-o", str(tmp_path / "rooms"), "--seeds"])
+    assert end.value.code == 1 and "--seeds without a value: expected" in capsys.readouterr().err
