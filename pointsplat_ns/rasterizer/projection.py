@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
@@ -42,12 +43,22 @@ def camera_centre(viewmat: Tensor) -> Tensor:
     translation of 1e6 turns into a tenth of a unit.
 
     Raises:
-        ValueError: if the matrix is not finite or its rotation cannot be inverted.
+        ValueError: if the matrix is not finite, its rotation cannot be inverted, or its last row is not 0, 0, 0, 1.
     """
     viewmat = viewmat.double()
-    if not viewmat.isfinite().all() or torch.linalg.det(viewmat[:3, :3]) == 0:
-        raise ValueError(f"viewmat is {viewmat.tolist()}; expected finite numbers and a rotation")
+    rows = viewmat.tolist()
+    if not all(math.isfinite(value) for row in rows for value in row) or torch.linalg.det(viewmat[:3, :3]) == 0:
+        raise ValueError(f"viewmat is {rows}; expected finite numbers and a rotation")
+    if not _close(rows[3], (0.0, 0.0, 0.0, 1.0)):
+        raise ValueError(
+            f"viewmat has the last row {rows[3]}; expected 0, 0, 0, 1: it takes world to camera, row by row"
+        )
     return torch.linalg.solve(viewmat[:3, :3], -viewmat[:3, 3])
+
+
+def _close(values: Sequence[float], wanted: Sequence[float]) -> bool:
+    """Whether numbers of a camera are what they should be, up to the rounding of a matrix that was inverted."""
+    return all(abs(value - right) <= 1e-5 for value, right in zip(values, wanted, strict=True))
 
 
 @torch.no_grad()
@@ -97,13 +108,15 @@ def project(
     - No axis is drawn longer than 1e9 pixels (float32), so that no determinant overflows.
 
     Raises:
-        ValueError: if a focal length is zero, or the camera is not finite.
+        ValueError: if a focal length is zero, or the camera is not finite, has skew or is no motion.
     """
     # R (m - c) and not R m + t: far from the origin the first rounds alike for all Gaussians
     centre = camera_centre(viewmat)
-    (fx, _, cx), (_, fy, cy), _ = K.tolist()
+    (fx, skew, cx), (below, fy, cy), last = K.tolist()
     if not all(map(math.isfinite, (fx, fy, cx, cy))) or fx == 0 or fy == 0:
         raise ValueError(f"K has fx {fx}, fy {fy}, cx {cx}, cy {cy}; expected finite numbers and focal lengths not 0")
+    if not _close((skew, below, *last), (0.0, 0.0, 0.0, 0.0, 1.0)):
+        raise ValueError(f"K is {K.tolist()}; expected no skew: zeros but for fx, fy, cx, cy and the 1 of the last row")
     lens = Lens(fx, fy, cx, cy, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased)
     ids, means2d, depths, cov2d, det, alphas, directions, radii = Project.apply(
         means, quats, scales, opacities, viewmat[:3, :3].to(means.dtype), centre, lens

@@ -7,6 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from pointsplat_ns.rasterizer.arguments import check_options, check_tensors
 from pointsplat_ns.rasterizer.backends import use_gsplat
 from pointsplat_ns.rasterizer.blending import blend
 from pointsplat_ns.rasterizer.constants import EPS2D, QUALITIES, TILE, Quality
@@ -17,29 +18,6 @@ from pointsplat_ns.rasterizer.tiles import Footprints
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 QualityName = Literal["exact", "balanced", "fast"]
-
-
-def _check(means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds, render_mode) -> None:
-    n, c = means.shape[0], viewmats.shape[0]
-    wanted = {
-        "means": (means, (n, 3)),
-        "quats": (quats, (n, 4)),
-        "scales": (scales, (n, 3)),
-        "opacities": (opacities, (n,)),
-        "viewmats": (viewmats, (c, 4, 4)),
-        "Ks": (Ks, (c, 3, 3)),
-    }
-    for name, (tensor, shape) in wanted.items():
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; expected {shape}")
-    if colors.shape[:1] != (n,) and colors.shape[:2] != (c, n):
-        raise ValueError(f"colors has shape {tuple(colors.shape)}; expected ({n}, ...) or ({c}, {n}, ...)")
-    if width < 1 or height < 1:
-        raise ValueError(f"image is {width} x {height} pixels; expected at least 1 x 1")
-    if render_mode not in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
-        raise ValueError(f"render_mode is {render_mode!r}; expected RGB, D, ED, RGB+D or RGB+ED")
-    if backgrounds is not None and backgrounds.shape[0] != c:
-        raise ValueError(f"backgrounds has shape {tuple(backgrounds.shape)}; expected ({c}, channels)")
 
 
 def _cat(tensors: list[Tensor]) -> Tensor:
@@ -71,7 +49,7 @@ def rasterization(
     means: Tensor,  # [N, 3]
     quats: Tensor,  # [N, 4]
     scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
+    opacities: Tensor,  # [N] or [N, 1]
     colors: Tensor,  # [(C,) N, D] or [(C,) N, K, 3]
     viewmats: Tensor,  # [C, 4, 4]
     Ks: Tensor,  # [C, 3, 3]
@@ -147,7 +125,8 @@ def rasterization(
         they would be seen), width, height, n_cameras, tile_size, tile_width and tile_height.
 
     Raises:
-        ValueError: if a shape or option does not fit.
+        ValueError: if a shape or option does not fit, or a camera has skew or is no motion; the text names the
+            argument.
         PointSplatError: if gsplat is asked for and cannot be used.
 
     Example:
@@ -168,8 +147,11 @@ def rasterization(
             means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane, radius_clip,
             eps2d, sh_degree, packed, 16, backgrounds, render_mode, sparse_grad, absgrad, rasterize_mode, channel_chunk,
         )  # fmt: skip
-    opacities = opacities.reshape(-1) if opacities.dim() == 2 else opacities
-    _check(means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds, render_mode)
+    opacities = opacities[:, 0] if opacities.dim() == 2 and opacities.shape[1] == 1 else opacities
+    check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, backgrounds)
+    check_options(
+        width, height, near_plane, far_plane, radius_clip, eps2d, render_mode, rasterize_mode, quality, memory_budget
+    )
     dtype = means.dtype if means.dtype in (torch.float32, torch.float64) else torch.float32
     means, quats, scales, opacities, colors = (tensor.to(dtype) for tensor in (means, quats, scales, opacities, colors))
     n, cameras = means.shape[0], viewmats.shape[0]
@@ -228,7 +210,7 @@ def rasterization(
 
     if backgrounds is not None and color_channels:
         background = backgrounds.to(dtype)[:, None, None, :]
-        over = image[..., :color_channels] + through * background[..., :color_channels]
+        over = image[..., :color_channels] + through * background
         image = torch.cat([over, image[..., color_channels:]], dim=-1)
     if render_mode.endswith("ED"):
         expected = image[..., -1:] / accumulated.clamp_min(1e-10)

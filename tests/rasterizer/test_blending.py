@@ -116,7 +116,7 @@ def test_lower_qualities_are_within_the_error_they_state_and_in_order():
     assert errors["exact"] == 0
     assert 0 < errors["balanced"] < errors["fast"]
     assert errors["balanced"] < 10 ** (-45 / 10)  # 53 dB and more on trained scenes; this one is all edges
-    with pytest.raises(KeyError):
+    with pytest.raises(ValueError, match="quality is 'worst'"):
         draw(scene, quality="worst")
 
 

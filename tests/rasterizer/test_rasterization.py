@@ -1,5 +1,7 @@
 """The fast rasterizer against the per-pixel reference, in value and gradient."""
 
+import math
+
 import pytest
 import torch
 
@@ -205,7 +207,38 @@ def test_tiles_hold_every_pair_that_draws_and_few_others():
         (dict(means=torch.zeros(3, 2)), r"means has shape \(3, 2\)"),
         (dict(opacities=torch.zeros(4)), r"opacities has shape \(4,\); expected \(3,\)"),
         (dict(width=0), "0 x 8 pixels"),
-        (dict(render_mode="depth"), "render_mode is 'depth'"),
+        (dict(width=7.5), "7.5 x 8 pixels; expected whole numbers"),
+        (dict(render_mode="depth"), "render_mode is 'depth'; expected RGB, D, ED, RGB.D or RGB.ED"),
+        (dict(rasterize_mode="antialiasing"), "rasterize_mode is 'antialiasing'; expected classic or antialiased"),
+        (dict(quality="best"), "quality is 'best'; expected exact, balanced or fast"),
+        (dict(eps2d=-1.0), "eps2d is -1.0; expected a number from 0"),
+        (dict(eps2d=math.nan), "eps2d is nan"),
+        (dict(radius_clip=math.nan), "radius_clip is nan"),
+        (dict(near_plane=-1.0), "near_plane is -1.0"),
+        (dict(near_plane=2.0, far_plane=1.0), "near_plane is 2.0 and far_plane 1.0"),
+        (dict(memory_budget=0), "memory_budget is 0"),
+        (dict(means=torch.tensor(1.0)), r"means has shape \(\)"),
+        (dict(viewmats=torch.tensor(1.0)), r"viewmats has shape \(\)"),
+        (dict(viewmats=torch.eye(4)), r"viewmats has shape \(4, 4\); expected \(4, 4, 4\)"),
+        (dict(viewmats=torch.zeros(0, 4, 4), Ks=torch.zeros(0, 3, 3)), "viewmats holds no camera"),
+        (dict(opacities=torch.ones(1, 3)), r"opacities has shape \(1, 3\)"),
+        (dict(colors=torch.ones(3, 16, 3)), r"colors has shape \(3, 16, 3\).*SH coefficients need sh_degree"),
+        (dict(colors=torch.ones(1, 3, 16, 3)), "SH coefficients need sh_degree"),
+        (dict(colors=torch.ones(3)), r"colors has shape \(3,\)"),
+        (dict(colors=torch.ones(3, 0)), r"colors has shape \(3, 0\)"),
+        (dict(colors=torch.ones(4, 3)), r"colors has shape \(4, 3\); expected \(3, channels\)"),
+        (dict(colors=torch.ones(3, 3), sh_degree=0), r"colors has shape \(3, 3\); expected SH coefficients"),
+        (dict(colors=torch.ones(3, 16, 2), sh_degree=3), r"colors has shape \(3, 16, 2\); expected SH coefficients"),
+        (dict(colors=torch.ones(2, 3, 16, 3), sh_degree=3), r"colors has shape \(2, 3, 16, 3\)"),
+        (dict(colors=torch.ones(3, 25, 3), sh_degree=4), "sh_degree is 4; expected 0 to 3"),
+        (dict(colors=torch.ones(3, 16, 3), sh_degree=1.5), "sh_degree is 1.5"),
+        (dict(backgrounds=torch.zeros(1, 5)), r"backgrounds has shape \(1, 5\); expected \(1, 3\)"),
+        (dict(backgrounds=torch.zeros(3)), r"backgrounds has shape \(3,\); expected \(1, 3\)"),
+        (dict(backgrounds=torch.zeros(2, 3)), r"backgrounds has shape \(2, 3\); expected \(1, 3\)"),
+        (dict(Ks=torch.tensor([[[9.0, 0.5, 4], [0, 9, 4], [0, 0, 1]]])), "K is .*0.5.*expected no skew"),
+        (dict(Ks=torch.tensor([[[9.0, 0, 4], [0, 9, 4], [0, 0, 2]]])), "K is .*expected no skew"),
+        (dict(viewmats=torch.diag(torch.tensor([1.0, 1, 1, 2]))[None]), "viewmat has the last row .*2.0"),
+        (dict(viewmats=(torch.eye(4) + torch.eye(4).roll(1, 1))[None].mT), "viewmat has the last row"),
         (dict(colors=torch.zeros(3, 4, 3), sh_degree=3), "4 SH coefficients given; degree 3 needs 16"),
     ],
 )

@@ -1,0 +1,108 @@
+"""Checks the arguments of :func:`~pointsplat_ns.rasterizer.rendering.rasterization`, not the values of tensors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+from pointsplat_ns.rasterizer.constants import QUALITIES, Quality
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+RASTERIZE_MODES = ("classic", "antialiased")
+
+
+def check_tensors(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    sh_degree: int | None,
+    backgrounds: Tensor | None,
+) -> None:
+    """Check shapes. Values are left alone: looking at them would have to wait for the device.
+
+    Raises:
+        ValueError: if a shape does not fit; the text names the argument.
+    """
+    n, c = (tensor.shape[0] if tensor.dim() else 0 for tensor in (means, viewmats))
+    wanted = {
+        "means": (means, (n, 3)),
+        "quats": (quats, (n, 4)),
+        "scales": (scales, (n, 3)),
+        "opacities": (opacities, (n,)),
+        "viewmats": (viewmats, (c, 4, 4)),
+        "Ks": (Ks, (c, 3, 3)),
+    }
+    for name, (tensor, shape) in wanted.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; expected {shape}")
+    if c == 0:
+        raise ValueError("viewmats holds no camera; expected at least one")
+    if sh_degree is None:
+        channels = _check_channels(colors, n, c)
+    else:
+        channels = _check_harmonics(colors, n, c, sh_degree)
+    if backgrounds is not None and tuple(backgrounds.shape) != (c, channels):
+        raise ValueError(f"backgrounds has shape {tuple(backgrounds.shape)}; expected {(c, channels)}")
+
+
+def _check_channels(colors: Tensor, n: int, c: int) -> int:
+    """The number of channels of colours that are no SH coefficients."""
+    shape = tuple(colors.shape)
+    if shape[:-1] not in ((n,), (c, n)) or shape[-1] < 1:
+        hint = "; SH coefficients need sh_degree" if shape in ((n, *shape[1:2], 3), (c, n, *shape[2:3], 3)) else ""
+        raise ValueError(f"colors has shape {shape}; expected ({n}, channels) or ({c}, {n}, channels){hint}")
+    return shape[-1]
+
+
+def _check_harmonics(colors: Tensor, n: int, c: int, sh_degree: int) -> int:
+    """The number of channels of SH coefficients: three."""
+    if not isinstance(sh_degree, int) or not 0 <= sh_degree <= 3:
+        raise ValueError(f"sh_degree is {sh_degree!r}; expected 0 to 3, or None")
+    shape, needed = tuple(colors.shape), (sh_degree + 1) ** 2
+    if len(shape) < 3 or shape[:-2] not in ((n,), (c, n)) or shape[-1] != 3:
+        raise ValueError(f"colors has shape {shape}; expected SH coefficients ({n}, K, 3) or ({c}, {n}, K, 3)")
+    if shape[-2] < needed:
+        raise ValueError(f"colors: {shape[-2]} SH coefficients given; degree {sh_degree} needs {needed}")
+    return 3
+
+
+def check_options(
+    width: int,
+    height: int,
+    near_plane: float,
+    far_plane: float,
+    radius_clip: float,
+    eps2d: float,
+    render_mode: str,
+    rasterize_mode: str,
+    quality: str | Quality,
+    memory_budget: int,
+) -> None:
+    """Check numbers and names.
+
+    Raises:
+        ValueError: if one has no meaning; the text names the argument.
+    """
+    if not (hasattr(width, "__index__") and hasattr(height, "__index__") and width >= 1 and height >= 1):
+        raise ValueError(f"image is {width} x {height} pixels; expected whole numbers, at least 1 x 1")
+    if not 0 <= near_plane < far_plane:  # NaN fails too, here and below
+        raise ValueError(f"near_plane is {near_plane} and far_plane {far_plane}; expected 0 <= near_plane < far_plane")
+    for name, value in {"radius_clip": radius_clip, "eps2d": eps2d}.items():
+        if not 0 <= value < float("inf"):
+            raise ValueError(f"{name} is {value}; expected a number from 0")
+    if not memory_budget > 0:
+        raise ValueError(f"memory_budget is {memory_budget}; expected a number of bytes above 0")
+    _check_name("render_mode", render_mode, RENDER_MODES)
+    _check_name("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
+    if not isinstance(quality, Quality):
+        _check_name("quality", quality, tuple(QUALITIES))
+
+
+def _check_name(argument: str, value: Any, names: tuple[str, ...]) -> None:
+    if value not in names:
+        raise ValueError(f"{argument} is {value!r}; expected {', '.join(names[:-1])} or {names[-1]}")
