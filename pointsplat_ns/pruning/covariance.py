@@ -110,9 +110,11 @@ def overlap(first: Tensor, second: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """Integral over the plane of the product of two shadows of peak 1 whose centres are (u, v) apart, (N,).
 
     The product of two Gaussians is a Gaussian. Its integral is the product of their areas, divided by the area of the
-    summed covariance, times exp(-d^2 / 2) with d the Mahalanobis distance of the centres under that covariance.
+    summed covariance, times exp(-d^2 / 2) with d the Mahalanobis distance of the centres under that covariance. It is
+    no larger than the smaller area, also where the area of the sum, of shadows like lines, is lost to rounding.
     """
     both = first + second
     area = flat_area(both).clamp_min(TINY)
     distance = (both[:, 2] * u * u - 2 * both[:, 1] * u * v + both[:, 0] * v * v) / area / area
-    return flat_area(first) * flat_area(second) / area * torch.exp(-0.5 * distance.clamp_min(0))
+    large, small = (order(flat_area(first), flat_area(second)) for order in (torch.maximum, torch.minimum))
+    return small * (large / area).clamp_max(1) * torch.exp(-0.5 * distance.clamp_min(0))
