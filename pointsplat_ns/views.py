@@ -15,6 +15,10 @@ RasterizeMode = Literal["classic", "antialiased"]
 """How a scene was trained to be drawn (nerfstudio's ``rasterize_mode``)."""
 
 
+NEAR_PLANE = 0.01
+"""Near plane of gsplat, scene units."""
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """One pinhole camera, and how a scene is drawn from it. An element of :class:`Views`.
@@ -27,6 +31,7 @@ class View:
         height: of the image, pixels.
         background: (3,) colour behind the scene, RGB in [0, 1].
         rasterize_mode: how the scene was trained to be drawn.
+        near_plane: depth below which nothing is drawn, scene units; gsplat's by default.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -41,6 +46,7 @@ class View:
     height: int
     background: Tensor  # [3] in [0, 1]
     rasterize_mode: RasterizeMode = "classic"
+    near_plane: float = NEAR_PLANE  # scene units
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +64,7 @@ class Views:
         height: of every image, pixels.
         background: (3,) colour behind the scene, RGB in [0, 1].
         rasterize_mode: how the scene was trained to be drawn.
+        near_plane: depth below which nothing is drawn, scene units; gsplat's by default.
 
     Raises:
         DataError: if a shape does not fit the others, or the image has no pixel.
@@ -77,6 +84,7 @@ class Views:
     height: int
     background: Tensor  # [3] in [0, 1]
     rasterize_mode: RasterizeMode = "classic"
+    near_plane: float = NEAR_PLANE  # scene units
 
     def __post_init__(self) -> None:
         count = self.viewmats.shape[0] if self.viewmats.dim() else 0
@@ -103,7 +111,7 @@ class Views:
         """
         viewmats, Ks = self.viewmats[index], self.Ks[index]
         kind = View if viewmats.dim() == 2 else Views
-        return kind(viewmats, Ks, self.width, self.height, self.background, self.rasterize_mode)
+        return kind(viewmats, Ks, self.width, self.height, self.background, self.rasterize_mode, self.near_plane)
 
     def __iter__(self) -> Iterator[View]:
         return (self[index] for index in range(len(self)))

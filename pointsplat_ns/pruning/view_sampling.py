@@ -1,15 +1,21 @@
-"""Samples views in the free space of a scene that comes without cameras."""
+"""Samples views of a scene that comes without cameras: where people would stand, and what they would look at.
+
+All is done in units of the content (its diagonal is 10), so that the scene's own unit does not matter.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.scores import area_score
+from pointsplat_ns.pruning.content import UNITS, content_box, content_diagonal, in_units, thinned
+from pointsplat_ns.pruning.surface import Surface
+from pointsplat_ns.pruning.upright import UprightBox, level_directions, pointing_up, upright_axis
 from pointsplat_ns.rasterizer import render_depth
 from pointsplat_ns.views import Views
 
@@ -18,74 +24,100 @@ FIELD_OF_VIEW = 70.0
 
 BACKGROUND = (0.0, 0.0, 0.0)
 
-_PROBE_SIDE = 32
-"""Longer side, in pixels, of the depth image that tests a camera position."""
+NEAR_PLANE = 1e-3
+"""Depth that sampled views start at, as a share of the diagonal of the content's box."""
 
-_TOO_NEAR = 0.05
-"""Distance, as a share of the diagonal of the content's box, below which a surface is too near to the camera."""
+PROBED = 5_000
+"""Number of Gaussians, at most, of the depth images that test a view."""
+
+_PROBE_SIDE = 32
+"""Longer side, in pixels, of these images."""
+
+_TOO_NEAR = 0.5
+"""Distance, in units, below which a surface is too near to the camera."""
 
 _NEAR_PIXELS = 0.05
 """Largest allowed share of pixels that show a surface that is too near."""
 
-_COVERED = 0.7
-"""Least mean alpha of the image: it must show something nearly everywhere."""
+_COVERED = {True: 0.7, False: 0.05}
+"""Least mean alpha of the image. Inside it must show something nearly everywhere; an object may stand before
+nothing."""
 
-_BOX_SIZES = (0.7, 1.0, 1.0, 1.5, 2.5, 4.0)
-"""Sizes, relative to the content's box, of the boxes that camera positions are drawn from, in this order: first inside,
-as in a room, then outside, as around an object."""
+_ENCLOSED = 0.6
+"""Least share of all directions in which there is a surface, for a place inside a room."""
 
+_MOSTLY = 0.85
+"""Least share of the free places of a room's box that are enclosed. Beside an object there are others."""
 
-def content_box(scene: Gaussians) -> tuple[Tensor, Tensor]:
-    """Corners (3,), (3,) of the box that holds 90 % of the scene's opacity along each axis, float64.
+_AS_MUCH = 0.9
+"""Least share of what is seen from outside that the enclosed places of a room see."""
 
-    Raises:
-        DataError: if nothing of the scene is visible.
-    """
-    means, alphas = scene.means.double(), scene.alphas.double()
-    seen = scene.usable() & (alphas > 0)
-    if not bool(seen.any()):
-        raise DataError("nothing of the scene can be seen, so there is no place to look from")
-    means, alphas = means[seen], alphas[seen]
-    corners = []
-    for axis in means.unbind(1):
-        ranked, order = axis.sort()
-        below = alphas[order].cumsum(0)
-        at = torch.searchsorted(below, below[-1] * below.new_tensor([0.05, 0.95])).clamp_max(len(ranked) - 1)
-        corners.append(ranked[at])
-    low, high = torch.stack(corners, dim=1)
-    return low, high
+_HEIGHTS = (0.3, 0.75)
+"""Where eyes are between the floor and the ceiling of a room."""
 
+_PITCH = (-10.0, 8.0, -30.0, 10.0)
+"""Mean, standard deviation and bounds of how far up a camera in a room looks, degrees."""
 
-def content_diagonal(scene: Gaussians, low: Tensor, high: Tensor) -> float:
-    """Diagonal of the box with corners ``low`` (3,) and ``high`` (3,) that :func:`content_box` gives, scene units. If
-    the box is a point (one Gaussian, or all at one position), four times the largest standard deviation; 1 if that is
-    0."""
-    return float((high - low).norm()) or 4 * float(scene.stds[scene.usable()].double().amax()) or 1.0
+_ELEVATION = (-5.0, 60.0)
+"""How far above an object's middle it is looked at from, degrees."""
+
+_ABOVE_GROUND = 0.05
+"""Least height of a camera outside, as a share of the content's."""
+
+_DISTANCE = (5.5, 9.5)
+"""How far from an object's middle cameras are, units."""
+
+_PLACES = 48
+"""Number of places, at most, whose views compete for being taken."""
+
+_TURNS = {True: 8, False: 4}
+"""Number of views at each place, inside and outside."""
+
+_ROUND = 16
+"""Number of views, at most, that are taken before other places are drawn."""
+
+_COMPARED = 4096
+"""Number of points that views compete for."""
+
+_FAR = 4.0
+"""Distance, units, from which on a surface counts less, as it is then small in the image."""
+
+_NOVEL = 0.1
+"""Once a point has been shown this well (1 is in the middle of a picture and near), it counts half."""
+
+_FRUITLESS = 4
+"""Rounds without any view after which the search ends."""
 
 
 @torch.no_grad()
-def sample_views(scene: Gaussians, count: int, width: int = 320, height: int = 240, seed: int = 0) -> Views:
-    """Sample cameras in free space that look at the content of a scene.
+def sample_views(
+    scene: Gaussians, count: int, width: int = 320, height: int = 240, seed: int = 0, up: Tensor | None = None
+) -> Views:
+    """Sample cameras that look at a scene as people would.
 
-    A camera position is drawn at random from the box that holds 90 % of the scene's opacity along each axis, and a
-    target among the Gaussians with probability proportional to opacity times area. The camera is kept if a small depth
-    image from there shows free space: nearly all of it is covered, and hardly any surface is very near. If too few
-    positions are found, larger boxes are tried. The z axis is taken to point up.
+    A scene that is seen whole from enclosed places in it is a room: cameras then stand in free space at the height of
+    eyes and look about level. Any other is looked at from around. Of many such views, those are taken that show most of
+    what the views before them have not shown, in the middle of the picture rather than at its edge; a small depth image
+    tests that nothing is in the way. Ask for all the views at once that are wanted, as they then complete each other.
 
     Args:
         scene: N Gaussians.
         count: number of views, at least 1.
         width: of the images, pixels.
         height: of the images, pixels. The field of view is 70 degrees across the longer side.
-        seed: the same scene and seed give the same views.
+        seed: the same scene and seed give the same views, another seed gives others.
+        up: (3,) which way is up in the world, of any length; by default it is estimated from the scene, see
+
+            :mod:`pointsplat_ns.pruning.upright`.
 
     Returns:
         ``count`` views, on the CPU, over black: ``viewmats`` (count, 4, 4) from world to camera in OpenCV axes and
-        ``Ks`` (count, 3, 3) in pixels, float64. Fewer where the search finds fewer.
+        ``Ks`` (count, 3, 3) in pixels, float64, with a near plane that suits the scene's size. Fewer where the search
+        finds fewer.
 
     Raises:
-        DataError: if ``count`` or the size is not positive, nothing of the scene is visible, or no free position is
-            found.
+        DataError: if ``count`` or the size is not positive, ``up`` is not a direction, nothing of the scene is visible,
+            or no free position is found.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -98,45 +130,45 @@ def sample_views(scene: Gaussians, count: int, width: int = 320, height: int = 2
         raise DataError(f"{count} views asked for; expected at least 1")
     if min(width, height) < 1:
         raise DataError(f"views of {width} x {height} pixels asked for; expected at least 1 x 1")
+    if up is not None:
+        up = torch.as_tensor(up).detach().double().cpu()
+        if up.shape != (3,) or not 0 < float(up.norm()) < math.inf:
+            raise DataError(f"up is {up.tolist()}; expected three numbers, not all 0")
+        up = up / up.norm()
     low, high = content_box(scene)
     diagonal = content_diagonal(scene, low, high)
+    centre = 0.5 * (low + high).cpu()
+    surface = Surface.of(scene, centre, diagonal)
+    axis = upright_axis(surface) if up is None else up
+    inside = _is_room(surface, UprightBox.of(surface, axis))
+    box = UprightBox.of(surface, pointing_up(surface, axis, inside) if up is None else up)
+    small = in_units(thinned(scene, PROBED), centre, diagonal)
     generator = torch.Generator().manual_seed(seed)
-    weights = area_score(scene).nan_to_num(nan=-math.inf).cpu()
-    chances = torch.softmax(weights.clamp_max(_not_giant(weights)), dim=0)
-    cumulative = chances.cumsum(0)
-    taken: list[Tensor] = []
-    for size in _BOX_SIZES:
-        for _ in range(2):
-            positions = torch.rand(2 * count, 3, generator=generator, dtype=torch.float64) - 0.5
-            positions = 0.5 * (low + high).cpu() + size * positions * (high - low).cpu().clamp_min(0.25 * diagonal)
-            drawn = torch.rand(2 * count, generator=generator, dtype=torch.float64) * cumulative[-1]
-            targets = scene.means.cpu().double()[torch.searchsorted(cumulative, drawn).clamp_max(len(scene) - 1)]
-            targets = targets.clamp(low.cpu() - diagonal, high.cpu() + diagonal)
-            viewmats = look_at(positions, targets)
-            candidates = _views(viewmats, width, height)
-            for index in range(len(candidates)):
-                if len(taken) < count and _is_free(scene, candidates, index, _TOO_NEAR * diagonal):
-                    taken.append(viewmats[index])
-            if len(taken) == count:
-                return _views(torch.stack(taken), width, height)
-    if not taken:
+    for kind in (inside, not inside):
+        taken = _Search(small, surface, box, kind, width, height, generator).views(count)
+        if len(taken):
+            break
+    else:
         raise DataError(
             "no free place to look at the scene from was found; give a run whose data is at hand, which has poses"
         )
-    return _views(torch.stack(taken), width, height)
+    rotation, translation = taken[:, :3, :3], taken[:, :3, 3]
+    viewmats = taken.clone()
+    viewmats[:, :3, 3] = translation * (diagonal / UNITS) - rotation @ centre
+    return _views(viewmats, width, height, NEAR_PLANE * diagonal)
 
 
-def look_at(positions: Tensor, targets: Tensor) -> Tensor:
-    """World-to-camera matrices (C, 4, 4) of cameras at ``positions`` (C, 3) that look at ``targets`` (C, 3), with z up
-    where that is possible; OpenCV axes."""
+def look_at(positions: Tensor, targets: Tensor, up: Tensor | None = None) -> Tensor:
+    """World-to-camera matrices (C, 4, 4) of cameras at ``positions`` (C, 3) that look at ``targets`` (C, 3), with
+    ``up`` (3,), by default z, up where that is possible; OpenCV axes."""
     forward = targets - positions
     length = forward.norm(dim=1, keepdim=True)
     ahead = forward.new_tensor([1.0, 0.0, 0.0]).expand_as(forward)
     forward = torch.where(length > 0, forward / length.clamp_min(1e-300), ahead)
-    up = forward.new_tensor([0.0, 0.0, 1.0]).expand_as(forward)
-    steep = forward[:, 2:].abs() > 0.99
-    up = torch.where(steep, forward.new_tensor([0.0, 1.0, 0.0]), up)
-    right = torch.linalg.cross(forward, up)
+    up = forward.new_tensor([0.0, 0.0, 1.0]) if up is None else up.to(forward) / up.to(forward).norm()
+    other = torch.eye(3, dtype=forward.dtype)[int(up.abs().argmin())]
+    steep = (forward @ up).abs() > 0.99
+    right = torch.linalg.cross(forward, torch.where(steep[:, None], other, up))
     right = right / right.norm(dim=1, keepdim=True)
     down = torch.linalg.cross(forward, right)
     rotation = torch.stack([right, down, forward], dim=1)  # (C, 3, 3) world to camera
@@ -146,20 +178,120 @@ def look_at(positions: Tensor, targets: Tensor) -> Tensor:
     return viewmats
 
 
-def _views(viewmats: Tensor, width: int, height: int) -> Views:
+def _views(viewmats: Tensor, width: int, height: int, near_plane: float) -> Views:
     focal = 0.5 * max(width, height) / math.tan(math.radians(FIELD_OF_VIEW) / 2)
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=viewmats.dtype)
-    return Views(viewmats, K.repeat(len(viewmats), 1, 1), width, height, torch.tensor(BACKGROUND))
+    Ks = K.repeat(len(viewmats), 1, 1)
+    return Views(viewmats, Ks, width, height, torch.tensor(BACKGROUND), near_plane=near_plane)
 
 
-def _not_giant(weights: Tensor) -> float:
-    """The 99th percentile of the weights, to which larger ones are clamped."""
-    ranked = weights[weights > -math.inf].sort().values
-    return float(ranked[int(0.99 * (len(ranked) - 1))])
+def _is_room(surface: Surface, box: UprightBox) -> bool:
+    """Whether the scene is one to look at from inside."""
+    generator = torch.Generator().manual_seed(0)
+    places = box.places(4 * _PLACES, generator)
+    places = places[surface.clearance(places) > _TOO_NEAR][:_PLACES]
+    if len(places) == 0:
+        return False
+    seen, around = surface.seen_from(places)
+    enclosed = around >= _ENCLOSED
+    if float(enclosed.float().mean()) < _MOSTLY:
+        return False
+    outside = torch.randn(_PLACES, 3, generator=generator, dtype=torch.float64)
+    outside = outside / outside.norm(dim=1, keepdim=True) * _DISTANCE[1]
+    from_inside, from_outside = (some.any(0).float().mean() for some in (seen[enclosed], surface.seen_from(outside)[0]))
+    return float(from_inside) >= _AS_MUCH * float(from_outside)
 
 
-def _is_free(scene: Gaussians, views: Views, index: int, near: float) -> bool:
-    """Whether a camera is in free space: its image is covered, with hardly any surface nearer than ``near``."""
-    depth, alpha = render_depth(scene, views[[index]].resized(_PROBE_SIDE)[0])
-    too_near = (alpha > 0.5) & (depth < near)
-    return bool(alpha.mean() >= _COVERED) and bool(too_near.float().mean() < _NEAR_PIXELS)
+@dataclass
+class _Search:
+    """A search for views, all of it in units of the content."""
+
+    small: Gaussians
+    surface: Surface
+    box: UprightBox
+    inside: bool
+    width: int
+    height: int
+    generator: torch.Generator
+
+    def views(self, count: int) -> Tensor:
+        """At most ``count`` world-to-camera matrices (n, 4, 4)."""
+        shown = torch.zeros(_COMPARED)
+        taken: list[Tensor] = []
+        fruitless = 0
+        while len(taken) < count and fruitless < _FRUITLESS:
+            viewmats, owner, gains = self._candidates()
+            before = len(taken)
+            while len(taken) < min(count, before + _ROUND) and bool((owner >= 0).any()):
+                best = int((gains @ (1 / (_NOVEL + shown))).masked_fill(owner < 0, -1.0).argmax())
+                if self._is_free(viewmats[best]):
+                    taken.append(viewmats[best])
+                    shown += gains[best]
+                    owner[owner == owner[best].item()] = -1  # one view a place
+                else:
+                    owner[best] = -1
+            fruitless = 0 if len(taken) > before else fruitless + 1
+        return torch.stack(taken) if taken else torch.empty(0, 4, 4, dtype=torch.float64)
+
+    def _candidates(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Views (V, 4, 4) of some places, the place (V,) of each, and how much they show of each point (V, P)."""
+        places = self._inside() if self.inside else self._outside()
+        places = places[self.surface.clearance(places) > _TOO_NEAR][:_PLACES]
+        seen, around = self.surface.seen_from(places)
+        if self.inside:
+            places, seen = places[around >= _ENCLOSED], seen[around >= _ENCLOSED]
+        owner = torch.arange(len(places)).repeat_interleave(_TURNS[self.inside])
+        eyes = places[owner]
+        targets = self._ahead(eyes) if self.inside else self._at_content(seen[owner])
+        viewmats = look_at(eyes, targets, self.box.up)
+        return viewmats, owner, self._shown(viewmats, seen[:, :_COMPARED][owner])
+
+    def _inside(self) -> Tensor:
+        places = self.box.places(4 * _PLACES, self.generator)
+        heights = self.box.heights(places)
+        return places[(heights > _HEIGHTS[0]) & (heights < _HEIGHTS[1])]
+
+    def _outside(self) -> Tensor:
+        turn, lift, far = torch.rand(3, 2 * _PLACES, generator=self.generator, dtype=torch.float64)
+        low, high = (math.sin(math.radians(angle)) for angle in _ELEVATION)
+        lift = low + (high - low) * lift
+        rays = (1 - lift.square()).sqrt()[:, None] * level_directions(self.box.up, 2 * math.pi * turn) + lift[
+            :, None
+        ] * self.box.up
+        places = rays * (_DISTANCE[0] + (_DISTANCE[1] - _DISTANCE[0]) * far)[:, None]
+        return places[self.box.heights(places) > _ABOVE_GROUND]
+
+    def _ahead(self, eyes: Tensor) -> Tensor:
+        """What cameras at ``eyes`` (V, 3) in a room look at, turned evenly at each place."""
+        turns = _TURNS[True]
+        first = torch.rand(len(eyes) // turns, generator=self.generator, dtype=torch.float64)
+        turn = 2 * math.pi * (first[:, None] + torch.arange(turns) / turns).reshape(-1)
+        mean, deviation, low, high = _PITCH
+        pitch = mean + deviation * torch.randn(len(eyes), generator=self.generator, dtype=torch.float64)
+        pitch = torch.deg2rad(pitch.clamp(low, high))
+        return eyes + pitch.cos()[:, None] * level_directions(self.box.up, turn) + pitch.sin()[:, None] * self.box.up
+
+    def _at_content(self, seen: Tensor) -> Tensor:
+        """Targets (V, 3) between the middle of an object and a visible point of it."""
+        near = self.surface.points.norm(dim=1) < 0.6 * UNITS
+        weights = (seen & near).float() + 1e-9
+        drawn = torch.multinomial(weights, 1, generator=self.generator)[:, 0] if len(seen) else seen.new_zeros(0).long()
+        share = torch.rand(len(seen), 1, generator=self.generator, dtype=torch.float64)
+        return 0.7 * share * self.surface.points[drawn]
+
+    def _shown(self, viewmats: Tensor, seen: Tensor) -> Tensor:
+        """How well views (V, 4, 4) show points, of which ``seen`` (V, P) are visible, (V, P) float32."""
+        points = self.surface.points[:_COMPARED].float()
+        x, y, z = (viewmats[:, :3, :3].float() @ points.T + viewmats[:, :3, 3:].float()).unbind(1)
+        edge = math.tan(math.radians(FIELD_OF_VIEW) / 2) * torch.tensor([self.width, self.height])
+        edge = edge / max(self.width, self.height)
+        aside = torch.maximum(x.abs() / edge[0], y.abs() / edge[1]) / z.clamp_min(1e-6)
+        inside = seen & (z > 0) & (aside < 1)
+        return inside * (1 - 0.5 * aside.square().clamp_max(1)) / (1 + (z / _FAR).square())
+
+    def _is_free(self, viewmat: Tensor) -> bool:
+        """Whether a view shows enough, and hardly any surface that is very near."""
+        view = _views(viewmat[None], self.width, self.height, NEAR_PLANE * UNITS).resized(_PROBE_SIDE)[0]
+        depth, alpha = render_depth(self.small, view)
+        too_near = (alpha > 0.5) & (depth < _TOO_NEAR)
+        return float(alpha.mean()) >= _COVERED[self.inside] and float(too_near.float().mean()) < _NEAR_PIXELS

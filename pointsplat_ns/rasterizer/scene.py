@@ -46,6 +46,7 @@ def render(scene: Gaussians, views: View | Views) -> Tensor:
         width=views.width,
         height=views.height,
         sh_degree=scene.sh_degree,
+        near_plane=views.near_plane,
         rasterize_mode=views.rasterize_mode,
     )
     return (image[0] + (1 - alpha[0]) * views.background.to(image)).clamp(0, 1)
@@ -72,6 +73,7 @@ def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
         width=view.width,
         height=view.height,
         render_mode="ED",
+        near_plane=view.near_plane,
         rasterize_mode=view.rasterize_mode,
     )
     return depth[0, ..., 0], alpha[0, ..., 0]

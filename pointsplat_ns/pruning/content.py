@@ -1,0 +1,69 @@
+"""Where the content of a scene is, and how large: what positions, distances and sizes are measured by."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.gaussians import Gaussians
+
+UNITS = 10.0
+"""Diagonal of the content after :func:`in_units`: all sizes that rendering knows, as that of its near plane, are small
+against it."""
+
+
+def content_box(scene: Gaussians) -> tuple[Tensor, Tensor]:
+    """Corners (3,), (3,) of the box that holds 90 % of the scene's opacity along each axis, float64.
+
+    Raises:
+        DataError: if nothing of the scene is visible.
+    """
+    means, alphas = scene.means.double(), scene.alphas.double()
+    seen = scene.usable() & (alphas > 0)
+    if not bool(seen.any()):
+        raise DataError("nothing of the scene can be seen, so there is no place to look from")
+    means, alphas = means[seen], alphas[seen]
+    corners = []
+    for axis in means.unbind(1):
+        ranked, order = axis.sort()
+        below = alphas[order].cumsum(0)
+        at = torch.searchsorted(below, below[-1] * below.new_tensor([0.05, 0.95])).clamp_max(len(ranked) - 1)
+        corners.append(ranked[at])
+    low, high = torch.stack(corners, dim=1)
+    return low, high
+
+
+def content_diagonal(scene: Gaussians, low: Tensor, high: Tensor) -> float:
+    """Diagonal of the box with corners ``low`` (3,) and ``high`` (3,) that :func:`content_box` gives, scene units. If
+    the box is a point (one Gaussian, or all at one position), four times the largest standard deviation; 1 if that is
+    0."""
+    return float((high - low).norm()) or 4 * float(scene.stds[scene.usable()].double().amax()) or 1.0
+
+
+def content_size(scene: Gaussians) -> tuple[Tensor, float]:
+    """Centre (3,) float64 and diagonal of the box that holds most of a scene's opacity; of the largest Gaussian if that
+    box is a point; 1 if that is a point as well."""
+    try:
+        low, high = content_box(scene)
+    except DataError:  # nothing can be seen
+        return torch.zeros(3, dtype=torch.float64), 1.0
+    size = float((high - low).norm())
+    if size == 0:
+        size = float(scene.stds[scene.usable()].double().amax())
+    return 0.5 * (low + high).cpu(), size if 0 < size < math.inf else 1.0
+
+
+def in_units(scene: Gaussians, centre: Tensor, size: float) -> Gaussians:
+    """A scene moved and scaled so that its content has its centre at 0 and a diagonal of :data:`UNITS`."""
+    means = ((scene.means.double() - centre.to(scene.device)) * (UNITS / size)).to(scene.dtype)
+    return scene.replace(means=means, scales=scene.scales + math.log(UNITS / size))
+
+
+def thinned(scene: Gaussians, most: int) -> Gaussians:
+    """At most about ``most`` Gaussians, evenly taken, grown so that they cover as much as all; without colours."""
+    step = max(1, len(scene) // most)
+    some = Gaussians(*(value[::step] for value in scene.tensors()))
+    return some.replace(scales=some.scales + 0.5 * math.log(step), features_rest=some.features_rest[:, :0])
