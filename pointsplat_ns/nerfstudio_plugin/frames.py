@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import cv2
@@ -18,6 +19,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from PIL import Image
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.memory_cache import CacheKey, MemoryCache, free_memory_share
@@ -55,7 +57,8 @@ class Frames:
         max_workers: number of threads that decode ahead.
 
     Raises:
-        DataError: when a photo or mask is missing, broken or of another size than its camera.
+        DataError: if a pose or an intrinsic is NaN or infinite; when a photo or mask is missing, broken, of another size
+            than its camera, or not of 8 bits a channel.
     """
 
     def __init__(
@@ -65,6 +68,7 @@ class Frames:
         cache: MemoryCache | None = None,
         max_workers: int = 2,
     ):
+        _need_finite(dataset)
         self.dataset = dataset
         self.image_type: Literal["uint8", "float32"] = image_type
         self.cache = MemoryCache(free_memory_share()) if cache is None else cache
@@ -118,6 +122,7 @@ class Frames:
     def _load(self, index: int) -> Frame:
         path = self.dataset.image_filenames[index]
         try:
+            _need_eight_bits(path)
             data = self.dataset.get_data(index, image_type=self.image_type)
         except FileNotFoundError as error:
             raise DataError(
@@ -136,6 +141,25 @@ class Frames:
             return _undistorted(camera, data)
         except (AssertionError, NotImplementedError, cv2.error) as error:
             raise DataError(f"{path}: the lens distortion of its camera cannot be undone: {error}") from error
+
+
+def _need_finite(dataset: InputDataset) -> None:
+    """Refuse cameras with NaN or infinity; the error names the first photo."""
+    cameras = dataset.cameras
+    numbers = [cameras.camera_to_worlds.flatten(1), cameras.fx, cameras.fy, cameras.cx, cameras.cy]
+    bad = (~torch.cat([part.double() for part in numbers], dim=1).isfinite().all(dim=1)).nonzero()[:, 0].tolist()
+    if bad:
+        raise DataError(
+            f"{dataset.image_filenames[bad[0]]}: the pose or the intrinsics of frame {bad[0]} hold NaN or infinity, as "
+            f"do those of {len(bad) - 1} more of {len(cameras)}; expected numbers; correct them or leave the photo out"
+        )
+
+
+def _need_eight_bits(path: Path) -> None:
+    """Refuse photos that nerfstudio would misread: 16-bit greys modulo 256, the indices of a palette as greys."""
+    with Image.open(path) as photo:
+        if photo.mode not in ("L", "RGB", "RGBA"):
+            raise ValueError(f"its pixels are of mode {photo.mode}; expected 8-bit grey, RGB or RGBA; convert it")
 
 
 def _bytes_of(data: dict[str, Any]) -> int:

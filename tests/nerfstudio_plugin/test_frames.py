@@ -14,6 +14,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.scene_box import SceneBox
+from PIL import Image
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.frames import Frames
@@ -222,3 +223,34 @@ def test_a_lens_that_cannot_be_undone_is_named(tmp_path):
     dataset = make_dataset(tmp_path, distortion=[0.1, 0.0, 0.0, 0.2, 0.0, 0.0])
     with pytest.raises(DataError, match="photo0.png.*distortion"):
         Frames(dataset)[0]
+
+
+@pytest.mark.parametrize("kind", ["16-bit grey", "palette"])
+def test_photos_that_nerfstudio_would_misread_are_refused(tmp_path, kind):
+    dataset = make_dataset(tmp_path)
+    photo = Image.fromarray(np.full((HEIGHT, WIDTH), 300, np.uint16))  # 300 modulo 256 is nearly black
+    if kind == "palette":
+        photo = Image.new("P", (WIDTH, HEIGHT))
+    path = dataset.image_filenames[2]
+    photo.save(path)
+    with pytest.raises(
+        DataError, match="photo2.png: cannot be read .* frame 2: its pixels are of mode .*expected 8-bit"
+    ):
+        Frames(dataset)[2]
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB", "RGBA"])
+def test_8_bit_photos_of_every_usual_kind_are_read(tmp_path, mode):
+    dataset = make_dataset(tmp_path)
+    Image.new(mode, (WIDTH, HEIGHT)).save(dataset.image_filenames[2])
+    assert Frames(dataset)[2][1]["image"].shape == (HEIGHT, WIDTH, 4 if mode == "RGBA" else 3)
+
+
+@pytest.mark.parametrize("name", ["camera_to_worlds", "fx", "cy"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_camera_that_is_not_finite_names_its_photo(tmp_path, name, value):
+    dataset = make_dataset(tmp_path)
+    for index in (1, 3):
+        getattr(dataset.cameras, name)[index].view(-1)[-1] = value
+    with pytest.raises(DataError, match="photo1.png: .* frame 1 hold NaN or infinity, as do those of 1 more of 5"):
+        Frames(dataset)

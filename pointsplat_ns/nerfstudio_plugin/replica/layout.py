@@ -27,6 +27,9 @@ MAX_ROTATION_DRIFT = 1e-2
 """Largest accepted entry of |R^T R - I|. Real files print few digits, which causes a drift of 1e-7 to 1e-4; it is
 removed. Beyond one percent the matrix holds a scale or a shear and is not a camera pose."""
 
+FARTHEST = 1e18
+"""Poses with larger numbers count as lost tracking: float32, in which scenes are trained, cannot square them."""
+
 UNKNOWN_DEPTH = (0, 65535)
 """Raw 16-bit depths that mean "not measured": empty and saturated."""
 
@@ -108,7 +111,7 @@ class ReplicaScene:
 def load_replica(folder: Path, check_sizes: bool = True) -> ReplicaScene:
     """Reads and checks a scene. Image headers are read, but no image is decoded.
 
-    Frames whose pose is not finite (lost tracking) are dropped, with one warning.
+    Frames whose pose is not finite, or farther than :data:`FARTHEST` (lost tracking), are dropped, with one warning.
 
     Args:
         folder: The scene folder.
@@ -144,13 +147,15 @@ def load_replica(folder: Path, check_sizes: bool = True) -> ReplicaScene:
                 f"{folder / 'results'}: {len(missing)} of {len(numbers)} photos have no depth image ({names}); "
                 "restore them, or remove all depth*.png to go without depth"
             )
-    finite = np.isfinite(poses).all(axis=(1, 2))
+    finite = (np.abs(poses) < FARTHEST).all(axis=(1, 2))  # NaN fails too
     if not finite.all():
         lines = [int(i) + 1 for i in np.flatnonzero(~finite)]
         if not finite.any():
-            raise DataError(f"{folder / 'traj.txt'}: none of the {len(poses)} poses is finite; expected numbers")
+            raise DataError(
+                f"{folder / 'traj.txt'}: none of the {len(poses)} poses is finite; expected numbers below {FARTHEST:g}"
+            )
         logger.warning(
-            "%s: %d of %d poses hold NaN or Inf (line %s): their frames are left out",
+            "%s: %d of %d poses hold NaN, Inf or numbers beyond 1e18 (line %s): their frames are left out",
             folder / "traj.txt",
             len(lines),
             len(poses),
@@ -249,10 +254,12 @@ def read_photo(path: Path, params: PinholeParams) -> np.ndarray:
     """Decodes one photo: uint8 (H, W, 3), sRGB.
 
     Raises:
-        DataError: The file is missing or broken, or its size differs from ``params``.
+        DataError: The file is missing or broken, not of 8 bits a channel, or its size differs from ``params``.
     """
     image = _open_image(path)
     _check_size(path, image.size, params)
+    if image.mode.startswith(("I", "F")):
+        raise DataError(f"{path}: pixels of mode {image.mode}; expected 8 bits a channel; convert the photo")
     return np.asarray(_decoded(path, image).convert("RGB"))
 
 

@@ -148,6 +148,23 @@ def test_lost_poses_are_dropped_and_their_lines_said(tmp_path, caplog):
     assert "none of the 4 poses is finite" in fault(scene)
 
 
+@pytest.mark.parametrize("number", ["1e300", "-1e300", "1e39", "1e999", "1e19"])
+def test_a_pose_beyond_float32_is_dropped_as_a_lost_one(tmp_path, caplog, number):
+    scene = write_scene(tmp_path / "s")
+    edit_line(scene, 2, f"1 0 0 {number} 0 1 0 0 0 0 1 0 0 0 0 1")
+    with caplog.at_level(logging.WARNING):
+        loaded = load_replica(scene)
+    assert loaded.numbers == (0, 2, 3) and np.isfinite(loaded.poses.astype(np.float32)).all()
+    assert "1 of 4 poses" in caplog.text and "line 2" in caplog.text
+
+
+def test_a_16_bit_grey_photo_is_refused_and_not_read_modulo_256(tmp_path):
+    scene = load_replica(write_scene(tmp_path / "s"))
+    Image.fromarray(np.full((6, 8), 300, np.uint16)).save(scene.photos[1])
+    with pytest.raises(DataError, match="frame000001.png: pixels of mode I.*expected 8 bits a channel"):
+        read_photo(scene.photos[1], scene.params)
+
+
 def test_gaps_in_the_numbering_are_fine_where_counts_agree(tmp_path):
     scene = write_scene(tmp_path / "s")
     for kind in ("frame", "depth"):
