@@ -57,8 +57,8 @@ class Frames:
         max_workers: number of threads that decode ahead.
 
     Raises:
-        DataError: if a pose or an intrinsic is NaN or infinite; when a photo or mask is missing, broken, of another size
-            than its camera, or not of 8 bits a channel.
+        DataError: if a pose or an intrinsic is NaN or infinite; when a photo or mask is missing, broken, not the size
+            that its camera says, or not of 8 bits a channel.
     """
 
     def __init__(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import copy
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
@@ -25,7 +26,8 @@ SPLATFACTO_STEPS = 30_000
 
 
 class SplatfactoCpuTrainer(Trainer):
-    """nerfstudio's trainer. It removes the run folder if the input cannot be used, and reuses freed memory on a CPU."""
+    """nerfstudio's trainer. It removes the run folder if the input cannot be used, reuses freed memory on a CPU, and
+    ends with the status of an interrupted program when it is interrupted."""
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """As nerfstudio's.
@@ -41,6 +43,19 @@ class SplatfactoCpuTrainer(Trainer):
         except PointSplatError:
             self._withdraw()
             raise
+        except KeyboardInterrupt:
+            _interrupted()
+
+    def train(self) -> None:
+        """As nerfstudio's, but Ctrl-C ends ``ns-train`` with status 130. nerfstudio ends with 0, as if it had finished.
+
+        Raises:
+            SystemExit: if it is interrupted.
+        """
+        try:
+            super().train()
+        except KeyboardInterrupt:
+            _interrupted()
 
     def _withdraw(self) -> None:
         config = self.base_dir / "config.yml"
@@ -52,6 +67,12 @@ class SplatfactoCpuTrainer(Trainer):
             if folder == output_dir.parent or any(folder.iterdir()):
                 break
             folder.rmdir()
+
+
+def _interrupted() -> NoReturn:
+    """End the program as Ctrl-C does, past nerfstudio, which catches KeyboardInterrupt alone."""
+    print("interrupted", file=sys.stderr)
+    sys.exit(130)
 
 
 @dataclass
