@@ -1,13 +1,16 @@
 """Cameras sampled in free space."""
 
+import dataclasses
 import math
 
 import pytest
 import torch
+from upright_scenes import TURNS, room, tower, turned
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.pruning.view_sampling import content_box, look_at, sample_views
-from pointsplat_ns.rasterizer import render
+from pointsplat_ns.pruning.content import content_box
+from pointsplat_ns.pruning.view_sampling import look_at, sample_views
+from pointsplat_ns.rasterizer import render, render_depth
 
 
 def places_of(views):
@@ -66,3 +69,73 @@ def test_looking_straight_up_or_at_oneself_is_a_rotation_too():
     rotation = look_at(places, targets)[:, :3, :3]
     assert torch.allclose(rotation @ rotation.mT, torch.eye(3).double().expand(4, 3, 3), atol=1e-12)
     assert torch.allclose(rotation[0] @ targets[0], torch.tensor([0, 0, 1.0]).double(), atol=1e-12)
+
+
+def ground_and_post(factor=1.0):
+    scene = tower()
+    return scene.replace(means=scene.means * factor, scales=scene.scales + math.log(factor))
+
+
+def test_a_room_is_looked_at_from_inside_at_the_height_of_eyes_and_level():
+    turn = TURNS[1]
+    views = sample_views(turned(room(), turn), 8, 64, 48)
+    up = torch.from_numpy(turn.apply([0.0, 0.0, 1.0]))
+    places = places_of(views) @ torch.from_numpy(turn.as_matrix())  # as in the room before it was turned
+    assert bool((places.abs() < torch.tensor([2.0, 1.5, 0.8]).double()).all())
+    right, ahead = views.viewmats[:, 0, :3], views.viewmats[:, 2, :3]
+    # sines: 3 degrees of error in the estimate of up; a pitch of -30 to 10 degrees
+    assert float((right @ up).abs().max()) < 0.05
+    assert -0.56 < float((ahead @ up).min()) and float((ahead @ up).max()) < 0.23
+    assert float((views.viewmats[:, 1, :3] @ up).max()) < 0  # the image is not upside down
+
+
+def test_a_room_is_seen_whole_by_a_dozen_views():
+    scene = room()
+    views = sample_views(scene, 12, 64, 48)
+    grey = torch.zeros_like(scene.features_dc, requires_grad=True)
+    render(scene.replace(features_dc=grey), views).sum().backward()
+    assert float((grey.grad[:, 0] > 0).double().mean()) > 0.95
+
+
+def test_an_object_on_the_ground_is_in_the_middle_of_the_picture_and_seen_from_all_sides():
+    views = sample_views(ground_and_post(), 12, 64, 48)
+    places = places_of(views)
+    assert float(places[:, 2].min()) > 0  # above the ground
+    turns = torch.atan2(places[:, 1], places[:, 0]).sort().values
+    gaps = torch.cat([turns[1:], turns[:1] + 2 * math.pi]) - turns
+    assert float(gaps.max()) < 0.6 * math.pi
+    middle = views.viewmats[:, :3, :3] @ torch.tensor([0.0, 0.0, 1.0]).double() + views.viewmats[:, :3, 3]
+    pixels = (views.Ks @ middle[..., None])[..., 0]
+    aside = (pixels[:, :2] / pixels[:, 2:] - torch.tensor([32.0, 24.0])).abs() / torch.tensor([32.0, 24.0])
+    assert bool((pixels[:, 2] > 0).all()) and float(aside.amax(1).median()) < 0.6
+
+
+def test_up_can_be_given():
+    scene = ground_and_post()
+    for up in ([1.0, 0.0, 0.0], torch.tensor([0.0, -3.0, 4.0])):
+        views = sample_views(scene, 4, 64, 48, up=up)
+        up = torch.as_tensor(up).double()
+        assert torch.allclose(views.viewmats[:, 0, :3] @ up, torch.zeros(4).double(), atol=1e-12)
+    for wrong in ([0.0, 0.0, 0.0], [1.0, 0.0], [math.nan, 0.0, 1.0]):
+        with pytest.raises(DataError, match="expected three numbers, not all 0"):
+            sample_views(scene, 4, up=wrong)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+@pytest.mark.parametrize("make", [room, tower])
+def test_views_do_not_depend_on_the_unit_of_length(make, factor):
+    scene = make()
+    other = scene.replace(means=scene.means * factor, scales=scene.scales + math.log(factor))
+    one, two = sample_views(scene, 6, 64, 48, seed=3), sample_views(other, 6, 64, 48, seed=3)
+    assert two.near_plane == pytest.approx(one.near_plane * factor, rel=1e-4)
+    # 1e-3: float32 positions round otherwise at another scale
+    assert torch.allclose(places_of(one) * factor, places_of(two), rtol=1e-3, atol=1e-3 * factor)
+    assert torch.allclose(render(scene, one), render(other, two), atol=0.02)
+
+
+def test_nothing_nearer_than_the_near_plane_is_drawn(hollow_ball):
+    views = sample_views(hollow_ball, 1, 32, 24)
+    beyond = dataclasses.replace(views, near_plane=1e5)
+    assert render(hollow_ball, views).max() > 0 and render(hollow_ball, beyond).max() == 0
+    assert beyond[0].near_plane == beyond.resized(8).near_plane == beyond[[0]].near_plane == 1e5
+    assert render_depth(hollow_ball, views[0])[1].max() > 0 and render_depth(hollow_ball, beyond[0])[1].max() == 0

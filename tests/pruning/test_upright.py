@@ -1,0 +1,89 @@
+"""Which way is up in a scene without cameras, and the upright box around it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from upright_scenes import TURNS, plates, room, tower, turned
+
+from making import ball, box_room
+from pointsplat_ns.pruning.content import content_size
+from pointsplat_ns.pruning.surface import Surface
+from pointsplat_ns.pruning.upright import UprightBox, level_directions, pointing_up, upright_axis
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def degrees_between(a: torch.Tensor, b: torch.Tensor) -> float:
+    return math.degrees(math.acos(max(-1.0, min(1.0, float(a @ b)))))
+
+
+@pytest.mark.parametrize("turn", TURNS)
+@pytest.mark.parametrize(("make", "inside"), [(room, True), (tower, False)])
+def test_up_is_found_however_the_scene_is_turned(make, inside, turn):
+    scene = turned(make(), turn)
+    surface = Surface.of(scene, *content_size(scene))
+    up = pointing_up(surface, upright_axis(surface), inside)
+    # 3 degrees: directions are refined in steps of half a degree, from points of which some lie across
+    assert degrees_between(up, torch.from_numpy(turn.apply(UP.numpy()))) < 3
+
+
+def test_minus_y_is_found_where_a_scene_has_the_axes_of_its_first_camera():
+    scene = turned(tower(), Rotation.from_euler("x", 90, degrees=True))
+    surface = Surface.of(scene, *content_size(scene))
+    up = pointing_up(surface, upright_axis(surface), False)
+    assert torch.equal(up, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
+
+
+def test_up_is_z_without_evidence():
+    scene = ball(3000, log_size=math.log(0.05))
+    surface = Surface.of(scene, *content_size(scene))
+    assert torch.equal(pointing_up(surface, upright_axis(surface), True), UP)
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_the_box_turns_with_the_scene(turn):
+    scene = turned(box_room(0, 3000), turn)
+    centre, size = content_size(scene)
+    surface = Surface.of(scene, centre, size)
+    box = UprightBox.of(surface, torch.from_numpy(turn.apply(UP.numpy())))
+    assert torch.allclose(box.frame @ box.frame.T, torch.eye(3).double(), atol=1e-12)
+    found = sorted(((box.high - box.low) * size / 10).tolist())
+    # nine tenths of each axis, between walls; 12 %: yaws are 5 degrees apart, and points are drawn at random
+    assert found == pytest.approx([2.0, 3.0, 4.0], rel=0.12)
+    places = box.places(100, torch.Generator().manual_seed(0))
+    heights = box.heights(places)
+    assert bool(((heights >= 0) & (heights <= 1)).all())
+
+
+def test_level_directions_are_level_for_any_up():
+    for up in (*torch.eye(3).double(), torch.tensor([0.6, 0.0, -0.8]).double()):
+        found = level_directions(up, torch.linspace(0, 6, 7).double())
+        assert torch.allclose(found @ up, torch.zeros(7).double(), atol=1e-12)
+        assert torch.allclose(found.norm(dim=1), torch.ones(7).double(), atol=1e-12)
+
+
+def test_points_stand_for_what_can_be_seen_and_are_finite():
+    scene = box_room(0)
+    far = scene.means.clone()
+    far[0], far[1] = 1e30, math.nan
+    faint = scene.opacities.clone()
+    faint[2:300] = -20.0
+    surface = Surface.of(scene.replace(means=far, opacities=faint), *content_size(scene))
+    assert bool(surface.normals.isfinite().all()) and bool(surface.points.isfinite().all())
+    flat = scene.replace(scales=torch.full_like(scene.scales, -math.inf))
+    assert bool(Surface.of(flat, *content_size(flat)).points.isfinite().all())
+
+
+def test_a_wall_hides_what_is_behind_it():
+    scene = plates(((1, 0, 0), (0, 1, 1)), ((2, 0, 0), (0, 0.5, 0.5)), density=400)
+    surface = Surface.of(scene, torch.zeros(3, dtype=torch.float64), 10.0)
+    seen, around = surface.seen_from(torch.tensor([[-1.0, 0, 0], [4.0, 0, 0]], dtype=torch.float64))
+    first = surface.points[:, 0] < 1.5
+    assert float(seen[0, first].float().mean()) > 0.95 and float(seen[0, ~first].float().mean()) < 0.05
+    assert float(seen[1, ~first].float().mean()) > 0.95
+    assert bool((around < 0.2).all())
+    assert float(surface.clearance(torch.zeros(1, 3).double())) == pytest.approx(1.0, abs=0.1)
