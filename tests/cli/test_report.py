@@ -7,6 +7,8 @@ import json
 import pytest
 
 from pointsplat_ns.cli import main
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.nerfstudio_plugin.pointsplat.report import report
 
 
 def evaluation(lpips: float | None = 0.25) -> dict:
@@ -89,6 +91,57 @@ def test_report_of_something_else_is_one_line_and_status_1(tmp_path, capsys, con
         main(["report", str(path)])
     error = capsys.readouterr().err
     assert end.value.code == 1 and str(path) in error and error.count("\n") == 1
+
+
+DEEP = "[" * 100_000
+WRONG = [None, [], {}, "text", [1], 10**400, {"psnr": "high"}]
+
+
+@pytest.mark.parametrize("content", [DEEP, '{"results":' * 50_000, "9" * 5000, "\ud800", "null", '{"results": null}'])
+def test_report_of_json_that_is_deep_or_odd_is_one_line_and_status_1(tmp_path, capsys, content):
+    path = tmp_path / "eval.json"
+    path.write_bytes(content.encode("utf-8", "surrogatepass"))
+    with pytest.raises(SystemExit) as end:
+        main(["report", str(path)])
+    error = capsys.readouterr().err
+    assert end.value.code == 1 and f"{path}: not an evaluation" in error and error.count("\n") == 1
+
+
+def places(node, path=()):
+    """The path to every entry of nested dictionaries."""
+    for key, value in node.items():
+        yield (*path, key)
+        if isinstance(value, dict):
+            yield from places(value, (*path, key))
+
+
+def test_results_that_are_malformed_anywhere_are_shown_or_one_error(tmp_path, capsys):
+    path, refused, shown = tmp_path / "eval.json", 0, 0
+    whole = evaluation()
+    whole["results"]["against_dense_renders"] = {"reference": "dense renders", "average": whole["results"]["average"]}
+    for place in places(whole):
+        for wrong in WRONG:
+            broken = json.loads(json.dumps(whole))
+            node = broken
+            for key in place[:-1]:
+                node = node[key]
+            node[place[-1]] = wrong
+            path.write_text(json.dumps(broken))
+            try:
+                report(path)
+                shown += 1
+            except DataError:
+                refused += 1
+    assert refused > 300 and shown > 0
+
+
+def test_names_of_scenes_are_shown_as_they_are(tmp_path, capsys):
+    content = evaluation()
+    content["results"]["scenes"]["[/b]"] = content["results"]["scenes"].pop("b")
+    path = tmp_path / "eval.json"
+    path.write_text(json.dumps(content))
+    main(["report", str(path)])
+    assert "[/b]" in capsys.readouterr().out
 
 
 def test_rooms_are_named_by_their_seeds(tmp_path):

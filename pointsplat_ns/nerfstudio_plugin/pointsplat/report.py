@@ -56,12 +56,13 @@ def report_tables(results: dict[str, Any]) -> list:
 
 def _table(results: dict[str, Any], part: dict[str, Any]):
     """One row for each scene and variant of a part, then the averages; "seen" says whether the scene was trained on."""
+    from rich.markup import escape
     from rich.table import Table
 
     settings = results.get("settings", {})
     reference = part.get("reference", PHOTOS)
     title = f"keep {settings.get('keep')}, by {settings.get('by')}, refiner {settings.get('size')}"
-    table = Table(title=f"{title}; compared with {NAMES.get(reference, reference)}")
+    table = Table(title=escape(f"{title}; compared with {NAMES.get(reference, reference)}"))
     table.add_column("scene")
     table.add_column("seen")
     table.add_column("variant")
@@ -79,7 +80,7 @@ def _table(results: dict[str, Any], part: dict[str, Any]):
         for i, row in enumerate(VARIANTS):
             values = block[row]
             table.add_row(
-                title if i == 0 else "",
+                escape(title) if i == 0 else "",
                 seen if i == 0 else "",
                 row,
                 _number(values["psnr"], 2),

@@ -15,6 +15,13 @@ VARIANTS = ("dense", "pruned", "refined")
 """The variants of each scene that an evaluation compares."""
 
 
+VALUES = ("psnr", "ssim", "lpips", "gaussians", "megabytes", "fps")
+"""What an evaluation says of each variant; None where it cannot be computed."""
+
+MAX_BYTES = 1 << 26
+"""An evaluation has about 2 kB a scene."""
+
+
 def read_evaluation(path: Path) -> dict[str, Any]:
     """The results in a file that ``ns-eval`` wrote for a pointsplat run.
 
@@ -22,10 +29,37 @@ def read_evaluation(path: Path) -> dict[str, Any]:
         DataError: if the file is missing or is not such an evaluation.
     """
     try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ValueError(f"more than {MAX_BYTES} bytes")
         results = json.loads(path.read_text("utf-8"))["results"]
-        assert set(VARIANTS) <= set(next(iter(results["scenes"].values())))
+        _check(results)
         return results
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); expected what ns-eval wrote") from error
-    except (ValueError, KeyError, TypeError, AttributeError, AssertionError, StopIteration) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise DataError(f"{path}: not an evaluation of a pointsplat run; expected what ns-eval wrote") from error
+
+
+def _check(results: dict[str, Any]) -> None:
+    """Check all that :mod:`~pointsplat_ns.nerfstudio_plugin.pointsplat.report` shows.
+
+    Raises:
+        ValueError, KeyError, TypeError, AttributeError, OverflowError: if something is missing or of another type.
+    """
+    blocks = list(results["scenes"].values())
+    if not blocks:
+        raise ValueError("no scene")
+    for scene in blocks:
+        scene["seen_in_training"]
+    results.get("settings", {}).get("keep")
+    other = results.get("against_dense_renders")
+    parts = [results] if other is None else [results, other]
+    for part in parts:
+        blocks += [part[name] for name in ("average", "average_seen", "average_unseen") if name in part]
+    for block in blocks:
+        for value in (block[variant][name] for variant in VARIANTS for name in VALUES):
+            if value is not None:
+                float(value + 0)  # a text has no sum with a number, and 10^400 is no float
+    for part in [*parts, *results["scenes"].values()]:
+        if not isinstance(part.get("reference", ""), str):
+            raise TypeError("reference")
