@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
-from pointsplat_ns.io.files import keep_usable, one_line, replacing, require_file
+from pointsplat_ns.io.files import keep_usable, logger, one_line, replacing, require_file
 from pointsplat_ns.io.ply_header import Element, Header, read_header
 
 CHUNK_ROWS = 16384
@@ -34,9 +34,9 @@ _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
 def read_ply(path: Path | str) -> Gaussians:
     """Read a 3DGS PLY: binary of either byte order, or ASCII; properties in any order and of any type.
 
-    The SH degree follows from the number of ``f_rest`` properties. Other properties and elements are
-    ignored. Gaussians that cannot be drawn (NaN, or Inf where it is not valid) are dropped, and their number
-    is logged; all-zero rows are kept (a zero quaternion is the identity).
+    The SH degree follows from the number of ``f_rest`` properties. Other properties and elements, and bytes after the
+    last element, are not read; a warning says so. Gaussians that cannot be drawn (NaN, or Inf where it is not valid)
+    are dropped, and their number is logged; all-zero rows are kept (a zero quaternion is the identity).
 
     Args:
         path: the file.
@@ -55,6 +55,7 @@ def read_ply(path: Path | str) -> Gaussians:
             header = read_header(stream, path)
         vertex = _gaussian_element(header, path)
         k = _num_rest(vertex, path)
+        _report_unread(header, vertex, path)
         with _GaussiansAlone(path, header) as stream:
             # Binary rows are mapped, not read: only the Gaussians below take memory.
             rows = PlyData.read(stream, mmap="r")["vertex"].data
@@ -135,6 +136,19 @@ def _gaussian_element(header: Header, path: Path) -> Element:
             f"{path}: truncated; the header declares {vertex.count} Gaussians of {row} bytes, the file holds {held}"
         )
     return vertex
+
+
+def _report_unread(header: Header, vertex: Element, path: Path) -> None:
+    """Warn of what a file holds beside the Gaussians."""
+    known = {*_MEANS, *_NORMALS, *_DC, *_OPACITY, *_SCALES, *_QUATS}
+    others = [name for name, _ in vertex.properties if name not in known and not name.startswith("f_rest_")]
+    unread = [f"the vertex properties {', '.join(others[:4])}{'...' if len(others) > 4 else ''}"] if others else []
+    unread += [f"the element {element.name!r}" for element in header.elements if element != vertex and element.count]
+    if header.order and not any(element.lists for element in header.elements):
+        after = path.stat().st_size - header.size - sum(_least_bytes(element, header) for element in header.elements)
+        unread += [f"{after} bytes after the last element"] if after > 0 else []
+    if unread:
+        logger.warning("%s: not read: %s", path, "; ".join(unread[:4]))
 
 
 def _least_bytes(element: Element, header: Header) -> int:

@@ -6,6 +6,7 @@ without an end) does no harm. :mod:`~pointsplat_ns.io.ply` checks its counts aga
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -111,15 +112,12 @@ def _header_text(stream: BinaryIO, path: Path) -> tuple[list[str], int]:
     if start[:4] not in (b"ply\n", b"ply\r"):
         raise SceneError(f"{path}: not a PLY file (starts with {start[:4]!r}); expected the line 'ply'")
     newline = b"\n" if start[3:4] == b"\n" else b"\r\n" if start[4:5] == b"\n" else b"\r"
-    end = start.find(newline + b"end_header" + newline)
-    if end < 0:
-        # The newline after end_header may be missing where nothing follows.
-        if not start.endswith(newline + b"end_header"):
-            why = "is truncated" if len(start) < MAX_HEADER_BYTES else f"is longer than {MAX_HEADER_BYTES} bytes"
-            raise SceneError(f"{path}: PLY header {why}; no line 'end_header' found")
-        end = len(start) - len(newline) - len(b"end_header")
-    size = min(end + 2 * len(newline) + len(b"end_header"), len(start))
-    return start[:end].decode("latin-1").split(newline.decode()), size
+    # Some programs write spaces after the keyword. The newline may be missing where nothing follows.
+    found = re.compile(newline + rb"end_header[ \t]*(" + newline + rb"|\Z)").search(start)
+    if found is None:
+        why = "is truncated" if len(start) < MAX_HEADER_BYTES else f"is longer than {MAX_HEADER_BYTES} bytes"
+        raise SceneError(f"{path}: PLY header {why}; no line 'end_header' found")
+    return start[: found.start()].decode("latin-1").split(newline.decode()), found.end()
 
 
 def _reject_duplicates(names: list[str], what: str, path: Path) -> None:

@@ -128,6 +128,40 @@ def test_crlf_header_is_read(tmp_path):
     assert same_bits(scene, read_ply(tmp_path / "b.ply"))
 
 
+@pytest.mark.parametrize("newline", [b"\n", b"\r\n", b"\r"])
+@pytest.mark.parametrize("end", [b"end_header", b"end_header ", b"end_header\t  "])
+@pytest.mark.parametrize("text", [False, True])
+def test_every_line_end_and_spaces_after_the_last_keyword_are_read(tmp_path, newline, end, text):
+    scene = normal_scene(5, 1)
+    write_ply(scene, tmp_path / "a.ply")
+    if text:
+        rewrite(tmp_path / "a.ply", rows_of(tmp_path / "a.ply"), text=True)
+    header, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    header = (header + end + b"\n").replace(b"\n", newline)
+    (tmp_path / "b.ply").write_bytes(header + (data.replace(b"\n", newline) if text else data))
+    assert same_bits(scene, read_ply(tmp_path / "b.ply"))
+
+
+def test_what_a_gaussian_has_no_place_for_is_said(tmp_path, caplog):
+    path, scene = tmp_path / "a.ply", normal_scene(5, 1)
+    write_ply(scene, path)
+    assert same_bits(scene, read_ply(path)) and not caplog.records
+    path.write_bytes(path.read_bytes() + b"xyz")
+    assert same_bits(scene, read_ply(path))
+    assert caplog.messages == [f"{path}: not read: 3 bytes after the last element"]
+    caplog.clear()
+    rows = rows_of(path)
+    extra = numpy.lib.recfunctions.append_fields(rows, ["red", "class"], [np.zeros(5, "u1"), np.ones(5, "i4")])
+    rewrite(path, extra.data)
+    assert same_bits(scene, read_ply(path))
+    assert caplog.messages == [f"{path}: not read: the vertex properties red, class"]
+    caplog.clear()
+    faces = PlyElement.describe(np.zeros(2, [("area", "f4")]), "face")
+    PlyData([PlyElement.describe(rows, "vertex"), faces]).write(str(path))
+    assert same_bits(scene, read_ply(path))
+    assert caplog.messages == [f"{path}: not read: the element 'face'"]
+
+
 @pytest.mark.parametrize("text", [False, True])
 def test_comments_in_any_encoding_are_passed_over(tmp_path, text):
     scene = normal_scene(5, 0)
