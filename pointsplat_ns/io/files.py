@@ -37,6 +37,25 @@ def require_file(path: Path | str, what: str) -> Path:
     return path
 
 
+def require_memory(path: Path | str, size: int) -> None:
+    """Refuse a file that would take more memory than is free, such as a sparse one whose zeros take no disk space.
+
+    Args:
+        path: the file, for the error.
+        size: bytes that its content takes.
+
+    Raises:
+        SceneError: if they are not free.
+    """
+    import psutil
+
+    free = psutil.virtual_memory().available
+    if size > free:
+        raise SceneError(
+            f"{path}: takes {size / 1e9:.1f} GB of memory, {free / 1e9:.1f} GB are free; expected a file that fits"
+        )
+
+
 def content_hash(path: Path | str) -> str:
     """SHA-256 of a file's bytes, as 64 hexadecimal digits.
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
-from pointsplat_ns.io.files import keep_usable, logger, one_line, replacing, require_file
+from pointsplat_ns.io.files import keep_usable, logger, one_line, replacing, require_file, require_memory
 from pointsplat_ns.io.ply_header import Element, Header, read_header
 
 CHUNK_ROWS = 16384
@@ -55,6 +55,7 @@ def read_ply(path: Path | str) -> Gaussians:
             header = read_header(stream, path)
         vertex = _gaussian_element(header, path)
         k = _num_rest(vertex, path)
+        require_memory(path, vertex.count * 4 * (14 + 3 * k))  # float32 numbers
         _report_unread(header, vertex, path)
         with _GaussiansAlone(path, header) as stream:
             # Binary rows are mapped, not read: only the Gaussians below take memory.

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import SH_C0, Gaussians
-from pointsplat_ns.io.files import keep_usable, one_line, require_file
+from pointsplat_ns.io.files import keep_usable, one_line, require_file, require_memory
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 
 PREFIXES = ("_model.gauss_params.", "_model.module.gauss_params.", "_model.", "_model.module.")
@@ -49,6 +49,8 @@ def read_checkpoint(path: Path | str) -> Gaussians:
             f"expected {PREFIXES[0]}means, as Splatfacto saves"
         )
     limit = path.stat().st_size
+    held = (state.get(prefix + name) for name in NAMES)
+    require_memory(path, min(limit, sum(4 * value.numel() for value in held if isinstance(value, Tensor))))
     tensors = {name: _parameter(state, prefix + name, path, limit) for name in NAMES}
     try:
         scene = Gaussians(**tensors)

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.io.files import one_line, write_tensors
+from pointsplat_ns.io.files import one_line, require_memory, write_tensors
 from pointsplat_ns.refiner.config import RefinerConfig, RefinerConfigError
 from pointsplat_ns.refiner.refiner import Refiner
 
@@ -69,6 +69,7 @@ def read_refiner(path: str | Path, device: torch.device | str = "cpu") -> Refine
         for name, tensor in found.items():
             if (tensor.get_dtype() in _FLOATS) != expected[name].is_floating_point():
                 raise WeightsError(f"{path}: {name} is of type {tensor.get_dtype()}; the file is damaged")
+        require_memory(path, path.stat().st_size)
         state = {name: file.get_tensor(name) for name in names}
     bad = [name for name, value in state.items() if not value.float().isfinite().all()]
     if bad:

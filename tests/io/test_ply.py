@@ -2,9 +2,12 @@
 
 import logging
 import math
+import os
+from unittest import mock
 
 import numpy as np
 import numpy.lib.recfunctions
+import psutil
 import pytest
 import torch
 from hypothesis import given, settings
@@ -140,6 +143,22 @@ def test_every_line_end_and_spaces_after_the_last_keyword_are_read(tmp_path, new
     header = (header + end + b"\n").replace(b"\n", newline)
     (tmp_path / "b.ply").write_bytes(header + (data.replace(b"\n", newline) if text else data))
     assert same_bits(scene, read_ply(tmp_path / "b.ply"))
+
+
+def test_a_sparse_file_that_would_fill_the_memory_is_refused(tmp_path):
+    path = tmp_path / "a.ply"
+    write_ply(normal_scene(1, 3), path)
+    content = path.read_bytes().replace(b"vertex 1\n", b"vertex 200000000\n")
+    path.write_bytes(content)
+    try:
+        os.truncate(path, len(content) + 199_999_999 * 248)
+    except OSError:
+        pytest.skip("the file system has no sparse files")
+    before = psutil.Process().memory_info().rss
+    with mock.patch("psutil.virtual_memory", return_value=mock.Mock(available=10**9)):
+        with pytest.raises(SceneError, match="a.ply: takes 47.2 GB of memory, 1.0 GB are free"):
+            read_ply(path)
+    assert psutil.Process().memory_info().rss < before + 2**28
 
 
 def test_what_a_gaussian_has_no_place_for_is_said(tmp_path, caplog):
