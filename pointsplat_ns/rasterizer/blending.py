@@ -20,10 +20,17 @@ from pointsplat_ns.rasterizer import eager
 from pointsplat_ns.rasterizer.compiled import SMALLEST
 from pointsplat_ns.rasterizer.constants import CHUNK, TILE
 from pointsplat_ns.rasterizer.frame import BlendOptions, Chunk, Frame, Inputs, Tiles
+from pointsplat_ns.rasterizer.precision import full_precision
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS, chain, gather, mean_slopes, moments
 from pointsplat_ns.rasterizer.tiles import Footprints, Region
 
-_BYTES_PER_PAIR = 192  # lists, tape and gradient sums in float32: 75 MB for 0.30 M pairs, less what every image takes
+_BYTES_PER_PAIR = 192  # of RGB in float32: lists, tape, gradient sums; 75 MB for 0.30 M pairs, less what images take
+
+
+def bytes_per_pair(colors: Tensor) -> int:
+    """Bytes that a pair of tile and Gaussian takes with colours (M, D): each channel has a gradient sum."""
+    size = colors.element_size()
+    return _BYTES_PER_PAIR * size // 4 + (colors.shape[1] - 3) * size
 
 
 def _blend_block(
@@ -177,6 +184,7 @@ class Blend(torch.autograd.Function):
         return image, final
 
     @staticmethod
+    @full_precision
     def backward(ctx, grad_image, grad_final):
         means2d, cov2d, det, opacities, colors, final = ctx.saved_tensors
         footprints, region, options, absgrad_of = ctx.arguments
@@ -218,7 +226,7 @@ def blend(
         Colours (C, H, W, D) over black, and the remaining transmittance (C, H, W, 1).
     """
     cameras, width, height = footprints.cameras, footprints.width, footprints.height
-    regions = footprints.regions(max(1, options.memory_budget // _BYTES_PER_PAIR))
+    regions = footprints.regions(max(1, options.memory_budget // bytes_per_pair(colors)))
     if absgrad_of is not None and len(regions) > 1:
         absgrad_of = _Summed(absgrad_of, len(regions))
 

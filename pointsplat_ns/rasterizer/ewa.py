@@ -22,6 +22,7 @@ from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.geometry.quaternions import rotation_components
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, COMPENSATION_MIN, FRUSTUM_MARGIN
+from pointsplat_ns.rasterizer.precision import full_precision
 from pointsplat_ns.rasterizer.spherical_harmonics import unit_rows
 
 
@@ -185,6 +186,7 @@ class Project(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @full_precision
     def backward(ctx, _ids, grad_means2d, grad_depths, grad_cov2d, grad_det, grad_alphas, grad_directions, _radii):
         ids, state, directions, view, opacities = ctx.saved_tensors
         lens = ctx.lens

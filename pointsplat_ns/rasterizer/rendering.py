@@ -12,6 +12,7 @@ from pointsplat_ns.rasterizer.backends import use_gsplat
 from pointsplat_ns.rasterizer.blending import blend
 from pointsplat_ns.rasterizer.constants import EPS2D, QUALITIES, TILE, Quality
 from pointsplat_ns.rasterizer.frame import MEMORY_BUDGET, BlendOptions
+from pointsplat_ns.rasterizer.precision import full_precision
 from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, project
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.rasterizer.tiles import Footprints
@@ -45,6 +46,7 @@ def _colors_of(seen: Projected, colors: Tensor, camera: int, per_camera: bool, s
     return sh_to_color(seen.directions, colors, sh_degree, seen.ids)
 
 
+@full_precision
 def rasterization(
     means: Tensor,  # [N, 3]
     quats: Tensor,  # [N, 4]
@@ -77,8 +79,8 @@ def rasterization(
 
     Takes what ``gsplat.rasterization`` takes and returns what it returns. Differentiable in means,
     quats, scales, opacities, colors, backgrounds and viewmats. float32 and float64 are computed as
-    they are, lower precisions in float32. float64 viewmats beside float32 Gaussians place the camera
-    exactly, however far from the origin.
+    they are, lower precisions in float32, also under autocast. float64 viewmats beside float32 Gaussians
+    place the camera exactly, however far from the origin.
 
     Degenerate input that has a meaning keeps it: the zero quaternion is the identity, a scale of 0 a
     flat Gaussian, an opacity of 1 opaque. What has none (NaN, infinities, a negative scale or opacity)

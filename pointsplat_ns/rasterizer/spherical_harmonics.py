@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from pointsplat_ns.rasterizer.precision import full_precision
+
 # Normalisation constants of the real spherical harmonics (Sloan, "Efficient Spherical Harmonic
 # Evaluation", 2013), with the signs that 3DGS files use.
 C0 = 0.28209479177387814
@@ -114,6 +116,7 @@ class _Color(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @full_precision
     def backward(ctx, grad):
         coefficients, unit, inverse_length, basis, positive, ids = ctx.saved_tensors
         grad = grad * positive

@@ -9,6 +9,7 @@ import warnings
 import pytest
 import torch
 
+from making import camera_askew
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.rasterizer import blending, frame, rasterization
 from pointsplat_ns.rasterizer.compiled import kernels
@@ -55,8 +56,23 @@ def assert_same(results, wanted, tolerance):
 def test_a_lower_memory_budget_changes_neither_image_nor_gradients(pairs):
     scene = make_scene(dtype=torch.float64)
     wanted = draw(scene, absgrad=True)
-    got = draw(scene, absgrad=True, memory_budget=pairs * blending._BYTES_PER_PAIR)
+    got = draw(scene, absgrad=True, memory_budget=pairs * blending.bytes_per_pair(scene[4][:, 0]))
     assert_same(got, wanted, 1e-12)  # sums over regions in another order
+
+
+@pytest.mark.parametrize(
+    "channels, double, size", [(1, False, 184), (3, False, 192), (256, False, 1204), (3, True, 384)]
+)
+def test_the_memory_budget_counts_channels_and_precision(channels, double, size, monkeypatch):
+    """192 bytes a pair for RGB in float32, of which each channel's gradient sum takes 4."""
+    dtype = torch.float64 if double else torch.float32
+    scene = make_scene(dtype=dtype)
+    scene[4] = scene[4][:, :1, 0].expand(-1, channels)
+    view, K = camera_askew(dtype)
+    asked, regions = [], blending.Footprints.regions
+    monkeypatch.setattr(blending.Footprints, "regions", lambda self, most: asked.append(most) or regions(self, most))
+    rasterization(*scene, view[None], K[None], WIDTH, HEIGHT, memory_budget=10**6)
+    assert asked == [10**6 // size]
 
 
 def test_regions_cover_every_tile_once_and_keep_within_the_budget_where_tiles_allow():

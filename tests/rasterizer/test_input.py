@@ -108,3 +108,19 @@ def test_a_camera_without_meaning_says_so(change, message):
         dict(K=K, view=view)[name][row, column] = value
     with pytest.raises(ValueError, match=message):
         rasterization(*splats_in_view(50, 11, scale=-2.5), view[None], K[None], 37, 29, sh_degree=0)
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_autocast_changes_neither_image_nor_gradients(absgrad):
+    scene = [t.float() for t in splats_in_view(50, 11, scale=-2.5)]
+    view, K = (t.float()[None] for t in camera_askew())
+
+    def run(enabled):
+        leaves = [t.clone().requires_grad_() for t in (*scene, view)]
+        with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+            image, alpha, _ = rasterization(*leaves, K, 37, 29, sh_degree=3, absgrad=absgrad)
+            (image.square().sum() + alpha.sum()).backward()
+        return [image, alpha, *(leaf.grad for leaf in leaves)]
+
+    for got, want in zip(run(True), run(False), strict=True):
+        assert got.dtype == torch.float32 and torch.equal(got, want)
