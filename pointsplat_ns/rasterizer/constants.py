@@ -21,6 +21,10 @@ its extent (0.3 makes the 1.3 x field of view of 3DGS)."""
 COMPENSATION_MIN = 0.005
 """Lower bound of the antialiasing compensation factor."""
 
+LARGEST_COLOR = 0.8
+"""Exponent of the largest number of the precision, above which a colour counts as infinite: 6e30 in float32. Gradients,
+sums over pixels of colours times slopes, then stay finite."""
+
 TILE = 8
 """Tile edge in pixels. 8 was measured faster than 16: fewer pixels evaluated for nothing."""
 

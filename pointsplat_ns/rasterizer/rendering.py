@@ -10,7 +10,7 @@ from torch import Tensor
 from pointsplat_ns.rasterizer.arguments import check_options, check_tensors
 from pointsplat_ns.rasterizer.backends import use_gsplat
 from pointsplat_ns.rasterizer.blending import blend
-from pointsplat_ns.rasterizer.constants import EPS2D, QUALITIES, TILE, Quality
+from pointsplat_ns.rasterizer.constants import EPS2D, LARGEST_COLOR, QUALITIES, TILE, Quality
 from pointsplat_ns.rasterizer.frame import MEMORY_BUDGET, BlendOptions
 from pointsplat_ns.rasterizer.precision import full_precision
 from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, project
@@ -26,16 +26,16 @@ def _cat(tensors: list[Tensor]) -> Tensor:
 
 
 def _finite_colors(seen: Projected, *rest) -> tuple[Projected, Tensor, Tensor]:
-    """What a camera sees without the Gaussians whose colour is NaN or infinite, the colours, and the ids dropped."""
+    """What a camera sees without the Gaussians whose colour is NaN or too large, the colours, and the ids dropped."""
     colors = _colors_of(seen, *rest)
     dropped = seen.ids[:0]
-    if not bool(colors.detach().sum().isfinite()):  # one bad value spoils the sum
-        finite = colors.detach().isfinite().all(-1)
-        dropped = seen.ids[~finite]
-        if dropped.numel():
-            # evaluated again, and not selected, so that the gradient never multiplies 0 by infinity
-            seen = seen.select(finite.nonzero()[:, 0])
-            colors = _colors_of(seen, *rest)
+    limit = torch.finfo(colors.dtype).max ** LARGEST_COLOR
+    if colors.numel() and not bool(torch.stack(colors.detach().aminmax()).abs().amax() < limit):  # NaN spoils both
+        usable = (colors.detach().abs() < limit).all(-1)
+        dropped = seen.ids[~usable]
+        # evaluated again, and not selected, so that the gradient never multiplies 0 by infinity
+        seen = seen.select(usable.nonzero()[:, 0])
+        colors = _colors_of(seen, *rest)
     return seen, colors, dropped
 
 
@@ -83,8 +83,9 @@ def rasterization(
     place the camera exactly, however far from the origin.
 
     Degenerate input that has a meaning keeps it: the zero quaternion is the identity, a scale of 0 a
-    flat Gaussian, an opacity of 1 opaque. What has none (NaN, infinities, a negative scale or opacity)
-    is not drawn, gets a zero gradient and is counted in ``meta["skipped"]``.
+    flat Gaussian, an opacity of 1 opaque. What has none (NaN, infinities, a negative scale or opacity, a
+    colour above 6e30, whose gradients float32 could not hold) is not drawn, gets a zero gradient and is
+    counted in ``meta["skipped"]``.
 
     The same input gives the same bits, forward and backward, on the same machine with the same number of
     threads. Another number of threads sums gradients in another order (1 and 2 were seen to give the same

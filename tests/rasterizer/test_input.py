@@ -124,3 +124,19 @@ def test_autocast_changes_neither_image_nor_gradients(absgrad):
 
     for got, want in zip(run(True), run(False), strict=True):
         assert got.dtype == torch.float32 and torch.equal(got, want)
+
+
+@pytest.mark.parametrize("value", [1e20, 1e30, 1e37, 1e38, 3e38])
+@pytest.mark.parametrize("sh_degree", [0, 3])
+def test_colours_up_to_the_largest_number_have_finite_gradients(value, sh_degree):
+    scene = [t.float() for t in splats_in_view(50, 11, scale=-2.5)]
+    scene[0][:, :2] *= 0.2  # all in sight
+    scene[3] = scene[3].clamp_min(0.1)
+    scene[4][:10] = scene[4][:10].sign() * value
+    scene[4][:10, 0] = value
+    view, K = (t.float()[None] for t in camera_askew())
+    leaves = [t.clone().requires_grad_() for t in (*scene, view)]
+    image, _, meta = rasterization(*leaves, K, 37, 29, sh_degree=sh_degree)
+    assert image.isfinite().all() and (value > 1e31) == (meta["skipped"] > 0)
+    for grad in torch.autograd.grad(image.sum(), leaves):
+        assert grad.isfinite().all()
