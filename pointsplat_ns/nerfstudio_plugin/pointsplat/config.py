@@ -10,13 +10,13 @@ from typing import Literal
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import CosineDecaySchedulerConfig, MultiStepSchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.io.runs import REFINER_METHOD, step_of
+from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 
@@ -135,7 +135,7 @@ def pointsplat_config() -> TrainerConfig:
         pipeline=PointSplatPipelineConfig(),
         optimizers={
             name: {
-                "optimizer": AdamOptimizerConfig(lr=rate, eps=1e-15, max_norm=2.0),
+                "optimizer": FusedAdamConfig(lr=rate, eps=1e-15, max_norm=2.0),
                 "scheduler": CosineDecaySchedulerConfig(warm_up_end=0, learning_rate_alpha=0.02, max_steps=0),
             }
             for name, rate in RATES.items()

@@ -11,13 +11,13 @@ from typing import Any, Literal, NoReturn
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
+from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig, SplatfactoCpuPipelineConfig
 from pointsplat_ns.system.memory import keep_freed_memory
 
@@ -127,7 +127,7 @@ def _optimizers() -> dict[str, dict[str, Any]]:
 
     def group(lr: float, lr_final: float | None = None, **schedule) -> dict[str, Any]:
         decay = ExponentialDecaySchedulerConfig(lr_final=lr_final, max_steps=SPLATFACTO_STEPS, **schedule)
-        return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": decay if lr_final else None}
+        return {"optimizer": FusedAdamConfig(lr=lr, eps=1e-15), "scheduler": decay if lr_final else None}
 
     return {
         "means": group(1.6e-4, 1.6e-6),
