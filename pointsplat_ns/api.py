@@ -16,6 +16,7 @@ from pointsplat_ns.compression.compact import Compacted, compact_scene, resolve_
 from pointsplat_ns.compression.level_folder import check_folder, source_file
 from pointsplat_ns.compression.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
 from pointsplat_ns.compression.prune import check_options, prune_scene
+from pointsplat_ns.compression.repair import Effort, RepairBudget
 from pointsplat_ns.compression.trained_refiner import (
     TrainedRefiner,
     load_refiner,
@@ -180,10 +181,15 @@ def compact(
     by: str | None = None,
     sh: str = "all",
     clean: bool = False,
+    effort: Effort = "quick",
+    seconds: float | None = None,
     views: Views | str | Path | None = None,
     progress: bool | Progress = False,
 ) -> Compacted:
-    """Make a scene smaller, repair it with a trained refiner, and check by rendering how far that helps.
+    """Make a scene smaller, repair it, and check by rendering how far that helps.
+
+    A trained refiner repairs it in one pass. Then it is optimised against the given scene's own renders, no photos, for
+    as long as ``effort`` or ``seconds`` says. What does not bring renders closer is left out.
 
     Args:
         scene: N Gaussians, or where to read them: a PLY, a checkpoint, or a Splatfacto run.
@@ -193,31 +199,35 @@ def compact(
         by: the method, as for :func:`prune`; by default the one that the refiner was trained with.
         sh: SH bands to keep, as for :func:`prune`.
         clean: as for :func:`prune`.
-        views: where renders are compared, as for :func:`prune`; at most 12 are taken.
+        effort: "instant" is only the refiner; "quick" and "thorough" optimise 32 and 400 steps.
+        seconds: optimise for so long, instead; Ctrl-C ends it earlier, and what has been reached is kept.
+        views: where renders are compared, as for :func:`prune`; at most 12 are taken. If there are more than twice as
+            many, the scene is optimised on the others, else on views sampled in free space.
         progress: True shows a bar; a function is called with what is being done and the share done of it.
 
     Returns:
-        ``.scene``, ``.accepted`` (whether refinement is in it), ``.psnr`` (dB against the given scene's renders),
+        ``.scene``, ``.accepted`` (whether the refiner is in it), ``.psnr`` (dB against the given scene's renders),
         ``.seconds``, ``.verdict`` (all of that in a line), and more: see :class:`Compacted`.
 
     Raises:
         BudgetError: if no such scene can be made.
         SceneError: if no Gaussian can be drawn, the file is not usable, or the SH degree exceeds the refiner's.
         DataError: if the budget or ``sh`` needs views and none can be had.
-        PointSplatError: if there is no such method.
+        PointSplatError: if there is no such method or effort, or the time is negative.
 
     Example:
         >>> import pointsplat_ns as ps
-        >>> result = ps.compact(ps.example_room()[::10], keep="20%")
+        >>> result = ps.compact(ps.example_room()[::10], keep="20%", seconds=1)
         >>> result.psnr > 15, result.seconds > 0
         (True, True)
     """
     refiner = refiner or load_refiner()
+    budget = RepairBudget(effort, seconds)
     resolve_options(refiner, keep, by, sh)  # before the scene is read
     dense, source = _read(scene, views)
     with progress_bar(progress) as report:
-        result = compact_scene(dense, refiner, keep, by, sh, source, report, clean)
-    _log((result.verdict, *result.notes))
+        result = compact_scene(dense, refiner, keep, by, sh, source, report, clean, budget)
+    _log((*result.verdict.splitlines(), *result.notes))
     return result
 
 

@@ -120,7 +120,7 @@ class Views:
         """At most ``count`` of the views, evenly spread over their order, the first and the last among them."""
         if count >= len(self):
             return self
-        return self[torch.linspace(0, len(self) - 1, count).round().long()]
+        return self[spread_indices(len(self), count)]
 
     def resized(self, max_side: int) -> Views:
         """The same views with the longer side of the image at most ``max_side`` pixels; never more pixels than now."""
@@ -130,3 +130,10 @@ class Views:
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
         stretch = self.Ks.new_tensor([[width / self.width], [height / self.height], [1.0]])
         return replace(self, Ks=self.Ks * stretch, width=width, height=height)
+
+
+def spread_indices(length: int, count: int) -> list[int]:
+    """At most ``count`` indices below ``length``, evenly spread, the first and the last among them."""
+    if count >= length:
+        return list(range(length))
+    return torch.linspace(0, length - 1, count).round().long().tolist()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -26,15 +26,17 @@ def compact(
     by: str | None = None,
     sh: Bands = "all",
     clean: bool = False,
+    effort: Literal["instant", "quick", "thorough"] = "quick",
+    seconds: float | None = None,
     picture: Path | None = None,
     dry_run: bool = False,
     force: bool = False,
 ) -> None:
-    """Make any scene smaller and repair it with a trained refiner. No photos are needed.
+    """Make any scene smaller and repair it. No photos are needed.
 
-    Renders of the smaller scene, with and without refinement, are compared with renders of the dense scene, from the
-    poses of the run's dataset if it is found, else from poses sampled in free space. Refinement is applied as far as it
-    brings renders closer to the dense scene's, and left out if it does not help.
+    A trained refiner repairs the smaller scene in one pass; then it is optimised against the dense scene's renders.
+    After each, renders are compared with the dense scene's in other views, and what does not help is left out. Views
+    are the poses of the run's dataset if it is found, else sampled in free space.
 
     Args:
         scene: a 3DGS .ply, a Splatfacto checkpoint, or a run (its folder or config.yml).
@@ -47,23 +49,30 @@ def compact(
         by: the method of prune; by default the one that the refiner was trained with.
         sh: SH bands to keep, as for prune: all, up to a degree, or auto.
         clean: as for prune: first remove what cannot be drawn and what is seen from nowhere.
-        picture: a .png file for images of some views: dense, before and after refinement, side by side.
+        effort: how long to optimise: not at all (instant), 32 steps (quick, about as long as merging takes), or 400.
+        seconds: optimise for so many seconds, instead of a fixed effort. Ctrl-C ends it earlier and loses nothing.
+        picture: a .png file for images of some views: dense, before and after the repair, side by side.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.compression.compact import resolve_options
+    from pointsplat_ns.compression.repair import RepairBudget
     from pointsplat_ns.io import read_scene
 
     output = output or output_beside(scene, "compact")
     check_outputs(None if dry_run else output, picture, force)
     trained = ps.load_refiner(refiner)
     resolve_options(trained, keep, by, sh)
+    RepairBudget(effort, seconds)
     dense = read_scene(scene)
-    result = ps.compact(dense, keep, trained, by=by, sh=sh, clean=clean, views=scene, progress=True)
+    result = ps.compact(
+        dense, keep, trained, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds, views=scene, progress=True
+    )
     if not dry_run:
         ps.save(result.scene, output)
-    what = "kept and refined" if result.accepted else "kept"
+    repaired = result.repaired is not None and result.scene is result.repaired.scene
+    what = "kept" + (" and refined" if result.accepted else "") + (" and repaired" if repaired else "")
     print_result(what, len(dense), result.scene, result.seconds, None if dry_run else output)
     print_distributions(dense, result.scene)
     if picture is not None:

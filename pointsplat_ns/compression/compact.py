@@ -1,7 +1,8 @@
-"""Prune a scene, refine it, and keep the refinement as far as it brings renders closer to the dense scene's."""
+"""Prune a scene, refine it, repair it, and keep of that what brings renders closer to the dense scene's."""
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ import torch
 
 from pointsplat_ns.compression.closeness import Closeness, DenseReference, views_text
 from pointsplat_ns.compression.prune import check_options, prune_scene
+from pointsplat_ns.compression.repair import RepairBudget, Repaired, repair
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import DataError, SceneError
@@ -23,19 +25,23 @@ MIN_GAIN = 0.1
 """Least gain of PSNR, in dB, for which refinement is kept: the sign of a smaller gain depends on the views."""
 
 
+NO_REPAIR = RepairBudget("instant")
+
+
 @dataclass(frozen=True, eq=False)
 class Compacted:
     """The result of :func:`pointsplat_ns.compact`: a smaller scene, and whether refining it helped.
 
     Example:
         >>> import pointsplat_ns as ps
-        >>> result = ps.compact(ps.example_room()[::10], keep="20%")
+        >>> result = ps.compact(ps.example_room()[::10], keep="20%", effort="instant")
         >>> result.scene is (result.refined if result.accepted else result.pruned)
         True
     """
 
     scene: Gaussians
-    """``refined`` if it was accepted, else ``pruned``."""
+    """``repaired.scene`` if it is better than what it started from; else ``refined`` if that was accepted, else
+    ``pruned``."""
     pruned: Gaussians
     """The scene before refinement."""
     refined: Gaussians
@@ -43,9 +49,9 @@ class Compacted:
     strength: float
     """Share of the refiner's residuals in ``refined``, in (0, 1]: the best one tried, or 1 if none helps."""
     accepted: bool
-    """Whether ``scene`` is the refined one."""
+    """Whether ``refined`` was accepted."""
     verdict: str
-    """One line of text: what refinement gained, or why it was left out."""
+    """Text: what refinement gained, or why it was left out; and the same of the repair, if there was one."""
     notes: tuple[str, ...]
     """Lines of text: SH bands dropped, PSNR reached, where views came from."""
     reference: DenseReference | None
@@ -56,13 +62,23 @@ class Compacted:
     """Errors of ``refined`` against the reference; None if it was not compared."""
     seconds: float
     """Total duration."""
+    repaired: Repaired | None = None
+    """The scene after optimisation against the dense scene's renders; None if there was no time for it."""
+    after_repair: Closeness | None = None
+    """Errors of the repaired scene; None if there is none."""
+
+    @property
+    def closeness(self) -> Closeness | None:
+        """Errors of ``scene`` against the reference; None if nothing was compared."""
+        if self.repaired is not None and self.scene is self.repaired.scene:
+            return self.after_repair
+        return self.after if self.accepted else self.before
 
     @property
     def psnr(self) -> float | None:
         """PSNR of ``scene`` against the dense scene's renders, over all pixels of all views, dB; None if nothing was
         compared."""
-        close = self.after if self.accepted else self.before
-        return None if close is None else close.psnr
+        return None if self.closeness is None else self.closeness.psnr
 
     @property
     def views(self) -> Views | None:
@@ -79,15 +95,17 @@ def compact_scene(
     views: ViewSource | None = None,
     progress: Progress = silent,
     clean: bool = False,
+    budget: RepairBudget = NO_REPAIR,
 ) -> Compacted:
-    """Make a scene smaller, and refine it if that helps.
+    """Make a scene smaller, refine it if that helps, and repair it as long as the budget says.
 
     The pruned and the refined scene are rendered and compared with renders of the dense scene, by the mean squared
     error over all pixels of all views. On scenes unlike its training scenes, a refiner's residuals tend to have the
     right direction but to be too large. So half of the residuals are tried as well, and the share at the minimum of the
     parabola through the errors at 0, 1/2 and 1, where the error is least if renders change linearly with the residuals.
     The best is kept if it gains at least :data:`MIN_GAIN`. A requested PSNR (``auto``) is reached before refinement, so
-    that it holds in any case.
+    that it holds in any case. Then the scene is repaired (:func:`~pointsplat_ns.compression.repair.repair`), from views
+    other than those compared; that, too, is kept if it gains as much.
 
     Args:
         dense: N Gaussians.
@@ -98,6 +116,7 @@ def compact_scene(
         views: views that renders are compared in; by default sampled in free space.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
         clean: as for :func:`~pointsplat_ns.compression.prune.prune_scene`.
+        budget: how long to repair.
 
     Raises:
         BudgetError, SceneError, PointSplatError: as :func:`~pointsplat_ns.compression.prune.prune_scene`.
@@ -131,8 +150,21 @@ def compact_scene(
     notes = smaller.notes
     if views.origin and views.origin not in notes:
         notes = (*notes, views.origin)
-    scene, seconds = refined if accepted else pruned, time.perf_counter() - start
-    return Compacted(scene, pruned, refined, strength, accepted, verdict, notes, reference, before, after, seconds)
+    scene, close = (refined, after) if accepted else (pruned, before)
+    repaired, after_repair = None, None
+    if reference is not None and close is not None and not budget.empty and close.psnr < math.inf:
+        progress("repairing", 0.0)
+        device = reference.renders[0].device
+        repaired = repair(scene.to(device), dense.to(device), views, budget, functools.partial(progress, "repairing"))
+        after_repair = reference.closeness(repaired.scene)
+        verdict += "\n" + _repair_verdict(close, after_repair, repaired)
+        if helps(close, after_repair):
+            scene = repaired.scene
+    seconds = time.perf_counter() - start
+    return Compacted(
+        *(scene, pruned, refined, strength, accepted, verdict, notes, reference, before, after, seconds),
+        *(repaired, after_repair),
+    )
 
 
 def resolve_options(refiner: TrainedRefiner, keep: Keep | str | None, by: str | None, sh: str) -> tuple[Keep, str]:
@@ -229,18 +261,34 @@ def helps(before: Closeness, after: Closeness) -> bool:
     return after.psnr >= before.psnr + MIN_GAIN and math.isfinite(before.psnr)
 
 
-def _verdict(before: Closeness, after: Closeness, strength: float) -> str:
-    """One line of text: what refinement gained, or why it was left out."""
+def _figures(before: Closeness, after: Closeness) -> str:
+    """Errors before and after in words."""
     count = len(before.errors)
     better = sum(new < old for new, old in zip(after.errors, before.errors, strict=True))
     figures = f"{before.psnr:.2f} -> {after.psnr:.2f} dB against the dense scene's renders in {views_text(count)}"
     if before.ssim is not None and after.ssim is not None:
         figures += f", SSIM {before.ssim:.3f} -> {after.ssim:.3f}"
-    figures += f", worst view {before.worst:.2f} -> {after.worst:.2f} dB, closer in {better} of {count}"
+    return f"{figures}, worst view {before.worst:.2f} -> {after.worst:.2f} dB, closer in {better} of {count}"
+
+
+def _left_out(before: Closeness, after: Closeness) -> str:
+    return "it does not help" if after.psnr <= before.psnr else f"it brings less than {MIN_GAIN:g} dB"
+
+
+def _verdict(before: Closeness, after: Closeness, strength: float) -> str:
+    """One line of text: what refinement gained, or why it was left out."""
+    figures = _figures(before, after)
     if helps(before, after):
         share = "" if strength == 1 else f" at {strength:.0%} of its strength"
         return f"refinement{share}: {figures}"
     if after.errors == before.errors:
-        return f"refinement left out: it changes nothing, {before.psnr:.2f} dB in {views_text(count)}"
-    why = "it does not help" if after.psnr <= before.psnr else f"it brings less than {MIN_GAIN:g} dB"
-    return f"refinement left out, {why}: {figures}"
+        return f"refinement left out: it changes nothing, {before.psnr:.2f} dB in {views_text(len(before.errors))}"
+    return f"refinement left out, {_left_out(before, after)}: {figures}"
+
+
+def _repair_verdict(before: Closeness, after: Closeness, repaired: Repaired) -> str:
+    """One line of text: what the repair gained and cost, or why it was left out."""
+    cost = f"{repaired.steps} steps in {repaired.seconds:.1f} s" + (", interrupted" if repaired.interrupted else "")
+    if helps(before, after):
+        return f"repair, {cost}: {_figures(before, after)}"
+    return f"repair left out, {_left_out(before, after)} ({cost}): {_figures(before, after)}"

@@ -8,24 +8,11 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from pointsplat_ns.compression.optimiser import RATES, Optimiser
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.metrics import SSIM_WINDOW, ssim
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views
-
-RATES = {
-    "means": 1.6e-6,  # times the extent of the scene: the final rate of 3DGS, as the scene has been trained
-    "scales": 5e-3,
-    "quats": 1e-3,
-    "opacities": 2.5e-2,
-    "features_dc": 2.5e-3,
-    "features_rest": 2.5e-3 / 20,
-}
-"""Learning rates of Adam, as in 3DGS."""
-
-SSIM_WEIGHT = 0.2
-"""Weight of 1 - SSIM in the loss, as in 3DGS; L1 has the rest."""
 
 
 def fine_tune(
@@ -47,7 +34,7 @@ def fine_tune(
         views: C views.
         targets: the dense scene, whose renders are then the targets; or C images (H, W, 3) in [0, 1], one per view.
         steps: number of optimisation steps.
-        rates: learning rates by parameter name, which replace those in :data:`RATES`; that of the means is multiplied
+        rates: learning rates by parameter name, which replace those of 3DGS; that of the means is multiplied
             by the extent of the scene.
         seed: seed of the order of the views.
         progress: called with the share done, in [0, 1].
@@ -62,13 +49,7 @@ def fine_tune(
         raise DataError("no view to fine-tune on; expected at least one pose")
     if not isinstance(targets, Gaussians) and len(targets) != len(views):
         raise DataError(f"{len(targets)} pictures for {len(views)} views; expected one each")
-    extent = float((scene.means.detach().double() - scene.means.detach().double().mean(0)).norm(dim=1).quantile(0.9))
-    parameters = {name: value.detach().clone().requires_grad_() for name, value in scene.items()}
-    fixed = {name: ~value.detach().isfinite() for name, value in parameters.items()}
-    rates = {**RATES, **(rates or {})}
-    rates["means"] *= extent or 1.0
-    groups = [{"params": [value], "lr": rates[name]} for name, value in parameters.items() if value.numel()]
-    optimizer = torch.optim.Adam(groups, eps=1e-15)
+    optimiser = Optimiser(scene, {**RATES, **(rates or {})})
     target_images: dict[int, Tensor] = {}
     order: list[int] = []
     generator = random.Random(seed)
@@ -78,16 +59,10 @@ def fine_tune(
         index = order.pop()
         if index not in target_images:
             target_images[index] = _target(targets, views, index, scene)
-        optimizer.zero_grad()
-        image = render(Gaussians(**parameters), views[index])
-        _loss(image, target_images[index]).backward()
-        for name, value in parameters.items():
-            if value.grad is not None:
-                value.grad[fixed[name]] = 0.0  # values that are not finite do not change
-        optimizer.step()
+        optimiser.step(views[index], target_images[index])
         if progress is not None:
             progress((step + 1) / steps)
-    return Gaussians(**parameters).detach()
+    return optimiser.scene
 
 
 def _target(targets: Gaussians | Sequence[Tensor], views: Views, index: int, like: Gaussians) -> Tensor:
@@ -98,10 +73,3 @@ def _target(targets: Gaussians | Sequence[Tensor], views: Views, index: int, lik
     if tuple(image.shape) != (views.height, views.width, 3):
         raise DataError(f"picture {index} has shape {tuple(image.shape)}; expected {(views.height, views.width, 3)}")
     return image
-
-
-def _loss(image: Tensor, target: Tensor) -> Tensor:
-    l1 = (image - target).abs().mean()
-    if min(image.shape[:2]) < SSIM_WINDOW:
-        return l1
-    return (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - ssim(image, target))

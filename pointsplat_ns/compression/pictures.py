@@ -21,7 +21,7 @@ SHOWN_VIEWS = 3
 
 @torch.no_grad()
 def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> str:
-    """Draw some of the views compared: dense, before and after refinement, side by side.
+    """Draw some of the views compared: dense, before and after each repair, side by side.
 
     Args:
         dense: the scene that was compacted.
@@ -54,6 +54,10 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> st
         names.append(f"refined{share}" if result.accepted else "refined (left out)")
         titles.append(_title(names[-1], result.refined, result.after))
         scenes.append(result.refined)
+    if result.repaired is not None:
+        names.append("repaired" if result.scene is result.repaired.scene else "repaired (left out)")
+        titles.append(_title(names[-1], result.repaired.scene, result.after_repair))
+        scenes.append(result.repaired.scene)
     rows = [[renders[i].cpu(), *(render(scene, views[i]).cpu() for scene in scenes)] for i in shown]
     side_by_side(rows, titles, path)
     return f"{path}: {', '.join(names)}, side by side"

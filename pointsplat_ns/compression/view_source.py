@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import random
+from collections.abc import Callable, Iterator
 from functools import cached_property
+from itertools import count as counted
 from pathlib import Path
 
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.pruning.view_sampling import sample_views
-from pointsplat_ns.views import RasterizeMode, Views
+from pointsplat_ns.views import RasterizeMode, View, Views, spread_indices
 
 COMPARED_VIEWS, COMPARED_SIDE = 12, 400
 """Maximum number of views that renders are compared in, and maximum of their longer side in pixels."""
+
+SAMPLED_AT_ONCE = 32
+"""Number of further views sampled at a time."""
 
 
 class ViewSource:
@@ -82,3 +87,29 @@ class ViewSource:
     def compared(self) -> Views:
         """The views that renders are compared in: at most 12, with a longer side of at most 400 pixels."""
         return self.views(COMPARED_VIEWS).resized(COMPARED_SIDE)
+
+    def others(self, seed: int = 0) -> Iterator[View]:
+        """Views to optimise on, without end: none of those that :meth:`compared` gives, and of the same size.
+
+        The given views and the dataset's poses come in random order, each once before any is repeated. If there are no
+        more of them than are compared, views are sampled in free space, each time others.
+
+        Args:
+            seed: of the order.
+
+        Raises:
+            DataError: if none can be sampled.
+        """
+        compared = self.compared()
+        known = self.given if self.given is not None else self._of_dataset
+        if known is not None and len(known) > 2 * len(compared):
+            left = sorted(set(range(len(known))) - set(spread_indices(len(known), COMPARED_VIEWS)))
+            rest, generator = known.resized(COMPARED_SIDE), random.Random(seed)
+            while True:
+                for index in generator.sample(left, len(left)):
+                    yield rest[index]
+        for batch in counted(1):
+            sampled = sample_views(self._scene, SAMPLED_AT_ONCE, seed=SAMPLED_AT_ONCE * seed + batch)
+            sampled = dataclasses.replace(sampled, background=compared.background, rasterize_mode=self._rasterize_mode)
+            for index in random.Random(batch).sample(range(len(sampled)), len(sampled)):
+                yield sampled[index]

@@ -1,0 +1,144 @@
+"""Repair by optimisation: what it gains, what it sees, how long it takes, and how it ends."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+import torch
+
+import pointsplat_ns.compression.repair as repair_module
+from making import same
+from pointsplat_ns.compression.closeness import DenseReference
+from pointsplat_ns.compression.optimiser import RATES, Optimiser
+from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
+from pointsplat_ns.compression.view_source import COMPARED_VIEWS, ViewSource
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.pruning import prune
+from pointsplat_ns.pruning.view_sampling import sample_views
+from pointsplat_ns.rasterizer import render
+
+
+class Few(ViewSource):
+    """Fresh views of 48 x 36 pixels."""
+
+    def others(self, seed: int = 0):
+        for number in itertools.count(1):
+            yield from sample_views(self._scene, 8, 48, 36, seed=number)
+
+
+@pytest.fixture(scope="module")
+def pruned(hollow_ball):
+    return prune(hollow_ball, 300, "merge")
+
+
+def test_repair_comes_closer_in_views_that_it_has_not_seen(hollow_ball, pruned, ball_views):
+    before = [value.clone() for value in pruned.tensors()]
+    shares = []
+    repaired = repair(pruned, hollow_ball, Few(hollow_ball), RepairBudget("quick"), shares.append)
+    reference = DenseReference(hollow_ball, ball_views)
+    assert reference.psnr(repaired.scene)[0] > reference.psnr(pruned)[0] + 1
+    assert len(repaired.scene) == 300 and bool(repaired.scene.usable().all())
+    assert not any(value.requires_grad for value in repaired.scene.tensors())
+    assert all(torch.equal(a, b) for a, b in zip(before, pruned.tensors(), strict=True)), "the input was changed"
+    assert repaired.steps == STEPS["quick"] and not repaired.interrupted and repaired.seconds > 0
+    assert shares == pytest.approx([(i + 1) / STEPS["quick"] for i in range(STEPS["quick"])])
+
+
+def test_an_effort_gives_the_same_result_each_time(hollow_ball, pruned, monkeypatch):
+    monkeypatch.setitem(STEPS, "quick", 5)
+    first, second = (repair(pruned, hollow_ball, Few(hollow_ball), RepairBudget("quick")) for _ in range(2))
+    assert same(first.scene, second.scene) and not same(first.scene, pruned)
+
+
+def test_no_effort_takes_no_step_and_a_time_takes_that_long(hollow_ball, pruned, monkeypatch):
+    for budget in (RepairBudget("instant"), RepairBudget("thorough", 0.0)):
+        assert budget.empty
+        repaired = repair(pruned, hollow_ball, Few(hollow_ball), budget)
+        assert repaired.steps == 0 and same(repaired.scene, pruned)
+    clock = itertools.count()  # a second each time that anybody looks
+    monkeypatch.setattr(repair_module.time, "perf_counter", lambda: float(next(clock)))
+    assert repair(pruned, hollow_ball, Few(hollow_ball), RepairBudget("thorough", 7.0)).steps == 7
+
+
+def test_learning_rates_fall_to_nearly_nothing(hollow_ball, pruned, monkeypatch):
+    shares = []
+    monkeypatch.setattr(Optimiser, "step", lambda self, view, target, share: shares.append(share))
+    repair(pruned, hollow_ball, Few(hollow_ball), RepairBudget("quick"))
+    assert shares[0] == 1 and shares == sorted(shares, reverse=True) and 0.02 <= shares[-1] < 0.03
+
+
+def test_an_interruption_loses_nothing(hollow_ball, pruned):
+    def stop(share: float) -> None:
+        if share > 0.2:
+            raise KeyboardInterrupt
+
+    repaired = repair(pruned, hollow_ball, Few(hollow_ball), RepairBudget("quick"), stop)
+    assert repaired.interrupted and repaired.steps == 7  # 7/32 is the first share above 0.2
+    assert bool(repaired.scene.usable().all()) and not same(repaired.scene, pruned)
+
+
+@pytest.mark.parametrize(
+    ("effort", "seconds", "message"),
+    [("slow", None, "effort is 'slow'; expected one of instant, quick, thorough"), *(
+        ("quick", seconds, "the time to repair is") for seconds in (-1.0, math.nan, math.inf)
+    )],
+)  # fmt: skip
+def test_a_budget_that_means_nothing_is_refused(effort, seconds, message):
+    with pytest.raises(PointSplatError, match=message):
+        RepairBudget(effort, seconds)
+
+
+def test_views_to_optimise_on_are_none_of_those_compared(hollow_ball):
+    many = sample_views(hollow_ball, 40, 48, 36)
+    source = ViewSource(hollow_ball, given=many)
+    compared = {tuple(m.flatten().tolist()) for m in source.compared().viewmats}
+    first, second = (
+        [tuple(view.viewmat.flatten().tolist()) for view in itertools.islice(source.others(seed), 56)] for seed in (0, 1)
+    )
+    assert len(compared) == COMPARED_VIEWS and not compared & set(first)
+    assert len(set(first[:28])) == 28 and set(first[:28]) == set(first[28:]), "each once before any is repeated"
+    assert first != second
+
+
+def test_where_few_views_are_given_others_are_sampled_with_what_lies_behind(hollow_ball):
+    few = sample_views(hollow_ball, 3, 48, 36)
+    white = type(few)(few.viewmats, few.Ks, few.width, few.height, torch.ones(3))
+    taken = list(itertools.islice(ViewSource(hollow_ball, given=white).others(), 40))
+    places = {tuple(view.viewmat.flatten().tolist()) for view in taken}
+    assert len(places) == 40 and not places & {tuple(m.flatten().tolist()) for m in few.viewmats}
+    assert all(view.background.tolist() == [1, 1, 1] for view in taken)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_that_are_not_finite_and_values_that_are_not_stay_out(pruned, ball_views, dtype, monkeypatch):
+    scene = pruned.map(torch.clone).to(dtype)
+    scene.opacities[0], scene.scales[1, 2] = math.inf, -math.inf
+    optimiser = Optimiser(scene, RATES)
+
+    def spoiled(scene, view):
+        weight = torch.ones_like(scene.means)
+        weight[2] = math.nan
+        return render(scene, view) + 0.0 * (weight * scene.means).sum().nan_to_num()
+
+    monkeypatch.setattr("pointsplat_ns.compression.optimiser.render", spoiled)
+    optimiser.step(ball_views[0], torch.zeros(48, 64, 3, dtype=dtype))
+    after = optimiser.scene
+    assert after.opacities[0] == math.inf and after.scales[1, 2] == -math.inf
+    assert bool(after.usable().all()) and after.dtype == dtype
+    assert torch.equal(after.means[2], scene.means[2]), "a NaN gradient moves nothing"
+    assert not torch.equal(after.features_dc, scene.features_dc)
+
+
+def test_rates_of_the_means_follow_the_size_of_the_scene(pruned, ball_views):
+    """A scene a thousand times as large moves a thousand times as far."""
+    target = torch.zeros(48, 64, 3)
+    moved = []
+    for size in (1e-3, 1.0, 1e3):
+        scene = pruned.replace(means=pruned.means * size, scales=pruned.scales + math.log(size))
+        views = sample_views(scene, 2, 64, 48)
+        optimiser = Optimiser(scene, RATES)
+        optimiser.step(views[0], target)
+        moved.append(float((optimiser.scene.means - scene.means).abs().max()) / size)
+    assert moved[0] == pytest.approx(moved[1], rel=1e-2) and moved[2] == pytest.approx(moved[1], rel=1e-2)
