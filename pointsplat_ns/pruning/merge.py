@@ -252,9 +252,9 @@ class Merging:
         viewmats = views.viewmats.double().cpu().clone()
         viewmats[:, :3, 3] += viewmats[:, :3, :3] @ self.centre
         viewmats[:, :3, 3] *= UNITS / self.size
-        return dataclasses.replace(
-            views, viewmats=viewmats, Ks=views.Ks.double().cpu(), background=views.background.cpu()
-        )
+        near_plane = views.near_plane * UNITS / self.size
+        Ks, background = views.Ks.double().cpu(), views.background.cpu()
+        return dataclasses.replace(views, viewmats=viewmats, Ks=Ks, background=background, near_plane=near_plane)
 
     def _see(self) -> None:
         """Render what remains, once it is few enough."""

@@ -188,6 +188,7 @@ def _project(means: Tensor, stds: Tensor, scene: Gaussians, views: Views, index:
         views.Ks[index].to(means),
         views.width,
         views.height,
+        near_plane=views.near_plane,
         antialiased=views.rasterize_mode == "antialiased",
     )
 
