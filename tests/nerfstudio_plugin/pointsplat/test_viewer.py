@@ -12,9 +12,9 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModel
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
-from making import fast_config, run_of, same
+from making import fast_config, pipeline_of, run_of, same
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io import read_ply, read_scene
+from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.pruning import prune
 
 
@@ -93,3 +93,24 @@ def test_the_cli_exports_any_scene_of_the_run(trained, trained_walls, tmp_path):
     with pytest.raises(SceneError, match="scene 'wall-z': no such scene.*wall-a, wall-b"):
         export(config.get_base_dir(), tmp_path / "z.ply", scene="wall-z")
     assert not (tmp_path / "z.ply").exists()
+
+
+def test_ns_render_draws_the_views_of_the_dataset(trained_walls, tmp_path):
+    from nerfstudio.scripts.render import DatasetRender
+
+    config = fast_config(trained_walls, tmp_path / "runs")
+    config.save_config()
+    config.get_checkpoint_dir().mkdir()
+    state = config.pipeline.setup(device="cpu", test_mode="inference").state_dict()
+    torch.save({"step": 9, "pipeline": state}, config.get_checkpoint_dir() / "step-000000009.ckpt")
+    DatasetRender(config.get_base_dir() / "config.yml", output_path=tmp_path / "renders", split="train+test").main()
+    for split in ("train", "test"):
+        folders = (tmp_path / "renders" / split / name for name in ("gt-rgb", "rgb"))
+        photos, renders = (sorted(path.name for path in folder.iterdir()) for folder in folders)
+        assert photos == renders and len(photos) > 1, split
+
+
+def test_a_training_does_not_save_the_transform_of_one_scene_as_its_own(hollow_ball, tmp_path):
+    write_ply(hollow_ball, tmp_path / "ball.ply")
+    pipeline = pipeline_of(tmp_path / "ball.ply", test_mode="val")
+    assert not hasattr(pipeline.datamanager, "train_dataparser_outputs")
