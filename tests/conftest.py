@@ -14,12 +14,21 @@ import pytest
 import torch
 
 from making import SHARED_DATA
+from pointsplat_ns.compression import repair
 from pointsplat_ns.gaussians import Gaussians
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 WALL_DISTANCE = 2.0
 DEPTH_SCALE = 6553.5
 NUM_FRAMES = 11
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_repair_by_default():
+    """``compact`` optimises for seconds unless told otherwise; here only those tests wait for it that are about it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(repair.STEPS, "quick", 0)
+        yield
 
 
 def wall_colors(x: np.ndarray, y: np.ndarray) -> np.ndarray:

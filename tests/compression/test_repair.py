@@ -28,6 +28,12 @@ class Few(ViewSource):
             yield from sample_views(self._scene, 8, 48, 36, seed=number)
 
 
+@pytest.fixture(autouse=True)
+def quick_as_it_ships(monkeypatch):
+    """Other tests go without."""
+    monkeypatch.setitem(STEPS, "quick", 32)
+
+
 @pytest.fixture(scope="module")
 def pruned(hollow_ball):
     return prune(hollow_ball, 300, "merge")
