@@ -15,6 +15,7 @@ from making import ball, same
 from pointsplat_ns import api
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression import trained_refiner
+from pointsplat_ns.compression.repair import STEPS
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.pruning import METHODS, prune
@@ -216,3 +217,25 @@ def test_files_that_exist_are_only_overwritten_by_force(ply, helps, tmp_path, ca
 def test_a_method_that_there_is_not_is_refused_with_the_list_of_those_there_are(ply, helps, tmp_path, capsys):
     said = refusal(capsys, tmp_path / "small.ply", ply, "--refiner", helps, "--by", "best")
     assert f"expected one of {', '.join(METHODS)}" in said
+
+
+def test_a_scene_is_repaired_as_long_as_asked_and_what_it_brought_and_cost_is_said(
+    tmp_path, helps, capsys, monkeypatch
+):
+    """By an effort, of which the number of steps is known."""
+    monkeypatch.setitem(STEPS, "quick", 25)
+    write_ply(room(400), tmp_path / "room.ply")
+    options = ("--refiner", helps, "--keep", "40", "--by", "merge", "--effort", "quick", "-o", tmp_path / "small.ply")
+    run("compact", tmp_path / "room.ply", *options, "--picture", tmp_path / "shown.png")
+    said = " ".join(capsys.readouterr().out.split())
+    found = re.search(r"repair, 25 steps in [\d.]+ s: ([\d.]+) -> ([\d.]+) dB against the dense scene's renders", said)
+    assert found is not None, said
+    assert float(found[2]) >= float(found[1]) + compact_module.MIN_GAIN
+    assert re.search(r"kept( and refined)? and repaired 40 of 400", said)
+    assert "repaired, side by side" in said
+    assert len(read_ply(tmp_path / "small.ply")) == 40
+
+
+def test_a_time_or_effort_that_means_nothing_is_refused_before_the_scene_is_read(tmp_path, ply, helps, capsys):
+    said = refusal(capsys, tmp_path / "small.ply", tmp_path / "gone.ply", "--refiner", helps, "--seconds", "-1")
+    assert "the time to repair is -1 s; expected 0 or more" in said

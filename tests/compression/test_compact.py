@@ -13,6 +13,7 @@ from making import ball, same
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.compact import MIN_GAIN, Compacted, at_strength, bottom_of_parabola, compact_scene
 from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.repair import RepairBudget, Repaired
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
@@ -88,7 +89,7 @@ def test_a_refiner_that_helps_is_kept_and_the_figures_are_those_of_the_renders(s
 
 def test_the_psnr_of_the_result_is_that_of_the_scene_returned(scene, views):
     reference = DenseReference(scene, views)
-    for refiner, accepted in ((tiny_refiner("scales", 0.1), True), (tiny_refiner("features_dc", 2.0), False)):
+    for refiner, accepted in ((tiny_refiner("scales", 0.1), True), (tiny_refiner("features_dc", -2.0), False)):
         result = compacted(scene, trained(refiner), views)
         assert result.accepted == accepted
         assert result.psnr == reference.psnr(result.scene)[0]
@@ -97,7 +98,7 @@ def test_the_psnr_of_the_result_is_that_of_the_scene_returned(scene, views):
 
 
 def test_a_refiner_that_harms_is_left_out_and_both_figures_are_said(scene, views):
-    result = compacted(scene, trained(tiny_refiner("features_dc", 2.0)), views)
+    result = compacted(scene, trained(tiny_refiner("features_dc", -2.0)), views)
     assert not result.accepted and same(result.scene, prune(scene, 0.5, "opacity"))
     assert not same(result.refined, result.scene)
     assert result.after.psnr < result.before.psnr
@@ -280,3 +281,29 @@ def test_progress_names_what_is_done_and_never_goes_back(scene, views):
     assert list(dict.fromkeys(what for what, _ in steps)) == ["by merge", "refining", "comparing renders"]
     shares = [share for what, share in steps if what == "comparing renders"]
     assert shares == sorted(shares) and shares[-1] == 1 and all(0 <= share <= 1 for _, share in steps)
+
+
+def test_a_repair_that_helps_is_kept_and_one_that_harms_is_left_out(scene, views, monkeypatch):
+    """Also one that is not finite."""
+    refiner, budget = trained(tiny_refiner()), RepairBudget("quick", 1.0)
+    pruned, reference = prune(scene, 0.5, "opacity"), DenseReference(scene, views)
+    larger = pruned.replace(scales=pruned.scales + 0.1)
+    spoiled = pruned.replace(features_dc=pruned.features_dc * math.nan)
+    far = pruned.replace(features_dc=pruned.features_dc + 2.0)
+    for made, kept in ((larger, True), (far, False), (spoiled, False)):
+        monkeypatch.setattr(compact_module, "repair", lambda *_, made=made, kept=kept: Repaired(made, 5, 0.5, not kept))
+        result = compacted(scene, refiner, views, budget=budget)
+        assert (result.scene is made) == kept and result.repaired.scene is made
+        assert same(result.scene, made if kept else pruned)
+        assert result.psnr == reference.psnr(result.scene)[0] and result.psnr >= result.before.psnr
+        line = result.verdict.splitlines()[1]
+        assert line.startswith("repair, 5 steps in 0.5 s: " if kept else "repair left out, ")
+        assert ("interrupted" in line) == (not kept)
+
+
+def test_what_cannot_be_compared_or_is_as_good_as_can_be_is_not_repaired(scene, views, monkeypatch):
+    monkeypatch.setattr(compact_module, "repair", None)  # a call of it would fail
+    budget = RepairBudget("quick", 1.0)
+    blind = compact_scene(scene, trained(tiny_refiner()), views=NoViews(scene), budget=budget)
+    whole = compacted(scene, trained(tiny_refiner()), views, 1.0, budget=budget)
+    assert blind.repaired is None and whole.repaired is None and same(whole.scene, scene)

@@ -101,7 +101,8 @@ def test_views_to_optimise_on_are_none_of_those_compared(hollow_ball):
     source = ViewSource(hollow_ball, given=many)
     compared = {tuple(m.flatten().tolist()) for m in source.compared().viewmats}
     first, second = (
-        [tuple(view.viewmat.flatten().tolist()) for view in itertools.islice(source.others(seed), 56)] for seed in (0, 1)
+        [tuple(view.viewmat.flatten().tolist()) for view in itertools.islice(source.others(seed), 56)]
+        for seed in (0, 1)
     )
     assert len(compared) == COMPARED_VIEWS and not compared & set(first)
     assert len(set(first[:28])) == 28 and set(first[:28]) == set(first[28:]), "each once before any is repeated"
