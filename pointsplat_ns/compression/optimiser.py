@@ -35,9 +35,18 @@ class Optimiser:
         scene: K Gaussians; they are copied.
         rates: learning rates by parameter name; that of the means is multiplied by the extent of the scene.
         betas: decay of Adam's averages of the gradient and of its square.
+        damping: Adam's epsilon, as a share of the root mean square of a parameter's gradient, over what is seen in the
+            first step. Adam moves all Gaussians equally far, also those that are right already and whose gradients are
+            next to nothing; what is damped moves less.
     """
 
-    def __init__(self, scene: Gaussians, rates: dict[str, float], betas: tuple[float, float] = (0.9, 0.999)):
+    def __init__(
+        self,
+        scene: Gaussians,
+        rates: dict[str, float],
+        betas: tuple[float, float] = (0.9, 0.999),
+        damping: float = 0.0,
+    ):
         centred = scene.means.detach().double() - scene.means.detach().double().mean(0)
         extent = float(centred.norm(dim=1).quantile(0.9)) or 1.0
         self._parameters = {name: value.detach().clone().requires_grad_() for name, value in scene.items()}
@@ -47,6 +56,7 @@ class Optimiser:
             rate = rates[name] * (extent if name == "means" else 1.0)
             if value.numel():
                 groups.append({"params": [value], "lr": rate, "peak": rate})
+        self._damping = damping
         self._adam = torch.optim.Adam(groups, betas=betas, eps=1e-15, fused=True)
 
     @property
@@ -69,7 +79,17 @@ class Optimiser:
                 value.grad.nan_to_num_(0.0, 0.0, 0.0)[self._fixed[name]] = 0.0
         for group in self._adam.param_groups:
             group["lr"] = share * group["peak"]
+            if self._damping and "damped" not in group:
+                group["eps"], group["damped"] = max(1e-15, self._damping * seen_rms(group["params"][0].grad)), True
         self._adam.step()
+
+
+def seen_rms(gradient: Tensor | None) -> float:
+    """Root mean square of the gradients that are not 0, in float64; 0 if all are."""
+    if gradient is None:
+        return 0.0
+    seen = gradient[gradient != 0].double()
+    return float(seen.square().mean().sqrt()) if seen.numel() else 0.0
 
 
 def _loss(image: Tensor, target: Tensor) -> Tensor:

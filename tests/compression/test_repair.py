@@ -11,7 +11,7 @@ import torch
 import pointsplat_ns.compression.repair as repair_module
 from making import same
 from pointsplat_ns.compression.closeness import DenseReference
-from pointsplat_ns.compression.optimiser import RATES, Optimiser
+from pointsplat_ns.compression.optimiser import RATES, Optimiser, seen_rms
 from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.compression.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.errors import PointSplatError
@@ -149,3 +149,33 @@ def test_rates_of_the_means_follow_the_size_of_the_scene(pruned, ball_views):
         optimiser.step(views[0], target)
         moved.append(float((optimiser.scene.means - scene.means).abs().max()) / size)
     assert moved[0] == pytest.approx(moved[1], rel=1e-2) and moved[2] == pytest.approx(moved[1], rel=1e-2)
+
+
+def test_what_is_right_already_hardly_moves_where_steps_are_damped(pruned, ball_views):
+    """Adam alone moves it as far as everything else."""
+    view = ball_views[0]
+    target = render(pruned, view).detach()
+    target[:, : view.width // 2] = (target[:, : view.width // 2] + 0.3).clamp(max=1)
+    target[:, view.width // 2 :] += 1e-4 * torch.randn(target[:, view.width // 2 :].shape)
+    moved = []
+    for damping in (0.0, 0.5):
+        optimiser = Optimiser(pruned, RATES, damping=damping)
+        for _ in range(3):
+            optimiser.step(view, target)
+        shift = (optimiser.scene.features_dc - pruned.features_dc).abs().amax(1)
+        points = (pruned.means.double() @ view.viewmat[:3, :3].T.double() + view.viewmat[:3, 3].double()).float()
+        column = points[:, 0] / points[:, 2] * view.K[0, 0] + view.K[0, 2]
+        ahead = (points[:, 2] > 0.1) & (shift > 0)
+        wrong, right = ahead & (column < 0.3 * view.width), ahead & (column > 0.75 * view.width)
+        assert bool(wrong.any()) and bool(right.any())
+        moved.append(float(shift[right].median() / shift[wrong].median()))
+    assert moved[0] > 2 * moved[1] > 0
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e-20, 1.0, 1e18])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_size_of_gradients_is_right_at_the_extremes(size, dtype):
+    gradient = torch.zeros(6, 2, dtype=dtype)
+    gradient[:3] = torch.tensor([1.0, -2.0, 2.0], dtype=dtype)[:, None] * size
+    assert seen_rms(gradient) == pytest.approx(size * 3**0.5, rel=1e-6)
+    assert seen_rms(None) == 0 and seen_rms(gradient[:0]) == 0
