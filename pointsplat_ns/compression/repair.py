@@ -25,8 +25,7 @@ FASTER = 8.0
 """Factor on the learning rates of 3DGS, which suit 30,000 steps."""
 
 DAMPING = 0.5
-"""See :class:`Optimiser`. Without it and with half the rates, what changes is gained alike, but what was right already is
-disturbed."""
+"""See :class:`Optimiser`. Half the rates without it gain as much where a scene is wrong, but disturb what was right."""
 
 BETAS = (0.8, 0.98)
 """Decays of Adam's averages: shorter than usual, as there are few steps."""
