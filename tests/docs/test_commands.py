@@ -105,7 +105,8 @@ def inline_code() -> Iterator[tuple[Path, str]]:
 def runs_quickly(words: tuple[str, ...]) -> bool:
     """Whether a command makes the example room small with nothing else at hand and no optimisation."""
     ours = words[:1] == ("pointsplat",) and words[1] in ("prune", "compact") and words[2] == "room.ply"
-    return ours and "--fine-tune" not in words and not any(word.startswith("outputs/") for word in words)
+    optimises = {"--fine-tune", "--seconds"} & {*words}
+    return ours and not optimises and not any(word.startswith("outputs/") for word in words)
 
 
 BLOCKS = [block for page in PAGES for block in blocks_of(page)]
