@@ -105,7 +105,8 @@ def compact_scene(
     parabola through the errors at 0, 1/2 and 1, where the error is least if renders change linearly with the residuals.
     The best is kept if it gains at least :data:`MIN_GAIN`. A requested PSNR (``auto``) is reached before refinement, so
     that it holds in any case. Then the scene is repaired (:func:`~pointsplat_ns.compression.repair.repair`), from views
-    other than those compared; that, too, is kept if it gains as much.
+    other than those compared; that, too, is kept if it gains as much, and
+    is closer in at least half of the views.
 
     Args:
         dense: N Gaussians.
@@ -158,7 +159,7 @@ def compact_scene(
         repaired = repair(scene.to(device), dense.to(device), views, budget, functools.partial(progress, "repairing"))
         after_repair = reference.closeness(repaired.scene)
         verdict += "\n" + _repair_verdict(close, after_repair, repaired)
-        if helps(close, after_repair):
+        if helps(close, after_repair) and _in_most_views(close, after_repair):
             scene = repaired.scene
     seconds = time.perf_counter() - start
     return Compacted(
@@ -263,15 +264,27 @@ def helps(before: Closeness, after: Closeness) -> bool:
 
 def _figures(before: Closeness, after: Closeness) -> str:
     """Errors before and after in words."""
-    count = len(before.errors)
-    better = sum(new < old for new, old in zip(after.errors, before.errors, strict=True))
+    count, better = len(before.errors), _closer_in(before, after)
     figures = f"{before.psnr:.2f} -> {after.psnr:.2f} dB against the dense scene's renders in {views_text(count)}"
     if before.ssim is not None and after.ssim is not None:
         figures += f", SSIM {before.ssim:.3f} -> {after.ssim:.3f}"
     return f"{figures}, worst view {before.worst:.2f} -> {after.worst:.2f} dB, closer in {better} of {count}"
 
 
+def _closer_in(before: Closeness, after: Closeness) -> int:
+    """Number of views in which a scene has come closer."""
+    return sum(new < old for new, old in zip(after.errors, before.errors, strict=True))
+
+
+def _in_most_views(before: Closeness, after: Closeness) -> bool:
+    """Whether a scene has come closer in at least half of the views: a gain over all pixels may be that of a few views,
+    paid for by the others."""
+    return 2 * _closer_in(before, after) >= len(before.errors)
+
+
 def _left_out(before: Closeness, after: Closeness) -> str:
+    if helps(before, after):
+        return "it is farther in most views"
     return "it does not help" if after.psnr <= before.psnr else f"it brings less than {MIN_GAIN:g} dB"
 
 
@@ -289,6 +302,6 @@ def _verdict(before: Closeness, after: Closeness, strength: float) -> str:
 def _repair_verdict(before: Closeness, after: Closeness, repaired: Repaired) -> str:
     """One line of text: what the repair gained and cost, or why it was left out."""
     cost = f"{repaired.steps} steps in {repaired.seconds:.1f} s" + (", interrupted" if repaired.interrupted else "")
-    if helps(before, after):
+    if helps(before, after) and _in_most_views(before, after):
         return f"repair, {cost}: {_figures(before, after)}"
     return f"repair left out, {_left_out(before, after)} ({cost}): {_figures(before, after)}"

@@ -10,7 +10,7 @@ import torch
 
 import pointsplat_ns.compression.compact as compact_module
 from making import ball, same
-from pointsplat_ns.compression.closeness import DenseReference
+from pointsplat_ns.compression.closeness import Closeness, DenseReference
 from pointsplat_ns.compression.compact import MIN_GAIN, Compacted, at_strength, bottom_of_parabola, compact_scene
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import RepairBudget, Repaired
@@ -307,3 +307,18 @@ def test_what_cannot_be_compared_or_is_as_good_as_can_be_is_not_repaired(scene, 
     blind = compact_scene(scene, trained(tiny_refiner()), views=NoViews(scene), budget=budget)
     whole = compacted(scene, trained(tiny_refiner()), views, 1.0, budget=budget)
     assert blind.repaired is None and whole.repaired is None and same(whole.scene, scene)
+
+
+def test_a_repair_that_most_views_pay_for_is_left_out(scene, views, monkeypatch):
+    """Over all pixels it is a gain."""
+    pruned = prune(scene, 0.5, "opacity")
+    made = pruned.replace(scales=pruned.scales + 0.1)
+
+    def closeness(self, scene, progress=None):
+        return Closeness((0.9, 0.2, 0.2) if same(scene, pruned) else (0.1, 0.21, 0.21), None)
+
+    monkeypatch.setattr(DenseReference, "closeness", closeness)
+    monkeypatch.setattr(compact_module, "repair", lambda *_: Repaired(made, 5, 0.5, False))
+    result = compacted(scene, trained(tiny_refiner()), views, budget=RepairBudget("quick", 1.0))
+    assert same(result.scene, pruned) and result.after_repair.psnr > result.before.psnr + 3
+    assert "repair left out, it is farther in most views (5 steps in 0.5 s)" in result.verdict
