@@ -17,6 +17,7 @@ from pointsplat_ns.compression.cleaning import Cleaning, blend_weights, clean_sc
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, write_ply
 from pointsplat_ns.pruning import WithinPsnr, resolve_keep
@@ -244,7 +245,13 @@ def test_a_visible_loss_is_measured(room, views, monkeypatch):
 
 
 def test_without_a_free_place_or_views_only_the_undrawable_go(monkeypatch):
-    scene = with_junk(box_room(0, 40, size=0.05))  # too few to enclose anything
+    def nowhere(*_, **options):
+        raise DataError("no free place to look from was found")
+
+    monkeypatch.setattr("pointsplat_ns.pruning.viewpoints.sample_views", nowhere)
+    monkeypatch.setattr("pointsplat_ns.compression.cleaning.sample_views", nowhere)
+    monkeypatch.setattr("pointsplat_ns.compression.view_source.sample_views", nowhere)
+    scene = with_junk(box_room(0, 40, size=0.05))
     junk = find_junk(scene)
     assert junk.places == 0 and len(junk.unseen) == 0
     (first, second) = clean_scene(scene, 1, ViewSource(scene)).notes
