@@ -106,9 +106,8 @@ def sample_views(
         width: of the images, pixels.
         height: of the images, pixels. The field of view is 70 degrees across the longer side.
         seed: the same scene and seed give the same views, another seed gives others.
-        up: (3,) which way is up in the world, of any length; by default it is estimated from the scene, see
-
-            :mod:`pointsplat_ns.pruning.upright`.
+        up: (3,) which way is up in the world, of any length; by default it is estimated from the scene
+            (:mod:`pointsplat_ns.pruning.upright`).
 
     Returns:
         ``count`` views, on the CPU, over black: ``viewmats`` (count, 4, 4) from world to camera in OpenCV axes and

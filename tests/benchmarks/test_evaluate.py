@@ -15,7 +15,7 @@ from pointsplat_ns.compression.trained_refiner import load_refiner
 from pointsplat_ns.refiner import save_refiner
 
 BENCHMARKS = REPOSITORY / "benchmarks"
-PROGRAMS = ("compaction", "example_room", "quality", "rasterizer", "refinement", "refiner")
+PROGRAMS = ("compaction", "example_room", "quality", "rasterizer", "refinement", "refiner", "repair", "sampled_views")
 
 
 def run(*words: object) -> str:

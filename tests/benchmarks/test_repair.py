@@ -1,0 +1,39 @@
+"""The benchmarks of repairing and of sampled views, end to end on a painted wall."""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+from pathlib import Path
+
+from making import REPOSITORY
+
+
+def run(name: str, *words: object) -> str:
+    """What a benchmark prints."""
+    command = [sys.executable, REPOSITORY / "benchmarks" / name, *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def wall_of(trained_walls: Path) -> Path:
+    (scene,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
+    return scene
+
+
+def test_every_repair_is_a_row_and_a_point_of_the_picture(trained_walls, tmp_path):
+    options = ("--keep", "50%", "--seconds", "0.1", "--fine-tune-steps", "1", "--views", "1")
+    said = run("repair.py", wall_of(trained_walls), *options, "--output", tmp_path / "repair.csv")
+    with (tmp_path / "repair.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["kind"] for row in rows] == ["merge", "refiner", "fine-tune", "repair", "repair"]
+    assert [row["steps"] for row in rows[:4]] == ["0", "0", "1", "32"] and int(rows[4]["steps"]) >= 1
+    assert all(float(row[name]) > 5 for row in rows for name in ("psnr_a", "psnr_b", "photo_psnr"))
+    assert said.count("photos") == 5
+    assert (tmp_path / "repair.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_sampled_views_are_held_against_poses_of_photos(trained_walls):
+    assert "wall-a" in run("sampled_views.py", wall_of(trained_walls), "--views", "1", "--side", "32")
