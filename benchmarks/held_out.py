@@ -18,7 +18,7 @@ from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.rasterizer import render, render_depth
-from pointsplat_ns.views import View, Views
+from pointsplat_ns.views import View, Views, spread_indices
 
 COLUMNS = ("psnr", "ssim", "lpips")
 REFERENCES = ("photo", "dense")
@@ -89,8 +89,7 @@ def photos_of(path: Path, split: Literal["train", "test"], count: int) -> tuple[
     scene = TrainedScene(scene_name(run), run, MemoryCache(0))
     frames = scene.train_frames if split == "train" else scene.eval_frames
     total = len(frames)
-    taken = range(total) if count >= total else torch.linspace(0, total - 1, count).round().long().tolist()
-    shown = [frames[i] for i in taken]
+    shown = [frames[i] for i in spread_indices(total, count)]
     photos = [data["image"][..., :3] for _, data in shown]
     photos = [photo.float() / 255 if photo.dtype == torch.uint8 else photo.float() for photo in photos]
     height, width = photos[0].shape[:2]
@@ -123,6 +122,12 @@ def compare(scene: Scene, small: Gaussians, lpips: Lpips | None) -> dict[str, fl
                 values.setdefault(f"{against}_lpips", []).append(float(lpips(image, target)))
     names = [f"{against}_{column}" for against in REFERENCES for column in COLUMNS]
     return {name: fmean(values[name]) if name in values else None for name in (*names, *HALVES, BRIGHTNESS)}
+
+
+@torch.no_grad()
+def mean_psnr(scene: Gaussians, views: Views, pictures: list[Tensor]) -> float:
+    """Mean PSNR of a scene's renders against one picture (H, W, 3) a view, dB, each at most :data:`MOST_PSNR`."""
+    return fmean(_psnr(render(scene, view), picture) for view, picture in zip(views, pictures, strict=True))
 
 
 def _psnr(image: Tensor, target: Tensor) -> float:

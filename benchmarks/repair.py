@@ -12,12 +12,11 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from statistics import fmean
 from typing import Annotated
 
 import torch
 import tyro
-from held_out import MOST_PSNR, name_of, photos_of
+from held_out import mean_psnr, name_of, photos_of
 from torch import Tensor
 
 import pointsplat_ns as ps
@@ -71,16 +70,11 @@ class Judge:
             _, views, photos = photos_of(path, "test", count)
             self.photos = (views, photos)
 
-    @torch.no_grad()
     def psnr(self, scene: Gaussians) -> dict[str, float | None]:
         """Mean PSNR in each set and against the photos."""
-        values = [fmean(_psnr(scene, view, image) for view, image in zip(*pair, strict=True)) for pair in self.sets]
-        photo = self.photos and fmean(_psnr(scene, view, image) for view, image in zip(*self.photos, strict=True))
-        return {"psnr_a": values[0], "psnr_b": values[1], "photo_psnr": photo}
-
-
-def _psnr(scene: Gaussians, view: ps.View, target: Tensor) -> float:
-    return min(float(ps.psnr(ps.render(scene, view), target)), MOST_PSNR)
+        first, second = (mean_psnr(scene, *pair) for pair in self.sets)
+        photo = self.photos and mean_psnr(scene, *self.photos)
+        return {"psnr_a": first, "psnr_b": second, "photo_psnr": photo}
 
 
 def rows_of(path: Path, keep: str, seconds: list[float], fine_tune_steps: list[int], count: int) -> Iterator[Row]:

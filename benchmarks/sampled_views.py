@@ -14,11 +14,10 @@ import dataclasses
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean
 
 import torch
 import tyro
-from held_out import MOST_PSNR, name_of, photos_of
+from held_out import mean_psnr, name_of, photos_of
 from torch import Tensor
 
 import pointsplat_ns as ps
@@ -40,11 +39,9 @@ class Judged:
     views: ps.Views
     pictures: list[Tensor]  # [H, W, 3]
 
-    @torch.no_grad()
     def psnr(self, scene: ps.Gaussians) -> float:
         """Mean PSNR over the views, dB."""
-        pairs = zip(self.views, self.pictures, strict=True)
-        return fmean(min(float(ps.psnr(ps.render(scene, view), picture)), MOST_PSNR) for view, picture in pairs)
+        return mean_psnr(scene, self.views, self.pictures)
 
 
 @torch.no_grad()

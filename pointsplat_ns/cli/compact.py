@@ -71,8 +71,7 @@ def compact(
     )
     if not dry_run:
         ps.save(result.scene, output)
-    repaired = result.repaired is not None and result.scene is result.repaired.scene
-    what = "kept" + (" and refined" if result.accepted else "") + (" and repaired" if repaired else "")
+    what = "kept" + (" and refined" if result.accepted else "") + (" and repaired" if result.repair_accepted else "")
     print_result(what, len(dense), result.scene, result.seconds, None if dry_run else output)
     print_distributions(dense, result.scene)
     if picture is not None:

@@ -68,9 +68,14 @@ class Compacted:
     """Errors of the repaired scene; None if there is none."""
 
     @property
+    def repair_accepted(self) -> bool:
+        """Whether ``scene`` is the repaired one."""
+        return self.repaired is not None and self.scene is self.repaired.scene
+
+    @property
     def closeness(self) -> Closeness | None:
         """Errors of ``scene`` against the reference; None if nothing was compared."""
-        if self.repaired is not None and self.scene is self.repaired.scene:
+        if self.repair_accepted:
             return self.after_repair
         return self.after if self.accepted else self.before
 
@@ -105,8 +110,8 @@ def compact_scene(
     parabola through the errors at 0, 1/2 and 1, where the error is least if renders change linearly with the residuals.
     The best is kept if it gains at least :data:`MIN_GAIN`. A requested PSNR (``auto``) is reached before refinement, so
     that it holds in any case. Then the scene is repaired (:func:`~pointsplat_ns.compression.repair.repair`), from views
-    other than those compared; that, too, is kept if it gains as much, and
-    is closer in at least half of the views.
+    other than those compared; that, too, is kept if it gains as much, and is closer in at least half of
+    the views.
 
     Args:
         dense: N Gaussians.
@@ -159,7 +164,7 @@ def compact_scene(
         repaired = repair(scene.to(device), dense.to(device), views, budget, functools.partial(progress, "repairing"))
         after_repair = reference.closeness(repaired.scene)
         verdict += "\n" + _repair_verdict(close, after_repair, repaired)
-        if helps(close, after_repair) and _in_most_views(close, after_repair):
+        if _repair_helps(close, after_repair):
             scene = repaired.scene
     seconds = time.perf_counter() - start
     return Compacted(
@@ -276,13 +281,14 @@ def _closer_in(before: Closeness, after: Closeness) -> int:
     return sum(new < old for new, old in zip(after.errors, before.errors, strict=True))
 
 
-def _in_most_views(before: Closeness, after: Closeness) -> bool:
-    """Whether a scene has come closer in at least half of the views: a gain over all pixels may be that of a few views,
-    paid for by the others."""
-    return 2 * _closer_in(before, after) >= len(before.errors)
+def _repair_helps(before: Closeness, after: Closeness) -> bool:
+    """Whether a repair is worth keeping: also closer in at least half of the views, as a gain over all pixels may be
+    that of a few views, paid for by the others."""
+    return helps(before, after) and 2 * _closer_in(before, after) >= len(before.errors)
 
 
 def _left_out(before: Closeness, after: Closeness) -> str:
+    """Why what brought these errors was left out."""
     if helps(before, after):
         return "it is farther in most views"
     return "it does not help" if after.psnr <= before.psnr else f"it brings less than {MIN_GAIN:g} dB"
@@ -302,6 +308,6 @@ def _verdict(before: Closeness, after: Closeness, strength: float) -> str:
 def _repair_verdict(before: Closeness, after: Closeness, repaired: Repaired) -> str:
     """One line of text: what the repair gained and cost, or why it was left out."""
     cost = f"{repaired.steps} steps in {repaired.seconds:.1f} s" + (", interrupted" if repaired.interrupted else "")
-    if helps(before, after) and _in_most_views(before, after):
+    if _repair_helps(before, after):
         return f"repair, {cost}: {_figures(before, after)}"
     return f"repair left out, {_left_out(before, after)} ({cost}): {_figures(before, after)}"

@@ -16,7 +16,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import content_hash, open_run, write_ply
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.pruning.view_sampling import content_box
+from pointsplat_ns.pruning.content import content_box
 from pointsplat_ns.rasterizer import render
 
 if TYPE_CHECKING:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.views import spread_indices
 
 SHOWN_VIEWS = 3
 """Number of views in the image, spread over those compared."""
@@ -47,7 +49,7 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> st
     if result.reference is None:
         return f"{path}: not drawn, as there is no view to draw"
     views, renders = result.reference.views, result.reference.renders
-    shown = torch.linspace(0, len(views) - 1, min(SHOWN_VIEWS, len(views))).round().int().tolist()
+    shown = spread_indices(len(views), SHOWN_VIEWS)
     names, scenes = ["dense", "before refinement"], [result.pruned]
     titles = [_title("dense", dense, None), _title("before refinement", result.pruned, result.before)]
     if result.after is not None:
@@ -56,7 +58,7 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> st
         titles.append(_title(names[-1], result.refined, result.after))
         scenes.append(result.refined)
     if result.repaired is not None:
-        names.append("repaired" if result.scene is result.repaired.scene else "repaired (left out)")
+        names.append("repaired" if result.repair_accepted else "repaired (left out)")
         titles.append(_title(names[-1], result.repaired.scene, result.after_repair))
         scenes.append(result.repaired.scene)
     rows = [[renders[i].cpu(), *(render(scene, views[i]).cpu() for scene in scenes)] for i in shown]
@@ -69,7 +71,7 @@ def _title(name: str, scene: Gaussians, close: Closeness | None) -> str:
     return f"{name}: {size}" + (f", {close.psnr:.2f} dB" if close is not None else "")
 
 
-def side_by_side(rows: list[list[ArrayLike]], titles: list[str], path: Path | str) -> None:
+def side_by_side(rows: Sequence[Sequence[ArrayLike]], titles: list[str], path: Path | str) -> None:
     """Draw a grid of images of one size, a title above each column.
 
     Args:

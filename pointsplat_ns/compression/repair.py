@@ -59,8 +59,9 @@ class RepairBudget:
         return self.seconds == 0 if self.seconds is not None else STEPS[self.effort] == 0
 
     def share_done(self, steps: int, seconds: float) -> float:
-        """Share of the budget that so many steps, which took so long, have used; 1 or more at the end."""
-        return seconds / self.seconds if self.seconds else steps / max(STEPS[self.effort], 1)
+        """Share of the budget, which must not be empty, that so many steps, which took so long, have used; 1 or more at
+        the end."""
+        return seconds / self.seconds if self.seconds is not None else steps / STEPS[self.effort]
 
 
 @dataclass(frozen=True)

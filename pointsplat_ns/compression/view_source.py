@@ -86,6 +86,10 @@ class ViewSource:
 
     def compared(self) -> Views:
         """The views that renders are compared in: at most 12, with a longer side of at most 400 pixels."""
+        return self._compared
+
+    @cached_property
+    def _compared(self) -> Views:
         return self.views(COMPARED_VIEWS).resized(COMPARED_SIDE)
 
     def others(self, seed: int = 0) -> Iterator[View]:

@@ -24,13 +24,14 @@ from torch import Tensor
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
+from pointsplat_ns.pruning.content import UNITS, content_size, in_units
 from pointsplat_ns.pruning.covariance import TINY, unpack
 from pointsplat_ns.pruning.coverage import curve_keys, unit_cells
 from pointsplat_ns.pruning.finishing import SIDE, Finish, Reference
 from pointsplat_ns.pruning.matching import cheapest_pairs
 from pointsplat_ns.pruning.merge_state import CHUNK, OPAQUE, start
 from pointsplat_ns.pruning.pair_costs import costs_of
-from pointsplat_ns.pruning.viewpoints import UNITS, content_size, in_units, viewpoints, weights_seen
+from pointsplat_ns.pruning.viewpoints import viewpoints, weights_seen
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
 from pointsplat_ns.views import Views
 

@@ -83,9 +83,14 @@ class UprightBox:
 
 def level_directions(up: Tensor, turn: Tensor) -> Tensor:
     """Directions (n, 3) across ``up`` (3,), by their angle (n,) about it, radians."""
-    right = torch.linalg.cross(up, torch.eye(3, dtype=up.dtype)[int(up.abs().argmin())])
-    right = right / right.norm()
+    right = _across(up)
     return turn.cos()[:, None] * right + turn.sin()[:, None] * torch.linalg.cross(up, right)
+
+
+def _across(axes: Tensor) -> Tensor:
+    """A direction at a right angle to each axis (..., 3)."""
+    right = torch.linalg.cross(axes, torch.eye(3, dtype=axes.dtype)[axes.abs().argmin(-1)])
+    return right / right.norm(dim=-1, keepdim=True)
 
 
 def upright_axis(surface: Surface) -> Tensor:
@@ -162,9 +167,7 @@ def uprightness(axes: Tensor, points: Tensor, normals: Tensor, flatness: Tensor)
 
 def _nearby(axes: Tensor, angle: float) -> Tensor:
     """Axes turned by an angle (radians) to four sides, (4 D, 3)."""
-    least = torch.eye(3, dtype=axes.dtype)[axes.abs().argmin(1)]
-    right = torch.linalg.cross(axes, least)
-    right = right / right.norm(dim=1, keepdim=True)
+    right = _across(axes)
     other = torch.linalg.cross(axes, right)
     turned = torch.cat([axes + side * math.tan(angle) for side in (right, -right, other, -other)])
     return turned / turned.norm(dim=1, keepdim=True)

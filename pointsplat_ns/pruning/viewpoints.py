@@ -13,8 +13,6 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.pruning.content import UNITS, thinned
-from pointsplat_ns.pruning.content import content_size as content_size  # which users of views take from here
-from pointsplat_ns.pruning.content import in_units as in_units
 from pointsplat_ns.pruning.view_sampling import PROBED, sample_views
 from pointsplat_ns.views import Views
 
@@ -29,7 +27,8 @@ SEED = 1
 
 
 def viewpoints(scene: Gaussians, width: int, height: int) -> Views | None:
-    """Views from free places in a scene in units of its content (:func:`in_units`); None if there are none."""
+    """Views from free places in a scene in units of its content, see :func:`~pointsplat_ns.pruning.content.in_units`;
+    None if there are none."""
     try:
         return sample_views(thinned(scene, PROBED), VIEWPOINTS, width, height, seed=SEED)
     except DataError:

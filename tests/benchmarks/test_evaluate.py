@@ -3,36 +3,21 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 
-from making import REPOSITORY
+from making import BENCHMARKS, run_benchmark
 from pointsplat_ns.compression.trained_refiner import load_refiner
 from pointsplat_ns.refiner import save_refiner
 
-BENCHMARKS = REPOSITORY / "benchmarks"
 PROGRAMS = ("compaction", "example_room", "quality", "rasterizer", "refinement", "refiner", "repair", "sampled_views")
-
-
-def run(*words: object) -> str:
-    """What a benchmark prints."""
-    done = subprocess.run(
-        [sys.executable, BENCHMARKS / str(words[0]), *map(str, words[1:])],
-        capture_output=True,
-        text=True,
-        cwd=REPOSITORY,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_every_benchmark_starts(name):
-    assert "usage:" in run(f"{name}.py", "--help")
+    assert "usage:" in run_benchmark(f"{name}.py", "--help")
 
 
 def test_the_programs_are_all_there_are():
@@ -55,7 +40,7 @@ def test_refiners_are_judged_row_by_row_and_what_is_there_is_not_done_again(refi
     (scene,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
     options = ("--keeps", "0.5", "--starts", "paper", "--views", "2", "--fine-tune", "2", "--photos", "--no-lpips")
     command = ("refinement.py", "evaluate", "--refiners", refiners, "--scenes", scene, "--json", tmp_path / "rows.json")
-    said = run(*command, *options, "--pictures", tmp_path / "pictures")
+    said = run_benchmark(*command, *options, "--pictures", tmp_path / "pictures")
     rows = json.loads((tmp_path / "rows.json").read_text())["rows"]
     variants = ["dense", "selected", "as shipped", "dual", "fine-tuned", "fine-tuned on photos"]
     assert sorted(row["variant"] for row in rows) == sorted(variants)
@@ -66,10 +51,10 @@ def test_refiners_are_judged_row_by_row_and_what_is_there_is_not_done_again(refi
     assert by["dual"]["seen"] is False
     assert (tmp_path / "pictures" / "wall-a_50.png").read_bytes().startswith(b"\x89PNG")
     assert "1 refiners: " in said and "paper + dual, seed 0" in said
-    again = run(*command, *options, "--pictures", tmp_path / "pictures")
+    again = run_benchmark(*command, *options, "--pictures", tmp_path / "pictures")
     assert json.loads((tmp_path / "rows.json").read_text())["rows"] == rows
     assert "dB against photos" in said and "dB against photos" not in again
-    assert "dual beats selected" in run("refinement.py", "report", tmp_path / "rows.json")
+    assert "dual beats selected" in run_benchmark("refinement.py", "report", tmp_path / "rows.json")
 
 
 def test_a_trained_scene_is_a_case_of_the_rasterizers_benchmark(trained_walls, monkeypatch):

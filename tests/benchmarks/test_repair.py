@@ -3,19 +3,9 @@
 from __future__ import annotations
 
 import csv
-import subprocess
-import sys
 from pathlib import Path
 
-from making import REPOSITORY
-
-
-def run(name: str, *words: object) -> str:
-    """What a benchmark prints."""
-    command = [sys.executable, REPOSITORY / "benchmarks" / name, *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+from making import run_benchmark
 
 
 def wall_of(trained_walls: Path) -> Path:
@@ -25,7 +15,7 @@ def wall_of(trained_walls: Path) -> Path:
 
 def test_every_repair_is_a_row_and_a_point_of_the_picture(trained_walls, tmp_path):
     options = ("--keep", "50%", "--seconds", "0.1", "--fine-tune-steps", "1", "--views", "1")
-    said = run("repair.py", wall_of(trained_walls), *options, "--output", tmp_path / "repair.csv")
+    said = run_benchmark("repair.py", wall_of(trained_walls), *options, "--output", tmp_path / "repair.csv")
     with (tmp_path / "repair.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["kind"] for row in rows] == ["merge", "refiner", "fine-tune", "repair", "repair"]
@@ -36,4 +26,4 @@ def test_every_repair_is_a_row_and_a_point_of_the_picture(trained_walls, tmp_pat
 
 
 def test_sampled_views_are_held_against_poses_of_photos(trained_walls):
-    assert "wall-a" in run("sampled_views.py", wall_of(trained_walls), "--views", "1", "--side", "32")
+    assert "wall-a" in run_benchmark("sampled_views.py", wall_of(trained_walls), "--views", "1", "--side", "32")

@@ -9,7 +9,8 @@ import torch
 
 from making import ball, box_room
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.viewpoints import UNITS, content_size, in_units, thinned, viewpoints, weights_seen
+from pointsplat_ns.pruning.content import UNITS, content_size, in_units, thinned
+from pointsplat_ns.pruning.viewpoints import viewpoints, weights_seen
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views
 

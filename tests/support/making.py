@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import shlex
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import torch
@@ -12,9 +14,19 @@ import torch
 from pointsplat_ns.gaussians import Gaussians
 
 REPOSITORY = Path(__file__).resolve().parents[2]
+BENCHMARKS = REPOSITORY / "benchmarks"
 
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 """Real captures, splats and weights that tests read in place; they skip where it is absent."""
+
+
+def run_benchmark(name: str, *words: object) -> str:
+    """What a benchmark, by its file's name, prints."""
+    done = subprocess.run(
+        [sys.executable, BENCHMARKS / name, *map(str, words)], capture_output=True, text=True, cwd=REPOSITORY
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def same(a: Gaussians, b: Gaussians) -> bool:
