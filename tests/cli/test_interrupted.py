@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+HEEDED = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+"""Where the tests run in the background of a shell, SIGINT is ignored, also by what they start, unless told otherwise."""
+
 MAKE_REFINER = """
 import sys
 from pathlib import Path
@@ -56,7 +59,7 @@ def start(tmp_path):
 
     def run(script: str, count: int) -> subprocess.Popen[str]:
         process = subprocess.Popen(
-            [sys.executable, "-c", script, str(tmp_path)],
+            [sys.executable, "-c", HEEDED + script, str(tmp_path)],
             start_new_session=True,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
