@@ -89,6 +89,7 @@ def main(args: list[str] | None = None) -> None:
     from pointsplat_ns.cli.demo import demo
     from pointsplat_ns.cli.export import export
     from pointsplat_ns.cli.lod import lod
+    from pointsplat_ns.cli.make_feedback import make_feedback
     from pointsplat_ns.cli.make_refiner import make_refiner
     from pointsplat_ns.cli.prune import prune
     from pointsplat_ns.cli.report import report
@@ -105,6 +106,7 @@ def main(args: list[str] | None = None) -> None:
         "report": report,
         "rooms": rooms,
         "make-refiner": make_refiner,
+        "make-feedback": make_feedback,
         "demo": demo,
     }
     try:

@@ -27,7 +27,7 @@ from pointsplat_ns.compression.level_errors import (
 )
 from pointsplat_ns.compression.level_folder import LevelFolder, SourceFile
 from pointsplat_ns.compression.prune import prune_scene
-from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.compression.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable
@@ -237,7 +237,7 @@ def make_levels(
 
     before = torch.arange(len(dense), device=dense.device)  # [N] index in the level before of the one that each is in
     start = time.perf_counter()
-    for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging")):
+    for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), views.known(MERGED_FROM)):
         seconds = time.perf_counter() - start
         parents = _parents(before, merged.assignment, len(made[-1].scene) if made else len(dense))
         if out is not None:

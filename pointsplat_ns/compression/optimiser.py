@@ -34,60 +34,66 @@ class Optimiser:
     Args:
         scene: K Gaussians; they are copied.
         rates: learning rates by parameter name; that of the means is multiplied by the extent of the scene.
-        betas: decay of Adam's averages of the gradient and of its square.
-        damping: Adam's epsilon, as a share of the root mean square of a parameter's gradient, over what is seen in the
-            first step. Adam moves all Gaussians equally far, also those that are right already and whose gradients are
-            next to nothing; what is damped moves less.
     """
 
-    def __init__(
-        self,
-        scene: Gaussians,
-        rates: dict[str, float],
-        betas: tuple[float, float] = (0.9, 0.999),
-        damping: float = 0.0,
-    ):
-        centred = scene.means.detach().double() - scene.means.detach().double().mean(0)
-        extent = float(centred.norm(dim=1).quantile(0.9)) or 1.0
-        self._parameters = {name: value.detach().clone().requires_grad_() for name, value in scene.items()}
-        self._fixed = {name: ~value.detach().isfinite() for name, value in self._parameters.items()}
-        groups = []
-        for name, value in self._parameters.items():
-            rate = rates[name] * (extent if name == "means" else 1.0)
-            if value.numel():
-                groups.append({"params": [value], "lr": rate, "peak": rate})
-        self._damping = damping
-        self._adam = torch.optim.Adam(groups, betas=betas, eps=1e-15, fused=True)
+    def __init__(self, scene: Gaussians, rates: dict[str, float]):
+        reach = extent(scene)
+        self._scene = scene.map(lambda value: value.detach().clone())
+        groups = [
+            {"params": [value], "lr": rates[name] * (reach if name == "means" else 1.0)}
+            for name, value in self._scene.items()
+            if value.numel()
+        ]
+        self._adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     @property
     def scene(self) -> Gaussians:
         """The scene as it is now."""
-        return Gaussians(**{name: value.detach().clone() for name, value in self._parameters.items()})
+        return self._scene.map(torch.clone)
 
-    def step(self, view: View, target: Tensor, share: float = 1.0) -> None:
+    def step(self, view: View, target: Tensor) -> None:
         """Take one step.
 
         Args:
             view: what is rendered.
             target: (H, W, 3) image that it should look like, in [0, 1].
-            share: of the learning rates.
         """
-        self._adam.zero_grad()
-        _loss(render(Gaussians(**self._parameters), view), target).backward()
-        for name, value in self._parameters.items():
-            if value.grad is not None:
-                value.grad.nan_to_num_(0.0, 0.0, 0.0)[self._fixed[name]] = 0.0
-        for group in self._adam.param_groups:
-            group["lr"] = share * group["peak"]
-            if self._damping and "damped" not in group:
-                group["eps"], group["damped"] = max(1e-15, self._damping * seen_rms(group["params"][0].grad)), True
+        gradients = gradients_of(self._scene, view, target)
+        for name, value in self._scene.items():
+            value.grad = gradients[name]
         self._adam.step()
 
 
-def seen_rms(gradient: Tensor | None) -> float:
+def extent(scene: Gaussians) -> float:
+    """How far the Gaussians of a scene reach from their mean position, but for the farthest tenth, scene units; 1 if
+    they are all in one place."""
+    centred = scene.means.detach().double() - scene.means.detach().double().mean(0)
+    return float(centred.norm(dim=1).quantile(0.9)) or 1.0
+
+
+def gradients_of(scene: Gaussians, view: View, target: Tensor) -> dict[str, Tensor]:
+    """Gradients of the loss of one view by parameter. What is not finite is 0, and so are the gradients of values that
+    are not finite themselves.
+
+    Args:
+        scene: K Gaussians.
+        view: what is rendered.
+        target: (H, W, 3) image that it should look like, in [0, 1].
+    """
+    leaves = scene.map(lambda value: value.detach().requires_grad_())
+    with torch.enable_grad():
+        _loss(render(leaves, view), target).backward()
+    return {name: _finite_gradient(value) for name, value in leaves.items()}
+
+
+def _finite_gradient(value: Tensor) -> Tensor:
+    if value.grad is None:
+        return torch.zeros_like(value)
+    return value.grad.nan_to_num_(0.0, 0.0, 0.0).masked_fill_(~value.detach().isfinite(), 0.0)
+
+
+def seen_rms(gradient: Tensor) -> float:
     """Root mean square of the gradients that are not 0, in float64; 0 if all are."""
-    if gradient is None:
-        return 0.0
     seen = gradient[gradient != 0].double()
     return float(seen.square().mean().sqrt()) if seen.numel() else 0.0
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pointsplat_ns.compression.budget_search import SH_PSNR, needed_sh_degree, smallest_within
 from pointsplat_ns.compression.cleaning import Cleaning, clean_scene
 from pointsplat_ns.compression.fine_tune import fine_tune
-from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.compression.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.errors import BudgetError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import (
@@ -152,7 +152,8 @@ def _pruner(
     """A function from a count to a scene of that many Gaussians. Scores are computed once, for all counts."""
     method = method_named(by)
     if method.score is None:
-        return lambda count: prune(scene, count, by, views.given)
+        known = views.known(MERGED_FROM)
+        return lambda count: prune(scene, count, by, known)
     progress(0.0)
     scores = score_of(scene, method, functools.partial(views.views, SCORED_VIEWS), opacity_weight, progress)
     return lambda count: scene[select(scores, count)]
@@ -166,8 +167,11 @@ def _refilling(
 
 
 def _seen_from(by: str, views: ViewSource) -> Views | Callable[[], Views] | None:
-    """The views that a method sees the scene from: only given ones, where it needs none."""
-    return functools.partial(views.views, SCORED_VIEWS) if method_named(by).needs_views else views.given
+    """The views that a method sees the scene from: only known ones for merging, which needs none."""
+    method = method_named(by)
+    if method.needs_views:
+        return functools.partial(views.views, SCORED_VIEWS)
+    return views.known(MERGED_FROM) if method.score is None else None
 
 
 def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress, notes: list[str]) -> Gaussians:

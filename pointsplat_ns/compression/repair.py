@@ -1,4 +1,4 @@
-"""Repairs a smaller scene by what it can see: steps of Adam against the dense scene's own renders, from fresh views."""
+"""Repairs a smaller scene by what it can see: learned steps against the dense scene's own renders, from fresh views."""
 
 from __future__ import annotations
 
@@ -9,29 +9,23 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from torch import Tensor
 
-from pointsplat_ns.compression.optimiser import RATES, Optimiser
+from pointsplat_ns.compression.feedback import MOST_STEPS, Feedback
+from pointsplat_ns.compression.optimiser import gradients_of
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.refiner.feedback import FeedbackRefiner, shipped_feedback_refiner
 
 Effort = Literal["instant", "quick", "thorough"]
 
 STEPS: dict[Effort, int] = {"instant": 0, "quick": 32, "thorough": 400}
 """Steps of each effort. Those of "quick" take about as long as merging 100,000 to a million Gaussians."""
 
-FASTER = 8.0
-"""Factor on the learning rates of 3DGS, which suit 30,000 steps."""
-
-DAMPING = 0.5
-"""See :class:`Optimiser`. Half the rates without it gain as much where a scene is wrong, but disturb what was right."""
-
-BETAS = (0.8, 0.98)
-"""Decays of Adam's averages: shorter than usual, as there are few steps."""
-
 LAST_SHARE = 0.02
-"""Share of the learning rates at the last step; they fall as a cosine."""
+"""Share of the learning rates at the last step, see :func:`share_of_rates`."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +75,14 @@ def repair(
     views: ViewSource,
     budget: RepairBudget,
     progress: Callable[[float], None] | None = None,
+    network: FeedbackRefiner | Literal["shipped"] | None = "shipped",
 ) -> Repaired:
     """Optimise a smaller scene against renders of the dense one; its number of Gaussians does not change.
 
-    Each step renders both from a view and takes one step of Adam (:class:`Optimiser`). The views are none of those that
-    results are compared in, and come from :meth:`ViewSource.others`: no sampled view comes twice, so that there is none
-    to overfit. Ctrl-C ends the repair; what has been reached is returned.
+    Each step renders both from a view. A network sees what the gradients of the loss have said of each Gaussian, and
+    sets how far it moves (:mod:`~pointsplat_ns.refiner.feedback`). The views are none of those that results are
+    compared in, and come from :meth:`ViewSource.others`: no sampled view comes twice, so that there is none to overfit.
+    Ctrl-C ends the repair; what has been reached is returned.
 
     Args:
         scene: K Gaussians; not changed.
@@ -94,12 +90,15 @@ def repair(
         views: where views come from.
         budget: how long.
         progress: called with the share done, in [0, 1].
+        network: on the scene's device; by default the one that ships, None for the steps of Adam.
 
     Raises:
         DataError: if there is no place to look from.
     """
     start = time.perf_counter()
-    optimiser = Optimiser(scene, {name: FASTER * rate for name, rate in RATES.items()}, BETAS, DAMPING)
+    if network == "shipped":
+        network = shipped_feedback_refiner(scene.device)
+    feedback = Feedback(scene, len(dense))
     examples = views.others()
     steps, done, interrupted = 0, 0.0, False
     try:
@@ -107,11 +106,29 @@ def repair(
             view = next(examples)
             with torch.no_grad():
                 target = render(dense, view)
-            optimiser.step(view, target, LAST_SHARE + (1 - LAST_SHARE) * 0.5 * (1 + math.cos(math.pi * done)))
+            feedback.observe(gradients_of(scene, view, target))
+            learned = _learned(network, feedback, scene, done, round(steps / done) if done else MOST_STEPS)
+            moves = feedback.moves(share_of_rates(done), *learned)
+            scene = Gaussians(**{name: value + moves[name] for name, value in scene.items()})
             steps += 1
             done = budget.share_done(steps, time.perf_counter() - start)
             if progress is not None:
                 progress(min(done, 1.0))
     except KeyboardInterrupt:
         interrupted = True
-    return Repaired(optimiser.scene, steps, time.perf_counter() - start, interrupted)
+    return Repaired(scene, steps, time.perf_counter() - start, interrupted)
+
+
+def share_of_rates(done: float) -> float:
+    """What is left of the learning rates when a share of the steps, in [0, 1], is done: it falls as a cosine."""
+    return LAST_SHARE + (1 - LAST_SHARE) * 0.5 * (1 + math.cos(math.pi * done))
+
+
+def _learned(
+    network: FeedbackRefiner | None, feedback: Feedback, scene: Gaussians, done: float, steps: int
+) -> tuple[Tensor, Tensor] | tuple[None, None]:
+    """Factors and offsets of the next step, None without a network."""
+    if network is None:
+        return None, None
+    with torch.no_grad():
+        return network(feedback.features(scene, done, steps))

@@ -15,6 +15,9 @@ from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.views import RasterizeMode, View, Views, spread_indices
 
+MERGED_FROM = 48
+"""Maximum number of known views that merging looks from."""
+
 COMPARED_VIEWS, COMPARED_SIDE = 12, 400
 """Maximum number of views that renders are compared in, and maximum of their longer side in pixels."""
 
@@ -83,6 +86,13 @@ class ViewSource:
         views = sample_views(self._scene, count)
         self.origin = f"poses sampled in free space{self._missing}"
         return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
+
+    def known(self, count: int) -> Views | None:
+        """At most ``count`` of the views that need not be sampled: given ones, or those of the dataset's training
+        poses; None if there are none."""
+        if self.given is None and self._of_dataset is None:
+            return None
+        return self.views(count)
 
     def compared(self) -> Views:
         """The views that renders are compared in: at most 12, with a longer side of at most 400 pixels."""

@@ -31,7 +31,7 @@ from pointsplat_ns.pruning.finishing import SIDE, Finish, Reference
 from pointsplat_ns.pruning.matching import cheapest_pairs
 from pointsplat_ns.pruning.merge_state import CHUNK, OPAQUE, start
 from pointsplat_ns.pruning.pair_costs import costs_of
-from pointsplat_ns.pruning.viewpoints import viewpoints, weights_seen
+from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, viewpoints, weights_seen
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
 from pointsplat_ns.views import Views
 
@@ -70,7 +70,8 @@ def merge(
             ``k`` is N.
         k: number of Gaussians in the result; N returns the scene itself.
         progress: called with the share done, in [0, 1].
-        views: where the scene is looked at from; by default from free places in it.
+        views: where the scene is looked at from, such as the poses of its photos; what they do not show is merged
+            first. By default from free places in it, in all directions.
 
     Returns:
         Exactly ``k`` Gaussians. Deterministic.
@@ -197,6 +198,7 @@ class Merging:
         self.members = members[curve_keys(unit_cells(scene.means[members])).argsort(stable=True)]
         self.centre, self.size = content_size(scene)
         self.views = self._in_units(views) if views is not None else None
+        self.not_shown = NOT_SHOWN if views is not None else 1.0
         if self.views is None and len(members) >= FEWEST_SEEN:
             self.views = viewpoints(in_units(scene, self.centre, self.size), SIDE, 3 * SIDE // 4)
         self.state = start(scene, self.members, self._weights(), self.centre, self.size)
@@ -246,7 +248,7 @@ class Merging:
         if self.views is None:
             return torch.ones(len(self.members))
         means = (self.scene.means[self.members].double() - self.centre) * (UNITS / self.size)
-        return weights_seen(means, self.views)
+        return weights_seen(means, self.views, self.not_shown)
 
     def _in_units(self, views: Views) -> Views:
         """Views in units of the content."""

@@ -14,7 +14,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.pruning.content import UNITS, thinned
 from pointsplat_ns.pruning.view_sampling import PROBED, sample_views
-from pointsplat_ns.views import Views
+from pointsplat_ns.views import View, Views
 
 VIEWPOINTS = 16
 """Number of views that a scene is looked at from."""
@@ -22,6 +22,14 @@ VIEWPOINTS = 16
 NEAREST = 0.1
 """Added in quadrature to distances, as a share of the content's diagonal: eyes are seldom closer, and a view that is
 near a place by chance must not outweigh all others there."""
+
+NOT_SHOWN = 1e-5
+"""``not_shown`` of :func:`weights_seen` for the poses of photos. What no photo shows has never been trained: a quarter
+of a scene was seen to be such Gaussians, left as they were at the start. On that scene (fox, 30 % kept) 0.02 gave 29.9
+dB in held-out views, 1e-3 30.6, 1e-5 30.9."""
+
+EDGE = 0.05
+"""How far outside of a picture its content is counted as shown, as a share of its width and height."""
 
 SEED = 1
 
@@ -35,15 +43,29 @@ def viewpoints(scene: Gaussians, width: int, height: int) -> Views | None:
         return None
 
 
-def weights_seen(means: Tensor, views: Views) -> Tensor:
-    """Mean of 1 / distance^2 over views, (N,) float32: how large a unit of area at each position is in them.
+def weights_seen(means: Tensor, views: Views, not_shown: float = 1.0) -> Tensor:
+    """Mean over views of 1 / distance^2, (N,) float32: how large a unit of area at each position is in them.
 
     Args:
         means: (N, 3) positions, in units of the content.
         views: where they are looked at from.
+        not_shown: factor for the views that do not show a position. At 1 only the places of the views matter, and not
+            where they look: somebody who stands there may turn round.
     """
     eyes = invert_rigid(views.viewmats.double())[:, :3, 3].to(means)
     total = torch.zeros(len(means), dtype=torch.float32)
-    for eye in eyes:
-        total += 1 / ((means - eye).square().sum(1) + (NEAREST * UNITS) ** 2).float()
+    for eye, view in zip(eyes, views, strict=True):
+        size = 1 / ((means - eye).square().sum(1) + (NEAREST * UNITS) ** 2).float()
+        total += size.where(in_picture(means, view), not_shown * size)
     return total / len(eyes)
+
+
+def in_picture(means: Tensor, view: View) -> Tensor:
+    """Whether each position (N, 3) is in front of a camera and in its picture or close to its edge, (N,)."""
+    viewmat, K = view.viewmat.to(means), view.K.to(means)
+    at = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    depth = at[:, 2:]
+    # Multiplied by the depth, so that nothing is divided by it.
+    size = at.new_tensor([view.width, view.height])
+    place = at[:, :2] * K.diagonal()[:2] + (K[:2, 2] - 0.5 * size) * depth
+    return ((depth > 0) & (place.abs() <= (0.5 + EDGE) * size * depth)).all(1)

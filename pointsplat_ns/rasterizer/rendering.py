@@ -147,8 +147,9 @@ def rasterization(
         from gsplat.rendering import rasterization as gsplat_rasterization
 
         return gsplat_rasterization(
-            means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane, radius_clip,
-            eps2d, sh_degree, packed, 16, backgrounds, render_mode, sparse_grad, absgrad, rasterize_mode, channel_chunk,
+            means, quats, scales, opacities, colors, viewmats.to(means), Ks.to(means), width, height, near_plane,
+            far_plane, radius_clip, eps2d, sh_degree, packed, 16, backgrounds, render_mode, sparse_grad, absgrad,
+            rasterize_mode, channel_chunk,
         )  # fmt: skip
     opacities = opacities[:, 0] if opacities.dim() == 2 and opacities.shape[1] == 1 else opacities
     check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, backgrounds)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 HEEDED = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-"""Where the tests run in the background of a shell, SIGINT is ignored, also by what they start, unless told otherwise."""
+"""What a shell runs in its background ignores SIGINT, and so does what that starts, unless told otherwise."""
 
 MAKE_REFINER = """
 import sys

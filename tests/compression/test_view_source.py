@@ -40,6 +40,16 @@ def test_a_run_is_looked_at_from_its_own_poses(scene, trained_walls):
     assert views.background.tolist() == [1.0, 1.0, 1.0]
 
 
+def test_known_views_are_given_or_those_of_the_dataset_and_never_sampled(scene, trained_walls):
+    assert ViewSource(scene, run="scene.ply", dataset_views=dataset_views).known(4) is None
+    of_run = ViewSource(scene, run=run_of(trained_walls, "wall-b"), dataset_views=dataset_views)
+    known = of_run.known(4)
+    assert known is not None and len(known) == 4 and of_run.origin == "poses of the dataset"
+    given = sample_views(scene, 6, 32, 24)
+    assert len(ViewSource(scene, given=given).known(3)) == 3
+    assert ViewSource(scene, given=given[:0]).known(3) is None
+
+
 def data_is_gone(path: Path | str) -> Views:
     raise SceneError("its data is not there")
 

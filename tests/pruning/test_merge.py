@@ -314,6 +314,19 @@ def test_small_things_where_people_look_are_kept_before_large_ones_far_away():
     assert from_afar.assignment[400:].unique().numel() > of_near[1]
 
 
+def test_what_the_given_views_do_not_show_is_merged_first():
+    """Two equal walls, one before the camera and one behind it."""
+    ahead = wall(20).replace(features_dc=torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
+    ahead = ahead.replace(means=ahead.means + torch.tensor([0.0, 0.0, 2.0]))
+    both = Gaussians.cat([ahead, ahead.replace(means=ahead.means * torch.tensor([1.0, 1.0, -1.0]))])
+    shown, hidden = (
+        merge(both, 400, views=one_view()).assignment[part].unique().numel() for part in (slice(400), slice(400, 800))
+    )
+    assert shown > 1.8 * hidden
+    eyes_only = merge(both, 400).assignment
+    assert eyes_only[:400].unique().numel() < 1.5 * eyes_only[400:].unique().numel()
+
+
 def one_view(back: float = 0.0) -> Views:
     """A view from the origin, or from behind it."""
     viewmats = torch.eye(4)[None].clone()

@@ -10,7 +10,7 @@ import torch
 from making import ball, box_room
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.content import UNITS, content_size, in_units, thinned
-from pointsplat_ns.pruning.viewpoints import viewpoints, weights_seen
+from pointsplat_ns.pruning.viewpoints import EDGE, NOT_SHOWN, in_picture, viewpoints, weights_seen
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views
 
@@ -38,6 +38,23 @@ def test_weights_are_the_mean_over_places_and_finite_at_the_eye_itself():
 def test_positions_at_the_end_of_the_range_have_a_weight_of_zero_or_more():
     weights = weights_seen(torch.full((1, 3), 1e300, dtype=torch.float64), at((0, 0, 0)))
     assert float(weights) == 0.0
+
+
+def test_what_is_in_a_picture_is_in_front_and_inside_of_its_edges():
+    """Focal length 10 and 16 pixels: the edge is at 0.8 of the depth."""
+    edge = 0.8 * (1 + 2 * EDGE)
+    x = torch.tensor([0.0, 0.0, 0.0, 0.99 * edge, 1.01 * edge, -0.99 * edge, -1.01 * edge, 0.0], dtype=torch.float64)
+    z = torch.tensor([1.0, -1.0, 0.0, 1, 1, 1, 1, 1e300], dtype=torch.float64)
+    for places in (torch.stack([x, 0 * x, z], 1), torch.stack([0 * x, x, z], 1)):
+        assert in_picture(places, at((0, 0, 0))[0]).tolist() == [True, False, False, True, False, True, False, True]
+
+
+def test_what_no_view_shows_counts_for_next_to_nothing_if_where_they_look_matters():
+    means = torch.tensor([[0.0, 0, 50.0], [0.0, 0, -50.0]], dtype=torch.float64)
+    views = at((0, 0, 0), (0, 1, 0))
+    ahead, behind = weights_seen(means, views, NOT_SHOWN).tolist()
+    assert behind == pytest.approx(NOT_SHOWN * ahead, rel=1e-3)
+    assert weights_seen(means, views).tolist() == pytest.approx([ahead, ahead], rel=1e-3)
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1.0, 1e6])

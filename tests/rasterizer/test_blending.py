@@ -154,6 +154,22 @@ def test_gradients_of_a_lower_quality_are_those_of_its_image():
         assert abs(numeric - analytic) <= 2e-3 * (1 + abs(analytic))  # a pixel may cross the threshold
 
 
+def test_gsplat_gets_cameras_of_the_gaussians_type(monkeypatch):
+    """It knows no float64, and raised where ours takes such cameras beside float32 Gaussians."""
+    import gsplat.rendering
+
+    given = {}
+
+    def positional(means, quats, scales, opacities, colors, viewmats, Ks, *rest):
+        given.update(means=means.dtype, viewmats=viewmats.dtype, Ks=Ks.dtype)
+
+    monkeypatch.setattr(gsplat.rendering, "rasterization", positional)
+    monkeypatch.setattr("pointsplat_ns.rasterizer.rendering.use_gsplat", lambda *_: True)
+    eyes = torch.eye(4, dtype=torch.float64)[None], torch.eye(3, dtype=torch.float64)[None]
+    rasterization(*make_scene(5), *eyes, WIDTH, HEIGHT, sh_degree=3, backend="gsplat")
+    assert given == dict.fromkeys(given, torch.float32) and len(given) == 3
+
+
 def test_gsplat_on_a_cpu_is_refused_in_one_line_and_auto_draws_with_torch():
     scene = make_scene(n=20)
     with pytest.raises(PointSplatError, match="backend gsplat: the Gaussians are on cpu .* use auto or torch"):

@@ -1,0 +1,46 @@
+"""``pointsplat make-feedback``: trains the network that sets the steps of repairs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+def make_feedback(
+    scenes: Annotated[list[Path], tyro.conf.Positional],
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("outputs/feedback.safetensors"),
+    keep: tuple[str, ...] = ("3%", "10%", "30%", "50%"),
+    updates: int = 1000,
+    at_once: int = 4,
+    seed: int = 0,
+) -> None:
+    """Train the network that sets the steps of `compact`'s repairs, on scenes and what is merged of them; no photos.
+
+    It is saved every minute and at the end. With a GPU, 1,000 updates take some minutes to an hour; without one, days.
+
+    Args:
+        scenes: 3DGS .ply files, Splatfacto checkpoints or runs.
+        output: file for the network.
+        keep: budgets that the scenes are merged to: ratios (0.3), percentages (30%) or counts (50000).
+        updates: number of updates of the network.
+        at_once: number of repairs in an update.
+        seed: seed of the initial weights and of all choices.
+    """
+    import functools
+
+    import torch
+
+    import pointsplat_ns as ps
+    from pointsplat_ns.compression.feedback_training import TrainingScene, train_feedback
+    from pointsplat_ns.system.progress import progress_bar, tracked
+
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    ready = []
+    for path in tracked(scenes, "merging scenes", len(scenes)):
+        ready.append(TrainingScene.of(path.stem, ps.load(path).to(device), keep))
+        print(f"{path}: {len(ready[-1].dense):,} Gaussians, {len(ready[-1].views)} views")
+    with progress_bar() as show:
+        train_feedback(ready, updates, at_once, seed, output, functools.partial(show, "training"))
+    print(f"{output}: the network")

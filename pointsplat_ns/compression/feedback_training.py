@@ -1,0 +1,150 @@
+"""Trains the feedback refiner across scenes: it repairs pruned scenes, and learns from how close they have come.
+
+An update repairs a few pruned scenes for some steps each, from sampled views, and then renders them from others. The
+mean PSNR of these renders is differentiated with respect to the network through all steps. What the network sees counts
+as constant, as usual for learned optimisers (Andrychowicz et al., arXiv 1606.04474): no second derivatives are needed.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.compression.feedback import FEWEST_STEPS, MOST_STEPS, Feedback
+from pointsplat_ns.compression.optimiser import gradients_of
+from pointsplat_ns.compression.repair import share_of_rates
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.pruning import prune
+from pointsplat_ns.pruning.view_sampling import sample_views
+from pointsplat_ns.rasterizer import render
+from pointsplat_ns.refiner.feedback import FeedbackRefiner, save_feedback_refiner
+from pointsplat_ns.views import Views
+
+STEPS = (FEWEST_STEPS, 12, 24, MOST_STEPS)
+"""Lengths of the repairs that the network learns from."""
+
+AT_ONCE, TIMES = 32, 6
+"""Views of a scene: so many sampled at once, so many times."""
+
+SIDE = 400
+"""Their longer side, pixels, as in repairs."""
+
+FLOOR = 1e-5
+"""Added to mean squared errors, so that scenes that are nearly right do not rule: 50 dB."""
+
+RATE, WARM_UP, LAST_SHARE = 3e-3, 20, 0.02
+"""Learning rate of Adam, updates until it is reached, and the share of it that is left at the end, after a cosine."""
+
+SAVED_EVERY = 60.0
+"""Seconds between intermediate saves."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingScene:
+    """A dense scene, what was made of it, and views of it."""
+
+    name: str
+    dense: Gaussians
+    pruned: dict[str, Gaussians]
+    """By budget."""
+    views: Views
+
+    @classmethod
+    def of(cls, name: str, dense: Gaussians, keep: Sequence[str], times: int = TIMES) -> TrainingScene:
+        """Merge a scene to each budget, and sample views of it."""
+        sampled = [sample_views(dense, AT_ONCE, seed=100 + number) for number in range(times)]
+        viewmats, Ks = (torch.cat([getattr(v, field) for v in sampled]) for field in ("viewmats", "Ks"))
+        first = sampled[0]
+        views = Views(viewmats, Ks, first.width, first.height, first.background, near_plane=first.near_plane)
+        return cls(name, dense, {budget: prune(dense, budget, "merge") for budget in keep}, views.resized(SIDE))
+
+
+def roll_out(
+    network: FeedbackRefiner, scene: TrainingScene, pruned: Gaussians, steps: int, generator: random.Random
+) -> Tensor:
+    """How close a repair comes in views that it has not seen: the PSNR half-way or so and the mean of two views at the
+    end, each with half the weight, dB. Differentiable in the network."""
+    chosen = generator.sample(range(len(scene.views)), steps + 3)
+    looked_at = {generator.randrange(max(1, steps // 4), steps): chosen[steps : steps + 1], steps: chosen[steps + 1 :]}
+    feedback, now = Feedback(pruned, len(scene.dense)), pruned
+    reached: list[Tensor] = []
+    for step in range(steps):
+        view = scene.views[chosen[step]]
+        feedback.observe(gradients_of(now.detach(), view, _target(scene, chosen[step])))
+        learned = network(feedback.features(now.detach(), step / steps, steps))
+        moves = feedback.moves(share_of_rates(step / steps), *learned)
+        now = Gaussians(**{name: value + moves[name] for name, value in now.items()})
+        seen = [
+            _decibels(render(now, scene.views[index]), _target(scene, index)) for index in looked_at.get(step + 1, [])
+        ]
+        if seen:
+            reached.append(torch.stack(seen).mean())
+    return 0.5 * torch.stack(reached).sum()
+
+
+def train_feedback(
+    scenes: Sequence[TrainingScene],
+    updates: int,
+    at_once: int = 4,
+    seed: int = 0,
+    output: Path | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> FeedbackRefiner:
+    """Train a network.
+
+    Args:
+        scenes: on one device, where all is computed.
+        updates: number of steps of the network's optimiser.
+        at_once: repairs whose gradients are averaged in an update.
+        seed: of the network's initial weights and of all choices.
+        output: file that the network is saved to now and then, and at the end.
+        progress: called with the share done, in [0, 1].
+
+    Raises:
+        DataError: if there is no scene, or one has too few views for a repair.
+    """
+    if not scenes:
+        raise DataError("no scene to train on; expected at least one")
+    for scene in scenes:
+        if len(scene.views) < max(STEPS) + 3:
+            raise DataError(f"{scene.name}: {len(scene.views)} views; expected at least {max(STEPS) + 3}")
+    generator = random.Random(seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = FeedbackRefiner().to(scenes[0].dense.device)
+    adam = torch.optim.Adam(network.parameters(), lr=RATE, betas=(0.9, 0.99))
+    metadata = {"scenes": [scene.name for scene in scenes], "keep": [*scenes[0].pruned], "repairs_per_update": at_once}
+    saved = time.monotonic()
+    for update in range(updates):
+        share = LAST_SHARE + (1 - LAST_SHARE) * 0.5 * (1 + math.cos(math.pi * update / updates))
+        adam.param_groups[0]["lr"] = RATE * min(1, (update + 1) / WARM_UP) * share
+        adam.zero_grad()
+        for _ in range(at_once):
+            scene = generator.choice(scenes)
+            pruned = generator.choice(list(scene.pruned.values()))
+            (-roll_out(network, scene, pruned, generator.choice(STEPS), generator) / at_once).backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0, error_if_nonfinite=True)
+        adam.step()
+        if output is not None and (time.monotonic() - saved > SAVED_EVERY or update == updates - 1):
+            save_feedback_refiner(network, output, {**metadata, "updates": update + 1})
+            saved = time.monotonic()
+        if progress is not None:
+            progress((update + 1) / updates)
+    return network.eval()
+
+
+@torch.no_grad()
+def _target(scene: TrainingScene, index: int) -> Tensor:
+    return render(scene.dense, scene.views[index])
+
+
+def _decibels(image: Tensor, target: Tensor) -> Tensor:
+    return -10 * torch.log10((image - target).square().mean() + FLOOR)

@@ -1,0 +1,123 @@
+"""The feedback refiner: a small network that sees what renders say of each Gaussian, and sets how far it moves.
+
+The refiner of the paper sees a scene and not its error. This one sees the error: after each render it is given, for
+every Gaussian by itself, what the gradients of the rendering loss have been so far. It multiplies the steps of Adam, by
+kind of parameter, and adds steps of its own. Untrained it changes nothing, so that what remains is Adam. Such learned
+optimisers are due to Andrychowicz et al. (arXiv 1606.04474); G3R (arXiv 2409.19405) and QuickSplat (ICCV 2025) use
+gradients as the input of networks that reconstruct scenes.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from pointsplat_ns.io.files import one_line, write_tensors
+from pointsplat_ns.refiner.weights import WeightsError
+
+PARAMETERS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
+"""Kinds of parameters, each of which has a factor."""
+
+OFFSETS = {"scales": 3, "opacities": 1, "features_dc": 3}
+"""Kinds of parameters that the network may also move where their gradients do not say so, and their numbers."""
+
+FEATURES = 39
+"""Numbers that the network sees of a Gaussian, see :mod:`pointsplat_ns.compression.feedback`."""
+
+WIDTH, DEPTH = 64, 2
+"""Size and number of the hidden layers."""
+
+REACH = 2.0
+"""Bound of the logarithms of the factors: from 1/7 to 7."""
+
+FORMAT = "pointsplat-feedback/1"
+
+PRETRAINED = Path(__file__).parent / "pretrained" / "feedback.safetensors"
+"""The network that ships; ``CARD.md`` beside it describes its training and results."""
+
+
+class FeedbackRefiner(nn.Module):
+    """An MLP that every Gaussian goes through by itself.
+
+    Example:
+        >>> factors, offsets = FeedbackRefiner()(torch.zeros(5, FEATURES))
+        >>> factors.unique().tolist(), offsets.unique().tolist()
+        ([1.0], [0.0])
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        width = FEATURES
+        for _ in range(DEPTH):
+            layers += [nn.Linear(width, WIDTH), nn.SiLU()]
+            width = WIDTH
+        last = nn.Linear(width, len(PARAMETERS) + sum(OFFSETS.values()))
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.mlp = nn.Sequential(*layers, last)
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Factors and offsets of the steps.
+
+        Args:
+            features: (N, :data:`FEATURES`).
+
+        Returns:
+            Factors (N, 6) above 0, one a kind of :data:`PARAMETERS`; offsets (N, 7) in (-1, 1), what is
+            added to the kinds of :data:`OFFSETS` in their order, in units of the learning rates.
+        """
+        out = self.mlp(features)
+        kinds = len(PARAMETERS)
+        return (REACH * torch.tanh(out[:, :kinds] / REACH)).exp(), torch.tanh(out[:, kinds:])
+
+
+def save_feedback_refiner(network: FeedbackRefiner, path: Path | str, metadata: dict[str, Any] | None = None) -> None:
+    """Write a network.
+
+    Args:
+        network: on any device.
+        path: the .safetensors file to write or replace; its folder is created if missing.
+        metadata: anything JSON can hold: data, command, steps, results.
+    """
+    write_tensors(path, network.state_dict(), {"format": FORMAT, "metadata": json.dumps(metadata or {})})
+
+
+def read_feedback_refiner(path: Path | str = PRETRAINED, device: torch.device | str = "cpu") -> FeedbackRefiner:
+    """Read a network, in evaluation mode; by default the one that ships.
+
+    Raises:
+        WeightsError: if the file is missing, damaged or of another kind.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path)
+    network = FeedbackRefiner()
+    expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    if not path.is_file():
+        raise WeightsError(f"{path}: no such file; expected a feedback refiner (.safetensors)")
+    try:
+        with safe_open(path, framework="pt") as file:
+            if (file.metadata() or {}).get("format") != FORMAT:
+                raise WeightsError(f"{path}: not a feedback refiner; expected the format {FORMAT!r}")
+            found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
+            if found != expected:
+                raise WeightsError(f"{path}: tensors {found}; expected {expected}: damaged, or of another version")
+            state = {name: file.get_tensor(name).float() for name in found}
+    except (SafetensorError, OSError, ValueError) as error:
+        raise WeightsError(f"{path}: not a readable safetensors file ({one_line(error)})") from error
+    if not all(bool(value.isfinite().all()) for value in state.values()):
+        raise WeightsError(f"{path}: holds NaN or Inf; expected finite weights")
+    network.load_state_dict(state)
+    return network.to(device).eval().requires_grad_(requires_grad=False)
+
+
+@lru_cache(maxsize=2)
+def shipped_feedback_refiner(device: torch.device) -> FeedbackRefiner:
+    """The network that ships, read once a device."""
+    return read_feedback_refiner(device=device)

@@ -1,0 +1,128 @@
+"""What a network sees of the gradients, and the steps that follow."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from pointsplat_ns.compression import feedback as feedback_module
+from pointsplat_ns.compression.feedback import BETAS, DAMPING, Feedback
+from pointsplat_ns.compression.optimiser import seen_rms
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.pruning import prune
+from pointsplat_ns.refiner.feedback import FEATURES, PARAMETERS, FeedbackRefiner
+
+
+@pytest.fixture(scope="module")
+def scene(hollow_ball) -> Gaussians:
+    return prune(hollow_ball, 60, "merge")
+
+
+def gradients(scene: Gaussians, seed: int, size: float = 1.0) -> dict[str, torch.Tensor]:
+    """Random ones; a third of the Gaussians is not seen."""
+    generator = torch.Generator().manual_seed(seed)
+    values = {
+        name: size * torch.randn(value.shape, generator=generator, dtype=torch.float64).to(value)
+        for name, value in scene.items()
+    }
+    for value in values.values():
+        value[::3] = 0
+    return values
+
+
+def test_steps_that_are_not_learned_are_those_of_adam(scene):
+    feedback = Feedback(scene, 1000)
+    values = {name: value.clone() for name, value in scene.items()}
+    first = gradients(scene, 0)
+    groups = [
+        {"params": [values[name]], "lr": feedback.rates[name], "eps": DAMPING * seen_rms(first[name])}
+        for name in PARAMETERS
+        if values[name].numel()
+    ]
+    adam = torch.optim.Adam(groups, betas=BETAS)
+    moved = {name: value.clone() for name, value in scene.items()}
+    for seed in range(4):
+        given = gradients(scene, seed)
+        for name, value in values.items():
+            value.grad = given[name]
+        adam.step()
+        feedback.observe(given)
+        steps = feedback.moves(1.0)
+        moved = {name: value + steps[name] for name, value in moved.items()}
+    for name in PARAMETERS:
+        torch.testing.assert_close(moved[name], values[name], rtol=1e-5, atol=1e-7)
+
+
+def test_an_untrained_network_changes_no_step(scene):
+    feedback = Feedback(scene, 1000)
+    feedback.observe(gradients(scene, 0))
+    learned = FeedbackRefiner()(feedback.features(scene, 0.0, 8))
+    for name, plain in feedback.moves(0.5).items():
+        torch.testing.assert_close(feedback.moves(0.5, *learned)[name], plain)
+
+
+def test_factors_and_offsets_reach_their_parameters(scene):
+    feedback = Feedback(scene, 1000)
+    feedback.observe(gradients(scene, 0))
+    plain = feedback.moves(0.5)
+    factors = torch.arange(1.0, 7.0).expand(len(scene), 6)
+    offsets = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]).expand(len(scene), 7)
+    learned = feedback.moves(0.5, factors, offsets)
+    added = {"scales": offsets[:, :3], "opacities": offsets[:, 3:4], "features_dc": offsets[:, 4:]}
+    for kind, name in enumerate(PARAMETERS):
+        expected = (kind + 1) * plain[name] + 0.5 * feedback.rates[name] * added.get(name, torch.zeros(()))
+        torch.testing.assert_close(learned[name], expected)
+
+
+def seen(scene: Gaussians, size: float = 1.0) -> torch.Tensor:
+    """Features after two steps."""
+    feedback = Feedback(scene, 1000)
+    for seed in (0, 1):
+        feedback.observe(gradients(scene, seed, size))
+    return feedback.features(scene, 0.25, 8)
+
+
+@pytest.mark.parametrize("size", [1e-12, 1e-6, 1e3, 1e12])
+def test_features_do_not_depend_on_the_unit_of_the_loss(scene, size):
+    torch.testing.assert_close(seen(scene, size), seen(scene), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1e3])
+def test_features_do_not_depend_on_the_unit_of_the_scene(scene, size):
+    other = scene.replace(means=size * scene.means, scales=scene.scales + math.log(size))
+    torch.testing.assert_close(seen(other), seen(scene), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1.0, 1e18])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_features_and_steps_are_right_at_the_extremes(scene, size, degree):
+    rest = torch.zeros(len(scene), (degree + 1) ** 2 - 1, 3)
+    wild = scene.replace(features_rest=rest, opacities=scene.opacities.clone(), scales=scene.scales.clone())
+    wild.opacities[0], wild.opacities[1], wild.scales[2, 0], wild.scales[3] = math.inf, -math.inf, -math.inf, 80.0
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        feedback = Feedback(wild.to(dtype), 1000)
+        for seed in (0, 1):
+            feedback.observe(gradients(wild.to(dtype), seed, size))
+        features = feedback.features(wild.to(dtype), 1.0, 10**6)
+        moves = feedback.moves(1.0)
+        assert features.shape == (len(scene), FEATURES) and features.dtype == torch.float32
+        assert bool(features.isfinite().all()) and float(features.abs().max()) <= 8
+        assert all(bool(value.isfinite().all()) for value in moves.values())
+        found.append((features, moves))
+    if 1e-18 < size or size == 0:  # squares of smaller gradients are 0 in float32
+        torch.testing.assert_close(found[0][0], found[1][0], rtol=1e-3, atol=1e-3)
+        for name in PARAMETERS:
+            torch.testing.assert_close(found[0][1][name].double(), found[1][1][name], rtol=1e-4, atol=1e-6)
+
+
+def test_what_is_seen_for_the_first_time_later_is_damped_as_it_is_then(scene, monkeypatch):
+    feedback = Feedback(scene, 1000)
+    feedback.observe({name: torch.zeros_like(value) for name, value in scene.items()})
+    assert all(not bool(value.any()) for value in feedback.moves(1.0).values())
+    feedback.observe(gradients(scene, 0))
+    monkeypatch.setattr(feedback_module, "DAMPING", 1e9)
+    feedback.observe(gradients(scene, 1))
+    assert float(feedback.moves(1.0)["means"].abs().max()) > 0.01 * feedback.rates["means"]
