@@ -1,7 +1,7 @@
 """Exact copies: Gaussians that equal others in every parameter, to the bit.
 
-Broken files have thousands of them, such as rows of zeros. They look like one Gaussian, and become one before a scene is
-merged.
+Broken files have thousands of them, such as rows of zeros. They look like one Gaussian, and become one before a scene
+is merged.
 """
 
 from __future__ import annotations

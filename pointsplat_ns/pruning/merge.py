@@ -27,7 +27,7 @@ from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.pruning.content import UNITS, content_size, in_units
 from pointsplat_ns.pruning.covariance import TINY, unpack
 from pointsplat_ns.pruning.coverage import curve_keys, unit_cells
-from pointsplat_ns.pruning.duplicates import Copies
+from pointsplat_ns.pruning.duplicates import Copies, Reduced
 from pointsplat_ns.pruning.finishing import SIDE, Finish, Reference
 from pointsplat_ns.pruning.matching import cheapest_pairs
 from pointsplat_ns.pruning.merge_state import CHUNK, OPAQUE, start
@@ -128,9 +128,10 @@ def _levels(
     dense = scene.to(device="cpu")
     copies = Copies(dense, _visible(dense, counts[0]))
     first, last = len(copies), counts[-1]
+    reduced: Reduced | None = None
     for k in counts:
         left = max(k, copies.distinct)
-        if k == counts[0] or left < len(reduced.members):
+        if reduced is None or left < len(reduced.members):
             reduced = copies.reduced(left)
             merging = Merging(reduced.scene, reduced.members, views)
         while len(merging) > k:
