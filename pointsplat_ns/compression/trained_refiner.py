@@ -136,7 +136,7 @@ def settings_from(saved: Mapping[str, Any]) -> PruneSettings:
 
     Raises:
         KeyError: if a setting is missing.
-        PointSplatError, TypeError, ValueError: if one is not usable.
+        PointSplatError, TypeError, ValueError, OverflowError: if one is not usable.
     """
     by = saved["by"] if "by" in saved else saved["score"]
     saved_weight = saved.get("opacity_weight")
@@ -180,7 +180,7 @@ def _settings_of_file(path: Path) -> PruneSettings:
     metadata = read_metadata(path)
     try:
         return settings_from({**DEFAULTS, **metadata})
-    except (PointSplatError, KeyError, TypeError, ValueError) as error:
+    except (PointSplatError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise WeightsError(
             f"{path}: metadata not understood ({one_line(error)}); train or download it again"
         ) from error

@@ -5,6 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+SHORTEST = torch.finfo(torch.float32).tiny
+"""Smallest normal number of float32. A quaternion whose largest component is below it is taken for zero, in any
+precision: float32 has no inverse of its length, so its direction would depend on the precision."""
+
 
 def rotation_components(unit: Tensor) -> Tensor:
     """Rotation matrices (3, 3, M) of unit quaternions (4, M), each entry contiguous; zero gives the identity."""
@@ -20,7 +24,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotation matrices of quaternions of any length.
 
     Args:
-        quats: (N, 4) wxyz, finite; zero is the identity, and so are quaternions so short that their squares underflow.
+        quats: (N, 4) wxyz, finite; zero is the identity, and so are those shorter than :data:`SHORTEST`.
 
     Returns:
         (N, 3, 3), of the same dtype.
@@ -29,16 +33,13 @@ def rotation_matrices(quats: Tensor) -> Tensor:
         >>> rotation_matrices(torch.tensor([[0.0, 0.0, 0.0, 2.0]])).tolist()  # half a turn about z
         [[[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]]
     """
-    length = quats.norm(dim=1, keepdim=True)
-    unit = torch.where(length > 0, quats / length.clamp_min(torch.finfo(quats.dtype).tiny), identity_like(quats))
+    wide = zero_as_identity(quats).double()  # squares of 1e-30 underflow in float32
+    unit = (wide / wide.norm(dim=1, keepdim=True)).to(quats.dtype)
     return rotation_components(unit.T).permute(2, 0, 1)
 
 
-def identity_like(quats: Tensor) -> Tensor:
-    """The identity (4,) of the dtype and device of ``quats``."""
-    return quats.new_tensor([1.0, 0.0, 0.0, 0.0])
-
-
 def zero_as_identity(quats: Tensor) -> Tensor:
-    """Quaternions (N, 4), with the identity in place of each zero one."""
-    return torch.where((quats == 0).all(dim=1, keepdim=True), identity_like(quats), quats)
+    """Quaternions (N, 4), with the identity in place of each that is zero or shorter than :data:`SHORTEST`."""
+    largest = quats.detach().abs().amax(dim=1, keepdim=True)
+    # In float32, because half precision would round the bound to 0.
+    return torch.where(largest.float() < SHORTEST, quats.new_tensor([1.0, 0.0, 0.0, 0.0]), quats)

@@ -2,30 +2,56 @@
 
 from __future__ import annotations
 
+import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl, viewmats_to_opengl
-from pointsplat_ns.views import RasterizeMode, Views
+from pointsplat_ns.views import NEAR_PLANE, RasterizeMode, Views
+
+_NEAR_PLANE = "near_plane"
+"""Under this name the cameras' metadata hold the near planes (C, 1) in scene units, float64."""
 
 
 def cameras_of_views(views: Views) -> Cameras:
-    """Views as nerfstudio cameras (C,), float32 on the CPU. Their poses are camera-to-world, in OpenGL axes."""
+    """Views as nerfstudio cameras (C,), float32 on the CPU. Their poses are camera-to-world, in OpenGL axes.
+
+    nerfstudio's cameras have no near plane: it goes into their metadata, where :func:`near_plane_of` finds it. The
+    background and the rasterize mode are not carried over.
+    """
     poses, Ks = viewmats_to_opengl(views.viewmats.double().cpu()).float(), views.Ks.float().cpu()
     fx, fy, cx, cy = (Ks[:, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return Cameras(poses, fx, fy, cx, cy, views.width, views.height, camera_type=CameraType.PERSPECTIVE)
+    metadata = {_NEAR_PLANE: torch.full((len(views), 1), views.near_plane, dtype=torch.float64)}
+    kind = CameraType.PERSPECTIVE
+    return Cameras(poses, fx, fy, cx, cy, views.width, views.height, camera_type=kind, metadata=metadata)
+
+
+def near_plane_of(cameras: Cameras) -> float:
+    """Near plane of cameras (C,), scene units; gsplat's if they do not come from :func:`cameras_of_views`.
+
+    Raises:
+        DataError: if they have several.
+    """
+    carried = (cameras.metadata or {}).get(_NEAR_PLANE)
+    if carried is None or carried.numel() == 0:
+        return NEAR_PLANE
+    depths = carried.unique().tolist()
+    if len(depths) != 1:
+        raise DataError(f"cameras of {len(depths)} near planes; expected one for all views")
+    return depths[0]
 
 
 def views_of_cameras(cameras: Cameras, background: Tensor, rasterize_mode: RasterizeMode = "classic") -> Views:
     """nerfstudio cameras (C,) as pinhole views on their device. Lens distortion is ignored.
 
     Raises:
-        DataError: if the cameras have images of several sizes.
+        DataError: if the cameras have images of several sizes, or several near planes.
     """
     sizes = {(int(w), int(h)) for w, h in zip(cameras.width, cameras.height, strict=True)}
     if len(sizes) != 1:
         raise DataError(f"photos of {len(sizes)} sizes; expected one size for all views")
     ((width, height),) = sizes
     viewmats = viewmats_from_opengl(cameras.camera_to_worlds)
-    return Views(viewmats, cameras.get_intrinsics_matrices(), width, height, background, rasterize_mode)
+    near_plane = near_plane_of(cameras)
+    return Views(viewmats, cameras.get_intrinsics_matrices(), width, height, background, rasterize_mode, near_plane)

@@ -87,15 +87,16 @@ class Reference:
 
         before = attempt(0.0, 0.0)
         deepening = top_of_parabola(DEEPENINGS, [attempt(value, 0.0) for value in DEEPENINGS], beyond=0.15)
-        spread = top_of_parabola(SPREADS, [attempt(deepening, value) for value in SPREADS], beyond=0.05)
-        attempt(deepening, spread)
+        # Beyond what was tried, the parabola is a guess: the nearest that was tried is gone on with as well.
+        for value in dict.fromkeys((deepening, min(max(deepening, DEEPENINGS[0]), DEEPENINGS[-1]))):
+            attempt(value, top_of_parabola(SPREADS, [attempt(value, spread) for spread in SPREADS], beyond=0.05))
         found = max(tried, key=lambda key: tried[key])
         return Finish(*found, psnr=tried[found], before=before)
 
 
 def top_of_parabola(at: tuple[float, float, float], values: list[float], beyond: float) -> float:
-    """Where the parabola through three points is highest, at most ``beyond`` outside of them; the best of the three if
-    it has no top.
+    """Where the parabola through three points is highest, at most ``beyond`` outside of them. If it has no top, as far
+    out if the values only rise that way, else the best of the three.
 
     Example:
         >>> round(top_of_parabola((0.0, 1.0, 3.0), [-4.0, -1.0, -1.0], beyond=0.0), 6)
@@ -104,6 +105,8 @@ def top_of_parabola(at: tuple[float, float, float], values: list[float], beyond:
     (a, b, c), (p, q, r) = at, values
     left, right = (q - p) / (b - a), (r - q) / (c - b)
     bend = (right - left) / (c - a)
+    if bend >= 0 and left * right > 0:
+        return c + beyond if right > 0 else a - beyond
     if bend >= 0 or bend != bend:
         return at[max(range(3), key=lambda index: values[index])]
     top = 0.5 * (a + b) - 0.5 * left / bend

@@ -27,6 +27,7 @@ from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.pruning.content import UNITS, content_size, in_units
 from pointsplat_ns.pruning.covariance import TINY, unpack
 from pointsplat_ns.pruning.coverage import curve_keys, unit_cells
+from pointsplat_ns.pruning.duplicates import Copies, Reduced
 from pointsplat_ns.pruning.finishing import SIDE, Finish, Reference
 from pointsplat_ns.pruning.matching import cheapest_pairs
 from pointsplat_ns.pruning.merge_state import CHUNK, OPAQUE, start
@@ -63,7 +64,8 @@ def merge(
 ) -> Merged:
     """Replace a scene by ``k`` Gaussians that look the same.
 
-    Gaussians too faint to be drawn are dropped first; the others are merged in pairs, cheapest first.
+    Gaussians too faint to be drawn are dropped first. Of the others, exact copies become one, and the rest is merged in
+    pairs, cheapest first.
 
     Args:
         scene: N Gaussians. Those that are not :meth:`~pointsplat_ns.gaussians.Gaussians.usable` are dropped, unless
@@ -125,16 +127,22 @@ def _levels(
     if not counts:
         return
     dense = scene.to(device="cpu")
-    merging = Merging(dense, _visible(dense, counts[0]), views)
-    first, last = len(merging), counts[-1]
+    copies = Copies(dense, _visible(dense, counts[0]))
+    first, last = len(copies), counts[-1]
+    reduced: Reduced | None = None
     for k in counts:
+        left = max(k, copies.distinct)
+        if reduced is None or left < len(reduced.members):
+            reduced = copies.reduced(left)
+            merging = Merging(reduced.scene, reduced.members, views)
         while len(merging) > k:
             merging.round(k)
             report(0.95 * (first - len(merging)) / max(first - last, 1))
         merged = merging.level()
         if k == last:
             report(1.0)
-        yield Merged(merged.scene.to(scene.device), merged.assignment.to(scene.device), merged.finish)
+        assignment = merged.assignment[reduced.index]
+        yield Merged(merged.scene.to(scene.device), assignment.to(scene.device), merged.finish)
 
 
 def _visible(scene: Gaussians, k: int) -> Tensor:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pointsplat_ns.geometry.quaternions import SHORTEST
 from pointsplat_ns.rasterizer.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -21,9 +22,9 @@ from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
 
 def _rotation(quat: Tensor) -> Tensor:
-    if not quat.any():
+    if quat.abs().max() < SHORTEST:
         return torch.eye(3, dtype=quat.dtype)
-    w, x, y, z = quat / quat.norm()
+    w, x, y, z = (quat.double() / quat.double().norm()).to(quat.dtype)
     q = torch.stack([x, y, z])
     zero = torch.zeros_like(w)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)

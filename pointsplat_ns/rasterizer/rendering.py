@@ -93,7 +93,7 @@ def rasterization(
 
     Args:
         means: centres, world space.
-        quats: wxyz, any length; the zero quaternion is the identity.
+        quats: wxyz, any length; the zero quaternion is the identity, and so is one of less than 1e-38.
         scales: standard deviations (not logarithms), scene units.
         opacities: in [0, 1].
         colors: D channels, or SH coefficients if ``sh_degree`` is given; for all cameras or each.

@@ -132,7 +132,8 @@ def canonical_quats(quats: Tensor) -> tuple[Tensor, Tensor]:
     """Unit quaternions of one sign, and what they were divided by.
 
     A quaternion and its negative are the same rotation; the one whose first non-zero component is positive is taken.
-    Zero becomes the identity, with a length of 1. Components are divided by the largest before they are squared, so
+    Zero, and what is shorter than :data:`~pointsplat_ns.geometry.quaternions.SHORTEST`, becomes the identity, with a
+    length of 1. Components are divided by the largest before they are squared, so
     that neither 1e-30 underflows nor 1e30 overflows.
 
     Args:

@@ -1,14 +1,19 @@
-"""Progress bars."""
+"""Progress bars, and lines in place of them where there is no terminal."""
 
 from __future__ import annotations
 
 import functools
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 Progress = Callable[[str, float], None]
 """Called with the name of the current task and the share of it that is done, in [0, 1]."""
+
+LINE_SECONDS = 30.0
+"""Seconds from one line to the next in a log. What is done sooner writes none."""
 
 T = TypeVar("T")
 
@@ -19,11 +24,12 @@ def silent(what: str, share: float) -> None:
 
 @contextmanager
 def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
-    """A bar in the terminal or notebook, with an estimate of the time left; it is erased at the end.
+    """A bar in the terminal or notebook, with an estimate of the time left; it is erased at the end. Elsewhere, as in a
+    log file, a line from time to time, such as ``[1:30] merging: 45 %`` with the minutes and seconds so far.
 
     Args:
-        progress: True shows a bar (on standard error, if that is a terminal), False shows none; a function is returned
-            as it is.
+        progress: True shows a bar or writes lines, on standard error; False shows nothing; a function is returned as it
+            is.
     """
     if callable(progress):
         yield progress
@@ -37,8 +43,11 @@ def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
 
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     console = Console(stderr=True)
-    shown = console.is_terminal or console.is_jupyter
-    with Bar(*columns, console=console, transient=True, disable=not shown) as bar:
+    if not console.is_jupyter and (console.is_dumb_terminal or not console.is_terminal):
+        with _lines(console.file) as show:
+            yield show
+        return
+    with Bar(*columns, console=console, transient=True) as bar:
         tasks: dict[str, Any] = {}
 
         def show(what: str, share: float) -> None:
@@ -49,6 +58,32 @@ def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
             bar.update(tasks[what], completed=share, visible=True)
 
         yield show
+
+
+@contextmanager
+def _lines(stream: IO[str]) -> Iterator[Progress]:
+    """Write what is being done to ``stream``, every :data:`LINE_SECONDS` seconds until the context is left. A thread
+    writes, so that steps that report nothing for minutes are told from a program that hangs."""
+    start, ended, current = time.monotonic(), threading.Event(), ["starting"]
+
+    def write() -> None:
+        while not ended.wait(LINE_SECONDS):
+            minutes, seconds = divmod(round(time.monotonic() - start), 60)
+            try:
+                print(f"[{minutes}:{seconds:02d}] {current[0]}", file=stream, flush=True)
+            except (OSError, ValueError):  # nobody reads any more: the work goes on
+                return
+
+    def show(what: str, share: float) -> None:
+        current[0] = f"{what}: {100 * share:.0f} %"
+
+    writer = threading.Thread(target=write, daemon=True)
+    writer.start()
+    try:
+        yield show
+    finally:
+        ended.set()
+        writer.join()
 
 
 def tracked(items: Iterable[T], what: str, total: int, progress: bool | Progress = True) -> Iterator[T]:

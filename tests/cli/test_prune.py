@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from making import normal_scene, same
+from making import box_room, normal_scene, same
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.trained_refiner import open_refiner_run, scenes_of_run
@@ -20,6 +20,7 @@ from pointsplat_ns.compression.view_source import COMPARED_VIEWS
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning import METHODS, prune, select
+from pointsplat_ns.system import progress
 
 SEED = 5
 
@@ -39,6 +40,15 @@ def splatfacto_run(trained_walls) -> Path:
 @pytest.fixture(scope="module")
 def refined_run(make_refined_run, trained_walls, tmp_path_factory) -> Path:
     return make_refined_run(tmp_path_factory.mktemp("refined"), trained_walls, ("wall-b",), moved=0.5)
+
+
+def test_a_log_says_from_time_to_time_how_far_it_is(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.005)
+    write_ply(box_room(1, count=1900), tmp_path / "scene.ply")
+    run("prune", tmp_path / "scene.ply", "-o", tmp_path / "small.ply")
+    lines = capsys.readouterr().err.splitlines()
+    assert any(re.fullmatch(r"\[\d:\d\d\] by merge: \d+ %", line) for line in lines)
+    assert not any(ord(letter) < 32 for line in lines for letter in line)
 
 
 def run(*args) -> None:

@@ -76,7 +76,16 @@ def test_a_file_of_weights_refines(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "metadata", [{"keep": "some"}, {"keep": 1.5}, {"score": "best"}, {"keep": None}, {"opacity_weight": []}]
+    "metadata",
+    [
+        {"keep": "some"},
+        {"keep": 1.5},
+        {"keep": 10**400},
+        {"score": "best"},
+        {"keep": None},
+        {"opacity_weight": []},
+        {"opacity_weight": -(10**400)},
+    ],
 )
 def test_metadata_that_make_no_sense_are_refused_in_one_line(metadata, tmp_path):
     save_refiner(network(), tmp_path / "r.safetensors", metadata)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
-from pointsplat_ns.views import Views
+from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, near_plane_of, views_of_cameras
+from pointsplat_ns.views import NEAR_PLANE, Views
 
 SEED = 20
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
@@ -72,6 +75,32 @@ def test_cameras_of_views_in_float64_are_float32_as_nerfstudio_needs_them(views)
     double = Views(views.viewmats.double(), views.Ks.double(), views.width, views.height, BACKGROUND)
     cameras = cameras_of_views(double)
     assert (cameras.camera_to_worlds.dtype, cameras.fx.dtype) == (torch.float32, torch.float32)
+
+
+@pytest.mark.parametrize("near_plane", [NEAR_PLANE, 1e-7, 0.1, 300.0])
+def test_the_near_plane_goes_to_nerfstudios_cameras_and_back(views, near_plane):
+    cameras = cameras_of_views(dataclasses.replace(views, near_plane=near_plane))
+    for some in (cameras, cameras[1:2], copy.deepcopy(cameras).to("cpu")):
+        assert near_plane_of(some) == near_plane == views_of_cameras(some, BACKGROUND).near_plane
+
+
+def test_cameras_of_a_dataset_have_gsplats_near_plane(views):
+    assert near_plane_of(some_cameras()) == views.near_plane == NEAR_PLANE
+    with_others = some_cameras()
+    with_others.metadata = {"cam_idx": 1}
+    assert near_plane_of(with_others) == NEAR_PLANE
+
+
+def test_cameras_of_several_near_planes_are_refused(views):
+    cameras = cameras_of_views(views)
+    cameras.metadata["near_plane"] = torch.tensor([[0.1], [0.1], [0.2]])
+    with pytest.raises(DataError, match="2 near planes; expected one for all views"):
+        views_of_cameras(cameras, BACKGROUND)
+
+
+def test_rays_of_cameras_of_views_start_as_those_of_any(views):
+    rays = [some[:1].generate_rays(0) for some in (cameras_of_views(views), some_cameras())]
+    torch.testing.assert_close(rays[0].directions, rays[1].directions, atol=1e-6, rtol=0)
 
 
 def test_cameras_of_several_sizes_are_refused():

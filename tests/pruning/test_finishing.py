@@ -25,10 +25,17 @@ def test_a_top_outside_is_moved_to_the_border():
 
 
 @pytest.mark.parametrize(
-    ("values", "want"), [([1.0, 1.0, 1.0], 0.0), ([3.0, 1.0, 2.0], 0.0), ([1.0, 0.0, 2.0], 2.0), ([0.0, 1.0, 2.0], 2.0)]
+    ("values", "want"), [([1.0, 1.0, 1.0], 0.0), ([3.0, 1.0, 2.0], 0.0), ([1.0, 0.0, 2.0], 2.0), ([0.0, 0.0, 2.0], 2.0)]
 )
 def test_without_a_top_it_is_the_best_that_was_tried(values, want):
     assert top_of_parabola((0.0, 1.0, 2.0), values, beyond=0.5) == want
+
+
+@pytest.mark.parametrize("values", [[0.0, 1.0, 2.0], [0.0, 1.0, 3.0]])
+def test_where_values_rise_ever_faster_it_goes_on_to_the_border(values):
+    """A flower scene gained 1.3 dB at each step, more at each, and stopped 0.8 dB short of what it could have."""
+    assert top_of_parabola((0.0, 1.0, 2.0), values, beyond=0.5) == 2.5
+    assert top_of_parabola((0.0, 1.0, 2.0), values[::-1], beyond=0.5) == -0.5
 
 
 def test_not_a_number_is_never_chosen():

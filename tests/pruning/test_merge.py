@@ -119,7 +119,8 @@ def test_an_edge_between_colours_stays_where_it_is():
 
 def test_two_coincident_halves_become_one_of_their_common_mass():
     one = cloud(1)
-    pair = Gaussians.cat([one, one]).replace(opacities=torch.zeros(2, 1))
+    # Exact copies would never be merged as a pair.
+    pair = Gaussians.cat([one, one.replace(means=one.means + 1e-6)]).replace(opacities=torch.zeros(2, 1))
     result = merge(pair, 1)
     merged, finish = result.scene, result.finish
     # Mass 0.5 + 0.5 less the integral of what is covered twice, 0.25 G^2: half of 0.25; then deepened for two members.

@@ -1,10 +1,13 @@
-"""The progress bar: on a terminal only, gone when the work is done, or handed to a function."""
+"""The progress bar: on a terminal, gone when the work is done, or handed to a function; in a log, lines."""
 
 import io
+import re
 import sys
+import time
 
 import pytest
 
+from pointsplat_ns.system import progress
 from pointsplat_ns.system.progress import progress_bar, tracked
 
 
@@ -34,7 +37,51 @@ def test_a_terminal_shows_what_is_done_and_takes_it_away_at_the_end(stderr):
     assert shown.getvalue().endswith("\x1b[2K")  # erases its line
 
 
-def test_nothing_is_written_where_there_is_no_terminal(stderr):
+def read_until(stream: io.StringIO, text: str) -> str:
+    """What was written, as soon as it holds ``text``; after a minute at the latest."""
+    end = time.monotonic() + 60
+    while text not in stream.getvalue() and time.monotonic() < end:
+        time.sleep(0.01)
+    assert text in stream.getvalue()
+    return stream.getvalue()
+
+
+def test_a_log_gets_a_plain_line_from_time_to_time_also_while_nothing_is_reported(stderr, monkeypatch):
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.05)
+    log = stderr(io.StringIO())
+    with progress_bar() as report:
+        read_until(log, "[0:00] starting\n")
+        report("First", 0.126)
+        read_until(log, "First: 13 %\n")
+        report("Second", 1.0)
+        read_until(log, "Second: 100 %\n")
+    lines = log.getvalue().splitlines()
+    assert all(re.fullmatch(r"\[\d+:\d\d\] (starting|First: 13 %|Second: 100 %)", line) for line in lines)
+    time.sleep(0.2)
+    assert log.getvalue().splitlines() == lines  # it ends with the work
+
+
+def test_a_terminal_that_cannot_move_its_cursor_gets_lines_too(stderr, monkeypatch):
+    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.05)
+    shown = stderr(Terminal())
+    with progress_bar() as report:
+        report("First", 0.5)
+        assert "\x1b" not in read_until(shown, "First: 50 %\n")
+
+
+def test_work_goes_on_where_the_log_is_closed(stderr, monkeypatch):
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.01)
+    log = stderr(io.StringIO())
+    done = []
+    for number in tracked(range(3), "Counting", 3):
+        log.close()
+        time.sleep(0.05)
+        done.append(number)
+    assert done == [0, 1, 2]
+
+
+def test_nothing_is_written_where_there_is_no_terminal_and_little_to_do(stderr):
     shown = stderr(io.StringIO())
     assert list(tracked("abc", "Counting letters", 3)) == ["a", "b", "c"]
     assert shown.getvalue() == ""

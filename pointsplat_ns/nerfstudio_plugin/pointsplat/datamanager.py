@@ -134,7 +134,7 @@ class ScenesDataManager(DataManager):
 
     @property
     def train_dataparser_outputs(self) -> DataparserOutputs:
-        """File names of the training photos of the shown scene, for ``ns-render dataset``.
+        """File names of the training photos of the shown scene, or of its renders, for ``ns-render dataset``.
 
         Raises:
             AttributeError: in a training, whose trainer would save the transform of this one scene as that of the run.

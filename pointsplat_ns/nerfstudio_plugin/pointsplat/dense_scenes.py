@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
@@ -224,15 +225,18 @@ class RenderedFrames(Sequence[tuple[Cameras, dict[str, Any]]]):
 
     @property
     def dataset(self) -> RenderedDataset:
-        """As a nerfstudio dataset, for the viewer."""
+        """As a nerfstudio dataset, for the viewer and ``ns-render``."""
         return RenderedDataset(self)
 
 
 class RenderedDataset:
-    """Renders of a scene, with the part of a dataset's interface that nerfstudio's viewer uses."""
+    """Renders of a scene, with the part of a dataset's interface that nerfstudio's viewer and ``ns-render`` use."""
 
     def __init__(self, frames: RenderedFrames):
         self._frames, self.cameras = frames, frames.cameras
+        # There are no files: ``ns-render dataset`` names its own after these.
+        names = [Path(f"{index:05d}.png") for index in range(len(frames))]
+        self._dataparser_outputs = DataparserOutputs(image_filenames=names, cameras=frames.cameras)
 
     def __len__(self) -> int:
         return len(self._frames)

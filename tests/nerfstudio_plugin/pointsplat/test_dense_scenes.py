@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from pathlib import Path
 from unittest import mock
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
-from making import box_room, without_data
+from making import box_room, pipeline_of, without_data
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.io import write_ply
@@ -134,6 +135,20 @@ def test_targets_are_the_dense_scenes_exact_renders_in_8_bits(rooms):
     assert scene.rendered_train[0][1]["image"].dtype == torch.uint8
     with pytest.raises(IndexError):
         scene.rendered_train[6]
+
+
+def test_a_tiny_room_is_seen_as_the_same_room_in_other_units(rooms, tmp_path):
+    room = box_room(1)
+    write_ply(room.replace(means=room.means / 1024, scales=room.scales - math.log(1024)), tmp_path / "tiny.ply")
+    manager = manager_of(tmp_path / "tiny.ply")
+    camera, data = manager.scenes[0].rendered_eval[0]
+    _, wanted = manager_of(rooms / "one.ply").scenes[0].rendered_eval[0]
+    # float32 of numbers 1000 times smaller; gsplat's near plane of 0.01 units hid the whole room
+    assert wanted["image"].std() > 0.05
+    torch.testing.assert_close(data["image"], wanted["image"], atol=1e-3, rtol=0)
+    model = pipeline_of(tmp_path / "tiny.ply", keep=1.0).model.eval()
+    drawn = model.draw(manager.scenes[0].read_dense(), manager.scenes[0], camera)["rgb"]
+    torch.testing.assert_close(drawn, data["image"], atol=1e-6, rtol=0)
 
 
 def test_a_run_is_rendered_from_its_datasets_poses_as_it_was_trained(trained_walls):

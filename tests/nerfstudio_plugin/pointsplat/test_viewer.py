@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from pathlib import Path
 from unittest import mock
 
+import matplotlib.image
+import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -12,7 +16,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModel
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
-from making import fast_config, pipeline_of, run_of, same
+from making import fast_config, pipeline_of, run_of, same, without_data
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.pruning import prune
@@ -95,19 +99,40 @@ def test_the_cli_exports_any_scene_of_the_run(trained, trained_walls, tmp_path):
     assert not (tmp_path / "z.ply").exists()
 
 
-def test_ns_render_draws_the_views_of_the_dataset(trained_walls, tmp_path):
+def drawn_by_ns_render(config, folder: Path, **options) -> dict[tuple[str, str], list[Path]]:
+    """The files that ``ns-render dataset`` writes of a run that is not trained, by split and output."""
     from nerfstudio.scripts.render import DatasetRender
 
-    config = fast_config(trained_walls, tmp_path / "runs")
     config.save_config()
     config.get_checkpoint_dir().mkdir()
     state = config.pipeline.setup(device="cpu", test_mode="inference").state_dict()
     torch.save({"step": 9, "pipeline": state}, config.get_checkpoint_dir() / "step-000000009.ckpt")
-    DatasetRender(config.get_base_dir() / "config.yml", output_path=tmp_path / "renders", split="train+test").main()
+    DatasetRender(config.get_base_dir() / "config.yml", output_path=folder, split="train+test", **options).main()
+    outputs = itertools.product(("train", "test"), ("gt-rgb", "rgb"))
+    return {(split, name): sorted((folder / split / name).iterdir()) for split, name in outputs}
+
+
+def test_ns_render_draws_the_views_of_the_dataset(trained_walls, tmp_path):
+    written = drawn_by_ns_render(fast_config(trained_walls, tmp_path / "runs"), tmp_path / "renders")
     for split in ("train", "test"):
-        folders = (tmp_path / "renders" / split / name for name in ("gt-rgb", "rgb"))
-        photos, renders = (sorted(path.name for path in folder.iterdir()) for folder in folders)
+        photos, renders = ([path.name for path in written[split, name]] for name in ("gt-rgb", "rgb"))
         assert photos == renders and len(photos) > 1, split
+
+
+@pytest.mark.parametrize("data", ["a PLY", "a run without its photos"])
+def test_ns_render_draws_the_sampled_views_of_a_scene_without_photos(data, three_rooms, trained_walls, tmp_path):
+    folder = three_rooms if data == "a PLY" else without_data(trained_walls, tmp_path / "walls")
+    config = fast_config(folder, tmp_path / "runs")
+    manager = config.pipeline.datamanager
+    manager.supervision, manager.sampled_poses, manager.sampled_size = "dense", 10, (32, 24)
+    written = drawn_by_ns_render(config, tmp_path / "renders", image_format="png")
+    pipeline = config.pipeline.setup(device="cpu", test_mode="test")
+    shown = pipeline.datamanager.scenes[pipeline.datamanager.shown]
+    for split, frames in (("train", shown.rendered_train), ("test", shown.rendered_eval)):
+        assert len(frames) == len(written[split, "rgb"]) == len(written[split, "gt-rgb"]) > 1
+        for path, (_, data) in zip(written[split, "gt-rgb"], frames, strict=True):
+            image = data["image"].float() / (255 if data["image"].dtype == torch.uint8 else 1)
+            assert np.abs(matplotlib.image.imread(path)[..., :3] - image.numpy()).max() < 1 / 255  # rounded to 8 bits
 
 
 def test_a_training_does_not_save_the_transform_of_one_scene_as_its_own(hollow_ball, tmp_path):

@@ -1,0 +1,146 @@
+"""Exact copies of Gaussians."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from making import same
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.pruning import duplicates
+from pointsplat_ns.pruning.duplicates import Copies, stacked
+from pointsplat_ns.pruning.merge import merge, merge_levels
+from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
+
+
+def cloud(n: int, seed: int = 0, sh_degree: int = 1) -> Gaussians:
+    """``n`` random Gaussians in a unit cube."""
+    g = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=torch.rand(n, 3, generator=g),
+        scales=-3 + 0.5 * torch.randn(n, 3, generator=g),
+        quats=torch.randn(n, 4, generator=g),
+        opacities=torch.randn(n, 1, generator=g),
+        features_dc=torch.randn(n, 3, generator=g),
+        features_rest=0.1 * torch.randn(n, (sh_degree + 1) ** 2 - 1, 3, generator=g),
+    )
+
+
+def with_zeros(n: int = 700, zeros: int = 300) -> tuple[Gaussians, torch.Tensor]:
+    """A cloud in which rows of nothing but zeros are strewn, as in broken files, and the mask of these."""
+    rows = Gaussians(*(torch.zeros(zeros, *value.shape[1:]) for value in cloud(1).tensors()))
+    order = torch.randperm(n + zeros, generator=torch.Generator().manual_seed(1))
+    return Gaussians.cat([cloud(n), rows])[order], order >= n
+
+
+def covered(alpha: float, count: int, growth: float = 0.0) -> float:
+    """Integral of what ``count`` equal Gaussians of unit size cover, as the rasterizer draws them, by 300,000 rings."""
+    r = torch.linspace(0, 20, 300_001, dtype=torch.float64)
+    drawn = alpha * torch.exp(-0.5 * (r / math.exp(growth)).square())
+    drawn = torch.where(drawn < ALPHA_MIN, 0, drawn.clamp_max(ALPHA_MAX))
+    return float(((1 - (1 - drawn) ** count) * r).sum() * (r[1] - r[0]))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 100, 10**6])
+def test_one_covers_as_much_as_all_copies_and_is_as_opaque_at_the_centre(count):
+    alphas = torch.tensor([0.00393, 0.02, 0.1, 0.5, 0.99, 1.0], dtype=torch.float64)
+    found, growth = stacked(alphas, torch.full((6,), count))
+    # one by one, naively, so not to rel 1e-15
+    torch.testing.assert_close(found, (1 - (1 - alphas) ** count).clamp_max(ALPHA_MAX), rtol=1e-9, atol=0)
+    for alpha, one, grown in zip(alphas.tolist(), found.tolist(), growth.tolist(), strict=True):
+        # The rings are as coarse as 3e-3 of the small disk that is drawn of the faintest.
+        want = covered(alpha, count)
+        assert covered(one, 1, grown) == pytest.approx(want, rel=5e-3 if alpha < 0.01 else 1e-3), alpha
+
+
+def test_copies_too_faint_to_be_drawn_stay_too_faint():
+    faint = torch.tensor([0.0, 1e-300, 1e-5, ALPHA_MIN], dtype=torch.float64)
+    alphas, growth = stacked(faint, torch.tensor([1000] * 4))
+    assert torch.equal(alphas, faint) and growth.tolist() == [0.0] * 4
+
+
+def test_those_alike_in_all_but_one_parameter_are_no_copies():
+    one = cloud(1, sh_degree=3)
+    other = [one]
+    for name, value in one.items():
+        for column in range(value[0].numel()):
+            changed = value.clone()
+            changed.view(-1)[column] = torch.nextafter(changed.view(-1)[column], torch.tensor(math.inf))
+            other.append(one.replace(**{name: changed}))
+    scene = Gaussians.cat([*other, *other])
+    n = len(other)
+    copies = Copies(scene, torch.arange(2 * n))
+    assert n == 60 and copies.distinct == n
+    assert copies.first.tolist() == [*range(n), *range(n)]
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+def test_copies_are_found_in_any_precision_and_pieces(dtype, monkeypatch):
+    scene, zero = with_zeros()
+    members = torch.arange(1, len(scene), 2)
+    monkeypatch.setattr(duplicates, "CHUNK", 37)
+    copies = Copies(scene.to(dtype), members)
+    zero = zero[members]
+    assert copies.distinct == int((~zero).sum()) + 1
+    assert torch.equal(copies.first[~zero], torch.arange(len(members))[~zero])
+    assert bool((copies.first[zero] == zero.nonzero()[0]).all())
+
+
+def test_hashes_that_collide_make_no_copies_of_others(monkeypatch):
+    monkeypatch.setattr(duplicates, "_hashes", lambda columns, rows: torch.zeros(len(rows), dtype=torch.int64))
+    scene = cloud(50)
+    assert Copies(scene, torch.arange(50)).distinct == 50
+    assert Copies(Gaussians.cat([scene, scene[:1]]), torch.arange(51)).first.tolist() == [*range(50), 0]
+
+
+def test_copies_become_one_gaussian_and_do_not_crowd_out_the_others():
+    scene, zero = with_zeros()
+    merged = merge(scene, 100)
+    assert len(merged.scene) == 100
+    assert len(merged.assignment[zero].unique()) == 1
+
+
+@pytest.mark.parametrize("k", [701, 702, 850, 999])
+def test_the_count_is_exact_also_where_fewer_differ(k):
+    scene, zero = with_zeros()
+    merged = merge(scene, k)
+    assert len(merged.scene) == k and bool(merged.scene.usable().all())
+    assert merged.assignment.bincount(minlength=k).min() == 1
+    assert same(merged.scene[merged.assignment[~zero]], scene[~zero])  # they are kept to the bit
+    firsts = merged.assignment[zero].unique()
+    assert len(firsts) == k - 700 and same(merged.scene[firsts[1:]], scene[zero][1 : len(firsts)])
+
+
+def test_levels_with_copies_are_nested_and_exact():
+    scene, _ = with_zeros()
+    counts = [990, 800, 701, 300, 20, 1]
+    levels = list(merge_levels(scene, counts))
+    assert [len(level.scene) for level in levels] == counts
+    for finer, coarser in zip(levels[:-1], levels[1:], strict=True):
+        parents = torch.full((len(finer.scene),), -1)
+        parents[finer.assignment] = coarser.assignment
+        assert torch.equal(parents[finer.assignment], coarser.assignment)
+    assert same(levels[3].scene, merge(scene, 300).scene)
+
+
+def test_renders_without_the_copies_are_those_with_them():
+    scene = cloud(40)
+    scene = Gaussians.cat([scene, scene[:20], scene[:20], scene[10:20]])
+    reduced = Copies(scene, torch.arange(len(scene))).reduced(40).scene
+
+    def drawn(some: Gaussians) -> torch.Tensor:
+        view, size = torch.eye(4), 64
+        view[:3, 3] = torch.tensor([-0.5, -0.5, 1.5])
+        K = torch.tensor([[size * 1.2, 0, size / 2], [0, size * 1.2, size / 2], [0, 0, 1.0]])
+        args = (some.means, some.quats, some.stds, some.alphas, some.sh, view[None], K[None], size, size)
+        return rasterization(*args, sh_degree=some.sh_degree)[0][0]
+
+    whole = drawn(scene)
+    trials = reduced, scene[:40], reduced.replace(scales=scene.scales[:40])
+    loss, dropped, not_grown = (float((drawn(some) - whole).square().mean()) for some in trials)
+    assert len(reduced) == 40 and same(scene[20:40], reduced[20:])
+    assert dropped > 1e-3  # the copies are seen
+    assert loss < dropped / 10 and loss < not_grown / 4
