@@ -1,4 +1,4 @@
-"""What repairing a merged scene brings, in dB over seconds: the refiner alone, fine-tuning, and ``compact``'s repair.
+"""What repairing a merged scene brings, in dB over seconds: the refiner, fine-tuning, Adam, and ``compact``'s repair.
 
     python benchmarks/repair.py scenes/rock.ply outputs/diorama/splatfacto-cpu/RUN --keep 10% --seconds 5 10 20
 
@@ -27,6 +27,7 @@ from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.refiner.feedback import shipped_feedback_refiner
 from pointsplat_ns.views import Views
 
 SETS = {"a": 1001, "b": 1002}
@@ -44,7 +45,7 @@ class Row:
     gaussians: int
     keep: str
     kind: str
-    """merge, refiner, fine-tune (``prune --fine-tune``) or repair (``compact``)."""
+    """merge, refiner, fine-tune (``prune --fine-tune``), Adam (a repair without its network) or repair (``compact``)."""
     steps: int
     seconds: float
     """Wall-clock time after merging. That of the refiner includes finding out how far it helps."""
@@ -83,7 +84,7 @@ def rows_of(path: Path, keep: str, seconds: list[float], fine_tune_steps: list[i
     judge = Judge(path, dense, count)
     source = ViewSource(dense, run=path, dataset_views=dataset_views)
     views = source.compared()
-    merged = ps.prune(dense, keep, "merge")
+    merged = ps.prune(path, keep, "merge")
 
     def row(kind: str, scene: Gaussians, steps: int, started: tuple[float, float]) -> Row:
         wall, cpu = time.perf_counter() - started[0], time.process_time() - started[1]
@@ -101,9 +102,10 @@ def rows_of(path: Path, keep: str, seconds: list[float], fine_tune_steps: list[i
         tuned = fine_tune(merged, ps.sample_views(dense, FINE_TUNED_ON), dense, steps)
         yield row("fine-tune", tuned, steps, started)
     for budget in (RepairBudget("quick"), *(RepairBudget(seconds=limit) for limit in seconds)):
-        started = now()
-        repaired = repair(refined, dense, source, budget)
-        yield row("repair", repaired.scene, repaired.steps, started)
+        for kind, network in (("Adam", None), ("repair", shipped_feedback_refiner(dense.device))):
+            started = now()
+            repaired = repair(refined, dense, source, budget, network=network)
+            yield row(kind, repaired.scene, repaired.steps, started)
 
 
 def now() -> tuple[float, float]:
@@ -121,7 +123,7 @@ def plot(rows: list[Row], path: Path) -> None:
     for axis, key in zip(axes, scenes, strict=False):
         here = [row for row in rows if (row.scene, row.keep) == key]
         start = next(row for row in here if row.kind == "merge")
-        for kind in ("refiner", "fine-tune", "repair"):
+        for kind in ("refiner", "fine-tune", "Adam", "repair"):
             points = sorted((row.cpu_seconds, gain(row, start)) for row in here if row.kind == kind)
             if points:
                 axis.plot(*zip(*points, strict=True), marker="o", label=kind)
