@@ -21,9 +21,6 @@ LOG_SCALE_LIMIT = 40.0
 THINNEST = 11.5
 """Axes shorter than exp(-this) (1e-5) of the longest are set to that length, which float64 still tells from zero."""
 
-SQUARINGS = 6
-"""Power iteration for the thinnest axis: where the two thinnest variances differ by a tenth, it is found to 1 %."""
-
 
 def covariances(log_scales: Tensor, quats: Tensor) -> Tensor:
     """Covariances (N, 6) of Gaussians with log-scales (N, 3), +-Inf allowed, and quaternions (N, 4), float64."""
@@ -74,11 +71,11 @@ def shadow(six: Tensor) -> Tensor:
 def normals(six: Tensor) -> Tensor:
     """Unit vectors (N, 3) near the thinnest axis; any axis if there is no thinnest one.
 
-    The thinnest axis is the dominant eigenvector of the adjugate. Squaring the matrix :data:`SQUARINGS` times makes it
-    dominate (power iteration).
+    The thinnest axis is the dominant eigenvector of the adjugate. Squaring the matrix three times makes it dominate
+    (power iteration).
     """
     matrix = unpack(adjugate(six))
-    for _ in range(SQUARINGS):
+    for _ in range(3):
         matrix = matrix / matrix.diagonal(dim1=1, dim2=2).sum(1).clamp_min(TINY)[:, None, None]
         matrix = matrix @ matrix
     column = matrix.diagonal(dim1=1, dim2=2).argmax(1)

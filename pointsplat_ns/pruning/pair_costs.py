@@ -5,20 +5,23 @@ colour contrast with its surroundings, and less the more others cover the same p
 background shows through and counts as well. The change is an integral over the projections of three Gaussians onto a
 plane. All products of Gaussians have closed integrals.
 
-A pair is looked at along the three axes of its first member, so that nothing depends on the axes of the world.
+A pair is looked at from three perpendicular directions: along the thinnest axis of its first member, and from the
+sides. They are rounded to thirteen fixed ones, the axes and diagonals of a cube. So every Gaussian is projected once
+for each direction, not once for each of its pairs.
 
-Shapes: n Gaussians, m of them at a time, k neighbours of each, C colour axes. The projection of a Gaussian onto a plane
-is called its shadow: three variances (uu, uv, vv).
+Shapes: n Gaussians, k neighbours of each, C colour axes. The projection of a Gaussian onto a plane is called its
+shadow: three variances (uu, uv, vv).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import itertools
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.pruning.covariance import flatten, normals, plane
+from pointsplat_ns.pruning.covariance import plane
 from pointsplat_ns.pruning.merge_state import GROWTH, MOST_SURPLUS, OPAQUE, State
 from pointsplat_ns.system.threads import in_threads
 
@@ -27,6 +30,11 @@ LOCAL_CONTRAST = 0.01
 
 BACKGROUND_CONTRAST = 0.3
 """Contrast assumed with the far background, which shows where few Gaussians overlap."""
+
+DIRECTIONS = torch.nn.functional.normalize(
+    torch.tensor([way for way in itertools.product((-1.0, 0.0, 1.0), repeat=3) if way > (0, 0, 0)], dtype=torch.float64)
+)
+"""The directions (13, 3) that pairs are seen from."""
 
 THINNEST = 1e-5
 """Share of a shadow's summed variances that is added to each, so that float32 tells thin shadows from lines. So widths
@@ -43,11 +51,34 @@ CHUNK = 1 << 14
 
 TINY = 1e-30
 
-PLANES = ((1, 2), (0, 2), (0, 1))
-"""Pairs of axes; a plane is seen along the axis that is left out."""
 
-SIX = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Rows and columns of the six numbers of a covariance."""
+def _projections() -> tuple[Tensor, Tensor]:
+    """For each direction the two axes of its plane, (13, 3, 2), and the matrix that turns the six numbers of a
+    covariance into its shadow, (13, 6, 3)."""
+    axes = torch.stack(plane(DIRECTIONS), dim=2)
+    u, v = axes[..., 0], axes[..., 1]
+
+    def row(a: Tensor, b: Tensor) -> Tensor:
+        x, y, z = a.unbind(1)
+        p, q, r = b.unbind(1)
+        return torch.stack([x * p, x * q + y * p, x * r + z * p, y * q, y * r + z * q, z * r], dim=1)
+
+    return axes, torch.stack([row(u, u), row(u, v), row(v, v)], dim=2)
+
+
+def _sides() -> Tensor:
+    """(13, 3): each direction, and two that are perpendicular to it and to each other, as far as the thirteen are."""
+    across = (DIRECTIONS @ DIRECTIONS.T).abs()
+    rows = []
+    for face in range(len(DIRECTIONS)):
+        one = int(across[face].sort(stable=True).indices[0])
+        other = int((across[face] + across[one]).sort(stable=True).indices[0])
+        rows.append([face, one, other])
+    return torch.tensor(rows)
+
+
+AXES, TO_SHADOW = _projections()
+SIDES = _sides()
 
 
 def costs_of(state: State, near: Tensor) -> Tensor:
@@ -60,26 +91,32 @@ def costs_of(state: State, near: Tensor) -> Tensor:
     Returns:
         (n, k) float32: squared colour units times solid angle, with the surroundings of the first of each pair.
     """
+    n = len(state)
     means, cov = _scaled(state)
-    alphas, colours = state.alphas.float(), state.colours
-    lengths, costs = colours.square().sum(1), torch.zeros(near.shape)
+    ways = torch.empty(n, 3, dtype=torch.uint8)
+    everywhere = torch.arange(n).split(CHUNK)
 
-    def add(these: Tensor) -> None:
-        (m, k), flat = near[these].shape, near[these].flatten()
-        axes = own_axes(cov[these])
-        apart = ((means[these][:, None] - means.index_select(0, flat).view(m, k, 3)) @ axes).float()
-        turn = _turn(axes)
-        first = (cov[these][:, None] @ turn).float()  # (m, 1, 6)
-        second = (cov.index_select(0, flat).view(m, k, 6) @ turn).float()
-        paints = (
-            Paint(alphas[these][:, None], colours[these][:, None], lengths[these][:, None]),
-            Paint(alphas[flat].view(m, k), colours.index_select(0, flat).view(m, k, -1), lengths[flat].view(m, k)),
-        )
-        for u, v in PLANES:
-            shadows = _shadow(first, u, v), _shadow(second, u, v)
-            costs[these] += change(*shadows, *paints, apart[..., u], apart[..., v])
+    def choose(these: Tensor) -> None:
+        shadows = (cov[these] @ TO_SHADOW.permute(1, 0, 2).reshape(6, -1)).view(-1, len(DIRECTIONS), 3)
+        areas = shadows[..., 0] * shadows[..., 2] - shadows[..., 1] ** 2
+        ways[these] = SIDES[areas.argmax(1)].to(torch.uint8)
 
-    in_threads(add, torch.arange(len(state)).split(CHUNK))
+    in_threads(choose, everywhere)
+    alphas, costs = state.alphas.float(), torch.zeros(near.shape)
+    for way in range(len(DIRECTIONS)):
+        here = (ways == way).any(1).nonzero()[:, 0]
+        if len(here) == 0:
+            continue
+        centres, shadows = (means @ AXES[way]).float(), (cov @ TO_SHADOW[way]).float()
+        spread = THINNEST * (shadows[:, 0] + shadows[:, 2]) + NARROWEST**2
+        shadows[:, 0] += spread
+        shadows[:, 2] += spread
+        seen = Seen.of(centres, shadows, alphas, state.colours)
+
+        def add(these: Tensor, seen: Seen = seen) -> None:
+            costs[these] += seen.costs(these, near[these])
+
+        in_threads(add, here.split(CHUNK))
     return costs.mul_(state.weights[:, None])
 
 
@@ -90,27 +127,6 @@ def _scaled(state: State) -> tuple[Tensor, Tensor]:
     total = cov[:, 0] + cov[:, 3] + cov[:, 5]
     cov *= (WIDEST**2 / total.clamp_min(WIDEST**2))[:, None]
     return means, cov
-
-
-def own_axes(cov: Tensor) -> Tensor:
-    """Axes of Gaussians with covariances (m, 6), as columns (m, 3, 3): the thinnest, the longest and the one across.
-    Axes of equal length are any."""
-    thin = normals(cov)
-    u, v = plane(thin)
-    uu, uv, vv = flatten(cov, u, v).unbind(1)
-    angle = 0.5 * torch.atan2(2 * uv, uu - vv)[:, None]
-    long = angle.cos() * u + angle.sin() * v
-    return torch.stack([thin, long, torch.linalg.cross(thin, long)], dim=2)
-
-
-def _turn(axes: Tensor) -> Tensor:
-    """Matrices (m, 6, 6) that turn the six numbers of covariances to those along ``axes`` (m, 3, 3)."""
-    turn = axes.new_empty(len(axes), 6, 6)
-    for to, (p, q) in enumerate(SIX):
-        for of, (a, b) in enumerate(SIX):
-            both = axes[:, a, p] * axes[:, b, q]
-            turn[:, of, to] = both if a == b else both + axes[:, b, p] * axes[:, a, q]
-    return turn
 
 
 def area_of(uu: Tensor, uv: Tensor, vv: Tensor) -> Tensor:
@@ -135,79 +151,63 @@ def overlap(uu: Tensor, uv: Tensor, vv: Tensor, product: Tensor, u: Tensor, v: T
     return distance.mul_(-0.5).exp_().mul_(inverse.sqrt_()).mul_(product)
 
 
-class Shadow(NamedTuple):
-    """Shadows of Gaussians, each (m, k), or (m, 1) for the first members of pairs."""
+@dataclass
+class Seen:
+    """All Gaussians as seen from one direction."""
 
-    uu: Tensor
-    uv: Tensor
-    vv: Tensor
-    area: Tensor
+    plane: Tensor  # [n, 8] centre u, v; variances uu, uv, vv; area; opacity; squared length of the colour
+    colours: Tensor  # [n, C]
 
+    @classmethod
+    def of(cls, centres: Tensor, shadows: Tensor, alphas: Tensor, colours: Tensor) -> Seen:
+        """From centres (n, 2), shadows (n, 3), opacities (n,) and colours (n, C)."""
+        columns = area_of(*shadows.unbind(1)), alphas, colours.square().sum(1)
+        return cls(torch.cat([centres, shadows, torch.stack(columns, dim=1)], dim=1), colours)
 
-class Paint(NamedTuple):
-    """What Gaussians look like, but for their shape; k is 1 for the first members of pairs."""
-
-    alphas: Tensor  # [m, k]
-    colours: Tensor  # [m, k, C]
-    lengths: Tensor  # [m, k] squared length of the colour
-
-
-def _shadow(six: Tensor, u: int, v: int) -> Shadow:
-    """Shadows on the plane of two axes of covariances (..., 6) along these axes."""
-    uu, uv, vv = (six[..., SIX.index(which)] for which in ((u, u), (u, v), (v, v)))
-    spread = THINNEST * (uu + vv) + NARROWEST**2
-    uu, vv = uu + spread, vv + spread
-    return Shadow(uu, uv, vv, area_of(uu, uv, vv))
-
-
-def change(si: Shadow, sj: Shadow, first: Paint, second: Paint, u: Tensor, v: Tensor) -> Tensor:
-    """Change of the image by each merge of Gaussians with their neighbours, (m, k).
-
-    Args:
-        si, sj: shadows of the Gaussians, and of their neighbours.
-        first, second: what they look like.
-        u, v: from the centres of neighbours to those of the Gaussians, (m, k) each.
-    """
-    uui, uvi, vvi, pi = si
-    uuj, uvj, vvj, pj = sj
-    (ai, ci, cci), (aj, cj, ccj) = first, second
-    ci = ci[:, 0]
-    oij = overlap(uui + uuj, uvi + uvj, vvi + vvj, pi * pj, u, v)
-    # How much covers the first, itself included, and the mean colour of that.
-    on = aj * oij / pi
-    cover = ai / 2 + on.sum(1, keepdim=True)
-    around = torch.baddbmm((ai / 2 * ci)[:, None], on[:, None], cj)[:, 0] / cover.clamp_min(TINY)
-    # The replacement: common mass, centre and covariance.
-    mi, mj = ai * pi, aj * pj
-    wi = mi / (mi + mj).clamp_min_(TINY)
-    wj = 1 - wi
-    wu, wv = wi * wj * u, wi * wj * v
-    uuk = (wu * u).addcmul_(wi, uui).addcmul_(wj, uuj)
-    uvk = (wu * v).addcmul_(wi, uvi).addcmul_(wj, uvj)
-    vvk = (wv * v).addcmul_(wi, vvi).addcmul_(wj, vvj)
-    pk = area_of(uuk, uvk, vvk)
-    gij = ai * aj * oij
-    ak = (mi + mj).sub_(gij).clamp_min_(0).div_(pk)
-    if bool((ak > OPAQUE).any()):
-        growth = (ak / OPAQUE).clamp_(1, MOST_SURPLUS).pow_(GROWTH)
-        uuk, uvk, vvk, pk = uuk * growth, uvk * growth, vvk * growth, pk * growth
-        ak = ak.clamp_max_(OPAQUE)
-    oik = overlap(uui + uuk, uvi + uvk, vvi + vvk, pi * pk, wj * u, wj * v)
-    ojk = overlap(uuj + uuk, uvj + uvk, vvj + vvk, pj * pk, wi * u, wi * v)
-    # |f_i a_i G_i + f_j a_j G_j - f_k a_k G_k|^2 over the plane, for features f: f_k is their mean by mass. The
-    # products of colours less the one around are written out: no difference is stored for each pair.
-    assumed = 3 * LOCAL_CONTRAST**2
-    aa, ia = around.square().sum(1, keepdim=True), (ci * around).sum(1, keepdim=True)
-    cij, ja = (torch.stack([ci, around], dim=1) @ cj.mT).unbind(1)
-    ii = (cci - 2 * ia + aa).clamp_min_(0) + assumed
-    jj = ccj.sub(ja, alpha=2).add_(aa).clamp_min_(0).add_(assumed)
-    ij = cij.sub_(ja).add_(aa - ia + assumed)
-    ik, jk = (wi * ii).addcmul_(wj, ij), (wj * jj).addcmul_(wi, ij)
-    kk = (wi * ik).addcmul_(wj, jk)
-    gii, gjj, gkk = ai * ai * pi / 2, aj * aj * pj / 2, ak * ak * pk / 2
-    gij, gik, gjk = 2 * gij, 2 * ai * ak * oik, 2 * aj * ak * ojk
-    blend = (jj * gjj).addcmul_(ii, gii).addcmul_(kk, gkk).addcmul_(ij, gij)
-    blend.addcmul_(ik, gik, value=-1).addcmul_(jk, gjk, value=-1).clamp_min_(0)
-    holes = (gjj + gii).add_(gkk).add_(gij).sub_(gik).sub_(gjk).clamp_min_(0)
-    through = 3 * BACKGROUND_CONTRAST**2 * torch.exp(-4 * cover)
-    return blend.div_(cover.clamp_min(0.5).square()).addcmul_(holes, through)
+    def costs(self, i: Tensor, j: Tensor) -> Tensor:
+        """Change of the image by each merge of Gaussians ``i`` (m,) with their neighbours ``j`` (m, k), (m, k)."""
+        m, k = j.shape
+        flat = j.flatten()
+        ui, vi, uui, uvi, vvi, pi, ai, cci = self.plane.index_select(0, i).T.contiguous().view(8, m, 1)
+        uj, vj, uuj, uvj, vvj, pj, aj, ccj = self.plane.index_select(0, flat).T.contiguous().view(8, m, k)
+        ci, cj = self.colours.index_select(0, i), self.colours.index_select(0, flat).view(m, k, -1)
+        u, v = ui - uj, vi - vj
+        oij = overlap(uui + uuj, uvi + uvj, vvi + vvj, pi * pj, u, v)
+        # How much covers the first, itself included, and the mean colour of that.
+        on = aj * oij / pi
+        cover = ai / 2 + on.sum(1, keepdim=True)
+        around = torch.baddbmm((ai / 2 * ci)[:, None], on[:, None], cj)[:, 0] / cover.clamp_min(TINY)
+        # The replacement: common mass, centre and covariance.
+        mi, mj = ai * pi, aj * pj
+        wi = mi / (mi + mj).clamp_min_(TINY)
+        wj = 1 - wi
+        wu, wv = wi * wj * u, wi * wj * v
+        uuk = (wu * u).addcmul_(wi, uui).addcmul_(wj, uuj)
+        uvk = (wu * v).addcmul_(wi, uvi).addcmul_(wj, uvj)
+        vvk = (wv * v).addcmul_(wi, vvi).addcmul_(wj, vvj)
+        pk = area_of(uuk, uvk, vvk)
+        gij = ai * aj * oij
+        ak = (mi + mj).sub_(gij).clamp_min_(0).div_(pk)
+        if bool((ak > OPAQUE).any()):
+            growth = (ak / OPAQUE).clamp_(1, MOST_SURPLUS).pow_(GROWTH)
+            uuk, uvk, vvk, pk = uuk * growth, uvk * growth, vvk * growth, pk * growth
+            ak = ak.clamp_max_(OPAQUE)
+        oik = overlap(uui + uuk, uvi + uvk, vvi + vvk, pi * pk, wj * u, wj * v)
+        ojk = overlap(uuj + uuk, uvj + uvk, vvj + vvk, pj * pk, wi * u, wi * v)
+        # |f_i a_i G_i + f_j a_j G_j - f_k a_k G_k|^2 over the plane, for features f: f_k is their mean by mass. The
+        # products of colours less the one around are written out: no difference is stored for each pair.
+        assumed = 3 * LOCAL_CONTRAST**2
+        aa, ia = around.square().sum(1, keepdim=True), (ci * around).sum(1, keepdim=True)
+        cij, ja = (torch.stack([ci, around], dim=1) @ cj.mT).unbind(1)
+        ii = (cci - 2 * ia + aa).clamp_min_(0) + assumed
+        jj = ccj.sub(ja, alpha=2).add_(aa).clamp_min_(0).add_(assumed)
+        ij = cij.sub_(ja).add_(aa - ia + assumed)
+        ik, jk = (wi * ii).addcmul_(wj, ij), (wj * jj).addcmul_(wi, ij)
+        kk = (wi * ik).addcmul_(wj, jk)
+        gii, gjj, gkk = ai * ai * pi / 2, aj * aj * pj / 2, ak * ak * pk / 2
+        gij, gik, gjk = 2 * gij, 2 * ai * ak * oik, 2 * aj * ak * ojk
+        blend = (jj * gjj).addcmul_(ii, gii).addcmul_(kk, gkk).addcmul_(ij, gij)
+        blend.addcmul_(ik, gik, value=-1).addcmul_(jk, gjk, value=-1).clamp_min_(0)
+        holes = (gjj + gii).add_(gkk).add_(gij).sub_(gik).sub_(gjk).clamp_min_(0)
+        through = 3 * BACKGROUND_CONTRAST**2 * torch.exp(-4 * cover)
+        return blend.div_(cover.clamp_min(0.5).square()).addcmul_(holes, through)
