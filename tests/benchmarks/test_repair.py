@@ -5,17 +5,15 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from making import run_benchmark
-
 
 def wall_of(trained_walls: Path) -> Path:
     (scene,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
     return scene
 
 
-def test_every_repair_is_a_row_and_a_point_of_the_picture(trained_walls, tmp_path):
+def test_every_repair_is_a_row_and_a_point_of_the_picture(trained_walls, tmp_path, run_benchmark):
     options = ("--keep", "50%", "--seconds", "0.1", "--fine-tune-steps", "1", "--views", "1")
-    said = run_benchmark("repair.py", wall_of(trained_walls), *options, "--output", tmp_path / "repair.csv")
+    said = run_benchmark("repair", wall_of(trained_walls), *options, "--output", tmp_path / "repair.csv")
     with (tmp_path / "repair.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["kind"] for row in rows] == ["merge", "refiner", "fine-tune", "repair", "repair"]
@@ -25,5 +23,5 @@ def test_every_repair_is_a_row_and_a_point_of_the_picture(trained_walls, tmp_pat
     assert (tmp_path / "repair.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_sampled_views_are_held_against_poses_of_photos(trained_walls):
-    assert "wall-a" in run_benchmark("sampled_views.py", wall_of(trained_walls), "--views", "1", "--side", "32")
+def test_sampled_views_are_held_against_poses_of_photos(trained_walls, run_benchmark):
+    assert "wall-a" in run_benchmark("sampled_views", wall_of(trained_walls), "--views", "1", "--side", "32")
