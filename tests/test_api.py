@@ -24,6 +24,8 @@ from pointsplat_ns.cli.scene_options import Bands
 from pointsplat_ns.compression.prune import SH_CHOICES
 from pointsplat_ns.pruning import METHODS, resolve_keep
 
+pytestmark = pytest.mark.xdist_group("api")  # one worker runs the ten lines for all tests of this file
+
 TEN_LINES = """
 import pointsplat_ns as ps
 scene   = ps.load("room.ply")                     # any format, a checkpoint, a run

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import runpy
 import sys
 from collections.abc import Callable, Iterator
 from types import ModuleType
@@ -20,3 +21,19 @@ def benchmark() -> Iterator[Callable[[str], ModuleType]]:
         yield importlib.import_module
     finally:
         sys.path.remove(str(BENCHMARKS))
+
+
+@pytest.fixture()
+def run_benchmark(benchmark, monkeypatch, capsys) -> Callable[..., str]:
+    """A function that runs a benchmark, by its name and its arguments, and gives what it prints.
+
+    It runs in this process, where what takes seconds to import is there already.
+    """
+
+    def run(name: str, *words: object) -> str:
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "argv", [f"{name}.py", *map(str, words)])
+            runpy.run_module(name, run_name="__main__")
+        return capsys.readouterr().out
+
+    return run

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from making import run_benchmark
+from pointsplat_ns.compression.repair import STEPS
 
 
 def wall_of(trained_walls: Path) -> Path:
@@ -13,17 +13,18 @@ def wall_of(trained_walls: Path) -> Path:
     return scene
 
 
-def test_every_repair_is_a_row_and_a_point_of_the_picture(trained_walls, tmp_path):
+def test_every_repair_is_a_row_and_a_point_of_the_picture(trained_walls, tmp_path, run_benchmark, monkeypatch):
+    monkeypatch.setitem(STEPS, "quick", 4)
     options = ("--keep", "50%", "--seconds", "0.1", "--fine-tune-steps", "1", "--views", "1")
-    said = run_benchmark("repair.py", wall_of(trained_walls), *options, "--output", tmp_path / "repair.csv")
+    said = run_benchmark("repair", wall_of(trained_walls), *options, "--output", tmp_path / "repair.csv")
     with (tmp_path / "repair.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["kind"] for row in rows] == ["merge", "refiner", "fine-tune", *2 * ["Adam", "repair"]]
-    assert [row["steps"] for row in rows[:5]] == ["0", "0", "1", "32", "32"] and int(rows[6]["steps"]) >= 1
+    assert [row["steps"] for row in rows[:5]] == ["0", "0", "1", "4", "4"] and int(rows[6]["steps"]) >= 1
     assert all(float(row[name]) > 5 for row in rows for name in ("psnr_a", "psnr_b", "photo_psnr"))
     assert said.count("photos") == 7
     assert (tmp_path / "repair.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_sampled_views_are_held_against_poses_of_photos(trained_walls):
-    assert "wall-a" in run_benchmark("sampled_views.py", wall_of(trained_walls), "--views", "1", "--side", "32")
+def test_sampled_views_are_held_against_poses_of_photos(trained_walls, run_benchmark):
+    assert "wall-a" in run_benchmark("sampled_views", wall_of(trained_walls), "--views", "1", "--side", "32")

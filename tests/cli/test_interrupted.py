@@ -11,8 +11,13 @@ from pathlib import Path
 
 import pytest
 
-HEEDED = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-"""What a shell runs in its background ignores SIGINT, and so does what that starts, unless told otherwise."""
+HEEDED = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+"""
+"""Where the tests run in the background of a shell or by nohup, SIGINT or SIGHUP is ignored, also by what they start,
+unless told otherwise."""
 
 MAKE_REFINER = """
 import sys

@@ -144,7 +144,7 @@ def test_names_of_scenes_are_shown_as_they_are(tmp_path, capsys):
     assert "[/b]" in capsys.readouterr().out
 
 
-def test_rooms_are_named_by_their_seeds(tmp_path):
+def test_rooms_are_named_by_their_seeds(tmp_path, coarse_rooms):
     main(["rooms", "-o", str(tmp_path / "r"), "--seeds", "3", "--frames", "2", "--width", "32", "--height", "24"])
     assert sorted(p.name for p in (tmp_path / "r").iterdir()) == ["room3"]
     assert len(list((tmp_path / "r" / "room3" / "results").glob("frame*"))) == 2

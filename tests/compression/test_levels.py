@@ -331,7 +331,7 @@ def test_a_level_of_all_gaussians_is_the_scene_itself(scene, views, tmp_path):
 
 
 @pytest.mark.parametrize("asked", ["100%", "1"])
-def test_a_scene_of_one_gaussian_has_one_level(asked, tmp_path):
+def test_a_scene_of_one_gaussian_has_one_level(asked, short_search, tmp_path):
     one = normal_scene(1)
     levels = ps.lod(one, [asked], folder=tmp_path / "out")
     assert same(levels[0].scene, one) and levels[0].parents.tolist() == [0]
@@ -340,7 +340,7 @@ def test_a_scene_of_one_gaussian_has_one_level(asked, tmp_path):
         ps.lod(one)
 
 
-def test_where_nothing_can_be_seen_levels_are_made_and_not_measured(scene, tmp_path):
+def test_where_nothing_can_be_seen_levels_are_made_and_not_measured(scene, short_search, tmp_path):
     faint = scene.replace(opacities=torch.full_like(scene.opacities, -7.0))
     levels = ps.lod(faint, ["50%"], folder=tmp_path / "out")
     assert levels.errors == [None] and levels.reference is None and len(levels[0].scene) == 200

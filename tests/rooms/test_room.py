@@ -1,6 +1,7 @@
 """The built-in rooms: repeatable, watertight, lit, with highlights that move, and readable as Replica scenes."""
 
 import errno
+import functools
 import json
 import logging
 import os
@@ -18,12 +19,17 @@ from pointsplat_ns.rooms.camera_path import CLEARANCE, STYLES, clearance
 from pointsplat_ns.rooms.raycast import BOX, CHARTS, chart_points, chart_starts, trace_camera
 from pointsplat_ns.rooms.textures import Canvas
 
+pytestmark = pytest.mark.xdist_group("rooms")  # one worker computes the light of each room for all tests of this file
+
 WIDTH, HEIGHT = 96, 72
+
+room_of = functools.cache(make_room)
+"""The room of a seed. Its light, which takes seconds, is computed once for all tests here."""
 
 
 @pytest.fixture(scope="module")
 def room():
-    return make_room(3)
+    return room_of(3)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +39,11 @@ def poses(room):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    return write_room(tmp_path_factory.mktemp("rooms") / "room1", seed=1, frames=6, width=64, height=48, progress=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pointsplat_ns.rooms.write.make_room", room_of)
+        return write_room(
+            tmp_path_factory.mktemp("rooms") / "room1", seed=1, frames=6, width=64, height=48, progress=False
+        )
 
 
 def picture(room, pose, **options):
@@ -106,7 +116,7 @@ def test_matte_surfaces_keep_their_colour_from_view_to_view(room, poses):
 
 def test_highlights_brighten_only_and_move_with_the_viewer(room, poses):
     peaks = []
-    for k in range(0, 40, 2):
+    for k in range(0, 40, 4):
         plain, depth = picture(room, poses[k], highlights=False)
         shiny, _ = picture(room, poses[k])
         gain = (shiny - plain).mean(dim=-1)
@@ -168,7 +178,7 @@ def test_the_walk_sees_nearly_all_of_the_shell_from_several_places(seed):
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_pictures_are_neither_black_nor_blown_out_and_have_texture(seed):
-    room = make_room(seed)
+    room = room_of(seed)
     for pose in capture_path(room, 8, seed)[::3]:
         rgb, depth = picture(room, pose)
         assert torch.isfinite(rgb).all() and float(rgb.min()) >= 0 and float(rgb.max()) <= 1
@@ -218,7 +228,7 @@ def test_a_written_room_reads_back_as_a_replica_scene_without_a_warning(written,
     assert len(scene) == 6 and scene.depths is not None
     assert scene.params.principal_point() == (32.0, 24.0)
     assert {p.name for p in written.iterdir()} == {"results", "traj.txt", "cam_params.json"}
-    room = make_room(1)
+    room = room_of(1)
     expected = capture_path(room, 6, 1)
     assert np.allclose(scene.poses, expected.numpy(), atol=1e-6)  # nine digits, then made orthonormal
     rgb, depth = render_room(room, expected[2], default_intrinsics(64, 48), 64, 48)
@@ -238,7 +248,7 @@ def test_the_dataparser_reads_a_written_room_with_seed_points_on_its_surfaces(wr
     assert torch.all((xyz - torch.tensor([0, 0, 1.0]) * size / 2).abs() < size / 2 + 0.01)
 
 
-def test_writing_leaves_nothing_behind_when_it_fails_and_keeps_what_is_there(tmp_path, monkeypatch):
+def test_writing_leaves_nothing_behind_when_it_fails_and_keeps_what_is_there(tmp_path, coarse_rooms, monkeypatch):
     target = tmp_path / "room"
     target.mkdir()
     (target / "mine.txt").write_text("kept")
@@ -275,7 +285,7 @@ def test_a_place_where_no_folder_can_be_is_one_error_at_once(tmp_path, monkeypat
         write_room(tmp_path / place, 0, 2, 16, 12, progress=False)
 
 
-def test_a_folder_with_the_longest_name_there_is_is_written(tmp_path):
+def test_a_folder_with_the_longest_name_there_is_is_written(tmp_path, coarse_rooms):
     folder = tmp_path / ("\u00e9" * 127)
     assert write_room(folder, 0, 2, 16, 12, progress=False) == folder
     assert [path.name for path in tmp_path.iterdir()] == [folder.name]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import shlex
 import shutil
-import subprocess
-import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from unittest import mock
 
 import torch
 
@@ -18,15 +19,6 @@ BENCHMARKS = REPOSITORY / "benchmarks"
 
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 """Real captures, splats and weights that tests read in place; they skip where it is absent."""
-
-
-def run_benchmark(name: str, *words: object) -> str:
-    """What a benchmark, by its file's name, prints."""
-    done = subprocess.run(
-        [sys.executable, BENCHMARKS / name, *map(str, words)], capture_output=True, text=True, cwd=REPOSITORY
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 def same(a: Gaussians, b: Gaussians) -> bool:
@@ -222,6 +214,24 @@ def dense_config(data: Path, output_dir: Path, steps: int):
     config.steps_per_eval_image = 3
     config.pipeline.datamanager.sampled_poses, config.pipeline.datamanager.sampled_size = 6, (48, 36)
     return config
+
+
+@contextmanager
+def views_sampled_once() -> Iterator[None]:
+    """Within, trainings do not sample a scene's poses again that they sampled before. That takes most of their time."""
+    from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
+    from pointsplat_ns.pruning.view_sampling import sample_views
+
+    known = {}
+
+    def sampled(scene: Gaussians, *arguments: int):
+        key = (*arguments, *(value.numpy().tobytes() for value in scene.tensors()))
+        if key not in known:
+            known[key] = sample_views(scene, *arguments)
+        return known[key]
+
+    with mock.patch.object(dense_scenes, "sample_views", sampled):
+        yield
 
 
 def pipeline_of(data: Path, eval_scenes: tuple[str, ...] = (), test_mode: str = "test", **model):

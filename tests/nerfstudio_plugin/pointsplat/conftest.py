@@ -13,8 +13,14 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.utils.eval_utils import eval_setup
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
-from making import box_room, fast_config
+from making import box_room, fast_config, views_sampled_once
 from pointsplat_ns.io import write_ply
+
+
+@pytest.fixture(scope="session", autouse=True)
+def poses_sampled_once():
+    with views_sampled_once():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -18,6 +18,7 @@ from pointsplat_ns.io import write_ply
 from pointsplat_ns.io.discovery import find_plys
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views
 from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
+from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import PlyScene, SampledPoses
 from pointsplat_ns.pruning.view_sampling import sample_views
@@ -110,7 +111,8 @@ def test_cameras_of_views_see_what_the_views_see():
     assert (int(cameras.width[0]), int(cameras.height[0])) == (32, 24)
 
 
-def test_sampled_poses_are_the_same_each_time_and_none_is_in_both_splits(rooms):
+def test_sampled_poses_are_the_same_each_time_and_none_is_in_both_splits(rooms, monkeypatch):
+    monkeypatch.setattr(dense_scenes, "sample_views", sample_views)  # anew for each
     first, second = scene_of(rooms), scene_of(rooms)
     assert len(first.train_frames) == 6 and len(first.eval_frames) == 3
     for split in ("train", "test"):

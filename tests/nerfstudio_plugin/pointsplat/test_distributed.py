@@ -15,6 +15,8 @@ import pytest
 import torch
 from torch import nn
 
+pytestmark = pytest.mark.xdist_group("distributed")  # one worker trains for all tests of this file
+
 UPDATES = 3
 ROWS, CHANNELS = 10, 4
 BROKEN = {3}, {6}
@@ -323,9 +325,12 @@ def test_a_process_alone_is_left_as_it_is():
 
 
 if __name__ == "__main__":
+    sys.path.append(str(Path(__file__).parents[2] / "support"))
     import method_configs.methods  # noqa: F401  (what takes seconds to import is imported once, for both)
+    from making import views_sampled_once
 
     child = os.fork()  # nothing has been computed, so there are no threads yet
-    work(0 if child else 1, Path(sys.argv[1]))
+    with views_sampled_once():
+        work(0 if child else 1, Path(sys.argv[1]))
     if child:
         sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))

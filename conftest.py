@@ -1,0 +1,42 @@
+"""What keeps tests and the examples in docstrings quick: smaller views, no repair, coarse rooms."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+
+import pytest
+
+from pointsplat_ns.compression import repair, view_source
+from pointsplat_ns.pruning.view_sampling import sample_views
+from pointsplat_ns.rooms import light
+
+
+@pytest.fixture(scope="session", autouse=True)
+def small_views_by_default() -> Iterator[None]:
+    """Where no views are given, those that renders are compared in have a 25th of the pixels that users get."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(view_source, "sample_views", functools.partial(sample_views, width=64, height=48))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_repair_by_default() -> Iterator[None]:
+    """``compact`` optimises for seconds unless told otherwise; here only those tests wait for it that are about it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(repair.STEPS, "quick", 0)
+        yield
+
+
+@pytest.fixture()
+def coarse_rooms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Built-in rooms whose textures and light have few points: made in a second, for tests that do not look at them."""
+    monkeypatch.setattr(light, "TEXEL", 0.1)
+    monkeypatch.setattr(light, "LUMEL", 0.5)
+
+
+@pytest.fixture(autouse=True)
+def coarse_rooms_in_examples(request: pytest.FixtureRequest) -> None:
+    """An example shows how a room is made, and not how it looks."""
+    if isinstance(request.node, pytest.DoctestItem):
+        request.getfixturevalue("coarse_rooms")
