@@ -45,7 +45,7 @@ class Row:
     gaussians: int
     keep: str
     kind: str
-    """merge, refiner, fine-tune (``prune --fine-tune``), Adam (a repair without its network) or repair (``compact``)."""
+    """merge, refiner, fine-tune (``prune --fine-tune``), Adam (repair without its network) or repair (``compact``)."""
     steps: int
     seconds: float
     """Wall-clock time after merging. That of the refiner includes finding out how far it helps."""
