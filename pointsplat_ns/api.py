@@ -188,8 +188,8 @@ def compact(
 ) -> Compacted:
     """Make a scene smaller, repair it, and check by rendering how far that helps.
 
-    A trained refiner repairs it in one pass. Then it is optimised against the given scene's own renders, no photos, for
-    as long as ``effort`` or ``seconds`` says. What does not bring renders closer is left out.
+    A trained refiner repairs it in one pass. Then learned steps bring it closer to the given scene's own renders, no
+    photos, for as long as ``effort`` or ``seconds`` says. What does not bring renders closer is left out.
 
     Args:
         scene: N Gaussians, or where to read them: a PLY, a checkpoint, or a Splatfacto run.
@@ -199,10 +199,10 @@ def compact(
         by: the method, as for :func:`prune`; by default the one that the refiner was trained with.
         sh: SH bands to keep, as for :func:`prune`.
         clean: as for :func:`prune`.
-        effort: "instant" is only the refiner; "quick" and "thorough" optimise 32 and 400 steps.
-        seconds: optimise for so long, instead; Ctrl-C ends it earlier, and what has been reached is kept.
+        effort: "instant" is only the refiner; "quick" and "thorough" take 32 and 400 steps.
+        seconds: repair for so long, instead; Ctrl-C ends it earlier, and what has been reached is kept.
         views: where renders are compared, as for :func:`prune`; at most 12 are taken. If there are more than twice as
-            many, the scene is optimised on the others, else on views sampled in free space.
+            many, the scene is repaired from the others, else on views sampled in free space.
         progress: True shows a bar; a function is called with what is being done and the share done of it.
 
     Returns:

@@ -34,9 +34,9 @@ def compact(
 ) -> None:
     """Make any scene smaller and repair it. No photos are needed.
 
-    A trained refiner repairs the smaller scene in one pass; then it is optimised against the dense scene's renders.
-    After each, renders are compared with the dense scene's in other views, and what does not help is left out. Views
-    are the poses of the run's dataset if it is found, else sampled in free space.
+    A trained refiner repairs the smaller scene in one pass; then learned steps bring it closer to the dense scene's
+    renders. After each, renders are compared with the dense scene's in other views, and what does not help is left
+    out. Views are the poses of the run's dataset if it is found, else sampled in free space.
 
     Args:
         scene: a 3DGS .ply, a Splatfacto checkpoint, or a run (its folder or config.yml).
@@ -49,8 +49,8 @@ def compact(
         by: the method of prune; by default the one that the refiner was trained with.
         sh: SH bands to keep, as for prune: all, up to a degree, or auto.
         clean: as for prune: first remove what cannot be drawn and what is seen from nowhere.
-        effort: how long to optimise: not at all (instant), 32 steps (quick, about as long as merging takes), or 400.
-        seconds: optimise for so many seconds, instead of a fixed effort. Ctrl-C ends it earlier and loses nothing.
+        effort: how long to repair then: not at all (instant), 32 steps (quick, about as long as merging takes), or 400.
+        seconds: repair for so many seconds, instead of a fixed effort. Ctrl-C ends it earlier and loses nothing.
         picture: a .png file for images of some views: dense, before and after the repair, side by side.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.

@@ -79,12 +79,13 @@ def test_a_level_by_size_fits_into_its_file(scene, views, tmp_path):
         assert size <= limit < size + row + 1  # one more, and perhaps another digit of the count, would not fit
 
 
-def test_the_first_level_is_what_prune_gives(scene, levels):
-    assert same(levels[0].scene, ps.prune(scene, "50%"))
+def test_the_first_level_is_what_prune_gives(scene, levels, views):
+    assert same(levels[0].scene, ps.prune(scene, "50%", views=views))
+    assert not same(levels[0].scene, ps.prune(scene, "50%")), "merging looks from the views"
 
 
-def test_composing_parents_gives_where_merging_put_each_gaussian(scene, levels):
-    for index, merged in enumerate(merge_levels(scene, [200, 100, 40, 12])):
+def test_composing_parents_gives_where_merging_put_each_gaussian(scene, levels, views):
+    for index, merged in enumerate(merge_levels(scene, [200, 100, 40, 12], views=views)):
         assert torch.equal(levels.assignment(index), merged.assignment)
         assert torch.equal(levels.assignment(index - len(levels)), merged.assignment)
     with pytest.raises(IndexError):
@@ -323,7 +324,7 @@ def test_a_level_of_all_gaussians_is_the_scene_itself(scene, views, tmp_path):
     levels = ps.lod(scene, ["100%", "10%"], views=views, folder=tmp_path / "out")
     assert same(levels[0].scene, scene) and same(ps.load(tmp_path / "out" / "level_0.ply"), scene)
     assert torch.equal(levels[0].parents, torch.arange(400, dtype=torch.int32))
-    assert torch.equal(levels.assignment(1), merge(scene, 40).assignment)
+    assert torch.equal(levels.assignment(1), merge(scene, 40, views=views).assignment)
     first, second = manifest_of(tmp_path / "out")["levels"]
     assert (first["mse"], first["psnr"], first["worst_psnr"]) == (0, None, None), "JSON has no infinity"
     assert first["displacement"] == {"rms": 0, "median": 0, "p95": 0} and first["dropped"] == 0
@@ -367,7 +368,7 @@ def test_bands_are_cut_for_all_levels_and_the_error_is_against_all_bands(scene, 
     assert [level.scene.sh_degree for level in cut] == [0, 0] and cut.dense.sh_degree == 1
     assert 0 < cut[0].errors.near.error < cut[1].errors.near.error
     assert any(note.startswith("SH degree 1 cut to 0") for note in cut.notes)
-    assert same(cut[1].scene, ps.prune(scene, "10%", sh="0"))
+    assert same(cut[1].scene, ps.prune(scene, "10%", sh="0", views=views))
 
 
 def test_errors_are_those_that_compact_and_auto_budgets_go_by(scene, views, levels):
