@@ -199,8 +199,8 @@ def make_levels(
         dense: N Gaussians. Those that cannot be drawn are left out first, and their number is logged.
         levels: see :func:`parse_levels`; in any order.
         sh: SH bands of every level, as for :func:`~pointsplat_ns.compression.prune.prune_scene`.
-        views: source of the views that renders are compared in, and that merging looks from where they need not be sampled; by
-            default poses sampled in free space.
+        views: source of the views that renders are compared in; merging looks from them where they need not be sampled.
+            By default poses sampled in free space.
         source: the file that ``dense`` was read from, for the manifest.
         folder: where to write; None writes nothing.
         force: overwrite existing files.

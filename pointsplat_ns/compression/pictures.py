@@ -68,7 +68,7 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> st
 
 def _title(name: str, scene: Gaussians, close: Closeness | None) -> str:
     size = f"{len(scene):,} Gaussians, {ply_bytes(len(scene), scene.sh_degree) / 1e6:.2f} MB"
-    return f"{name}: {size}" + (f", {close.psnr:.2f} dB" if close is not None else "")
+    return f"{name}\n{size}" + (f", {close.psnr:.2f} dB" if close is not None else "")
 
 
 def side_by_side(rows: Sequence[Sequence[ArrayLike]], titles: list[str], path: Path | str) -> None:
@@ -86,7 +86,7 @@ def side_by_side(rows: Sequence[Sequence[ArrayLike]], titles: list[str], path: P
 
     height, width = np.shape(rows[0][0])[:2]
     panel = 16 / max(len(titles), 3)  # inches across
-    size = (panel * len(titles), panel * len(rows) * height / width + 0.4)
+    size = (panel * len(titles), panel * len(rows) * height / width + 0.6)
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(len(rows), len(titles), squeeze=False)
     for row, images in zip(axes, rows, strict=True):
