@@ -13,7 +13,7 @@ import pointsplat_ns.compression.repair as repair_module
 from making import same
 from pointsplat_ns.api import example_room
 from pointsplat_ns.compression.closeness import DenseReference
-from pointsplat_ns.compression.feedback import Feedback
+from pointsplat_ns.compression.feedback import MOST_STEPS, Feedback
 from pointsplat_ns.compression.optimiser import RATES, Optimiser, gradients_of, seen_rms
 from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.compression.view_source import COMPARED_VIEWS, ViewSource
@@ -66,6 +66,23 @@ def test_learned_steps_come_closer_than_those_of_adam(monkeypatch):
         repair(pruned, room, source, RepairBudget("quick"), network=network).scene for network in ("shipped", None)
     )
     assert reference.psnr(learned)[0] > reference.psnr(plain)[0] + 0.05 > reference.psnr(pruned)[0] + 0.1
+
+
+@pytest.mark.parametrize(("steps", "learned"), [(4, True), (5, False)])
+def test_repairs_longer_than_the_network_is_good_for_are_left_to_adam(hollow_ball, pruned, monkeypatch, steps, learned):
+    monkeypatch.setattr(repair_module, "LONGEST", 4)
+    monkeypatch.setitem(STEPS, "quick", steps)
+    first, second = (
+        repair(pruned, hollow_ball, Few(hollow_ball), RepairBudget("quick"), network=network).scene
+        for network in ("shipped", None)
+    )
+    assert same(first, second) != learned
+
+
+def test_how_many_steps_there_will_be_is_known_or_estimated():
+    assert RepairBudget("quick").steps_in_all(0, 0.0) == STEPS["quick"]
+    timed = RepairBudget(seconds=10.0)
+    assert timed.steps_in_all(0, 0.0) == MOST_STEPS and timed.steps_in_all(3, 0.25) == 12
 
 
 def test_an_effort_gives_the_same_result_each_time(hollow_ball, pruned, monkeypatch):
