@@ -23,6 +23,7 @@ import pointsplat_ns as ps
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.compact import as_far_as_it_helps, helps
 from pointsplat_ns.compression.fine_tune import fine_tune
+from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.gaussians import Gaussians
@@ -84,7 +85,7 @@ def rows_of(path: Path, keep: str, seconds: list[float], fine_tune_steps: list[i
     judge = Judge(path, dense, count)
     source = ViewSource(dense, run=path, dataset_views=dataset_views)
     views = source.compared()
-    merged = ps.prune(path, keep, "merge")
+    merged = prune_scene(dense, keep, "merge", views=source).scene
 
     def row(kind: str, scene: Gaussians, steps: int, started: tuple[float, float]) -> Row:
         wall, cpu = time.perf_counter() - started[0], time.process_time() - started[1]

@@ -131,6 +131,13 @@ class Feedback:
             moves[name] = step * (-share * self.rates[name])
         return moves
 
+    def moved(
+        self, scene: Gaussians, share: float, factors: Tensor | None = None, offsets: Tensor | None = None
+    ) -> Gaussians:
+        """A scene after a step; arguments as for :meth:`moves`."""
+        moves = self.moves(share, factors, offsets)
+        return Gaussians(**{name: value + moves[name] for name, value in scene.items()})
+
     def _whole(self, which: int) -> float:
         """What an average that began at 0 is divided by."""
         return 1 - BETAS[which] ** self._steps

@@ -7,7 +7,6 @@ as constant, as usual for learned optimisers (Andrychowicz et al., arXiv 1606.04
 
 from __future__ import annotations
 
-import math
 import random
 import time
 from collections.abc import Callable, Sequence
@@ -40,8 +39,8 @@ SIDE = 400
 FLOOR = 1e-5
 """Added to mean squared errors, so that scenes that are nearly right do not rule: 50 dB."""
 
-RATE, WARM_UP, LAST_SHARE = 3e-3, 20, 0.02
-"""Learning rate of Adam, updates until it is reached, and the share of it that is left at the end, after a cosine."""
+RATE, WARM_UP = 3e-3, 20
+"""Learning rate of Adam, and updates until it is reached; then it falls as those of repairs do."""
 
 SAVED_EVERY = 60.0
 """Seconds between intermediate saves."""
@@ -80,8 +79,7 @@ def roll_out(
         view = scene.views[chosen[step]]
         feedback.observe(gradients_of(now.detach(), view, _target(scene, chosen[step])))
         learned = network(feedback.features(now.detach(), step / steps, steps))
-        moves = feedback.moves(share_of_rates(step / steps), *learned)
-        now = Gaussians(**{name: value + moves[name] for name, value in now.items()})
+        now = feedback.moved(now, share_of_rates(step / steps), *learned)
         seen = [
             _decibels(render(now, scene.views[index]), _target(scene, index)) for index in looked_at.get(step + 1, [])
         ]
@@ -124,8 +122,7 @@ def train_feedback(
     metadata = {"scenes": [scene.name for scene in scenes], "keep": [*scenes[0].pruned], "repairs_per_update": at_once}
     saved = time.monotonic()
     for update in range(updates):
-        share = LAST_SHARE + (1 - LAST_SHARE) * 0.5 * (1 + math.cos(math.pi * update / updates))
-        adam.param_groups[0]["lr"] = RATE * min(1, (update + 1) / WARM_UP) * share
+        adam.param_groups[0]["lr"] = RATE * min(1, (update + 1) / WARM_UP) * share_of_rates(update / updates)
         adam.zero_grad()
         for _ in range(at_once):
             scene = generator.choice(scenes)

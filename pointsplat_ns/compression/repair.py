@@ -119,8 +119,7 @@ def repair(
                 target = render(dense, view)
             feedback.observe(gradients_of(scene, view, target))
             learned = _learned(network, feedback, scene, done, budget.steps_in_all(steps, done))
-            moves = feedback.moves(share_of_rates(done), *learned)
-            scene = Gaussians(**{name: value + moves[name] for name, value in scene.items()})
+            scene = feedback.moved(scene, share_of_rates(done), *learned)
             steps += 1
             done = budget.share_done(steps, time.perf_counter() - start)
             if progress is not None:

@@ -56,7 +56,7 @@ def weights_seen(means: Tensor, views: Views, not_shown: float = 1.0) -> Tensor:
     total = torch.zeros(len(means), dtype=torch.float32)
     for eye, view in zip(eyes, views, strict=True):
         size = 1 / ((means - eye).square().sum(1) + (NEAREST * UNITS) ** 2).float()
-        total += size.where(in_picture(means, view), not_shown * size)
+        total += size if not_shown == 1 else size.where(in_picture(means, view), not_shown * size)
     return total / len(eyes)
 
 

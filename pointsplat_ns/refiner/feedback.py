@@ -17,8 +17,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pointsplat_ns.io.files import one_line, write_tensors
-from pointsplat_ns.refiner.weights import WeightsError
+from pointsplat_ns.io.files import write_tensors
+from pointsplat_ns.refiner.weights import checked_tensors, opened_weights
 
 PARAMETERS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
 """Kinds of parameters, each of which has a factor."""
@@ -94,25 +94,9 @@ def read_feedback_refiner(path: Path | str = PRETRAINED, device: torch.device | 
     Raises:
         WeightsError: if the file is missing, damaged or of another kind.
     """
-    from safetensors import SafetensorError, safe_open
-
-    path = Path(path)
-    network = FeedbackRefiner()
-    expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
-    if not path.is_file():
-        raise WeightsError(f"{path}: no such file; expected a feedback refiner (.safetensors)")
-    try:
-        with safe_open(path, framework="pt") as file:
-            if (file.metadata() or {}).get("format") != FORMAT:
-                raise WeightsError(f"{path}: not a feedback refiner; expected the format {FORMAT!r}")
-            found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
-            if found != expected:
-                raise WeightsError(f"{path}: tensors {found}; expected {expected}: damaged, or of another version")
-            state = {name: file.get_tensor(name).float() for name in found}
-    except (SafetensorError, OSError, ValueError) as error:
-        raise WeightsError(f"{path}: not a readable safetensors file ({one_line(error)})") from error
-    if not all(bool(value.isfinite().all()) for value in state.values()):
-        raise WeightsError(f"{path}: holds NaN or Inf; expected finite weights")
+    path, network = Path(path), FeedbackRefiner()
+    with opened_weights(path, FORMAT, "a feedback refiner") as (file, _):
+        state = checked_tensors(file, network.state_dict(), path)
     network.load_state_dict(state)
     return network.to(device).eval().requires_grad_(requires_grad=False)
 

@@ -55,27 +55,37 @@ def read_refiner(path: str | Path, device: torch.device | str = "cpu") -> Refine
         WeightsError: if the file is missing, damaged, of another kind, or its tensors do not fit.
     """
     path = Path(path)
-    with _opened(path) as (file, header):
-        names = sorted(file.keys())
-        refiner = _hollow(header, len(names), path)
-        expected = refiner.state_dict()
-        found = {name: file.get_slice(name) for name in names}
-        wrong = [name for name in sorted({*expected, *found}) if _shape(expected, name) != _shape(found, name)]
-        if wrong:
-            raise WeightsError(
-                f"{path}: {len(wrong)} tensors do not fit, first {wrong[0]}: found {_shape(found, wrong[0])}, expected "
-                f"{_shape(expected, wrong[0])}; the file is damaged or of another version"
-            )
-        for name, tensor in found.items():
-            if (tensor.get_dtype() in _FLOATS) != expected[name].is_floating_point():
-                raise WeightsError(f"{path}: {name} is of type {tensor.get_dtype()}; the file is damaged")
-        require_memory(path, path.stat().st_size)
-        state = {name: file.get_tensor(name) for name in names}
+    with opened_weights(path, FORMAT, "refiner weights") as (file, header):
+        refiner = _hollow(header, len(file.keys()), path)
+        state = checked_tensors(file, refiner.state_dict(), path)
+    refiner.to_empty(device="cpu").load_state_dict(state)
+    return refiner.to(device).eval()
+
+
+def checked_tensors(file: Any, expected: dict[str, torch.Tensor], path: Path) -> dict[str, torch.Tensor]:
+    """The tensors of an opened file, whose names, shapes and kinds of numbers must be those of ``expected``; these are
+    compared before memory is taken.
+
+    Raises:
+        WeightsError: if they do not fit, or are not finite.
+    """
+    names = sorted(file.keys())
+    found = {name: file.get_slice(name) for name in names}
+    wrong = [name for name in sorted({*expected, *found}) if _shape(expected, name) != _shape(found, name)]
+    if wrong:
+        raise WeightsError(
+            f"{path}: {len(wrong)} tensors do not fit, first {wrong[0]}: found {_shape(found, wrong[0])}, expected "
+            f"{_shape(expected, wrong[0])}; the file is damaged or of another version"
+        )
+    for name, tensor in found.items():
+        if (tensor.get_dtype() in _FLOATS) != expected[name].is_floating_point():
+            raise WeightsError(f"{path}: {name} is of type {tensor.get_dtype()}; the file is damaged")
+    require_memory(path, path.stat().st_size)
+    state = {name: file.get_tensor(name) for name in names}
     bad = [name for name, value in state.items() if not value.float().isfinite().all()]
     if bad:
         raise WeightsError(f"{path}: {bad[0]} holds NaN or Inf; expected finite weights; train or download it again")
-    refiner.to_empty(device="cpu").load_state_dict(state)
-    return refiner.to(device).eval()
+    return state
 
 
 def read_metadata(path: str | Path) -> dict[str, Any]:
@@ -85,24 +95,31 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
         WeightsError: if the file is missing, damaged or of another kind.
     """
     path = Path(path)
-    with _opened(path) as (_, header):
+    with opened_weights(path, FORMAT, "refiner weights") as (_, header):
         return _json(header, "metadata", path)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, dict[str, str]]]:
-    """A file of weights, of which only the header has been read, and that header's texts."""
+def opened_weights(path: Path, form: str, what: str) -> Iterator[tuple[Any, dict[str, str]]]:
+    """A file of weights, of which only the header has been read, and that header's texts.
+
+    Args:
+        path: the .safetensors file.
+        form: the text that the header's entry "format" must be.
+        what: what it holds, for errors.
+
+    Raises:
+        WeightsError: if the file is missing, damaged or of another kind.
+    """
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
-        raise WeightsError(f"{path}: no such file; expected refiner weights (.safetensors)")
+        raise WeightsError(f"{path}: no such file; expected {what} (.safetensors)")
     try:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
-            if header.get("format") != FORMAT:
-                raise WeightsError(
-                    f"{path}: format {header.get('format')!r}; expected {FORMAT!r}, as save_refiner writes it"
-                )
+            if header.get("format") != form:
+                raise WeightsError(f"{path}: not {what}: format {header.get('format')!r}; expected {form!r}")
             yield file, header
     except (SafetensorError, OSError, ValueError) as error:
         raise WeightsError(

@@ -201,7 +201,7 @@ def test_what_is_right_already_hardly_moves_where_steps_are_damped(pruned, ball_
         feedback, scene = Feedback(pruned, len(pruned)), pruned
         for _ in range(3):
             feedback.observe(gradients_of(scene, view, target))
-            scene = scene.replace(**{name: value + feedback.moves(1.0)[name] for name, value in scene.items()})
+            scene = feedback.moved(scene, 1.0)
         shift = (scene.features_dc - pruned.features_dc).abs().amax(1)
         points = (pruned.means.double() @ view.viewmat[:3, :3].T.double() + view.viewmat[:3, 3].double()).float()
         column = points[:, 0] / points[:, 2] * view.K[0, 0] + view.K[0, 2]

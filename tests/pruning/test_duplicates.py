@@ -7,26 +7,13 @@ import math
 import pytest
 import torch
 
-from making import same
+from making import cloud, same
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import duplicates
 from pointsplat_ns.pruning.duplicates import Copies, stacked
 from pointsplat_ns.pruning.merge import merge, merge_levels
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
-
-
-def cloud(n: int, seed: int = 0, sh_degree: int = 1) -> Gaussians:
-    """``n`` random Gaussians in a unit cube."""
-    g = torch.Generator().manual_seed(seed)
-    return Gaussians(
-        means=torch.rand(n, 3, generator=g),
-        scales=-3 + 0.5 * torch.randn(n, 3, generator=g),
-        quats=torch.randn(n, 4, generator=g),
-        opacities=torch.randn(n, 1, generator=g),
-        features_dc=torch.randn(n, 3, generator=g),
-        features_rest=0.1 * torch.randn(n, (sh_degree + 1) ** 2 - 1, 3, generator=g),
-    )
 
 
 def with_zeros(n: int = 700, zeros: int = 300) -> tuple[Gaussians, torch.Tensor]:

@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 
-from making import same
+from making import cloud, same
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.quaternions import rotation_matrices
@@ -19,20 +19,6 @@ from pointsplat_ns.pruning.merge import merge, merge_levels
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX
 from pointsplat_ns.views import Views
-
-
-def cloud(n: int, seed: int = 0, sh_degree: int = 1) -> Gaussians:
-    """``n`` random Gaussians in a unit cube."""
-    g = torch.Generator().manual_seed(seed)
-    rest = (sh_degree + 1) ** 2 - 1
-    return Gaussians(
-        means=torch.rand(n, 3, generator=g),
-        scales=-3 + 0.5 * torch.randn(n, 3, generator=g),
-        quats=torch.randn(n, 4, generator=g),
-        opacities=torch.randn(n, 1, generator=g),
-        features_dc=torch.randn(n, 3, generator=g),
-        features_rest=0.1 * torch.randn(n, rest, 3, generator=g),
-    )
 
 
 def wall(side: int = 40, seed: int = 0) -> Gaussians:

@@ -45,6 +45,20 @@ def normal_scene(n: int = 5, degree: int = 3, seed: int = 0, dtype: torch.dtype 
     return Gaussians(*(torch.randn(shape, generator=generator, dtype=dtype) for shape in shapes))
 
 
+def cloud(n: int, seed: int = 0, sh_degree: int = 1) -> Gaussians:
+    """``n`` random Gaussians in a unit cube."""
+    g = torch.Generator().manual_seed(seed)
+    rest = (sh_degree + 1) ** 2 - 1
+    return Gaussians(
+        means=torch.rand(n, 3, generator=g),
+        scales=-3 + 0.5 * torch.randn(n, 3, generator=g),
+        quats=torch.randn(n, 4, generator=g),
+        opacities=torch.randn(n, 1, generator=g),
+        features_dc=torch.randn(n, 3, generator=g),
+        features_rest=0.1 * torch.randn(n, rest, 3, generator=g),
+    )
+
+
 def ball(
     n: int, degree: int = 1, seed: int = 0, log_size: float = math.log(0.25), opacity: float = 2.0, bright: float = 0.0
 ) -> Gaussians:
