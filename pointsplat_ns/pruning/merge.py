@@ -32,7 +32,8 @@ from pointsplat_ns.pruning.finishing import SIDE, Finish, Reference
 from pointsplat_ns.pruning.matching import cheapest_pairs
 from pointsplat_ns.pruning.merge_state import CHUNK, OPAQUE, start
 from pointsplat_ns.pruning.pair_costs import costs_of
-from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, viewpoints, weights_seen
+from pointsplat_ns.pruning.traces import how_much_seen, photo_places
+from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, viewpoints, weights_seen, weights_seen_from
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
 from pointsplat_ns.views import Views
 
@@ -255,8 +256,19 @@ class Merging:
     def _weights(self) -> Tensor:
         if self.views is None:
             return torch.ones(len(self.members))
-        means = (self.scene.means[self.members].double() - self.centre) * (UNITS / self.size)
-        return weights_seen(means, self.views, self.not_shown)
+        means = self._positions(self.scene.means[self.members])
+        if self.not_shown < 1:
+            weights = weights_seen(means, self.views, self.not_shown)
+        elif (photos := photo_places(self.scene)) is not None:
+            places, shares = photos
+            weights = weights_seen_from(means, self._positions(places), shares)
+        else:
+            return weights_seen(means, self.views)
+        return weights * how_much_seen(self.scene, self.members)
+
+    def _positions(self, positions: Tensor) -> Tensor:
+        """Positions (n, 3) in units of the content, float64."""
+        return (positions.double() - self.centre) * (UNITS / self.size)
 
     def _in_units(self, views: Views) -> Views:
         """Views in units of the content."""

@@ -55,9 +55,22 @@ def weights_seen(means: Tensor, views: Views, not_shown: float = 1.0) -> Tensor:
     eyes = invert_rigid(views.viewmats.double())[:, :3, 3].to(means)
     total = torch.zeros(len(means), dtype=torch.float32)
     for eye, view in zip(eyes, views, strict=True):
-        size = 1 / ((means - eye).square().sum(1) + (NEAREST * UNITS) ** 2).float()
+        size = _size_seen(means, eye)
         total += size if not_shown == 1 else size.where(in_picture(means, view), not_shown * size)
     return total / len(eyes)
+
+
+def weights_seen_from(means: Tensor, places: Tensor, shares: Tensor) -> Tensor:
+    """As :func:`weights_seen`, from places (P, 3) that count by their shares (P,)."""
+    total = torch.zeros(len(means), dtype=torch.float32)
+    for place, share in zip(places.to(means), shares.tolist(), strict=True):
+        total += share * _size_seen(means, place)
+    return total
+
+
+def _size_seen(means: Tensor, eye: Tensor) -> Tensor:
+    """How large a unit of area at each position (N, 3) is from a place (3,), (N,) float32."""
+    return 1 / ((means - eye).square().sum(1) + (NEAREST * UNITS) ** 2).float()
 
 
 def in_picture(means: Tensor, view: View) -> Tensor:

@@ -1,0 +1,159 @@
+"""Traces that photos leave in a scene: how much they showed of each part of it, and where they were taken.
+
+A scene is trained from nothing, or from round Gaussians of one colour. Each photo that shows a Gaussian moves its SH
+coefficients, and pulls it flat onto the surface; what no photo shows stays as it was. So the energy of the SH and the
+flatness of a neighbourhood tell how much it was looked at, with what was in the way taken into account.
+
+A photo from direction d moves the coefficients f along Y(d), the basis there. So the part of the colour that depends
+on the direction, f . Y, is large where photos were taken from, and small elsewhere. A place from which it is large for
+many Gaussians is one where photos were taken.
+
+Neither is in the literature that we know of; both were found on trained scenes whose poses are known, see
+``docs/pruning.md``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool1d
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.pruning.merge_state import CHUNK
+from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
+
+NEIGHBOURHOOD = 129
+"""Number of Gaussians along the curve whose mean says how much a place was seen; one alone says little."""
+
+ENERGY_POWER = 0.75
+"""Exponent of the mean energy of the SH; with that of the mean flatness, 1, fitted to the poses of four captures."""
+
+FAINTEST = 1e-4
+"""SH coefficients, root of the sum of squares, below which no photo is taken to have changed them."""
+
+LARGEST = 1e3
+"""SH coefficients are taken to be at most this: a colour of 1 is white."""
+
+FLATTEST = 7.0
+"""Largest flatness, logarithm of width over thickness: flat Gaussians of any kind are alike."""
+
+MOST_FACTOR = 8.0
+"""Bound of the logarithm of a factor, either way from the median's."""
+
+PROBED = 1_500
+"""Number of Gaussians, at most, that are asked for the places of photos."""
+
+OPAQUE_ENOUGH = 0.1
+"""Least opacity of these."""
+
+CANDIDATES = 2_000
+"""Number of places that are compared."""
+
+ASKED_FIRST, PROMISING = 300, 0.8
+"""Number of them that are compared first, and share of :data:`TELLING` that the best of these must reach for the others
+to be compared as well."""
+
+AROUND = 1.5
+"""Size of the box that these are in, relative to one that holds 96 % of those Gaussians along each axis."""
+
+TELLING = 2.0
+"""How much more than SH of no direction a place must explain, for the scene to have told where photos were taken.
+The captures reach 3.3 to 3.7 where photos were taken; scenes seen from all around 1.2 to 1.6, and their best places lie
+in the wrong parts of them (-0.1 to -0.4 dB)."""
+
+CONTRAST = 16
+"""Shares of places rise with this power of what they explain."""
+
+LEAST_SHARE = 0.01
+"""Places of a smaller share than this, relative to the best one's, are left out."""
+
+
+def how_much_seen(scene: Gaussians, members: Tensor) -> Tensor:
+    """How much photos showed of the neighbourhood of each member, relative to the median, (n,) float32.
+
+    Mean energy of the SH to the power 3/4, times the mean flatness, the geometric mean of width over thickness. 1 for
+    all if the Gaussians have no SH and are equally flat.
+
+    Args:
+        scene: N Gaussians.
+        members: (n,) indices, n at least 1, in an order in which neighbours are near each other.
+    """
+    energy = _around(_of_members(_energy, scene.features_rest, members))
+    flatness = _around(_of_members(_flatness, scene.scales, members))
+    logs = ENERGY_POWER * (energy + FAINTEST**2).log() + flatness
+    return (logs - logs.median()).clamp(-MOST_FACTOR, MOST_FACTOR).exp().float()
+
+
+def _of_members(function: Callable[[Tensor], Tensor], values: Tensor, members: Tensor) -> Tensor:
+    """A function of rows of values (N, ...) for the members (n,), float64; in pieces, as values may be on disk."""
+    return torch.cat([function(values[these].double()) for these in members.split(CHUNK)])
+
+
+def _energy(rest: Tensor) -> Tensor:
+    """Sums of squares (n,) of SH coefficients (n, K, 3)."""
+    return rest.clamp(-LARGEST, LARGEST).square().sum((1, 2))
+
+
+def _flatness(scales: Tensor) -> Tensor:
+    """Logarithms (n,) of width over thickness of log-scales (n, 3)."""
+    thickness, width, length = scales.sort(dim=1).values.unbind(1)
+    return (0.5 * (width + length) - thickness).nan_to_num(0.0).clamp(0.0, FLATTEST)
+
+
+def _around(values: Tensor) -> Tensor:
+    """Means over the neighbourhoods of values (n,)."""
+    means: Tensor = avg_pool1d(
+        values[None, None], NEIGHBOURHOOD, stride=1, padding=NEIGHBOURHOOD // 2, count_include_pad=False
+    )
+    return means[0, 0]
+
+
+def photo_places(scene: Gaussians) -> tuple[Tensor, Tensor] | None:
+    """Where the photos were taken that a scene was trained on, as far as its SH tell.
+
+    Args:
+        scene: N Gaussians.
+
+    Returns:
+        Places (P, 3), in the scene's unit, float64, and their shares (P,), which sum to 1; None if the SH do not tell.
+        Deterministic.
+    """
+    generator = torch.Generator().manual_seed(0)
+    some = scene[torch.randperm(len(scene), generator=generator)[: 8 * PROBED]]
+    rest = some.features_rest.double().clamp(-LARGEST, LARGEST)
+    length = _energy(rest).sqrt()
+    telling = some.usable() & (some.alphas > OPAQUE_ENOUGH) & (length > FAINTEST)
+    chosen = telling.nonzero()[:PROBED, 0]
+    if len(chosen) == 0:
+        return None
+    means = some.means[chosen].double()
+    low, high = torch.quantile(means, means.new_tensor([0.02, 0.98]), dim=0)
+    centre, size = 0.5 * (low + high), AROUND * (high - low)
+    spread = torch.rand(CANDIDATES, 3, generator=generator).double() - 0.5
+    places = centre + size * spread
+    rest = (rest[chosen] / length[chosen, None, None]).float()
+
+    def explained(these: Tensor) -> Tensor:
+        return torch.stack([_explained(means - place, rest, some.sh_degree) for place in these])
+
+    at_first = explained(places[:ASKED_FIRST])
+    if not float(at_first.max()) >= PROMISING * TELLING:
+        return None
+    all_explained = torch.cat([at_first, explained(places[ASKED_FIRST:])])
+    best = float(all_explained.max())
+    if best < TELLING:
+        return None
+    shares = (all_explained / best) ** CONTRAST
+    chosen = shares > LEAST_SHARE
+    return places[chosen], shares[chosen] / shares[chosen].sum()
+
+
+def _explained(offsets: Tensor, rest: Tensor, degree: int) -> Tensor:
+    """Mean share of the energy of SH (n, K, 3) of length 1 that lies along the basis in the directions ``offsets``
+    (n, 3), relative to that of SH of no direction."""
+    directions = (offsets / offsets.norm(dim=1, keepdim=True).clamp_min(torch.finfo(offsets.dtype).tiny)).float()
+    basis = sh_basis(directions, degree)[:, 1:]
+    along = (rest * basis[:, :, None]).sum(1).square().sum(1) / basis.square().sum(1).clamp_min(FAINTEST)
+    return along.mean() * rest.shape[1]

@@ -1,0 +1,164 @@
+"""What a scene tells of the photos that it was trained on."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from making import ball, normal_scene
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.pruning.merge import merge
+from pointsplat_ns.pruning.traces import MOST_FACTOR, how_much_seen, photo_places
+from pointsplat_ns.pruning.view_sampling import look_at
+from pointsplat_ns.rasterizer import render
+from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
+from pointsplat_ns.views import Views
+
+EYES = torch.tensor([[3.0, 0.0, 0.5], [2.6, 1.5, 0.5], [2.6, -1.5, 0.6]])
+
+
+def photographed(n: int = 600, degree: int = 3, eyes: Tensor = EYES) -> Gaussians:
+    """A ball whose SH were moved along the basis in the directions that eyes (E, 3) see it from, by random steps."""
+    scene = ball(n, degree)
+    generator = torch.Generator().manual_seed(1)
+    rest = torch.zeros_like(scene.features_rest)
+    for eye in eyes:
+        directions = torch.nn.functional.normalize(scene.means - eye, dim=1)
+        steps = 0.05 * torch.randn(n, 1, 3, generator=generator)
+        rest += steps * sh_basis(directions, degree)[:, 1:, None]
+    return scene.replace(features_rest=rest)
+
+
+def test_places_of_photos_are_found():
+    places, shares = photo_places(photographed())
+    away = torch.cdist(places, EYES.double()).min(1).values
+    assert float(shares.sum()) == pytest.approx(1) and bool((shares > 0).all())
+    assert float((shares * away).sum()) < 1.0
+    opposite = torch.cdist(places, -EYES.double()).min(1).values
+    assert float((shares * opposite).sum()) > 4.0
+
+
+def test_sh_learned_by_gradient_descent_tell_where_the_photos_were_taken():
+    """Not planted: SH of 0 are trained to show another colour in each of some photos of one side."""
+    scene = ball(300, 3).replace(features_rest=torch.zeros(300, 15, 3))
+    viewmats = look_at(2 * EYES.double(), torch.zeros_like(EYES.double()))
+    K = torch.tensor([[40.0, 0, 24], [0, 40, 18], [0, 0, 1]]).double().repeat(3, 1, 1)
+    views = Views(viewmats, K, 48, 36, torch.zeros(3))
+    rest = scene.features_rest.clone().requires_grad_()
+    optimiser = torch.optim.Adam([rest], lr=0.01)
+    shades = torch.tensor([0.8, 1.0, 1.2])
+    photos = [shade * render(scene, view) for shade, view in zip(shades, views, strict=True)]
+    for step in range(30):
+        optimiser.zero_grad()
+        (render(scene.replace(features_rest=rest), views[step % 3]) - photos[step % 3]).abs().mean().backward()
+        optimiser.step()
+    places, shares = photo_places(scene.replace(features_rest=rest.detach()))
+    eyes = invert_rigid(viewmats)[:, :3, 3]
+    towards = (shares[:, None] * torch.nn.functional.normalize(places, dim=1)).sum(0)
+    assert float(towards @ eyes.mean(0) / eyes.mean(0).norm()) > 0.7
+
+
+@pytest.mark.parametrize(
+    "silent",
+    [
+        normal_scene(3000),
+        ball(500, 0),
+        ball(500).replace(features_rest=torch.zeros(500, 3, 3)),
+        photographed().replace(opacities=torch.full((600, 1), -math.inf)),
+        photographed().replace(features_rest=torch.full((600, 15, 3), math.nan)),
+    ],
+    ids=["random", "degree 0", "zero", "invisible", "NaN"],
+)
+def test_sh_without_a_direction_say_nothing_about_places(silent):
+    assert photo_places(silent) is None
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_places_move_and_grow_with_the_scene(scale):
+    scene = Gaussians(*(value.double() for value in photographed().tensors()))
+    places, shares = photo_places(scene)
+    moved = scene.replace(means=scale * (scene.means + 100))
+    other, as_large = photo_places(moved)
+    torch.testing.assert_close(other / scale - 100, places, atol=1e-5, rtol=0)
+    torch.testing.assert_close(as_large, shares, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("factor", [1e-30, 1e3, 1e38])
+def test_the_size_of_sh_says_nothing_about_places_and_breaks_nothing(factor):
+    scene = photographed()
+    large = scene.replace(features_rest=(scene.features_rest.double() * factor).clamp(-3e38, 3e38).float())
+    found = photo_places(large)
+    if factor == 1e-30:
+        assert found is None
+    else:
+        assert bool(found[0].isfinite().all()) and float(found[1].sum()) == pytest.approx(1)
+
+
+def halves(factor: float = 10.0) -> Gaussians:
+    """Two clusters far apart, the first with ``factor`` times the SH of the second."""
+    scene = ball(2000, 1)
+    first = torch.arange(2000) < 1000
+    means = scene.means + torch.where(first, 0.0, 100.0)[:, None]
+    rest = scene.features_rest * torch.where(first, factor, 1.0)[:, None, None]
+    return scene.replace(means=means, features_rest=rest, scales=torch.full((2000, 3), -2.0))
+
+
+def test_a_neighbourhood_of_strong_sh_was_seen_much():
+    seen = how_much_seen(halves(2.0), torch.arange(2000))
+    # 2 ^ (2 * 3/4), where neighbourhoods do not mix
+    ratio = seen[:900].double().log().mean() - seen[1100:].double().log().mean()
+    assert float(ratio.exp()) == pytest.approx(2**1.5, rel=0.05)
+    assert seen.dtype == torch.float32 and float(seen.log().median().abs()) < 1
+
+
+def test_flat_neighbourhoods_were_seen_much():
+    scene = halves(1.0)
+    scales = scene.scales.clone()
+    scales[:1000, 1] -= math.log(3)
+    flat = scene.replace(scales=scales)
+    seen = how_much_seen(flat, torch.arange(2000))
+    ratio = seen[:900].double().log().mean() - seen[1100:].double().log().mean()
+    assert float(ratio.exp()) == pytest.approx(3, rel=0.1)
+
+
+def test_all_is_seen_alike_if_nothing_tells():
+    scene = ball(500, 0).replace(scales=torch.full((500, 3), -3.0))
+    assert how_much_seen(scene, torch.arange(500)).tolist() == [1.0] * 500
+    assert how_much_seen(scene, torch.tensor([7])).tolist() == [1.0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_extremes_stay_within_bounds(dtype):
+    scene = Gaussians(*(value.to(dtype) for value in halves(0.0).tensors()))
+    largest = torch.finfo(dtype).max
+    for size in (0.0, torch.finfo(dtype).tiny, largest):
+        rest = scene.features_rest.clone()
+        rest[1000:] = size
+        scales = scene.scales.clone()
+        scales[:500] = -math.inf
+        scales[500:800, 0], scales[800:900, 2] = -math.inf, 0.5 * largest
+        seen = how_much_seen(scene.replace(features_rest=rest, scales=scales), torch.arange(2000))
+        assert bool(seen.isfinite().all())
+        assert float(seen.log().abs().max()) <= MOST_FACTOR + 1e-5
+
+
+def test_merging_keeps_more_where_photos_showed_more():
+    viewmats = look_at(torch.tensor([[50.0, 50.0, -400.0]]).double(), torch.full((1, 3), 50.0).double())
+    K = torch.tensor([[[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]]).double()
+    both = Views(viewmats, K, 64, 48, torch.zeros(3))
+    kept, even = (merge(halves(factor), 400, views=both).scene.means[:, 0] < 50 for factor in (10.0, 1.0))
+    assert int(kept.sum()) > 1.2 * int(even.sum())
+
+
+def test_merging_keeps_more_where_sh_tell_that_photos_looked():
+    """What no photo showed is there as well, of the same shape."""
+    shown = photographed(1100)
+    hidden = shown.replace(means=shown.means + 5.0, features_rest=torch.zeros_like(shown.features_rest))
+    scene = Gaussians(*(torch.cat(pair) for pair in zip(shown.tensors(), hidden.tensors(), strict=True)))
+    assert photo_places(scene) is not None
+    near = torch.cdist(merge(scene, 400).scene.means, torch.stack([torch.zeros(3), torch.full((3,), 5.0)])).argmin(1)
+    assert int((near == 0).sum()) > 270
