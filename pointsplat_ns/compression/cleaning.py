@@ -209,8 +209,9 @@ def _normalised(scene: Gaussians) -> Gaussians:
 
 
 def _places(scene: Gaussians) -> Tensor:
-    """Positions (P, 3) in free space, float64."""
-    return invert_rigid(sample_views(scene, PLACES, seed=_SEED).viewmats)[:, :3, 3]
+    """Positions (P, 3) in free space, float64; all over it, wherever photos were taken, which SH may tell."""
+    silent = scene.replace(features_rest=scene.features_rest[:, :0])
+    return invert_rigid(sample_views(silent, PLACES, seed=_SEED).viewmats)[:, :3, 3]
 
 
 def _six_directions() -> Tensor:

@@ -63,7 +63,7 @@ def in_units(scene: Gaussians, centre: Tensor, size: float) -> Gaussians:
 
 
 def thinned(scene: Gaussians, most: int) -> Gaussians:
-    """At most about ``most`` Gaussians, evenly taken, grown so that they cover as much as all; without colours."""
+    """At most about ``most`` Gaussians, evenly taken, grown so that they cover as much as all."""
     step = max(1, len(scene) // most)
     some = Gaussians(*(value[::step] for value in scene.tensors()))
-    return some.replace(scales=some.scales + 0.5 * math.log(step), features_rest=some.features_rest[:, :0])
+    return some.replace(scales=some.scales + 0.5 * math.log(step))

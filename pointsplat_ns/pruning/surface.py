@@ -15,7 +15,9 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.quaternions import rotation_matrices
 from pointsplat_ns.pruning.content import UNITS
+from pointsplat_ns.pruning.coverage import curve_keys, unit_cells
 from pointsplat_ns.pruning.scores import area_score
+from pointsplat_ns.pruning.traces import how_much_seen, unit_sh
 
 POINTS = 12288
 """Number of points that stand for a scene."""
@@ -44,6 +46,8 @@ class Surface:
     points: Tensor  # [M, 3] float64
     normals: Tensor  # [M, 3] float64 along the shortest axis of the Gaussian, of either sign
     flatness: Tensor  # [M] float64 in [0, 1]: 1 less the ratio of the shortest axis to the next
+    shown: Tensor  # [M] float32, how much photos showed of it, see :func:`~pointsplat_ns.pruning.traces.how_much_seen`
+    sh: Tensor  # [M, K, 3] float32, SH coefficients of its Gaussian, without the constant, at a length of 1
 
     @staticmethod
     def of(scene: Gaussians, centre: Tensor, size: float) -> Surface:
@@ -72,7 +76,11 @@ class Surface:
         axes = axes.gather(2, order[:, None, :].expand(-1, 3, 3))
         within = torch.randn(POINTS, 3, generator=generator, dtype=torch.float64).clamp(-1.5, 1.5) * stds
         points = (some.means.double() - centre.cpu()) * (UNITS / size) + (axes @ within[..., None])[..., 0]
-        return Surface(points, axes[:, :, 0], 1 - stds[:, 0] / stds[:, 1].clamp_min(1e-300))
+        flatness = 1 - stds[:, 0] / stds[:, 1].clamp_min(1e-300)
+        along = curve_keys(unit_cells(some.means)).argsort(stable=True)
+        shown = torch.empty(POINTS)
+        shown[along] = how_much_seen(some, along)
+        return Surface(points, axes[:, :, 0], flatness, shown, unit_sh(some.features_rest))
 
     def clearance(self, places: Tensor) -> Tensor:
         """Distance (P,) from places (P, 3) to the nearest surface, units."""

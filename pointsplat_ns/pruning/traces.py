@@ -14,6 +14,7 @@ Neither is in the literature that we know of; both were found on trained scenes 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -121,10 +122,10 @@ def photo_places(scene: Gaussians) -> tuple[Tensor, Tensor] | None:
         Deterministic.
     """
     generator = torch.Generator().manual_seed(0)
-    some = scene[torch.randperm(len(scene), generator=generator)[: 8 * PROBED]]
-    rest = some.features_rest.double().clamp(-LARGEST, LARGEST)
-    length = _energy(rest).sqrt()
-    telling = some.usable() & (some.alphas > OPAQUE_ENOUGH) & (length > FAINTEST)
+    drawn = torch.randperm(len(scene), generator=generator)[: 8 * PROBED]
+    some = scene[drawn.to(scene.device)].to("cpu")
+    rest = unit_sh(some.features_rest)
+    telling = some.usable() & (some.alphas > OPAQUE_ENOUGH) & (rest != 0).any(2).any(1)
     chosen = telling.nonzero()[:PROBED, 0]
     if len(chosen) == 0:
         return None
@@ -133,27 +134,41 @@ def photo_places(scene: Gaussians) -> tuple[Tensor, Tensor] | None:
     centre, size = 0.5 * (low + high), AROUND * (high - low)
     spread = torch.rand(CANDIDATES, 3, generator=generator).double() - 0.5
     places = centre + size * spread
-    rest = (rest[chosen] / length[chosen, None, None]).float()
+    rest = rest[chosen]
 
-    def explained(these: Tensor) -> Tensor:
-        return torch.stack([_explained(means - place, rest, some.sh_degree) for place in these])
+    def votes(these: Tensor) -> Tensor:
+        return torch.stack([explained(means - place, rest).mean() for place in these])
 
-    at_first = explained(places[:ASKED_FIRST])
+    at_first = votes(places[:ASKED_FIRST])
     if not float(at_first.max()) >= PROMISING * TELLING:
         return None
-    all_explained = torch.cat([at_first, explained(places[ASKED_FIRST:])])
-    best = float(all_explained.max())
+    of_all = torch.cat([at_first, votes(places[ASKED_FIRST:])])
+    best = float(of_all.max())
     if best < TELLING:
         return None
-    shares = (all_explained / best) ** CONTRAST
+    shares = (of_all / best) ** CONTRAST
     chosen = shares > LEAST_SHARE
     return places[chosen], shares[chosen] / shares[chosen].sum()
 
 
-def _explained(offsets: Tensor, rest: Tensor, degree: int) -> Tensor:
-    """Mean share of the energy of SH (n, K, 3) of length 1 that lies along the basis in the directions ``offsets``
-    (n, 3), relative to that of SH of no direction."""
+def unit_sh(rest: Tensor) -> Tensor:
+    """SH coefficients (n, K, 3) at a length of 1, or 0 if they are :data:`FAINTEST`, float32."""
+    rest = rest.double().clamp(-LARGEST, LARGEST)
+    length = _energy(rest).sqrt()[:, None, None]
+    return torch.where(length > FAINTEST, rest / length.clamp_min(FAINTEST), 0.0).float()
+
+
+def explained(offsets: Tensor, rest: Tensor) -> Tensor:
+    """Share of the energy of SH that lies along the basis in some directions, relative to that of SH of no direction.
+
+    Args:
+        offsets: (n, 3) from an eye to Gaussians, of any length.
+        rest: (n, K, 3) SH coefficients of degrees 1 and up, of length 1.
+
+    Returns:
+        (n,) float32, 0 to K: large if photos were taken from that direction.
+    """
     directions = (offsets / offsets.norm(dim=1, keepdim=True).clamp_min(torch.finfo(offsets.dtype).tiny)).float()
-    basis = sh_basis(directions, degree)[:, 1:]
+    basis = sh_basis(directions, math.isqrt(rest.shape[1] + 1) - 1)[:, 1:]
     along = (rest * basis[:, :, None]).sum(1).square().sum(1) / basis.square().sum(1).clamp_min(FAINTEST)
-    return along.mean() * rest.shape[1]
+    return along * rest.shape[1]

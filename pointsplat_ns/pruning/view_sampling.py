@@ -15,6 +15,7 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.content import UNITS, content_box, content_diagonal, in_units, thinned
 from pointsplat_ns.pruning.surface import Surface
+from pointsplat_ns.pruning.traces import TELLING, explained, photo_places
 from pointsplat_ns.pruning.upright import UprightBox, level_directions, pointing_up, upright_axis
 from pointsplat_ns.rasterizer import render_depth
 from pointsplat_ns.views import Views
@@ -35,6 +36,15 @@ _PROBE_SIDE = 32
 
 _TOO_NEAR = 0.5
 """Distance, in units, below which a surface is too near to the camera."""
+
+_PHOTO_TOO_NEAR = 0.1
+"""The same where photos were taken: what they show may be a small part of the content, and was not too near."""
+
+_PHOTOS_APART = 0.4
+"""Standard deviation of candidates about the places of photos, units: how far these are from each other."""
+
+_LIKE_PHOTOS = 0.6
+"""Least worth of what a view shows, relative to that of the best tenth of the candidates."""
 
 _NEAR_PIXELS = 0.05
 """Largest allowed share of pixels that show a surface that is too near."""
@@ -100,6 +110,9 @@ def sample_views(
     what the views before them have not shown, in the middle of the picture rather than at its edge; a small depth image
     tests that nothing is in the way. Ask for all the views at once that are wanted, as they then complete each other.
 
+    Where the SH of a scene tell from where its photos were taken (:mod:`pointsplat_ns.pruning.traces`), cameras stand
+    about there and look at what photos showed.
+
     Args:
         scene: N Gaussians.
         count: number of views, at least 1.
@@ -143,9 +156,12 @@ def sample_views(
     box = UprightBox.of(surface, pointing_up(surface, axis, inside) if up is None else up)
     small = in_units(thinned(scene, PROBED), centre, diagonal)
     generator = torch.Generator().manual_seed(seed)
-    for kind in (inside, not inside):
-        taken = _Search(small, surface, box, kind, width, height, generator).views(count)
-        if len(taken):
+    photos = photo_places(scene)
+    if photos is not None:
+        photos = ((photos[0] - centre) * (UNITS / diagonal), photos[1])
+    for kind, places in ((inside, photos), (inside, None), (not inside, None)):
+        taken = _Search(small, surface, box, kind, width, height, generator, places).views(count)
+        if len(taken) >= (1 if places is None else 0.5 * count):
             break
     else:
         raise DataError(
@@ -212,11 +228,14 @@ class _Search:
     width: int
     height: int
     generator: torch.Generator
+    photos: tuple[Tensor, Tensor] | None
+    """Places (P, 3) where photos were taken, and their shares (P,), if that is known."""
 
     def views(self, count: int) -> Tensor:
         """At most ``count`` world-to-camera matrices (n, 4, 4)."""
         shown = torch.zeros(_COMPARED)
         taken: list[Tensor] = []
+        wanted = torch.ones(_COMPARED) if self.photos is None else self.surface.shown[:_COMPARED]
         fruitless = 0
         while len(taken) < count and fruitless < _FRUITLESS:
             viewmats, owner, gains = self._candidates()
@@ -225,7 +244,7 @@ class _Search:
                 best = int((gains @ (1 / (_NOVEL + shown))).masked_fill(owner < 0, -1.0).argmax())
                 if self._is_free(viewmats[best]):
                     taken.append(viewmats[best])
-                    shown += gains[best]
+                    shown += gains[best] / wanted
                     owner[owner == owner[best].item()] = -1  # one view a place
                 else:
                     owner[best] = -1
@@ -234,6 +253,8 @@ class _Search:
 
     def _candidates(self) -> tuple[Tensor, Tensor, Tensor]:
         """Views (V, 4, 4) of some places, the place (V,) of each, and how much they show of each point (V, P)."""
+        if self.photos is not None:
+            return self._like_photos(*self.photos)
         places = self._inside() if self.inside else self._outside()
         places = places[self.surface.clearance(places) > _TOO_NEAR][:_PLACES]
         seen, around = self.surface.seen_from(places)
@@ -244,6 +265,33 @@ class _Search:
         targets = self._ahead(eyes) if self.inside else self._at_content(seen[owner])
         viewmats = look_at(eyes, targets, self.box.up)
         return viewmats, owner, self._shown(viewmats, seen[:, :_COMPARED][owner])
+
+    def _like_photos(self, places: Tensor, shares: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As :meth:`_candidates`, about where photos were taken: ``places`` (P, 3) by their ``shares`` (P,). What the
+        SH of a point do not say to have been shown from there counts for little."""
+        drawn = torch.multinomial(shares.float(), 2 * _PLACES, replacement=True, generator=self.generator)
+        places = places[drawn] + _PHOTOS_APART * torch.randn(len(drawn), 3, generator=self.generator).double()
+        if self.inside:
+            places = torch.cat([places, self._inside()[: 2 * _PLACES]])
+        places = places[self.surface.clearance(places) > _PHOTO_TOO_NEAR]
+        points, sh = self.surface.points[:_COMPARED], self.surface.sh[:_COMPARED]
+        seen = self.surface.seen_from(places)[0][:, :_COMPARED]
+        told = torch.empty(len(places), _COMPARED)
+        for row, place in zip(told, places, strict=True):
+            row.copy_(explained(points - place, sh))
+        best = ((seen * told).sum(1) / seen.sum(1).clamp_min(1)).topk(min(2 * _PLACES, len(places))).indices
+        places, seen, told = places[best], seen[best], told[best]
+        owner = torch.arange(len(places)).repeat_interleave(_TURNS[True])
+        worth = seen * self.surface.shown[:_COMPARED] * told / TELLING
+        near = 1 / (1 + torch.cdist(places.float(), points.float()).square())
+        weights = (worth * near + 1e-12)[owner]
+        at = torch.multinomial(weights, 1, generator=self.generator)[:, 0] if len(owner) else owner
+        viewmats = look_at(places[owner], points[at], self.box.up)
+        shown = self._shown(viewmats, seen[owner])
+        gains = shown * worth[owner]
+        average = gains.sum(1) / shown.sum(1).clamp_min(1e-6)
+        like_photos = average >= (_LIKE_PHOTOS * average.quantile(0.9) if len(owner) else 0.0)
+        return viewmats[like_photos], owner[like_photos], gains[like_photos]
 
     def _inside(self) -> Tensor:
         places = self.box.places(4 * _PLACES, self.generator)
@@ -290,7 +338,8 @@ class _Search:
 
     def _is_free(self, viewmat: Tensor) -> bool:
         """Whether a view shows enough, and hardly any surface that is very near."""
+        close = _TOO_NEAR if self.photos is None else _PHOTO_TOO_NEAR
         view = _views(viewmat[None], self.width, self.height, NEAR_PLANE * UNITS).resized(_PROBE_SIDE)[0]
         depth, alpha = render_depth(self.small, view)
-        too_near = (alpha > 0.5) & (depth < _TOO_NEAR)
+        too_near = (alpha > 0.5) & (depth < close)
         return float(alpha.mean()) >= _COVERED[self.inside] and float(too_near.float().mean()) < _NEAR_PIXELS

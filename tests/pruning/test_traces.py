@@ -13,7 +13,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.pruning.merge import merge
 from pointsplat_ns.pruning.traces import MOST_FACTOR, how_much_seen, photo_places
-from pointsplat_ns.pruning.view_sampling import look_at
+from pointsplat_ns.pruning.view_sampling import look_at, sample_views
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.views import Views
@@ -162,3 +162,21 @@ def test_merging_keeps_more_where_sh_tell_that_photos_looked():
     assert photo_places(scene) is not None
     near = torch.cdist(merge(scene, 400).scene.means, torch.stack([torch.zeros(3), torch.full((3,), 5.0)])).argmin(1)
     assert int((near == 0).sum()) > 270
+
+
+def test_views_are_sampled_where_photos_were_taken_and_look_at_what_they_showed():
+    """A smooth shell around photos that were all taken from about one place, of one side."""
+    shell = ball(3000, 3, log_size=math.log(0.12), opacity=5.0)
+    eye = torch.tensor([0.6, 0.0, 0.0])
+    directions = torch.nn.functional.normalize(shell.means - eye, dim=1)
+    steps = torch.where(directions[:, :1] > 0.5, 0.1, 1e-3) * torch.randn(3000, 3, generator=torch.manual_seed(1))
+    scene = shell.replace(features_rest=steps[:, None] * sh_basis(directions, 3)[:, 1:, None])
+    assert photo_places(scene) is not None
+    eyes, ahead = [], []
+    for views in (sample_views(scene, 6, 64, 48), sample_views(shell, 6, 64, 48)):
+        poses = invert_rigid(views.viewmats)
+        eyes.append(float((poses[:, :3, 3] - eye.double()).norm(dim=1).mean()))
+        ahead.append(float(poses[:, 0, 2].mean()))
+        assert len(views) == 6
+    assert eyes[0] < 0.8 * eyes[1]
+    assert ahead[0] > 0.6 and ahead[0] > ahead[1] + 0.3
