@@ -256,17 +256,17 @@ class Merging:
     def _weights(self) -> Tensor:
         if self.views is None:
             return torch.ones(len(self.members))
-        means = self._positions(self.scene.means[self.members])
+        means = self.positions(self.scene.means[self.members])
         if self.not_shown < 1:
             weights = weights_seen(means, self.views, self.not_shown)
         elif (photos := photo_places(self.scene)) is not None:
             places, shares = photos
-            weights = weights_seen_from(means, self._positions(places), shares)
+            weights = weights_seen_from(means, self.positions(places), shares)
         else:
             return weights_seen(means, self.views)
         return weights * how_much_seen(self.scene, self.members)
 
-    def _positions(self, positions: Tensor) -> Tensor:
+    def positions(self, positions: Tensor) -> Tensor:
         """Positions (n, 3) in units of the content, float64."""
         return (positions.double() - self.centre) * (UNITS / self.size)
 

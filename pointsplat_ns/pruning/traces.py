@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -111,6 +112,33 @@ def _around(values: Tensor) -> Tensor:
     return means[0, 0]
 
 
+@dataclass(frozen=True, eq=False)
+class Witnesses:
+    """Some Gaussians of a scene that say from which directions photos showed them."""
+
+    means: Tensor  # [n, 3] float64, scene units
+    sh: Tensor  # [n, K, 3] float32, SH coefficients of degrees 1 and up, of length 1
+
+    @staticmethod
+    def of(scene: Gaussians, generator: torch.Generator) -> Witnesses:
+        """At most :data:`PROBED` Gaussians drawn from a scene; none if none has SH."""
+        drawn = torch.randperm(len(scene), generator=generator)[: 8 * PROBED]
+        some = scene[drawn.to(scene.device)].to("cpu")
+        sh = unit_sh(some.features_rest)
+        telling = some.usable() & (some.alphas > OPAQUE_ENOUGH) & (sh != 0).any(2).any(1)
+        chosen = telling.nonzero()[:PROBED, 0]
+        return Witnesses(some.means[chosen].double(), sh[chosen])
+
+    def box(self) -> tuple[Tensor, Tensor]:
+        """Centre (3,) and sides (3,) of the box that places are looked for in."""
+        low, high = torch.quantile(self.means, self.means.new_tensor([0.02, 0.98]), dim=0)
+        return 0.5 * (low + high), AROUND * (high - low)
+
+    def votes(self, places: Tensor) -> Tensor:
+        """How well photos from each place (P, 3) explain the SH, relative to SH of no direction, (P,) float32."""
+        return torch.stack([explained(self.means - place, self.sh).mean() for place in places])
+
+
 def photo_places(scene: Gaussians) -> tuple[Tensor, Tensor] | None:
     """Where the photos were taken that a scene was trained on, as far as its SH tell.
 
@@ -122,31 +150,20 @@ def photo_places(scene: Gaussians) -> tuple[Tensor, Tensor] | None:
         Deterministic.
     """
     generator = torch.Generator().manual_seed(0)
-    drawn = torch.randperm(len(scene), generator=generator)[: 8 * PROBED]
-    some = scene[drawn.to(scene.device)].to("cpu")
-    rest = unit_sh(some.features_rest)
-    telling = some.usable() & (some.alphas > OPAQUE_ENOUGH) & (rest != 0).any(2).any(1)
-    chosen = telling.nonzero()[:PROBED, 0]
-    if len(chosen) == 0:
+    witnesses = Witnesses.of(scene, generator)
+    if len(witnesses.means) == 0:
         return None
-    means = some.means[chosen].double()
-    low, high = torch.quantile(means, means.new_tensor([0.02, 0.98]), dim=0)
-    centre, size = 0.5 * (low + high), AROUND * (high - low)
+    centre, sides = witnesses.box()
     spread = torch.rand(CANDIDATES, 3, generator=generator).double() - 0.5
-    places = centre + size * spread
-    rest = rest[chosen]
-
-    def votes(these: Tensor) -> Tensor:
-        return torch.stack([explained(means - place, rest).mean() for place in these])
-
-    at_first = votes(places[:ASKED_FIRST])
-    if not float(at_first.max()) >= PROMISING * TELLING:
+    places = centre + sides * spread
+    votes = witnesses.votes(places[:ASKED_FIRST])
+    if not float(votes.max()) >= PROMISING * TELLING:
         return None
-    of_all = torch.cat([at_first, votes(places[ASKED_FIRST:])])
-    best = float(of_all.max())
+    votes = torch.cat([votes, witnesses.votes(places[ASKED_FIRST:])])
+    best = float(votes.max())
     if best < TELLING:
         return None
-    shares = (of_all / best) ** CONTRAST
+    shares = (votes / best) ** CONTRAST
     chosen = shares > LEAST_SHARE
     return places[chosen], shares[chosen] / shares[chosen].sum()
 

@@ -6,9 +6,8 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
 
-from making import ball, normal_scene
+from making import EYES, ball, normal_scene, photographed
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.pruning.merge import merge
@@ -17,20 +16,6 @@ from pointsplat_ns.pruning.view_sampling import look_at, sample_views
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.views import Views
-
-EYES = torch.tensor([[3.0, 0.0, 0.5], [2.6, 1.5, 0.5], [2.6, -1.5, 0.6]])
-
-
-def photographed(n: int = 600, degree: int = 3, eyes: Tensor = EYES) -> Gaussians:
-    """A ball whose SH were moved along the basis in the directions that eyes (E, 3) see it from, by random steps."""
-    scene = ball(n, degree)
-    generator = torch.Generator().manual_seed(1)
-    rest = torch.zeros_like(scene.features_rest)
-    for eye in eyes:
-        directions = torch.nn.functional.normalize(scene.means - eye, dim=1)
-        steps = 0.05 * torch.randn(n, 1, 3, generator=generator)
-        rest += steps * sh_basis(directions, degree)[:, 1:, None]
-    return scene.replace(features_rest=rest)
 
 
 def test_places_of_photos_are_found():

@@ -85,6 +85,30 @@ def ball(
     )
 
 
+EYES = torch.tensor([[3.0, 0.0, 0.5], [2.6, 1.5, 0.5], [2.6, -1.5, 0.6]])
+"""Where photos of :func:`photographed` were taken."""
+
+
+def photographed(n: int = 600, degree: int = 3, eyes: torch.Tensor = EYES) -> Gaussians:
+    """A ball whose SH were moved along the basis in the directions that eyes see it from, by random steps.
+
+    Args:
+        n: how many.
+        degree: of SH.
+        eyes: (E, 3).
+    """
+    from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
+
+    scene = ball(n, degree)
+    generator = torch.Generator().manual_seed(1)
+    rest = torch.zeros_like(scene.features_rest)
+    for eye in eyes:
+        directions = torch.nn.functional.normalize(scene.means - eye, dim=1)
+        steps = 0.05 * torch.randn(n, 1, 3, generator=generator)
+        rest += steps * sh_basis(directions, degree)[:, 1:, None]
+    return scene.replace(features_rest=rest)
+
+
 def box_room(seed: int, count: int = 900, size: float = 0.15, smooth: bool = False) -> Gaussians:
     """A closed box of opaque Gaussians, 4 x 3 x 2 scene units: free inside, covered all around.
 

@@ -1,0 +1,129 @@
+"""Do the SH of a scene tell where its photos were taken? Runs know; their Gaussians are asked.
+
+    python benchmarks/photo_places.py RUN... [--picture photo_places.jpg]
+
+For each run: how well photos from the best of the places compared explain the SH (below 2 the scene has not told);
+how far from a training pose the places found are, by their shares, and any place of the same box is, in shares of the
+content's diagonal; how often a training pose explains more than any place does; and the correlation, over the Gaussians
+that photos show, of the logarithms of how large they are in photos and of the weights that merging gives them without
+poses. The picture shows what explains the SH, from above, at the height of the training poses, these in red, and some
+Gaussians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import tyro
+from held_out import name_of
+from torch import Tensor
+
+import pointsplat_ns as ps
+from pointsplat_ns.compression.view_source import MERGED_FROM
+from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.pruning.content import content_size
+from pointsplat_ns.pruning.merge import Merging
+from pointsplat_ns.pruning.traces import Witnesses, photo_places
+from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, weights_seen
+
+ANY = 500
+"""Number of places that the poses are compared with."""
+
+CELLS = 48
+"""Side of the maps."""
+
+SEEN = 8.0
+"""Gaussians whose weight is less than the largest one's by more than this, in logarithms, are not correlated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Map:
+    """What explains the SH at one height, seen from above."""
+
+    name: str
+    votes: Tensor  # [CELLS, CELLS]
+    extent: float  # half of its side
+    eyes: Tensor  # [E, 2]
+    gaussians: Tensor  # [n, 2]
+
+
+@torch.no_grad()
+def asked(run: Path) -> Map:
+    """Print a row about a run, and give its map."""
+    dense, poses = ps.load(run), dataset_views(run, "train")
+    eyes = invert_rigid(poses.viewmats.double())[:, :3, 3]
+    witnesses = Witnesses.of(dense, torch.Generator().manual_seed(0))
+    if len(witnesses.means) == 0:
+        raise SystemExit(f"{run} has no SH beyond degree 0")
+    size = content_size(dense)[1]
+    centre, sides = witnesses.box()
+    anywhere = centre + sides * (torch.rand(ANY, 3, generator=torch.Generator().manual_seed(0)).double() - 0.5)
+    found = photo_places(dense)
+    at_eyes, at_any = witnesses.votes(eyes), witnesses.votes(anywhere)
+    more = (at_eyes[:, None] > at_any).float().mean()
+    away = float(torch.cdist(anywhere, eyes).amin(1).mean()) / size
+    in_photos = log_sizes(Merging(dense, torch.arange(len(dense)), poses.spread(MERGED_FROM)))
+    blind = Merging(dense, torch.arange(len(dense)), None)
+    given = blind.state.weights.clamp_min(1e-12).log()
+    seen = in_photos > in_photos.max() - SEEN
+    alike = torch.corrcoef(torch.stack([in_photos[seen], given[seen]]))[0, 1]
+    distance = "not told"
+    if found is not None:
+        distance = f"{float((found[1] * torch.cdist(found[0], eyes).amin(1)).sum()) / size:.1%}"
+    best = float(torch.cat([at_eyes, at_any]).max())
+    print(f"| {name_of(run)} | {best:.2f} | {distance} | {away:.1%} | {more:.0%} | {alike:.2f} |", flush=True)
+    return mapped(name_of(run), witnesses, eyes)
+
+
+def log_sizes(merging: Merging) -> Tensor:
+    """Logarithms of how large a unit of area at each Gaussian is in the known views of a merge, (N,)."""
+    means = merging.positions(merging.scene.means[merging.members])
+    return weights_seen(means, merging.views, NOT_SHOWN).clamp_min(1e-12).log()
+
+
+def mapped(name: str, witnesses: Witnesses, eyes: Tensor) -> Map:
+    """The map of a scene; the axis along which its poses spread least is taken to be upright."""
+    middle = eyes.mean(0)
+    axes = torch.linalg.svd(eyes - middle, full_matrices=True).Vh[:2]  # level, as far as the poses are
+    at, gaussians = (eyes - middle) @ axes.T, (witnesses.means - middle) @ axes.T
+    extent = 1.15 * float(torch.cat([gaussians.abs().quantile(0.8, dim=0), at.abs().amax(0)]).max())
+    line = torch.linspace(-extent, extent, CELLS, dtype=torch.float64)
+    cells = torch.cartesian_prod(line, line).flip(1)  # rows from bottom to top
+    return Map(name, witnesses.votes(middle + cells @ axes).view(CELLS, CELLS), extent, at, gaussians)
+
+
+def draw(maps: list[Map], path: Path) -> None:
+    """Maps beside one another, as a picture."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(3.6 * len(maps), 3.9), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, drawn in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps, strict=True):
+        side = (-drawn.extent, drawn.extent)
+        axes.imshow(drawn.votes, origin="lower", extent=(*side, *side))
+        axes.scatter(*drawn.gaussians[::3].T, s=1, c="white", alpha=0.35, linewidths=0)
+        axes.scatter(*drawn.eyes.T, s=9, c="red", linewidths=0)
+        axes.set(xlim=side, ylim=side, xticks=[], yticks=[], title=drawn.name)
+    figure.savefig(path, dpi=100)
+
+
+def main(runs: tyro.conf.Positional[tuple[Path, ...]], /, picture: Path | None = None) -> None:
+    """Print a table, and draw maps if asked to.
+
+    Args:
+        runs: trained runs whose data is at hand.
+        picture: file to draw the maps into.
+    """
+    print("| | explained, best place | from a pose | any place | poses explain more | weights alike |")
+    print("|---|---|---|---|---|---|")
+    maps = [asked(run) for run in runs]
+    if picture is not None:
+        draw(maps, picture)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
