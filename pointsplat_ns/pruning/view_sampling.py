@@ -156,12 +156,13 @@ def sample_views(
     box = UprightBox.of(surface, pointing_up(surface, axis, inside) if up is None else up)
     small = in_units(thinned(scene, PROBED), centre, diagonal)
     generator = torch.Generator().manual_seed(seed)
-    photos = photo_places(scene)
-    if photos is not None:
-        photos = ((photos[0] - centre) * (UNITS / diagonal), photos[1])
-    for kind, places in ((inside, photos), (inside, None), (not inside, None)):
-        taken = _Search(small, surface, box, kind, width, height, generator, places).views(count)
-        if len(taken) >= (1 if places is None else 0.5 * count):
+    kinds: list[tuple[bool, tuple[Tensor, Tensor] | None]] = [(inside, None), (not inside, None)]
+    told = photo_places(scene)
+    if told is not None:
+        kinds.insert(0, (inside, ((told[0] - centre) * (UNITS / diagonal), told[1])))
+    for kind, photos in kinds:
+        taken = _Search(small, surface, box, kind, width, height, generator, photos).views(count)
+        if len(taken) >= (1 if photos is None else 0.5 * count):
             break
     else:
         raise DataError(
