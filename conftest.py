@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from pointsplat_ns.compression import repair, view_source
-from pointsplat_ns.pruning.view_sampling import sample_views
+from pointsplat_ns.pruning.view_sampling import views_about
 from pointsplat_ns.rooms import light
 
 
@@ -16,7 +16,7 @@ from pointsplat_ns.rooms import light
 def small_views_by_default() -> Iterator[None]:
     """Where no views are given, those that renders are compared in have a 25th of the pixels that users get."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(view_source, "sample_views", functools.partial(sample_views, width=64, height=48))
+        patch.setattr(view_source, "views_about", functools.partial(views_about, width=64, height=48))
         yield
 
 

@@ -9,10 +9,13 @@ from functools import cached_property
 from itertools import count as counted
 from pathlib import Path
 
+from torch import Tensor
+
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import open_run
-from pointsplat_ns.pruning.view_sampling import sample_views
+from pointsplat_ns.pruning.traces import photo_places
+from pointsplat_ns.pruning.view_sampling import views_about
 from pointsplat_ns.views import RasterizeMode, View, Views, spread_indices
 
 MERGED_FROM = 48
@@ -83,9 +86,14 @@ class ViewSource:
         if self._of_dataset is not None:
             self.origin = "poses of the dataset"
             return self._of_dataset.spread(count)
-        views = sample_views(self._scene, count)
-        self.origin = f"poses sampled in free space{self._missing}"
+        views = views_about(self._scene, self._photos, count)
+        where = "in free space" if self._photos is None else "about where photos were taken, as the SH tell"
+        self.origin = f"poses sampled {where}{self._missing}"
         return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
+
+    @cached_property
+    def _photos(self) -> tuple[Tensor, Tensor] | None:
+        return photo_places(self._scene)
 
     def known(self, count: int) -> Views | None:
         """At most ``count`` of the views that need not be sampled: given ones, or those of the dataset's training
@@ -123,7 +131,7 @@ class ViewSource:
                 for index in generator.sample(left, len(left)):
                     yield rest[index]
         for batch in counted(1):
-            sampled = sample_views(self._scene, SAMPLED_AT_ONCE, seed=SAMPLED_AT_ONCE * seed + batch)
+            sampled = views_about(self._scene, self._photos, SAMPLED_AT_ONCE, seed=SAMPLED_AT_ONCE * seed + batch)
             sampled = dataclasses.replace(sampled, background=compared.background, rasterize_mode=self._rasterize_mode)
             for index in random.Random(batch).sample(range(len(sampled)), len(sampled)):
                 yield sampled[index]

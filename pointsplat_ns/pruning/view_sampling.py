@@ -138,6 +138,20 @@ def sample_views(
         >>> len(views), tuple(views.viewmats.shape), (views.width, views.height)
         (3, (3, 4, 4), (64, 48))
     """
+    return views_about(scene, photo_places(scene), count, width, height, seed, up)
+
+
+@torch.no_grad()
+def views_about(
+    scene: Gaussians,
+    photos: tuple[Tensor, Tensor] | None,
+    count: int,
+    width: int = 320,
+    height: int = 240,
+    seed: int = 0,
+    up: Tensor | None = None,
+) -> Views:
+    """As :func:`sample_views`, with what :func:`~pointsplat_ns.pruning.traces.photo_places` says of the scene."""
     if count < 1:
         raise DataError(f"{count} views asked for; expected at least 1")
     if min(width, height) < 1:
@@ -157,12 +171,11 @@ def sample_views(
     small = in_units(thinned(scene, PROBED), centre, diagonal)
     generator = torch.Generator().manual_seed(seed)
     kinds: list[tuple[bool, tuple[Tensor, Tensor] | None]] = [(inside, None), (not inside, None)]
-    told = photo_places(scene)
-    if told is not None:
-        kinds.insert(0, (inside, ((told[0] - centre) * (UNITS / diagonal), told[1])))
-    for kind, photos in kinds:
-        taken = _Search(small, surface, box, kind, width, height, generator, photos).views(count)
-        if len(taken) >= (1 if photos is None else 0.5 * count):
+    if photos is not None:
+        kinds.insert(0, (inside, ((photos[0] - centre) * (UNITS / diagonal), photos[1])))
+    for kind, about in kinds:
+        taken = _Search(small, surface, box, kind, width, height, generator, about).views(count)
+        if len(taken) >= (1 if about is None else 0.5 * count):
             break
     else:
         raise DataError(

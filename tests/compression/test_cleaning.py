@@ -250,7 +250,7 @@ def test_without_a_free_place_or_views_only_the_undrawable_go(monkeypatch):
 
     monkeypatch.setattr("pointsplat_ns.pruning.viewpoints.sample_views", nowhere)
     monkeypatch.setattr("pointsplat_ns.compression.cleaning.sample_views", nowhere)
-    monkeypatch.setattr("pointsplat_ns.compression.view_source.sample_views", nowhere)
+    monkeypatch.setattr("pointsplat_ns.compression.view_source.views_about", nowhere)
     scene = with_junk(box_room(0, 40, size=0.05))
     junk = find_junk(scene)
     assert junk.places == 0 and len(junk.unseen) == 0

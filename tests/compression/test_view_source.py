@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from making import ball
+from making import ball, box_room
 from pointsplat_ns.compression.view_source import COMPARED_SIDE, COMPARED_VIEWS, ViewSource
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -95,3 +95,13 @@ def test_views_are_spread_resized_and_checked(ball_views):
         Views(torch.eye(4), ball_views.Ks, 8, 8, torch.zeros(3))
     with pytest.raises(DataError, match="0 x 8 pixels"):
         Views(ball_views.viewmats, ball_views.Ks, 0, 8, torch.zeros(3))
+
+
+def test_sampled_poses_of_a_scene_whose_sh_tell_of_its_photos_say_so(monkeypatch):
+    asked = []
+    told = torch.tensor([[0.5, 0.0, 0.0]], dtype=torch.float64), torch.ones(1)
+    monkeypatch.setattr("pointsplat_ns.compression.view_source.photo_places", lambda scene: asked.append(scene) or told)
+    source = ViewSource(box_room(0))
+    assert len(source.views(3)) and len(source.compared())
+    assert source.origin == "poses sampled about where photos were taken, as the SH tell"
+    assert len(asked) == 1  # what takes seconds is asked once
