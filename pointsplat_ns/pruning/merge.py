@@ -3,8 +3,8 @@
 Over a few rounds, pairs of neighbours are replaced by one Gaussian with their common mass (opacity times the area of
 the projection), centre, covariance and colour. The cost of a pair is the expected change of rendered images, see
 :mod:`~pointsplat_ns.pruning.pair_costs`, as large as it appears from where the scene is looked at, see
-:mod:`~pointsplat_ns.pruning.viewpoints`. Two numbers of the result are chosen by small renders, see
-:mod:`~pointsplat_ns.pruning.finishing`.
+:mod:`~pointsplat_ns.pruning.viewpoints` and :mod:`~pointsplat_ns.pruning.traces`. Two numbers of the result are chosen
+by small renders, see :mod:`~pointsplat_ns.pruning.finishing`.
 
 Memory: besides the scene itself about 0.4 kB a Gaussian. SH coefficients are read twice, in pieces: for the principal
 axes of colours, and at the end for the means of members.
@@ -74,7 +74,8 @@ def merge(
         k: number of Gaussians in the result; N returns the scene itself.
         progress: called with the share done, in [0, 1].
         views: where the scene is looked at from, such as the poses of its photos; what they do not show is merged
-            first. By default from free places in it, in all directions.
+            first. By default from about where photos were taken, if the SH tell (:mod:`~pointsplat_ns.pruning.traces`),
+            else from free places in it, in all directions.
 
     Returns:
         Exactly ``k`` Gaussians. Deterministic.
