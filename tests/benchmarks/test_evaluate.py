@@ -15,7 +15,17 @@ from making import BENCHMARKS
 from pointsplat_ns.compression.trained_refiner import load_refiner
 from pointsplat_ns.refiner import save_refiner
 
-PROGRAMS = ("compaction", "example_room", "quality", "rasterizer", "refinement", "refiner", "repair", "sampled_views")
+PROGRAMS = (
+    "compaction",
+    "example_room",
+    "photo_places",
+    "quality",
+    "rasterizer",
+    "refinement",
+    "refiner",
+    "repair",
+    "sampled_views",
+)
 
 
 ASK_FOR_HELP = """
