@@ -59,8 +59,7 @@ def asked(run: Path) -> Map:
     if len(witnesses.means) == 0:
         raise SystemExit(f"{run} has no SH beyond degree 0")
     size = content_size(dense)[1]
-    centre, sides = witnesses.box()
-    anywhere = centre + sides * (torch.rand(ANY, 3, generator=torch.Generator().manual_seed(0)).double() - 0.5)
+    anywhere = witnesses.places(ANY, torch.Generator().manual_seed(0))
     found = photo_places(dense)
     at_eyes, at_any = witnesses.votes(eyes), witnesses.votes(anywhere)
     more = (at_eyes[:, None] > at_any).float().mean()

@@ -129,10 +129,11 @@ class Witnesses:
         chosen = telling.nonzero()[:PROBED, 0]
         return Witnesses(some.means[chosen].double(), sh[chosen])
 
-    def box(self) -> tuple[Tensor, Tensor]:
-        """Centre (3,) and sides (3,) of the box that places are looked for in."""
+    def places(self, count: int, generator: torch.Generator) -> Tensor:
+        """Places (count, 3) drawn evenly from the box that those of photos are looked for in, float64."""
         low, high = torch.quantile(self.means, self.means.new_tensor([0.02, 0.98]), dim=0)
-        return 0.5 * (low + high), AROUND * (high - low)
+        spread = torch.rand(count, 3, generator=generator).double() - 0.5
+        return 0.5 * (low + high) + AROUND * (high - low) * spread
 
     def votes(self, places: Tensor) -> Tensor:
         """How well photos from each place (P, 3) explain the SH, relative to SH of no direction, (P,) float32."""
@@ -153,9 +154,7 @@ def photo_places(scene: Gaussians) -> tuple[Tensor, Tensor] | None:
     witnesses = Witnesses.of(scene, generator)
     if len(witnesses.means) == 0:
         return None
-    centre, sides = witnesses.box()
-    spread = torch.rand(CANDIDATES, 3, generator=generator).double() - 0.5
-    places = centre + sides * spread
+    places = witnesses.places(CANDIDATES, generator)
     votes = witnesses.votes(places[:ASKED_FIRST])
     if not float(votes.max()) >= PROMISING * TELLING:
         return None
