@@ -1,0 +1,79 @@
+"""What was measured of a scene: one point for each way of making it smaller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Means over views: PSNR in dB, SSIM, and LPIPS, which is None where its weights are not at hand."""
+
+    psnr: float
+    ssim: float
+    lpips: float | None = None
+
+
+@dataclass(frozen=True)
+class Point:
+    """One way of making a scene smaller, measured."""
+
+    key: str
+    """Short name, unique in a sweep and fit for a file's name: ``dense``, ``10pct_sh3_quick``."""
+    label: str
+    """The same for people: ``10 %, repaired for 12 s``."""
+    command: str
+    """The exact command that produces the scene; empty for the dense one."""
+    by: str
+    """The method of pruning; ``dense`` for the scene as it is."""
+    share: float
+    """Share of the Gaussians kept."""
+    gaussians: int
+    sh_degree: int
+    repair: str
+    """``none``, or what repaired it: ``refiner``, ``quick``, ``thorough``."""
+    bytes: int
+    """Size of the file."""
+    against_dense: Quality
+    """Against renders of the dense scene. Its PSNR is infinite for the dense scene itself."""
+    against_photos: Quality | None
+    """Against held-out photos; None where there are none."""
+    frame_ms: float
+    """Median time of one frame, in milliseconds, after a warm-up."""
+    frame_ms_low: float
+    frame_ms_high: float
+    """Quartiles of it over views."""
+    seconds: float
+    """Time that making it took."""
+    peak_bytes: int | None = None
+    """Peak memory of the process that made it; None where it was not measured."""
+
+
+@dataclass(frozen=True)
+class Tradeoff:
+    """Every point that was measured of a scene. The first is the dense scene."""
+
+    scene: str
+    """Name of the scene."""
+    machine: str
+    """Processor, number of threads, device and version of torch, as text."""
+    views_origin: str
+    """Where the views came from."""
+    width: int
+    height: int
+    """Size of the views, in pixels."""
+    points: tuple[Point, ...]
+    notes: tuple[str, ...] = ()
+    """Lines of text for the reader: that the machine was busy and times are not to be trusted, that LPIPS is missing."""
+
+
+def picture_path(folder: Path, view: int, what: str) -> Path:
+    """Where the picture of a view lies.
+
+    Args:
+        folder: the folder of the sweep.
+        view: the view's number, from 0.
+        what: a point's ``key``, or ``photo``.
+    """
+    return folder / "pictures" / f"{view:02d}_{what}.png"
