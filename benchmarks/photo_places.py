@@ -24,7 +24,7 @@ import pointsplat_ns as ps
 from pointsplat_ns.compression.view_source import MERGED_FROM
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.pruning.content import content_size
+from pointsplat_ns.pruning.content import content_size, positions_in_units, views_in_units
 from pointsplat_ns.pruning.merge import Merging
 from pointsplat_ns.pruning.traces import Witnesses, photo_places
 from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, weights_seen
@@ -64,9 +64,9 @@ def asked(run: Path) -> Map:
     at_eyes, at_any = witnesses.votes(eyes), witnesses.votes(anywhere)
     more = (at_eyes[:, None] > at_any).float().mean()
     away = float(torch.cdist(anywhere, eyes).amin(1).mean()) / size
-    in_photos = log_sizes(Merging(dense, torch.arange(len(dense)), poses.spread(MERGED_FROM)))
     blind = Merging(dense, torch.arange(len(dense)), None)
     given = blind.state.weights.clamp_min(1e-12).log()
+    in_photos = log_sizes(dense[blind.members], poses.spread(MERGED_FROM), *content_size(dense))
     seen = in_photos > in_photos.max() - SEEN
     alike = torch.corrcoef(torch.stack([in_photos[seen], given[seen]]))[0, 1]
     distance = "not told"
@@ -77,10 +77,10 @@ def asked(run: Path) -> Map:
     return mapped(name_of(run), witnesses, eyes)
 
 
-def log_sizes(merging: Merging) -> Tensor:
-    """Logarithms of how large a unit of area at each Gaussian is in the known views of a merge, (N,)."""
-    means = merging.positions(merging.scene.means[merging.members])
-    return weights_seen(means, merging.views, NOT_SHOWN).clamp_min(1e-12).log()
+def log_sizes(scene: ps.Gaussians, poses: ps.Views, centre: Tensor, size: float) -> Tensor:
+    """Logarithms of how large a unit of area at each Gaussian is in the photos of these poses, (N,)."""
+    means, views = positions_in_units(scene.means, centre, size), views_in_units(poses, centre, size)
+    return weights_seen(means, views, NOT_SHOWN).clamp_min(1e-12).log()
 
 
 def mapped(name: str, witnesses: Witnesses, eyes: Tensor) -> Map:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.views import Views
 
 UNITS = 10.0
 """Diagonal of the content after :func:`in_units`: all sizes that rendering knows, as that of its near plane, are small
@@ -56,10 +58,25 @@ def content_size(scene: Gaussians) -> tuple[Tensor, float]:
     return 0.5 * (low + high).cpu(), size if 0 < size < math.inf else 1.0
 
 
+def positions_in_units(positions: Tensor, centre: Tensor, size: float) -> Tensor:
+    """Positions (..., 3) where the content has its centre at 0 and a diagonal of :data:`UNITS`, float64."""
+    return (positions.double() - centre.to(positions.device)) * (UNITS / size)
+
+
 def in_units(scene: Gaussians, centre: Tensor, size: float) -> Gaussians:
-    """A scene moved and scaled so that its content has its centre at 0 and a diagonal of :data:`UNITS`."""
-    means = ((scene.means.double() - centre.to(scene.device)) * (UNITS / size)).to(scene.dtype)
+    """A scene moved and scaled as :func:`positions_in_units` moves and scales positions."""
+    means = positions_in_units(scene.means, centre, size).to(scene.dtype)
     return scene.replace(means=means, scales=scene.scales + math.log(UNITS / size))
+
+
+def views_in_units(views: Views, centre: Tensor, size: float) -> Views:
+    """Views of a scene as views of it :func:`in_units`, float64, on the CPU."""
+    viewmats = views.viewmats.double().cpu().clone()
+    viewmats[:, :3, 3] += viewmats[:, :3, :3] @ centre
+    viewmats[:, :3, 3] *= UNITS / size
+    near_plane = views.near_plane * UNITS / size
+    Ks, background = views.Ks.double().cpu(), views.background.cpu()
+    return dataclasses.replace(views, viewmats=viewmats, Ks=Ks, background=background, near_plane=near_plane)
 
 
 def thinned(scene: Gaussians, most: int) -> Gaussians:

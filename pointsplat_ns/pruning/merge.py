@@ -12,7 +12,6 @@ axes of colours, and at the end for the means of members.
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -24,7 +23,7 @@ from torch import Tensor
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
-from pointsplat_ns.pruning.content import UNITS, content_size, in_units
+from pointsplat_ns.pruning.content import content_size, in_units, positions_in_units, views_in_units
 from pointsplat_ns.pruning.covariance import TINY, unpack
 from pointsplat_ns.pruning.coverage import curve_keys, unit_cells
 from pointsplat_ns.pruning.duplicates import Copies, Reduced
@@ -207,10 +206,13 @@ class Merging:
         # Along a space-filling curve, neighbours are near each other in memory.
         self.members = members[curve_keys(unit_cells(scene.means[members])).argsort(stable=True)]
         self.centre, self.size = content_size(scene)
-        self.views = self._in_units(views) if views is not None else None
+        self.views = views_in_units(views, self.centre, self.size) if views is not None else None
         self.not_shown = NOT_SHOWN if views is not None else 1.0
+        self.photos: tuple[Tensor, Tensor] | None = None
         if self.views is None and len(members) >= FEWEST_SEEN:
-            self.views = viewpoints(in_units(scene, self.centre, self.size), SIDE, 3 * SIDE // 4)
+            content = in_units(scene, self.centre, self.size)
+            self.photos = photo_places(content)
+            self.views = viewpoints(content, self.photos, SIDE, 3 * SIDE // 4)
         self.state = start(scene, self.members, self._weights(), self.centre, self.size)
         self.tree = Tree(torch.arange(len(self.members), dtype=torch.int32))
         self.alive = torch.arange(len(self.members))  # [n left] index in members
@@ -257,28 +259,14 @@ class Merging:
     def _weights(self) -> Tensor:
         if self.views is None:
             return torch.ones(len(self.members))
-        means = self.positions(self.scene.means[self.members])
+        means = positions_in_units(self.scene.means[self.members], self.centre, self.size)
         if self.not_shown < 1:
             weights = weights_seen(means, self.views, self.not_shown)
-        elif (photos := photo_places(self.scene)) is not None:
-            places, shares = photos
-            weights = weights_seen_from(means, self.positions(places), shares)
+        elif self.photos is not None:
+            weights = weights_seen_from(means, *self.photos)
         else:
             return weights_seen(means, self.views)
         return weights * how_much_seen(self.scene, self.members)
-
-    def positions(self, positions: Tensor) -> Tensor:
-        """Positions (n, 3) in units of the content, float64."""
-        return (positions.double() - self.centre) * (UNITS / self.size)
-
-    def _in_units(self, views: Views) -> Views:
-        """Views in units of the content."""
-        viewmats = views.viewmats.double().cpu().clone()
-        viewmats[:, :3, 3] += viewmats[:, :3, :3] @ self.centre
-        viewmats[:, :3, 3] *= UNITS / self.size
-        near_plane = views.near_plane * UNITS / self.size
-        Ks, background = views.Ks.double().cpu(), views.background.cpu()
-        return dataclasses.replace(views, viewmats=viewmats, Ks=Ks, background=background, near_plane=near_plane)
 
     def _see(self) -> None:
         """Render what remains, once it is few enough."""

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.quaternions import rotation_matrices
-from pointsplat_ns.pruning.content import UNITS
+from pointsplat_ns.pruning.content import UNITS, positions_in_units
 from pointsplat_ns.pruning.coverage import curve_keys, unit_cells
 from pointsplat_ns.pruning.scores import area_score
 from pointsplat_ns.pruning.traces import how_much_seen, unit_sh
@@ -75,7 +75,7 @@ class Surface:
         axes = rotation_matrices(some.quats.double())  # columns are the axes
         axes = axes.gather(2, order[:, None, :].expand(-1, 3, 3))
         within = torch.randn(POINTS, 3, generator=generator, dtype=torch.float64).clamp(-1.5, 1.5) * stds
-        points = (some.means.double() - centre.cpu()) * (UNITS / size) + (axes @ within[..., None])[..., 0]
+        points = positions_in_units(some.means, centre.cpu(), size) + (axes @ within[..., None])[..., 0]
         flatness = 1 - stds[:, 0] / stds[:, 1].clamp_min(1e-300)
         along = curve_keys(unit_cells(some.means)).argsort(stable=True)
         shown = torch.empty(POINTS)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.content import UNITS, content_box, content_diagonal, in_units, thinned
+from pointsplat_ns.pruning.content import UNITS, content_box, content_diagonal, in_units, positions_in_units, thinned
 from pointsplat_ns.pruning.surface import Surface
 from pointsplat_ns.pruning.traces import TELLING, explained, photo_places
 from pointsplat_ns.pruning.upright import UprightBox, level_directions, pointing_up, upright_axis
@@ -172,7 +172,7 @@ def views_about(
     generator = torch.Generator().manual_seed(seed)
     kinds: list[tuple[bool, tuple[Tensor, Tensor] | None]] = [(inside, None), (not inside, None)]
     if photos is not None:
-        kinds.insert(0, (inside, ((photos[0] - centre) * (UNITS / diagonal), photos[1])))
+        kinds.insert(0, (inside, (positions_in_units(photos[0], centre, diagonal), photos[1])))
     for kind, about in kinds:
         taken = _Search(small, surface, box, kind, width, height, generator, about).views(count)
         if len(taken) >= (1 if about is None else 0.5 * count):

@@ -13,7 +13,7 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.pruning.content import UNITS, thinned
-from pointsplat_ns.pruning.view_sampling import PROBED, sample_views
+from pointsplat_ns.pruning.view_sampling import PROBED, views_about
 from pointsplat_ns.views import View, Views
 
 VIEWPOINTS = 16
@@ -34,11 +34,11 @@ EDGE = 0.05
 SEED = 1
 
 
-def viewpoints(scene: Gaussians, width: int, height: int) -> Views | None:
+def viewpoints(scene: Gaussians, photos: tuple[Tensor, Tensor] | None, width: int, height: int) -> Views | None:
     """Views from free places in a scene in units of its content, see :func:`~pointsplat_ns.pruning.content.in_units`;
-    None if there are none."""
+    None if there are none. ``photos`` is what :func:`~pointsplat_ns.pruning.traces.photo_places` says of the scene."""
     try:
-        return sample_views(thinned(scene, PROBED), VIEWPOINTS, width, height, seed=SEED)
+        return views_about(thinned(scene, PROBED), photos, VIEWPOINTS, width, height, seed=SEED)
     except DataError:
         return None
 

@@ -76,7 +76,7 @@ def test_the_size_of_a_point_is_that_of_its_gaussian_and_of_nothing_one():
 def test_a_thinned_scene_covers_as_much():
     room = in_units(box_room(0), *content_size(box_room(0)))
     thin = thinned(room, len(room) // 8)
-    view = viewpoints(room, 64, 48)[0]
+    view = viewpoints(room, None, 64, 48)[0]
     white = torch.full((3,), 1.0)
 
     def cover(scene: Gaussians) -> float:
@@ -88,4 +88,4 @@ def test_a_thinned_scene_covers_as_much():
 
 def test_without_a_free_place_there_are_no_views():
     fog = ball(200)
-    assert viewpoints(fog.replace(opacities=torch.full((200, 1), -math.inf)), 32, 24) is None
+    assert viewpoints(fog.replace(opacities=torch.full((200, 1), -math.inf)), None, 32, 24) is None
