@@ -87,7 +87,7 @@ class ViewSource:
             self.origin = "poses of the dataset"
             return self._of_dataset.spread(count)
         views = views_about(self._scene, self._photos, count)
-        where = "in free space" if self._photos is None else "about where photos were taken, as the SH tell"
+        where = "in free space" if self._photos is None else "about where photos were taken, as the Gaussians tell"
         self.origin = f"poses sampled {where}{self._missing}"
         return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
 

@@ -73,8 +73,8 @@ def merge(
         k: number of Gaussians in the result; N returns the scene itself.
         progress: called with the share done, in [0, 1].
         views: where the scene is looked at from, such as the poses of its photos; what they do not show is merged
-            first. By default from about where photos were taken, if the SH tell (:mod:`~pointsplat_ns.pruning.traces`),
-            else from free places in it, in all directions.
+            first. By default from about where photos were taken, if the scene tells
+            (:mod:`~pointsplat_ns.pruning.traces`), else from free places in it, in all directions.
 
     Returns:
         Exactly ``k`` Gaussians. Deterministic.

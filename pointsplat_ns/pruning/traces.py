@@ -6,9 +6,10 @@ flatness of a neighbourhood tell how much it was looked at, with what was in the
 
 A photo from direction d moves the coefficients f along Y(d), the basis there. So the part of the colour that depends
 on the direction, f . Y, is large where photos were taken from, and small elsewhere. A place from which it is large for
-many Gaussians is one where photos were taken.
+many Gaussians is one where photos were taken. Without SH, sizes tell, if less: training splits what is large in a photo,
+so that Gaussians are small near the places of photos and large far from them.
 
-Neither is in the literature that we know of; both were found on trained scenes whose poses are known, see
+None of this is in the literature that we know of; it was found on trained scenes whose poses are known, see
 ``docs/pruning.md``.
 """
 
@@ -32,6 +33,9 @@ NEIGHBOURHOOD = 129
 ENERGY_POWER = 0.75
 """Exponent of the mean energy of the SH; with that of the mean flatness, 1, fitted to the poses of four captures."""
 
+FLATNESS_POWER = 2.0
+"""Exponent of the mean flatness where there are no SH."""
+
 FAINTEST = 1e-4
 """SH coefficients, root of the sum of squares, below which no photo is taken to have changed them."""
 
@@ -40,6 +44,9 @@ LARGEST = 1e3
 
 FLATTEST = 7.0
 """Largest flatness, logarithm of width over thickness: flat Gaussians of any kind are alike."""
+
+MOST_LOG = 100.0
+"""Bound of log-scales, either way, when sizes are compared: some are infinite."""
 
 MOST_FACTOR = 8.0
 """Bound of the logarithm of a factor, either way from the median's."""
@@ -68,6 +75,10 @@ in the wrong parts of them (-0.1 to -0.4 dB)."""
 CONTRAST = 16
 """Shares of places rise with this power of what they explain."""
 
+TELLING_SIZE, CONTRAST_OF_SIZE = 0.48, 8
+"""The same for sizes: least correlation of the logarithms of size and distance, and its power. The captures that are
+looked at from outside reach 0.50 to 0.78, those of rooms, where any free place will do, 0.23 to 0.46."""
+
 LEAST_SHARE = 0.01
 """Places of a smaller share than this, relative to the best one's, are left out."""
 
@@ -75,8 +86,8 @@ LEAST_SHARE = 0.01
 def how_much_seen(scene: Gaussians, members: Tensor) -> Tensor:
     """How much photos showed of the neighbourhood of each member, relative to the median, (n,) float32.
 
-    Mean energy of the SH to the power 3/4, times the mean flatness, the geometric mean of width over thickness. 1 for
-    all if the Gaussians have no SH and are equally flat.
+    Mean energy of the SH to the power 3/4, times the mean flatness, the geometric mean of width over thickness; without
+    SH, that squared. 1 for all if the Gaussians have no SH and are equally flat.
 
     Args:
         scene: N Gaussians.
@@ -84,7 +95,8 @@ def how_much_seen(scene: Gaussians, members: Tensor) -> Tensor:
     """
     energy = _around(_of_members(_energy, scene.features_rest, members))
     flatness = _around(_of_members(_flatness, scene.scales, members))
-    logs = ENERGY_POWER * (energy + FAINTEST**2).log() + flatness
+    power = 1.0 if bool((energy > 0).any()) else FLATNESS_POWER
+    logs = ENERGY_POWER * (energy + FAINTEST**2).log() + power * flatness
     return (logs - logs.median()).clamp(-MOST_FACTOR, MOST_FACTOR).exp().float()
 
 
@@ -114,20 +126,29 @@ def _around(values: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Witnesses:
-    """Some Gaussians of a scene that say from which directions photos showed them."""
+    """Some Gaussians of a scene that say from where photos showed them: by their SH, or if none has any, by their size."""
 
     means: Tensor  # [n, 3] float64, scene units
     sh: Tensor  # [n, K, 3] float32, SH coefficients of degrees 1 and up, of length 1
+    sizes: Tensor  # [n] float64, logarithms of the geometric means of width and length
 
     @staticmethod
     def of(scene: Gaussians, generator: torch.Generator) -> Witnesses:
-        """At most :data:`PROBED` Gaussians drawn from a scene; none if none has SH."""
+        """At most :data:`PROBED` Gaussians drawn from a scene that have SH; if none has, four times as many others, as
+        the size of one says less."""
         drawn = torch.randperm(len(scene), generator=generator)[: 8 * PROBED]
         some = scene[drawn.to(scene.device)].to("cpu")
         sh = unit_sh(some.features_rest)
-        telling = some.usable() & (some.alphas > OPAQUE_ENOUGH) & (sh != 0).any(2).any(1)
-        chosen = telling.nonzero()[:PROBED, 0]
-        return Witnesses(some.means[chosen].double(), sh[chosen])
+        telling = some.usable() & (some.alphas > OPAQUE_ENOUGH)
+        with_sh = telling & (sh != 0).any(2).any(1)
+        chosen = with_sh.nonzero()[:PROBED, 0] if bool(with_sh.any()) else telling.nonzero()[: 4 * PROBED, 0]
+        sizes = some.scales[chosen].double().clamp(-MOST_LOG, MOST_LOG).sort(dim=1).values[:, 1:].mean(1)
+        return Witnesses(some.means[chosen].double(), sh[chosen], sizes)
+
+    @property
+    def have_sh(self) -> bool:
+        """Whether they tell by their SH."""
+        return bool((self.sh != 0).any())
 
     def places(self, count: int, generator: torch.Generator) -> Tensor:
         """Places (count, 3) drawn evenly from the box that those of photos are looked for in, float64."""
@@ -136,18 +157,21 @@ class Witnesses:
         return 0.5 * (low + high) + AROUND * (high - low) * spread
 
     def votes(self, places: Tensor) -> Tensor:
-        """How well photos from each place (P, 3) explain the SH, relative to SH of no direction, (P,) float32."""
-        return torch.stack([explained(self.means - place, self.sh).mean() for place in places])
+        """How well photos from each place (P, 3) explain the SH, relative to SH of no direction, or the sizes: how the
+        logarithms of size and distance correlate; (P,) float32."""
+        if self.have_sh:
+            return torch.stack([explained(self.means - place, self.sh).mean() for place in places])
+        return torch.stack([correlation(log_norms(self.means - place), self.sizes) for place in places]).float()
 
 
 def photo_places(scene: Gaussians) -> tuple[Tensor, Tensor] | None:
-    """Where the photos were taken that a scene was trained on, as far as its SH tell.
+    """Where the photos were taken that a scene was trained on, as far as its Gaussians tell.
 
     Args:
         scene: N Gaussians.
 
     Returns:
-        Places (P, 3), in the scene's unit, float64, and their shares (P,), which sum to 1; None if the SH do not tell.
+        Places (P, 3), in the scene's unit, float64, and their shares (P,), which sum to 1; None if they do not tell.
         Deterministic.
     """
     generator = torch.Generator().manual_seed(0)
@@ -155,14 +179,15 @@ def photo_places(scene: Gaussians) -> tuple[Tensor, Tensor] | None:
     if len(witnesses.means) == 0:
         return None
     places = witnesses.places(CANDIDATES, generator)
+    telling, contrast = (TELLING, CONTRAST) if witnesses.have_sh else (TELLING_SIZE, CONTRAST_OF_SIZE)
     votes = witnesses.votes(places[:ASKED_FIRST])
-    if not float(votes.max()) >= PROMISING * TELLING:
+    if not float(votes.max()) >= PROMISING * telling:
         return None
     votes = torch.cat([votes, witnesses.votes(places[ASKED_FIRST:])])
     best = float(votes.max())
-    if best < TELLING:
+    if best < telling:
         return None
-    shares = (votes / best) ** CONTRAST
+    shares = (votes.clamp_min(0) / best) ** contrast
     chosen = shares > LEAST_SHARE
     return places[chosen], shares[chosen] / shares[chosen].sum()
 
@@ -172,6 +197,18 @@ def unit_sh(rest: Tensor) -> Tensor:
     rest = rest.double().clamp(-LARGEST, LARGEST)
     length = _energy(rest).sqrt()[:, None, None]
     return torch.where(length > FAINTEST, rest / length.clamp_min(FAINTEST), 0.0).float()
+
+
+def log_norms(offsets: Tensor) -> Tensor:
+    """Logarithms (n,) of the lengths of offsets (n, 3); finite."""
+    return offsets.norm(dim=1).clamp_min(torch.finfo(offsets.dtype).tiny).log()
+
+
+def correlation(a: Tensor, b: Tensor) -> Tensor:
+    """Pearson's correlation coefficient of a (n,) and b (n,), a scalar; 0 if either is constant."""
+    a, b = a - a.mean(), b - b.mean()
+    spread = a.norm() * b.norm()
+    return torch.where(spread > 0, (a @ b) / spread, 0.0)
 
 
 def explained(offsets: Tensor, rest: Tensor) -> Tensor:

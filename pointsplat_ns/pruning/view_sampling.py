@@ -282,7 +282,7 @@ class _Search:
 
     def _like_photos(self, places: Tensor, shares: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """As :meth:`_candidates`, about where photos were taken: ``places`` (P, 3) by their ``shares`` (P,). What the
-        SH of a point do not say to have been shown from there counts for little."""
+        SH of a point, if there are any, do not say to have been shown from there counts for little."""
         drawn = torch.multinomial(shares.float(), 2 * _PLACES, replacement=True, generator=self.generator)
         places = places[drawn] + _PHOTOS_APART * torch.randn(len(drawn), 3, generator=self.generator).double()
         if self.inside:
@@ -290,9 +290,10 @@ class _Search:
         places = places[self.surface.clearance(places) > _PHOTO_TOO_NEAR]
         points, sh = self.surface.points[:_COMPARED], self.surface.sh[:_COMPARED]
         seen = self.surface.seen_from(places)[0][:, :_COMPARED]
-        told = torch.empty(len(places), _COMPARED)
-        for row, place in zip(told, places, strict=True):
-            row.copy_(explained(points - place, sh))
+        told = torch.full((len(places), _COMPARED), float(TELLING))
+        if bool(sh.any()):
+            for row, place in zip(told, places, strict=True):
+                row.copy_(explained(points - place, sh))
         best = ((seen * told).sum(1) / seen.sum(1).clamp_min(1)).topk(min(2 * _PLACES, len(places))).indices
         places, seen, told = places[best], seen[best], told[best]
         owner = torch.arange(len(places)).repeat_interleave(_TURNS[True])

@@ -103,5 +103,5 @@ def test_sampled_poses_of_a_scene_whose_sh_tell_of_its_photos_say_so(monkeypatch
     monkeypatch.setattr("pointsplat_ns.compression.view_source.photo_places", lambda scene: asked.append(scene) or told)
     source = ViewSource(box_room(0))
     assert len(source.views(3)) and len(source.compared())
-    assert source.origin == "poses sampled about where photos were taken, as the SH tell"
+    assert source.origin == "poses sampled about where photos were taken, as the Gaussians tell"
     assert len(asked) == 1  # what takes seconds is asked once

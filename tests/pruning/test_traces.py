@@ -11,8 +11,8 @@ from making import EYES, ball, normal_scene, photographed
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.pruning.merge import merge
-from pointsplat_ns.pruning.traces import MOST_FACTOR, how_much_seen, photo_places
-from pointsplat_ns.pruning.view_sampling import look_at, sample_views
+from pointsplat_ns.pruning.traces import MOST_FACTOR, correlation, how_much_seen, log_norms, photo_places
+from pointsplat_ns.pruning.view_sampling import look_at, sample_views, views_about
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.views import Views
@@ -45,6 +45,69 @@ def test_sh_learned_by_gradient_descent_tell_where_the_photos_were_taken():
     eyes = invert_rigid(viewmats)[:, :3, 3]
     towards = (shares[:, None] * torch.nn.functional.normalize(places, dim=1)).sum(0)
     assert float(towards @ eyes.mean(0) / eyes.mean(0).norm()) > 0.7
+
+
+def grown_from(eye: torch.Tensor, degree: int = 0) -> Gaussians:
+    """A full ball whose Gaussians are the larger the farther they are from an eye (3,)."""
+    generator = torch.manual_seed(2)
+    shell = ball(3000, degree, opacity=5.0)
+    means = shell.means * torch.rand(3000, 1, generator=generator) ** (1 / 3)
+    scales = (0.08 * (means - eye).norm(dim=1, keepdim=True)).log() + 0.1 * torch.randn(3000, 3, generator=generator)
+    return shell.replace(means=means, scales=scales, features_rest=torch.zeros_like(shell.features_rest))
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_without_sh_sizes_tell_where_photos_were_taken(degree):
+    eye = torch.tensor([0.7, 0.2, 0.0])
+    places, shares = photo_places(grown_from(eye, degree))
+    assert float(shares.sum()) == pytest.approx(1) and bool((shares > 0).all())
+    towards = torch.nn.functional.normalize((shares[:, None] * places).sum(0), dim=0)
+    assert float(towards @ eye.double() / eye.norm()) > 0.95
+
+
+def test_random_sizes_say_nothing_about_places():
+    scene = grown_from(torch.zeros(3))
+    scales = torch.randn(3000, 3, generator=torch.manual_seed(3)) - 2
+    assert photo_places(scene.replace(scales=scales)) is None
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_places_told_by_sizes_move_and_grow_with_the_scene(scale):
+    scene = Gaussians(*(value.double() for value in grown_from(torch.tensor([0.7, 0.2, 0.0])).tensors()))
+    places, shares = photo_places(scene)
+    moved = scene.replace(means=scale * (scene.means + 100), scales=scene.scales + math.log(scale))
+    other, as_large = photo_places(moved)
+    torch.testing.assert_close(other / scale - 100, places, atol=1e-5, rtol=0)
+    torch.testing.assert_close(as_large, shares, atol=1e-4, rtol=0)
+
+
+def test_infinite_sizes_and_gaussians_at_one_position_break_nothing():
+    scene = grown_from(torch.tensor([0.7, 0.2, 0.0]))
+    scales = scene.scales.clone()
+    scales[::7, 0] = -math.inf
+    scales[::11] = -math.inf
+    found = photo_places(scene.replace(scales=scales))
+    assert found is None or bool(found[1].isfinite().all())
+    assert photo_places(scene.replace(means=torch.zeros(3000, 3))) is None
+    assert photo_places(scene.replace(scales=torch.full((3000, 3), -math.inf))) is None
+
+
+@pytest.mark.parametrize("size", [1e-30, 1.0, 1e30])
+def test_correlation_is_that_of_float64_at_any_size(size):
+    generator = torch.manual_seed(4)
+    a, b = torch.randn(2, 500, generator=generator, dtype=torch.float64)
+    b = b + a
+    expected = float(torch.corrcoef(torch.stack([a, b]))[0, 1])
+    assert float(correlation(size * a, b)) == pytest.approx(expected, abs=1e-12)
+    assert float(correlation(torch.full_like(a, size), b)) == pytest.approx(0, abs=1e-6)
+    assert float(correlation(torch.zeros_like(a), b)) == 0
+
+
+def test_log_norms_of_nothing_are_finite():
+    lengths = torch.tensor([0.0, 1e-150, 1.0, 1e150], dtype=torch.float64)
+    logs = log_norms(lengths[:, None] * torch.tensor([0.6, 0.0, 0.8]).double())
+    assert bool(logs.isfinite().all()) and bool((logs.diff() > 0).all())
+    assert float(logs[3]) == pytest.approx(150 * math.log(10))
 
 
 @pytest.mark.parametrize(
@@ -108,6 +171,25 @@ def test_flat_neighbourhoods_were_seen_much():
     seen = how_much_seen(flat, torch.arange(2000))
     ratio = seen[:900].double().log().mean() - seen[1100:].double().log().mean()
     assert float(ratio.exp()) == pytest.approx(3, rel=0.1)
+
+
+def test_without_sh_flatness_counts_squared():
+    scene = halves(1.0)
+    scales = scene.scales.clone()
+    scales[:1000, 1] -= math.log(3)
+    seen = how_much_seen(scene.replace(scales=scales, features_rest=scene.features_rest[:, :0]), torch.arange(2000))
+    ratio = seen[:900].double().log().mean() - seen[1100:].double().log().mean()
+    assert float(ratio.exp()) == pytest.approx(9, rel=0.2)
+
+
+def test_views_of_a_scene_without_sh_are_sampled_where_sizes_tell():
+    scene = grown_from(torch.tensor([1.5, 0.0, 0.0]))
+    towards = []
+    for views in (sample_views(scene, 6, 64, 48), views_about(scene, None, 6, 64, 48)):
+        assert len(views) == 6
+        eyes = invert_rigid(views.viewmats)[:, :3, 3]
+        towards.append(float((eyes[:, 0] / eyes.norm(dim=1)).mean()))
+    assert towards[0] > 0.7 and towards[0] > towards[1] + 0.3
 
 
 def test_all_is_seen_alike_if_nothing_tells():
