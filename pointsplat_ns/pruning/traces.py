@@ -6,8 +6,8 @@ flatness of a neighbourhood tell how much it was looked at, with what was in the
 
 A photo from direction d moves the coefficients f along Y(d), the basis there. So the part of the colour that depends
 on the direction, f . Y, is large where photos were taken from, and small elsewhere. A place from which it is large for
-many Gaussians is one where photos were taken. Without SH, sizes tell, if less: training splits what is large in a photo,
-so that Gaussians are small near the places of photos and large far from them.
+many Gaussians is one where photos were taken. Without SH, sizes tell, if less: training splits what is large in a
+photo, so that Gaussians are small near the places of photos and large far from them.
 
 None of this is in the literature that we know of; it was found on trained scenes whose poses are known, see
 ``docs/pruning.md``.
@@ -126,7 +126,7 @@ def _around(values: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Witnesses:
-    """Some Gaussians of a scene that say from where photos showed them: by their SH, or if none has any, by their size."""
+    """Some Gaussians of a scene that say from where photos showed them: by their SH; if none has any, by their size."""
 
     means: Tensor  # [n, 3] float64, scene units
     sh: Tensor  # [n, K, 3] float32, SH coefficients of degrees 1 and up, of length 1
