@@ -95,6 +95,10 @@ _FAR = 4.0
 _NOVEL = 0.1
 """Once a point has been shown this well (1 is in the middle of a picture and near), it counts half."""
 
+_REFUSED = 32
+"""A round ends after so many candidates in a row that something stands in front of; in trained scenes three were the
+most."""
+
 _FRUITLESS = 4
 """Rounds without any view after which the search ends."""
 
@@ -253,15 +257,17 @@ class _Search:
         fruitless = 0
         while len(taken) < count and fruitless < _FRUITLESS:
             viewmats, owner, gains = self._candidates()
-            before = len(taken)
-            while len(taken) < min(count, before + _ROUND) and bool((owner >= 0).any()):
+            before, refused = len(taken), 0
+            while len(taken) < min(count, before + _ROUND) and refused < _REFUSED and bool((owner >= 0).any()):
                 best = int((gains @ (1 / (_NOVEL + shown))).masked_fill(owner < 0, -1.0).argmax())
                 if self._is_free(viewmats[best]):
                     taken.append(viewmats[best])
                     shown += gains[best] / wanted
                     owner[owner == owner[best].item()] = -1  # one view a place
+                    refused = 0
                 else:
                     owner[best] = -1
+                    refused += 1
             fruitless = 0 if len(taken) > before else fruitless + 1
         return torch.stack(taken) if taken else torch.empty(0, 4, 4, dtype=torch.float64)
 
