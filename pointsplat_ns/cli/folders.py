@@ -63,6 +63,7 @@ def compact_folder(folder: Path, output: Path | None, picture: Path | None, dry_
 
 def _print_table(results: list[SceneResult]) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(caption="dB: PSNR against the scene's own renders")
@@ -70,18 +71,10 @@ def _print_table(results: list[SceneResult]) -> None:
     for name in ("before", "after", "MB", "dB", "seconds"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("status")
+    forms = (",", ",", ".2f", ".1f", ".1f")
     for result in results:
-        table.add_row(
-            result.name,
-            *(_text(value, form) for value, form in zip(_numbers(result), (",", ",", ".2f", ".1f", ".1f"), strict=True)),
-            f"{result.status}: {result.error}" if result.error else result.status,
-        )
-    Console().print(table, markup=False)
-
-
-def _numbers(result: SceneResult) -> tuple[float | None, ...]:
-    return result.before, result.after, result.megabytes, result.psnr, result.seconds
-
-
-def _text(value: float | None, form: str) -> str:
-    return "-" if value is None else f"{value:{form}}"
+        numbers = (result.before, result.after, result.megabytes, result.psnr, result.seconds)
+        cells = ("-" if value is None else f"{value:{form}}" for value, form in zip(numbers, forms, strict=True))
+        what = f"{result.status}: {result.error}" if result.error else result.status
+        table.add_row(escape(result.name), *cells, escape(what))
+    Console().print(table)

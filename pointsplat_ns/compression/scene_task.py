@@ -100,9 +100,7 @@ class SceneTask:
         return self.output.with_name(f".{self.output.name}.lock")
 
 
-def settle(
-    task: SceneTask, make: Callable[[Path], Made], options: Options, force: bool = False
-) -> SceneResult | None:
+def settle(task: SceneTask, make: Callable[[Path], Made], options: Options, force: bool = False) -> SceneResult | None:
     """Make a scene's result, unless it is finished or another process is at work on it.
 
     Whatever fails becomes a result with the status ``failed``. Nothing of it is left but its record.
@@ -148,7 +146,7 @@ def remove_unfinished(task: SceneTask) -> None:
 
 
 def note_failure(task: SceneTask, failed: SceneResult) -> None:
-    """Write the record of a scene that failed, for tables that other processes make. An earlier result keeps its own."""
+    """Write the record of a scene that failed, for the tables of other processes. An earlier result keeps its own."""
     with suppress(SceneError):  # the folder may be what failed
         if not task.output.exists():
             _write_record(task, failed, {})

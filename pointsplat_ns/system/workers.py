@@ -160,7 +160,9 @@ class _Worker(Generic[Item, Result]):
     """Number of the item that it works on."""
 
     @classmethod
-    def start(cls, function: Callable[[Item], Result | None], threads: int, preload: Sequence[str]) -> _Worker[Item, Result]:
+    def start(
+        cls, function: Callable[[Item], Result | None], threads: int, preload: Sequence[str]
+    ) -> _Worker[Item, Result]:
         """Start a process."""
         # A server that has imported everything is forked, which takes no time and shares memory. This process is not,
         # as threads of its own may hold locks.

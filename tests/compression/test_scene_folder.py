@@ -190,7 +190,8 @@ def test_results_among_the_scenes_are_not_taken_for_scenes(folder):
 def test_a_damaged_record_or_description_is_never_believed(folder):
     settle(folder)
     record = folder.parent / "small" / "a.ply.json"
-    for content in ("", "[]", '{"status": "done"}', "[" * 100_000, json.dumps({"status": "done", "error": "", "before": "6"})):
+    wrong = json.dumps({"status": "done", "error": "", "before": "6"})
+    for content in ("", "[]", '{"status": "done"}', "[" * 100_000, wrong):
         record.write_text(content)
         assert settle(folder)["a"].status == "failed", "the result was taken for its own, or for nobody's"
     (folder.parent / "small" / "pointsplat-scenes.json").write_text("{}")

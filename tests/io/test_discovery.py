@@ -9,7 +9,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import find_runs, read_scene, write_ply
 from pointsplat_ns.io.discovery import RESULTS_NAME, find_scenes
 
-POINTS = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n"
+POINTS = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
 
 
 def test_files_and_the_newest_run_of_each_experiment_are_scenes_and_nothing_else_is(make_run, tmp_path, caplog):
