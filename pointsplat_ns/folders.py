@@ -14,7 +14,7 @@ from pointsplat_ns.compression.compact import compact_scene, resolve_options
 from pointsplat_ns.compression.level_folder import source_file
 from pointsplat_ns.compression.repair import Effort, RepairBudget
 from pointsplat_ns.compression.scene_folder import WHOLE, Command, Shard, output_folder, settle_folder
-from pointsplat_ns.compression.scene_task import Made, SceneResult
+from pointsplat_ns.compression.scene_task import Made, Options, SceneResult
 from pointsplat_ns.compression.trained_refiner import load_refiner
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.io.scene import read_scene
@@ -90,14 +90,18 @@ def compact_folder(
         dist.init_process_group("gloo", timeout=FOREVER)
     device = f"cuda:{os.environ.get('LOCAL_RANK', 0)}" if torch.cuda.is_available() else "cpu"
     trained = _refiner_on(refiner, device)
-    RepairBudget(effort, seconds)
+    repair = RepairBudget(effort, seconds)
     budget, method = resolve_options(trained, keep, by, sh)
-    shared = {"by": method, "sh": sh, "clean": clean, "effort": effort if seconds is None else None, "seconds": seconds}
-    options = {"keep": str(budget), "refiner": source_file(trained.source).sha256, **shared}
-    repair = {"effort": effort, "seconds": seconds}
-    make = functools.partial(
-        _compacted, refiner=refiner, device=device, keep=budget, by=method, sh=sh, clean=clean, **repair
-    )
+    options: Options = {
+        "keep": str(budget),
+        "refiner": source_file(trained.source).sha256,
+        "by": method,
+        "sh": sh,
+        "clean": clean,
+        "effort": effort if seconds is None else None,
+        "seconds": seconds,
+    }
+    make = functools.partial(_compacted, refiner, device, budget, method, sh, clean, repair)
     with progress_bar(progress if rank == 0 else False) as report:
         results = settle_folder(
             folder, target, Command("compact", make, options), jobs, part.within(rank, world_size), force, report
@@ -109,20 +113,18 @@ _refiner_on = functools.cache(load_refiner)
 
 
 def _compacted(
-    path: Path,
     refiner: str | Path | None,
     device: str,
     keep: Keep,
     by: str,
     sh: str,
     clean: bool,
-    effort: Effort,
-    seconds: float | None,
+    budget: RepairBudget,
+    path: Path,
 ) -> Made:
     """One scene of a folder, made smaller."""
     dense = read_scene(path)
     source = ViewSource(dense, run=path, dataset_views=dataset_views)
-    budget = RepairBudget(effort, seconds)
     result = compact_scene(dense, _refiner_on(refiner, device), keep, by, sh, source, clean=clean, budget=budget)
     if result.repaired is not None and result.repaired.interrupted:
         raise KeyboardInterrupt  # which is meant for all scenes, not for the repair of this one

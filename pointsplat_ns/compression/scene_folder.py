@@ -9,7 +9,7 @@ import functools
 import json
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -160,7 +160,7 @@ def _tasks(folder: Path, output: Path) -> list[SceneTask]:
 
 def _settled(
     work: Callable[[SceneTask], SceneResult | None], tasks: Sequence[SceneTask], jobs: int
-) -> Iterator[SceneResult]:
+) -> Generator[SceneResult, None, None]:
     if jobs == 1:
         return in_turn(work, tasks)
     return in_processes(work, tasks, jobs, _given_up, _clear, preload=_SLOW_IMPORTS)

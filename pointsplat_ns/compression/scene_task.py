@@ -7,11 +7,11 @@ was read, of the options and of the result itself.
 from __future__ import annotations
 
 import dataclasses
-import glob
 import hashlib
 import json
 import math
 import os
+import re
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -138,11 +138,12 @@ def settle(task: SceneTask, make: Callable[[Path], Made], options: Options, forc
 
 def remove_unfinished(task: SceneTask) -> None:
     """Remove what a process that was killed left of a result. To be called by who holds the task's lock."""
-    for path in (task.output, task.record):
-        for dots in (".", ".."):  # the file, and what was written on the way to it
-            pattern = f"{dots}{glob.escape(path.name)}.*.part"
-            for part in path.parent.glob(pattern):
-                part.unlink(missing_ok=True)
+    # As :func:`~pointsplat_ns.io.files.replacing` names them; a result is written within one call by another.
+    pattern = re.compile(rf"\.{{1,2}}{re.escape(task.output.name)}(\.json)?(\.\d+\.part){{1,2}}")
+    with os.scandir(task.output.parent) as entries:
+        parts = [entry.path for entry in entries if pattern.fullmatch(entry.name)]
+    for part in parts:
+        Path(part).unlink(missing_ok=True)
 
 
 def note_failure(task: SceneTask, failed: SceneResult) -> None:

@@ -10,12 +10,12 @@ import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import connection
 from multiprocessing.process import BaseProcess
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 
@@ -42,7 +42,7 @@ def threads_for(jobs: int) -> int:
     return max(1, cores // jobs)
 
 
-def in_turn(function: Callable[[Item], Result | None], items: Sequence[Item]) -> Iterator[Result]:
+def in_turn(function: Callable[[Item], Result | None], items: Sequence[Item]) -> Generator[Result, None, None]:
     """The results of a function for each item, made in this process.
 
     An item whose result is None is tried again later, until it has one.
@@ -64,7 +64,7 @@ def in_processes(
     on_death: Callable[[Item, str], Result],
     on_stop: Callable[[Item], object],
     preload: Sequence[str],
-) -> Iterator[Result]:
+) -> Generator[Result, None, None]:
     """The results of a function for each item, in the order in which they are made, in several processes.
 
     An item whose result is None is tried again later, until it has one. An item whose process is killed is tried again
@@ -167,12 +167,12 @@ class _Worker(Generic[Item, Result]):
         # A server that has imported everything is forked, which takes no time and shares memory. This process is not,
         # as threads of its own may hold locks.
         forks = "forkserver" in multiprocessing.get_all_start_methods()
-        context = multiprocessing.get_context("forkserver" if forks else "spawn")
+        context: Any = multiprocessing.get_context("forkserver" if forks else "spawn")
         here, there = context.Pipe()
         process = context.Process(target=_serve, args=(function, threads, there), daemon=True)
         with _environment(OMP_NUM_THREADS=str(threads)):  # for the server, of which processes inherit it
             if forks:
-                context.set_forkserver_preload([*preload])  # type: ignore[attr-defined]
+                context.set_forkserver_preload([*preload])
             process.start()
         there.close()
         return cls(process, here)

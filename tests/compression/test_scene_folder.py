@@ -85,6 +85,9 @@ def test_what_is_finished_is_not_made_again_and_what_is_not_is(folder):
     (folder.parent / "small" / "b.ply").unlink()  # as by a process killed before it renamed the result
     (folder.parent / "small" / ".b.ply.77.part").touch()
     (folder.parent / "small" / "..b.ply.77.part.77.part").touch()
+    (folder.parent / "small" / ".b.ply.json.77.part").touch()
+    of_another = folder.parent / "small" / ".b.ply.more.ply.77.part"  # being written just now
+    of_another.touch()
     second = settle(folder)
     assert {name: result.status for name, result in second.items()} == {
         "a": "done before",
@@ -92,7 +95,8 @@ def test_what_is_finished_is_not_made_again_and_what_is_not_is(folder):
         "deep/c": "done before",
     }
     assert made(folder) == {"a": 1, "b": 2, "c": 1}
-    assert files(folder) == RESULTS | ABOUT
+    assert of_another.exists()
+    assert files(folder) == RESULTS | ABOUT | {of_another.name}
     assert second["a"].seconds == first["a"].seconds and second["a"].after == 3
 
 

@@ -6,7 +6,7 @@ import copy
 import math
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -18,6 +18,7 @@ from pointsplat_ns.io.files import replacing
 from pointsplat_ns.metrics import psnr
 
 if TYPE_CHECKING:
+    from nerfstudio.cameras.cameras import Cameras
     from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
 FIRST_PICTURE, FIRST_SHARE = 50, 1 / 64
@@ -29,14 +30,16 @@ PICTURE_SIDE = 400
 MOST_TIME = 0.02
 """Largest share of the time that pictures take."""
 
-_WARM_UP, _TIMED_STEPS, _TIMED_SECONDS = 2, 5, 3.0
-"""Steps that are not timed, and the least steps and seconds that an estimate is made from."""
+_WARM_UP, _TIMED_STEPS, _TIMED_SECONDS, _TIMED_RENDERS = 2, 5, 3.0, 2
+"""Steps that are not timed; the least steps and seconds that an estimate is made from; how often a view is rendered to
+time it, as the first time is slower."""
 
 
 class EarlyLook:
     """Logs how long a training will take, and writes pictures of a held-out view.
 
-    An estimate is logged after some seconds, and again whenever the resolution of training has risen.
+    An estimate is logged after some seconds, and again whenever the resolution of training has risen. How much slower
+    later steps are is told by rendering a view at full resolution; that Gaussians become more is not foreseen.
 
     Args:
         pipeline: of a Splatfacto model.
@@ -78,11 +81,38 @@ class EarlyLook:
             return
         self._timed_from = self._last  # until the resolution rises
         per_step, left = seconds / steps, range(step, self._last)
-        least = per_step * len(left)
-        most = per_step * sum((factor / self._factor_at(later)) ** 2 for later in left)
-        time_left = duration(least) if most < 1.2 * least else f"{duration(least)} to {duration(most)}"
-        why = "" if most < 1.2 * least else ", as the resolution will rise"
-        CONSOLE.log(f"{per_step:.2g} s a step: the {len(left):,} steps left take about {time_left}{why}")
+        at_full, speed = 1.0, f"{per_step:.2g} s a step"
+        if self._factor_at(self._last - 1) < factor:
+            at_full = max(1.0, self._seconds_to_render(1) / self._seconds_to_render(factor))
+            speed += f", about {per_step * at_full:.2g} s at full resolution"
+        # Time that rises with the number of pixels, from 1 now to ``at_full``.
+        rise = (at_full - 1) / max(1 - factor**-2, 1e-9)
+        time_left = per_step * sum(1 + rise * (self._factor_at(later) ** -2 - factor**-2) for later in left)
+        CONSOLE.log(f"{speed}: the {len(left):,} steps left take about {duration(time_left)}")
+
+    @torch.no_grad()
+    def _seconds_to_render(self, factor: int) -> float:
+        """Time to render the first training view, ``factor`` times smaller than its photo."""
+        dataset = self._pipeline.datamanager.train_dataset
+        assert dataset is not None
+        camera = copy.deepcopy(dataset.cameras[:1])
+        camera.rescale_output_resolution(1 / factor)
+        times = []
+        for _ in range(_TIMED_RENDERS):
+            start = time.perf_counter()
+            self._render(camera)
+            times.append(time.perf_counter() - start)
+        return min(times)
+
+    def _render(self, camera: Cameras) -> dict[str, Tensor]:
+        """What a model in evaluation makes of a camera."""
+        model = self._pipeline.model
+        training = model.training
+        model.eval()
+        try:
+            return model.get_outputs_for_camera(camera)
+        finally:
+            model.train(training)
 
     def _factor_at(self, step: int) -> int:
         """How many times smaller than the photos images are at a step."""
@@ -114,15 +144,14 @@ class EarlyLook:
     def _look(self) -> tuple[Tensor, Tensor]:
         """The first held-out photo and its render, (H, W, 3) in [0, 1], at the size of a picture."""
         model = self._pipeline.model
-        camera, data = next(iter(self._pipeline.datamanager.fixed_indices_eval_dataloader))
-        camera, training = copy.deepcopy(camera), model.training
+        frames: Any = self._pipeline.datamanager.fixed_indices_eval_dataloader
+        camera, data = next(iter(frames))
+        camera = copy.deepcopy(camera)
         camera.rescale_output_resolution(min(1.0, PICTURE_SIDE / float(max(camera.width.max(), camera.height.max()))))
-        model.eval()
-        try:
-            outputs = model.get_outputs_for_camera(camera)
-            photo = model.composite_with_background(model.get_gt_img(data["image"]), outputs["background"][:1, :1])
-        finally:
-            model.train(training)
+        outputs = self._render(camera)
+        photo = data["image"].to(model.device)
+        photo = photo / 255 if photo.dtype == torch.uint8 else photo
+        photo = model.composite_with_background(photo, outputs["background"][:1, :1])
         image = outputs["rgb"].clamp(0, 1)
         photo = interpolate(photo.permute(2, 0, 1)[None], size=image.shape[:2], mode="bilinear", antialias=True)
         return photo[0].permute(1, 2, 0).clamp(0, 1), image

@@ -10,9 +10,6 @@ import torch
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu import early_look
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.early_look import EarlyLook, picture_steps
 
-RISES = (0, 100, 200)
-"""Steps at which the resolution rises."""
-
 
 class Clock:
     """Time that passes by the step."""
@@ -33,6 +30,7 @@ def pipeline():
 def test_the_time_left_is_said_after_some_steps_and_whenever_the_resolution_has_risen(monkeypatch, tmp_path):
     clock = Clock(monkeypatch)
     look = EarlyLook(pipeline(), tmp_path, first=0, count=1000)
+    monkeypatch.setattr(look, "_seconds_to_render", lambda factor: 0.1 / factor**2)
     said = {}
     for step in range(1000):
         look.before_step(step)
@@ -42,8 +40,9 @@ def test_the_time_left_is_said_after_some_steps_and_whenever_the_resolution_has_
         # Steps whose time is that of their pixels; the first ones are slow, and are not counted.
         clock.now += 30.0 if step < 2 else (0.25, 1.0, 4.0)[min(step // 100, 2)]
     assert list(said) == [14, 107, 207]
-    assert said[14] == "0.25 s a step: the 986 steps left take about 4 min to 55 min, as the resolution will rise"
-    assert said[107] == "1 s a step: the 893 steps left take about 15 min to 55 min, as the resolution will rise"
+    # 86 steps at 0.25 s, 100 at 1 s and 800 at 4 s are 55 minutes.
+    assert said[14] == "0.25 s a step, about 4 s at full resolution: the 986 steps left take about 55 min"
+    assert said[107] == "1 s a step, about 4 s at full resolution: the 893 steps left take about 55 min"
     assert said[207] == "4 s a step: the 793 steps left take about 53 min"
     assert not list(tmp_path.iterdir())
 

@@ -10,7 +10,8 @@ import torch
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts.train import launch
 
-from pointsplat_ns.io import open_run, read_scene
+from making import box_room, dense_config
+from pointsplat_ns.io import open_run, read_scene, write_ply
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainer, splatfacto_cpu_config
 
@@ -41,9 +42,11 @@ def test_an_interrupted_training_ends_as_interrupted_and_not_as_finished(kind, w
     assert capsys.readouterr().err.endswith("interrupted\n")
 
 
-def stopped_at(step: int, config, run_training, monkeypatch, number: int, times: int = 1) -> int:
+def stopped_at(
+    step: int, config, run_training, monkeypatch, number: int, times: int = 1, trainer_class=SplatfactoCpuTrainer
+) -> int:
     """The status with which a training ends that gets a signal in the middle of a step."""
-    iteration = SplatfactoCpuTrainer.train_iteration
+    iteration = trainer_class.train_iteration
 
     def signalled(trainer, now):
         if now == step:
@@ -52,7 +55,7 @@ def stopped_at(step: int, config, run_training, monkeypatch, number: int, times:
         return iteration(trainer, now)
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
-        patch.setattr(SplatfactoCpuTrainer, "train_iteration", signalled)
+        patch.setattr(trainer_class, "train_iteration", signalled)
         run_training(config)
     return end.value.code
 
@@ -77,6 +80,16 @@ def test_a_training_that_is_stopped_leaves_a_scene_and_can_be_gone_on_with(
     state = torch.load(run.checkpoint, weights_only=True)
     assert state["step"] == 10
     assert signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL)
+
+
+def test_a_training_of_a_refiner_stops_in_the_same_way(run_training, monkeypatch, tmp_path, no_lpips):
+    write_ply(box_room(1), tmp_path / "rooms" / "one.ply")
+    config = dense_config(tmp_path / "rooms", tmp_path, steps=5)
+    status = stopped_at(2, config, run_training, monkeypatch, signal.SIGINT, trainer_class=PointSplatTrainer)
+    assert status == 130 and open_run(config.get_base_dir()).step == 2
+    again = dense_config(tmp_path / "rooms", tmp_path, steps=1)
+    again.load_dir = config.get_checkpoint_dir()
+    assert run_training(again)[0]._start_step == 3
 
 
 def test_a_second_signal_ends_it_at_once_and_saves_nothing(
