@@ -55,7 +55,11 @@ def compact_folder(
             by default beside ``folder``: ``scenes_compact`` for ``scenes``.
         keep: as for :func:`compact`.
         refiner: what :func:`load_refiner` takes.
-        by, sh, clean, effort, seconds: as for :func:`compact`.
+        by: as for :func:`compact`.
+        sh: as for :func:`compact`.
+        clean: as for :func:`compact`.
+        effort: as for :func:`compact`.
+        seconds: of repairing each scene, as for :func:`compact`.
         jobs: number of processes. More than one share the cores; a program that asks for them must be a file, with what
             it does under ``if __name__ == "__main__":``, as for any Python program that starts processes.
         shard: only a part of the scenes: "2/5" is the second of five.

@@ -133,16 +133,16 @@ def settle_folder(
     _check_and_describe(output, command, force)
     results: dict[str, SceneResult] = {}
     work = functools.partial(settle, make=command.make, options=command.options, force=force)
-    with contextlib.closing(_settled(work, tasks, jobs)) as settled:
-        try:
+    try:
+        with contextlib.closing(_settled(work, tasks, jobs)) as settled:
             progress(command.name, 0.0)
             for result in settled:
                 results[result.name] = result
                 progress(command.name, len(results) / len(tasks))
                 if result.status == "failed":
                     logger.warning("%s failed: %s", result.name, result.error)
-        finally:  # also when it is interrupted
-            _write_table(output, everything, results)
+    finally:  # also when it is interrupted
+        _write_table(output, everything, results)
     return [results[task.name] for task in tasks]
 
 
@@ -208,11 +208,9 @@ def _check_and_describe(output: Path, command: Command, force: bool) -> None:
 def _description(path: Path) -> dict | None:
     """What a folder says of its results; None if it has none."""
     try:
-        text = path.read_text("utf-8")
+        known = json.loads(path.read_text("utf-8"))
     except FileNotFoundError:
         return None
-    try:
-        known = json.loads(text)
     except (ValueError, RecursionError):
         known = None
     if not isinstance(known, dict) or known.get("format") != FORMAT or not isinstance(known.get("options"), dict):

@@ -198,7 +198,7 @@ def test_a_damaged_record_or_description_is_never_believed(folder):
     for content in ("", "[]", '{"status": "done"}', "[" * 100_000, wrong):
         record.write_text(content)
         assert settle(folder)["a"].status == "failed", "the result was taken for its own, or for nobody's"
-    (folder.parent / "small" / "pointsplat-scenes.json").write_text("{}")
+    (folder.parent / "small" / "pointsplat-scenes.json").write_bytes(b"{\xff}")
     with pytest.raises(SceneError, match="pointsplat-scenes.json: damaged"):
         settle(folder)
 
