@@ -43,7 +43,7 @@ class SceneResult:
         ...     ps.save(ps.example_room()[::100], f"{folder}/rooms/hall.ply")
         ...     [result] = ps.compact_folder(f"{folder}/rooms", keep="50%", effort="instant")
         >>> result.name, result.status, result.before, result.after
-        ('hall', 'done', 629, 314)
+        ('hall', 'done', 629, 315)
     """
 
     name: str
