@@ -72,7 +72,7 @@ def test_a_training_that_is_stopped_leaves_a_scene_and_can_be_gone_on_with(
     run = open_run(config.get_base_dir())
     assert run.step == 10 and "Saved after step 10" in said.out
     scene = read_scene(run.folder)
-    assert len({len(value) for value in scene.tensors()}) == 1 and len(scene) != 300
+    assert len({len(value) for value in scene.tensors()}) == 1 and scene.usable().all() and len(scene) > 100
     again = wall_config(wall_scene, tmp_path, steps=3)
     again.load_dir = config.get_checkpoint_dir()
     trainer, _ = run_training(again)
