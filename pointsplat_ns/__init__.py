@@ -26,8 +26,10 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.distributions import plot_distributions
     from pointsplat_ns.compression.levels import Levels
     from pointsplat_ns.compression.pictures import plot_comparison
+    from pointsplat_ns.compression.scene_task import SceneResult
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
     from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
+    from pointsplat_ns.folders import compact_folder
     from pointsplat_ns.gaussians import Gaussians
     from pointsplat_ns.io.scene import save
     from pointsplat_ns.metrics import psnr, ssim
@@ -45,9 +47,11 @@ _PUBLIC = {
     "pointsplat_ns.compression.distributions": ("plot_distributions",),
     "pointsplat_ns.compression.levels": ("Levels",),
     "pointsplat_ns.compression.pictures": ("plot_comparison",),
+    "pointsplat_ns.compression.scene_task": ("SceneResult",),
     "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner"),
     "pointsplat_ns.pruning.view_sampling": ("sample_views",),
     "pointsplat_ns.errors": ("BudgetError", "DataError", "PointSplatError", "SceneError"),
+    "pointsplat_ns.folders": ("compact_folder",),
     "pointsplat_ns.gaussians": ("Gaussians",),
     "pointsplat_ns.io.scene": ("save",),
     "pointsplat_ns.metrics": ("psnr", "ssim"),
@@ -70,10 +74,12 @@ __all__ = [
     "Levels",
     "PointSplatError",
     "SceneError",
+    "SceneResult",
     "TrainedRefiner",
     "View",
     "Views",
     "compact",
+    "compact_folder",
     "dataset_views",
     "example_room",
     "load",

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from pointsplat_ns.cli.folders import compact_folder, is_folder_of_scenes
 from pointsplat_ns.cli.scene_options import (
     Bands,
     Output,
@@ -31,17 +32,23 @@ def compact(
     picture: Path | None = None,
     dry_run: bool = False,
     force: bool = False,
+    jobs: int | None = None,
+    shard: str | None = None,
 ) -> None:
-    """Make any scene smaller and repair it. No photos are needed.
+    """Make any scene smaller and repair it, or all scenes of a folder. No photos are needed.
 
     A trained refiner repairs the smaller scene in one pass; then learned steps bring it closer to the dense scene's
     renders. After each, renders are compared with the dense scene's in other views, and what does not help is left
     out. Views are the poses of the run's dataset if it is found, else sampled in free space.
 
+    A folder that holds config.yml is a run: one scene. Any other folder is a folder of scenes: all files with Gaussians
+    below it, and the newest Splatfacto run of each experiment. What is finished is left alone, so that the same command
+    goes on after an interruption; it may also be started several times, or on several machines that share the folder.
+
     Args:
-        scene: a 3DGS .ply, a Splatfacto checkpoint, or a run (its folder or config.yml).
+        scene: a 3DGS .ply, a Splatfacto checkpoint, a run (its folder or config.yml), or a folder of scenes.
         output: the .ply to write; by default beside the scene: room_compact.ply for room.ply, compact.ply in the folder
-            of a run.
+            of a run. For a folder of scenes, another folder; by default rooms_compact beside rooms.
         keep: how much, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before refinement. By default
             what the refiner was trained with.
         refiner: a trained pointsplat run (its folder or config.yml), or a .safetensors file; by default the refiner
@@ -54,8 +61,20 @@ def compact(
         picture: a .png file for images of some views: dense, before and after the repair, side by side.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
+        jobs: of a folder: number of processes that share its scenes and the cores; by default 1.
+        shard: of a folder: only a part of its scenes; 2/5 is the second of five. Under torchrun each process takes its
+            part.
     """
     import pointsplat_ns as ps
+
+    if is_folder_of_scenes(scene):
+        compact_folder(
+            scene, output, picture, dry_run, keep=keep, refiner=refiner, by=by, sh=sh, clean=clean, effort=effort,
+            seconds=seconds, jobs=1 if jobs is None else jobs, shard=shard, force=force,
+        )  # fmt: skip
+        return
+    if jobs is not None or shard is not None:
+        raise ps.SceneError(f"{scene}: one scene; --jobs and --shard are for a folder of scenes")
     from pointsplat_ns.compression.compact import resolve_options
     from pointsplat_ns.compression.repair import RepairBudget
     from pointsplat_ns.io import read_scene

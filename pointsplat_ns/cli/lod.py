@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pointsplat_ns.cli.folders import need_one_scene
 from pointsplat_ns.cli.scene_options import Bands, Output, Scene, output_beside
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ def lod(
     """
     import pointsplat_ns as ps
 
+    need_one_scene(scene)
     folder = output or output_beside(scene, "lod").with_suffix("")
     made = ps.lod(scene, levels, sh=sh, folder=folder, force=force, progress=True)
     _print_table(made, folder)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+from pointsplat_ns.cli.folders import need_one_scene
 from pointsplat_ns.cli.scene_options import (
     Bands,
     Output,
@@ -55,6 +56,7 @@ def prune(
     from pointsplat_ns.compression.prune import check_options
     from pointsplat_ns.io import read_scene
 
+    need_one_scene(scene)
     output = output or output_beside(scene, "pruned")
     check_outputs(None if dry_run else output, plot, force)
     check_options(keep, by, sh, opacity_weight, fine_tune)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Literal
@@ -12,9 +13,55 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import file_stem, logger
 from pointsplat_ns.io.ply_header import read_header
 from pointsplat_ns.io.runs import CONFIG_NAME, Run, open_run, scene_name
+from pointsplat_ns.io.scene import is_scene_file
 
 Supervision = Literal["auto", "photos", "dense"]
 """Training targets: a run's photos, or renders of the scene before it was pruned."""
+
+RESULTS_NAME = "pointsplat-scenes.json"
+"""File in the folder of what was made of many scenes. Such a folder is not searched for further scenes."""
+
+
+@dataclass(frozen=True)
+class FoundScene:
+    """A scene below a folder."""
+
+    name: str
+    """Where it lies below the folder, without a suffix and with ``/`` between folders; distinct."""
+    path: Path
+    """What :func:`~pointsplat_ns.io.read_scene` takes."""
+
+
+def find_scenes(folder: Path | str) -> list[FoundScene]:
+    """Every scene below a folder: files that hold Gaussians, and the newest trained run of each experiment.
+
+    Files in the folders of runs, hidden folders, what was made of many scenes (:data:`RESULTS_NAME`), and files and
+    runs without Gaussians are passed over.
+
+    Args:
+        folder: a folder that is no run itself.
+
+    Returns:
+        The scenes, sorted by name. A run has the name of its experiment's folder.
+
+    Raises:
+        SceneError: if there is no such folder, it is a run, or there is no scene below it.
+    """
+    folder = Path(folder)
+    if not folder.is_dir() or (folder / CONFIG_NAME).is_file():
+        raise SceneError(f"{folder}: expected a folder with scenes below it")
+    named = [(path.relative_to(folder).with_suffix("").as_posix(), path) for path in _scene_files(folder)]
+    if _run_folders(folder):
+        try:
+            runs = find_runs(folder, need_data=False)
+        except SceneError:
+            runs = []  # those passed over have been named
+        named += [(_name_below(folder, run), run.folder) for run in runs]
+    if not named:
+        raise SceneError(f"{folder}: no scene below it; expected 3DGS .ply files or trained Splatfacto runs")
+    named.sort(key=lambda pair: (pair[0], str(pair[1])))
+    names = distinct(name for name, _ in named)
+    return [FoundScene(name, path) for name, (_, path) in zip(names, named, strict=True)]
 
 
 def find_runs_and_plys(
@@ -137,6 +184,33 @@ def shown_scene(names: list[str], eval_scenes: Iterable[str]) -> str:
     """The scene that the viewer and the exporters get: the first one held out of training, or else the first."""
     held_out = set(eval_scenes)
     return next((name for name in names if name in held_out), names[0])
+
+
+def _scene_files(folder: Path) -> list[Path]:
+    """Files below ``folder`` that hold a scene, sorted. A PLY may also hold points or a mesh, and is looked into."""
+    paths = []
+    for place, inner, files in os.walk(folder):
+        if CONFIG_NAME in files or (RESULTS_NAME in files and Path(place) != folder):
+            inner.clear()
+            continue
+        inner[:] = sorted(name for name in inner if not name.startswith("."))
+        paths += [Path(place) / name for name in files if is_scene_file(name) and not name.startswith(".")]
+    scenes = []
+    for path in sorted(paths):
+        if path.suffix.lower() != ".ply" or _holds_gaussians(path):
+            scenes.append(path)
+        else:
+            logger.warning("passed over %s: no Gaussians in it", path)
+    return scenes
+
+
+def _name_below(folder: Path, run: Run) -> str:
+    """The path from a folder to a run's experiment; the scene's name if that does not lie below the folder."""
+    try:
+        name = _experiment_folder(run).relative_to(folder.resolve()).as_posix()
+    except ValueError:
+        return scene_name(run)
+    return scene_name(run) if name == "." else name
 
 
 def _run_folders(folder: Path) -> list[Path]:

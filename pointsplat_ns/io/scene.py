@@ -13,6 +13,14 @@ from pointsplat_ns.io.splatfacto import read_checkpoint
 
 ACCEPTED = "a 3DGS .ply, a Splatfacto .ckpt, or a Splatfacto run (its folder or config.yml)"
 
+SCENE_SUFFIXES = (".ply", ".ckpt")
+"""Suffixes of files that hold a whole scene."""
+
+
+def is_scene_file(path: Path | str) -> bool:
+    """Whether :func:`read_scene` takes a file for a scene, by its suffix. A run is told by its folder instead."""
+    return Path(path).suffix.lower() in SCENE_SUFFIXES
+
 
 def read_scene(path: Path | str) -> Gaussians:
     """Read a scene: a 3DGS PLY, a Splatfacto checkpoint, or the newest checkpoint of a Splatfacto run.

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import pytest
 import tyro
+from torch.distributed.run import get_args_parser as torchrun_parser
 
 import pointsplat_ns as ps
 from pointsplat_ns.api import EXAMPLE
@@ -212,6 +213,10 @@ def test_command_is_one_that_works(command, monkeypatch, capsys):
     program = words[0]
     if program in ("pointsplat", *NS_PROGRAMS):
         check_arguments(words, monkeypatch, capsys)
+    elif program == "torchrun":
+        started = torchrun_parser().parse_args(words[1:])
+        assert started.no_python and started.training_script == "pointsplat", "no rule for this program"
+        check_arguments((started.training_script, *started.training_script_args), monkeypatch, capsys)
     elif program == "python" and words[1:2] == ("-m",):
         assert words[2] == "pytest", "no rule for this module"
         assert all((ROOT / word).exists() for word in words[3:] if not word.startswith("-"))

@@ -16,7 +16,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.nerfstudio_plugin.pointsplat import distributed
 from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import average_gradients
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainer
+from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainer
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.config import PointSplatTrainerConfig
@@ -46,7 +46,7 @@ class AveragingOptimizers(Optimizers):
         super().optimizer_scaler_step_some(grad_scaler, param_groups)
 
 
-class PointSplatTrainer(SplatfactoCpuTrainer):
+class PointSplatTrainer(StoppableTrainer):
     """nerfstudio's trainer, with averaged gradients, that skips steps whose loss or gradients are not finite.
 
     If a loss or a gradient is NaN or infinite in any process, all processes skip the step: it changes neither

@@ -3,76 +3,48 @@
 from __future__ import annotations
 
 import copy
-import sys
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
-from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.early_look import EarlyLook
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig, SplatfactoCpuPipelineConfig
-from pointsplat_ns.system.memory import keep_freed_memory
+from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainer
 
 SPLATFACTO_STEPS = 30_000
 """Training steps that Splatfacto's schedules were chosen for."""
 
+PICTURES_NAME = "pictures"
+"""Folder in a run's folder."""
 
-class SplatfactoCpuTrainer(Trainer):
-    """nerfstudio's trainer. It removes the run folder if the input cannot be used, reuses freed memory on a CPU, and
-    ends with the status of an interrupted program when it is interrupted."""
+
+class SplatfactoCpuTrainer(StoppableTrainer):
+    """nerfstudio's trainer, which can be stopped at any time and tells early how long it takes and what comes of it."""
+
+    config: SplatfactoCpuTrainerConfig
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """As nerfstudio's.
 
         Raises:
-            PointSplatError: if the data cannot be used. The run folder, which then holds only the config, is removed
-                first.
+            PointSplatError: if the data cannot be used.
         """
-        if torch.device(self.device).type == "cpu":
-            keep_freed_memory()
-        try:
-            super().setup(test_mode)
-        except PointSplatError:
-            self._withdraw()
-            raise
-        except KeyboardInterrupt:
-            _interrupted()
-
-    def train(self) -> None:
-        """As nerfstudio's, but Ctrl-C ends ``ns-train`` with status 130. nerfstudio ends with 0, as if it had finished.
-
-        Raises:
-            SystemExit: if it is interrupted.
-        """
-        try:
-            super().train()
-        except KeyboardInterrupt:
-            _interrupted()
-
-    def _withdraw(self) -> None:
-        config = self.base_dir / "config.yml"
-        if not config.is_file() or list(self.base_dir.iterdir()) != [config]:
-            return
-        config.unlink()
-        output_dir = Path(self.config.output_dir)
-        for folder in (self.base_dir, *self.base_dir.parents):
-            if folder == output_dir.parent or any(folder.iterdir()):
-                break
-            folder.rmdir()
-
-
-def _interrupted() -> NoReturn:
-    """End the program as Ctrl-C does, past nerfstudio, which catches KeyboardInterrupt alone."""
-    print("interrupted", file=sys.stderr)
-    sys.exit(130)
+        super().setup(test_mode)
+        if self.config.early_look and test_mode == "val":
+            pictures = self.base_dir / PICTURES_NAME
+            look = EarlyLook(self.pipeline, pictures, self._start_step, self.config.max_num_iterations)
+            before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN
+            self.callbacks.append(TrainingCallback([before], look.before_step, update_every_num_iters=1))
+            self.callbacks.append(TrainingCallback([after], look.after_training, update_every_num_iters=1))
 
 
 @dataclass
@@ -83,6 +55,9 @@ class SplatfactoCpuTrainerConfig(TrainerConfig):
     scale_schedules: bool = True
     """Shorten Splatfacto's schedules (resolution, SH degree, densification, learning rates) in proportion if the run is
     shorter than 30,000 steps. Options set by hand are not changed."""
+    early_look: bool = True
+    """Say after some seconds how long the training will take, and draw a held-out photo and its render now and then, in
+    the folder pictures of the run."""
 
     def setup(self, **kwargs) -> Trainer:
         """Build the trainer with a copy of this config whose schedules are fitted."""

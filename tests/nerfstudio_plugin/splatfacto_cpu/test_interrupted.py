@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+import os
+import signal
+
 import pytest
+import torch
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts.train import launch
 
+from making import box_room, dense_config
+from pointsplat_ns.io import open_run, read_scene, write_ply
+from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainer, splatfacto_cpu_config
 
 
+@pytest.fixture(autouse=True)
+def heeded():
+    """Where the tests run in the background of a shell, SIGINT is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize("when", ["setup", "train"])
-def test_an_interrupted_training_ends_as_interrupted_and_not_as_finished(when, monkeypatch, capsys):
+@pytest.mark.parametrize("kind", [SplatfactoCpuTrainer, PointSplatTrainer])
+def test_an_interrupted_training_ends_as_interrupted_and_not_as_finished(kind, when, monkeypatch, capsys):
     def interrupted(*_):
         raise KeyboardInterrupt
 
     def main(**_):
-        trainer = object.__new__(SplatfactoCpuTrainer)
-        trainer.device = "cpu"
+        trainer = object.__new__(kind)
+        trainer.device, trainer.world_size = "cpu", 1
         getattr(trainer, when)()
 
     monkeypatch.setattr(Trainer, when, interrupted)
@@ -24,3 +40,77 @@ def test_an_interrupted_training_ends_as_interrupted_and_not_as_finished(when, m
         launch(main, num_devices_per_machine=1, config=splatfacto_cpu_config(), device_type="cpu")
     assert end.value.code == 130
     assert capsys.readouterr().err.endswith("interrupted\n")
+
+
+def stopped_at(
+    step: int, config, run_training, monkeypatch, number: int, times: int = 1, trainer_class=SplatfactoCpuTrainer
+) -> int:
+    """The status with which a training ends that gets a signal in the middle of a step."""
+    iteration = trainer_class.train_iteration
+
+    def signalled(trainer, now):
+        if now == step:
+            for _ in range(times):
+                os.kill(os.getpid(), number)
+        return iteration(trainer, now)
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setattr(trainer_class, "train_iteration", signalled)
+        run_training(config)
+    return end.value.code
+
+
+@pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_training_that_is_stopped_leaves_a_scene_and_can_be_gone_on_with(
+    number, status, wall_scene, wall_config, run_training, monkeypatch, tmp_path, capsys
+):
+    config = wall_config(wall_scene, tmp_path, steps=30)
+    # Step 10 densifies, which is not to be interrupted.
+    assert stopped_at(10, config, run_training, monkeypatch, number) == status
+    said = capsys.readouterr()
+    assert "stopping after this step" in said.err and said.err.endswith("interrupted\n")
+    run = open_run(config.get_base_dir())
+    assert run.step == 10 and "Saved after step 10" in said.out
+    scene = read_scene(run.folder)
+    assert len({len(value) for value in scene.tensors()}) == 1 and scene.usable().all() and len(scene) > 100
+    again = wall_config(wall_scene, tmp_path, steps=3)
+    again.load_dir = config.get_checkpoint_dir()
+    trainer, _ = run_training(again)
+    assert trainer._start_step == 11 and trainer.step == 13
+    state = torch.load(run.checkpoint, weights_only=True)
+    assert state["step"] == 10
+    assert signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL)
+
+
+def test_a_training_of_a_refiner_stops_in_the_same_way(run_training, monkeypatch, tmp_path, no_lpips):
+    write_ply(box_room(1), tmp_path / "rooms" / "one.ply")
+    config = dense_config(tmp_path / "rooms", tmp_path, steps=5)
+    status = stopped_at(2, config, run_training, monkeypatch, signal.SIGINT, trainer_class=PointSplatTrainer)
+    assert status == 130 and open_run(config.get_base_dir()).step == 2
+    again = dense_config(tmp_path / "rooms", tmp_path, steps=1)
+    again.load_dir = config.get_checkpoint_dir()
+    assert run_training(again)[0]._start_step == 3
+
+
+def test_a_second_signal_ends_it_at_once_and_saves_nothing(
+    wall_scene, wall_config, run_training, monkeypatch, tmp_path
+):
+    config = wall_config(wall_scene, tmp_path, steps=30)
+    assert stopped_at(3, config, run_training, monkeypatch, signal.SIGINT, times=2) == 130
+    assert not list(config.get_checkpoint_dir().glob("*"))
+
+
+def test_a_training_that_is_stopped_before_its_first_step_saves_nothing(
+    wall_scene, wall_config, run_training, monkeypatch, tmp_path
+):
+    config = wall_config(wall_scene, tmp_path, steps=30)
+    stop = SplatfactoCpuTrainer._stop_if_asked
+
+    def asked(trainer, step):
+        trainer._asked = signal.SIGINT
+        stop(trainer, step)
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setattr(SplatfactoCpuTrainer, "_stop_if_asked", asked)
+        run_training(config)
+    assert end.value.code == 130 and not config.get_checkpoint_dir().exists()

@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
@@ -14,6 +15,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.scene_box import OrientedBox, SceneBox
 from nerfstudio.models import splatfacto as stock
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
+from PIL import Image
 
 from making import SHARED_DATA
 from pointsplat_ns.errors import DataError, PointSplatError
@@ -253,6 +255,22 @@ def test_training_lowers_the_loss_and_densifies(trained):
     assert sum(losses[-5:]) < 0.5 * sum(losses[:5])
     assert trainer.pipeline.model.num_points > 300
     assert all(value.isfinite().all() for value in trainer.pipeline.model.gauss_params.values())
+
+
+def test_a_held_out_photo_and_its_render_lie_in_the_run(trained):
+    config, trainer, _ = trained
+    (path,) = (config.get_base_dir() / "pictures").iterdir()
+    assert path.name == "step-000000050.jpg"
+    picture = torch.from_numpy(np.asarray(Image.open(path)).copy()).float() / 255
+    camera, data = next(iter(trainer.pipeline.datamanager.fixed_indices_eval_dataloader))
+    model = trainer.pipeline.model.eval()
+    render = model.get_outputs_for_camera(camera)["rgb"]
+    model.train()
+    assert picture.shape == (48, 2 * 64, 3)
+    # JPEG at quality 90 errs by some levels.
+    assert (picture[:, :64] - data["image"] / 255).abs().mean() < 0.02
+    assert (picture[:, 64:] - render).abs().mean() < 0.02
+    assert picture[:, 64:].std() > 0.05, "a plain picture proves nothing"
 
 
 def test_checkpoint_has_splatfactos_layout_and_loads_weights_only(trained):

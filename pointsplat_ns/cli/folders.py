@@ -1,0 +1,80 @@
+"""``pointsplat compact`` on a folder of scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pointsplat_ns.compression.scene_task import SceneResult
+
+
+def is_folder_of_scenes(path: Path) -> bool:
+    """Whether a path is a folder and no run: a run's folder holds ``config.yml`` and is one scene."""
+    return path.is_dir() and not (path / "config.yml").is_file()
+
+
+def need_one_scene(path: Path) -> None:
+    """Refuse a folder of scenes where a single scene is expected.
+
+    Raises:
+        SceneError: if it is one.
+    """
+    from pointsplat_ns.errors import SceneError
+    from pointsplat_ns.io.scene import ACCEPTED
+
+    if is_folder_of_scenes(path):
+        raise SceneError(
+            f"{path}: a folder without config.yml, so no run; expected {ACCEPTED}; of the commands, compact takes a "
+            "folder of scenes"
+        )
+
+
+def compact_folder(folder: Path, output: Path | None, picture: Path | None, dry_run: bool, **options) -> None:
+    """Compact every scene of a folder, and print a table of them.
+
+    Args:
+        folder: the folder.
+        output: the folder for results.
+        picture, dry_run: what is refused here.
+        options: further ones of :func:`pointsplat_ns.compact_folder`.
+
+    Raises:
+        SceneError: if an option is for one scene only.
+        PointSplatError: if a scene fails, after all the others.
+    """
+    import pointsplat_ns as ps
+    from pointsplat_ns.compression.scene_folder import TABLE_NAME, output_folder
+    from pointsplat_ns.folders import torchrun_rank
+
+    for name, given in (("--picture", picture is not None), ("--dry-run", dry_run)):
+        if given:
+            raise ps.SceneError(f"{name} is for one scene; {folder} is a folder of scenes")
+    target = output or output_folder(folder, "compact")
+    results = ps.compact_folder(folder, target, progress=True, **options)
+    if torchrun_rank()[0] > 0:
+        return  # the first process speaks for all
+    _print_table(results)
+    failed = sum(result.status == "failed" for result in results)
+    print(f"{target}: {len(results) - failed} of {len(results)} scenes, and the table {TABLE_NAME}")
+    if failed:
+        raise ps.PointSplatError(f"{failed} of {len(results)} scenes failed; the same command tries them again")
+
+
+def _print_table(results: list[SceneResult]) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(caption="dB: PSNR against the scene's own renders")
+    table.add_column("scene", overflow="fold")
+    for name in ("before", "after", "MB", "dB", "seconds"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("status")
+    forms = (",", ",", ".2f", ".1f", ".1f")
+    for result in results:
+        numbers = (result.before, result.after, result.megabytes, result.psnr, result.seconds)
+        cells = ("-" if value is None else f"{value:{form}}" for value, form in zip(numbers, forms, strict=True))
+        what = f"{result.status}: {result.error}" if result.error else result.status
+        table.add_row(escape(result.name), *cells, escape(what))
+    Console().print(table)

@@ -1,0 +1,236 @@
+"""Every scene of a folder: which ones, in which shard, by how many processes, and a table of what became of them."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import dataclasses
+import functools
+import json
+import os
+import re
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pointsplat_ns.compression.scene_task import (
+    Made,
+    Options,
+    SceneResult,
+    SceneTask,
+    known_result,
+    note_failure,
+    remove_unfinished,
+    settle,
+)
+from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.io.discovery import RESULTS_NAME, find_scenes
+from pointsplat_ns.io.files import logger, replacing
+from pointsplat_ns.system.claims import claim
+from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.system.workers import in_processes, in_turn
+
+TABLE_NAME, LOCK_NAME = "scenes.csv", ".scenes.lock"
+
+FORMAT = "pointsplat-scenes"
+
+_SLOW_IMPORTS = ("pointsplat_ns.folders", "kornia.metrics", "plyfile", "safetensors.torch", "scipy.spatial")
+"""What the processes import, most of it only when it is first needed."""
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of several parts of a list, as ``2/5``: the second of five.
+
+    Raises:
+        DataError: if there is no such part.
+
+    Example:
+        >>> Shard.of("2/3").part(list("abcdefg"))
+        ['b', 'e']
+    """
+
+    index: int
+    """From 1 on."""
+    count: int
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.index <= self.count:
+            raise DataError(f"shard {self.index}/{self.count}; expected 1/{self.count} to {self.count}/{self.count}")
+
+    @classmethod
+    def of(cls, text: str) -> Shard:
+        """The shard that a text such as ``2/5`` means."""
+        numbers = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
+        if numbers is None:
+            raise DataError(f"shard {text!r}; expected which one of how many, such as 1/4")
+        return cls(int(numbers[1]), int(numbers[2]))
+
+    def within(self, rank: int, world_size: int) -> Shard:
+        """The part of this shard that one of several processes takes, by its rank from 0 on."""
+        return Shard((self.index - 1) * world_size + rank + 1, self.count * world_size)
+
+    def part(self, items: Sequence) -> list:
+        """The items of this part: every ``count``-th one."""
+        return list(items[self.index - 1 :: self.count])
+
+
+WHOLE = Shard(1, 1)
+
+
+@dataclass(frozen=True)
+class Command:
+    """What is done to every scene.
+
+    Pickled for other processes, so ``make`` has to be a function of a module, or a partial of one.
+    """
+
+    name: str
+    make: Callable[[Path], Made]
+    options: Options
+    """All that ``make`` depends on beside the scene."""
+
+    @property
+    def description(self) -> dict[str, object]:
+        """What the folder of the results says of them."""
+        return {"format": FORMAT, "command": self.name, "options": dict(self.options)}
+
+
+def settle_folder(
+    folder: Path,
+    output: Path,
+    command: Command,
+    jobs: int = 1,
+    shard: Shard = WHOLE,
+    force: bool = False,
+    progress: Progress = silent,
+) -> list[SceneResult]:
+    """Do something to every scene of a folder, and write the results to another.
+
+    Results that are finished are left alone, so that an interrupted call is taken up by the next one. Several
+    processes may work on the same folders at the same time: each scene is claimed by one of them.
+
+    Args:
+        folder: searched by :func:`~pointsplat_ns.io.discovery.find_scenes`.
+        output: folder for ``NAME.ply`` and its record ``NAME.ply.json``, and the table ``scenes.csv``.
+        command: what is done.
+        jobs: number of processes; 1 works in this one.
+        shard: the part of the scenes that is worked on here.
+        force: overwrite files that this function did not write, or wrote with other options.
+        progress: called with the name of the current task and the share of it that is done, in [0, 1].
+
+    Returns:
+        What became of each scene of the shard, in the order of their names.
+
+    Raises:
+        DataError: if ``jobs`` is not positive.
+        SceneError: if there are no scenes, or the output folder holds other results.
+    """
+    if jobs < 1:
+        raise DataError(f"jobs is {jobs}; expected 1 or more")
+    everything = _tasks(folder, output)
+    tasks = shard.part(everything)
+    _check_and_describe(output, command, force)
+    results: dict[str, SceneResult] = {}
+    work = functools.partial(settle, make=command.make, options=command.options, force=force)
+    try:
+        with contextlib.closing(_settled(work, tasks, jobs)) as settled:
+            progress(command.name, 0.0)
+            for result in settled:
+                results[result.name] = result
+                progress(command.name, len(results) / len(tasks))
+                if result.status == "failed":
+                    logger.warning("%s failed: %s", result.name, result.error)
+    finally:  # also when it is interrupted
+        _write_table(output, everything, results)
+    return [results[task.name] for task in tasks]
+
+
+def output_folder(folder: Path, suffix: str) -> Path:
+    """The folder beside a folder where results go by default: ``scenes_compact`` for ``scenes``."""
+    place = Path(os.path.abspath(folder))
+    return place.with_name(f"{place.name}_{suffix}")
+
+
+def _tasks(folder: Path, output: Path) -> list[SceneTask]:
+    if os.path.realpath(folder) == os.path.realpath(output):
+        raise SceneError(f"{output}: holds the scenes themselves; name another folder for the results")
+    return [SceneTask(scene.name, scene.path, output / f"{scene.name}.ply") for scene in find_scenes(folder)]
+
+
+def _settled(
+    work: Callable[[SceneTask], SceneResult | None], tasks: Sequence[SceneTask], jobs: int
+) -> Generator[SceneResult, None, None]:
+    if jobs == 1:
+        return in_turn(work, tasks)
+    return in_processes(work, tasks, jobs, _given_up, _clear, preload=_SLOW_IMPORTS)
+
+
+def _given_up(task: SceneTask, how: str) -> SceneResult:
+    """The result of a scene at which process after process was killed."""
+    _clear(task)
+    failed = task.result("failed", error=f"every process that worked on it ended early; the last {how}")
+    note_failure(task, failed)
+    return failed
+
+
+def _clear(task: SceneTask) -> None:
+    """Remove what a killed process left, unless another one is at work on the scene by now."""
+    with claim(task.lock) as claimed:
+        if claimed:
+            remove_unfinished(task)
+
+
+def _check_and_describe(output: Path, command: Command, force: bool) -> None:
+    """Write down what the results are. If others are there, refuse to mix them.
+
+    Raises:
+        SceneError: if the output is no folder, or holds results of another command or other options.
+    """
+    path, description = output / RESULTS_NAME, command.description
+    if output.exists() and not output.is_dir():
+        raise SceneError(f"{output}: is a file; expected the name of a folder")
+    try:
+        with claim(output / LOCK_NAME, wait=True):
+            known = _description(path)
+            if known is not None and known != description and not force:
+                raise SceneError(
+                    f"{output}: holds results of {_differences(known, description)}; name another folder, or overwrite "
+                    "them with --force"
+                )
+            if known != description:
+                with replacing(path) as part:
+                    part.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise SceneError(f"{output}: cannot be used ({error.strerror or error})") from error
+
+
+def _description(path: Path) -> dict | None:
+    """What a folder says of its results; None if it has none."""
+    try:
+        known = json.loads(path.read_text("utf-8"))
+    except FileNotFoundError:
+        return None
+    except (ValueError, RecursionError):
+        known = None
+    if not isinstance(known, dict) or known.get("format") != FORMAT or not isinstance(known.get("options"), dict):
+        raise SceneError(f"{path}: damaged; remove it, or name another folder")
+    return known
+
+
+def _differences(known: Mapping, wanted: Mapping) -> str:
+    if known.get("command") != wanted["command"]:
+        return f"the command {known.get('command')}"
+    before, now = known["options"], wanted["options"]
+    names = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
+    return "other options (" + ", ".join(f"{name}: {before.get(name)}, now {now.get(name)}" for name in names) + ")"
+
+
+def _write_table(output: Path, everything: Sequence[SceneTask], results: Mapping[str, SceneResult]) -> None:
+    """Write the table of all scenes, those of other shards as their records tell."""
+    with claim(output / LOCK_NAME, wait=True):  # who writes last has read all records
+        rows = [results.get(task.name) or known_result(task) for task in everything]
+        with replacing(output / TABLE_NAME) as part, part.open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.DictWriter(stream, [field.name for field in dataclasses.fields(SceneResult)])
+            writer.writeheader()
+            writer.writerows(map(dataclasses.asdict, rows))

@@ -1,0 +1,232 @@
+"""One of many scenes: who works on it, whether it is finished, and what is written beside the result.
+
+Beside a result ``room.ply`` lies its record ``room.ply.json``. A result is finished if its record has the hash of what
+was read, of the options and of the result itself.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+import os
+import re
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pointsplat_ns.compression.level_folder import source_file
+from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import content_hash, logger, one_line, replacing
+from pointsplat_ns.io.ply import write_ply
+from pointsplat_ns.system.claims import claim
+
+Status = Literal["done", "done before", "failed", "open"]
+
+Options = Mapping[str, str | float | bool | None]
+"""What a result depends on beside the scene."""
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """What became of one of many scenes.
+
+    Example:
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ps.save(ps.example_room()[::100], f"{folder}/rooms/hall.ply")
+        ...     [result] = ps.compact_folder(f"{folder}/rooms", keep="50%", effort="instant")
+        >>> result.name, result.status, result.before, result.after
+        ('hall', 'done', 629, 315)
+    """
+
+    name: str
+    """Where the scene lies below its folder, without a suffix."""
+    source: str
+    """Path of the file or run that was read."""
+    output: str
+    """Path of the PLY that was written."""
+    status: Status
+    """``done before``: by an earlier call, or by another process. ``open``: not tried yet, or left to another shard."""
+    before: int | None = None
+    """Gaussians of the scene."""
+    after: int | None = None
+    """Gaussians of the result."""
+    megabytes: float | None = None
+    """Size of the result, 10^6 bytes."""
+    psnr: float | None = None
+    """PSNR against the scene's own renders, dB; None if nothing was compared or they are equal."""
+    seconds: float | None = None
+    """Duration."""
+    error: str = ""
+    """What failed, in one line."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """What a scene was made into."""
+
+    scene: Gaussians
+    before: int
+    psnr: float | None
+
+
+@dataclass(frozen=True)
+class SceneTask:
+    """A scene to work on, and the PLY to write."""
+
+    name: str
+    source: Path
+    output: Path
+
+    def result(self, status: Status, **facts: Any) -> SceneResult:
+        """A result of this scene."""
+        return SceneResult(self.name, str(self.source), str(self.output), status, **facts)
+
+    @property
+    def record(self) -> Path:
+        """The file that says what the result was made of."""
+        return self.output.with_name(f"{self.output.name}.json")
+
+    @property
+    def lock(self) -> Path:
+        """The file whose lock is held by who works on the scene."""
+        return self.output.with_name(f".{self.output.name}.lock")
+
+
+def settle(task: SceneTask, make: Callable[[Path], Made], options: Options, force: bool = False) -> SceneResult | None:
+    """Make a scene's result, unless it is finished or another process is at work on it.
+
+    Whatever fails becomes a result with the status ``failed``. Nothing of it is left but its record.
+
+    Args:
+        task: the scene.
+        make: makes the result from what the task names.
+        options: all that ``make`` depends on beside the scene.
+        force: overwrite a result that this function did not write, or that was changed since.
+
+    Returns:
+        What became of it; None if another process is at work on it.
+    """
+    start = time.perf_counter()
+    try:
+        with claim(task.lock) as claimed:
+            if not claimed:
+                return None
+            remove_unfinished(task)
+            key = _key(task, options)
+            result = _finished(task, key)
+            if result is None:
+                _check_overwriting(task, force)
+                result = _write(task, make(task.source), key, options, start)
+            task.lock.unlink(missing_ok=True)  # whoever gets its lock now sees that the scene is finished
+            return result
+    except Exception as error:  # one scene must not stop the others
+        kind = "" if isinstance(error, (PointSplatError, OSError)) else f"{type(error).__name__}: "
+        text = one_line(error, limit=1000)  # with the paths in it
+        failed = task.result("failed", seconds=time.perf_counter() - start, error=kind + text)
+        logger.debug("%s", task.source, exc_info=True)
+        note_failure(task, failed)
+        return failed
+
+
+def remove_unfinished(task: SceneTask) -> None:
+    """Remove what a process that was killed left of a result. To be called by who holds the task's lock."""
+    # As :func:`~pointsplat_ns.io.files.replacing` names them; a result is written within one call by another.
+    pattern = re.compile(rf"\.{{1,2}}{re.escape(task.output.name)}(\.json)?(\.\d+\.part){{1,2}}")
+    with os.scandir(task.output.parent) as entries:
+        parts = [entry.path for entry in entries if pattern.fullmatch(entry.name)]
+    for part in parts:
+        Path(part).unlink(missing_ok=True)
+
+
+def note_failure(task: SceneTask, failed: SceneResult) -> None:
+    """Write the record of a scene that failed, for the tables of other processes. An earlier result keeps its own."""
+    with suppress(SceneError):  # the folder may be what failed
+        if not task.output.exists():
+            _write_record(task, failed, {})
+
+
+def known_result(task: SceneTask) -> SceneResult:
+    """What a scene's record says became of it; nothing is checked against files."""
+    record = _read_record(task)
+    if record is None:
+        return task.result("open")
+    status: Status = "failed" if record["status"] == "failed" else "done before"
+    facts = {field.name: record[field.name] for field in dataclasses.fields(SceneResult)[4:]}
+    return task.result(status, **facts)
+
+
+def _key(task: SceneTask, options: Options) -> str:
+    """Hash of what a result depends on."""
+    text = json.dumps([source_file(task.source).sha256, dict(options)], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _finished(task: SceneTask, key: str) -> SceneResult | None:
+    """The result of an earlier call, if it is there, unchanged, and of the same scene and options."""
+    record = _read_record(task)
+    if record is None or record.get("key") != key or not _as_written(task, record):
+        return None
+    return known_result(task)
+
+
+def _as_written(task: SceneTask, record: Mapping[str, Any]) -> bool:
+    """Whether a result is there and was not changed since."""
+    return task.output.is_file() and content_hash(task.output) == record.get("sha256")
+
+
+def _check_overwriting(task: SceneTask, force: bool) -> None:
+    """Refuse to replace anything but a result of this module whose scene has changed."""
+    if force or not os.path.lexists(task.output):
+        return
+    record = _read_record(task)
+    if record is None or not _as_written(task, record):
+        raise SceneError(
+            f"{task.output}: exists already, and was not made by an earlier call or was changed since; name another "
+            "folder, or overwrite it with --force"
+        )
+
+
+def _write(task: SceneTask, made: Made, key: str, options: Options, start: float) -> SceneResult:
+    """Write a result and its record. Killed in between, it leaves the record alone: the scene is not finished."""
+    with replacing(task.output) as part:
+        write_ply(made.scene, part)
+        done = task.result(
+            "done",
+            before=made.before,
+            after=len(made.scene),
+            megabytes=part.stat().st_size / 1e6,
+            psnr=made.psnr if made.psnr is not None and math.isfinite(made.psnr) else None,
+            seconds=time.perf_counter() - start,
+        )
+        task.output.unlink(missing_ok=True)  # else it could stand beside a record that is not its own
+        _write_record(task, done, {"key": key, "sha256": content_hash(part), "options": dict(options)})
+    return done
+
+
+def _write_record(task: SceneTask, result: SceneResult, proofs: Mapping[str, Any]) -> None:
+    facts = {name: value for name, value in dataclasses.asdict(result).items() if name not in ("name", "output")}
+    with replacing(task.record) as part:
+        part.write_text(json.dumps({**facts, **proofs}, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+_FACTS = {"before": int, "after": int, "megabytes": float, "psnr": float, "seconds": float}
+
+
+def _read_record(task: SceneTask) -> dict[str, Any] | None:
+    """The content of a scene's record; None if there is none or it is none."""
+    try:
+        record = json.loads(task.record.read_text("utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    if not isinstance(record, dict) or record.get("status") not in ("done", "failed"):
+        return None
+    numbers = all(isinstance(record.get(name), (kind, int, type(None))) for name, kind in _FACTS.items())
+    return record if numbers and isinstance(record.get("error"), str) else None

@@ -1,0 +1,142 @@
+"""What is done to every scene of a folder."""
+
+from __future__ import annotations
+
+import datetime
+import functools
+import os
+from pathlib import Path
+
+import torch
+import torch.distributed as dist
+
+from pointsplat_ns.compression.compact import compact_scene, resolve_options
+from pointsplat_ns.compression.level_folder import source_file
+from pointsplat_ns.compression.repair import Effort, RepairBudget
+from pointsplat_ns.compression.scene_folder import WHOLE, Command, Shard, output_folder, settle_folder
+from pointsplat_ns.compression.scene_task import Made, Options, SceneResult
+from pointsplat_ns.compression.trained_refiner import load_refiner
+from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.io.scene import read_scene
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import gathered
+from pointsplat_ns.pruning import Keep
+from pointsplat_ns.system.progress import Progress, progress_bar
+
+FOREVER = datetime.timedelta(days=1000)
+"""How long processes of ``torchrun`` wait for one another; the last scene of one may take long."""
+
+
+def compact_folder(
+    folder: str | Path,
+    output: str | Path | None = None,
+    keep: Keep | str | None = None,
+    refiner: str | Path | None = None,
+    *,
+    by: str | None = None,
+    sh: str = "all",
+    clean: bool = False,
+    effort: Effort = "quick",
+    seconds: float | None = None,
+    jobs: int = 1,
+    shard: str | None = None,
+    force: bool = False,
+    progress: bool | Progress = False,
+) -> list[SceneResult]:
+    """Make every scene of a folder smaller, as :func:`compact` does, and write the results to another folder.
+
+    A result that is there, unchanged, and of the same scene and options, is left alone: called again, this goes on with
+    what is not finished. Several calls may work on the same folders at once; each scene is claimed by one of them.
+    Under ``torchrun`` each process takes its part, waits for the others, and gives the results of all.
+
+    Args:
+        folder: scenes are the files with Gaussians below it, and the newest Splatfacto run of each experiment.
+        output: folder for ``NAME.ply`` and its record ``NAME.ply.json`` of each scene, and the table ``scenes.csv``;
+            by default beside ``folder``: ``scenes_compact`` for ``scenes``.
+        keep: as for :func:`compact`.
+        refiner: what :func:`load_refiner` takes.
+        by: as for :func:`compact`.
+        sh: as for :func:`compact`.
+        clean: as for :func:`compact`.
+        effort: as for :func:`compact`.
+        seconds: of repairing each scene, as for :func:`compact`.
+        jobs: number of processes. More than one share the cores; a program that asks for them must be a file, with what
+            it does under ``if __name__ == "__main__":``, as for any Python program that starts processes.
+        shard: only a part of the scenes: "2/5" is the second of five.
+        force: overwrite files that this function did not write, that were changed since, or that it wrote with other
+            options.
+        progress: True shows a bar; a function is called with what is being done and the share done of it.
+
+    Returns:
+        What became of each scene of the shard, sorted by name. A scene that fails does not stop the others; its status
+        is "failed".
+
+    Raises:
+        BudgetError, PointSplatError: if the options fit no scene.
+        DataError: if there is no such shard, or no job.
+        SceneError: if there is no scene, or the output folder holds other results.
+
+    Example:
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for every in (100, 200):
+        ...         ps.save(ps.example_room()[::every], f"{folder}/rooms/{every}.ply")
+        ...     results = ps.compact_folder(f"{folder}/rooms", keep=50, effort="instant")
+        >>> [(result.name, result.status, result.before, result.after) for result in results]
+        [('100', 'done', 629, 50), ('200', 'done', 315, 50)]
+    """
+    folder = Path(folder)
+    target = output_folder(folder, "compact") if output is None else Path(output)
+    part = WHOLE if shard is None else Shard.of(shard)
+    rank, world_size = torchrun_rank()
+    if world_size > 1 and not dist.is_initialized():
+        dist.init_process_group("gloo", timeout=FOREVER)
+    device = f"cuda:{os.environ.get('LOCAL_RANK', 0)}" if torch.cuda.is_available() else "cpu"
+    trained = _refiner_on(refiner, device)
+    repair = RepairBudget(effort, seconds)
+    budget, method = resolve_options(trained, keep, by, sh)
+    options: Options = {
+        "keep": str(budget),
+        "refiner": source_file(trained.source).sha256,
+        "by": method,
+        "sh": sh,
+        "clean": clean,
+        "effort": effort if seconds is None else None,
+        "seconds": seconds,
+    }
+    make = functools.partial(_compacted, refiner, device, budget, method, sh, clean, repair)
+    with progress_bar(progress if rank == 0 else False) as report:
+        results = settle_folder(
+            folder, target, Command("compact", make, options), jobs, part.within(rank, world_size), force, report
+        )
+    return sorted(gathered(results), key=lambda result: result.name)
+
+
+_refiner_on = functools.cache(load_refiner)
+
+
+def _compacted(
+    refiner: str | Path | None,
+    device: str,
+    keep: Keep,
+    by: str,
+    sh: str,
+    clean: bool,
+    budget: RepairBudget,
+    path: Path,
+) -> Made:
+    """One scene of a folder, made smaller."""
+    dense = read_scene(path)
+    source = ViewSource(dense, run=path, dataset_views=dataset_views)
+    result = compact_scene(dense, _refiner_on(refiner, device), keep, by, sh, source, clean=clean, budget=budget)
+    if result.repaired is not None and result.repaired.interrupted:
+        raise KeyboardInterrupt  # which is meant for all scenes, not for the repair of this one
+    return Made(result.scene, len(dense), result.psnr)
+
+
+def torchrun_rank() -> tuple[int, int]:
+    """Rank of this process and number of processes that ``torchrun`` started together; 0 and 1 without it."""
+    if "TORCHELASTIC_RUN_ID" not in os.environ:
+        return 0, 1
+    return int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])

@@ -1,0 +1,194 @@
+"""What a training tells before it ends: how long it takes, and a held-out photo beside its render now and then."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.io.files import replacing
+from pointsplat_ns.metrics import psnr
+
+if TYPE_CHECKING:
+    from nerfstudio.cameras.cameras import Cameras
+    from nerfstudio.pipelines.base_pipeline import VanillaPipeline
+
+FIRST_PICTURE, FIRST_SHARE = 50, 1 / 64
+"""The first picture is made after so many steps, and after this share of them; each further one after twice as many."""
+
+PICTURE_SIDE = 400
+"""Maximum of the longer side of the render in a picture, pixels."""
+
+MOST_TIME = 0.02
+"""Largest share of the time that pictures take."""
+
+_WARM_UP, _TIMED_STEPS, _TIMED_SECONDS, _TIMED_RENDERS = 2, 5, 3.0, 2
+"""Steps that are not timed; the least steps and seconds that an estimate is made from; how often a view is rendered to
+time it, as the first time is slower."""
+
+
+class EarlyLook:
+    """Logs how long a training will take, and writes pictures of a held-out view.
+
+    An estimate is logged after some seconds, and again whenever the resolution of training has risen. How much slower
+    later steps are is told by rendering a view at full resolution; that Gaussians become more is not foreseen.
+
+    Args:
+        pipeline: of a Splatfacto model.
+        folder: where pictures go, as ``step-000000109.jpg``: the photo, and its render beside it.
+        first: number of the first step.
+        count: number of steps.
+    """
+
+    def __init__(self, pipeline: VanillaPipeline, folder: Path, first: int, count: int):
+        self._pipeline, self._folder, self._last = pipeline, folder, first + count
+        self._start = time.perf_counter()
+        self._due: list[int] = [first + steps for steps in picture_steps(count)]
+        self._spent, self._dearest = 0.0, 0.0
+        self._factor, self._timed_from, self._timed_since = 0, first, self._start
+
+    def before_step(self, step: int) -> None:
+        """Called before each step, when the one before is complete."""
+        self._estimate(step)
+        if self._due and step >= self._due[0] and self._affordable():
+            self._picture(step)
+
+    def after_training(self, step: int) -> None:
+        """Called after the last step, whose number is given."""
+        if self._due:
+            self._picture(step + 1)
+
+    def _affordable(self) -> bool:
+        """Whether a picture as dear as the dearest so far keeps to :data:`MOST_TIME`."""
+        return self._spent + self._dearest <= MOST_TIME * (time.perf_counter() - self._start)
+
+    def _estimate(self, step: int) -> None:
+        factor, now = self._factor_at(step), time.perf_counter()
+        if factor != self._factor:
+            self._factor, self._timed_from, self._timed_since = factor, step + _WARM_UP, now
+        if step <= self._timed_from:
+            self._timed_since = now
+        steps, seconds = step - self._timed_from, now - self._timed_since
+        if steps < _TIMED_STEPS or seconds < _TIMED_SECONDS:
+            return
+        self._timed_from = self._last  # until the resolution rises
+        per_step, left = seconds / steps, range(step, self._last)
+        at_full, speed = 1.0, f"{per_step:.2g} s a step"
+        if self._factor_at(self._last - 1) < factor:
+            at_full = max(1.0, self._seconds_to_render(1) / self._seconds_to_render(factor))
+            speed += f", about {per_step * at_full:.2g} s at full resolution"
+        # Time that rises with the number of pixels, from 1 now to ``at_full``.
+        rise = (at_full - 1) / max(1 - factor**-2, 1e-9)
+        time_left = per_step * sum(1 + rise * (self._factor_at(later) ** -2 - factor**-2) for later in left)
+        CONSOLE.log(f"{speed}: the {len(left):,} steps left take about {duration(time_left)}")
+
+    @torch.no_grad()
+    def _seconds_to_render(self, factor: int) -> float:
+        """Time to render the first training view, ``factor`` times smaller than its photo."""
+        dataset = self._pipeline.datamanager.train_dataset
+        assert dataset is not None
+        camera = copy.deepcopy(dataset.cameras[:1])
+        camera.rescale_output_resolution(1 / factor)
+        times = []
+        for _ in range(_TIMED_RENDERS):
+            start = time.perf_counter()
+            self._render(camera)
+            times.append(time.perf_counter() - start)
+        return min(times)
+
+    def _render(self, camera: Cameras) -> dict[str, Tensor]:
+        """What a model in evaluation makes of a camera."""
+        model = self._pipeline.model
+        training = model.training
+        model.eval()
+        try:
+            return model.get_outputs_for_camera(camera)
+        finally:
+            model.train(training)
+
+    def _factor_at(self, step: int) -> int:
+        """How many times smaller than the photos images are at a step."""
+        config = self._pipeline.model.config
+        return 2 ** max(config.num_downscales - step // config.resolution_schedule, 0)
+
+    def _picture(self, step: int) -> None:
+        """Write a picture. Where it cannot be written, that is logged, and there are no more."""
+        start = time.perf_counter()
+        while self._due and self._due[0] <= step:
+            self._due.pop(0)
+        if not self._pipeline.datamanager.eval_dataset:
+            self._due.clear()
+            return
+        photo, image = self._look()
+        path = self._folder / f"step-{step:09d}.jpg"
+        try:
+            _write(torch.cat([photo, image], dim=1), path)
+        except SceneError as error:
+            self._due.clear()
+            CONSOLE.log(f"no more pictures: {error}")
+            return
+        cost = time.perf_counter() - start
+        self._spent, self._dearest = self._spent + cost, max(self._dearest, cost)
+        elapsed = duration(time.perf_counter() - self._start)
+        CONSOLE.log(f"{path}: a held-out photo and its render after {elapsed}, {float(psnr(image, photo)):.1f} dB")
+
+    @torch.no_grad()
+    def _look(self) -> tuple[Tensor, Tensor]:
+        """The first held-out photo and its render, (H, W, 3) in [0, 1], at the size of a picture."""
+        model = self._pipeline.model
+        frames: Any = self._pipeline.datamanager.fixed_indices_eval_dataloader
+        camera, data = next(iter(frames))
+        camera = copy.deepcopy(camera)
+        camera.rescale_output_resolution(min(1.0, PICTURE_SIDE / float(max(camera.width.max(), camera.height.max()))))
+        outputs = self._render(camera)
+        photo = data["image"].to(model.device)
+        photo = photo / 255 if photo.dtype == torch.uint8 else photo
+        photo = model.composite_with_background(photo, outputs["background"][:1, :1])
+        image = outputs["rgb"].clamp(0, 1)
+        photo = interpolate(photo.permute(2, 0, 1)[None], size=image.shape[:2], mode="bilinear", antialias=True)
+        return photo[0].permute(1, 2, 0).clamp(0, 1), image
+
+
+def picture_steps(count: int) -> list[int]:
+    """After how many of ``count`` steps pictures are made.
+
+    Example:
+        >>> picture_steps(7000)
+        [110, 220, 440, 880, 1760, 3520, 7000]
+        >>> picture_steps(30)
+        [30]
+    """
+    steps, after = [], max(FIRST_PICTURE, math.ceil(count * FIRST_SHARE))
+    while after < 0.75 * count:
+        steps.append(after)
+        after *= 2
+    return [*steps, count]
+
+
+def duration(seconds: float) -> str:
+    """A duration in words.
+
+    Example:
+        >>> duration(8.4), duration(200), duration(7000), duration(100_000)
+        ('8 s', '3 min', '1 h 57 min', '27 h 47 min')
+    """
+    minutes = round(seconds / 60)
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def _write(image: Tensor, path: Path) -> None:
+    """Write an image (H, W, 3) in [0, 1] as a JPEG."""
+    from PIL import Image
+
+    with replacing(path) as part:
+        Image.fromarray((255 * image).round().to(torch.uint8).cpu().numpy()).save(part, format="JPEG", quality=90)

@@ -1,0 +1,120 @@
+"""nerfstudio's trainer, which can be stopped at any time."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Literal, NoReturn
+
+import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.system.memory import keep_freed_memory
+
+
+class StoppableTrainer(Trainer):
+    """nerfstudio's trainer. It removes the run folder if the input cannot be used, and reuses freed memory on a CPU.
+
+    Ctrl-C and SIGTERM end it after the step at hand, with a checkpoint of that step, and with the status of an
+    interrupted program: in the middle of densification, parameters are of different numbers. A second one ends it at
+    once.
+    """
+
+    _asked: int | None = None
+    """Number of the signal that asked it to stop."""
+    _between_steps = False
+    """Whether it was stopped where a checkpoint can be saved."""
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """As nerfstudio's.
+
+        Raises:
+            PointSplatError: if the data cannot be used. The run folder, which then holds only the config, is removed
+                first.
+        """
+        if torch.device(self.device).type == "cpu":
+            keep_freed_memory()
+        try:
+            super().setup(test_mode)
+        except PointSplatError:
+            self._withdraw()
+            raise
+        except KeyboardInterrupt:
+            _interrupted(signal.SIGINT)
+        before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
+        self.callbacks.append(TrainingCallback(before, self._stop_if_asked, update_every_num_iters=1))
+
+    def train(self) -> None:
+        """As nerfstudio's, but Ctrl-C saves a checkpoint and ends ``ns-train`` with status 130. nerfstudio saves none
+        and ends with 0, as if it had finished.
+
+        Raises:
+            SystemExit: if it is interrupted.
+        """
+        with self._signals_noted():
+            try:
+                super().train()
+            except KeyboardInterrupt:
+                if self._between_steps and self.step > self._start_step:
+                    self.save_checkpoint(self.step - 1)
+                    CONSOLE.log(
+                        f"Saved after step {self.step - 1}. The scene is usable as it is; to go on: --load-dir "
+                        f"{self.checkpoint_dir}"
+                    )
+                _interrupted(self._asked or signal.SIGINT)
+
+    @contextmanager
+    def _signals_noted(self) -> Iterator[None]:
+        """While this is open, signals that would end the program end the training after its step.
+
+        Not where several processes train together: they save together, and one of them cannot stop alone.
+        """
+        numbers = []
+        if threading.current_thread() is threading.main_thread() and self.world_size == 1:
+            numbers += [signal.SIGINT] if signal.getsignal(signal.SIGINT) is signal.default_int_handler else []
+            numbers += [signal.SIGTERM] if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL else []
+        before = {number: signal.signal(number, self._note) for number in numbers}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal."""
+        first, self._asked = self._asked is None, self._asked or number
+        self._between_steps = self.training_state == "paused"
+        if not first or self.training_state != "training":
+            raise KeyboardInterrupt
+        print("stopping after this step; once more to stop at once, without saving it", file=sys.stderr)
+
+    def _stop_if_asked(self, step: int) -> None:
+        """Called before each step."""
+        if self._asked is not None:
+            self._between_steps = True
+            raise KeyboardInterrupt
+
+    def _withdraw(self) -> None:
+        config = self.base_dir / "config.yml"
+        if not config.is_file() or list(self.base_dir.iterdir()) != [config]:
+            return
+        config.unlink()
+        output_dir = Path(self.config.output_dir)
+        for folder in (self.base_dir, *self.base_dir.parents):
+            if folder == output_dir.parent or any(folder.iterdir()):
+                break
+            folder.rmdir()
+
+
+def _interrupted(number: int) -> NoReturn:
+    """End the program as a signal does, past nerfstudio, which catches KeyboardInterrupt alone."""
+    print("interrupted", file=sys.stderr)
+    sys.exit(128 + number)

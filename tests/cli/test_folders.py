@@ -1,0 +1,130 @@
+"""pointsplat compact on a folder of scenes: what it writes and says, and what it refuses."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import pointsplat_ns as ps
+from making import ball, same
+from pointsplat_ns.cli import main
+from pointsplat_ns.folders import torchrun_rank
+from pointsplat_ns.system.claims import claim
+
+
+def run(*args) -> None:
+    main([str(a) for a in args])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Two scenes."""
+    folder = tmp_path_factory.mktemp("folder") / "rooms"
+    for seed in (1, 2):
+        ps.save(ball(120 + seed, seed=seed, log_size=-1.0, opacity=1.0, bright=1.0), folder / f"room{seed}.ply")
+    return folder
+
+
+OPTIONS = ("--keep", "50%", "--effort", "instant")
+
+
+def test_every_scene_is_what_compact_makes_of_it_and_a_table_says_so(folder, capsys):
+    run("compact", folder, *OPTIONS)
+    said = capsys.readouterr().out
+    small = folder.with_name("rooms_compact")
+    for seed in (1, 2):
+        result = ps.compact(folder / f"room{seed}.ply", "50%", effort="instant")
+        assert same(ps.load(small / f"room{seed}.ply"), result.scene)
+        row = next(line for line in said.splitlines() if f"room{seed}" in line)
+        assert all(text in row for text in (f"{120 + seed}", f"{len(result.scene)}", f"{result.psnr:.1f}", "done"))
+    assert said.endswith(f"{small}: 2 of 2 scenes, and the table scenes.csv\n")
+    before = (small / "room1.ply").stat().st_mtime_ns
+    run("compact", folder, *OPTIONS, "--keep", "0.5")
+    assert capsys.readouterr().out.count("done before") == 2
+    assert (small / "room1.ply").stat().st_mtime_ns == before
+
+
+def test_a_scene_that_fails_ends_it_with_status_1_after_the_others(folder, tmp_path, capsys):
+    (tmp_path / "rooms").mkdir()
+    (tmp_path / "rooms" / "a.ply").write_bytes((folder / "room1.ply").read_bytes()[:-7])
+    (tmp_path / "rooms" / "b.ply").write_bytes((folder / "room1.ply").read_bytes())
+    with pytest.raises(SystemExit) as end:
+        run("compact", tmp_path / "rooms", "-o", tmp_path / "small", "--by", "opacity", *OPTIONS)
+    assert end.value.code == 1
+    said = capsys.readouterr()
+    assert "failed" in said.out and "truncated" in said.out and (tmp_path / "small" / "b.ply").is_file()
+    assert said.err.splitlines()[0].startswith(f"a failed: {tmp_path / 'rooms' / 'a.ply'}: truncated")
+    assert said.err.endswith("error: 1 of 2 scenes failed; the same command tries them again\n")
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (("compact", "rooms", "--picture", "a.png"), "--picture is for one scene; rooms is a folder of scenes"),
+        (("compact", "rooms", "--dry-run"), "--dry-run is for one scene"),
+        (("compact", "rooms", "--jobs", "0"), "jobs is 0; expected 1 or more"),
+        (("compact", "rooms", "--shard", "3/2"), "shard 3/2; expected 1/2 to 2/2"),
+        (("compact", "rooms", "--keep", "half"), "keep is 'half'"),
+        (("compact", "rooms", "-o", "rooms"), "rooms: holds the scenes themselves"),
+        (("compact", "rooms/room1.ply", "--jobs", "2"), "one scene; --jobs and --shard are for a folder"),
+        (("compact", "empty"), "empty: no scene below it"),
+        (("prune", "rooms"), "rooms: a folder without config.yml, so no run; expected a 3DGS .ply"),
+        (("lod", "rooms"), "of the commands, compact takes a folder of scenes"),
+    ],
+)
+def test_what_does_not_fit_a_folder_is_refused_in_one_line(words, said, folder, tmp_path, monkeypatch, capsys):
+    (tmp_path / "rooms").symlink_to(folder)
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        run(*words)
+    error = capsys.readouterr().err
+    assert end.value.code == 1 and error.startswith("error: ") and error.count("\n") == 1 and said in error
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "rooms"]
+
+
+def test_only_torchrun_sets_the_part_of_a_process(monkeypatch):
+    monkeypatch.setenv("RANK", "3")  # as some schedulers do
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
+    assert torchrun_rank() == (0, 1)
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
+    assert torchrun_rank() == (3, 4)
+
+
+INTERRUPTED = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background of a shell
+from pointsplat_ns.cli import main
+main(["compact", sys.argv[1], "-o", sys.argv[2], "--keep", "50%", "--seconds", "600", "--jobs", "2"])
+"""
+
+
+def test_ctrl_c_stops_all_processes_at_once_and_leaves_nothing_unfinished(folder, tmp_path):
+    small = tmp_path / "small"
+    process = subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTED, str(folder), str(small)],
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    locks = [small / f".room{seed}.ply.lock" for seed in (1, 2)]
+    deadline = time.monotonic() + 300
+    while not all(lock.exists() for lock in locks):
+        assert process.poll() is None and time.monotonic() < deadline, process.communicate()
+        time.sleep(0.05)
+    (small / "..room1.ply.1.part.1.part").touch()  # as if it were written just now
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130 and errors.endswith("interrupted\n"), errors
+    for lock in locks:
+        with claim(lock) as free:
+            assert free, "a process is still at work"
+    assert not list(small.rglob("*.part")) and not list(small.rglob("*.ply"))

@@ -1,0 +1,53 @@
+"""Which scenes there are below a folder."""
+
+from __future__ import annotations
+
+import pytest
+
+from making import cloud
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.io import find_runs, read_scene, write_ply
+from pointsplat_ns.io.discovery import RESULTS_NAME, find_scenes
+
+POINTS = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
+
+
+def test_files_and_the_newest_run_of_each_experiment_are_scenes_and_nothing_else_is(make_run, tmp_path, caplog):
+    folder = tmp_path / "outputs"
+    make_run("kitchen", time="2024-05-06_070809", steps=(9,))
+    newest = make_run("kitchen", method="splatfacto-cpu", time="2025-05-06_070809", steps=(19,))
+    make_run("of-another-kind", method="nerfacto")
+    write_ply(cloud(3), newest / "compact.ply")  # in the folder of a run
+    for name in ("hall.ply", "deep/er/HALL.PLY", "kitchen.ply", ".hidden/x.ply", "made/y.ply"):
+        write_ply(cloud(3), folder / name)
+    (folder / "made" / RESULTS_NAME).touch()
+    (folder / "points.ply").write_bytes(POINTS)
+    (folder / "notes.txt").touch()
+    found = {scene.name: scene.path for scene in find_scenes(folder)}
+    assert found == {
+        "deep/er/HALL": folder / "deep/er/HALL.PLY",
+        "hall": folder / "hall.ply",
+        "kitchen": folder / "kitchen.ply",
+        "kitchen-2": newest,
+    }
+    assert all(len(read_scene(path)) > 0 for path in found.values())
+    assert "passed over" in caplog.text and "points.ply" in caplog.text
+
+
+def test_a_run_is_named_by_its_experiment_wherever_the_search_begins(make_run, tmp_path):
+    run = make_run("kitchen")
+    assert [scene.name for scene in find_scenes(tmp_path)] == ["outputs/kitchen"]
+    for folder in (run.parent, run.parents[1]):
+        assert [scene.name for scene in find_scenes(folder)] == ["kitchen"]
+    assert find_runs(run)[0].folder == run
+
+
+def test_a_run_no_folder_and_a_folder_without_scenes_are_refused(make_run, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for folder, said in (
+        (make_run(), "expected a folder with scenes below it"),
+        (tmp_path / "gone", "expected a folder with scenes below it"),
+        (tmp_path / "empty", "no scene below it; expected 3DGS .ply files or trained Splatfacto runs"),
+    ):
+        with pytest.raises(SceneError, match=said):
+            find_scenes(folder)

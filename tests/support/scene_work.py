@@ -1,0 +1,28 @@
+"""What tests do to scenes of a folder, also in other processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+from pointsplat_ns.compression.scene_task import Made
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.io import read_scene
+
+
+def halve(path: Path, journal: Path) -> Made:
+    """Every other Gaussian. A line of the journal says that it was made.
+
+    A scene called ``bad...`` fails; at one called ``killed...`` its process is killed the first time, at one called
+    ``deadly...`` each time.
+    """
+    with journal.open("a") as stream:
+        stream.write(f"{path.stem}\n")
+    seen = journal.read_text().split().count(path.stem)
+    if path.stem.startswith("bad"):
+        raise SceneError(f"{path}: is bad")
+    if path.stem.startswith("deadly") or (path.stem.startswith("killed") and seen == 1):
+        os.kill(os.getpid(), signal.SIGKILL)
+    scene = read_scene(path)
+    return Made(scene[::2], len(scene), 30.0)
