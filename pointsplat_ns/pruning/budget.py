@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 
 from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.io.ply import ply_bytes
 
 WANTED = (
     "expected a ratio above 0 and up to 1.0 (such as 0.3), a percentage (30%), a whole number of Gaussians "
@@ -34,17 +35,6 @@ class WithinPsnr:
 
 
 Keep = float | int | Megabytes | WithinPsnr
-
-
-def ply_bytes(count: int, sh_degree: int) -> int:
-    """Size of the 3DGS PLY of ``count`` Gaussians, bytes: an ASCII header, then 17 numbers a Gaussian (normals
-    included) and three for each SH coefficient beyond the constant one, as float32."""
-    rest = 3 * ((sh_degree + 1) ** 2 - 1)
-    names = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest))]
-    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [f"property float {name}" for name in names] + ["end_header"]
-    return sum(len(line) + 1 for line in lines) + 4 * len(names) * count
 
 
 def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3) -> int:
