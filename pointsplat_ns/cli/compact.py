@@ -12,9 +12,11 @@ from pointsplat_ns.cli.scene_options import (
     Output,
     Scene,
     check_outputs,
+    in_format_of,
     output_beside,
     print_distributions,
     print_result,
+    warn_if_larger,
 )
 
 
@@ -39,9 +41,9 @@ def compact(
     out. Views are the poses of the run's dataset if it is found, else sampled in free space.
 
     Args:
-        scene: a 3DGS .ply, a Splatfacto checkpoint, or a run (its folder or config.yml).
-        output: the .ply to write; by default beside the scene: room_compact.ply for room.ply, compact.ply in the folder
-            of a run.
+        scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
+        output: the file to write, of any format as for prune; by default beside the scene: room_compact.ply for
+            room.ply, compact.ply in the folder of a run.
         keep: how much, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before refinement. By default
             what the refiner was trained with.
         refiner: a trained pointsplat run (its folder or config.yml), or a .safetensors file; by default the refiner
@@ -62,6 +64,7 @@ def compact(
 
     output = output or output_beside(scene, "compact")
     check_outputs(None if dry_run else output, picture, force)
+    keep = None if keep is None else in_format_of(keep, output)
     trained = ps.load_refiner(refiner)
     resolve_options(trained, keep, by, sh)
     RepairBudget(effort, seconds)
@@ -70,7 +73,8 @@ def compact(
         dense, keep, trained, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds, views=scene, progress=True
     )
     if not dry_run:
-        ps.save(result.scene, output)
+        ps.save(result.scene, output, progress=True)
+        warn_if_larger(keep, output)
     what = "kept" + (" and refined" if result.accepted else "") + (" and repaired" if result.repair_accepted else "")
     print_result(what, len(dense), result.scene, result.seconds, None if dry_run else output)
     print_distributions(dense, result.scene)

@@ -183,7 +183,9 @@ def _num_rest(vertex: Element, path: Path) -> int:
     if "packed_position" in present:
         raise SceneError(f"{path}: a compressed PLY (property 'packed_position'); expected a plain one")
     if {*_SCALES[:2], *_OPACITY} <= present and _SCALES[2] not in present:
-        raise SceneError(f"{path}: 2D Gaussians (2DGS): no property 'scale_2'; expected 3D Gaussians")
+        raise SceneError(
+            f"{path}: lacks the vertex property 'scale_2', as 2D Gaussians (2DGS) do; expected a 3DGS PLY of 3D Gaussians"
+        )
     rest = sorted(int(name[7:]) for name in present if re.fullmatch(r"f_rest_(0|[1-9]\d{0,5})", name))
     required = [*_MEANS, *_DC, *_OPACITY, *_SCALES, *_QUATS]
     counts = [3 * ((degree + 1) ** 2 - 1) for degree in _FILE_DEGREES]

@@ -10,14 +10,11 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable, require_file
 from pointsplat_ns.io.formats import READABLE, format_to_read, format_to_write
-from pointsplat_ns.io.runs import CONFIG_NAME, open_run
+from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, open_run
 from pointsplat_ns.io.splatfacto import read_checkpoint
 from pointsplat_ns.system.progress import Progress, progress_bar
 
 ACCEPTED = f"a scene ({READABLE}), a Splatfacto .ckpt, or a Splatfacto run (its folder or config.yml)"
-
-RUN_SUFFIXES = (".ckpt", ".yml", ".yaml")
-"""Of files that belong to a run. A folder may be one, too; every other file holds nothing but a scene."""
 
 
 def read_scene(path: Path | str) -> Gaussians:

@@ -9,8 +9,21 @@ from pointsplat_ns.io.formats.registry import (
     READABLE,
     WRITABLE,
     Format,
+    format_named,
     format_to_read,
     format_to_write,
 )
+from pointsplat_ns.io.formats.sog_images import META as SOG_META
+from pointsplat_ns.io.formats.sog_images import PARTS as SOG_PARTS
 
-__all__ = ["FORMATS", "READABLE", "WRITABLE", "Format", "format_to_read", "format_to_write"]
+__all__ = [
+    "FORMATS",
+    "READABLE",
+    "SOG_META",
+    "SOG_PARTS",
+    "WRITABLE",
+    "Format",
+    "format_named",
+    "format_to_read",
+    "format_to_write",
+]

@@ -77,14 +77,14 @@ def read_ksplat(path: Path | str) -> Gaussians:
         data = load_bytes(path)
         if len(data) < _HEADER:
             raise SceneError(f"{path}: truncated; a .ksplat header has {_HEADER} bytes, found {len(data)}")
-        major, minor, room, used, total, compression = struct.unpack_from("<BB2xII4xIH", data)
+        major, minor, room, total, compression = struct.unpack_from("<BB2xI8xIH", data)
         if major != 0 or minor < 1 or compression > 2:
             raise SceneError(
                 f"{path}: .ksplat of version {major}.{minor}, compression {compression}; expected 0.1 and 0 to 2"
             )
-        if used > room or _HEADER + room * _SECTION > len(data):
+        if _HEADER + room * _SECTION > len(data):
             raise SceneError(f"{path}: truncated; {room} sections declared in {len(data)} bytes")
-        sections = [_section(data, index, compression, path) for index in range(used)]
+        sections = [_section(data, index, compression, path) for index in range(room)]
         if sum(section.count for section in sections) != total:
             found = sum(section.count for section in sections)
             raise SceneError(f"{path}: {total} Gaussians declared, {found} in its sections")

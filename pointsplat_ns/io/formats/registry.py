@@ -40,6 +40,11 @@ class Format:
     encode: Callable[[Gaussians, Progress], bytes] | None = None
     """The bytes of a file of a scene, where only they tell its size."""
 
+    @property
+    def budget_suffix(self) -> str:
+        """What follows a size in a budget, such as ``.spz`` in 5MB.spz."""
+        return self.suffix if self.suffix.startswith(".") else ".sog"
+
     def fits(self, path: Path) -> bool:
         """Whether a file's name is one of this format."""
         name = path.name.lower()
