@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import torch
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
-from pointsplat_ns.io.files import keep_usable, logger, require_file
+from pointsplat_ns.io.files import keep_usable, logger, replacing, require_file
 from pointsplat_ns.io.formats.coding import (
     Array,
     Blocks,
@@ -131,6 +132,17 @@ def encode_spz(scene: Gaussians, progress: Progress = silent, version: Version =
     head += struct.pack("<I12x", _HEADER_4)
     table = b"".join(struct.pack("<QQ", len(s), len(p)) for s, p in zip(streams, parts, strict=True))
     return b"".join([head, table, *streams])
+
+
+def write_spz(scene: Gaussians, path: Path | str, progress: Progress = silent, version: Version = 3) -> None:
+    """Write an SPZ file, as :func:`encode_spz` makes it. Gaussians that cannot be drawn are left out.
+
+    Raises:
+        SceneError: if it cannot be written, or the scene is too large for the format.
+    """
+    data = encode_spz(keep_usable(scene.detach().to("cpu", torch.float32), path), progress, version)
+    with replacing(path) as part:
+        part.write_bytes(data)
 
 
 def _head(data: bytes, path: Path) -> _Head:
