@@ -54,6 +54,8 @@ def convert(
             write_spz(after, output, report, spz_version)
     else:
         ps.save(after, output, progress=True)
-    degree = f"SH degree {before.sh_degree}" + (f" cut to {after.sh_degree}" if after.sh_degree < before.sh_degree else "")
+    degree = f"SH degree {before.sh_degree}" + (
+        f" cut to {after.sh_degree}" if after.sh_degree < before.sh_degree else ""
+    )
     size = file_bytes(output) / 1e6
     print(f"{output}: {len(after):,} Gaussians, {degree}, {size:.2f} MB, in {time.perf_counter() - start:.1f} s")

@@ -98,7 +98,9 @@ def frame_of(run: Run) -> Similarity:
     size = float(torch.linalg.det(linear).abs()) ** (1 / 3)
     matrix = linear / size if size > 0 else linear
     if not size > 0 or float((matrix @ matrix.T - torch.eye(3)).abs().max()) > _ORTHOGONAL:
-        raise SceneError(f"{run.folder}: its transform is no rotation with one scale, so the scene cannot be moved by it")
+        raise SceneError(
+            f"{run.folder}: its transform is no rotation with one scale, so the scene cannot be moved by it"
+        )
     u, _, v = torch.linalg.svd(matrix)
     return Similarity(u @ v, size * run.scale, run.transform[:, 3].double() * run.scale)
 

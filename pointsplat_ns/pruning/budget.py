@@ -125,7 +125,9 @@ def _that_fit(n: int, keep: Megabytes, sh_degree: int) -> int:
     """How many of ``n`` Gaussians fit into a file."""
     bytes_of, limit = keep.bytes_of, check_size(keep, n)
     if bytes_of is None:
-        raise BudgetError(f"keep is {keep}, which is found by writing; expected a ratio, a count or the size of a .ply here")
+        raise BudgetError(
+            f"keep is {keep}, which is found by writing; expected a ratio, a count or the size of a .ply here"
+        )
     # The size grows with the count, if not evenly: headers hold its digits, and chunks are begun.
     count = bisect.bisect_right(range(1, n + 1), limit, key=lambda count: bytes_of(count, sh_degree))
     if count < 1:

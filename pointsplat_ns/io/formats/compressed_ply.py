@@ -112,7 +112,7 @@ def encode_compressed_ply(scene: Gaussians, progress: Progress = silent) -> byte
         _pack(shares[1], _BITS_3),
         _pack(shares[2], _BITS_4[:3]) | opacity,
     )
-    rest = scene.features_rest.transpose(1, 2).reshape(n, -1).double().numpy()
+    rest = scene.features_rest.transpose(1, 2).flatten(1).double().numpy()
     sh = np.clip(np.floor((rest / _SH_RANGE + 0.5) * _SH_STEPS), 0, _SH_STEPS - 1).astype(np.uint8)
     packed = np.stack(words, axis=1).astype("<u4")
     return b"".join((_header_text(n, rest.shape[1]), chunks.tobytes(), packed.tobytes(), sh.tobytes()))

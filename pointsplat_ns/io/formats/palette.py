@@ -20,6 +20,7 @@ _SAMPLE = 1 << 17
 """Numbers that a codebook is made from, and rows that the first split of a palette is made from."""
 
 _STEPS_1D, _STEPS = 20, 6
+_BINS, _PER_BIN = (64, 4096), 16
 _BLOCK = 1 << 22  # distances computed at once, 16 MB
 
 
@@ -35,19 +36,36 @@ def codebook(values: Tensor) -> tuple[Tensor, Tensor]:
     flat = values.flatten()
     if not flat.numel():
         return torch.zeros(LEVELS), torch.zeros(values.shape, dtype=torch.uint8)
-    ordered = flat[:: -(-flat.numel() // _SAMPLE)].sort().values
-    ordered = torch.cat([flat.amin()[None], ordered, flat.amax()[None]])
-    # Half by rank, half by value, so that neither the many nor the extremes go without.
-    ranks = torch.linspace(0, len(ordered) - 1, LEVELS // 2).round().long()
-    book = torch.cat([ordered[ranks], torch.linspace(float(ordered[0]), float(ordered[-1]), LEVELS // 2)])
-    book = book.sort().values
-    for _ in range(_STEPS_1D):
-        index = _nearest(book, ordered)
-        count = torch.bincount(index, minlength=LEVELS)
-        total = torch.zeros(LEVELS, dtype=torch.float64).index_add_(0, index, ordered.double())
-        book = torch.where(count > 0, (total / count.clamp_min(1)).float(), book).sort().values
-    book[0], book[-1] = ordered[0], ordered[-1]
+    book = _distinct(flat)
+    if book is None:
+        ordered = torch.cat([flat[:: -(-flat.numel() // _SAMPLE)], flat.amin()[None], flat.amax()[None]])
+        book = _spread(ordered)
+        for _ in range(_STEPS_1D):
+            index = _nearest(book, ordered)
+            count = torch.bincount(index, minlength=LEVELS)
+            total = torch.zeros(LEVELS, dtype=torch.float64).index_add_(0, index, ordered.double())
+            book = torch.where(count > 0, (total / count.clamp_min(1)).float(), book).sort().values
     return book, _nearest(book, flat).to(torch.uint8).reshape(values.shape)
+
+
+def _distinct(values: Tensor) -> Tensor | None:
+    """The values themselves, if no more than 256 of them differ; the last is repeated."""
+    distinct = values[: 2 * LEVELS].unique()
+    distinct = distinct if len(distinct) > LEVELS else values.unique()
+    return distinct[torch.arange(LEVELS).clamp_max(len(distinct) - 1)] if len(distinct) <= LEVELS else None
+
+
+def _spread(values: Tensor) -> Tensor:
+    """256 numbers as dense as the cube root of the density of the values, which is best for the mean squared error where
+    numbers are many (Panter and Dite 1951)."""
+    low, high = float(values.amin()), float(values.amax())
+    bins = min(max(values.numel() // _PER_BIN, _BINS[0]), _BINS[1])
+    density = torch.histc(values, bins, low, high).double().pow(1 / 3)
+    below = torch.cat([density.new_zeros(1), density.cumsum(0)])
+    wanted = (torch.arange(LEVELS, dtype=torch.float64) + 0.5) / LEVELS * below[-1]
+    bin_ = (torch.searchsorted(below, wanted) - 1).clamp(0, bins - 1)
+    within = (wanted - below[bin_]) / density[bin_].clamp_min(1e-12)
+    return (low + (high - low) * (bin_ + within) / bins).float()
 
 
 def _nearest(book: Tensor, values: Tensor) -> Tensor:

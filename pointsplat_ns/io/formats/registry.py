@@ -6,16 +6,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from torch import Tensor
+
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import replacing
+from pointsplat_ns.io.formats.coding import morton_order
 from pointsplat_ns.io.formats.compressed_ply import compressed_ply_bytes, encode_compressed_ply, is_compressed
 from pointsplat_ns.io.formats.compressed_ply import read_compressed_ply
 from pointsplat_ns.io.formats.glb import encode_glb, glb_bytes
 from pointsplat_ns.io.formats.ksplat import read_ksplat
 from pointsplat_ns.io.formats.sog import encode_sog, read_sog, write_sog_folder
 from pointsplat_ns.io.formats.sog_images import META
-from pointsplat_ns.io.formats.splat import encode_splat, read_splat, splat_bytes
+from pointsplat_ns.io.formats.splat import drawing_order, encode_splat, read_splat, splat_bytes
 from pointsplat_ns.io.formats.spz import encode_spz, read_spz
 from pointsplat_ns.io.ply import ply_bytes, read_ply, write_ply
 from pointsplat_ns.io.ply_header import read_header
@@ -39,6 +42,8 @@ class Format:
     """Exact size of a file, bytes, by the number of Gaussians and their SH degree; None if it depends on the scene."""
     encode: Callable[[Gaussians, Progress], bytes] | None = None
     """The bytes of a file of a scene, where only they tell its size."""
+    order: Callable[[Gaussians], Tensor] | None = None
+    """Indices (N,) of a scene's Gaussians in the order in which they are written, if that is another."""
 
     @property
     def budget_suffix(self) -> str:
@@ -73,17 +78,17 @@ FORMATS = (
     # Longer ends of names come before those that they end with.
     Format(
         "compressed PLY", ".compressed.ply", _read_any_ply, _writer(encode_compressed_ply), (b"ply\n", b"ply\r"),
-        compressed_ply_bytes,
+        compressed_ply_bytes, order=morton_order,
     ),
     Format(
         "3DGS PLY", ".ply", _read_any_ply, lambda scene, path, _: write_ply(scene, path), (b"ply\n", b"ply\r"),
         ply_bytes,
     ),
     Format("SPZ", ".spz", read_spz, _writer(encode_spz), (b"\x1f\x8b", b"NGSP"), encode=encode_spz),
-    Format("SOG", ".sog", read_sog, _writer(encode_sog), (b"PK\x03\x04",), encode=encode_sog),
-    Format("SOG folder", META, read_sog, write_sog_folder, encode=encode_sog),
+    Format("SOG", ".sog", read_sog, _writer(encode_sog), (b"PK\x03\x04",), encode=encode_sog, order=morton_order),
+    Format("SOG folder", META, read_sog, write_sog_folder, encode=encode_sog, order=morton_order),
     Format("ksplat", ".ksplat", read_ksplat),
-    Format("splat", ".splat", read_splat, _writer(encode_splat), bytes_of=splat_bytes),
+    Format("splat", ".splat", read_splat, _writer(encode_splat), bytes_of=splat_bytes, order=drawing_order),
     Format("glTF", ".glb", write=_writer(encode_glb), bytes_of=glb_bytes),
 )  # fmt: skip
 """All formats of files that hold nothing but a scene."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -67,8 +68,14 @@ def splat_bytes(count: int, sh_degree: int) -> int:
     return _ROW.itemsize * count
 
 
+def drawing_order(scene: Gaussians) -> Tensor:
+    """Indices (N,): the largest and most opaque Gaussians first, as viewers draw while they load."""
+    weight = scene.scales.double().clamp(-20, 20).sum(dim=1).exp() * scene.alphas
+    return weight.argsort(descending=True, stable=True)
+
+
 def encode_splat(scene: Gaussians, progress: Progress = silent) -> bytes:
-    """The bytes of a ``.splat`` file: the largest and most opaque Gaussians first, as viewers draw while they load.
+    """The bytes of a ``.splat`` file, in :func:`drawing_order`.
 
     SH beyond the constant coefficient have no place in it; that they are left out is logged.
 
@@ -77,9 +84,10 @@ def encode_splat(scene: Gaussians, progress: Progress = silent) -> bytes:
         progress: not called.
     """
     if scene.sh_degree:
-        logger.warning(".splat holds no SH: degree %d is left out, colours no longer change with the view", scene.sh_degree)
-    weight = scene.scales.clamp(-20, 20).sum(dim=1).exp() * scene.alphas
-    scene = scene[weight.argsort(descending=True, stable=True)]
+        logger.warning(
+            ".splat holds no SH: degree %d is left out, colours no longer change with the view", scene.sh_degree
+        )
+    scene = scene[drawing_order(scene)]
     rows = np.empty(len(scene), _ROW)
     rows["means"] = scene.means.numpy()
     rows["stds"] = scene.stds.numpy()

@@ -186,7 +186,9 @@ def _parts_of_zstd(data: bytes, path: Path) -> tuple[_Head, list[bytes | memoryv
     sizes = [size for size in head.sizes if size]
     table = int(Blocks(data, path, _HEADER.size).take("<u4", 1)[0])
     if head.streams != len(sizes) or table < _HEADER_4:
-        raise SceneError(f"{path}: {head.streams} streams listed at byte {table}; expected {len(sizes)} from byte 32 on")
+        raise SceneError(
+            f"{path}: {head.streams} streams listed at byte {table}; expected {len(sizes)} from byte 32 on"
+        )
     blocks = Blocks(data, path, table)
     lengths = blocks.take("<u8", len(sizes), 2).tolist()
     parts: list[bytes | memoryview] = []
@@ -251,7 +253,9 @@ def _fraction_bits(scene: Gaussians) -> int:
     farthest = float(scene.means.abs().max()) if len(scene) else 0.0
     fitting = math.floor(math.log2((2**23 - 1) / farthest)) if farthest > 0 else FRACTION_BITS
     if fitting < 0:
-        raise SceneError(f"a Gaussian lies {farthest:.3g} units from the origin; SPZ reaches to {2**23 - 1}; scale the scene down")
+        raise SceneError(
+            f"a Gaussian lies {farthest:.3g} units from the origin; SPZ reaches to {2**23 - 1}; scale the scene down"
+        )
     if fitting < FRACTION_BITS:
         logger.warning("SPZ: the scene reaches to %.3g units, so positions are rounded to %g", farthest, 2.0**-fitting)
     return min(fitting, FRACTION_BITS)
