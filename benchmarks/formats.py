@@ -25,10 +25,13 @@ import pointsplat_ns as ps
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.geometry.quaternions import zero_as_identity
 from pointsplat_ns.io.formats import format_to_write
-from pointsplat_ns.io.formats.spz import write_spz
+from pointsplat_ns.io.formats.spz import SH_BITS, write_spz
 
 VIEWS, SEED = 12, 1
-WRITTEN = ("a.ply", "a.compressed.ply", "a.spz", "v4.spz", "a.sog", "a.splat")
+SPZ_4 = {"v4.spz": SH_BITS, "coarse.spz": (5, 4), "fine.spz": (8, 8)}
+"""Bits of SH of the files of version 4; the format's own programs keep 5 and 4."""
+
+WRITTEN = ("a.ply", "a.compressed.ply", "a.spz", *SPZ_4, "a.sog", "a.splat")
 OF_SPLAT_TRANSFORM = ("a.compressed.ply", "a.spz", "a.sog")
 
 
@@ -61,7 +64,8 @@ def measure(scene: ps.Gaussians, name: str, peer: Path | None) -> Iterator[Row]:
             back = ps.load(path)
             reading = time.perf_counter() - start
             ordered = scene if kind.order is None else scene[kind.order(scene)]
-            label = kind.name + (" 4" if file == "v4.spz" else " 3" if kind.suffix == ".spz" else "")
+            bits = SPZ_4.get(file)
+            label = f"SPZ 4, SH of {bits[0]} and {bits[1]} bits" if bits else f"{kind.name}{' 3' * (file == 'a.spz')}"
             yield row(name, label, path, seconds, reading, reference.psnr(back)[0], errors(ordered, back))
         for file in OF_SPLAT_TRANSFORM if peer is not None else ():
             path = Path(folder) / f"peer_{file}"
@@ -72,9 +76,9 @@ def measure(scene: ps.Gaussians, name: str, peer: Path | None) -> Iterator[Row]:
 
 
 def save(scene: ps.Gaussians, path: Path) -> None:
-    """Write a file; ``v4.spz`` in version 4."""
-    if path.name == "v4.spz":
-        write_spz(scene, path, version=4)
+    """Write a file; those in :data:`SPZ_4` in version 4."""
+    if path.name in SPZ_4:
+        write_spz(scene, path, version=4, sh_bits=SPZ_4[path.name])
     else:
         ps.save(scene, path)
 

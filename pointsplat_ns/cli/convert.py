@@ -19,6 +19,7 @@ def convert(
     scale: float = 1.0,
     original_frame: bool = False,
     spz_version: Literal[3, 4] = 3,
+    spz_sh_bits: tuple[int, int] = (6, 5),
     force: bool = False,
 ) -> None:
     """Write a scene in another format. What each format keeps and loses stands in docs/formats.md.
@@ -36,6 +37,8 @@ def convert(
         scale: factor on positions and sizes.
         original_frame: of a Splatfacto run: undo the turn, shift and scale that nerfstudio gave its data.
         spz_version: of an .spz file. 4 is newer, and fewer viewers read it.
+        spz_sh_bits: of an .spz file: bits of SH coefficients, of degree 1 and of the others, up to 8. More bits are a
+            larger file and a better picture.
         force: overwrite an existing file.
     """
     import pointsplat_ns as ps
@@ -51,11 +54,10 @@ def convert(
     after = ps.place(after, up, scale, scene if original_frame else None)
     if format_to_write(output).suffix == ".spz":
         with progress_bar() as report:
-            write_spz(after, output, report, spz_version)
+            write_spz(after, output, report, spz_version, spz_sh_bits)
     else:
         ps.save(after, output, progress=True)
-    degree = f"SH degree {before.sh_degree}" + (
-        f" cut to {after.sh_degree}" if after.sh_degree < before.sh_degree else ""
-    )
+    cut = f" cut to {after.sh_degree}" if after.sh_degree < before.sh_degree else ""
+    degree = f"SH degree {before.sh_degree}{cut}"
     size = file_bytes(output) / 1e6
     print(f"{output}: {len(after):,} Gaussians, {degree}, {size:.2f} MB, in {time.perf_counter() - start:.1f} s")

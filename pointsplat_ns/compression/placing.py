@@ -98,9 +98,7 @@ def frame_of(run: Run) -> Similarity:
     size = float(torch.linalg.det(linear).abs()) ** (1 / 3)
     matrix = linear / size if size > 0 else linear
     if not size > 0 or float((matrix @ matrix.T - torch.eye(3)).abs().max()) > _ORTHOGONAL:
-        raise SceneError(
-            f"{run.folder}: its transform is no rotation with one scale, so the scene cannot be moved by it"
-        )
+        raise SceneError(f"{run.folder}: its transform is no rotation with one scale; expected what nerfstudio saves")
     u, _, v = torch.linalg.svd(matrix)
     return Similarity(u @ v, size * run.scale, run.transform[:, 3].double() * run.scale)
 
@@ -120,7 +118,7 @@ def _axis(text: str) -> Tensor:
 
 
 def _turn(start: Tensor, end: Tensor) -> Tensor:
-    """The smallest rotation (3, 3) that turns one direction to another; half a turn about an axis if they are opposite."""
+    """The smallest rotation (3, 3) that turns one direction to another; one of many if they are opposite."""
     cosine = float(start @ end)
     if cosine < -1 + 1e-12:
         side = torch.linalg.cross(start, torch.eye(3, dtype=torch.float64)[int(start.abs().argmin())])

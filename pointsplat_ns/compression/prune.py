@@ -114,7 +114,7 @@ def prune_scene(
             f"{len(compared)} views; {len(search.tried)} counts tried"
         )
     elif isinstance(keep, Megabytes) and found_by_trying(keep):
-        kind, limit = format_to_write(f"a{keep.suffix}"), check_size(keep, len(dense))
+        kind, limit = format_to_write(keep.suffix), check_size(keep, len(dense))
         found = largest_within(start, make, kind, limit, functools.partial(progress, "trying counts"))
         scene = found.scene
         notes.append(f"as {kind.name} {found.size / 1e6:.2f} MB; {len(found.tried)} counts tried")

@@ -37,9 +37,10 @@ _FILE_DEGREES = (0, 1, 2, 3, 4)
 def read_ply(path: Path | str) -> Gaussians:
     """Read a 3DGS PLY: binary of either byte order, or ASCII; properties in any order and of any type.
 
-    The SH degree follows from the number of ``f_rest`` properties; of degree 4, the bands up to 3 are read. Other properties and elements, and bytes after the
-    last element, are not read; a warning says so. Gaussians that cannot be drawn (NaN, or Inf where it is not valid)
-    are dropped, and their number is logged; all-zero rows are kept (a zero quaternion is the identity).
+    The SH degree follows from the number of ``f_rest`` properties; of degree 4, the bands up to 3 are read. Other
+    properties and elements, and bytes after the last element, are not read; a warning says so. Gaussians that cannot be
+    drawn (NaN, or Inf where it is not valid) are dropped, and their number is logged; all-zero rows are kept (a zero
+    quaternion is the identity).
 
     Args:
         path: the file.
@@ -184,7 +185,7 @@ def _num_rest(vertex: Element, path: Path) -> int:
         raise SceneError(f"{path}: a compressed PLY (property 'packed_position'); expected a plain one")
     if {*_SCALES[:2], *_OPACITY} <= present and _SCALES[2] not in present:
         raise SceneError(
-            f"{path}: lacks the vertex property 'scale_2', as 2D Gaussians (2DGS) do; expected a 3DGS PLY of 3D Gaussians"
+            f"{path}: lacks the vertex property 'scale_2', as 2D Gaussians (2DGS) do; expected 3D Gaussians"
         )
     rest = sorted(int(name[7:]) for name in present if re.fullmatch(r"f_rest_(0|[1-9]\d{0,5})", name))
     required = [*_MEANS, *_DC, *_OPACITY, *_SCALES, *_QUATS]

@@ -1,5 +1,6 @@
 """Making a scene smaller: pruning methods, budgets, SH bands."""
 
+from pointsplat_ns.io.ply import ply_bytes
 from pointsplat_ns.pruning.budget import (
     AUTO_PSNR,
     Keep,
@@ -8,7 +9,6 @@ from pointsplat_ns.pruning.budget import (
     check_size,
     found_by_trying,
     parse_keep,
-    ply_bytes,
     resolve_keep,
 )
 from pointsplat_ns.pruning.methods import METHODS, Method, PruneSettings, method_named, need_usable, prune, score_of

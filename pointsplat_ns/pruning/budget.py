@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 
 from pointsplat_ns.errors import BudgetError
-from pointsplat_ns.io.formats.registry import WRITABLE, format_named
-from pointsplat_ns.io.ply import ply_bytes
+from pointsplat_ns.io.formats.registry import WRITABLE, format_named, format_to_write
 
 WANTED = (
     "expected a ratio above 0 and up to 1.0 (such as 0.3), a percentage (30%), a whole number of Gaussians "
@@ -31,17 +30,15 @@ class Megabytes:
     suffix: str = ".ply"
     """Of the format that is counted."""
 
-    @property
-    def bytes_of(self) -> Callable[[int, int], int] | None:
-        """Size of a file, bytes, by count and SH degree; None if only writing a scene tells it.
-
-        Raises:
-            BudgetError: if no format that is written has this suffix.
-        """
+    def __post_init__(self) -> None:
         kind = format_named(self.suffix)
         if kind is None or kind.write is None:
             raise BudgetError(f"keep is the size of a {self.suffix} file; expected one of {WRITABLE}")
-        return kind.bytes_of
+
+    @property
+    def bytes_of(self) -> Callable[[int, int], int] | None:
+        """Size of a file, bytes, by count and SH degree; None if only writing a scene tells it."""
+        return format_to_write(self.suffix).bytes_of
 
     def __str__(self) -> str:
         return f"{self.value:g}MB" + (self.suffix if self.suffix != ".ply" else "")
@@ -139,8 +136,8 @@ def _that_fit(n: int, keep: Megabytes, sh_degree: int) -> int:
 
 
 def parse_keep(text: str) -> Keep:
-    """Parse a budget: ``0.3`` and ``30%`` are ratios, ``50000`` is a count, ``12MB`` and ``12MB.spz`` are sizes, ``auto`` and
-    ``auto:35`` are the PSNR (dB) that renders must reach against the dense scene's own.
+    """Parse a budget: ``0.3`` and ``30%`` are ratios, ``50000`` is a count, ``12MB`` and ``12MB.spz`` are sizes,
+    ``auto`` and ``auto:35`` are the PSNR (dB) that renders must reach against the dense scene's own.
 
     Raises:
         BudgetError: if it is none of these. The range of a ratio, count or size is checked by :func:`resolve_keep`.
@@ -159,9 +156,7 @@ def parse_keep(text: str) -> Keep:
                 raise ValueError
             return WithinPsnr(psnr)
         if size := re.fullmatch(r"(.*)[mM][bB](\.\S+)?", text):
-            keep = Megabytes(float(size[1]), (size[2] or ".ply").lower())
-            keep.bytes_of  # refuses a format that is not written
-            return keep
+            return Megabytes(float(size[1]), (size[2] or ".ply").lower())
         if text.endswith("%"):
             return float(text[:-1]) / 100
         return int(text) if text.lstrip("+-").isdigit() else float(text)

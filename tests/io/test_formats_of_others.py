@@ -1,5 +1,7 @@
-"""Files that splat-transform writes and reads, both ways. It is a Node package; ``POINTSPLAT_SPLAT_TRANSFORM`` names the
-program where it is not on the path."""
+"""Files that splat-transform writes and reads, both ways.
+
+It is a Node package; ``POINTSPLAT_SPLAT_TRANSFORM`` names the program where it is not on the path.
+"""
 
 from __future__ import annotations
 

@@ -151,19 +151,19 @@ def _check(header: Header, chunk: Element, vertex: Element, sh: Element | None, 
         raise SceneError(f"{path}: {chunk.count} chunks for {vertex.count} Gaussians; expected {wanted}")
     rest = 0
     if sh is not None:
-        names = [f"f_rest_{i}" for i in range(len(sh.properties))]
-        bad = [prop for prop, kind in sh.properties if kind != "uint8" or prop not in names]
-        if bad or sh.count != vertex.count or len(names) % 3:
+        expected = [f"f_rest_{i}" for i in range(len(sh.properties))]
+        bad = [prop for prop, kind in sh.properties if kind != "uint8" or prop not in expected]
+        if bad or sh.count != vertex.count or len(expected) % 3:
             raise SceneError(
-                f"{path}: element 'sh' has {sh.count} rows of {len(names)} properties; expected {vertex.count} rows of "
-                "f_rest_0, f_rest_1, ... of type uchar"
+                f"{path}: element 'sh' has {sh.count} rows of {len(expected)} properties; expected {vertex.count} rows "
+                "of f_rest_0, f_rest_1, ... of type uchar"
             )
-        rest = len(names) // 3
+        rest = len(expected) // 3
         sh_degree_of(rest)
     size = header.size + sum(element.count * element.row_bytes for element in header.elements)
     if size > path.stat().st_size:
         raise SceneError(
-            f"{path}: truncated; the header declares {vertex.count} Gaussians, {size} bytes; found {path.stat().st_size}"
+            f"{path}: truncated; {vertex.count} Gaussians declared, {size} bytes; found {path.stat().st_size}"
         )
     return rest
 

@@ -1,7 +1,7 @@
 """glTF with ``KHR_gaussian_splatting``, as a binary ``.glb``: uncompressed, written only.
 
-Each attribute is a float32 array of its own, sizes and opacities not as logarithms and logits. The extension is a review
-draft of Khronos. Colours as bytes are added for programs that know only points.
+Each attribute is a float32 array of its own, sizes and opacities not as logarithms and logits. The extension is a
+review draft of Khronos. Colours as bytes are added for programs that know only points.
 """
 
 from __future__ import annotations
@@ -37,10 +37,12 @@ def encode_glb(scene: Gaussians, progress: Progress = silent) -> bytes:
         progress: not called.
     """
     arrays = _attributes(scene)
-    views, accessors, offset = [], [], 0
+    views: list[dict[str, object]] = []
+    accessors: list[dict[str, object]] = []
+    offset = 0
     for name, array in arrays.items():
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": _ARRAY_BUFFER})
-        accessor: dict[str, object] = {
+        accessor = {
             "bufferView": len(accessors),
             "componentType": _BYTE if array.dtype == np.uint8 else _FLOAT,
             "count": len(array),

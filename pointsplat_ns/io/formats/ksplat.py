@@ -1,8 +1,8 @@
 """``.ksplat`` files of mkkellogg's viewer, read only.
 
-A header, a header for each section, and in each section rows of one length. At compression 1 and 2, positions are 16-bit
-numbers about the centre of a bucket of Gaussians, sizes and quaternions are half precision, and SH are half precision
-or bytes.
+A header, a header for each section, and in each section rows of one length. At compression 1 and 2, positions are
+16-bit numbers about the centre of a bucket of Gaussians, sizes and quaternions are half precision, and SH are half
+precision or bytes.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def _section(data: bytes, index: int, compression: int, path: Path) -> _Section:
         )
     if compression and (buckets != full + partial or full * size > count or stored != 12):
         raise SceneError(
-            f"{path}: {buckets} buckets of {stored} bytes, {full} full and {partial} partly; expected buckets of 12 bytes"
+            f"{path}: {buckets} buckets of {stored} bytes, {full} full and {partial} partly; expected 12 bytes each"
         )
     return _Section(count, capacity, size, buckets, block, stored, steps or _STEPS[compression], full, partial, degree)
 
@@ -128,7 +128,7 @@ def _decode(
         ]
     )
     rows = blocks.take(row, section.capacity)[: section.count]
-    means = rows["means"].astype(np.float32)
+    means = rows["means"].astype(np.float64)
     if compression and section.count:
         of = np.repeat(
             np.arange(section.buckets),

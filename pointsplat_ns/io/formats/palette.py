@@ -20,6 +20,7 @@ _SAMPLE = 1 << 17
 """Numbers that a codebook is made from, and rows that the first split of a palette is made from."""
 
 _STEPS_1D, _STEPS = 20, 6
+_BRANCH, _DEPTH = 64, 6  # clusters that rows are split into, and how often
 _BINS, _PER_BIN = (64, 4096), 16
 _BLOCK = 1 << 22  # distances computed at once, 16 MB
 
@@ -56,8 +57,8 @@ def _distinct(values: Tensor) -> Tensor | None:
 
 
 def _spread(values: Tensor) -> Tensor:
-    """256 numbers as dense as the cube root of the density of the values, which is best for the mean squared error where
-    numbers are many (Panter and Dite 1951)."""
+    """256 numbers as dense as the cube root of the density of the values, which is best for the mean squared error
+    where numbers are many (Panter and Dite 1951)."""
     low, high = float(values.amin()), float(values.amax())
     bins = min(max(values.numel() // _PER_BIN, _BINS[0]), _BINS[1])
     density = torch.histc(values, bins, low, high).double().pow(1 / 3)
@@ -74,7 +75,7 @@ def _nearest(book: Tensor, values: Tensor) -> Tensor:
 
 
 def palette_size(count: int) -> int:
-    """Entries of the palette for so many Gaussians: a power of two of thousands, at most as many as an index reaches."""
+    """Entries of the palette for so many Gaussians: a power of two, at most what an index reaches."""
     size = GROUP
     while 2 * size <= min(count, MAX_COLORS):
         size *= 2
@@ -82,8 +83,8 @@ def palette_size(count: int) -> int:
 
 
 def palette(rows: Tensor, progress: Callable[[float], None]) -> tuple[Tensor, Tensor]:
-    """Rows that stand for many, by k-means in two levels: rows are split into clusters, and each cluster into its share
-    of the palette. That takes a fraction of the time of k-means with as many clusters at once.
+    """Rows that stand for many, by k-means in levels: rows are split into clusters, each gets its share of the palette,
+    and is split in turn. That takes a small part of the time of k-means with as many clusters at once.
 
     Args:
         rows: (N, D) float32, finite.
@@ -96,27 +97,46 @@ def palette(rows: Tensor, progress: Callable[[float], None]) -> tuple[Tensor, Te
     if n <= size:
         return torch.cat([rows, rows.new_zeros(size - n, rows.shape[1])]), torch.arange(n)
     generator = torch.Generator().manual_seed(0)  # the same input gives the same bits
-    first = max(int(size**0.5), 1)
-    sample = rows[torch.randperm(n, generator=generator)[:_SAMPLE]]
-    coarse = _assign(rows, _means(sample, first, generator))
-    order = coarse.argsort(stable=True)
-    counts = torch.bincount(coarse, minlength=first)
-    share = _apportion(counts, size)
     book, index = rows.new_zeros(size, rows.shape[1]), torch.empty(n, dtype=torch.int64)
-    start = used = 0
-    for count, k in zip(counts.tolist(), share.tolist(), strict=True):
-        members = order[start : start + count]
-        if count:
-            centres = _means(rows[members], k, generator)
-            index[members] = used + _assign(rows[members], centres)
-            book[used : used + len(centres)] = centres
-        start, used = start + count, used + k
-        progress(start / n)
+    waiting = [(torch.arange(n), size, 0)]
+    used = done = 0
+    while waiting:
+        members, k, depth = waiting.pop()
+        part = rows[members]
+        if k > _BRANCH and depth < _DEPTH:
+            sample = part[torch.randperm(len(part), generator=generator)[:_SAMPLE]]
+            of = _assign(part, _means(sample, _BRANCH, generator))
+            counts = torch.bincount(of, minlength=_BRANCH)
+            groups = members[of.argsort(stable=True)].split(counts.tolist())
+            share = _apportion(counts, k).tolist()
+            waiting += [(group, own, depth + 1) for group, own in zip(groups, share, strict=True) if own]
+            continue
+        # Rows that clusters do not tell apart, as where nearly all are equal, are cut into pieces of one size.
+        centres = _means(part, k, generator) if k <= _BRANCH else _pieces(part, k)
+        index[members] = used + (_assign(part, centres) if k <= _BRANCH else _piece_of(part, k))
+        book[used : used + len(centres)] = centres
+        used, done = used + len(centres), done + len(members)
+        progress(done / n)
     return book, index
 
 
+def _piece_of(rows: Tensor, k: int) -> Tensor:
+    """Which of ``k`` pieces of about one size each row (N, D) is in, along the column that varies most."""
+    order = rows[:, int(rows.var(dim=0).argmax())].argsort(stable=True)
+    pieces = torch.empty(len(rows), dtype=torch.int64)
+    pieces[order] = torch.arange(len(rows)) * k // len(rows)
+    return pieces
+
+
+def _pieces(rows: Tensor, k: int) -> Tensor:
+    """Means (k, D) of these pieces."""
+    of = _piece_of(rows, k)
+    total = rows.new_zeros(k, rows.shape[1]).index_add_(0, of, rows)
+    return total / torch.bincount(of, minlength=k)[:, None].clamp_min(1)
+
+
 def _apportion(counts: Tensor, size: int) -> Tensor:
-    """``size`` entries shared out in proportion to counts: at least one where there are members, none more than them."""
+    """``size`` entries shared out in proportion to counts: at least one where there are members, never more."""
     share = torch.minimum((counts.double() * size / counts.sum()).floor().long().clamp_min(1), counts)
     order = counts.argsort(descending=True, stable=True)
     while (left := size - int(share.sum())) != 0:

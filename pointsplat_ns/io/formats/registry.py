@@ -12,8 +12,12 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.formats.coding import morton_order
-from pointsplat_ns.io.formats.compressed_ply import compressed_ply_bytes, encode_compressed_ply, is_compressed
-from pointsplat_ns.io.formats.compressed_ply import read_compressed_ply
+from pointsplat_ns.io.formats.compressed_ply import (
+    compressed_ply_bytes,
+    encode_compressed_ply,
+    is_compressed,
+    read_compressed_ply,
+)
 from pointsplat_ns.io.formats.glb import encode_glb, glb_bytes
 from pointsplat_ns.io.formats.ksplat import read_ksplat
 from pointsplat_ns.io.formats.sog import encode_sog, read_sog, write_sog_folder

@@ -1,7 +1,7 @@
 """SOG files: PlayCanvas' format of WebP images, as a zip archive (``.sog``) or a folder with ``meta.json``.
 
-A Gaussian is a pixel of each image. Positions are 16-bit logarithms, log-scales and colours are entries of a codebook of
-256 numbers, quaternions lack their largest component, and SH are rows of a palette of up to 65,536.
+A Gaussian is a pixel of each image. Positions are 16-bit logarithms, log-scales and colours are entries of a codebook
+of 256 numbers, quaternions lack their largest component, and SH are rows of a palette of up to 65,536.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
@@ -42,8 +43,9 @@ Version = Literal[3, 4]
 FRACTION_BITS = 12
 """Bits of a position after the point, in scenes within 2048 units: steps of 0.00024. Larger scenes get fewer."""
 
-SH_BITS = (5, 4)
-"""Bits that are kept of SH coefficients, of degree 1 and above. Fewer bits compress better; these are the format's."""
+SH_BITS = (6, 5)
+"""Bits that are kept of SH coefficients, of degree 1 and of the others, up to 8. Fewer compress better. The format's own
+programs keep 5 and 4, which costs 8 dB in real captures (docs/formats.md)."""
 
 _MAGIC = b"NGSP"
 _GZIP = b"\x1f\x8b"
@@ -102,17 +104,25 @@ def read_spz(path: Path | str) -> Gaussians:
     return keep_usable(scene, path)
 
 
-def encode_spz(scene: Gaussians, progress: Progress = silent, version: Version = 3) -> bytes:
+def encode_spz(
+    scene: Gaussians, progress: Progress = silent, version: Version = 3, sh_bits: tuple[int, int] = SH_BITS
+) -> bytes:
     """The bytes of an SPZ file.
 
     Args:
         scene: N Gaussians, float32 on the CPU.
         progress: called while compressing.
-        version: 3, which most viewers read, or 4, which is smaller and loads sooner.
+        version: 3, which most viewers read, or 4, which loads sooner.
+        sh_bits: bits of SH coefficients, 1 to 8: of degree 1, and of the others.
+
+    Raises:
+        SceneError: if the scene is too large for the format, or there are no such bits.
     """
+    if not all(1 <= bits <= 8 for bits in sh_bits):
+        raise SceneError(f"SH of {sh_bits[0]} and {sh_bits[1]} bits; expected 1 to 8 bits in SPZ")
     n, flags = len(scene), 0
     bits = _fraction_bits(scene)
-    parts = _encode(scene, bits)
+    parts = _encode(scene, bits, sh_bits)
     if version == 3:
         head = _HEADER.pack(_MAGIC, 3, n, scene.sh_degree, bits, flags, 0)
         packer = zlib.compressobj(9, zlib.DEFLATED, 31)
@@ -134,13 +144,19 @@ def encode_spz(scene: Gaussians, progress: Progress = silent, version: Version =
     return b"".join([head, table, *streams])
 
 
-def write_spz(scene: Gaussians, path: Path | str, progress: Progress = silent, version: Version = 3) -> None:
+def write_spz(
+    scene: Gaussians,
+    path: Path | str,
+    progress: Progress = silent,
+    version: Version = 3,
+    sh_bits: tuple[int, int] = SH_BITS,
+) -> None:
     """Write an SPZ file, as :func:`encode_spz` makes it. Gaussians that cannot be drawn are left out.
 
     Raises:
         SceneError: if it cannot be written, or the scene is too large for the format.
     """
-    data = encode_spz(keep_usable(scene.detach().to("cpu", torch.float32), path), progress, version)
+    data = encode_spz(keep_usable(scene.detach().to("cpu", torch.float32), path), progress, version, sh_bits)
     with replacing(path) as part:
         part.write_bytes(data)
 
@@ -221,9 +237,9 @@ def _decode(head: _Head, parts: list[bytes | memoryview]) -> Gaussians:
     )
 
 
-def _encode(scene: Gaussians, bits: int) -> list[bytes]:
+def _encode(scene: Gaussians, bits: int, sh_bits: tuple[int, int]) -> list[bytes]:
     """The attributes in the file's order."""
-    first, other = (_coarse(scene.features_rest[:, part].numpy(), kept) for part, kept in _BANDS)
+    first, other = (_coarse(rest.numpy(), kept) for rest, kept in zip(_bands(scene), sh_bits, strict=True))
     fixed = np.rint(np.ldexp(scene.means.double().numpy(), bits)).astype("<i4")
     largest, others = smallest_three(unit_quats(scene)[:, _XYZW])
     magnitudes = np.rint(np.abs(others) * 2**0.5 * 511).astype(np.uint32) | (others < 0).astype(np.uint32) << 9
@@ -238,7 +254,9 @@ def _encode(scene: Gaussians, bits: int) -> list[bytes]:
     ]
 
 
-_BANDS = ((slice(0, 3), SH_BITS[0]), (slice(3, None), SH_BITS[1]))
+def _bands(scene: Gaussians) -> tuple[Tensor, Tensor]:
+    """SH coefficients of degree 1, and those above."""
+    return scene.features_rest[:, :3], scene.features_rest[:, 3:]
 
 
 def _coarse(coefficients: Array, bits: int) -> Array:
