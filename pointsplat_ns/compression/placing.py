@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.runs import Run, open_run
+from pointsplat_ns.io.runs import Run, may_be_run, open_run
 from pointsplat_ns.pruning.view_sampling import estimated_up
 from pointsplat_ns.refiner.augmentation import Transform
 
@@ -78,7 +78,7 @@ def place(
         raise PointSplatError(f"scale is {scale:g}; expected a number above 0")
     directions = None if up is None else _directions(up)
     if original_frame is not None:
-        scene = frame_of(open_run(original_frame, need_data=False)).inverse().apply(scene)
+        scene = _frame_at(original_frame).inverse().apply(scene)
     if directions is not None:
         now, wanted = directions
         matrix = _turn(estimated_up(scene) if now is None else now, wanted)
@@ -86,6 +86,13 @@ def place(
     if scale != 1.0:
         scene = Similarity(torch.eye(3, dtype=torch.float64), scale, torch.zeros(3, dtype=torch.float64)).apply(scene)
     return scene
+
+
+def _frame_at(path: str | Path) -> Similarity:
+    run = open_run(path, need_data=False) if may_be_run(path) else None
+    if run is None or not run.is_gaussian_scene:
+        raise SceneError(f"{path}: not a Splatfacto run, which knows the frame of its data; expected its folder")
+    return frame_of(run)
 
 
 def frame_of(run: Run) -> Similarity:

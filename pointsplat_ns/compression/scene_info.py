@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.quaternions import SHORTEST
 from pointsplat_ns.io.files import unusable_kept
@@ -49,7 +50,8 @@ class SceneInfo:
     suspicious: dict[str, int]
     """Rows that look wrong, by what is wrong with them; those without any are left out."""
     file_bytes: dict[str, dict[str, int]]
-    """Bytes of a file by format and share of the Gaussians that is kept. Those of ``.spz`` are an estimate."""
+    """Bytes of a file by format and share of the Gaussians that is kept. Those of ``.spz`` are an estimate, and left
+    out where the scene is too large for it."""
 
     def as_dict(self) -> dict[str, Any]:
         """The same as numbers, lists and dictionaries that JSON can hold."""
@@ -87,7 +89,7 @@ def info(scene: Gaussians | str | Path) -> SceneInfo:
         bounds=_corners(good.means, 0.0),
         content=_corners(good.means, 0.02),
         suspicious=_suspicious(scene, usable),
-        file_bytes={kind.suffix: _sizes(kind, good) for kind in FORMATS if kind.bytes_of or kind.suffix == ".spz"},
+        file_bytes={kind.suffix: sizes for kind in FORMATS if (sizes := _sizes(kind, good))},
     )
 
 
@@ -124,11 +126,15 @@ def _corners(means: Tensor, outside: float) -> list[list[float]]:
 
 
 def _sizes(kind: Format, scene: Gaussians) -> dict[str, int]:
-    """Bytes of a file by share; in proportion to that of a sample where the format compresses."""
+    """Bytes of a file by share, in SPZ in proportion to that of a sample; empty of formats that tell nothing."""
     counts = {f"{share:.0%}": round(share * len(scene)) for share in SHARES}
     if kind.bytes_of is not None:
         return {text: kind.bytes_of(count, scene.sh_degree) for text, count in counts.items()}
-    assert kind.encode is not None
+    if kind.suffix != ".spz" or kind.encode is None:  # the palette of SOG does not grow with the scene
+        return {}
     sample = scene[:: max(-(-len(scene) // SAMPLED), 1)]
-    each = len(kind.encode(sample, silent)) / max(len(sample), 1)
+    try:
+        each = len(kind.encode(sample, silent)) / max(len(sample), 1)
+    except SceneError:  # positions beyond what 24 bits hold
+        return {}
     return {text: round(each * count) for text, count in counts.items()}

@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import torch
+
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import Format
@@ -53,11 +55,10 @@ def largest_within(
     Raises:
         BudgetError: if not even one Gaussian fits.
     """
-    assert kind.encode is not None
     n = len(full)
     tried: dict[int, int] = {}
     best: FoundSize | None = None
-    count, size = n, len(kind.encode(full, silent))
+    count, size = n, _size(full, kind)
     low, high = 0, n + 1  # a count that fits, and one that does not
     scene = full
     while True:
@@ -81,4 +82,11 @@ def largest_within(
             return best
         progress(min(len(tried) / (TRIES + 1), 1.0))
         scene = make(count)
-        size = len(kind.encode(scene, silent))
+        size = _size(scene, kind)
+
+
+def _size(scene: Gaussians, kind: Format) -> int:
+    """Bytes of a scene's file, which leaves out what cannot be drawn."""
+    assert kind.encode is not None
+    scene = scene.detach().to("cpu", torch.float32)
+    return len(kind.encode(scene[scene.usable()], silent))

@@ -56,7 +56,7 @@ def test_convert_writes_spz_of_either_version(scene, tmp_path):
 def test_convert_overwrites_nothing_and_names_what_it_can_write(scene, tmp_path, capsys):
     assert "exists already" in fails(capsys, "convert", scene, scene)
     assert ".spz, .sog" in fails(capsys, "convert", scene, tmp_path / "a.ksplat")
-    assert str(scene) in fails(capsys, "convert", scene, tmp_path / "b.ply", "--original-frame")
+    assert "not a Splatfacto run" in fails(capsys, "convert", scene, tmp_path / "b.ply", "--original-frame")
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 

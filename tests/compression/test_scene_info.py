@@ -67,3 +67,9 @@ def test_a_scene_of_nothing_has_no_bounds():
     found = ps.info(Gaussians.empty(1))
     assert found.gaussians == 0 and found.bounds == [] and found.sizes == {}
     json.dumps(found.as_dict())
+
+
+def test_a_scene_too_large_for_spz_has_no_size_in_it():
+    scene = cloud(10)
+    scene.means[0] = 1e9
+    assert ".spz" not in ps.info(scene).file_bytes and ".ply" in ps.info(scene).file_bytes

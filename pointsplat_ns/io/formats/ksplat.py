@@ -136,7 +136,7 @@ def _decode(
         )
         centres = stored.copy().view("<f4")
         means = (means - section.steps) * (section.block_size / 2 / section.steps) + centres[of]
-    sh = rows["sh"].astype(np.float32)
+    sh = rows["sh"].astype(np.float64)
     if compression == 2:
         sh = bounds[0] + sh / 255 * (bounds[1] - bounds[0])
     return scene_of(

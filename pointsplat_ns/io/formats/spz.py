@@ -44,8 +44,8 @@ FRACTION_BITS = 12
 """Bits of a position after the point, in scenes within 2048 units: steps of 0.00024. Larger scenes get fewer."""
 
 SH_BITS = (6, 5)
-"""Bits that are kept of SH coefficients, of degree 1 and of the others, up to 8. Fewer compress better. The format's own
-programs keep 5 and 4, which costs 8 dB in real captures (docs/formats.md)."""
+"""Bits that are kept of SH coefficients, of degree 1 and of the others, up to 8. Fewer compress better. The format's
+own programs keep 5 and 4, which cost a capture 8 dB (``docs/formats.md``)."""
 
 _MAGIC = b"NGSP"
 _GZIP = b"\x1f\x8b"
