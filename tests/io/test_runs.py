@@ -227,7 +227,7 @@ def test_anything_else_is_refused_with_what_is_accepted(tmp_path):
     accepted = ".spz, .sog, meta.json, .ksplat, .splat), a Splatfacto .ckpt, or a Splatfacto run"
     (tmp_path / "scene.obj").write_bytes(b"")
     fails(lambda: read_scene(tmp_path / "scene.obj"), tmp_path / "scene.obj", "a .obj file", accepted)
-    fails(lambda: read_scene(tmp_path), "a folder without a run or a SOG in it", accepted)
+    fails(lambda: read_scene(tmp_path), "a folder without config.yml or meta.json", accepted)
     fails(lambda: read_scene(tmp_path / "none.ply"), "no such file", accepted)
     fails(lambda: save(normal_scene(), tmp_path / "a.obj"), "cannot write a .obj file", ".spz, .sog")
     fails(lambda: save(normal_scene(), tmp_path / "a.ksplat"), "cannot write a ksplat file")
