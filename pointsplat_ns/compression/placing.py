@@ -71,7 +71,7 @@ def place(
         >>> import pointsplat_ns as ps
         >>> room = ps.example_room()[::100]
         >>> turned = ps.place(room, up="z:y", scale=2.0)
-        >>> bool((turned.means[:, 1] == 2 * room.means[:, 2]).all())
+        >>> bool((turned.means[:, 1] - 2 * room.means[:, 2]).abs().max() < 1e-5)
         True
     """
     if not 0 < scale < math.inf:

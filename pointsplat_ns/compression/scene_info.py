@@ -127,7 +127,7 @@ def _corners(means: Tensor, outside: float) -> list[list[float]]:
 
 def _sizes(kind: Format, scene: Gaussians) -> dict[str, int]:
     """Bytes of a file by share, in SPZ in proportion to that of a sample; empty of formats that tell nothing."""
-    counts = {f"{share:.0%}": round(share * len(scene)) for share in SHARES}
+    counts = {f"{share:.0%}": int(share * len(scene) + 0.5) for share in SHARES}
     if kind.bytes_of is not None:
         return {text: kind.bytes_of(count, scene.sh_degree) for text, count in counts.items()}
     if kind.suffix != ".spz" or kind.encode is None:  # the palette of SOG does not grow with the scene
