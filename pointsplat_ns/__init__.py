@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.distributions import plot_distributions
     from pointsplat_ns.compression.levels import Levels
     from pointsplat_ns.compression.pictures import plot_comparison
+    from pointsplat_ns.compression.placing import place
+    from pointsplat_ns.compression.scene_info import SceneInfo, info
     from pointsplat_ns.compression.scene_task import SceneResult
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
     from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
@@ -47,6 +49,8 @@ _PUBLIC = {
     "pointsplat_ns.compression.distributions": ("plot_distributions",),
     "pointsplat_ns.compression.levels": ("Levels",),
     "pointsplat_ns.compression.pictures": ("plot_comparison",),
+    "pointsplat_ns.compression.placing": ("place",),
+    "pointsplat_ns.compression.scene_info": ("SceneInfo", "info"),
     "pointsplat_ns.compression.scene_task": ("SceneResult",),
     "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner"),
     "pointsplat_ns.pruning.view_sampling": ("sample_views",),
@@ -74,6 +78,7 @@ __all__ = [
     "Levels",
     "PointSplatError",
     "SceneError",
+    "SceneInfo",
     "SceneResult",
     "TrainedRefiner",
     "View",
@@ -82,11 +87,13 @@ __all__ = [
     "compact_folder",
     "dataset_views",
     "example_room",
+    "info",
     "load",
     "load_refiner",
     "lod",
     "lpips",
     "make_refiner",
+    "place",
     "plot_comparison",
     "plot_distributions",
     "prune",

@@ -26,7 +26,7 @@ from pointsplat_ns.compression.trained_refiner import (
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.runs import REFINER_METHOD, open_run
+from pointsplat_ns.io.runs import REFINER_METHOD, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning import Keep
@@ -46,8 +46,9 @@ def load(path: str | Path, scene: str | None = None) -> Gaussians:
     """Read a scene.
 
     Args:
-        path: a 3DGS ``.ply``, a Splatfacto ``.ckpt``, a Splatfacto run (its folder or ``config.yml``), or a
-            ``pointsplat`` run, whose dense scene is then pruned and refined as it was in the training.
+        path: a file of a scene (``.ply``, compressed or not, ``.spz``, ``.sog`` or its folder, ``.splat``,
+            ``.ksplat``), a Splatfacto ``.ckpt``, a Splatfacto run (its folder or ``config.yml``), or a ``pointsplat``
+            run, whose dense scene is then pruned and refined as it was in the training.
         scene: which scene of a ``pointsplat`` run; by default the first that it was not trained on, or the first.
 
     Returns:
@@ -111,8 +112,9 @@ def prune(
 
     Args:
         scene: N Gaussians, or where to read them: a PLY, a checkpoint, or a Splatfacto run.
-        keep: how much: a ratio (0.3, "30%"), a count (50000), the size of a PLY ("12MB"), or "auto:35", the smallest
-            scene whose renders reach 35 dB PSNR against those of the given one ("auto" alone means 35).
+        keep: how much: a ratio (0.3, "30%"), a count (50000), the size of a PLY ("12MB") or of a file of another format
+            ("12MB.spz"), or "auto:35", the smallest scene whose renders reach 35 dB PSNR against those of the given one
+            ("auto" alone means 35). For .spz and .sog the count is found by trying.
         by: the method. "merge" replaces neighbours by one Gaussian each; the others keep Gaussians bit for bit:
             "coverage", "paper" (eq. 3), "authors", "opacity", "volume", "log-volume", "area", "random", and
             "lightgaussian" and "pup", which look at the scene from ``views``.
@@ -329,7 +331,7 @@ def _read(scene: Source, views: Views | str | Path | None) -> tuple[Gaussians, V
 
 def _is_refiner_run(path: str | Path) -> bool:
     try:
-        return Path(path).suffix.lower() != ".ply" and open_run(path, need_data=False).method_name == REFINER_METHOD
+        return may_be_run(path) and open_run(path, need_data=False).method_name == REFINER_METHOD
     except SceneError:
         return False  # a scene that stands alone, or nothing that can be read: who reads it says which
 

@@ -86,8 +86,10 @@ def main(args: list[str] | None = None) -> None:
 
     from pointsplat_ns import __version__
     from pointsplat_ns.cli.compact import compact
+    from pointsplat_ns.cli.convert import convert
     from pointsplat_ns.cli.demo import demo
     from pointsplat_ns.cli.export import export
+    from pointsplat_ns.cli.info import info
     from pointsplat_ns.cli.lod import lod
     from pointsplat_ns.cli.make_feedback import make_feedback
     from pointsplat_ns.cli.make_refiner import make_refiner
@@ -102,6 +104,8 @@ def main(args: list[str] | None = None) -> None:
         "prune": prune,
         "compact": compact,
         "lod": lod,
+        "convert": convert,
+        "info": info,
         "export": export,
         "report": report,
         "rooms": rooms,

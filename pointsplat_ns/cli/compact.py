@@ -7,15 +7,17 @@ from typing import Annotated, Literal
 
 import tyro
 
-from pointsplat_ns.cli.folders import compact_folder, is_folder_of_scenes
+from pointsplat_ns.cli.folders import compact_folder
 from pointsplat_ns.cli.scene_options import (
     Bands,
     Output,
     Scene,
     check_outputs,
+    in_format_of,
     output_beside,
     print_distributions,
     print_result,
+    warn_if_larger,
 )
 
 
@@ -46,9 +48,10 @@ def compact(
     goes on after an interruption; it may also be started several times, or on several machines that share the folder.
 
     Args:
-        scene: a 3DGS .ply, a Splatfacto checkpoint, a run (its folder or config.yml), or a folder of scenes.
-        output: the .ply to write; by default beside the scene: room_compact.ply for room.ply, compact.ply in the folder
-            of a run. For a folder of scenes, another folder; by default rooms_compact beside rooms.
+        scene: a file of any format, a Splatfacto checkpoint, a run (its folder or config.yml), or a folder of scenes.
+        output: the file to write, of any format as for prune; by default beside the scene: room_compact.ply for
+            room.ply, compact.ply in the folder of a run. For a folder of scenes, another folder; by default
+            rooms_compact beside rooms.
         keep: how much, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before refinement. By default
             what the refiner was trained with.
         refiner: a trained pointsplat run (its folder or config.yml), or a .safetensors file; by default the refiner
@@ -66,6 +69,7 @@ def compact(
             part.
     """
     import pointsplat_ns as ps
+    from pointsplat_ns.io.scene import is_folder_of_scenes
 
     if is_folder_of_scenes(scene):
         compact_folder(
@@ -81,6 +85,7 @@ def compact(
 
     output = output or output_beside(scene, "compact")
     check_outputs(None if dry_run else output, picture, force)
+    keep = None if keep is None else in_format_of(keep, output)
     trained = ps.load_refiner(refiner)
     resolve_options(trained, keep, by, sh)
     RepairBudget(effort, seconds)
@@ -89,7 +94,8 @@ def compact(
         dense, keep, trained, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds, views=scene, progress=True
     )
     if not dry_run:
-        ps.save(result.scene, output)
+        ps.save(result.scene, output, progress=True)
+        warn_if_larger(keep, output)
     what = "kept" + (" and refined" if result.accepted else "") + (" and repaired" if result.repair_accepted else "")
     print_result(what, len(dense), result.scene, result.seconds, None if dry_run else output)
     print_distributions(dense, result.scene)

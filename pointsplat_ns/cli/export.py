@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from pointsplat_ns.cli.scene_options import check_outputs
+from pointsplat_ns.cli.scene_options import check_outputs, file_bytes
 
 
 def export(
@@ -17,11 +17,11 @@ def export(
     scene: str | None = None,
     force: bool = False,
 ) -> None:
-    """Write the refined scene of a pointsplat run, or the trained one of a Splatfacto run, as a 3DGS .ply.
+    """Write the refined scene of a pointsplat run, or the trained one of a Splatfacto run, as a file of any format.
 
     Args:
         run: the run's folder, config.yml or checkpoint.
-        output: the .ply to write.
+        output: the file to write, of any format as for prune.
         scene: which scene of a pointsplat run; by default the first that it was not trained on, or the first.
         force: overwrite an existing file.
     """
@@ -30,6 +30,6 @@ def export(
     check_outputs(output, None, force)
     start = time.perf_counter()
     exported = ps.load(run, scene)
-    ps.save(exported, output)
-    size = output.stat().st_size / 1e6
+    ps.save(exported, output, progress=True)
+    size = file_bytes(output) / 1e6
     print(f"{output}: {len(exported):,} Gaussians, {size:.2f} MB, in {time.perf_counter() - start:.1f} s")

@@ -9,11 +9,6 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_task import SceneResult
 
 
-def is_folder_of_scenes(path: Path) -> bool:
-    """Whether a path is a folder and no run: a run's folder holds ``config.yml`` and is one scene."""
-    return path.is_dir() and not (path / "config.yml").is_file()
-
-
 def need_one_scene(path: Path) -> None:
     """Refuse a folder of scenes where a single scene is expected.
 
@@ -21,7 +16,7 @@ def need_one_scene(path: Path) -> None:
         SceneError: if it is one.
     """
     from pointsplat_ns.errors import SceneError
-    from pointsplat_ns.io.scene import ACCEPTED
+    from pointsplat_ns.io.scene import ACCEPTED, is_folder_of_scenes
 
     if is_folder_of_scenes(path):
         raise SceneError(

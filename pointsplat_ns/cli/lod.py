@@ -26,7 +26,7 @@ def lod(
     free space.
 
     Args:
-        scene: a 3DGS .ply, a Splatfacto checkpoint, or a run (its folder or config.yml).
+        scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
         levels: how much each level keeps, in any order: ratios (0.3), percentages (30%), counts (50000) or sizes of the
             file (12MB).
         output: the folder for the levels (level_0.ply is the finest), their parents, the manifest lod.json and the

@@ -11,9 +11,11 @@ from pointsplat_ns.cli.scene_options import (
     Output,
     Scene,
     check_outputs,
+    in_format_of,
     output_beside,
     print_distributions,
     print_result,
+    warn_if_larger,
 )
 
 
@@ -32,14 +34,15 @@ def prune(
 ) -> None:
     """Make a scene smaller: keep the Gaussians that matter, or merge them, from the scene alone.
 
-    If something has to be rendered, the poses are those of the run's dataset if it is found; for a .ply they are
+    If something has to be rendered, the poses are those of the run's dataset if it is found; for a file they are
     sampled in free space.
 
     Args:
-        scene: a 3DGS .ply, a Splatfacto checkpoint, or a run (its folder or config.yml).
-        output: the .ply to write; by default beside the scene: room_pruned.ply for room.ply, pruned.ply in the folder
-            of a run.
-        keep: how much: a ratio (0.3), a percentage (30%), a count (50000), the size of the file (12MB), or auto:35, the
+        scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
+        output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog, .splat or .glb. By
+            default beside the scene: room_pruned.ply for room.ply, pruned.ply in the folder of a run.
+        keep: how much: a ratio (0.3), a percentage (30%), a count (50000), the size of the file (12MB; for .spz and
+            .sog it is found by trying, which takes two or three times as long), or auto:35, the
             smallest scene whose renders reach 35 dB PSNR against those of the dense scene (auto alone means 35).
         by: merge replaces neighbours by one Gaussian each and is by far the best; every other method keeps Gaussians as
             they are: coverage (empties no region), paper (eq. 3), authors (the formula of its released code), opacity,
@@ -59,6 +62,7 @@ def prune(
     need_one_scene(scene)
     output = output or output_beside(scene, "pruned")
     check_outputs(None if dry_run else output, plot, force)
+    keep = in_format_of(keep, output)
     check_options(keep, by, sh, opacity_weight, fine_tune)
     dense = read_scene(scene)
     start = time.perf_counter()
@@ -68,7 +72,8 @@ def prune(
     )  # fmt: skip
     seconds = time.perf_counter() - start
     if not dry_run:
-        ps.save(small, output)
+        ps.save(small, output, progress=True)
+        warn_if_larger(keep, output)
     print_result("kept", len(dense), small, seconds, None if dry_run else output)
     print_distributions(dense, small)
     if plot is not None:

@@ -1,4 +1,4 @@
-"""Arguments, output paths and printed results that ``prune`` and ``compact`` share."""
+"""Arguments, output paths and printed results that several commands share."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def check_outputs(scene: Path | None, picture: Path | None, force: bool) -> None
     """Check output paths before the long computations.
 
     Args:
-        scene: the .ply file to write; None for none.
+        scene: the file to write, of any format that is written; None for none.
         picture: the .png file to write; None for none.
         force: whether existing files may be overwritten.
 
@@ -47,24 +47,56 @@ def check_outputs(scene: Path | None, picture: Path | None, force: bool) -> None
         SceneError: if a path has another suffix, is a folder, or is a file that must not be overwritten.
     """
     from pointsplat_ns.errors import SceneError
+    from pointsplat_ns.io.formats import format_to_write
 
-    for path, kind in ((scene, ".ply"), (picture, ".png")):
-        if path is not None and path.suffix.lower() != kind:
-            raise SceneError(
-                f"{path}: cannot write a {path.suffix or 'nameless'} file; expected a name that ends in {kind}"
-            )
+    if scene is not None:
+        format_to_write(scene)
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise SceneError(
+            f"{picture}: cannot write a {picture.suffix or 'nameless'} file; expected a name that ends in .png"
+        )
+    for path in (scene, picture):
         if path is not None and path.is_dir():
             raise SceneError(f"{path}: is a folder; expected the name of a file to write")
         if path is not None and path.exists() and not force:
             raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
 
 
+def in_format_of(keep: str, output: Path) -> str:
+    """A budget as :func:`~pointsplat_ns.pruning.parse_keep` reads it: a size without a format, such as 5MB, means one
+    of the file that is written."""
+    from pointsplat_ns.io.formats import format_to_write
+
+    return keep.strip() + format_to_write(output).budget_suffix if keep.strip().lower().endswith("mb") else keep
+
+
+def warn_if_larger(keep: str | None, output: Path) -> None:
+    """Say so if a file is larger than a budget allows, as what is changed after pruning may compress less well."""
+    from pointsplat_ns.io.files import logger
+    from pointsplat_ns.pruning import Megabytes, parse_keep
+
+    budget = None if keep is None else parse_keep(keep)
+    if isinstance(budget, Megabytes) and file_bytes(output) > budget.value * 1e6:
+        logger.warning(
+            "%s: %.2f MB, more than %s, which held before the repair; try a smaller --keep",
+            output, file_bytes(output) / 1e6, budget,
+        )  # fmt: skip
+
+
+def file_bytes(path: Path) -> int:
+    """Size of a scene's file; of a SOG folder, which its meta.json stands for, of its parts together."""
+    from pointsplat_ns.io.formats import SOG_META, SOG_PARTS
+
+    names = (path.name, *SOG_PARTS) if path.name == SOG_META else (path.name,)
+    return sum(part.stat().st_size for part in map(path.with_name, names) if part.exists())
+
+
 def print_result(what: str, before: int, scene: Gaussians, seconds: float, where: Path | None) -> None:
-    """Print one line with counts, file size and time; ``where`` is None in a dry run."""
+    """Print one line with counts, file size (that of a PLY in a dry run) and time; ``where`` is None in a dry run."""
     from pointsplat_ns.pruning import ply_bytes
 
     share = f" ({100 * len(scene) / before:.1f} %)" if before else ""
-    size = ply_bytes(len(scene), scene.sh_degree) / 1e6
+    size = (ply_bytes(len(scene), scene.sh_degree) if where is None else file_bytes(where)) / 1e6
     place = "dry run, nothing is written" if where is None else where
     print(f"{place}: {what} {len(scene):,} of {before:,} Gaussians{share}, {size:.2f} MB, in {seconds:.1f} s")
 
@@ -81,7 +113,7 @@ def print_distributions(before: Gaussians, after: Gaussians) -> None:
     rows = {
         "Gaussians": lambda s: f"{len(s):,}",
         "SH degree": lambda s: f"{s.sh_degree}",
-        "file, MB": lambda s: f"{ply_bytes(len(s), s.sh_degree) / 1e6:.2f}",
+        "as .ply, MB": lambda s: f"{ply_bytes(len(s), s.sh_degree) / 1e6:.2f}",
         "opacity": lambda s: " / ".join(f"{value:.2f}" for value in opacity_quantiles(s)),
         "size, scene units": lambda s: " / ".join(f"{value:.2g}" for value in size_quantiles(s)),
     }

@@ -31,7 +31,7 @@ from pointsplat_ns.compression.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable
-from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, need_usable, parse_keep, resolve_keep
+from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, found_by_trying, need_usable, parse_keep, resolve_keep
 from pointsplat_ns.pruning.merge import merge_levels
 from pointsplat_ns.system.progress import Progress, silent
 
@@ -151,7 +151,7 @@ def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
             budget = parse_keep(level) if isinstance(level, str) else level
         except BudgetError as error:
             raise BudgetError(f"level {text}: {error}") from error
-        if isinstance(budget, WithinPsnr):
+        if found_by_trying(budget):
             raise BudgetError(
                 f"level {text}: expected a ratio (0.3), a percentage (30%), a count (50000) or a size (12MB)"
             )
@@ -162,7 +162,7 @@ def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
 def _text(level: Keep) -> str:
     if isinstance(level, WithinPsnr):
         return f"auto:{level.value:g}"
-    return f"{level.value:g}MB" if isinstance(level, Megabytes) else repr(level)
+    return str(level) if isinstance(level, Megabytes) else repr(level)
 
 
 def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int) -> list[int]:

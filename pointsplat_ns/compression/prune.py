@@ -14,14 +14,19 @@ from dataclasses import dataclass
 from pointsplat_ns.compression.budget_search import SH_PSNR, needed_sh_degree, smallest_within
 from pointsplat_ns.compression.cleaning import Cleaning, clean_scene
 from pointsplat_ns.compression.fine_tune import fine_tune
+from pointsplat_ns.compression.size_search import largest_within
 from pointsplat_ns.compression.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.errors import BudgetError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.pruning import (
     Keep,
+    Megabytes,
     WithinPsnr,
+    check_size,
     cut_sh,
     energy_lost,
+    found_by_trying,
     method_named,
     need_usable,
     parse_keep,
@@ -83,21 +88,24 @@ def prune_scene(
         PointSplatError: if there is no such method, or an option does not fit it.
     """
     keep = check_options(keep, by, sh, opacity_weight, fine_tune_steps)
-    if not isinstance(keep, WithinPsnr):
+    if isinstance(keep, Megabytes):
+        check_size(keep, len(dense))
+    if not found_by_trying(keep):
         resolve_keep(len(dense), keep, _lowest_degree(dense, sh))
     need_usable(dense)
     views = views or ViewSource(dense)
     notes: list[str] = []
     full = _with_sh(dense, sh, views, progress, notes)
-    count = 1 if isinstance(keep, WithinPsnr) else resolve_keep(len(full), keep, full.sh_degree)
+    count = 1 if found_by_trying(keep) else resolve_keep(len(full), keep, full.sh_degree)
     cleaning = clean_scene(dense, count, views, progress) if clean else None
     start = full if cleaning is None else cleaning.apply(full, count)
     notes += () if cleaning is None else cleaning.notes
     report = functools.partial(progress, f"by {by}")
-    if isinstance(keep, WithinPsnr):
+    if found_by_trying(keep):
         make = _pruner(start, by, views, opacity_weight, report)
         if cleaning is not None:
             make = _refilling(make, cleaning, full, len(start))
+    if isinstance(keep, WithinPsnr):
         compared = views.compared()
         search = smallest_within(dense, make, compared, keep.value, functools.partial(progress, "trying counts"))
         scene = search.scene
@@ -105,6 +113,11 @@ def prune_scene(
             f"renders reach {search.psnr:.1f} dB against the dense scene's, {search.worst:.1f} dB in the worst of "
             f"{len(compared)} views; {len(search.tried)} counts tried"
         )
+    elif isinstance(keep, Megabytes) and found_by_trying(keep):
+        kind, limit = format_to_write(keep.suffix), check_size(keep, len(dense))
+        found = largest_within(start, make, kind, limit, functools.partial(progress, "trying counts"))
+        scene = found.scene
+        notes.append(f"as {kind.name} {found.size / 1e6:.2f} MB; {len(found.tried)} counts tried")
     else:
         scene = prune(start, count, by, _seen_from(by, views), opacity_weight, report, notes.append)
     if fine_tune_steps:

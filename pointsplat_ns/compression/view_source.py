@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.runs import open_run
+from pointsplat_ns.io.runs import may_be_run, open_run
 from pointsplat_ns.pruning.traces import photo_places
 from pointsplat_ns.pruning.view_sampling import views_about
 from pointsplat_ns.views import RasterizeMode, View, Views, spread_indices
@@ -59,7 +59,7 @@ class ViewSource:
 
     @cached_property
     def _of_dataset(self) -> Views | None:
-        if self._run is None or self._dataset_views is None or Path(self._run).suffix.lower() == ".ply":
+        if self._run is None or self._dataset_views is None or not may_be_run(self._run):
             return None
         try:
             self._rasterize_mode = open_run(self._run, need_data=False).rasterize_mode

@@ -11,9 +11,11 @@ from typing import Literal
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import file_stem, logger
+from pointsplat_ns.io.formats import READABLE
+from pointsplat_ns.io.formats.compressed_ply import is_compressed
 from pointsplat_ns.io.ply_header import read_header
 from pointsplat_ns.io.runs import CONFIG_NAME, Run, open_run, scene_name
-from pointsplat_ns.io.scene import is_scene_file
+from pointsplat_ns.io.scene import is_folder_of_scenes, is_scene_file
 
 Supervision = Literal["auto", "photos", "dense"]
 """Training targets: a run's photos, or renders of the scene before it was pruned."""
@@ -48,7 +50,7 @@ def find_scenes(folder: Path | str) -> list[FoundScene]:
         SceneError: if there is no such folder, it is a run, or there is no scene below it.
     """
     folder = Path(folder)
-    if not folder.is_dir() or (folder / CONFIG_NAME).is_file():
+    if not is_folder_of_scenes(folder):
         raise SceneError(f"{folder}: expected a folder with scenes below it")
     named = [(path.relative_to(folder).with_suffix("").as_posix(), path) for path in _scene_files(folder)]
     if _run_folders(folder):
@@ -58,7 +60,7 @@ def find_scenes(folder: Path | str) -> list[FoundScene]:
             runs = []  # those passed over have been named
         named += [(_name_below(folder, run), run.folder) for run in runs]
     if not named:
-        raise SceneError(f"{folder}: no scene below it; expected 3DGS .ply files or trained Splatfacto runs")
+        raise SceneError(f"{folder}: no scene below it; expected files ({READABLE}) or trained Splatfacto runs")
     named.sort(key=lambda pair: (pair[0], str(pair[1])))
     names = distinct(name for name, _ in named)
     return [FoundScene(name, path) for name, (_, path) in zip(names, named, strict=True)]
@@ -243,7 +245,11 @@ def _when(run: Run) -> tuple[float, int]:
 def _holds_gaussians(path: Path) -> bool:
     try:
         with path.open("rb") as stream:
-            elements = read_header(stream, path).elements
+            header = read_header(stream, path)
     except (SceneError, OSError):
         return False
-    return any({"opacity", "scale_0", "rot_0"} <= {name for name, _ in element.properties} for element in elements)
+    if is_compressed(header):
+        return True
+    return any(
+        {"opacity", "scale_0", "rot_0"} <= {name for name, _ in element.properties} for element in header.elements
+    )

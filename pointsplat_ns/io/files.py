@@ -9,6 +9,7 @@ import re
 import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 
 from torch import Tensor
@@ -166,12 +167,27 @@ def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: dict[
             raise OSError(one_line(error)) from error
 
 
+_EVERYTHING: ContextVar[bool] = ContextVar("everything", default=False)
+
+
+@contextmanager
+def unusable_kept() -> Iterator[None]:
+    """Let readers keep Gaussians that cannot be drawn, for those who count them."""
+    token = _EVERYTHING.set(True)
+    try:
+        yield
+    finally:
+        _EVERYTHING.reset(token)
+
+
 def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:
     """``scene`` without the Gaussians that cannot be drawn, whose number is logged.
 
     Opacity logits of +-Inf and log-scales of -Inf are valid (see
     :meth:`~pointsplat_ns.gaussians.Gaussians.usable`).
     """
+    if _EVERYTHING.get():
+        return scene
     usable = scene.usable()
     dropped = len(scene) - int(usable.sum())
     if not dropped:

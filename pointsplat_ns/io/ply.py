@@ -18,7 +18,7 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
 from pointsplat_ns.io.files import keep_usable, logger, one_line, replacing, require_file, require_memory
-from pointsplat_ns.io.ply_header import Element, Header, read_header
+from pointsplat_ns.io.ply_header import Element, Header, read_header, warn_render_mode
 
 CHUNK_ROWS = 16384
 """Rows copied at a time, about 4 MB: small enough for the processor's cache."""
@@ -30,13 +30,17 @@ _OPACITY = ["opacity"]
 _SCALES = ["scale_0", "scale_1", "scale_2"]
 _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
 
+_FILE_DEGREES = (0, 1, 2, 3, 4)
+"""SH degrees that files have. Of degree 4, the highest band is not read."""
+
 
 def read_ply(path: Path | str) -> Gaussians:
     """Read a 3DGS PLY: binary of either byte order, or ASCII; properties in any order and of any type.
 
-    The SH degree follows from the number of ``f_rest`` properties. Other properties and elements, and bytes after the
-    last element, are not read; a warning says so. Gaussians that cannot be drawn (NaN, or Inf where it is not valid)
-    are dropped, and their number is logged; all-zero rows are kept (a zero quaternion is the identity).
+    The SH degree follows from the number of ``f_rest`` properties; of degree 4, the bands up to 3 are read. Other
+    properties and elements, and bytes after the last element, are not read; a warning says so. Gaussians that cannot be
+    drawn (NaN, or Inf where it is not valid) are dropped, and their number is logged; all-zero rows are kept (a zero
+    quaternion is the identity).
 
     Args:
         path: the file.
@@ -54,13 +58,17 @@ def read_ply(path: Path | str) -> Gaussians:
         with path.open("rb") as stream:
             header = read_header(stream, path)
         vertex = _gaussian_element(header, path)
-        k = _num_rest(vertex, path)
+        in_file = _num_rest(vertex, path)
+        k = min(in_file, (MAX_SH_DEGREE + 1) ** 2 - 1)
         require_memory(path, vertex.count * 4 * (14 + 3 * k))  # float32 numbers
         _report_unread(header, vertex, path)
+        if in_file > k:
+            logger.warning("%s: SH degree %d, read up to degree %d", path, _FILE_DEGREES[-1], MAX_SH_DEGREE)
+        warn_render_mode(header, path)
         with _GaussiansAlone(path, header) as stream:
             # Binary rows are mapped, not read: only the Gaussians below take memory.
             rows = PlyData.read(stream, mmap="r")["vertex"].data
-            scene = _scene(rows, k)
+            scene = _scene(rows, k, in_file)
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
     except (PlyParseError, ValueError, OverflowError) as error:
@@ -96,6 +104,16 @@ def write_ply(scene: Gaussians, path: Path | str) -> None:
     rows = np.ascontiguousarray(table).view([(name, "<f4") for name in names]).reshape(len(scene))
     with replacing(path) as part:
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(part))
+
+
+def ply_bytes(count: int, sh_degree: int) -> int:
+    """Size of the 3DGS PLY of ``count`` Gaussians, bytes: an ASCII header, then 17 numbers a Gaussian (normals
+    included) and three for each SH coefficient beyond the constant one, as float32."""
+    rest = 3 * ((sh_degree + 1) ** 2 - 1)
+    names = [*_MEANS, *_NORMALS, *_DC, *_rest_names(rest), *_OPACITY, *_SCALES, *_QUATS]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property float {name}" for name in names] + ["end_header"]
+    return sum(len(line) + 1 for line in lines) + 4 * len(names) * count
 
 
 def _rest_names(count: int) -> list[str]:
@@ -164,10 +182,14 @@ def _num_rest(vertex: Element, path: Path) -> int:
     """Number of SH coefficients per channel beyond the constant one; checks that all properties are present."""
     present = {name for name, _ in vertex.properties}
     if "packed_position" in present:
-        raise SceneError(f"{path}: a compressed PLY (property 'packed_position'); export it uncompressed")
+        raise SceneError(f"{path}: a compressed PLY (property 'packed_position'); expected a plain one")
+    if {*_SCALES[:2], *_OPACITY} <= present and _SCALES[2] not in present:
+        raise SceneError(
+            f"{path}: lacks the vertex property 'scale_2', as 2D Gaussians (2DGS) do; expected 3D Gaussians"
+        )
     rest = sorted(int(name[7:]) for name in present if re.fullmatch(r"f_rest_(0|[1-9]\d{0,5})", name))
     required = [*_MEANS, *_DC, *_OPACITY, *_SCALES, *_QUATS]
-    counts = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1)]
+    counts = [3 * ((degree + 1) ** 2 - 1) for degree in _FILE_DEGREES]
     if rest and rest[-1] + 1 in counts:
         required += _rest_names(rest[-1] + 1)
     missing = [name for name in required if name not in present]
@@ -177,13 +199,14 @@ def _num_rest(vertex: Element, path: Path) -> int:
     if len(rest) not in counts:
         raise SceneError(
             f"{path}: has {len(rest)} f_rest properties; expected {', '.join(map(str, counts[:-1]))} or {counts[-1]} "
-            f"(SH degree 0 to {MAX_SH_DEGREE})"
+            f"(SH degree 0 to {_FILE_DEGREES[-1]})"
         )
     return len(rest) // 3
 
 
-def _scene(rows: np.ndarray, k: int) -> Gaussians:
-    """The scene in structured rows (N,), with ``k`` coefficients per channel beyond the constant one."""
+def _scene(rows: np.ndarray, k: int, in_file: int) -> Gaussians:
+    """The scene in structured rows (N,), with ``k`` coefficients per channel beyond the constant one, of ``in_file``
+    that the file has."""
     from numpy.lib.recfunctions import structured_to_unstructured
 
     columns = {
@@ -193,7 +216,7 @@ def _scene(rows: np.ndarray, k: int) -> Gaussians:
         "opacities": _OPACITY,
         "features_dc": _DC,
         # Channel-major in the file, channel last in a scene.
-        "features_rest": [f"f_rest_{channel * k + i}" for i in range(k) for channel in range(3)],
+        "features_rest": [f"f_rest_{channel * in_file + i}" for i in range(k) for channel in range(3)],
     }
     tables = {name: np.empty((len(rows), len(fields)), np.float32) for name, fields in columns.items()}
     # A double beyond float32 becomes Inf and is dropped with the others.

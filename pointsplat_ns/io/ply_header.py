@@ -14,6 +14,7 @@ from typing import BinaryIO
 import numpy as np
 
 from pointsplat_ns.errors import SceneError
+from pointsplat_ns.io.files import logger
 
 MAX_HEADER_BYTES = 1 << 20
 """A 3DGS header has about 1.5 kB; comments may make it longer, but not by a thousandfold."""
@@ -58,6 +59,8 @@ class Header:
     elements: tuple[Element, ...]
     size: int
     """Bytes of the header: where the data starts."""
+    comments: tuple[str, ...] = ()
+    """Text of the comments."""
 
     def before(self, name: str) -> tuple[Element, ...]:
         """The elements that precede the one called ``name``."""
@@ -82,6 +85,7 @@ def read_header(stream: BinaryIO, path: Path) -> Header:
     text, size = _header_text(stream, path)
     order: str | None = None
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []
+    comments = tuple(line.partition(" ")[2].strip() for line in text[1:] if line.startswith("comment "))
     for number, line in enumerate(text[1:], start=2):
         words = line.split()
         keyword = words[0] if words else ""
@@ -103,7 +107,25 @@ def read_header(stream: BinaryIO, path: Path) -> Header:
     _reject_duplicates([name for name, _, _ in elements], "element", path)
     for name, _, properties in elements:
         _reject_duplicates([prop for prop, _ in properties], f"{name} property", path)
-    return Header(order, tuple(Element(name, count, tuple(props)) for name, count, props in elements), size)
+    return Header(order, tuple(Element(name, count, tuple(props)) for name, count, props in elements), size, comments)
+
+
+def warn_render_mode(header: Header, path: Path) -> None:
+    """Say that a scene was trained to be drawn in another way than scenes are here, if a comment says so.
+
+    Brush writes ``SplatRenderMode: mip`` or ``2dgs``, Postshot ``antialiased 1``.
+    """
+    for comment in header.comments:
+        words = comment.lower().replace(":", " ").split()
+        if words[:1] == ["splatrendermode"] and words[1:] not in (["default"], []):
+            logger.warning("%s: trained for %r rendering; drawn here as ordinary Gaussians", path, words[1])
+        elif words[:2] == ["antialiased", "1"]:
+            warn_antialiased(path)
+
+
+def warn_antialiased(path: Path) -> None:
+    """Say that a scene was trained with antialiasing, which a scene does not record here."""
+    logger.warning("%s: trained with antialiasing (Mip-Splatting); drawn here without", path)
 
 
 def _header_text(stream: BinaryIO, path: Path) -> tuple[list[str], int]:

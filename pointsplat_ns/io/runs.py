@@ -26,6 +26,9 @@ CONFIG_NAME = "config.yml"
 TRANSFORMS_NAME = "dataparser_transforms.json"
 CHECKPOINT_FOLDER = "nerfstudio_models"
 
+RUN_SUFFIXES = (".ckpt", ".yml", ".yaml")
+"""Of the files that lead to a run."""
+
 REFINER_METHOD = "pointsplat"
 """nerfstudio's name of the method that trains refiners."""
 
@@ -72,6 +75,12 @@ class Run:
     def rasterize_mode(self) -> Literal["classic", "antialiased"]:
         """Rasterize mode that the run was trained with."""
         return "antialiased" if self.model_fields.get("rasterize_mode") == "antialiased" else "classic"
+
+
+def may_be_run(path: Path | str) -> bool:
+    """Whether a path is one that runs have: a folder, a checkpoint or YAML. Other files hold nothing but a scene."""
+    path = Path(path)
+    return path.is_dir() or path.suffix.lower() in RUN_SUFFIXES
 
 
 def open_run(path: Path | str, need_data: bool = True) -> Run:

@@ -4,29 +4,41 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
+
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import require_file
-from pointsplat_ns.io.ply import read_ply, write_ply
-from pointsplat_ns.io.runs import CONFIG_NAME, open_run
+from pointsplat_ns.io.files import keep_usable, require_file
+from pointsplat_ns.io.formats import READABLE, SOG_META, format_named, format_to_read, format_to_write
+from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, open_run
 from pointsplat_ns.io.splatfacto import read_checkpoint
+from pointsplat_ns.system.progress import Progress, progress_bar
 
-ACCEPTED = "a 3DGS .ply, a Splatfacto .ckpt, or a Splatfacto run (its folder or config.yml)"
-
-SCENE_SUFFIXES = (".ply", ".ckpt")
-"""Suffixes of files that hold a whole scene."""
+ACCEPTED = f"a scene ({READABLE}), a Splatfacto .ckpt, or a Splatfacto run (its folder or config.yml)"
 
 
 def is_scene_file(path: Path | str) -> bool:
-    """Whether :func:`read_scene` takes a file for a scene, by its suffix. A run is told by its folder instead."""
-    return Path(path).suffix.lower() in SCENE_SUFFIXES
+    """Whether :func:`read_scene` takes a file for a whole scene, by its suffix. Runs and SOG folders are told by what
+    lies in them instead."""
+    path = Path(path)
+    kind = format_named(path.name)
+    return path.suffix.lower() == ".ckpt" or (kind is not None and kind.read is not None and path.name != SOG_META)
+
+
+def is_folder_of_scenes(path: Path | str) -> bool:
+    """Whether a path is a folder that is no scene itself, as those of runs and SOG folders are."""
+    path = Path(path)
+    return path.is_dir() and not (path / CONFIG_NAME).is_file() and format_to_read(path) is None
 
 
 def read_scene(path: Path | str) -> Gaussians:
-    """Read a scene: a 3DGS PLY, a Splatfacto checkpoint, or the newest checkpoint of a Splatfacto run.
+    """Read a scene: a file of any format, a Splatfacto checkpoint, or the newest checkpoint of a Splatfacto run.
+
+    What a file begins with tells its format, else its name.
 
     Args:
-        path: a ``.ply``, a ``.ckpt``, a ``config.yml`` or a run's folder. The photos of a run are not needed.
+        path: a 3DGS or compressed ``.ply``, ``.spz``, ``.sog`` (or its folder, or the ``meta.json`` in it), ``.splat``,
+            ``.ksplat``, ``.ckpt``, ``config.yml`` or a run's folder. The photos of a run are not needed.
 
     Returns:
         The scene, float32 on the CPU. Log-scales and logits are those of the file.
@@ -42,31 +54,34 @@ def read_scene(path: Path | str) -> Gaussians:
         2
     """
     path = Path(path)
-    if path.is_dir():
-        if not (path / CONFIG_NAME).is_file():
-            raise SceneError(f"{path}: a folder without {CONFIG_NAME}; expected {ACCEPTED}")
+    if path.is_dir() and (path / CONFIG_NAME).is_file():
         return read_checkpoint(open_run(path, need_data=False).checkpoint)
-    require_file(path, ACCEPTED)
-    kind = path.suffix.lower()
-    if kind == ".ply":
-        return read_ply(path)
-    if kind == ".ckpt":
+    if not path.is_dir():
+        require_file(path, ACCEPTED)
+    if path.suffix.lower() == ".ckpt":
         return read_checkpoint(path)
-    if kind in (".yml", ".yaml"):
+    if path.suffix.lower() in RUN_SUFFIXES:
         return read_checkpoint(open_run(path, need_data=False).checkpoint)
-    raise SceneError(f"{path}: a {kind or 'nameless'} file; expected {ACCEPTED}")
+    kind = format_to_read(path)
+    if kind is None or kind.read is None:
+        what = f"a folder without {CONFIG_NAME} or meta.json" if path.is_dir() else f"a {path.suffix or 'nameless'} file"
+        raise SceneError(f"{path}: {what}; expected {ACCEPTED}")
+    return kind.read(path)
 
 
-def save(scene: Gaussians, path: Path | str) -> None:
-    """Write a scene as a 3DGS PLY, which viewers of Gaussian scenes and :func:`pointsplat_ns.load` read.
+def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False) -> None:
+    """Write a scene in the format that the path's name asks for.
 
-    A float32 scene is read back unchanged to the bit. Gaussians that cannot be drawn (NaN, or Inf where it is not
+    ``.ply`` is the 3DGS PLY: a float32 scene is read back unchanged to the bit. The others keep fewer bits:
+    ``.compressed.ply``, ``.spz`` (version 3), ``.sog``, ``meta.json`` (the same in a folder), ``.splat``; ``.glb`` is
+    glTF, which :func:`pointsplat_ns.load` does not read. Gaussians that cannot be drawn (NaN, or Inf where it is not
     valid) are left out, and their number is logged. The write is atomic and replaces an existing file.
 
     Args:
-        scene: N Gaussians of SH degree d, on any device and of any floating dtype. Each takes 68 + 12 K bytes as
-            float32, with K = (d+1)^2 - 1 and 12 bytes of unused normals.
-        path: a path that ends in ``.ply``. Missing folders are created.
+        scene: N Gaussians of SH degree d, on any device and of any floating dtype. In a PLY each takes 68 + 12 K bytes,
+            with K = (d+1)^2 - 1 and 12 bytes of unused normals.
+        path: a path that ends in one of these. Missing folders are created.
+        progress: True shows a bar; a function is called with what is being done and the share done of it.
 
     Raises:
         SceneError: if the path has another suffix, is a folder, or cannot be written.
@@ -75,11 +90,12 @@ def save(scene: Gaussians, path: Path | str) -> None:
         >>> import tempfile
         >>> import pointsplat_ns as ps
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     ps.save(ps.example_room()[:100], f"{folder}/small.ply")
-        ...     len(ps.load(f"{folder}/small.ply"))
+        ...     ps.save(ps.example_room()[:100], f"{folder}/small.spz")
+        ...     len(ps.load(f"{folder}/small.spz"))
         100
     """
     path = Path(path)
-    if path.suffix.lower() != ".ply":
-        raise SceneError(f"{path}: cannot write a {path.suffix or 'nameless'} file; expected a name that ends in .ply")
-    write_ply(scene, path)
+    write = format_to_write(path).write
+    assert write is not None  # format_to_write gives no other
+    with progress_bar(progress) as report:
+        write(keep_usable(scene.detach().to("cpu", torch.float32), path), path, report)

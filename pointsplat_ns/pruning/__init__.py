@@ -1,6 +1,16 @@
 """Making a scene smaller: pruning methods, budgets, SH bands."""
 
-from pointsplat_ns.pruning.budget import AUTO_PSNR, Keep, Megabytes, WithinPsnr, parse_keep, ply_bytes, resolve_keep
+from pointsplat_ns.io.ply import ply_bytes
+from pointsplat_ns.pruning.budget import (
+    AUTO_PSNR,
+    Keep,
+    Megabytes,
+    WithinPsnr,
+    check_size,
+    found_by_trying,
+    parse_keep,
+    resolve_keep,
+)
 from pointsplat_ns.pruning.methods import METHODS, Method, PruneSettings, method_named, need_usable, prune, score_of
 from pointsplat_ns.pruning.select import select
 from pointsplat_ns.pruning.sh_bands import band_energies, cut_sh, energy_lost
@@ -14,8 +24,10 @@ __all__ = [
     "PruneSettings",
     "WithinPsnr",
     "band_energies",
+    "check_size",
     "cut_sh",
     "energy_lost",
+    "found_by_trying",
     "method_named",
     "need_usable",
     "parse_keep",

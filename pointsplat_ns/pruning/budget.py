@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import bisect
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Integral, Real
 
 from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.io.formats.registry import WRITABLE, format_named, format_to_write
 
 WANTED = (
     "expected a ratio above 0 and up to 1.0 (such as 0.3), a percentage (30%), a whole number of Gaussians "
@@ -21,9 +24,24 @@ PSNR against photos from 30 dB by 1.2 dB, and from 25 dB by 0.4 dB."""
 
 @dataclass(frozen=True)
 class Megabytes:
-    """A budget: the largest size of the PLY file, in units of 10^6 bytes."""
+    """A budget: the largest size of the file, in units of 10^6 bytes."""
 
     value: float
+    suffix: str = ".ply"
+    """Of the format that is counted."""
+
+    def __post_init__(self) -> None:
+        kind = format_named(self.suffix)
+        if kind is None or kind.write is None:
+            raise BudgetError(f"keep is the size of a {self.suffix} file; expected one of {WRITABLE}")
+
+    @property
+    def bytes_of(self) -> Callable[[int, int], int] | None:
+        """Size of a file, bytes, by count and SH degree; None if only writing a scene tells it."""
+        return format_to_write(self.suffix).bytes_of
+
+    def __str__(self) -> str:
+        return f"{self.value:g}MB" + (self.suffix if self.suffix != ".ply" else "")
 
 
 @dataclass(frozen=True)
@@ -34,17 +52,6 @@ class WithinPsnr:
 
 
 Keep = float | int | Megabytes | WithinPsnr
-
-
-def ply_bytes(count: int, sh_degree: int) -> int:
-    """Size of the 3DGS PLY of ``count`` Gaussians, bytes: an ASCII header, then 17 numbers a Gaussian (normals
-    included) and three for each SH coefficient beyond the constant one, as float32."""
-    rest = 3 * ((sh_degree + 1) ** 2 - 1)
-    names = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest))]
-    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [f"property float {name}" for name in names] + ["end_header"]
-    return sum(len(line) + 1 for line in lines) + 4 * len(names) * count
 
 
 def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3) -> int:
@@ -65,7 +72,7 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3) -> int:
 
     Raises:
         BudgetError: if ``keep`` is out of range, NaN or not a number, if it can only be resolved by rendering
-            (:class:`WithinPsnr`), or if the scene is empty.
+            (:class:`WithinPsnr`) or by writing (the size of a compressed file), or if the scene is empty.
 
     Example:
         >>> resolve_keep(1000, 0.3), resolve_keep(1000, 1), resolve_keep(1000, 1.0), resolve_keep(1000, "25%")
@@ -78,7 +85,7 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3) -> int:
     if isinstance(keep, WithinPsnr):
         raise BudgetError("keep is auto, which is found by rendering; expected a ratio, a count or a size here")
     if isinstance(keep, Megabytes):
-        return _that_fit(n, keep.value, sh_degree)
+        return _that_fit(n, keep, sh_degree)
     if isinstance(keep, bool) or not isinstance(keep, Real):
         raise BudgetError(f"keep is {keep!r}; {WANTED}")
     if n < 1:
@@ -92,36 +99,52 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3) -> int:
     return min(n, max(1, int(n * float(keep) + 0.5)))
 
 
-def _that_fit(n: int, megabytes: float, sh_degree: int) -> int:
-    """How many of ``n`` Gaussians fit into a PLY file of ``megabytes``."""
-    if not 0 < megabytes < math.inf:
-        raise BudgetError(f"keep is {megabytes:g}MB; {WANTED}")
+def found_by_trying(keep: Keep) -> bool:
+    """Whether the count that a budget means depends on the scene that is made: a PSNR, or the size of a compressed
+    file."""
+    return isinstance(keep, WithinPsnr) or isinstance(keep, Megabytes) and keep.bytes_of is None
+
+
+def check_size(keep: Megabytes, n: int) -> int:
+    """The bytes of a budget for a scene of ``n`` Gaussians.
+
+    Raises:
+        BudgetError: if it is no positive number, or the scene is empty.
+    """
+    if not 0 < keep.value < math.inf:
+        raise BudgetError(f"keep is {keep}; {WANTED}")
     if n < 1:
-        raise BudgetError(f"keep is {megabytes:g}MB but the scene holds no Gaussians; expected at least one")
-    limit = math.floor(megabytes * 1e6)
-    each = ply_bytes(1, sh_degree) - ply_bytes(0, sh_degree)
-    count = min(n, max(0, (limit - ply_bytes(0, sh_degree)) // each))
-    while count > 0 and ply_bytes(count, sh_degree) > limit:  # the header holds the count's digits
-        count -= 1
-    if count < 1:
-        least = ply_bytes(1, sh_degree)
+        raise BudgetError(f"keep is {keep} but the scene holds no Gaussians; expected at least one")
+    return math.floor(keep.value * 1e6)
+
+
+def _that_fit(n: int, keep: Megabytes, sh_degree: int) -> int:
+    """How many of ``n`` Gaussians fit into a file."""
+    bytes_of, limit = keep.bytes_of, check_size(keep, n)
+    if bytes_of is None:
         raise BudgetError(
-            f"keep is {megabytes:g}MB, too small for one Gaussian of SH degree {sh_degree}; expected at least "
-            f"{least / 1e6:g}MB"
+            f"keep is {keep}, which is found by writing; expected a ratio, a count or the size of a .ply here"
+        )
+    # The size grows with the count, if not evenly: headers hold its digits, and chunks are begun.
+    count = bisect.bisect_right(range(1, n + 1), limit, key=lambda count: bytes_of(count, sh_degree))
+    if count < 1:
+        least = bytes_of(1, sh_degree)
+        raise BudgetError(
+            f"keep is {keep}, too small for one Gaussian of SH degree {sh_degree}; expected at least {least / 1e6:g}MB"
         )
     return count
 
 
 def parse_keep(text: str) -> Keep:
-    """Parse a budget: ``0.3`` and ``30%`` are ratios, ``50000`` is a count, ``12MB`` is a size, ``auto`` and
-    ``auto:35`` are the PSNR (dB) that renders must reach against the dense scene's own.
+    """Parse a budget: ``0.3`` and ``30%`` are ratios, ``50000`` is a count, ``12MB`` and ``12MB.spz`` are sizes,
+    ``auto`` and ``auto:35`` are the PSNR (dB) that renders must reach against the dense scene's own.
 
     Raises:
         BudgetError: if it is none of these. The range of a ratio, count or size is checked by :func:`resolve_keep`.
 
     Example:
         >>> parse_keep("30%"), parse_keep("50000"), parse_keep("1"), parse_keep("1.0"), parse_keep("12MB")
-        (0.3, 50000, 1, 1.0, Megabytes(value=12.0))
+        (0.3, 50000, 1, 1.0, Megabytes(value=12.0, suffix='.ply'))
     """
     text = text.strip()
     try:
@@ -132,10 +155,12 @@ def parse_keep(text: str) -> Keep:
             if not 0 < psnr < math.inf:
                 raise ValueError
             return WithinPsnr(psnr)
-        if re.fullmatch(r".*[mM][bB]", text):
-            return Megabytes(float(text[:-2]))
+        if size := re.fullmatch(r"(.*)[mM][bB](\.\S+)?", text):
+            return Megabytes(float(size[1]), (size[2] or ".ply").lower())
         if text.endswith("%"):
             return float(text[:-1]) / 100
         return int(text) if text.lstrip("+-").isdigit() else float(text)
+    except BudgetError:
+        raise
     except ValueError as error:
         raise BudgetError(f"keep is {text!r}; {WANTED}, or auto or auto:DB (such as auto:35)") from error

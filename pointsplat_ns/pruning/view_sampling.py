@@ -165,13 +165,8 @@ def views_about(
         if up.shape != (3,) or not 0 < float(up.norm()) < math.inf:
             raise DataError(f"up is {up.tolist()}; expected three numbers, not all 0")
         up = up / up.norm()
-    low, high = content_box(scene)
-    diagonal = content_diagonal(scene, low, high)
-    centre = 0.5 * (low + high).cpu()
-    surface = Surface.of(scene, centre, diagonal)
-    axis = upright_axis(surface) if up is None else up
-    inside = _is_room(surface, UprightBox.of(surface, axis))
-    box = UprightBox.of(surface, pointing_up(surface, axis, inside) if up is None else up)
+    centre, diagonal, surface = _content_surface(scene)
+    box, inside = _upright(surface, up)
     small = in_units(thinned(scene, PROBED), centre, diagonal)
     generator = torch.Generator().manual_seed(seed)
     kinds: list[tuple[bool, tuple[Tensor, Tensor] | None]] = [(inside, None), (not inside, None)]
@@ -189,6 +184,31 @@ def views_about(
     viewmats = taken.clone()
     viewmats[:, :3, 3] = translation * (diagonal / UNITS) - rotation @ centre
     return _views(viewmats, width, height, NEAR_PLANE * diagonal)
+
+
+@torch.no_grad()
+def estimated_up(scene: Gaussians) -> Tensor:
+    """Which way is up in a scene, (3,) float64 of length 1, as :func:`sample_views` takes it.
+
+    Raises:
+        DataError: if nothing of the scene is visible.
+    """
+    return _upright(_content_surface(scene)[2])[0].up
+
+
+def _content_surface(scene: Gaussians) -> tuple[Tensor, float, Surface]:
+    """Centre (3,) and diagonal of the content, and its surface in units of it."""
+    low, high = content_box(scene)
+    diagonal = content_diagonal(scene, low, high)
+    centre = 0.5 * (low + high).cpu()
+    return centre, diagonal, Surface.of(scene, centre, diagonal)
+
+
+def _upright(surface: Surface, up: Tensor | None = None) -> tuple[UprightBox, bool]:
+    """The upright box of a scene, by the direction ``up`` (3,) if it is known, and whether the scene is a room."""
+    axis = upright_axis(surface) if up is None else up
+    inside = _is_room(surface, UprightBox.of(surface, axis))
+    return UprightBox.of(surface, pointing_up(surface, axis, inside) if up is None else up), inside
 
 
 def look_at(positions: Tensor, targets: Tensor, up: Tensor | None = None) -> Tensor:

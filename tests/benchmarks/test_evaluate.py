@@ -18,6 +18,7 @@ from pointsplat_ns.refiner import save_refiner
 PROGRAMS = (
     "compaction",
     "example_room",
+    "formats",
     "photo_places",
     "quality",
     "rasterizer",

@@ -184,7 +184,7 @@ def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
     assert "torn.safetensors: not a readable" in refusal(capsys, output, ply, "--refiner", torn)
     assert "gone.ply: no such file" in refusal(capsys, output, tmp_path / "gone.ply", "--refiner", helps)
     assert "keep is 'half'" in refusal(capsys, output, ply, "--refiner", helps, "--keep", "half")
-    assert "ends in .ply" in refusal(capsys, tmp_path / "small.splat", ply, "--refiner", helps)
+    assert ".spz, .sog" in refusal(capsys, tmp_path / "small.obj", ply, "--refiner", helps)
     assert "ends in .png" in refusal(capsys, output, ply, "--refiner", helps, "--picture", tmp_path / "shown.jpg")
     write_ply(room()[:0], tmp_path / "empty.ply")
     assert "Gaussians" in refusal(capsys, output, tmp_path / "empty.ply", "--refiner", helps)

@@ -128,7 +128,7 @@ def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
 
 
 def test_an_output_that_cannot_be_written_is_refused(ply, tmp_path, capsys):
-    assert "ends in .ply" in refusal(capsys, tmp_path / "out.splat", "prune", ply)
+    assert ".spz, .sog" in refusal(capsys, tmp_path / "out.obj", "prune", ply)
     (tmp_path / "folder.ply").mkdir()
     assert "is a folder" in refusal(capsys, tmp_path / "folder.ply", "prune", ply)
     assert "cannot be written" in refusal(capsys, ply / "below_a_file.ply", "prune", ply)

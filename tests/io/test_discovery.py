@@ -47,7 +47,7 @@ def test_a_run_no_folder_and_a_folder_without_scenes_are_refused(make_run, tmp_p
     for folder, said in (
         (make_run(), "expected a folder with scenes below it"),
         (tmp_path / "gone", "expected a folder with scenes below it"),
-        (tmp_path / "empty", "no scene below it; expected 3DGS .ply files or trained Splatfacto runs"),
+        (tmp_path / "empty", "no scene below it; expected files \\(.*\\) or trained Splatfacto runs"),
     ):
         with pytest.raises(SceneError, match=said):
             find_scenes(folder)

@@ -1,0 +1,63 @@
+"""``pointsplat convert``: a scene in another format, turned and scaled."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from pointsplat_ns.cli.scene_options import Scene, check_outputs, file_bytes
+
+
+def convert(
+    scene: Scene,
+    output: tyro.conf.Positional[Path],
+    sh: Literal["all", "0", "1", "2", "3"] = "all",
+    up: str | None = None,
+    scale: float = 1.0,
+    original_frame: bool = False,
+    spz_version: Literal[3, 4] = 3,
+    spz_sh_bits: tuple[int, int] = (6, 5),
+    force: bool = False,
+) -> None:
+    """Write a scene in another format. What each format keeps and loses stands in docs/formats.md.
+
+    For example: pointsplat convert room.ply room.spz --sh 1
+
+    Args:
+        scene: a file of any format (.ply, .compressed.ply, .spz, .sog or its folder, .splat, .ksplat), a Splatfacto
+            checkpoint, or a run (its folder or config.yml).
+        output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog, meta.json (a SOG as a
+            folder), .splat or .glb.
+        sh: SH bands to keep: all, or up to a degree.
+        up: the axis that shall point up: x, y, z, -x, -y or -z. What is up in the scene is estimated; -y:z says that it
+            is -y. Write --up=-y for a negative axis.
+        scale: factor on positions and sizes.
+        original_frame: of a Splatfacto run: undo the turn, shift and scale that nerfstudio gave its data.
+        spz_version: of an .spz file. 4 is newer, and fewer viewers read it.
+        spz_sh_bits: of an .spz file: bits of SH coefficients, of degree 1 and of the others, up to 8. More bits are a
+            larger file and a better picture.
+        force: overwrite an existing file.
+    """
+    import pointsplat_ns as ps
+    from pointsplat_ns.io.formats import format_to_write
+    from pointsplat_ns.io.formats.spz import write_spz
+    from pointsplat_ns.pruning import cut_sh
+    from pointsplat_ns.system.progress import progress_bar
+
+    check_outputs(output, None, force)
+    start = time.perf_counter()
+    before = ps.load(scene)
+    after = before if sh == "all" else cut_sh(before, int(sh))
+    after = ps.place(after, up, scale, scene if original_frame else None)
+    if format_to_write(output).suffix == ".spz":
+        with progress_bar() as report:
+            write_spz(after, output, report, spz_version, spz_sh_bits)
+    else:
+        ps.save(after, output, progress=True)
+    cut = f" cut to {after.sh_degree}" if after.sh_degree < before.sh_degree else ""
+    degree = f"SH degree {before.sh_degree}{cut}"
+    size = file_bytes(output) / 1e6
+    print(f"{output}: {len(after):,} Gaussians, {degree}, {size:.2f} MB, in {time.perf_counter() - start:.1f} s")

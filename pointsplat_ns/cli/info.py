@@ -1,0 +1,59 @@
+"""``pointsplat info``: what is in a scene."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from pointsplat_ns.cli.scene_options import Scene
+
+if TYPE_CHECKING:
+    from pointsplat_ns.compression.scene_info import SceneInfo
+
+WIDTH = 40
+"""Characters of the longest bar."""
+
+
+def info(scene: Scene, json_output: Annotated[bool, tyro.conf.arg(name="json")] = False) -> None:
+    """Look at a scene: counts, SH, opacities, sizes, bounds, rows that look wrong, and what files of it would weigh.
+
+    Args:
+        scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
+        json_output: print JSON.
+    """
+    import pointsplat_ns as ps
+
+    found = ps.info(scene)
+    if json_output:
+        print(json.dumps(found.as_dict(), indent=2))
+    else:
+        _print(found)
+
+
+def _print(found: SceneInfo) -> None:
+    print(f"{found.gaussians:,} Gaussians of SH degree {found.sh_degree}")
+    if found.sh_energies:
+        root = ", ".join(f"degree {index + 1}: {value**0.5:.3g}" for index, value in enumerate(found.sh_energies))
+        print(f"what SH add to colours, root mean square: {root}")
+    for name, corners in (("all", found.bounds), ("middle 96 %", found.content)):
+        if corners:
+            low, high = (" ".join(f"{value:.4g}" for value in corner) for corner in corners)
+            print(f"bounds, {name}: {low} to {high}, scene units")
+    step = 1 / max(len(found.opacities), 1)
+    _bars("opacity", {f"{index * step:.1f}": count for index, count in enumerate(found.opacities)})
+    _bars("largest standard deviation, scene units, from", found.sizes)
+    print("suspicious: " + (", ".join(f"{what} {n:,}" for what, n in found.suspicious.items()) or "nothing"))
+    print("files, MB, if a share of the Gaussians is kept (.spz is estimated):")
+    shares = next(iter(found.file_bytes.values()), {})
+    print(" " * 18 + "".join(f"{share:>9}" for share in shares))
+    for suffix, sizes in found.file_bytes.items():
+        print(f"  {suffix:<16}" + "".join(f"{size / 1e6:>9.2f}" for size in sizes.values()))
+
+
+def _bars(title: str, counts: dict[str, int]) -> None:
+    print(f"{title}:")
+    most = max([*counts.values(), 1])
+    for name, count in counts.items():
+        print(f"  {name:>6} {'#' * round(WIDTH * count / most):<{WIDTH}} {count:,}")

@@ -1,0 +1,145 @@
+"""Turning, scaling and moving scenes: which way is up, how long a unit is, and the frame of a run's data."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.runs import Run, may_be_run, open_run
+from pointsplat_ns.pruning.view_sampling import estimated_up
+from pointsplat_ns.refiner.augmentation import Transform
+
+_AXES = {"x": 0, "y": 1, "z": 2}
+_ORTHOGONAL = 1e-4
+"""Transforms are saved with about 7 digits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """Turns a scene, scales it, and moves it: a point x becomes ``scale * matrix @ x + offset``."""
+
+    matrix: Tensor  # [3, 3] float64, orthogonal; a determinant of -1 mirrors
+    scale: float  # above 0
+    offset: Tensor  # [3] float64
+
+    def inverse(self) -> Similarity:
+        """What undoes it."""
+        return Similarity(self.matrix.T, 1 / self.scale, -(self.matrix.T @ self.offset) / self.scale)
+
+    def apply(self, scene: Gaussians) -> Gaussians:
+        """The scene in its new place, its SH turned with it. Mirroring a scene mirrors what its SH show."""
+        mirrored = bool(torch.linalg.det(self.matrix) < 0)
+        quat = _quaternion(-self.matrix if mirrored else self.matrix)
+        turn = Transform(quat, mirrored, torch.ones(3, dtype=torch.float64), torch.arange(3))
+        turned = turn.apply(scene.to(dtype=torch.float64))
+        return turned.replace(
+            means=turned.means * self.scale + self.offset.to(turned.means), scales=turned.scales + math.log(self.scale)
+        ).to(dtype=scene.dtype)
+
+
+def place(
+    scene: Gaussians, up: str | None = None, scale: float = 1.0, original_frame: str | Path | None = None
+) -> Gaussians:
+    """Turn and scale a scene, and bring it back to the frame of the data that it was trained on.
+
+    nerfstudio turns, centres and scales the poses of a dataset before it trains. ``original_frame`` undoes that, so
+    that the scene fits the poses, meshes and measurements of the data. That comes first, then ``up``, then ``scale``.
+
+    Args:
+        scene: N Gaussians.
+        up: "z" turns the scene, about the origin, so that up is the z axis; also "x", "y", "-x", "-y" and "-z". Which
+            way is up in the given scene is estimated, or said: "-y:z" if it is the -y axis.
+        scale: factor on positions and sizes, above 0.
+        original_frame: the Splatfacto run that the scene is of (its folder, ``config.yml`` or checkpoint).
+
+    Returns:
+        N Gaussians on the same device.
+
+    Raises:
+        PointSplatError: if ``up`` or ``scale`` means nothing.
+        DataError: if up is to be estimated, and nothing of the scene is visible.
+        SceneError: if ``original_frame`` is no run.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> room = ps.example_room()[::100]
+        >>> turned = ps.place(room, up="z:y", scale=2.0)
+        >>> bool((turned.means[:, 1] - 2 * room.means[:, 2]).abs().max() < 1e-5)
+        True
+    """
+    if not 0 < scale < math.inf:
+        raise PointSplatError(f"scale is {scale:g}; expected a number above 0")
+    directions = None if up is None else _directions(up)
+    if original_frame is not None:
+        scene = _frame_at(original_frame).inverse().apply(scene)
+    if directions is not None:
+        now, wanted = directions
+        matrix = _turn(estimated_up(scene) if now is None else now, wanted)
+        scene = Similarity(matrix, 1.0, torch.zeros(3, dtype=torch.float64)).apply(scene)
+    if scale != 1.0:
+        scene = Similarity(torch.eye(3, dtype=torch.float64), scale, torch.zeros(3, dtype=torch.float64)).apply(scene)
+    return scene
+
+
+def _frame_at(path: str | Path) -> Similarity:
+    run = open_run(path, need_data=False) if may_be_run(path) else None
+    if run is None or not run.is_gaussian_scene:
+        raise SceneError(f"{path}: not a Splatfacto run, which knows the frame of its data; expected its folder")
+    return frame_of(run)
+
+
+def frame_of(run: Run) -> Similarity:
+    """From the frame of a run's data to that of its scene.
+
+    Raises:
+        SceneError: if the run's transform is not a rotation with one scale.
+    """
+    linear = run.transform[:, :3].double()
+    size = float(torch.linalg.det(linear).abs()) ** (1 / 3)
+    matrix = linear / size if size > 0 else linear
+    if not size > 0 or float((matrix @ matrix.T - torch.eye(3)).abs().max()) > _ORTHOGONAL:
+        raise SceneError(f"{run.folder}: its transform is no rotation with one scale; expected what nerfstudio saves")
+    u, _, v = torch.linalg.svd(matrix)
+    return Similarity(u @ v, size * run.scale, run.transform[:, 3].double() * run.scale)
+
+
+def _directions(up: str) -> tuple[Tensor | None, Tensor]:
+    """What is up now, None if that is to be estimated, and what shall be up."""
+    match = re.fullmatch(r"(?:([+-]?[xyz]):)?([+-]?[xyz])", up.strip().lower())
+    if not match:
+        raise PointSplatError(f"up is {up!r}; expected an axis such as z or -y, or two such as -y:z (from -y to z)")
+    return (None if match[1] is None else _axis(match[1])), _axis(match[2])
+
+
+def _axis(text: str) -> Tensor:
+    axis = torch.zeros(3, dtype=torch.float64)
+    axis[_AXES[text[-1]]] = -1.0 if text[0] == "-" else 1.0
+    return axis
+
+
+def _turn(start: Tensor, end: Tensor) -> Tensor:
+    """The smallest rotation (3, 3) that turns one direction to another; one of many if they are opposite."""
+    cosine = float(start @ end)
+    if cosine < -1 + 1e-12:
+        side = torch.linalg.cross(start, torch.eye(3, dtype=torch.float64)[int(start.abs().argmin())])
+        side = side / side.norm()
+        return 2 * side[:, None] * side[None] - torch.eye(3, dtype=torch.float64)
+    cross = torch.linalg.cross(start, end)
+    x, y, z = cross.tolist()
+    skew = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
+    return torch.eye(3, dtype=torch.float64) + skew + skew @ skew / (1 + cosine)
+
+
+def _quaternion(matrix: Tensor) -> Tensor:
+    """The quaternion (4,) wxyz of a rotation matrix."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(matrix.numpy()).as_quat()
+    return torch.tensor([w, x, y, z], dtype=torch.float64)

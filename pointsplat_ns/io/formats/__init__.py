@@ -1,0 +1,29 @@
+"""The files that scenes are exchanged in, beside the plain PLY: one module for each, and a registry of all.
+
+All of them keep numbers in few bits. What each loses is measured in ``docs/formats.md``. Readers check counts and sizes
+against the size of the file before memory is taken, and bound what is decompressed.
+"""
+
+from pointsplat_ns.io.formats.registry import (
+    FORMATS,
+    READABLE,
+    WRITABLE,
+    Format,
+    format_named,
+    format_to_read,
+    format_to_write,
+)
+from pointsplat_ns.io.formats.sog_images import META as SOG_META
+from pointsplat_ns.io.formats.sog_images import PARTS as SOG_PARTS
+
+__all__ = [
+    "FORMATS",
+    "READABLE",
+    "SOG_META",
+    "SOG_PARTS",
+    "WRITABLE",
+    "Format",
+    "format_named",
+    "format_to_read",
+    "format_to_write",
+]

@@ -1,0 +1,203 @@
+"""What the formats share: how numbers become few bits and come back, and reading bytes that may lie."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import SH_C0, Gaussians
+from pointsplat_ns.geometry.morton import interleave, spread_bits
+from pointsplat_ns.geometry.quaternions import zero_as_identity
+from pointsplat_ns.io.files import one_line, require_memory
+
+SATURATED = 0.25
+"""Opacity bytes 0 and 255 are read as 0.25 and 254.75: in the middle of what is written as these bytes, and with a
+logit that is finite. A logit of infinity would be dropped by some programs."""
+
+FREE_BYTES = 1 << 26
+"""Decompressed content up to this size is taken from a file of any size."""
+
+MAX_RATIO = 1032
+"""Beyond that, the largest ratio of decompressed to compressed bytes. It is deflate's own limit."""
+
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+
+Array = NDArray[Any]
+
+
+@contextmanager
+def damage_named(path: Path, kind: str) -> Iterator[None]:
+    """Turn what a damaged file causes in its decoder into a :class:`SceneError` that names the file.
+
+    Args:
+        path: the file that is read.
+        kind: of the file, for the error, such as "SPZ".
+    """
+    try:
+        yield
+    except SceneError:
+        raise
+    except OSError as error:
+        why = error.strerror or one_line(error)
+        raise SceneError(f"{path}: cannot be read as {kind} ({why})") from error
+    except (ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError, SyntaxError) as error:
+        why = f"lacks {error}" if isinstance(error, KeyError) else one_line(error)
+        raise SceneError(f"{path}: damaged {kind} file ({why})") from error
+
+
+def load_bytes(path: Path) -> bytes:
+    """The whole content of a file.
+
+    Raises:
+        SceneError: if it does not fit into memory.
+    """
+    require_memory(path, path.stat().st_size)
+    return path.read_bytes()
+
+
+def require_plausible(path: Path, unpacked: int, packed: int, count: int, rest: int) -> None:
+    """Refuse, before memory is taken, a compressed file that would decompress to more than its size can hold, or that
+    holds more Gaussians than fit into memory.
+
+    Args:
+        path: the file, for the error.
+        unpacked: bytes of its content by its header.
+        packed: bytes of the file.
+        count: number of Gaussians by its header.
+        rest: SH coefficients per channel beyond the constant one.
+
+    Raises:
+        SceneError: if so.
+    """
+    if unpacked > max(FREE_BYTES, MAX_RATIO * packed):
+        raise SceneError(
+            f"{path}: the header declares {count} Gaussians of {unpacked} bytes in all, more than {packed} compressed "
+            "bytes can hold"
+        )
+    require_memory(path, unpacked + 4 * count * (14 + 3 * rest))
+
+
+class Blocks:
+    """Arrays that follow one another in bytes.
+
+    Args:
+        data: the bytes.
+        path: the file that they are from, for the error.
+        start: where the first array begins.
+    """
+
+    def __init__(self, data: bytes | memoryview, path: Path, start: int = 0):
+        self._data, self._path, self.position = data, path, start
+
+    def take(self, dtype: str | np.dtype, *shape: int) -> NDArray:
+        """The next array, not copied.
+
+        Raises:
+            SceneError: if the bytes end before it does.
+        """
+        kind = np.dtype(dtype)
+        count = int(np.prod([int(side) for side in shape], dtype=object))
+        left = len(self._data) - self.position
+        if count * kind.itemsize > left:
+            raise SceneError(
+                f"{self._path}: truncated; {count * kind.itemsize} bytes expected at byte {self.position}, found {left}"
+            )
+        array = np.frombuffer(self._data, kind, count, self.position).reshape(shape)
+        self.position += count * kind.itemsize
+        return array
+
+
+def scene_of(
+    means: ArrayLike, scales: ArrayLike, quats: ArrayLike, opacities: ArrayLike, dc: ArrayLike, rest: ArrayLike
+) -> Gaussians:
+    """The scene of decoded arrays, as float32.
+
+    Args:
+        means: (N, 3).
+        scales: (N, 3) logarithms.
+        quats: (N, 4) wxyz.
+        opacities: (N,) logits.
+        dc: (N, 3).
+        rest: (N, K, 3).
+    """
+    columns = (means, scales, quats, np.reshape(opacities, (-1, 1)), dc, rest)
+    return Gaussians(*(torch.from_numpy(np.array(column, np.float32, order="C")) for column in columns))
+
+
+def logits_of_bytes(levels: Array) -> Array:
+    """Opacity logits of bytes, finite; see :data:`SATURATED`."""
+    share = np.clip(levels.astype(np.float64), SATURATED, 255 - SATURATED) / 255
+    return np.log(share / (1 - share)).astype(np.float32)
+
+
+def bytes_of_logits(scene: Gaussians) -> Array:
+    """Opacities (N,) as bytes, rounded."""
+    return to_bytes(255 * scene.alphas.double())
+
+
+def dc_of_shares(shares: Array) -> Array:
+    """Constant SH coefficients of colours, where 0 is black and 1 white."""
+    return ((shares - 0.5) / SH_C0).astype(np.float32)
+
+
+def shares_of_dc(scene: Gaussians) -> Array:
+    """Colours (N, 3) of the constant SH coefficients, float64; they may lie outside [0, 1]."""
+    return 0.5 + SH_C0 * scene.features_dc.double().numpy()
+
+
+def to_bytes(values: Array | Tensor) -> Array:
+    """Numbers rounded to the nearest byte."""
+    return np.clip(np.rint(np.asarray(values)), 0, 255).astype(np.uint8)
+
+
+def log_of_sizes(sizes: Array) -> Array:
+    """Log-scales of standard deviations. Zero is -Inf, a flat axis; a negative size is NaN and dropped by readers."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log(sizes.astype(np.float32))
+
+
+def unit_quats(scene: Gaussians) -> Array:
+    """Quaternions (N, 4) wxyz of length 1, float64; zero is the identity."""
+    quats = zero_as_identity(scene.quats).double()
+    return (quats / quats.norm(dim=1, keepdim=True)).numpy()
+
+
+def smallest_three(unit: Array) -> tuple[Array, Array]:
+    """Quaternions without their largest component, which is made positive.
+
+    Args:
+        unit: (N, 4) of length 1.
+
+    Returns:
+        The index of the largest component (N,), and the others in order, (N, 3), within +-1/sqrt(2).
+    """
+    largest = np.abs(unit).argmax(axis=1)
+    rows = np.arange(len(unit))
+    signed = unit * np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]
+    return largest, np.take_along_axis(signed, _OTHERS[largest], axis=1)
+
+
+def from_smallest_three(largest: Array, others: Array) -> Array:
+    """Quaternions (N, 4) of what :func:`smallest_three` returns; components that are too long leave the largest 0."""
+    quats = np.empty((len(others), 4), np.float32)
+    np.put_along_axis(quats, _OTHERS[largest], others.astype(np.float32), axis=1)
+    left = np.clip(1.0 - np.square(others.astype(np.float64)).sum(axis=1), 0.0, None)
+    quats[np.arange(len(others)), largest] = np.sqrt(left)
+    return quats
+
+
+def morton_order(scene: Gaussians) -> Tensor:
+    """Indices (N,) that bring neighbours in space together."""
+    if len(scene) == 0:
+        return torch.zeros(0, dtype=torch.int64)
+    low, high = scene.means.double().aminmax(dim=0)
+    cells = ((scene.means.double() - low) / (high - low).clamp_min(1e-300) * 0x1FFFFF).long()
+    return interleave(*(spread_bits(axis) for axis in cells.unbind(1))).argsort(stable=True)

@@ -1,0 +1,168 @@
+"""Codebooks for SOG: few numbers, or few rows of SH coefficients, that stand for many."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+LEVELS = 256
+"""Entries of a codebook of numbers."""
+
+MAX_COLORS = 65_536
+"""Entries, at most, of a palette of SH; an index has 16 bits."""
+
+GROUP = 1024
+"""Gaussians per entry of a palette where there are few, and entries that palettes are multiples of."""
+
+_SAMPLE = 1 << 17
+"""Numbers that a codebook is made from, and rows that the first split of a palette is made from."""
+
+_STEPS_1D, _STEPS = 20, 6
+_BRANCH, _DEPTH = 64, 6  # clusters that rows are split into, and how often
+_BINS, _PER_BIN = (64, 4096), 16
+_BLOCK = 1 << 22  # distances computed at once, 16 MB
+
+
+def codebook(values: Tensor) -> tuple[Tensor, Tensor]:
+    """256 numbers that stand for many, by Lloyd's algorithm (k-means in one dimension).
+
+    Args:
+        values: float32 of any shape, finite.
+
+    Returns:
+        The codebook (256,), ascending, and the index of the nearest entry for each value, uint8 of the same shape.
+    """
+    flat = values.flatten()
+    if not flat.numel():
+        return torch.zeros(LEVELS), torch.zeros(values.shape, dtype=torch.uint8)
+    book = _distinct(flat)
+    if book is None:
+        ordered = torch.cat([flat[:: -(-flat.numel() // _SAMPLE)], flat.amin()[None], flat.amax()[None]])
+        book = _spread(ordered)
+        for _ in range(_STEPS_1D):
+            index = _nearest(book, ordered)
+            count = torch.bincount(index, minlength=LEVELS)
+            total = torch.zeros(LEVELS, dtype=torch.float64).index_add_(0, index, ordered.double())
+            book = torch.where(count > 0, (total / count.clamp_min(1)).float(), book).sort().values
+    return book, _nearest(book, flat).to(torch.uint8).reshape(values.shape)
+
+
+def _distinct(values: Tensor) -> Tensor | None:
+    """The values themselves, if no more than 256 of them differ; the last is repeated."""
+    distinct = values[: 2 * LEVELS].unique()
+    distinct = distinct if len(distinct) > LEVELS else values.unique()
+    return distinct[torch.arange(LEVELS).clamp_max(len(distinct) - 1)] if len(distinct) <= LEVELS else None
+
+
+def _spread(values: Tensor) -> Tensor:
+    """256 numbers as dense as the cube root of the density of the values, which is best for the mean squared error
+    where numbers are many (Panter and Dite 1951)."""
+    low, high = float(values.amin()), float(values.amax())
+    bins = min(max(values.numel() // _PER_BIN, _BINS[0]), _BINS[1])
+    density = torch.histc(values, bins, low, high).double().pow(1 / 3)
+    below = torch.cat([density.new_zeros(1), density.cumsum(0)])
+    wanted = (torch.arange(LEVELS, dtype=torch.float64) + 0.5) / LEVELS * below[-1]
+    bin_ = (torch.searchsorted(below, wanted) - 1).clamp(0, bins - 1)
+    within = (wanted - below[bin_]) / density[bin_].clamp_min(1e-12)
+    return (low + (high - low) * (bin_ + within) / bins).float()
+
+
+def _nearest(book: Tensor, values: Tensor) -> Tensor:
+    """Index in an ascending codebook of the entry nearest to each value."""
+    return torch.bucketize(values, (book[1:] + book[:-1]) / 2)
+
+
+def palette_size(count: int) -> int:
+    """Entries of the palette for so many Gaussians: a power of two, at most what an index reaches."""
+    size = GROUP
+    while 2 * size <= min(count, MAX_COLORS):
+        size *= 2
+    return size
+
+
+def palette(rows: Tensor, progress: Callable[[float], None]) -> tuple[Tensor, Tensor]:
+    """Rows that stand for many, by k-means in levels: rows are split into clusters, each gets its share of the palette,
+    and is split in turn. That takes a small part of the time of k-means with as many clusters at once.
+
+    Args:
+        rows: (N, D) float32, finite.
+        progress: called with the share done.
+
+    Returns:
+        The palette (P, D), P a multiple of 64, and the index (N,) of the entry for each row.
+    """
+    n, size = len(rows), palette_size(len(rows))
+    if n <= size:
+        return torch.cat([rows, rows.new_zeros(size - n, rows.shape[1])]), torch.arange(n)
+    generator = torch.Generator().manual_seed(0)  # the same input gives the same bits
+    book, index = rows.new_zeros(size, rows.shape[1]), torch.empty(n, dtype=torch.int64)
+    waiting = [(torch.arange(n), size, 0)]
+    used = done = 0
+    while waiting:
+        members, k, depth = waiting.pop()
+        part = rows[members]
+        if k > _BRANCH and depth < _DEPTH:
+            sample = part[torch.randperm(len(part), generator=generator)[:_SAMPLE]]
+            of = _assign(part, _means(sample, _BRANCH, generator))
+            counts = torch.bincount(of, minlength=_BRANCH)
+            groups = members[of.argsort(stable=True)].split(counts.tolist())
+            share = _apportion(counts, k).tolist()
+            waiting += [(group, own, depth + 1) for group, own in zip(groups, share, strict=True) if own]
+            continue
+        # Rows that clusters do not tell apart, as where nearly all are equal, are cut into pieces of one size.
+        centres = _means(part, k, generator) if k <= _BRANCH else _pieces(part, k)
+        index[members] = used + (_assign(part, centres) if k <= _BRANCH else _piece_of(part, k))
+        book[used : used + len(centres)] = centres
+        used, done = used + len(centres), done + len(members)
+        progress(done / n)
+    return book, index
+
+
+def _piece_of(rows: Tensor, k: int) -> Tensor:
+    """Which of ``k`` pieces of about one size each row (N, D) is in, along the column that varies most."""
+    order = rows[:, int(rows.var(dim=0).argmax())].argsort(stable=True)
+    pieces = torch.empty(len(rows), dtype=torch.int64)
+    pieces[order] = torch.arange(len(rows)) * k // len(rows)
+    return pieces
+
+
+def _pieces(rows: Tensor, k: int) -> Tensor:
+    """Means (k, D) of these pieces."""
+    of = _piece_of(rows, k)
+    total = rows.new_zeros(k, rows.shape[1]).index_add_(0, of, rows)
+    return total / torch.bincount(of, minlength=k)[:, None].clamp_min(1)
+
+
+def _apportion(counts: Tensor, size: int) -> Tensor:
+    """``size`` entries shared out in proportion to counts: at least one where there are members, never more."""
+    share = torch.minimum((counts.double() * size / counts.sum()).floor().long().clamp_min(1), counts)
+    order = counts.argsort(descending=True, stable=True)
+    while (left := size - int(share.sum())) != 0:
+        can = order[(share[order] < counts[order]) if left > 0 else (share[order] > 1)][: abs(left)]
+        if not len(can):
+            break
+        share[can] += 1 if left > 0 else -1
+    return share
+
+
+def _means(rows: Tensor, k: int, generator: torch.Generator) -> Tensor:
+    """Centres (at most k, D) of k-means over rows (N, D)."""
+    if len(rows) <= k:
+        return rows
+    centres = rows[torch.randperm(len(rows), generator=generator)[:k]].clone()
+    for _ in range(_STEPS):
+        index = _assign(rows, centres)
+        count = torch.bincount(index, minlength=k)
+        total = torch.zeros_like(centres).index_add_(0, index, rows)
+        filled = count > 0
+        centres[filled] = total[filled] / count[filled, None]
+    return centres
+
+
+def _assign(rows: Tensor, centres: Tensor) -> Tensor:
+    """Index (N,) of the centre nearest to each row."""
+    half = 0.5 * centres.square().sum(dim=1)
+    step = max(_BLOCK // len(centres), 1)
+    return torch.cat([(half - part @ centres.T).argmin(dim=1) for part in rows.split(step)])

@@ -1,0 +1,141 @@
+"""The formats of scene files: which there are, and which one a path means."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import replacing
+from pointsplat_ns.io.formats.coding import morton_order
+from pointsplat_ns.io.formats.compressed_ply import (
+    compressed_ply_bytes,
+    encode_compressed_ply,
+    is_compressed,
+    read_compressed_ply,
+)
+from pointsplat_ns.io.formats.glb import encode_glb, glb_bytes
+from pointsplat_ns.io.formats.ksplat import read_ksplat
+from pointsplat_ns.io.formats.sog import encode_sog, read_sog, write_sog_folder
+from pointsplat_ns.io.formats.sog_images import META
+from pointsplat_ns.io.formats.splat import drawing_order, encode_splat, read_splat, splat_bytes
+from pointsplat_ns.io.formats.spz import encode_spz, read_spz
+from pointsplat_ns.io.ply import ply_bytes, read_ply, write_ply
+from pointsplat_ns.io.ply_header import read_header
+from pointsplat_ns.system.progress import Progress
+
+Writer = Callable[[Gaussians, Path, Progress], None]
+
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of scene file."""
+
+    name: str
+    suffix: str
+    """The end of its files' names, lower case."""
+    read: Callable[[Path], Gaussians] | None = None
+    write: Writer | None = None
+    starts: tuple[bytes, ...] = ()
+    """What its files begin with, if that tells."""
+    bytes_of: Callable[[int, int], int] | None = None
+    """Exact size of a file, bytes, by the number of Gaussians and their SH degree; None if it depends on the scene."""
+    encode: Callable[[Gaussians, Progress], bytes] | None = None
+    """The bytes of a file of a scene, where only they tell its size."""
+    order: Callable[[Gaussians], Tensor] | None = None
+    """Indices (N,) of a scene's Gaussians in the order in which they are written, if that is another."""
+
+    @property
+    def budget_suffix(self) -> str:
+        """What follows a size in a budget, such as ``.spz`` in 5MB.spz."""
+        return self.suffix if self.suffix.startswith(".") else ".sog"
+
+    def fits(self, path: Path) -> bool:
+        """Whether a file's name is one of this format."""
+        name = path.name.lower()
+        return name.endswith(self.suffix) if self.suffix.startswith(".") else name == self.suffix
+
+
+def _writer(encode: Callable[[Gaussians, Progress], bytes]) -> Writer:
+    """What writes encoded bytes to a file, whole or not at all."""
+
+    def write(scene: Gaussians, path: Path, progress: Progress) -> None:
+        data = encode(scene, progress)
+        with replacing(path) as part:
+            part.write_bytes(data)
+
+    return write
+
+
+def _read_any_ply(path: Path) -> Gaussians:
+    """Read a PLY, which its header tells to be compressed or not."""
+    with path.open("rb") as stream:
+        header = read_header(stream, path)
+    return read_compressed_ply(path) if is_compressed(header) else read_ply(path)
+
+
+FORMATS = (
+    # Longer ends of names come before those that they end with.
+    Format(
+        "compressed PLY", ".compressed.ply", _read_any_ply, _writer(encode_compressed_ply), (b"ply\n", b"ply\r"),
+        compressed_ply_bytes, order=morton_order,
+    ),
+    Format(
+        "3DGS PLY", ".ply", _read_any_ply, lambda scene, path, _: write_ply(scene, path), (b"ply\n", b"ply\r"),
+        ply_bytes,
+    ),
+    Format("SPZ", ".spz", read_spz, _writer(encode_spz), (b"\x1f\x8b", b"NGSP"), encode=encode_spz),
+    Format("SOG", ".sog", read_sog, _writer(encode_sog), (b"PK\x03\x04",), encode=encode_sog, order=morton_order),
+    Format("SOG folder", META, read_sog, write_sog_folder, encode=encode_sog, order=morton_order),
+    Format("ksplat", ".ksplat", read_ksplat),
+    Format("splat", ".splat", read_splat, _writer(encode_splat), bytes_of=splat_bytes, order=drawing_order),
+    Format("glTF", ".glb", write=_writer(encode_glb), bytes_of=glb_bytes),
+)  # fmt: skip
+"""All formats of files that hold nothing but a scene."""
+
+READABLE = ", ".join(kind.suffix for kind in FORMATS if kind.read)
+WRITABLE = ", ".join(kind.suffix for kind in FORMATS if kind.write)
+
+
+def format_named(name: str) -> Format | None:
+    """The format that the end of a file's name means, such as ``.spz``; None if there is none."""
+    return next((kind for kind in FORMATS if kind.fits(Path(name))), None)
+
+
+def format_to_read(path: Path) -> Format | None:
+    """The format of a file or SOG folder: what its first bytes say, else what its name says; None if neither does.
+
+    Raises:
+        SceneError: if the file cannot be read, or its format is written only.
+    """
+    if path.is_dir():
+        return format_named(META) if (path / META).is_file() else None
+    named = format_named(path.name)
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(8)
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read ({error.strerror})") from error
+    if named is None or named.starts and not start.startswith(named.starts):
+        named = next((kind for kind in FORMATS if kind.starts and start.startswith(kind.starts)), named)
+    if named is not None and named.read is None:
+        raise SceneError(f"{path}: {named.name} files are written, not read; expected one of {READABLE}")
+    return named
+
+
+def format_to_write(path: Path | str) -> Format:
+    """The format that a name asks for.
+
+    Raises:
+        SceneError: if no format that is written has such a name.
+    """
+    path = Path(path)
+    kind = format_named(path.name)
+    if kind is None or kind.write is None:
+        what = f"a {kind.name} file" if kind else f"a {path.suffix or 'nameless'} file"
+        raise SceneError(f"{path}: cannot write {what}; expected a name that ends in {WRITABLE}")
+    return kind

@@ -1,0 +1,254 @@
+"""SOG files: PlayCanvas' format of WebP images, as a zip archive (``.sog``) or a folder with ``meta.json``.
+
+A Gaussian is a pixel of each image. Positions are 16-bit logarithms, log-scales and colours are entries of a codebook
+of 256 numbers, quaternions lack their largest component, and SH are rows of a palette of up to 65,536.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+import math
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
+from pointsplat_ns.io.files import keep_usable, replacing, require_memory
+from pointsplat_ns.io.formats.coding import (
+    Array,
+    bytes_of_logits,
+    damage_named,
+    from_smallest_three,
+    logits_of_bytes,
+    morton_order,
+    scene_of,
+    smallest_three,
+    to_bytes,
+    unit_quats,
+)
+from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette
+from pointsplat_ns.io.formats.sog_images import META, Images, webp
+from pointsplat_ns.io.ply_header import warn_antialiased
+from pointsplat_ns.system.progress import Progress, silent
+
+MAX_SIDE = 16_383
+"""Pixels of a side of a WebP image, at most."""
+
+LOWEST_LOG_SCALE = -30.0
+"""Log-scales below this, such as those of flat axes, are written as this."""
+
+_ACROSS = 64  # palette entries in one row of pixels
+_LARGEST = 252  # alpha of a quaternion's pixel is this plus the index of its largest component
+
+
+def read_sog(path: Path | str) -> Gaussians:
+    """Read a SOG file, or a folder of its parts, of version 2 or of the first, which has no number.
+
+    Args:
+        path: a ``.sog`` file, a folder, or the ``meta.json`` in one.
+
+    Returns:
+        The scene, float32 on the CPU. Gaussians that cannot be drawn are dropped, and their number is logged.
+
+    Raises:
+        SceneError: if a part is missing or damaged, or declares more than it can hold.
+    """
+    path = Path(path)
+    images = Images(path)
+    try:
+        with damage_named(path, "SOG"):
+            scene = _decode(images, images.meta(), path)
+    finally:
+        images.close()
+    return keep_usable(scene, path)
+
+
+def encode_sog(scene: Gaussians, progress: Progress = silent) -> bytes:
+    """The bytes of a ``.sog`` file. Gaussians are reordered, so that neighbours in the images are neighbours in space.
+
+    Args:
+        scene: N Gaussians, float32 on the CPU.
+        progress: called with the share done.
+
+    Raises:
+        SceneError: if there are more Gaussians than the images can hold.
+    """
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in _parts(scene, progress).items():
+            # The same scene gives the same bytes, whenever it is written.
+            archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data)
+    return stream.getvalue()
+
+
+def write_sog_folder(scene: Gaussians, path: Path, progress: Progress = silent) -> None:
+    """Write the parts of a SOG file into the folder of ``path``, which is called ``meta.json``. It is written last, so
+    that a folder with it is whole.
+
+    Raises:
+        SceneError: if there are more Gaussians than the images can hold, or a part cannot be written.
+    """
+    parts = _parts(scene, progress)
+    for name in [*(name for name in parts if name != META), META]:
+        with replacing(path.with_name(name)) as part:
+            part.write_bytes(parts[name])
+
+
+def _decode(images: Images, meta: dict[str, Any], path: Path) -> Gaussians:
+    version = meta.get("version", 1)
+    if version not in (1, 2):
+        raise SceneError(f"{path}: SOG of version {version!r}; expected 1 or 2")
+    n = meta["count"] if version == 2 else meta["means"]["shape"][0]
+    if not isinstance(n, int) or not 0 <= n <= MAX_SIDE**2:
+        raise SceneError(f"{path}: declares {n!r} Gaussians; expected a number up to {MAX_SIDE**2}")
+    if meta.get("model", "default") == "antialiased":
+        warn_antialiased(path)
+    pixels = functools.partial(_pixels, images, n)
+    low, high = pixels(meta["means"], 0), pixels(meta["means"], 1)
+    require_memory(path, 4 * n * (14 + 3 * _rest_of(meta)))
+    mins, maxs = (_numbers(meta["means"][name], 3) for name in ("mins", "maxs"))
+    logs = mins + (maxs - mins) * (low[:, :3].astype(np.float64) + 256.0 * high[:, :3]) / 65535
+    quats, colors = pixels(meta["quats"]), pixels(meta["sh0"])
+    tops = quats[:, 3].astype(np.int64) - _LARGEST
+    rotations = from_smallest_three(tops.clip(0), (quats[:, :3].astype(np.float64) / 255 - 0.5) * 2**0.5)
+    rotations[tops < 0] = (1, 0, 0, 0)  # as the viewers of this format do
+    dc = _looked_up(meta["sh0"], colors, 3 if version == 2 else 4)
+    return scene_of(
+        np.sign(logs) * np.expm1(np.abs(logs)),
+        _looked_up(meta["scales"], pixels(meta["scales"]), 3),
+        rotations,
+        logits_of_bytes(colors[:, 3]) if version == 2 else dc[:, 3],
+        dc[:, :3],
+        _read_sh(images, n, meta),
+    )
+
+
+def _pixels(images: Images, n: int, part: dict[str, Any], file: int = 0) -> Array:
+    return images.pixels(part["files"][file], n).reshape(-1, 4)[:n]
+
+
+def _rest_of(meta: dict[str, Any]) -> int:
+    """SH coefficients per channel beyond the constant one; as many as there can be where only an image tells."""
+    bands = meta["shN"].get("bands", MAX_SH_DEGREE) if meta.get("shN") else 0
+    if not isinstance(bands, int) or not 0 <= bands <= MAX_SH_DEGREE:
+        raise ValueError(f"SH degree {bands!r}, expected 0 to {MAX_SH_DEGREE}")
+    return (bands + 1) ** 2 - 1
+
+
+def _read_sh(images: Images, n: int, meta: dict[str, Any]) -> Array:
+    part = meta.get("shN")
+    if not part:
+        return np.empty((n, 0, 3))
+    labels = _pixels(images, n, part, 1)
+    index = labels[:, 0].astype(np.int64) + 256 * labels[:, 1].astype(np.int64)
+    if "bands" in part:
+        rest, entries = _rest_of(meta), int(part["count"])
+        if not rest:
+            return np.empty((n, 0, 3))
+        if not 0 < entries <= 65536:
+            raise ValueError(f"a palette of {entries} entries, expected 1 to 65536")
+        colors = images.pixels(part["files"][0], _ACROSS * rest * -(-entries // _ACROSS), _ACROSS * rest)
+    else:  # version 1: the width of the image tells
+        colors = images.pixels(part["files"][0], _ACROSS * 3 * -(-(int(index.max(initial=0)) + 1) // _ACROSS))
+        rest, over = divmod(colors.shape[1], _ACROSS)
+        if over or rest not in (3, 8, 15):
+            raise ValueError(f"a palette {colors.shape[1]} pixels wide, expected 192, 512 or 960")
+        entries = colors.shape[0] * _ACROSS
+    table = _looked_up(part, colors.reshape(-1, 4), 3).reshape(-1, rest, 3)
+    known = index < min(entries, len(table))
+    return np.where(known[:, None, None], table[np.where(known, index, 0)], np.float32(0))
+
+
+def _looked_up(part: dict[str, Any], pixels: Array, channels: int) -> Array:
+    """What bytes stand for: entries of a codebook, or shares between bounds in version 1. (N, channels) float32."""
+    book = part.get("codebook")
+    if book is None:
+        low, high = (np.broadcast_to(_numbers(part[name]), channels) for name in ("mins", "maxs"))
+        table = low + (high - low) * np.linspace(0, 1, LEVELS)[:, None]
+    else:
+        entries = _numbers([0 if entry is None else entry for entry in book])
+        if not 0 < len(entries) <= LEVELS:
+            raise ValueError(f"a codebook of {len(entries)} entries, expected {LEVELS}")
+        table = np.broadcast_to(np.pad(entries, (0, LEVELS - len(entries)))[:, None], (LEVELS, channels))
+    table = table.astype(np.float32)
+    return np.stack([table[pixels[:, i], i] for i in range(channels)], axis=1)
+
+
+def _numbers(values: Any, count: int | None = None) -> Array:
+    """Numbers of a JSON file."""
+    array = np.asarray(values, np.float64)
+    if count is not None and array.shape != (count,):
+        raise ValueError(f"{array.size} numbers, expected {count}")
+    return array
+
+
+def _parts(scene: Gaussians, progress: Progress) -> dict[str, bytes]:
+    """The files of a SOG folder by name."""
+    n = len(scene)
+    width = max(4 * math.ceil(math.sqrt(n) / 4), 4)
+    height = max(4 * math.ceil(n / width / 4), 4)
+    if max(width, height) > MAX_SIDE:
+        raise SceneError(f"{n} Gaussians; a SOG file holds at most {MAX_SIDE**2}")
+    progress("packing", 0.0)
+    scene = scene[morton_order(scene)]
+    images: dict[str, tuple[Array, int, int]] = {}
+
+    def add(name: str, columns: Sequence[Array]) -> list[str]:
+        images[name] = (np.column_stack(columns).astype(np.uint8), width, height)
+        return [name]
+
+    means = scene.means.double().numpy()
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    mins, maxs = (logs.min(axis=0), logs.max(axis=0)) if n else (np.zeros(3), np.zeros(3))
+    span = np.where(maxs > mins, maxs - mins, 1.0)
+    steps = np.rint((logs - mins) / span * 65535).astype(np.int64)
+    scales, scale_index = codebook(scene.scales.clamp_min(LOWEST_LOG_SCALE))
+    colors, color_index = codebook(scene.features_dc)
+    largest, others = smallest_three(unit_quats(scene))
+    meta: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": "pointsplat-ns"},
+        "count": n,
+        "means": {
+            "mins": mins.tolist(),
+            "maxs": maxs.tolist(),
+            "files": add("means_l.webp", [steps & 255]) + add("means_u.webp", [steps >> 8]),
+        },
+        "scales": {"codebook": scales.tolist(), "files": add("scales.webp", [scale_index.numpy()])},
+        "quats": {"files": add("quats.webp", [to_bytes((others / 2**0.5 + 0.5) * 255), _LARGEST + largest])},
+        "sh0": {
+            "codebook": colors.tolist(),
+            "files": add("sh0.webp", [color_index.numpy(), bytes_of_logits(scene)]),
+        },
+    }
+    if scene.sh_degree:
+        meta["shN"] = _pack_sh(scene, images, (width, height), progress)
+    files = {}
+    for done, (name, image) in enumerate(images.items()):
+        progress("compressing", done / len(images))
+        files[name] = webp(*image)
+    return {META: json.dumps(meta).encode(), **files}
+
+
+def _pack_sh(
+    scene: Gaussians, images: dict[str, tuple[Array, int, int]], size: tuple[int, int], progress: Progress
+) -> dict[str, Any]:
+    """Add the palette and its indices to ``images``; returns what ``meta.json`` says of them."""
+    rest = scene.features_rest.shape[1]
+    rows, index = palette(scene.features_rest.flatten(1), functools.partial(progress, "a palette of SH"))
+    levels, level_index = codebook(rows)
+    labels = np.column_stack([index.numpy() & 255, index.numpy() >> 8, np.zeros(len(index))])
+    images["shN_centroids.webp"] = (level_index.reshape(-1, 3).numpy(), _ACROSS * rest, len(rows) // _ACROSS)
+    images["shN_labels.webp"] = (labels.astype(np.uint8), *size)
+    return {
+        "count": len(rows),
+        "bands": scene.sh_degree,
+        "codebook": levels.tolist(),
+        "files": ["shN_centroids.webp", "shN_labels.webp"],
+    }

@@ -1,0 +1,130 @@
+"""The WebP images of SOG files, in a zip archive or a folder."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.io.files import require_file, require_memory
+from pointsplat_ns.io.formats.coding import Array
+
+META = "meta.json"
+PARTS = tuple(
+    f"{name}.webp" for name in ("means_l", "means_u", "scales", "quats", "sh0", "shN_centroids", "shN_labels")
+)
+"""Names of the images that are written; a scene without SH has no shN."""
+
+MAX_META_BYTES = 1 << 22
+"""A meta.json has about 20 kB."""
+
+_SPARE = 1 << 20
+"""Pixels that an image may have beyond twice as many as are needed."""
+
+
+class Images:
+    """The parts of one SOG file.
+
+    Args:
+        path: a zip archive, a folder, or the ``meta.json`` in one.
+
+    Raises:
+        SceneError: if it is none of these.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._zip: zipfile.ZipFile | None = None
+        folder = path if path.is_dir() else path.parent
+        if path.is_dir() or path.name == META:
+            self._folder = folder
+            require_file(folder / META, f"{META} of a SOG folder")
+        else:
+            require_file(path, "a .sog file")
+            try:
+                self._zip = zipfile.ZipFile(path)
+            except (zipfile.BadZipFile, NotImplementedError) as error:
+                raise SceneError(f"{path}: not a .sog file, or truncated ({error}); expected a zip archive") from error
+
+    def close(self) -> None:
+        """Close the archive."""
+        if self._zip is not None:
+            self._zip.close()
+
+    def meta(self) -> dict[str, Any]:
+        """The content of ``meta.json``."""
+        content = json.loads(self._bytes(META, MAX_META_BYTES))
+        if not isinstance(content, dict):
+            raise SceneError(f"{self.path}: {META} holds a {type(content).__name__}; expected an object")
+        return content
+
+    def pixels(self, name: Any, least: int, width: int | None = None) -> Array:
+        """The pixels of one image.
+
+        Args:
+            name: its file name, as ``meta.json`` gives it.
+            least: the number of pixels that are needed.
+            width: of the image, pixels, if it matters.
+
+        Returns:
+            (height, width, 4) uint8, RGBA; at least ``least`` pixels.
+
+        Raises:
+            SceneError: if the image is missing, is no WebP, or has too few pixels or far too many.
+        """
+        from PIL import Image
+
+        if not isinstance(name, str) or PurePosixPath(name).name != name or "\\" in name:
+            raise SceneError(f"{self.path}: an image called {name!r}; expected the name of a file beside {META}")
+        data = self._bytes(name, 4 * (2 * least + _SPARE))
+        with Image.open(io.BytesIO(data), formats=("WEBP",)) as image:
+            across, down = image.size
+            if across * down < least or across * down > 2 * least + _SPARE or width not in (None, across):
+                needed = f"{least} pixels" + (f", {width} across" if width else "")
+                raise SceneError(f"{self.path}: {name} has {across} x {down} pixels; expected {needed}")
+            require_memory(self.path, 8 * across * down)
+            return np.asarray(image.convert("RGBA"))
+
+    def _bytes(self, name: str, most: int) -> bytes:
+        """The content of one part, which must not exceed ``most`` bytes."""
+        if self._zip is None:
+            part = require_file(self._folder / name, "a part of a SOG folder")
+            size = part.stat().st_size
+        else:
+            entries = [entry for entry in self._zip.infolist() if PurePosixPath(entry.filename).name == name]
+            if len(entries) != 1:
+                raise SceneError(f"{self.path}: holds {len(entries)} files called {name}; expected one")
+            size = entries[0].file_size
+        if size > most:
+            raise SceneError(f"{self.path}: {name} has {size} bytes; expected at most {most}")
+        if self._zip is None:
+            return part.read_bytes()
+        try:
+            with self._zip.open(entries[0]) as stream:
+                return stream.read(most + 1)  # the size in the archive may be a lie
+        except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+            raise SceneError(f"{self.path}: damaged; {name} cannot be read ({error})") from error
+
+
+def webp(pixels: Array, width: int, height: int) -> bytes:
+    """A lossless WebP image.
+
+    Args:
+        pixels: (up to width * height, 3 or 4) uint8; the rest is filled with zeros.
+        width: pixels.
+        height: pixels.
+    """
+    from PIL import Image
+
+    full = np.zeros((height * width, pixels.shape[1]), np.uint8)
+    full[: len(pixels)] = pixels
+    stream = io.BytesIO()
+    image = Image.fromarray(full.reshape(height, width, -1))
+    # "exact" keeps the colours where alpha is 0.
+    image.save(stream, "WEBP", lossless=True, exact=True, quality=60, method=4)
+    return stream.getvalue()

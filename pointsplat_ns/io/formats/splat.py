@@ -1,0 +1,97 @@
+"""``.splat`` files: 32 bytes a Gaussian and no header, as antimatter15's viewer introduced them.
+
+Position and standard deviations as float32, then colour and opacity, and the quaternion wxyz, as bytes. There are no
+SH beyond the constant coefficient.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import keep_usable, logger, require_file, require_memory
+from pointsplat_ns.io.formats.coding import (
+    bytes_of_logits,
+    damage_named,
+    dc_of_shares,
+    log_of_sizes,
+    logits_of_bytes,
+    scene_of,
+    shares_of_dc,
+    to_bytes,
+    unit_quats,
+)
+from pointsplat_ns.system.progress import Progress, silent
+
+_ROW = np.dtype([("means", "<f4", 3), ("stds", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+
+
+def read_splat(path: Path | str) -> Gaussians:
+    """Read a ``.splat`` file.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The scene, of SH degree 0, float32 on the CPU. Gaussians that cannot be drawn are dropped, and their number is
+        logged.
+
+    Raises:
+        SceneError: if its size is not a multiple of 32 bytes, or it does not fit into memory.
+    """
+    path = require_file(path, "a .splat file")
+    size = path.stat().st_size
+    if size % _ROW.itemsize:
+        raise SceneError(
+            f"{path}: {size} bytes, not a multiple of {_ROW.itemsize}; expected {_ROW.itemsize} bytes a Gaussian"
+        )
+    require_memory(path, size + size // _ROW.itemsize * 4 * 14)
+    with damage_named(path, ".splat"):
+        rows = np.fromfile(path, _ROW)
+        scene = scene_of(
+            rows["means"],
+            log_of_sizes(rows["stds"]),
+            (rows["quats"].astype(np.float32) - 128) / 128,
+            logits_of_bytes(rows["rgba"][:, 3]),
+            dc_of_shares(rows["rgba"][:, :3].astype(np.float32) / 255),
+            np.empty((len(rows), 0, 3)),
+        )
+    return keep_usable(scene, path)
+
+
+def splat_bytes(count: int, sh_degree: int) -> int:
+    """Size of a ``.splat`` file of ``count`` Gaussians, bytes."""
+    return _ROW.itemsize * count
+
+
+def drawing_order(scene: Gaussians) -> Tensor:
+    """Indices (N,): the largest and most opaque Gaussians first, as viewers draw while they load."""
+    weight = scene.scales.double().clamp(-20, 20).sum(dim=1).exp() * scene.alphas
+    return weight.argsort(descending=True, stable=True)
+
+
+def encode_splat(scene: Gaussians, progress: Progress = silent) -> bytes:
+    """The bytes of a ``.splat`` file, in :func:`drawing_order`.
+
+    SH beyond the constant coefficient have no place in it; that they are left out is logged.
+
+    Args:
+        scene: N Gaussians, float32 on the CPU.
+        progress: not called.
+    """
+    if scene.sh_degree:
+        logger.warning(
+            ".splat holds no SH: degree %d is left out, colours no longer change with the view", scene.sh_degree
+        )
+    scene = scene[drawing_order(scene)]
+    rows = np.empty(len(scene), _ROW)
+    rows["means"] = scene.means.numpy()
+    rows["stds"] = scene.stds.numpy()
+    rows["rgba"][:, :3] = to_bytes(255 * shares_of_dc(scene))
+    rows["rgba"][:, 3] = bytes_of_logits(scene)
+    rows["quats"] = to_bytes(128 * unit_quats(scene) + 128)
+    return rows.tobytes()

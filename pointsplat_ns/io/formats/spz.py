@@ -1,0 +1,304 @@
+"""SPZ files: Niantic's format, 20 bytes a Gaussian and one for each SH coefficient, compressed.
+
+Versions 2 and 3 are one gzip stream, with quaternions of three and four bytes. Version 4 has one zstd stream for each
+attribute. Positions are in fixed point of 24 bits. The format's documentation wants axes right, up, back (RUB);
+what is read and written here keeps the axes that it has, as most converters do.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
+from pointsplat_ns.io.files import keep_usable, logger, replacing, require_file
+from pointsplat_ns.io.formats.coding import (
+    Array,
+    Blocks,
+    bytes_of_logits,
+    damage_named,
+    from_smallest_three,
+    load_bytes,
+    logits_of_bytes,
+    require_plausible,
+    scene_of,
+    smallest_three,
+    to_bytes,
+    unit_quats,
+)
+from pointsplat_ns.io.ply_header import warn_antialiased
+from pointsplat_ns.system.progress import Progress, silent
+
+Version = Literal[3, 4]
+
+FRACTION_BITS = 12
+"""Bits of a position after the point, in scenes within 2048 units: steps of 0.00024. Larger scenes get fewer."""
+
+SH_BITS = (6, 5)
+"""Bits that are kept of SH coefficients, of degree 1 and of the others, up to 8. Fewer compress better. The format's
+own programs keep 5 and 4, which cost a capture 7.5 dB (``docs/formats.md``)."""
+
+_MAGIC = b"NGSP"
+_GZIP = b"\x1f\x8b"
+_HEADER = struct.Struct("<4sIIBBBB")  # magic, version, Gaussians, SH degree, bits after the point, flags, streams
+_HEADER_4 = 32
+_ANTIALIASED, _EXTENDED = 1, 2
+_COLOR_SCALE = 0.15
+_XYZW = np.array([1, 2, 3, 0])  # SPZ has w last
+
+
+@dataclass(frozen=True)
+class _Head:
+    version: int
+    count: int
+    degree: int
+    fraction_bits: int
+    flags: int
+    streams: int
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Bytes of positions, opacities, colours, scales, quaternions and SH."""
+        n = self.count
+        return (9 * n, n, 3 * n, 3 * n, (3 if self.version == 2 else 4) * n, 3 * ((self.degree + 1) ** 2 - 1) * n)
+
+
+def read_spz(path: Path | str) -> Gaussians:
+    """Read an SPZ file of version 2, 3 or 4. Of SH degree 4, the highest band is left out, which is logged.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The scene, float32 on the CPU, with the axes of the file. Gaussians that cannot be drawn are dropped, and their
+        number is logged.
+
+    Raises:
+        SceneError: if the file is of another kind or version, is truncated, or declares more than it can hold.
+    """
+    path = require_file(path, "an SPZ file")
+    with damage_named(path, "SPZ"):
+        data = load_bytes(path)
+        if data[:2] == _GZIP:
+            head, parts = _parts_of_gzip(data, path)
+        elif data[:4] == _MAGIC:
+            head, parts = _parts_of_zstd(data, path)
+        else:
+            raise SceneError(f"{path}: not an SPZ file (starts with {data[:4]!r}); expected gzip or {_MAGIC!r}")
+        if head.flags & _ANTIALIASED:
+            warn_antialiased(path)
+        if head.flags & _EXTENDED:
+            logger.warning("%s: not read: the extensions of the SPZ file", path)
+        if head.degree > MAX_SH_DEGREE:
+            logger.warning("%s: SH degree %d, read up to degree %d", path, head.degree, MAX_SH_DEGREE)
+        scene = _decode(head, parts)
+    return keep_usable(scene, path)
+
+
+def encode_spz(
+    scene: Gaussians, progress: Progress = silent, version: Version = 3, sh_bits: tuple[int, int] = SH_BITS
+) -> bytes:
+    """The bytes of an SPZ file.
+
+    Args:
+        scene: N Gaussians, float32 on the CPU.
+        progress: called while compressing.
+        version: 3, which most viewers read, or 4, which loads sooner.
+        sh_bits: bits of SH coefficients, 1 to 8: of degree 1, and of the others.
+
+    Raises:
+        SceneError: if the scene is too large for the format, or there are no such bits.
+    """
+    if not all(1 <= bits <= 8 for bits in sh_bits):
+        raise SceneError(f"SH of {sh_bits[0]} and {sh_bits[1]} bits; expected 1 to 8 bits in SPZ")
+    n, flags = len(scene), 0
+    bits = _fraction_bits(scene)
+    parts = _encode(scene, bits, sh_bits)
+    if version == 3:
+        head = _HEADER.pack(_MAGIC, 3, n, scene.sh_degree, bits, flags, 0)
+        packer = zlib.compressobj(9, zlib.DEFLATED, 31)
+        packed = [packer.compress(head)]
+        for index, part in enumerate(parts):
+            progress("compressing", index / len(parts))
+            packed.append(packer.compress(part))
+        return b"".join([*packed, packer.flush()])
+    from zstandard import ZstdCompressor
+
+    parts = [part for part in parts if part]
+    streams = []
+    for index, part in enumerate(parts):
+        progress("compressing", index / len(parts))
+        streams.append(ZstdCompressor(level=12).compress(part))
+    head = _HEADER.pack(_MAGIC, 4, n, scene.sh_degree, bits, flags, len(parts))
+    head += struct.pack("<I12x", _HEADER_4)
+    table = b"".join(struct.pack("<QQ", len(s), len(p)) for s, p in zip(streams, parts, strict=True))
+    return b"".join([head, table, *streams])
+
+
+def write_spz(
+    scene: Gaussians,
+    path: Path | str,
+    progress: Progress = silent,
+    version: Version = 3,
+    sh_bits: tuple[int, int] = SH_BITS,
+) -> None:
+    """Write an SPZ file, as :func:`encode_spz` makes it. Gaussians that cannot be drawn are left out.
+
+    Raises:
+        SceneError: if it cannot be written, or the scene is too large for the format.
+    """
+    data = encode_spz(keep_usable(scene.detach().to("cpu", torch.float32), path), progress, version, sh_bits)
+    with replacing(path) as part:
+        part.write_bytes(data)
+
+
+def _head(data: bytes, path: Path) -> _Head:
+    if len(data) < _HEADER.size:
+        raise SceneError(f"{path}: truncated; an SPZ header has {_HEADER.size} bytes, found {len(data)}")
+    magic, *numbers = _HEADER.unpack(data[: _HEADER.size])
+    head = _Head(*numbers)
+    if magic != _MAGIC or not 2 <= head.version <= 4:
+        raise SceneError(f"{path}: SPZ of {magic!r} and version {head.version}; expected {_MAGIC!r}, version 2, 3 or 4")
+    if head.degree > 4:
+        raise SceneError(f"{path}: SH degree {head.degree}; expected 0 to 4")
+    if head.fraction_bits > 23:
+        raise SceneError(f"{path}: {head.fraction_bits} bits after the point; expected at most 23 of 24")
+    return head
+
+
+def _parts_of_gzip(data: bytes, path: Path) -> tuple[_Head, list[bytes | memoryview]]:
+    """Header and attributes of versions 2 and 3. No more is decompressed than the header declares."""
+    try:
+        head = _head(zlib.decompressobj(31).decompress(data, _HEADER.size), path)
+        if head.version == 4:
+            raise SceneError(f"{path}: SPZ of version 4 inside gzip; expected version 2 or 3 there")
+        rest = (head.degree + 1) ** 2 - 1
+        size = _HEADER.size + sum(head.sizes)
+        require_plausible(path, size, len(data), head.count, rest)
+        content = zlib.decompressobj(31).decompress(data, size)
+    except zlib.error as error:
+        raise SceneError(f"{path}: damaged SPZ file ({error})") from error
+    blocks = Blocks(content, path, _HEADER.size)
+    return head, [blocks.take("u1", length).data for length in head.sizes]
+
+
+def _parts_of_zstd(data: bytes, path: Path) -> tuple[_Head, list[bytes | memoryview]]:
+    """Header and attributes of version 4. No more is decompressed than the header declares."""
+    from zstandard import ZstdDecompressor, ZstdError
+
+    head = _head(data, path)
+    if head.version != 4:
+        raise SceneError(f"{path}: SPZ of version {head.version} outside gzip; expected version 4 there")
+    require_plausible(path, sum(head.sizes), len(data), head.count, (head.degree + 1) ** 2 - 1)
+    sizes = [size for size in head.sizes if size]
+    table = int(Blocks(data, path, _HEADER.size).take("<u4", 1)[0])
+    if head.streams != len(sizes) or table < _HEADER_4:
+        raise SceneError(
+            f"{path}: {head.streams} streams listed at byte {table}; expected {len(sizes)} from byte 32 on"
+        )
+    blocks = Blocks(data, path, table)
+    lengths = blocks.take("<u8", len(sizes), 2).tolist()
+    parts: list[bytes | memoryview] = []
+    for (packed, unpacked), size in zip(lengths, sizes, strict=True):
+        if unpacked != size:
+            raise SceneError(f"{path}: a stream of {unpacked} bytes for {head.count} Gaussians; expected {size}")
+        stream = blocks.take("u1", packed)
+        try:
+            with ZstdDecompressor().stream_reader(stream.data) as reader:
+                part = reader.read(size)
+        except ZstdError as error:
+            raise SceneError(f"{path}: damaged SPZ file ({error})") from error
+        if len(part) != size:
+            raise SceneError(f"{path}: truncated; a stream ends after {len(part)} of {size} bytes")
+        parts.append(part)
+    return head, parts + [b""] * (len(head.sizes) - len(parts))
+
+
+def _decode(head: _Head, parts: list[bytes | memoryview]) -> Gaussians:
+    n, rest = head.count, (head.degree + 1) ** 2 - 1
+    positions, alphas, colors, scales, quats, sh = (np.frombuffer(part, np.uint8) for part in parts)
+    kept = min(rest, (MAX_SH_DEGREE + 1) ** 2 - 1)
+    return scene_of(
+        _from_fixed_point(positions.reshape(n, 3, 3), head.fraction_bits),
+        scales.reshape(n, 3).astype(np.float32) / 16 - 10,
+        _quats_of_three(quats) if head.version == 2 else _quats_of_four(quats),
+        logits_of_bytes(alphas),
+        (colors.reshape(n, 3).astype(np.float32) / 255 - 0.5) / _COLOR_SCALE,
+        (sh.reshape(n, rest, 3)[:, :kept].astype(np.float32) - 128) / 128,
+    )
+
+
+def _encode(scene: Gaussians, bits: int, sh_bits: tuple[int, int]) -> list[bytes]:
+    """The attributes in the file's order."""
+    first, other = (_coarse(rest.numpy(), kept) for rest, kept in zip(_bands(scene), sh_bits, strict=True))
+    fixed = np.rint(np.ldexp(scene.means.double().numpy(), bits)).astype("<i4")
+    largest, others = smallest_three(unit_quats(scene)[:, _XYZW])
+    magnitudes = np.rint(np.abs(others) * 2**0.5 * 511).astype(np.uint32) | (others < 0).astype(np.uint32) << 9
+    words = largest.astype(np.uint32) << 30 | magnitudes[:, 0] << 20 | magnitudes[:, 1] << 10 | magnitudes[:, 2]
+    return [
+        np.ascontiguousarray(fixed[..., None]).view(np.uint8)[..., :3].tobytes(),
+        bytes_of_logits(scene).tobytes(),
+        to_bytes((scene.features_dc.double().numpy() * _COLOR_SCALE + 0.5) * 255).tobytes(),
+        to_bytes((scene.scales.double() + 10) * 16).tobytes(),
+        words.astype("<u4").tobytes(),
+        np.concatenate([first, other], axis=1).tobytes(),
+    ]
+
+
+def _bands(scene: Gaussians) -> tuple[Tensor, Tensor]:
+    """SH coefficients of degree 1, and those above."""
+    return scene.features_rest[:, :3], scene.features_rest[:, 3:]
+
+
+def _coarse(coefficients: Array, bits: int) -> Array:
+    """SH coefficients as bytes of which only the upper ``bits`` differ; 0 stays 0."""
+    step = 1 << (8 - bits)
+    levels = np.rint(coefficients.astype(np.float64) * 128 / step) * step + 128
+    return np.clip(levels, 0, 255).astype(np.uint8)
+
+
+def _fraction_bits(scene: Gaussians) -> int:
+    """Bits after the point with which all positions fit into 24 bits."""
+    farthest = float(scene.means.abs().max()) if len(scene) else 0.0
+    fitting = math.floor(math.log2((2**23 - 1) / farthest)) if farthest > 0 else FRACTION_BITS
+    if fitting < 0:
+        raise SceneError(
+            f"a Gaussian lies {farthest:.3g} units from the origin; SPZ reaches to {2**23 - 1}; scale the scene down"
+        )
+    if fitting < FRACTION_BITS:
+        logger.warning("SPZ: the scene reaches to %.3g units, so positions are rounded to %g", farthest, 2.0**-fitting)
+    return min(fitting, FRACTION_BITS)
+
+
+def _from_fixed_point(parts: Array, bits: int) -> Array:
+    """Positions (N, 3) of three bytes each (N, 3, 3), the lowest first."""
+    low, middle, high = (parts[..., i].astype(np.int32) for i in range(3))
+    signed = (low | middle << 8 | high << 16) << 8 >> 8  # the upper bit becomes the sign
+    return np.ldexp(signed.astype(np.float32), -bits)
+
+
+def _quats_of_three(packed: Array) -> Array:
+    """Version 2: x, y and z in a byte each; w is positive."""
+    xyz = packed.reshape(-1, 3).astype(np.float32) / 127.5 - 1
+    w = np.sqrt(np.clip(1 - np.square(xyz).sum(axis=1, keepdims=True), 0, None))
+    return np.concatenate([w, xyz], axis=1)
+
+
+def _quats_of_four(packed: Array) -> Array:
+    """From version 3 on: which component is largest, and nine bits and a sign for each of the others."""
+    words = packed.view("<u4")
+    levels = np.stack([words >> shift & 511 for shift in (20, 10, 0)], axis=1).astype(np.float32) / 511
+    negative = np.stack([words >> shift & 512 for shift in (20, 10, 0)], axis=1) > 0
+    others = np.where(negative, -levels, levels) * 0.5**0.5
+    quats = np.empty((len(words), 4), np.float32)
+    quats[:, _XYZW] = from_smallest_three((words >> 30).astype(np.int64), others)
+    return quats

@@ -1,0 +1,76 @@
+"""``pointsplat convert`` and ``pointsplat info``, and output in other formats."""
+
+import json
+
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from making import cloud, same
+from pointsplat_ns.cli import main
+
+
+@pytest.fixture
+def scene(tmp_path):
+    ps.save(cloud(400, 2, 2), tmp_path / "a.ply")
+    return tmp_path / "a.ply"
+
+
+def run(*words):
+    main([str(word) for word in words])
+
+
+def fails(capsys, *words):
+    with pytest.raises(SystemExit) as ended:
+        run(*words)
+    assert ended.value.code == 1
+    return capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["a.spz", "a.sog", "folder/meta.json", "a.splat", "a.compressed.ply", "a.glb"])
+def test_convert_writes_what_the_name_says_and_prints_its_size(scene, tmp_path, capsys, name):
+    run("convert", scene, tmp_path / name)
+    said = capsys.readouterr().out
+    size = sum(path.stat().st_size for path in (tmp_path / name).parent.iterdir() if path != scene) / 1e6
+    assert f"{tmp_path / name}: 400 Gaussians, SH degree 2, {size:.2f} MB" in said
+    if name != "a.glb":
+        back = tmp_path / "back.ply"
+        run("convert", tmp_path / name, back)
+        assert same(ps.load(back), ps.load(tmp_path / name))
+
+
+def test_convert_cuts_turns_and_scales(scene, tmp_path, capsys):
+    run("convert", scene, tmp_path / "b.ply", "--sh", "1", "--up=-y:z", "--scale", "2")
+    assert "SH degree 2 cut to 1" in capsys.readouterr().out
+    before, after = ps.load(scene), ps.load(tmp_path / "b.ply")
+    assert after.sh_degree == 1 and torch.allclose(after.means[:, 2], -2 * before.means[:, 1], atol=1e-5)
+
+
+def test_convert_writes_spz_of_either_version(scene, tmp_path):
+    run("convert", scene, tmp_path / "a.spz")
+    run("convert", scene, tmp_path / "b.spz", "--spz-version", "4")
+    assert same(ps.load(tmp_path / "a.spz"), ps.load(tmp_path / "b.spz"))
+    assert (tmp_path / "b.spz").read_bytes()[:4] == b"NGSP"
+
+
+def test_convert_overwrites_nothing_and_names_what_it_can_write(scene, tmp_path, capsys):
+    assert "exists already" in fails(capsys, "convert", scene, scene)
+    assert ".spz, .sog" in fails(capsys, "convert", scene, tmp_path / "a.ksplat")
+    assert "not a Splatfacto run" in fails(capsys, "convert", scene, tmp_path / "b.ply", "--original-frame")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_prune_writes_other_formats_and_counts_their_bytes(scene, tmp_path, capsys):
+    run("prune", scene, "--by", "opacity", "--keep", "0.004MB", "-o", tmp_path / "s.splat")
+    assert (tmp_path / "s.splat").stat().st_size == 32 * 125
+    run("prune", scene, "--by", "opacity", "--keep", "0.004MB", "-o", tmp_path / "s.spz")
+    assert 3500 <= (tmp_path / "s.spz").stat().st_size <= 4000
+    assert "counts tried" in capsys.readouterr().out
+
+
+def test_info_prints_a_page_or_json(scene, capsys):
+    run("info", scene)
+    said = capsys.readouterr().out
+    assert "400 Gaussians of SH degree 2" in said and "suspicious: nothing" in said and ".splat" in said
+    run("info", scene, "--json")
+    assert json.loads(capsys.readouterr().out) == ps.info(scene).as_dict()

@@ -1,0 +1,50 @@
+"""Budgets in bytes of compressed files."""
+
+import pytest
+
+from making import cloud
+from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.size_search import CLOSE, largest_within
+from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.io.formats import Format, format_to_write
+from pointsplat_ns.io.formats.spz import encode_spz
+
+
+def search(full, limit, encode=encode_spz):
+    kind = Format("SPZ", ".spz", encode=encode)
+    return largest_within(full, lambda count: full[:count], kind, limit, lambda share: None)
+
+
+def test_the_file_fits_and_is_not_much_smaller():
+    full = cloud(4000)
+    for limit in (5000, 20_000, 60_000):
+        found = search(full, limit)
+        assert CLOSE * limit <= found.size <= limit
+        assert found.size == len(encode_spz(found.scene)) == found.tried[len(found.scene)]
+
+
+def test_all_are_kept_if_all_fit():
+    full = cloud(100)
+    found = search(full, 10**6)
+    assert found.scene is full and list(found.tried) == [100]
+
+
+def test_a_budget_for_less_than_one_gaussian_is_refused():
+    with pytest.raises(BudgetError, match="too small for one Gaussian; expected at least"):
+        search(cloud(100), 10)
+
+
+def test_a_size_that_jumps_ends_the_search_with_what_fits():
+    # Beyond 50 Gaussians the file is ten times as large.
+    found = search(cloud(100), 600, lambda scene, _: bytes(10 * len(scene) * (10 if len(scene) > 50 else 1)))
+    assert found.size <= 600 and 1 <= len(found.scene) <= 50
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply", ".splat", ".glb", ".ply"])
+def test_prune_counts_bytes_of_the_format_that_is_named(tmp_path, suffix):
+    scene = cloud(2000)
+    small = prune_scene(scene, f"0.02MB{suffix}", "opacity").scene
+    path = tmp_path / f"a{suffix}"
+    format_to_write(path).write(small, path, lambda what, share: None)
+    assert path.stat().st_size <= 20_000
+    assert len(small) < 2000 or suffix == ".sog"

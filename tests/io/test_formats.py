@@ -1,0 +1,305 @@
+"""Scene files of every format: what comes back, that the order is known, and that sizes are as said."""
+
+from __future__ import annotations
+
+import functools
+import json
+import logging
+import struct
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pointsplat_ns as ps
+from making import SHARED_DATA, cloud, normal_scene, same_bits
+from pointsplat_ns.gaussians import SH_C0, Gaussians
+from pointsplat_ns.geometry.quaternions import zero_as_identity
+from pointsplat_ns.io.formats import FORMATS, format_to_read, format_to_write
+from pointsplat_ns.io.formats.registry import format_named
+from pointsplat_ns.io.formats.spz import write_spz
+
+LOSSY = (".compressed.ply", ".spz", ".sog", ".splat")
+FIXED = (".ply", ".compressed.ply", ".splat", ".glb")
+
+SPLATS = SHARED_DATA / "splats"
+
+
+def written(scene, path):
+    """What is read back of a scene, and the scene in the order of the file."""
+    ps.save(scene, path)
+    order = format_to_write(path).order
+    return ps.load(path), scene if order is None else scene[order(scene)]
+
+
+def name_of(suffix):
+    return suffix if suffix == "meta.json" else f"a{suffix}"
+
+
+def degrees_apart(one, other):
+    a, b = (torch.nn.functional.normalize(zero_as_identity(s.quats).double(), dim=1) for s in (one, other))
+    apart = torch.minimum((a - b).norm(dim=1), (a + b).norm(dim=1))
+    return 4 * torch.asin(apart / 2).rad2deg()
+
+
+def greatest(value):
+    return float(value.abs().max()) if value.numel() else 0.0
+
+
+def assert_close(suffix, before, after):
+    """The tolerances are half of a step of each format, and what its reader adds in rounding."""
+    extent = float((before.means.amax(0) - before.means.amin(0)).max())
+    spread = float(before.scales.max() - before.scales.min())
+    colors = float(before.features_dc.max() - before.features_dc.min())
+    rest = float(before.features_rest.abs().max()) if before.sh_degree else 0.0
+    position = {".spz": 2**-13, ".splat": 0.0, ".compressed.ply": extent / 1022 / 2 + 1e-6}
+    log_scale = {".spz": 1 / 32, ".splat": 1e-6, ".compressed.ply": spread / 1023 / 2 + 1e-5}
+    dc = {".spz": 0.5 / 255 / 0.15, ".splat": 0.5 / 255 / SH_C0, ".compressed.ply": colors / 255 / 2 + 1e-5}
+    # The components of .splat have 7 bits and a sign, others 8 to 10 bits over sqrt(2); all four of them may be off.
+    turn = {".splat": 1.1, ".spz": 0.3, ".compressed.ply": 0.3}.get(suffix, 1.1)
+    logs = extent and float(torch.log1p(before.means.abs()).max())
+    assert greatest(before.means - after.means) <= position.get(suffix, 2 * logs / 65535 * (1 + extent)) * 1.001
+    assert greatest(before.scales - after.scales) <= log_scale.get(suffix, spread / 200) * 1.001
+    assert float(degrees_apart(before, after).max()) <= turn
+    assert greatest(before.alphas - after.alphas) <= 0.5 / 255 + 1e-5
+    assert greatest(before.features_dc - after.features_dc) <= dc.get(suffix, colors / 200) * 1.001 + 1e-6
+    if suffix == ".splat":
+        assert after.sh_degree == 0
+        return
+    assert after.sh_degree == before.sh_degree
+    # Steps of SPZ are 1/16 and, of degree 1, 1/32; of the compressed PLY 1/32.
+    first = greatest((before.features_rest - after.features_rest)[:, :3])
+    assert suffix != ".spz" or first <= 1 / 32 / 2
+    coefficient = {".spz": 1 / 16 / 2, ".compressed.ply": 8 / 256 / 2}.get(suffix, rest / 12 + 1e-6)
+    assert greatest(before.features_rest - after.features_rest) <= coefficient * 1.001
+
+
+def mild(n, degree, seed=0):
+    """Gaussians within what every format can hold: colours in [0, 1], no more SH than a palette has entries."""
+    scene = cloud(n, seed, degree)
+    return scene.replace(features_dc=(torch.rand(n, 3, generator=torch.Generator().manual_seed(seed)) - 0.5) / SH_C0)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("suffix", LOSSY)
+def test_a_scene_comes_back_within_half_a_step_of_its_format(tmp_path, suffix, degree):
+    for n in (1, 257, 1000) if degree == 3 else (2, 600):
+        after, before = written(mild(n, degree, seed=n), tmp_path / name_of(suffix))
+        assert_close(suffix, before, after)
+
+
+@given(data=st.data())
+@settings(max_examples=5, deadline=None)
+@pytest.mark.parametrize("suffix", LOSSY)
+def test_writing_again_what_was_read_changes_nothing_to_speak_of(tmp_path_factory, suffix, data):
+    n, degree = data.draw(st.integers(1, 40)), data.draw(st.integers(0, 3))
+    folder = tmp_path_factory.mktemp("twice")
+    first, _ = written(mild(n, degree, data.draw(st.integers(0, 2**31))), folder / name_of(suffix))
+    second, ordered = written(first, folder / name_of(suffix))
+    assert greatest(ordered.alphas - second.alphas) <= 1e-6  # a byte stays the same byte
+    assert_close(suffix, ordered, second)
+
+
+@pytest.mark.parametrize("suffix", LOSSY)
+def test_opacities_of_exactly_0_and_1_come_back_as_finite_logits(tmp_path, suffix):
+    scene = cloud(4, 0, 0).replace(opacities=torch.tensor([[torch.inf], [-torch.inf], [20.0], [-20.0]]))
+    after, before = written(scene, tmp_path / name_of(suffix))
+    assert len(after) == 4 and bool(after.opacities.isfinite().all())
+    assert greatest(after.alphas - before.alphas) <= 0.3 / 255
+    assert bool((after.alphas[before.alphas < 0.5] < 1 / 255).all())  # what was not drawn is not drawn
+
+
+@pytest.mark.parametrize("suffix", (*LOSSY, ".ply", ".glb", "meta.json"))
+@pytest.mark.parametrize("degree", [0, 3])
+def test_a_scene_of_nothing_is_written(tmp_path, suffix, degree):
+    ps.save(Gaussians.empty(degree), tmp_path / name_of(suffix))
+    if suffix != ".glb":
+        assert len(ps.load(tmp_path / name_of(suffix))) == 0
+
+
+@pytest.mark.parametrize("suffix", LOSSY)
+def test_flat_gaussians_zero_quaternions_and_great_numbers_survive(tmp_path, suffix):
+    scene = mild(300, 1)
+    scene.scales[0] = -torch.inf
+    scene.quats[1] = 0
+    scene.means[2] = 1000.0
+    scene.features_dc[3] = 50.0
+    after, before = written(scene, tmp_path / name_of(suffix))
+    assert len(after) == 300
+    flat = before.scales[:, 0] == -torch.inf
+    assert bool((after.scales[flat] <= -9.9).all())
+    assert float(degrees_apart(before, after).max()) < 1.1
+    assert greatest(before.means - after.means) <= 2.0
+
+
+@pytest.mark.parametrize("suffix", LOSSY)
+def test_gaussians_that_cannot_be_drawn_are_left_out(tmp_path, suffix, caplog):
+    scene = cloud(5, 0, 1)
+    scene.means[2, 1] = torch.nan
+    ps.save(scene, tmp_path / name_of(suffix))
+    assert len(ps.load(tmp_path / name_of(suffix))) == 4
+    assert "dropped 1 of 5" in caplog.text
+
+
+@pytest.mark.parametrize("suffix", FIXED)
+def test_the_size_of_a_file_is_known_to_the_byte(tmp_path, suffix):
+    bytes_of = format_named(suffix).bytes_of
+    for n, degree in ((0, 0), (1, 3), (255, 1), (256, 2), (257, 0), (1001, 3)):
+        ps.save(normal_scene(n, degree), tmp_path / f"a{suffix}")
+        assert (tmp_path / f"a{suffix}").stat().st_size == bytes_of(n, degree)
+
+
+@pytest.mark.parametrize("suffix", (".spz", ".sog", "meta.json", ".compressed.ply", ".splat", ".glb"))
+def test_the_same_scene_gives_the_same_bytes(tmp_path, suffix):
+    for folder in "ab":
+        ps.save(cloud(2000, 3, 1), tmp_path / folder / name_of(suffix))
+    for path in (tmp_path / "a").iterdir():
+        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
+
+
+def test_spz_4_holds_what_spz_3_holds(tmp_path):
+    scene = cloud(500, 1, 2)
+    write_spz(scene, tmp_path / "3.spz")
+    write_spz(scene, tmp_path / "4.spz", version=4)
+    assert (tmp_path / "3.spz").read_bytes()[:2] == b"\x1f\x8b" and (tmp_path / "4.spz").read_bytes()[:4] == b"NGSP"
+    assert same_bits(ps.load(tmp_path / "3.spz"), ps.load(tmp_path / "4.spz"))
+
+
+def test_spz_of_a_large_scene_has_fewer_bits_after_the_point_and_says_so(tmp_path, caplog):
+    scene = cloud(50)
+    scene.means[0] = 100_000.0
+    ps.save(scene, tmp_path / "a.spz")
+    assert "positions are rounded to 0.015625" in caplog.text
+    assert greatest(ps.load(tmp_path / "a.spz").means - scene.means) <= 0.5 / 64
+    scene.means[0] = 1e9
+    with pytest.raises(ps.SceneError, match="1e\\+09 units from the origin"):
+        ps.save(scene, tmp_path / "a.spz")
+
+
+def test_splat_says_that_it_leaves_sh_out(tmp_path, caplog):
+    ps.save(cloud(5, 0, 2), tmp_path / "a.splat")
+    assert "degree 2 is left out" in caplog.text
+
+
+def test_content_tells_the_format_where_the_name_is_wrong(tmp_path):
+    scene = cloud(30)
+    for suffix, wrong in ((".spz", "x.ply"), (".sog", "x"), (".ply", "x.spz"), (".compressed.ply", "x.ply")):
+        ps.save(scene, tmp_path / f"a{suffix}")
+        (tmp_path / f"a{suffix}").rename(tmp_path / wrong)
+        assert len(ps.load(tmp_path / wrong)) == 30, wrong
+
+
+def test_a_sog_folder_is_read_by_either_of_its_names_and_holds_what_the_file_holds(tmp_path):
+    scene = cloud(1500, 0, 3)
+    ps.save(scene, tmp_path / "room" / "meta.json")
+    ps.save(scene, tmp_path / "room.sog")
+    scenes = [ps.load(tmp_path / "room"), ps.load(tmp_path / "room" / "meta.json"), ps.load(tmp_path / "room.sog")]
+    assert same_bits(scenes[0], scenes[1]) and same_bits(scenes[0], scenes[2])
+
+
+def test_glb_holds_the_numbers_as_the_extension_names_them(tmp_path):
+    scene = cloud(7, 0, 2)
+    ps.save(scene, tmp_path / "a.glb")
+    data = (tmp_path / "a.glb").read_bytes()
+    magic, version, length, text_length, kind = struct.unpack_from("<4sIII4s", data)
+    assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
+    content = json.loads(data[20 : 20 + text_length])
+    binary = data[20 + text_length + 8 :]
+    assert content["buffers"][0]["byteLength"] == len(binary)
+    (primitive,) = content["meshes"][0]["primitives"]
+    assert primitive["mode"] == 0 and primitive["extensions"]["KHR_gaussian_splatting"]["kernel"] == "ellipse"
+
+    def array(name):
+        accessor = content["accessors"][primitive["attributes"][name]]
+        view = content["bufferViews"][accessor["bufferView"]]
+        part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        return np.frombuffer(part, "u1" if accessor["componentType"] == 5121 else "<f4").reshape(accessor["count"], -1)
+
+    named = functools.partial("KHR_gaussian_splatting:{}".format)
+    assert np.array_equal(array("POSITION"), scene.means.numpy())
+    assert np.array_equal(array(named("SCALE")), scene.stds.numpy())
+    assert np.allclose(array(named("OPACITY"))[:, 0], scene.alphas.numpy())
+    unit = torch.nn.functional.normalize(scene.quats, dim=1)[:, [1, 2, 3, 0]]  # xyzw
+    assert np.allclose(array(named("ROTATION")), unit.numpy(), atol=1e-6)
+    assert np.array_equal(array(named("SH_DEGREE_0_COEF_0")), scene.features_dc.numpy())
+    assert np.array_equal(array(named("SH_DEGREE_2_COEF_4")), scene.features_rest[:, 7].numpy())
+    assert len(primitive["attributes"]) == 2 + 3 + 9
+    assert array("COLOR_0").shape == (7, 4)
+    with pytest.raises(ps.SceneError, match="written, not read"):
+        ps.load(tmp_path / "a.glb")
+
+
+def test_degree_4_of_a_ply_is_read_up_to_3(tmp_path, caplog):
+    names = [*"xyz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(72)), "opacity"]
+    names += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
+    head += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    rows = np.arange(2 * len(names), dtype="<f4").reshape(2, -1)
+    (tmp_path / "a.ply").write_bytes(head.encode() + rows.tobytes())
+    scene = ps.load(tmp_path / "a.ply")
+    assert scene.sh_degree == 3 and "SH degree 4, read up to degree 3" in caplog.text
+    for channel in range(3):
+        first = names.index(f"f_rest_{24 * channel}")
+        assert scene.features_rest[1, :, channel].tolist() == rows[1, first : first + 15].tolist()
+
+
+@pytest.mark.parametrize("comment", ["SplatRenderMode: mip", "antialiased 1"])
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply"])
+def test_a_comment_that_a_scene_is_drawn_in_another_way_is_passed_on(tmp_path, caplog, comment, suffix):
+    ps.save(cloud(3), tmp_path / f"a{suffix}")
+    ps.load(tmp_path / f"a{suffix}")
+    assert "trained" not in caplog.text
+    data = (tmp_path / f"a{suffix}").read_bytes().replace(b" 1.0\n", f" 1.0\ncomment {comment}\n".encode(), 1)
+    (tmp_path / f"a{suffix}").write_bytes(data)
+    assert len(ps.load(tmp_path / f"a{suffix}")) == 3
+    assert "trained" in caplog.text and "drawn here" in caplog.text
+
+
+def test_no_format_hides_behind_another():
+    for kind in FORMATS:
+        assert format_named(name_of(kind.suffix)) is kind
+    assert format_named("lod-meta.json") is None and format_named("a.txt") is None
+
+
+REAL = {
+    "apt_bathroom/Toilet.compressed.ply": (57_574, 3),
+    "kettle_pod/pod.spz": (101_407, 3),
+    "mujoco_tabletop/scene.spz": (213_944, 0),
+    "pc_statue_massa/massa.sog": (58_649, 0),
+    "pc_flowers": (92_802, 2),
+}
+
+
+@pytest.mark.skipif(not SPLATS.is_dir(), reason="the files are not there")
+@pytest.mark.parametrize("name", REAL)
+def test_files_that_others_published_are_read(name, caplog):
+    with caplog.at_level(logging.WARNING):
+        scene = ps.load(SPLATS / name)
+    assert (len(scene), scene.sh_degree) == REAL[name]
+    assert bool(scene.opacities.isfinite().all()) and bool(scene.usable().all())
+    assert "dropped" not in caplog.text
+    assert format_to_read(SPLATS / name).name in ("compressed PLY", "SPZ", "SOG", "SOG folder")
+
+
+@pytest.mark.skipif(not SPLATS.is_dir(), reason="the files are not there")
+@pytest.mark.parametrize("name", [name for name in REAL if "." in name])
+def test_they_are_read_as_an_independent_reader_reads_them(name, monkeypatch):
+    monkeypatch.syspath_prepend(str(SPLATS))
+    import gsio
+
+    theirs, ours = gsio.read_any(str(SPLATS / name)), ps.load(SPLATS / name)
+    for field, value, within in (
+        ("means", ours.means, 1e-5),
+        ("scales", ours.scales, 1e-5),
+        ("dc", ours.features_dc, 1e-5),
+    ):
+        assert np.abs(theirs[field] - value.numpy()).max() <= within, field  # float32 in another order
+    # It keeps the ends of opacities at 0 and 1.
+    assert np.abs(1 / (1 + np.exp(-theirs["opac"])) - ours.alphas.numpy()).max() <= 0.3 / 255
+    unit = theirs["quats"] / np.linalg.norm(theirs["quats"], axis=1, keepdims=True)
+    assert np.abs((unit * ours.quats.numpy()).sum(1)).min() > 1 - 1e-6
+    if ours.sh_degree:
+        # It takes the bytes 0 and 255 of the compressed PLY for the middle of their steps.
+        assert np.abs(theirs["rest"] - ours.features_rest.numpy()).max() <= 4 / 256
