@@ -94,6 +94,7 @@ def main(args: list[str] | None = None) -> None:
     from pointsplat_ns.cli.prune import prune
     from pointsplat_ns.cli.report import report
     from pointsplat_ns.cli.rooms import rooms
+    from pointsplat_ns.cli.tradeoff import tradeoff
     from pointsplat_ns.errors import PointSplatError
     from pointsplat_ns.system.memory import keep_freed_memory
 
@@ -102,6 +103,7 @@ def main(args: list[str] | None = None) -> None:
         "prune": prune,
         "compact": compact,
         "lod": lod,
+        "tradeoff": tradeoff,
         "export": export,
         "report": report,
         "rooms": rooms,
