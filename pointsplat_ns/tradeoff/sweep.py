@@ -143,6 +143,7 @@ class Sweep:
         self.journal = Journal(folder, identity)
         self.judge = Judge(self.dense, self.looked_at, folder)
         self.note(self.judge.no_lpips)
+        self._forget_those_without_pictures()
         self._seconds: list[float] = []
         self._made: tuple[Setting, Gaussians] | None = None
         self._shown = False
@@ -187,7 +188,7 @@ class Sweep:
 
     def measure_dense(self, of: int | None = None) -> Point:
         """The dense scene's point; ``of`` as for :meth:`measure`."""
-        if self.journal.dense is None or not self._pictured(DENSE):
+        if self.journal.dense is None:
             show = self._shower(0, of)
             with one_at_a_time(self.progress) as alone:
                 start = time.perf_counter()
@@ -208,7 +209,7 @@ class Sweep:
             of: at most how many points there will be; None if that is not known.
         """
         key, label = self.naming.key(setting), self.naming.label(setting)
-        if setting not in self.journal.points or not self._pictured(key):
+        if setting not in self.journal.points:
             show = self._shower(1 + len(self.journal.points), of)
             with one_at_a_time(self.progress) as alone:
                 start = time.perf_counter()
@@ -277,9 +278,17 @@ class Sweep:
             f"to {max(disturbed):.1f} of {cores()} cores; times are not to be trusted"
         ]
 
-    def _pictured(self, key: str) -> bool:
-        """Whether the pictures of a point are there."""
-        return all(path.is_file() for path in self.judge.pictures(key))
+    def _forget_those_without_pictures(self) -> None:
+        """Points whose pictures somebody has removed are measured again: the page shows all of them."""
+
+        def pictured(key: str) -> bool:
+            return all(path.is_file() for path in self.judge.pictures(key))
+
+        if self.journal.dense is not None and not pictured(DENSE):
+            self.journal.dense = None
+        for setting in list(self.journal.points):
+            if not pictured(self.naming.key(setting)):
+                del self.journal.points[setting]
 
     def _shower(self, done: int, of: int | None) -> Progress:
         """Progress of one point as a part of the whole, if the whole is known. It never goes back, though making a

@@ -88,6 +88,7 @@ class Search:
         self.targets, self.plan = targets, plan
         self.tried: dict[Setting, Point] = {}
         self._measure, self._cut_psnr = measure, cut_psnr
+        self._slope: float | None = None  # dB for each e-fold of the count, as seen in the way before
 
     def run(self) -> Found:
         """Search.
@@ -151,7 +152,8 @@ class Search:
             if high >= most:
                 return None
             low, high = high, min(most, 2 * high)
-        return replace(way, count=_crossing(low, high, margin)[1])
+        _, fewest, self._slope = _crossing(low, high, margin, self._slope)
+        return replace(way, count=fewest)
 
     def _best(self) -> Found:
         """The best quality within the limits."""
@@ -245,22 +247,53 @@ def _fewer_bytes(way: Setting, size: int) -> int:
     return count
 
 
-def _crossing(low: int, high: int, margin: Callable[[int], float]) -> tuple[int, int]:
+def _crossing(
+    low: int, high: int, margin: Callable[[int], float], slope: float | None = None
+) -> tuple[int, int, float | None]:
     """Neighbouring counts, within :data:`PRECISION`, between which a margin rises through 0: below at the first (which
-    may be 0, that holds nothing), not below at the second.
+    may be 0, that holds nothing), not below at the second. For a limit, the first is the largest that is within it.
 
-    For a limit, the first is the largest that is within it.
+    Args:
+        low: a count at which it is below; 0 if none is known.
+        high: a count at which it is not.
+        margin: of a count.
+        slope: how much a margin of this kind was seen to rise while counts rise e-fold.
+
+    Returns:
+        The two, and the slope seen last.
     """
+    enough = [(high, margin(high))]  # counts and margins that are not below 0, descending
     while high > max(low, 1) * PRECISION and high - low > 1:
-        above = margin(high)
-        below = margin(low) if low else -math.inf
-        share = 0.5
-        if math.isfinite(above) and math.isfinite(below):
-            share = min(0.85, max(0.15, -below / (above - below) if above > below else 0.5))
-        start = math.log(low) if low else math.log(high / 4)
-        middle = min(high - 1, max(low + 1, round(math.exp(start + share * (math.log(high) - start)))))
-        if margin(middle) < 0:
+        if len(enough) > 1 and low == 0:
+            slope = _slope(enough[-1], enough[-2])
+        guess = _beyond(*enough[-1], slope) if low == 0 else _between((low, margin(low)), enough[-1])
+        middle = min(high - 1, max(low + 1, round(guess)))
+        value = margin(middle)
+        if value < 0:
             low = middle
         else:
             high = middle
-    return low, high
+            enough.append((middle, value))
+    return low, high, _slope((low, margin(low)), enough[-1]) if low else slope
+
+
+def _slope(fewer: tuple[int, float], more: tuple[int, float]) -> float | None:
+    """How much a margin rises from one count to another for each e-fold; None if it does not, or has no bound."""
+    slope = (more[1] - fewer[1]) / math.log(more[0] / fewer[0])
+    return slope if 0 < slope < math.inf else None
+
+
+def _between(below: tuple[int, float], above: tuple[int, float]) -> float:
+    """The count between two at which the margin is 0, if it is a straight line over the logarithm of the count; away
+    from both ends, so that each try narrows the gap."""
+    (fewer, lack), (more, spare) = below, above
+    share = -lack / (spare - lack) if math.isfinite(spare - lack) else 0.5
+    return fewer * (more / fewer) ** min(0.85, max(0.15, share))
+
+
+def _beyond(count: int, spare: float, slope: float | None) -> float:
+    """A count below one that has a margin to spare: a little below where a straight line of this slope has none; a
+    quarter where the slope is not known."""
+    if slope is None or not math.isfinite(spare):
+        return count / 4
+    return max(count / 16, 0.95 * count * math.exp(-spare / slope))

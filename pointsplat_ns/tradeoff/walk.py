@@ -12,8 +12,8 @@ loss in dB (:mod:`~pointsplat_ns.tradeoff.loss`), which is the same at each run,
 4. Other methods, if any were asked for, at these three.
 5. Then, again and again: the gap between neighbours on a way (the dense scene is the upper end of each) whose losses
    differ most is halved, in the logarithm of the number of Gaussians. The gap that the wanted loss lies in counts
-   :data:`AT_LIMIT` times. Gaps of less than :data:`FLAT` or of counts within :data:`CLOSE` are left; the walk ends when
-   all are.
+   :data:`AT_LIMIT` times. Other gaps of less than :data:`FLAT`, and all of counts within :data:`CLOSE`, are left; the
+   walk ends when all are.
 """
 
 from __future__ import annotations
@@ -123,9 +123,10 @@ def _steepest(ways: list[Setting], measured: Mapping[Setting, Point], dense: Poi
         for fewer, more in zip(counts, counts[1:], strict=False):
             low, high = chain[fewer], chain.get(more, 0.0)
             middle = round(math.sqrt(fewer * more))
-            if low - high < FLAT or more < CLOSE * fewer or middle in (fewer, more):
+            at_limit = high <= plan.within < low
+            if (low - high < FLAT and not at_limit) or more < CLOSE * fewer or middle in (fewer, more):
                 continue
-            steep = (low - high) * (AT_LIMIT if high <= plan.within < low else 1)
+            steep = (low - high) * (AT_LIMIT if at_limit else 1)
             if steep > steepest:
                 best, steepest = replace(way, count=middle), steep
     return best
