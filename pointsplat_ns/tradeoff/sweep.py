@@ -237,7 +237,7 @@ class Sweep:
         """What was measured so far, the dense scene first and the others by their size.
 
         Args:
-            recommended: a point; by default the fastest within the wanted loss.
+            recommended: a point; by default see :func:`~pointsplat_ns.tradeoff.loss.recommend`.
             why: a line of text on it.
         """
         dense = self.journal.dense
@@ -247,8 +247,9 @@ class Sweep:
             key=lambda p: (-p.gaussians, -p.sh_degree, REPAIRS.index(_repair(p)), p.by),
         )
         points = (dense, *others)
+        busy = self._busy_note(points)
         if recommended is None:
-            recommended, why = recommend(points, self.options.within)
+            recommended, why = recommend(points, self.options.within, trusted=not busy)
         views = self.looked_at.views
         return Tradeoff(
             scene=self.subject.name,
@@ -257,7 +258,7 @@ class Sweep:
             width=views.width,
             height=views.height,
             points=points,
-            notes=(*self._busy_note(points), *self._notes),
+            notes=(*busy, *self._notes),
             recommended=recommended.key,
             why=why,
         )

@@ -42,8 +42,15 @@ def test_the_fastest_within_the_loss_is_recommended_not_the_smallest():
     assert f"at least {psnr_within(0.5):.1f} dB" in why and "20 ms a frame in place of 100" in why
 
 
+def test_where_times_mean_nothing_counts_decide():
+    dense = point(ALL, math.inf, 1.0)
+    few, many = point(Setting(500, 3), 40, 30.0), point(Setting(900, 3), 45, 2.0)
+    best, why = recommend([dense, many, few], 0.5, trusted=False)
+    assert best is few and "fewest Gaussians" in why and "ms" not in why
+
+
 def test_where_nothing_is_good_enough_the_dense_scene_is_what_remains():
     dense, poor = point(ALL, math.inf, 100.0, photos=30.0), point(Setting(100, 3), 20, 5, photos=25.0)
     best, why = recommend([dense, poor], 0.5)
     assert best is dense
-    assert "nothing faster" in why and "30.0 dB against held-out photos" in why
+    assert "is the dense scene itself" in why and "30.0 dB against held-out photos" in why

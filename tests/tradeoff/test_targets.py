@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from pointsplat_ns.errors import BudgetError
-from pointsplat_ns.tradeoff.settings import Setting
 from pointsplat_ns.tradeoff.targets import PRECISION, Search, Targets
 from pointsplat_ns.tradeoff.walk import Plan
 from trades import Trade
