@@ -66,27 +66,32 @@ def tradeoff(
 
 def _print_table(found: Tradeoff) -> None:
     """The figures that matter most; the others are in the table on disk."""
+    from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
 
     photos = found.points[0].against_photos is not None
     print(f"{found.scene}: {len(found.points)} points, {found.width} x {found.height} pixels, {found.views_origin}")
     print(found.machine)
-    table = Table(caption="*: recommended; dB of PSNR; ms a frame: median and quartiles over views")
+    table = Table(box=SIMPLE, caption="*: recommended; dB of PSNR; ms a frame: median and quartiles over views")
     table.add_column("")
-    for name in ["Gaussians", "MB", "ms a frame", "dB, renders", *(["dB, photos"] if photos else []), "made in"]:
+    for name in ["Gaussians", "MB", "ms a frame", "dB,\nrenders", *(["dB,\nphotos"] if photos else []), "made in"]:
         table.add_column(name, justify="right", no_wrap=True)
     for point in found.points:
         table.add_row(
             point.label + (" *" if point.key == found.recommended else ""),
             f"{point.gaussians:,}",
             f"{point.bytes / 1e6:.2f}",
-            f"{point.frame_ms:.3g} ({point.frame_ms_low:.3g}-{point.frame_ms_high:.3g})",
+            f"{_ms(point.frame_ms)} ({_ms(point.frame_ms_low)}-{_ms(point.frame_ms_high)})",
             f"{point.against_dense.psnr:.2f}",
             *([_psnr(point.against_photos)] if photos else []),
             f"{point.seconds:.1f} s",
         )
     Console().print(table)
+
+
+def _ms(milliseconds: float) -> str:
+    return f"{milliseconds:.3g}" if milliseconds < 100 else f"{milliseconds:.0f}"
 
 
 def _psnr(quality: Quality | None) -> str:

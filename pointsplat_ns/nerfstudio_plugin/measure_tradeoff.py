@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pointsplat_ns.compression.level_folder import source_file
 from pointsplat_ns.compression.view_source import ViewSource
-from pointsplat_ns.errors import SceneError
+from pointsplat_ns.errors import BudgetError, SceneError
 from pointsplat_ns.io.files import file_stem
 from pointsplat_ns.io.runs import open_run, scene_name
 from pointsplat_ns.io.scene import read_scene, save
@@ -80,7 +80,7 @@ def measure_tradeoff(
     """
     options = Options(points, within, tuple(by), tuple(repairs), views, side)
     targets = None
-    if not target_db is target_ms is target_mb is None:
+    if any(target is not None for target in (target_db, target_ms, target_mb)):
         targets = Targets(target_db, target_ms, target_mb)
     path, folder = Path(scene), Path(folder)
     dense = read_scene(path)
@@ -98,12 +98,14 @@ def measure_tradeoff(
         sweep = Sweep(subject, folder, options, report)
         if targets is None:
             return sweep.run()
+        sweep.measure_dense()
         try:
-            sweep.measure_dense()
             found = Search(targets, sweep.plan, sweep.measure, sweep.cut_psnr).run()
-        except BaseException:
-            if sweep.journal.dense is not None:
-                sweep.finish()  # what was measured on the way
+        except BudgetError:
+            sweep.finish()  # what was measured on the way
+            raise
+        except (KeyboardInterrupt, SystemExit):
+            sweep.finish_early()
             raise
         output = folder / f"{subject.name}_{found.point.key}.ply"
         if not output.exists() or force:

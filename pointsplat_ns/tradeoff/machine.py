@@ -17,6 +17,9 @@ from pointsplat_ns.system.progress import Progress
 LOCK = "pointsplat-measuring.lock"
 """Name of the file, in the folder for temporary files, that whoever measures holds locked."""
 
+TURN = 0.2
+"""Seconds after a measurement in which others that wait for the lock can take it; they look every 0.05."""
+
 BUSY_CORES = 0.25
 """Cores that may be missing while frames are timed. Less does not show in medians."""
 
@@ -63,6 +66,7 @@ def one_at_a_time(progress: Progress) -> Iterator[bool]:
         yield True
     finally:
         lock.release()
+        time.sleep(TURN)
 
 
 class OtherPrograms:

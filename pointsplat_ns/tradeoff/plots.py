@@ -95,11 +95,21 @@ def _draw(axis: Axes, sweep: Tradeoff, against: str, photos: bool) -> None:
     for i, (point, value) in enumerate(found):
         if point.key == sweep.recommended:
             axis.plot([costs[i]], [value], "o", fillstyle="none", color="crimson", markersize=13, label="recommended")
-    axis.set_xscale("log")
+    _plain_logarithmic(axis)
     axis.set_xlabel(AXES[against] + (", median and quartiles over views" if against == "ms" else ""))
     axis.set_ylabel("PSNR, dB")
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8)
+
+
+def _plain_logarithmic(axis: Axes) -> None:
+    """A logarithmic axis with numbers that are not written as powers, and few enough of them to be read."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_xscale("log")
+    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _group(point: Point, dense: Point) -> str:

@@ -167,10 +167,10 @@ class Sweep:
         return LookedAt(views, None, source.origin)
 
     def run(self) -> Tradeoff:
-        """Walk the front. Ctrl-C ends it as well, with results of what was measured.
+        """Walk the front.
 
         Raises:
-            KeyboardInterrupt: after the results were written.
+            KeyboardInterrupt, SystemExit: of Ctrl-C or another signal, after results of what was measured were written.
         """
         dense = self.measure_dense(self.options.points)
         try:
@@ -180,9 +180,8 @@ class Sweep:
                 if 1 + len(self.journal.points) >= self.options.points:
                     break
                 self.measure(setting, self.options.points)
-        except KeyboardInterrupt:
-            self.note("the sweep was interrupted: the same command goes on with it")
-            self.finish()
+        except (KeyboardInterrupt, SystemExit):
+            self.finish_early()
             raise
         return self.finish()
 
@@ -269,6 +268,12 @@ class Sweep:
         result = self.result(recommended, why)
         write_outputs(result, self.folder)
         return result
+
+    def finish_early(self) -> None:
+        """Write the results of a sweep that is interrupted, if there are any."""
+        if self.journal.dense is not None:
+            self.note("the sweep was interrupted: the same command goes on with it")
+            self.finish()
 
     def _busy_note(self, points: tuple[Point, ...]) -> list[str]:
         disturbed = [p.others_cores for p in points if p.others_cores is not None and is_busy(p.others_cores)]

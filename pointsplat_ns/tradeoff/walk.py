@@ -39,7 +39,7 @@ FLAT = 0.25
 CLOSE = 1.1
 """Ratio of counts below which a gap is not halved."""
 
-AT_LIMIT = 3
+AT_LIMIT = 6
 """Weight of the gap that the wanted loss lies in: what is recommended is known the better for it."""
 
 

@@ -275,18 +275,7 @@ def test_readme_is_short():
 def test_options_named_in_text_exist(monkeypatch, capsys):
     programs = [
         ("pointsplat", name)
-        for name in (
-            "prune",
-            "compact",
-            "lod",
-            "tradeoff",
-            "export",
-            "report",
-            "rooms",
-            "make-refiner",
-            "make-feedback",
-            "demo",
-        )
+        for name in "prune compact lod tradeoff export report rooms make-refiner make-feedback demo".split()
     ]
     programs += [
         ("ns-train", "pointsplat"),

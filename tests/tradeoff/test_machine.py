@@ -29,6 +29,24 @@ def test_a_second_measurement_waits_for_the_first_and_says_so():
     other.join()
 
 
+def test_whoever_waits_gets_the_next_turn():
+    """Of two that measure one thing after the other, none has to wait until the other has measured everything."""
+    turns: list[str] = []
+
+    def measure(name: str) -> None:
+        for _ in range(2):
+            with one_at_a_time(lambda what, share: None):
+                turns.append(name)
+                threading.Event().wait(0.3)
+
+    both = [threading.Thread(target=measure, args=(name,)) for name in "ab"]
+    for thread in both:
+        thread.start()
+    for thread in both:
+        thread.join()
+    assert turns in (["a", "b", "a", "b"], ["b", "a", "b", "a"])
+
+
 def test_the_lock_is_given_back_after_an_error():
     for _ in range(2):
         try:
