@@ -284,10 +284,10 @@ def _slope(fewer: tuple[int, float], more: tuple[int, float]) -> float | None:
 
 
 def _between(below: tuple[int, float], above: tuple[int, float]) -> float:
-    """The count between two at which the margin is 0, if it is a straight line over the logarithm of the count; away
-    from both ends, so that each try narrows the gap."""
+    """The count between two at which the margin is 0, if it is a straight line over the logarithm of the count, and a
+    little more, so that it is likely to be enough; away from both ends, so that each try narrows the gap."""
     (fewer, lack), (more, spare) = below, above
-    share = -lack / (spare - lack) if math.isfinite(spare - lack) else 0.5
+    share = 0.05 - lack / (spare - lack) if math.isfinite(spare - lack) else 0.5
     return fewer * (more / fewer) ** min(0.85, max(0.15, share))
 
 
