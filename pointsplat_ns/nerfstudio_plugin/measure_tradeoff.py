@@ -71,11 +71,11 @@ def measure_tradeoff(
         >>> import tempfile
         >>> import pointsplat_ns as ps
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     ps.save(ps.example_room()[::50], f"{folder}/room.ply")
+        ...     ps.save(ps.example_room()[::200][:300], f"{folder}/room.ply")
         ...     found = ps.measure_tradeoff(
-        ...         f"{folder}/room.ply", f"{folder}/trade", target_mb=0.02, repairs=("none",), views=2, side=64
+        ...         f"{folder}/room.ply", f"{folder}/trade", target_mb=0.01, repairs=("none",), views=2, side=64
         ...     )
-        >>> found.point(found.recommended).bytes <= 20_000
+        >>> found.point(found.recommended).bytes <= 10_000
         True
     """
     options = Options(points, within, tuple(by), tuple(repairs), views, side)

@@ -99,7 +99,7 @@ def _draw(axis: Axes, sweep: Tradeoff, against: str, photos: bool) -> None:
     axis.set_xlabel(AXES[against] + (", median and quartiles over views" if against == "ms" else ""))
     axis.set_ylabel("PSNR, dB")
     axis.grid(alpha=0.3)
-    axis.legend(fontsize=8)
+    axis.legend(fontsize=8, loc="lower right")  # where a front that rises leaves room
 
 
 def _plain_logarithmic(axis: Axes) -> None:

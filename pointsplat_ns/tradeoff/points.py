@@ -60,10 +60,10 @@ class Tradeoff:
         >>> import tempfile
         >>> import pointsplat_ns as ps
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     ps.save(ps.example_room()[::50], f"{folder}/room.ply")
+        ...     ps.save(ps.example_room()[::200][:300], f"{folder}/room.ply")
         ...     found = ps.measure_tradeoff(f"{folder}/room.ply", f"{folder}/trade", points=2, views=2, side=64)
         >>> [point.key for point in found.points], found.point("10pct_sh1").gaussians
-        (['dense', '10pct_sh1'], 126)
+        (['dense', '10pct_sh1'], 30)
     """
 
     scene: str
