@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -15,10 +14,10 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import open_run, read_scene
 from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
 from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.rasterizer import render, render_depth
-from pointsplat_ns.views import View, Views, spread_indices
+from pointsplat_ns.views import View, Views
 
 COLUMNS = ("psnr", "ssim", "lpips")
 REFERENCES = ("photo", "dense")
@@ -78,29 +77,10 @@ def nearer_half(scene: Gaussians, view: View) -> Tensor:
 def photos_of(path: Path, split: Literal["train", "test"], count: int) -> tuple[str, Views, list[Tensor]]:
     """The run's name, and at most ``count`` photos of a split, evenly spread, with the views that they show once
     undistorted."""
-    from pointsplat_ns.geometry.cameras import viewmats_from_opengl
     from pointsplat_ns.io import scene_name
 
-    run, poses = open_run(path), dataset_views(path, split)  # which imports nerfstudio in the order that it can
-
-    from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
-
-    scene = TrainedScene(scene_name(run), run, MemoryCache(0))
-    frames = scene.train_frames if split == "train" else scene.eval_frames
-    total = len(frames)
-    shown = [frames[i] for i in spread_indices(total, count)]
-    photos = [data["image"][..., :3] for _, data in shown]
-    photos = [photo.float() / 255 if photo.dtype == torch.uint8 else photo.float() for photo in photos]
-    height, width = photos[0].shape[:2]
-    views = dataclasses.replace(
-        poses,
-        viewmats=torch.cat([viewmats_from_opengl(camera.camera_to_worlds) for camera, _ in shown]),
-        Ks=torch.cat([camera.get_intrinsics_matrices() for camera, _ in shown]),
-        width=width,
-        height=height,
-    )
-    return scene_name(run), views, photos
+    views, photos = dataset_photos(path, split, count)
+    return scene_name(open_run(path)), views, photos
 
 
 @torch.no_grad()

@@ -36,11 +36,13 @@ if TYPE_CHECKING:
     from pointsplat_ns.io.scene import save
     from pointsplat_ns.metrics import psnr, ssim
     from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+    from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import measure_tradeoff
     from pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner import make_refiner
     from pointsplat_ns.nerfstudio_plugin.pointsplat.report import report
     from pointsplat_ns.pruning.view_sampling import sample_views
     from pointsplat_ns.rasterizer import rasterization, render
     from pointsplat_ns.rooms import write_room
+    from pointsplat_ns.tradeoff.points import Tradeoff
     from pointsplat_ns.views import View, Views
 
 _PUBLIC = {
@@ -60,10 +62,12 @@ _PUBLIC = {
     "pointsplat_ns.io.scene": ("save",),
     "pointsplat_ns.metrics": ("psnr", "ssim"),
     "pointsplat_ns.nerfstudio_plugin.dataset_views": ("dataset_views",),
+    "pointsplat_ns.nerfstudio_plugin.measure_tradeoff": ("measure_tradeoff",),
     "pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner": ("make_refiner",),
     "pointsplat_ns.nerfstudio_plugin.pointsplat.report": ("report",),
     "pointsplat_ns.rasterizer": ("rasterization", "render"),
     "pointsplat_ns.rooms": ("write_room",),
+    "pointsplat_ns.tradeoff.points": ("Tradeoff",),
     "pointsplat_ns.views": ("View", "Views"),
 }
 """Public names by the module that defines them."""
@@ -80,6 +84,7 @@ __all__ = [
     "SceneError",
     "SceneInfo",
     "SceneResult",
+    "Tradeoff",
     "TrainedRefiner",
     "View",
     "Views",
@@ -93,6 +98,7 @@ __all__ = [
     "lod",
     "lpips",
     "make_refiner",
+    "measure_tradeoff",
     "place",
     "plot_comparison",
     "plot_distributions",

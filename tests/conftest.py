@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import sys
+import types
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -149,6 +151,23 @@ def no_lpips(tmp_path_factory, monkeypatch):
         raise OSError("no network")
 
     monkeypatch.setattr(torch.hub, "download_url_to_file", no_network)
+
+
+@pytest.fixture()
+def plain_page(monkeypatch) -> list[Path]:
+    """In place of the page of a sweep, which takes seconds, a file that names its points; the folders it was asked
+    for."""
+    asked: list[Path] = []
+
+    def write_page(sweep, folder: Path, output: Path) -> Path:
+        asked.append(folder)
+        output.write_text(" ".join(point.key for point in sweep.points))
+        return output
+
+    page = types.ModuleType("pointsplat_ns.tradeoff.page")
+    page.write_page = write_page
+    monkeypatch.setitem(sys.modules, "pointsplat_ns.tradeoff.page", page)
+    return asked
 
 
 @pytest.fixture()

@@ -96,6 +96,7 @@ def main(args: list[str] | None = None) -> None:
     from pointsplat_ns.cli.prune import prune
     from pointsplat_ns.cli.report import report
     from pointsplat_ns.cli.rooms import rooms
+    from pointsplat_ns.cli.tradeoff import tradeoff
     from pointsplat_ns.errors import PointSplatError
     from pointsplat_ns.system.memory import keep_freed_memory
 
@@ -104,6 +105,7 @@ def main(args: list[str] | None = None) -> None:
         "prune": prune,
         "compact": compact,
         "lod": lod,
+        "tradeoff": tradeoff,
         "convert": convert,
         "info": info,
         "export": export,

@@ -1,17 +1,29 @@
-"""The poses of a run's dataset."""
+"""The poses and photos of a run's dataset."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor
 
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.geometry.cameras import viewmats_from_opengl
+from pointsplat_ns.io.runs import open_run, scene_name
 from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstudio
-from pointsplat_ns.views import Views
+from pointsplat_ns.views import Views, spread_indices
+
+if TYPE_CHECKING:
+    from pointsplat_ns.nerfstudio_plugin.frames import Frames
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
+
+Split = Literal["train", "test"]
+"""The training photos of a dataset, or its held-out ones."""
 
 
-def dataset_views(path: Path | str, split: Literal["train", "test"] = "train") -> Views:
+def dataset_views(path: Path | str, split: Split = "train") -> Views:
     """The poses of a Splatfacto run's dataset, in the frame and at the resolution that it was trained in.
 
     Needs nerfstudio, which takes a few seconds to import.
@@ -35,22 +47,63 @@ def dataset_views(path: Path | str, split: Literal["train", "test"] = "train") -
         pointsplat_ns.errors.SceneError: outputs/kitchen/splatfacto/2026-01-01_120000: no such file or folder; \
 expected a nerfstudio run
     """
-    from pointsplat_ns.io.runs import open_run, scene_name
+    return _views_of(*_open(path, split), split)
 
+
+def dataset_photos(path: Path | str, split: Split, count: int) -> tuple[Views, list[Tensor]]:
+    """At most ``count`` photos of a run's dataset, evenly spread, and the views that they show once undistorted.
+
+    Args:
+        path: as for :func:`dataset_views`.
+        split: as for :func:`dataset_views`.
+        count: largest number of photos.
+
+    Returns:
+        C views on the CPU, and one photo (H, W, 3) in [0, 1] for each.
+
+    Raises:
+        SceneError: if ``path`` is not a run, or the run's data is missing.
+        DataError: if the poses or a photo are not usable, or the split has none.
+    """
+    scene, frames = _open(path, split)
+    poses = _views_of(scene, frames, split)
+    shown = [frames[index] for index in spread_indices(len(frames), count)]
+    photos = [data["image"][..., :3] for _, data in shown]
+    photos = [photo.float() / 255 if photo.dtype == torch.uint8 else photo.float() for photo in photos]
+    height, width = photos[0].shape[:2]
+    if any(photo.shape[:2] != (height, width) for photo in photos):
+        raise DataError(f"{scene.run.data}: photos of the {split} split have several sizes; expected one")
+    views = dataclasses.replace(
+        poses,
+        viewmats=torch.cat([viewmats_from_opengl(camera.camera_to_worlds) for camera, _ in shown]),
+        Ks=torch.cat([camera.get_intrinsics_matrices() for camera, _ in shown]),
+        width=width,
+        height=height,
+    )
+    return views, photos
+
+
+def _open(path: Path | str, split: Split) -> tuple[TrainedScene, Frames]:
+    """The scene of a run, and the frames of a split."""
     run = open_run(path)  # before nerfstudio is imported, which takes seconds
     import_nerfstudio()
 
-    from pointsplat_ns.nerfstudio_plugin.cameras import views_of_cameras
     from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
     from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
     scene = TrainedScene(scene_name(run), run, MemoryCache(0))
-    frames = scene.train_frames if split == "train" else scene.eval_frames
+    return scene, scene.train_frames if split == "train" else scene.eval_frames
+
+
+def _views_of(scene: TrainedScene, frames: Frames, split: Split) -> Views:
+    """The poses of frames, on the CPU."""
+    from pointsplat_ns.nerfstudio_plugin.cameras import views_of_cameras
+
     cameras = frames.dataset.cameras
     if len(cameras) == 0:
-        raise DataError(f"{run.data}: no pose in the {split} split; expected at least one")
+        raise DataError(f"{scene.run.data}: no pose in the {split} split; expected at least one")
     try:
         views = views_of_cameras(cameras, scene.background, scene.rasterize_mode)
     except DataError as error:
-        raise DataError(f"{run.data}: {error}") from error
+        raise DataError(f"{scene.run.data}: {error}") from error
     return dataclasses.replace(views, viewmats=views.viewmats.detach().cpu(), Ks=views.Ks.detach().cpu())

@@ -20,7 +20,7 @@ class Point:
     """One way of making a scene smaller, measured."""
 
     key: str
-    """Short name, unique in a sweep and fit for a file's name: ``dense``, ``10pct_sh3_quick``."""
+    """Short name, unique in a sweep and fit for a file's name: ``dense``, ``10pct_sh3``, ``10pct_sh3_quick``."""
     label: str
     """The same for people: ``10 %, repaired for 12 s``."""
     command: str
@@ -48,11 +48,23 @@ class Point:
     """Time that making it took."""
     peak_bytes: int | None = None
     """Peak memory of the process that made it; None where it was not measured."""
+    others_cores: float | None = None
+    """Cores that other programs kept busy while frames were timed; None where it was not measured."""
 
 
 @dataclass(frozen=True)
 class Tradeoff:
-    """Every point that was measured of a scene. The first is the dense scene."""
+    """Every point that was measured of a scene. The first is the dense scene.
+
+    Example:
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ps.save(ps.example_room()[::200][:300], f"{folder}/room.ply")
+        ...     found = ps.measure_tradeoff(f"{folder}/room.ply", f"{folder}/trade", points=2, views=2, side=64)
+        >>> [point.key for point in found.points], found.point("10pct_sh1").gaussians
+        (['dense', '10pct_sh1'], 30)
+    """
 
     scene: str
     """Name of the scene."""
@@ -65,7 +77,20 @@ class Tradeoff:
     """Size of the views, in pixels."""
     points: tuple[Point, ...]
     notes: tuple[str, ...] = ()
-    """Lines of text for the reader: that the machine was busy and times are not to be trusted, that LPIPS is missing."""
+    """Lines of text for the reader: that the machine was busy and times are not to be trusted, that LPIPS is
+    missing."""
+    recommended: str = ""
+    """``key`` of the recommended point, or of the one found for targets."""
+    why: str = ""
+    """One line of text: what it was recommended or found for, and at what cost."""
+
+    def point(self, key: str) -> Point:
+        """The point with a key.
+
+        Raises:
+            KeyError: if there is none.
+        """
+        return {point.key: point for point in self.points}[key]
 
 
 def picture_path(folder: Path, view: int, what: str) -> Path:

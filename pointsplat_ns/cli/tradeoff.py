@@ -1,0 +1,98 @@
+"""``pointsplat tradeoff``: what a scene loses and gains when it gets smaller, measured."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pointsplat_ns.cli.scene_options import Output, Scene, output_beside
+
+if TYPE_CHECKING:
+    from pointsplat_ns.tradeoff.points import Quality, Tradeoff
+
+
+def tradeoff(
+    scene: Scene,
+    output: Output = None,
+    points: int = 12,
+    within: float = 0.5,
+    by: tuple[str, ...] = ("merge",),
+    repairs: tuple[Literal["none", "refiner", "quick", "thorough"], ...] = ("none", "quick"),
+    views: int = 10,
+    side: int = 640,
+    target_db: float | None = None,
+    target_ms: float | None = None,
+    target_mb: float | None = None,
+    force: bool = False,
+) -> None:
+    """Measure how a scene trades quality for frame time, size and count, on this machine.
+
+    It measures where the front bends and stops where it is flat. Each point is saved as soon as it is measured: after
+    an interruption the same command goes on. With a target it searches for the cheapest scene that meets all targets
+    instead, and writes it.
+
+    Args:
+        scene: a 3DGS .ply, a Splatfacto checkpoint, or a run (its folder or config.yml), whose held-out photos are then
+            used where they are found.
+        output: the folder for points, pictures, tables, plots and the page; by default beside the scene: room_tradeoff
+            for room.ply, tradeoff in the folder of a run.
+        points: largest number of points, the dense scene among them.
+        within: the recommended point is the fastest that loses at most so many dB against photos; without photos, as
+            much as is expected of its renders.
+        by: methods of prune; the first one is walked, others are measured at three budgets.
+        repairs: what may repair: nothing, the refiner alone, or compact's efforts quick and thorough.
+        views: largest number of views; without photos at most 12.
+        side: largest side of their images, pixels; photos are reduced.
+        target_db: find the smallest scene of at least this PSNR against the dense scene's renders.
+        target_ms: and of at most so many milliseconds a frame. Without --target-db, find the best within the limits.
+        target_mb: and of at most so many megabytes.
+        force: start over, and overwrite results in the folder.
+    """
+    import pointsplat_ns as ps
+
+    folder = output or output_beside(scene, "tradeoff").with_suffix("")
+    found = ps.measure_tradeoff(
+        scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, side=side,
+        target_db=target_db, target_ms=target_ms, target_mb=target_mb, force=force, progress=True,
+    )  # fmt: skip
+    _print_table(found)
+    for note in found.notes:
+        print(f"note: {note}")
+    print(found.why)
+    command = found.point(found.recommended).command
+    if command:
+        print(f"$ {command}")
+    print(f"{folder}: tables, plots and pictures; open {folder / 'tradeoff.html'}")
+
+
+def _print_table(found: Tradeoff) -> None:
+    """The figures that matter most; the others are in the table on disk."""
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+
+    photos = found.points[0].against_photos is not None
+    print(f"{found.scene}: {len(found.points)} points, {found.width} x {found.height} pixels, {found.views_origin}")
+    print(found.machine)
+    table = Table(box=SIMPLE, caption="*: recommended; dB of PSNR; ms a frame: median and quartiles over views")
+    table.add_column("")
+    for name in ["Gaussians", "MB", "ms a frame", "dB,\nrenders", *(["dB,\nphotos"] if photos else []), "made in"]:
+        table.add_column(name, justify="right", no_wrap=True)
+    for point in found.points:
+        table.add_row(
+            point.label + (" *" if point.key == found.recommended else ""),
+            f"{point.gaussians:,}",
+            f"{point.bytes / 1e6:.2f}",
+            f"{_ms(point.frame_ms)} ({_ms(point.frame_ms_low)}-{_ms(point.frame_ms_high)})",
+            f"{point.against_dense.psnr:.2f}",
+            *([_psnr(point.against_photos)] if photos else []),
+            f"{point.seconds:.1f} s",
+        )
+    Console().print(table)
+
+
+def _ms(milliseconds: float) -> str:
+    return f"{milliseconds:.3g}" if milliseconds < 100 else f"{milliseconds:.0f}"
+
+
+def _psnr(quality: Quality | None) -> str:
+    return "-" if quality is None else f"{quality.psnr:.2f}"

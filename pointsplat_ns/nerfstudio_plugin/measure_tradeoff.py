@@ -1,0 +1,123 @@
+"""Measures what a scene in hand loses and gains when it gets smaller."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+from pointsplat_ns.compression.level_folder import source_file
+from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.errors import BudgetError, SceneError
+from pointsplat_ns.io.files import file_stem
+from pointsplat_ns.io.runs import open_run, scene_name
+from pointsplat_ns.io.scene import read_scene, save
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
+from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.tradeoff.points import Tradeoff
+from pointsplat_ns.tradeoff.sweep import Options, Subject, Sweep, check_folder
+from pointsplat_ns.tradeoff.targets import Search, Targets
+
+
+def measure_tradeoff(
+    scene: str | Path,
+    folder: str | Path,
+    *,
+    points: int = 12,
+    within: float = 0.5,
+    by: tuple[str, ...] = ("merge",),
+    repairs: tuple[str, ...] = ("none", "quick"),
+    views: int = 10,
+    side: int = 640,
+    target_db: float | None = None,
+    target_ms: float | None = None,
+    target_mb: float | None = None,
+    force: bool = False,
+    progress: bool | Progress = False,
+) -> Tradeoff:
+    """Measure how a scene trades quality for frame time, size and count, on this machine.
+
+    It measures where the front bends and stops where it is flat (:mod:`~pointsplat_ns.tradeoff.walk` has the rule). Or,
+    with targets, it searches for the cheapest scene that meets all of them and writes it; among limits of time and size
+    alone, for the best one within them. Each point is saved as soon as it is measured: the same call goes on after an
+    interruption. Measurements on one machine wait for one another.
+
+    Args:
+        scene: a PLY, a checkpoint, or a Splatfacto run, whose held-out photos are then used where they are found.
+        folder: where points, pictures, tables, plots, the page and the found scene go.
+        points: largest number of points of a sweep, the dense scene among them.
+        within: the recommended point is the fastest that loses at most so much, dB: against photos, or as much as is
+            expected of its renders (:mod:`~pointsplat_ns.tradeoff.loss`).
+        by: methods, as for :func:`pointsplat_ns.prune`; the first one is walked, others are measured at three budgets.
+        repairs: some of "none", "refiner", "quick" and "thorough", the efforts of :func:`pointsplat_ns.compact`.
+        views: largest number of views; without photos at most 12.
+        side: largest side of their images, pixels; photos are reduced.
+        target_db: least PSNR against the dense scene's renders, dB, mean over views.
+        target_ms: longest time of a frame, milliseconds.
+        target_mb: largest file, in units of 10^6 bytes.
+        force: start over, and overwrite results in the folder.
+        progress: True shows a bar; a function is called with what is being done and the share done of it.
+
+    Returns:
+        Every point of the folder, and the recommended or found one: see :class:`Tradeoff`.
+
+    Raises:
+        BudgetError: if no scene meets the targets, or they mean nothing.
+        SceneError: if the scene or the folder is not usable, or the folder holds points of another sweep.
+        DataError: if there is no view.
+        PointSplatError: if there is no such method or repair, or a number means nothing.
+        KeyboardInterrupt: after the results of an interrupted sweep were written.
+
+    Example:
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ps.save(ps.example_room()[::200][:300], f"{folder}/room.ply")
+        ...     found = ps.measure_tradeoff(
+        ...         f"{folder}/room.ply", f"{folder}/trade", target_mb=0.01, repairs=("none",), views=2, side=64
+        ...     )
+        >>> found.point(found.recommended).bytes <= 10_000
+        True
+    """
+    options = Options(points, within, tuple(by), tuple(repairs), views, side)
+    targets = None
+    if any(target is not None for target in (target_db, target_ms, target_mb)):
+        targets = Targets(target_db, target_ms, target_mb)
+    path, folder = Path(scene), Path(folder)
+    dense = read_scene(path)
+    check_folder(folder, force)
+    is_ply = path.suffix.lower() == ".ply"
+    subject = Subject(
+        dense=dense,
+        path=path,
+        name=_name(path),
+        sha256=source_file(path).sha256,
+        new_views=lambda: ViewSource(dense, run=path, dataset_views=dataset_views),
+        held_out=None if is_ply else functools.partial(dataset_photos, path, "test"),
+    )
+    with progress_bar(progress) as report:
+        sweep = Sweep(subject, folder, options, report)
+        if targets is None:
+            return sweep.run()
+        sweep.measure_dense()
+        try:
+            found = Search(targets, sweep.plan, sweep.measure, sweep.cut_psnr).run()
+        except BudgetError:
+            sweep.finish()  # what was measured on the way
+            raise
+        except (KeyboardInterrupt, SystemExit):
+            sweep.finish_early()
+            raise
+        output = folder / f"{subject.name}_{found.point.key}.ply"
+        if not output.exists() or force:
+            save(sweep.scene(found.setting), output)
+        return sweep.finish(found.point, f"{found.why}; written to {output}")
+
+
+def _name(path: Path) -> str:
+    """The name of a scene: that of a run, or of a file."""
+    if path.suffix.lower() != ".ply":
+        try:
+            return scene_name(open_run(path, need_data=False))
+        except SceneError:
+            pass  # a checkpoint outside a run
+    return file_stem(path.stem)

@@ -1,0 +1,180 @@
+"""Judges scenes: against the dense scene's renders and photos, and by the time that a frame takes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import replacing
+from pointsplat_ns.metrics import SSIM_WINDOW, ImageError, psnr, ssim
+from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
+from pointsplat_ns.rasterizer import render
+from pointsplat_ns.tradeoff.machine import OtherPrograms
+from pointsplat_ns.tradeoff.points import Quality, picture_path
+from pointsplat_ns.views import Views, spread_indices
+
+ROUNDS = 3
+"""Times that each view is drawn and timed. The least of a view is what was disturbed least."""
+
+SHOWN_VIEWS = 6
+"""Largest number of views of which pictures are kept."""
+
+MOST_PSNR = 100.0
+"""In place of the infinite PSNR of equal pictures, so that means over views stay finite."""
+
+
+@dataclass(frozen=True)
+class LookedAt:
+    """The views that scenes are judged in."""
+
+    views: Views
+    photos: list[Tensor] | None  # [H, W, 3] in [0, 1], what the views show; None where there are none
+    origin: str
+    """Text: where the views came from."""
+
+    def resized(self, side: int) -> LookedAt:
+        """The same with at most ``side`` pixels on the longer side; photos are averaged over the areas of pixels."""
+        views = self.views.resized(side)
+        if self.photos is None or views is self.views:
+            return LookedAt(views, self.photos, self.origin)
+        size = (views.height, views.width)
+        photos = [
+            torch.nn.functional.interpolate(photo.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
+            for photo in self.photos
+        ]
+        return LookedAt(views, photos, self.origin)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What a scene is worth; as the fields of :class:`~pointsplat_ns.tradeoff.points.Point`."""
+
+    against_dense: Quality
+    against_photos: Quality | None
+    frame_ms: float
+    frame_ms_low: float
+    frame_ms_high: float
+    others_cores: float
+
+
+class Judge:
+    """Judges scenes in the same views, against the same targets.
+
+    Args:
+        dense: the dense scene.
+        looked_at: in which views.
+        folder: of the sweep: pictures are written to it.
+
+    Raises:
+        DataError: if the views are too small for SSIM.
+        SceneError: if a picture cannot be written.
+    """
+
+    @torch.no_grad()
+    def __init__(self, dense: Gaussians, looked_at: LookedAt, folder: Path):
+        self.views, self.photos, self.folder = looked_at.views, looked_at.photos, folder
+        if min(self.views.width, self.views.height) < SSIM_WINDOW:
+            raise DataError(
+                f"views are {self.views.width} x {self.views.height} pixels; expected at least {SSIM_WINDOW} a side"
+            )
+        self.renders = [render(dense, view) for view in self.views]
+        self.lpips, self.no_lpips = _lpips(self.renders[0])
+        self.shown = spread_indices(len(self.views), SHOWN_VIEWS)
+        if self.photos is not None:
+            self._write([self.photos[i] for i in self.shown], "photo")
+
+    @torch.no_grad()
+    def judge(self, scene: Gaussians, key: str, progress: Callable[[float], None]) -> Judged:
+        """Render a scene, write pictures of it, and time it.
+
+        Args:
+            scene: what is judged.
+            key: of its point.
+            progress: called with the share done, in [0, 1].
+        """
+        against_dense: list[Quality] = []
+        against_photos: list[Quality] = []
+        pictures = []
+        passes = 1 + ROUNDS
+        for i, view in enumerate(self.views):
+            image = render(scene, view)
+            against_dense.append(self._quality(image, self.renders[i]))
+            if self.photos is not None:
+                against_photos.append(self._quality(image, self.photos[i].to(image)))
+            if i in self.shown:
+                pictures.append(image)
+            progress((i + 1) / (passes * len(self.views)))
+        self._write(pictures, key)
+        others = OtherPrograms()
+        times = [[_timed(scene, self.views, i) for i in range(len(self.views))] for _ in range(ROUNDS)]
+        per_view = [1000 * min(rounds) for rounds in zip(*times, strict=True)]
+        low, middle, high = (float(value) for value in np.quantile(per_view, (0.25, 0.5, 0.75)))
+        progress(1.0)
+        photos = _mean(against_photos) if against_photos else None
+        return Judged(_mean(against_dense), photos, middle, low, high, others.cores())
+
+    @torch.no_grad()
+    def psnr(self, scene: Gaussians) -> float:
+        """Mean PSNR of a scene against the dense scene's renders, dB."""
+        return fmean(_psnr(render(scene, view), target) for view, target in zip(self.views, self.renders, strict=True))
+
+    def pictures(self, key: str) -> list[Path]:
+        """Where the pictures of a point lie."""
+        return [picture_path(self.folder, number, key) for number in range(len(self.shown))]
+
+    def _quality(self, image: Tensor, target: Tensor) -> Quality:
+        lpips = None if self.lpips is None else float(self.lpips(image, target))
+        return Quality(_psnr(image, target), float(ssim(image, target)), lpips)
+
+    def _write(self, images: list[Tensor], key: str) -> None:
+        from PIL import Image
+
+        for path, image in zip(self.pictures(key), images, strict=True):
+            pixels = (255 * image.clamp(0, 1)).round().to(torch.uint8).cpu().numpy()
+            with replacing(path) as part:
+                Image.fromarray(pixels).save(part, format="png")
+
+
+def _timed(scene: Gaussians, views: Views, index: int) -> float:
+    """Seconds that drawing one view takes."""
+    _wait_for(scene.device)
+    start = time.perf_counter()
+    render(scene, views[index])
+    _wait_for(scene.device)
+    return time.perf_counter() - start
+
+
+def _wait_for(device: torch.device) -> None:
+    """Until a GPU has done what it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def _lpips(image: Tensor) -> tuple[Lpips | None, str]:
+    """LPIPS for images like one, if it can be had, and the reason if not. Nothing is downloaded."""
+    try:
+        lpips = load_lpips("alex", download=False).to(image.device)
+        lpips(image, image)
+    except (LpipsUnavailable, ImageError) as error:  # no weights, or an image too small for the network
+        return None, f"LPIPS is missing: {error}"
+    return lpips, ""
+
+
+def _psnr(image: Tensor, target: Tensor) -> float:
+    return min(float(psnr(image, target)), MOST_PSNR)
+
+
+def _mean(values: list[Quality]) -> Quality:
+    lpips = [value.lpips for value in values if value.lpips is not None]
+    return Quality(
+        fmean(value.psnr for value in values), fmean(value.ssim for value in values), fmean(lpips) if lpips else None
+    )

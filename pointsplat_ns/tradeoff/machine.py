@@ -1,0 +1,102 @@
+"""The machine that times are measured on: what it is, that one measurement runs at a time, and whether it is busy."""
+
+from __future__ import annotations
+
+import os
+import platform
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+from pointsplat_ns.system.progress import Progress
+
+LOCK = "pointsplat-measuring.lock"
+"""Name of the file, in the folder for temporary files, that whoever measures holds locked."""
+
+TURN = 0.2
+"""Seconds after a measurement in which others that wait for the lock can take it; they look every 0.05."""
+
+BUSY_CORES = 0.25
+"""Cores that may be missing while frames are timed. Less does not show in medians."""
+
+
+def machine_text(device: torch.device) -> str:
+    """Processor, number of threads, device and version of torch, as text."""
+    threads = torch.get_num_threads()
+    where = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+    return f"{_processor()}, {threads} thread{'s' if threads != 1 else ''}, {where}, torch {torch.__version__}"
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass  # another system than Linux
+    return platform.processor() or platform.machine()
+
+
+@contextmanager
+def one_at_a_time(progress: Progress) -> Iterator[bool]:
+    """Hold the lock of measurements on this machine while the context is open; wait for others that hold it.
+
+    Args:
+        progress: called with what is being waited for.
+
+    Yields:
+        Whether it could be had: its file may belong to another user.
+    """
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(Path(tempfile.gettempdir()) / LOCK, mode=0o666)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        progress("waiting for another measurement on this machine", 0.0)
+        lock.acquire()
+    except OSError:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        lock.release()
+        time.sleep(TURN)
+
+
+class OtherPrograms:
+    """Counts how many cores other programs keep busy from here on."""
+
+    def __init__(self) -> None:
+        self._before = self._read()
+
+    @staticmethod
+    def _read() -> tuple[float, float, float]:
+        """Seconds on the clock, of all cores in use, and of this process."""
+        import psutil
+
+        times = psutil.cpu_times()
+        idle = times.idle + getattr(times, "iowait", 0.0)
+        guests = getattr(times, "guest", 0.0) + getattr(times, "guest_nice", 0.0)  # counted as those of users, too
+        own = psutil.Process().cpu_times()
+        return time.monotonic(), sum(times) - idle - guests, own.user + own.system
+
+    def cores(self) -> float:
+        """Mean number of cores in use by others."""
+        seconds, used, own = (after - before for after, before in zip(self._read(), self._before, strict=True))
+        return max(0.0, used - own) / seconds if seconds > 0 else 0.0
+
+
+def cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def is_busy(others: float) -> bool:
+    """Whether others use so many cores that too few are left for torch's threads."""
+    return others + torch.get_num_threads() > cores() + BUSY_CORES

@@ -1,0 +1,58 @@
+"""What a sweep writes of its points: tables, plots and the page."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from pathlib import Path
+
+from pointsplat_ns.io.files import replacing
+from pointsplat_ns.tradeoff.journal import write_json
+from pointsplat_ns.tradeoff.plots import plot
+from pointsplat_ns.tradeoff.points import Point, Quality, Tradeoff
+
+TABLE, JSON, PAGE = "tradeoff.csv", "tradeoff.json", "tradeoff.html"
+PLOTS = {"ms": "tradeoff_ms.png", "mb": "tradeoff_mb.png", "count": "tradeoff_count.png"}
+"""Names of the plots by what quality is plotted against."""
+
+OUTPUTS = (TABLE, JSON, PAGE, *PLOTS.values())
+
+
+def write_outputs(sweep: Tradeoff, folder: Path) -> None:
+    """Write the table, the JSON, the plots and the page of a sweep.
+
+    Args:
+        sweep: what was measured.
+        folder: of the sweep, with the pictures.
+
+    Raises:
+        SceneError: if a file cannot be written.
+    """
+    from pointsplat_ns.tradeoff.page import write_page
+
+    write_json(dataclasses.asdict(sweep), folder / JSON)
+    _write_table(sweep, folder / TABLE)
+    for against, name in PLOTS.items():
+        plot(sweep, against, folder / name)
+    write_page(sweep, folder, folder / PAGE)
+
+
+def _write_table(sweep: Tradeoff, path: Path) -> None:
+    rows = [_row(point) for point in sweep.points]
+    with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _row(point: Point) -> dict[str, object]:
+    """A point as a row of the table: qualities take a column for each number."""
+    row: dict[str, object] = {}
+    for field in dataclasses.fields(point):
+        value = getattr(point, field.name)
+        if field.name in ("against_dense", "against_photos"):
+            for number in dataclasses.fields(Quality):
+                row[f"{field.name}_{number.name}"] = None if value is None else getattr(value, number.name)
+        else:
+            row[field.name] = value
+    return row

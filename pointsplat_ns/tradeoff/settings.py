@@ -1,0 +1,109 @@
+"""A way of making a scene smaller, by the numbers: what is to be measured, what it is called, and its command."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from pointsplat_ns.compression.repair import Effort
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.pruning import method_named, ply_bytes
+from pointsplat_ns.tradeoff.points import Point
+
+Repair = Literal["none", "refiner", "quick", "thorough"]
+"""Nothing; the refiner alone; the refiner and 32 steps; the refiner and 400 steps."""
+
+REPAIRS: tuple[Repair, ...] = get_args(Repair)
+
+EFFORTS: dict[Repair, Effort] = {"refiner": "instant", "quick": "quick", "thorough": "thorough"}
+"""The effort of ``compact`` that each repair is."""
+
+DENSE = "dense"
+"""Key and method of the scene as it is."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A way of making a scene smaller."""
+
+    count: int
+    """Number of Gaussians kept."""
+    sh_degree: int
+    repair: Repair = "none"
+    by: str = "merge"
+
+    @property
+    def bytes(self) -> int:
+        """Size of the file."""
+        return ply_bytes(self.count, self.sh_degree)
+
+
+def setting_of(point: Point) -> Setting:
+    """The setting that a point, other than the dense scene, was measured with.
+
+    Raises:
+        PointSplatError: if there is no such repair or method.
+    """
+    return Setting(point.gaussians, point.sh_degree, check_repairs((point.repair,))[0], method_named(point.by).name)
+
+
+@dataclass(frozen=True)
+class Naming:
+    """What settings of a scene are called.
+
+    Example:
+        >>> naming = Naming(Path("room.ply"), "room", 60_000, 3)
+        >>> naming.key(Setting(6000, 3, "quick")), naming.label(Setting(6000, 0))
+        ('10pct_sh3_quick', '10 %, SH degree 0')
+        >>> print(naming.command(Setting(6000, 0)))
+        pointsplat prune room.ply --keep 6000 --sh 0 -o room_10pct_sh0.ply
+    """
+
+    path: Path
+    """The scene, as commands name it."""
+    name: str
+    count: int
+    """Number of Gaussians in it."""
+    sh_degree: int
+    """And their SH degree."""
+
+    def key(self, setting: Setting) -> str:
+        """A short name that can be part of a file's name."""
+        words = [f"{100 * setting.count / self.count:.4g}pct", f"sh{setting.sh_degree}"]
+        words += [] if setting.repair == "none" else [setting.repair]
+        words += [] if setting.by == "merge" else [setting.by]
+        return "_".join(words)
+
+    def label(self, setting: Setting) -> str:
+        """The same for people."""
+        words = [f"{100 * setting.count / self.count:.3g} %" + ("" if setting.by == "merge" else f" by {setting.by}")]
+        words += [] if setting.sh_degree == self.sh_degree else [f"SH degree {setting.sh_degree}"]
+        repaired = "refined" if setting.repair == "refiner" else f"repaired ({setting.repair})"
+        words += [] if setting.repair == "none" else [repaired]
+        return ", ".join(words)
+
+    def command(self, setting: Setting) -> str:
+        """The command that makes the scene. Counts are exact, as percentages may be rounded."""
+        program = "prune" if setting.repair == "none" else "compact"
+        words = ["pointsplat", program, str(self.path), "--keep", str(setting.count)]
+        if program == "compact" or setting.by != "merge":
+            words += ["--by", setting.by]
+        if setting.sh_degree != self.sh_degree:
+            words += ["--sh", str(setting.sh_degree)]
+        if program == "compact":
+            words += ["--effort", EFFORTS[setting.repair]]
+        return shlex.join([*words, "-o", f"{self.name}_{self.key(setting)}.ply"])
+
+
+def check_repairs(repairs: tuple[str, ...]) -> tuple[Repair, ...]:
+    """Repairs, each once, in the order of :data:`REPAIRS`.
+
+    Raises:
+        PointSplatError: if there is none, or no such one.
+    """
+    unknown = [repair for repair in repairs if repair not in REPAIRS]
+    if unknown or not repairs:
+        raise PointSplatError(f"repairs are {', '.join(repairs) or 'empty'}; expected some of {', '.join(REPAIRS)}")
+    return tuple(repair for repair in REPAIRS if repair in repairs)

@@ -1,0 +1,56 @@
+"""A small room that sweeps measure within seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import pointsplat_ns as ps
+from making import box_room
+from pointsplat_ns.compression import repair
+from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.pruning.view_sampling import sample_views
+from pointsplat_ns.tradeoff import machine, outputs
+from pointsplat_ns.tradeoff.sweep import Options, Subject, Sweep
+from pointsplat_ns.views import Views
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory) -> Path:
+    """A closed box of 400 Gaussians, as a file."""
+    path = tmp_path_factory.mktemp("room") / "room.ply"
+    ps.save(box_room(0, 400), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def room_views(room) -> Views:
+    """Three small views of it."""
+    return sample_views(ps.load(room), 3, 48, 36)
+
+
+@pytest.fixture(autouse=True)
+def own_lock(tmp_path_factory, monkeypatch) -> None:
+    """Tests wait neither for one another nor for anything else on this machine."""
+    monkeypatch.setattr(machine, "LOCK", str(tmp_path_factory.mktemp("lock") / "lock"))
+
+
+@pytest.fixture()
+def plain_plots(monkeypatch) -> None:
+    """Files in place of plots, which take a second each."""
+    monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
+
+
+@pytest.fixture()
+def new_sweep(room, room_views, plain_page, plain_plots, no_lpips, monkeypatch) -> Callable[..., Sweep]:
+    """A function (folder, options) that begins a sweep of the room, whose repairs take two steps."""
+    monkeypatch.setitem(repair.STEPS, "quick", 2)
+
+    def begin(folder: Path, held_out=None, progress=lambda what, share: None, **options) -> Sweep:
+        dense = ps.load(room)
+        subject = Subject(dense, room, "room", "sum", lambda: ViewSource(dense, given=room_views), held_out)
+        return Sweep(subject, folder, Options(**options), progress)
+
+    return begin

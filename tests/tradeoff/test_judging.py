@@ -1,0 +1,110 @@
+"""The judge: figures are those of the metrics, photos are reduced with their views, times are of drawing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from statistics import fmean
+
+import pytest
+import torch
+from PIL import Image
+
+import pointsplat_ns as ps
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.rasterizer import render
+from pointsplat_ns.tradeoff import judging
+from pointsplat_ns.tradeoff.judging import MOST_PSNR, Judge, LookedAt
+from pointsplat_ns.tradeoff.points import picture_path
+
+
+@pytest.fixture()
+def dense(room):
+    return ps.load(room)
+
+
+@pytest.fixture()
+def photos(dense, room_views):
+    return [(image + 0.1).clamp(0, 1) for image in render(dense, room_views)]
+
+
+def judged(judge: Judge, scene, key="some"):
+    return judge.judge(scene, key, lambda share: None)
+
+
+def test_figures_are_means_over_views(dense, room_views, photos, tmp_path, no_lpips):
+    small = ps.prune(dense, 200, by="opacity")
+    got = judged(Judge(dense, LookedAt(room_views, photos, ""), tmp_path), small)
+    renders, wanted = render(small, room_views), render(dense, room_views)
+    assert got.against_dense.psnr == pytest.approx(fmean(ps.psnr(renders, wanted).tolist()), abs=1e-4)
+    assert got.against_dense.ssim == pytest.approx(fmean(ps.ssim(renders, wanted).tolist()), abs=1e-5)
+    assert got.against_photos.psnr == pytest.approx(fmean(ps.psnr(renders, torch.stack(photos)).tolist()), abs=1e-4)
+    assert got.against_dense.lpips is got.against_photos.lpips is None
+
+
+def test_judging_again_gives_the_same_figures_to_the_bit(dense, room_views, photos, tmp_path, no_lpips):
+    small = ps.prune(dense, 200)
+    first, second = (
+        judged(Judge(dense, LookedAt(room_views, photos, ""), tmp_path), small) for _ in range(2)
+    )  # fmt: skip
+    assert (first.against_dense, first.against_photos) == (second.against_dense, second.against_photos)
+
+
+def test_equal_pictures_do_not_make_means_infinite(dense, room_views, tmp_path, no_lpips):
+    assert judged(Judge(dense, LookedAt(room_views, None, ""), tmp_path), dense).against_dense.psnr == MOST_PSNR
+
+
+def test_times_are_medians_over_views_between_their_quartiles(dense, room_views, tmp_path, no_lpips, monkeypatch):
+    """Views take 1, 3 and 2 ms; two rounds of three are disturbed."""
+    asked: list[int] = []
+
+    def timed(scene, views, index):
+        asked.append(index)
+        return (0.9 if len(asked) <= 2 * len(views) else 0.0) + (0.001, 0.003, 0.002)[index]
+
+    monkeypatch.setattr(judging, "_timed", timed)
+    got = judged(Judge(dense, LookedAt(room_views, None, ""), tmp_path), dense)
+    assert (got.frame_ms_low, got.frame_ms, got.frame_ms_high) == pytest.approx((1.5, 2.0, 2.5))
+
+
+def test_pictures_are_what_was_rendered_and_the_photos(dense, room_views, photos, tmp_path, no_lpips):
+    judge = Judge(dense, LookedAt(room_views, photos, ""), tmp_path)
+    judged(judge, dense, "dense")
+    for view, image in enumerate(render(dense, room_views)):
+        for what, wanted in (("dense", image), ("photo", photos[view])):
+            with Image.open(picture_path(tmp_path, view, what)) as picture:
+                pixels = torch.tensor(picture.getdata()).reshape(36, 48, 3) / 255
+            assert (pixels - wanted).abs().max() <= 0.5 / 255 + 1e-6
+    assert len(judge.pictures("dense")) == len(list((tmp_path / "pictures").glob("*_dense.png"))) == 3
+
+
+def test_no_more_than_six_views_are_pictured(dense, tmp_path, no_lpips):
+    views = ps.sample_views(dense, 8, 16, 12)
+    judge = Judge(dense, LookedAt(views, None, ""), tmp_path)
+    judged(judge, dense)
+    assert len(list((tmp_path / "pictures").iterdir())) == len(judge.pictures("some")) == 6
+
+
+def test_photos_are_reduced_with_their_views_by_the_mean_of_each_area(room_views):
+    photos = [torch.rand(36, 48, 3, generator=torch.Generator().manual_seed(0))] * 3
+    small = LookedAt(room_views, photos, "").resized(24)
+    assert (small.views.width, small.views.height) == (24, 18)
+    wanted = photos[0].reshape(18, 2, 24, 2, 3).mean(dim=(1, 3))
+    assert torch.allclose(small.photos[0], wanted, atol=1e-6)
+    assert LookedAt(room_views, photos, "").resized(48).photos is photos
+
+
+def test_lpips_is_given_where_weights_are_at_hand(dense, room_views, tmp_path, some_lpips):
+    judge = Judge(dense, LookedAt(room_views, None, ""), tmp_path)
+    quality = judged(judge, ps.prune(dense, 100)).against_dense
+    assert (quality.lpips is not None and 0 < quality.lpips < 2) == some_lpips
+    assert ("LPIPS is missing" in judge.no_lpips) != some_lpips
+
+
+def test_pictures_too_small_for_lpips_go_without(dense, room_views, tmp_path, some_lpips):
+    judge = Judge(dense, LookedAt(room_views.resized(24), None, ""), tmp_path)
+    assert judged(judge, dense).against_dense.lpips is None and "LPIPS is missing" in judge.no_lpips
+
+
+def test_pictures_too_small_for_ssim_are_refused(dense, room_views, tmp_path):
+    with pytest.raises(DataError, match="views are 10 x 36 pixels; expected at least 11 a side"):
+        Judge(dense, LookedAt(replace(room_views, width=10), None, ""), tmp_path)

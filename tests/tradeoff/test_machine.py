@@ -1,0 +1,108 @@
+"""One measurement at a time; and whether others keep the machine busy."""
+
+from __future__ import annotations
+
+import multiprocessing
+import threading
+
+import torch
+from filelock import FileLock
+
+from pointsplat_ns.tradeoff import machine
+from pointsplat_ns.tradeoff.machine import OtherPrograms, cores, is_busy, machine_text, one_at_a_time
+
+
+def test_a_second_measurement_waits_for_the_first_and_says_so():
+    said, entered = [], threading.Event()
+
+    def second() -> None:
+        with one_at_a_time(lambda what, share: said.append(what)) as alone:
+            assert alone
+            entered.set()
+
+    with one_at_a_time(lambda what, share: None):
+        other = threading.Thread(target=second)
+        other.start()
+        assert not entered.wait(0.3)
+        assert said == ["waiting for another measurement on this machine"]
+    assert entered.wait(10)
+    other.join()
+
+
+def test_whoever_waits_gets_the_next_turn():
+    """Of two that measure one thing after the other, none has to wait until the other has measured everything."""
+    turns: list[str] = []
+
+    def measure(name: str) -> None:
+        for _ in range(2):
+            with one_at_a_time(lambda what, share: None):
+                turns.append(name)
+                threading.Event().wait(0.3)
+
+    both = [threading.Thread(target=measure, args=(name,)) for name in "ab"]
+    for thread in both:
+        thread.start()
+    for thread in both:
+        thread.join()
+    assert turns in (["a", "b", "a", "b"], ["b", "a", "b", "a"])
+
+
+def test_the_lock_is_given_back_after_an_error():
+    for _ in range(2):
+        try:
+            with one_at_a_time(lambda what, share: None) as alone:
+                assert alone
+                raise RuntimeError
+        except RuntimeError:
+            pass
+
+
+def test_a_lock_that_belongs_to_another_user_is_not_waited_for(monkeypatch):
+    def refuse(*args, **options):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(FileLock, "acquire", refuse)
+    with one_at_a_time(lambda what, share: None) as alone:
+        assert not alone
+
+
+def _work(stop) -> None:
+    while not stop.is_set():
+        sum(range(10_000))
+
+
+def test_cores_that_other_programs_use_are_counted_and_our_own_are_not(monkeypatch):
+    """By what the system says of processor time: 8 s of all cores, 3 s of them ours, within 2 s."""
+    readings = iter([(10.0, 100.0, 50.0), (12.0, 108.0, 53.0)])
+    monkeypatch.setattr(OtherPrograms, "_read", staticmethod(lambda: next(readings)))
+    assert OtherPrograms().cores() == 2.5
+
+
+def test_a_process_beside_this_one_is_seen():
+    context = multiprocessing.get_context("spawn")
+    stop = context.Event()
+    process = context.Process(target=_work, args=(stop,))
+    process.start()
+    try:
+        used = 0.0
+        others = OtherPrograms()
+        for _ in range(100):  # it takes a while to start
+            threading.Event().wait(0.1)
+            if (used := others.cores()) > 0.05:
+                break
+    finally:
+        stop.set()
+        process.join()
+    assert used > 0.05
+
+
+def test_a_machine_is_busy_when_too_few_cores_are_left(monkeypatch):
+    monkeypatch.setattr(machine, "cores", lambda: 4)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    assert [is_busy(others) for others in (0.0, 2.0, 2.3, 4.0)] == [False, False, True, True]
+
+
+def test_the_machine_is_named_with_its_threads():
+    text = machine_text(torch.device("cpu"))
+    assert f"{torch.get_num_threads()} thread" in text and torch.__version__ in text and "cpu" in text
+    assert cores() >= 1

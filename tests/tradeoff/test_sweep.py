@@ -1,0 +1,220 @@
+"""Sweeps: what is kept of them whatever happens, and that their figures come out the same again."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from making import same_bits
+from pointsplat_ns.compression.repair import Repaired
+from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.errors import DataError, PointSplatError, SceneError
+from pointsplat_ns.tradeoff import making, sweep
+from pointsplat_ns.tradeoff.journal import POINTS
+from pointsplat_ns.tradeoff.outputs import OUTPUTS, PAGE, PLOTS, TABLE
+from pointsplat_ns.tradeoff.plots import AXES
+from pointsplat_ns.tradeoff.points import picture_path
+from pointsplat_ns.tradeoff.settings import Setting
+from pointsplat_ns.tradeoff.sweep import Options, check_folder
+from trades import point
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_sweep_leaves_tables_plots_pictures_and_a_page(new_sweep, tmp_path, plain_page, monkeypatch):
+    result = new_sweep(tmp_path, points=2).run()
+    assert [point.key for point in result.points] == ["dense", "10pct_sh1"]
+    assert names(tmp_path) == sorted([*OUTPUTS, POINTS, "pictures"])
+    with (tmp_path / TABLE).open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["key"] for row in rows] == [point.key for point in result.points]
+    assert float(rows[1]["against_dense_psnr"]) == result.points[1].against_dense.psnr
+    content = json.loads((tmp_path / "tradeoff.json").read_text())
+    assert content["points"][0]["against_dense"]["psnr"] is None, "infinite"
+    assert content["recommended"] == result.recommended
+    assert [(tmp_path / name).read_text() for name in PLOTS.values()] == [*AXES]
+    for shown in result.points:
+        assert all(picture_path(tmp_path, view, shown.key).is_file() for view in range(3))
+    assert (tmp_path / PAGE).read_text().split() == [point.key for point in result.points]
+
+
+def test_the_first_useful_results_are_there_after_the_first_smaller_scene(new_sweep, tmp_path, plain_page):
+    running = new_sweep(tmp_path)
+    running.measure_dense()
+    assert plain_page == []
+    running.measure(Setting(40, 1))
+    assert plain_page == [tmp_path] and (tmp_path / PLOTS["count"]).is_file()
+
+
+def test_points_have_exact_counts_sizes_and_commands(new_sweep, tmp_path, room):
+    running = new_sweep(tmp_path)
+    running.measure_dense()
+    setting = Setting(40, 0)
+    measured = running.measure(setting)
+    assert (measured.gaussians, measured.sh_degree, measured.share) == (40, 0, 0.1)
+    ps.save(running.scene(setting), tmp_path / "made.ply")
+    assert (tmp_path / "made.ply").stat().st_size == measured.bytes
+    assert measured.command == f"pointsplat prune {room} --keep 40 --sh 0 -o room_10pct_sh0.ply"
+    assert measured.frame_ms_low <= measured.frame_ms <= measured.frame_ms_high
+    assert measured.seconds > 0 and (measured.peak_bytes is None or measured.peak_bytes > 10**7)
+
+
+def test_measuring_a_point_again_gives_the_same_quality_to_the_bit(new_sweep, tmp_path):
+    setting = Setting(40, 1, "quick")
+    first, second = (new_sweep(tmp_path / name) for name in "ab")
+    for running in (first, second):
+        running.measure_dense()
+    a, b = first.measure(setting), second.measure(setting)
+    assert a.against_dense == b.against_dense
+    assert same_bits(first.scene(setting), second.scene(setting))
+
+
+def test_a_scene_that_is_needed_again_is_made_again_the_same(new_sweep, tmp_path):
+    running = new_sweep(tmp_path)
+    running.measure_dense()
+    running.measure(Setting(40, 1))
+    kept = running.scene(Setting(40, 1))
+    running.measure(Setting(30, 1))
+    assert same_bits(running.scene(Setting(40, 1)), kept)
+
+
+@pytest.mark.parametrize("after", [1, 2])
+def test_an_interruption_leaves_what_was_measured_and_the_next_call_goes_on(new_sweep, tmp_path, monkeypatch, after):
+    made, make = [], making.make
+
+    def interrupted(dense, setting, *args):
+        if len(made) == after:
+            raise KeyboardInterrupt
+        made.append(setting)
+        return make(dense, setting, *args)
+
+    monkeypatch.setattr(sweep, "make", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        new_sweep(tmp_path, points=4, repairs=("none",)).run()
+    content = json.loads((tmp_path / "tradeoff.json").read_text())
+    assert len(content["points"]) == 1 + after
+    assert any("interrupted" in note for note in content["notes"])
+    made.clear()
+    monkeypatch.setattr(sweep, "make", lambda *args: (made.append(args[1]), make(*args))[1])
+    resumed = new_sweep(tmp_path, points=4, repairs=("none",)).run()
+    assert len(resumed.points) == 4 and len(made) == 3 - after, "nothing is measured twice"
+    whole = new_sweep(tmp_path / "whole", points=4, repairs=("none",)).run()
+    assert [(p.key, p.against_dense) for p in resumed.points] == [(p.key, p.against_dense) for p in whole.points]
+    assert not any("interrupted" in note for note in resumed.notes)
+
+
+def test_ctrl_c_during_a_repair_is_no_shorter_repair(new_sweep, tmp_path, monkeypatch):
+    from pointsplat_ns.compression import compact
+
+    monkeypatch.setattr(compact, "repair", lambda scene, *args: Repaired(scene, 1, 0.1, interrupted=True))
+    running = new_sweep(tmp_path)
+    running.measure_dense()
+    with pytest.raises(KeyboardInterrupt):
+        running.measure(Setting(40, 1, "quick"))
+    assert running.journal.points == {}
+
+
+def test_a_point_whose_pictures_are_gone_is_measured_again(new_sweep, tmp_path):
+    running = new_sweep(tmp_path, points=2)
+    [_, first] = running.run().points
+    picture_path(tmp_path, 1, first.key).unlink()
+    [_, again] = new_sweep(tmp_path, points=2).run().points
+    assert picture_path(tmp_path, 1, first.key).is_file()
+    assert again.against_dense == first.against_dense
+
+
+def test_more_points_can_be_asked_for_later(new_sweep, tmp_path):
+    few = new_sweep(tmp_path, points=2).run().points
+    more = new_sweep(tmp_path, points=3).run().points
+    assert len(more) == 3 and set(few) < set(more)
+
+
+def test_held_out_photos_are_what_scenes_are_judged_by(new_sweep, tmp_path, room, room_views):
+    photos = list(ps.render(ps.load(room), room_views))
+    photos = [(photo + 0.05).clamp(0, 1) for photo in photos]
+    result = new_sweep(tmp_path, lambda count: (room_views[:count], photos[:count]), points=2, views=2).run()
+    assert result.views_origin == "held-out photos of the dataset"
+    assert all(point.against_photos is not None for point in result.points)
+    assert result.points[0].against_photos.psnr < 40 and result.points[0].against_dense.psnr == math.inf
+    assert len(list((tmp_path / "pictures").glob("*_photo.png"))) == 2
+    assert "held-out photos" in result.why
+
+
+def test_where_photos_cannot_be_had_it_says_why_and_goes_on_without(new_sweep, tmp_path):
+    def gone(count):
+        raise DataError("photo_3.jpg: no such file")
+
+    result = new_sweep(tmp_path, gone, points=2).run()
+    assert result.points[1].against_photos is None and result.views_origin == "given views"
+    assert "there are no held-out photos: photo_3.jpg: no such file" in result.notes
+
+
+@pytest.mark.parametrize("others, said", [(50.0, True), (0.0, False)])
+def test_a_busy_machine_is_said_to_be_one(new_sweep, tmp_path, monkeypatch, others, said):
+    monkeypatch.setattr(sweep.Judge, "psnr", lambda self, scene: 0.0)
+    monkeypatch.setattr("pointsplat_ns.tradeoff.machine.OtherPrograms.cores", lambda self: others)
+    monkeypatch.setattr("pointsplat_ns.tradeoff.machine.cores", lambda: torch.get_num_threads())
+    result = new_sweep(tmp_path, points=2, repairs=("none",)).run()
+    assert any("times are not to be trusted" in note for note in result.notes) == said
+
+
+def test_progress_never_goes_back_and_ends(new_sweep, tmp_path):
+    shares = []
+    keep = lambda what, share: shares.append(share) if what == "measuring" else None  # noqa: E731
+    new_sweep(tmp_path, progress=keep, points=3).run()
+    assert shares == sorted(shares) and shares[-1] == 1.0
+
+
+def test_points_of_another_scene_are_refused_before_anything_is_measured(new_sweep, tmp_path, room, room_views):
+    new_sweep(tmp_path, points=2).run()
+    dense = ps.load(room)
+    other = sweep.Subject(dense, room, "room", "another sum", lambda: ViewSource(dense, given=room_views))
+    with pytest.raises(SceneError, match="its points are of another sweep"):
+        sweep.Sweep(other, tmp_path, Options(), lambda what, share: None)
+
+
+def test_results_without_points_are_not_overwritten(tmp_path):
+    (tmp_path / TABLE).write_text("precious")
+    with pytest.raises(SceneError, match="exists already, without points.json"):
+        check_folder(tmp_path, force=False)
+    check_folder(tmp_path, force=True)
+    assert names(tmp_path) == []
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
+    (tmp_path / "file").write_text("precious")
+    with pytest.raises(SceneError, match="is a file; expected the name of a folder"):
+        check_folder(tmp_path / "file", force=True)
+
+
+def test_points_are_listed_by_size_the_dense_scene_first(new_sweep, tmp_path):
+    running = new_sweep(tmp_path)
+    running.measure_dense()
+    for setting in (Setting(10, 1), Setting(40, 0), Setting(40, 1)):
+        running.journal.add(point(setting, 30.0, of=400))
+    assert [(p.gaussians, p.sh_degree) for p in running.result().points][1:] == [(40, 1), (40, 0), (10, 1)]
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        ({"points": 1}, "1 points; expected at least 2"),
+        ({"within": 0.0}, "a loss of 0 dB"),
+        ({"within": math.nan}, "a loss of nan dB"),
+        ({"views": 0}, "0 views"),
+        ({"side": 0}, "of 0 pixels"),
+        ({"methods": ()}, "no method is named"),
+        ({"methods": ("magic",)}, "no method is called 'magic'"),
+        ({"repairs": ("magic",)}, "repairs are magic"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(options, said):
+    with pytest.raises(PointSplatError, match=said):
+        Options(**options)
