@@ -114,7 +114,7 @@ def test_page_has_every_point_and_view(written, sweep):
         for key in ("photo", *keys):
             original = np.asarray(Image.open(picture_path(folder, view, key)), dtype=float)
             packed = np.asarray(decoded(shown[key]), dtype=float)
-            assert packed.shape == (48, 64, 3) and np.abs(packed - original).mean() < 6, "WebP, quality 90"
+            assert packed.shape == (48, 64, 3) and np.abs(packed - original).mean() < 8, "the noise of photos is not kept"
 
 
 def decoded(uri: str) -> Image.Image:
