@@ -17,7 +17,16 @@ from pointsplat_ns.io.files import replacing
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.pages.pictures import AMPLIFIED, error_colors, error_map, fit, read_png
 from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.tradeoff.front import COSTS, METRICS, REFERENCES, fastest_first, pareto_front, quality_of
+from pointsplat_ns.tradeoff.front import (
+    COSTS,
+    METRICS,
+    REFERENCES,
+    fastest_above,
+    fastest_first,
+    fastest_within,
+    pareto_front,
+    quality_of,
+)
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, picture_path
 
 MAX_BYTES = 10_000_000
@@ -124,6 +133,7 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
         "views": views,
         "references": REFERENCES if has_photos else REFERENCES[:1],
         "metrics": METRICS if has_lpips else METRICS[:2],
+        "recommended": fastest_within(sweep.points, WITHIN_DB) or fastest_above(sweep.points, ABOVE_DB) or sweep.points[0],
         "rows": [_row(point) for point in sweep.points],
         "columns": _columns(has_photos, has_lpips, any(point.peak_bytes is not None for point in sweep.points)),
         "amplified": AMPLIFIED,

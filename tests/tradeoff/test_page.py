@@ -21,6 +21,7 @@ from PIL import Image
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.pages import pictures
 from pointsplat_ns.tradeoff import page as page_module
+from pointsplat_ns.tradeoff.front import fastest_within
 from pointsplat_ns.tradeoff.page import write_page
 from pointsplat_ns.tradeoff.points import Quality, picture_path
 
@@ -131,7 +132,13 @@ def test_error_maps_are_those_of_the_lossless_pictures(sweep, tmp_path, monkeypa
             assert shown[f"{reference}:{point.key}"] == str(pictures.error_map(a, b).sum())
 
 
-def test_the_first_question_has_the_answer_that_python_gives(written, sweep):
+def test_without_scripts_the_page_says_what_is_recommended(written, sweep):
+    text = written.read_text("utf-8").partition("<noscript>")[2].partition("</noscript>")[0]
+    point = fastest_within(sweep[0].points, 0.5)
+    assert f"0.5 dB against held-out photos is\n{point.label}: <code>{point.command}</code>" in text
+
+
+def test_scripts_are_given_what_was_measured(written, sweep):
     points = parts_of(written).data["points"]
     for point, shown in zip(sweep[0].points, points, strict=True):
         assert float(shown["renders"]["psnr"]) == point.against_dense.psnr
@@ -150,7 +157,8 @@ def test_page_without_photos_and_with_lpips(sweep, tmp_path):
     radios = {(a["name"], a["value"]) for tag, a in parts.elements if tag == "input" and a.get("type") == "radio"}
     assert ("metric", "lpips") in radios and not [name for name, _ in radios if name == "reference"]
     assert not [name for view in parts.data["pictures"] for name in view if "photo" in name]
-    assert "photos" not in " ".join(column for column in header_of(tmp_path / "bare.html"))
+    assert "photos" not in " ".join(header_of(tmp_path / "bare.html"))
+    assert "at least 35.0 dB against the dense scene's renders" in (tmp_path / "bare.html").read_text("utf-8")
     assert "LPIPS, renders" in header_of(tmp_path / "bare.html")
 
 

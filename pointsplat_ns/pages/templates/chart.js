@@ -27,14 +27,16 @@ function steps(low, high, most) {
   return ticks;
 }
 
-// Ticks of a logarithmic axis: 1, 2 and 5 of each decade; where that is too few, round numbers at equal distances.
+// Ticks of a logarithmic axis: round factors in each decade, as many as fit; equal distances where it is short.
 function logSteps(low, high, most) {
-  if (high / low < 8) return steps(low, high, most);
-  const ticks = [];
-  for (let power = Math.floor(Math.log10(low)); power <= Math.log10(high); power++)
-    for (const factor of [1, 2, 5]) ticks.push(factor * 10 ** power);
-  const inside = ticks.filter((tick) => tick >= low && tick <= high);
-  return inside.length <= most ? inside : inside.filter((tick) => /^1/.test(tick.toExponential()));
+  if (high / low < 4) return steps(low, high, most);
+  for (const factors of [[1, 1.5, 2, 3, 4, 5, 7], [1, 2, 3, 5], [1, 2, 5], [1, 3], [1]]) {
+    const ticks = [];
+    for (let power = Math.floor(Math.log10(low)); power <= Math.log10(high); power++)
+      ticks.push(...factors.map((factor) => factor * 10 ** power).filter((tick) => tick >= low && tick <= high));
+    if (ticks.length <= most) return ticks;
+  }
+  return [];
 }
 
 // `points` have x, y (which may be infinite), low, high (null: no spread), label, title, group; `front` is a list of
