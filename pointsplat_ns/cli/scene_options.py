@@ -46,17 +46,33 @@ def check_outputs(scene: Path | None, picture: Path | None, force: bool) -> None
     Raises:
         SceneError: if a path has another suffix, is a folder, or is a file that must not be overwritten.
     """
+    check_output(scene, ".ply", force)
+    check_output(picture, ".png", force)
+
+
+def check_output(path: Path | None, kind: str, force: bool) -> None:
+    """Check the path of one file to write.
+
+    Args:
+        path: the file; None for none.
+        kind: the suffix that its name must have.
+        force: whether an existing file may be overwritten.
+
+    Raises:
+        SceneError: if it has another suffix, is a folder, or is a file that must not be overwritten.
+    """
     from pointsplat_ns.errors import SceneError
 
-    for path, kind in ((scene, ".ply"), (picture, ".png")):
-        if path is not None and path.suffix.lower() != kind:
-            raise SceneError(
-                f"{path}: cannot write a {path.suffix or 'nameless'} file; expected a name that ends in {kind}"
-            )
-        if path is not None and path.is_dir():
-            raise SceneError(f"{path}: is a folder; expected the name of a file to write")
-        if path is not None and path.exists() and not force:
-            raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
+    if path is None:
+        return
+    if path.suffix.lower() != kind:
+        raise SceneError(
+            f"{path}: cannot write a {path.suffix or 'nameless'} file; expected a name that ends in {kind}"
+        )
+    if path.is_dir():
+        raise SceneError(f"{path}: is a folder; expected the name of a file to write")
+    if path.exists() and not force:
+        raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
 
 
 def print_result(what: str, before: int, scene: Gaussians, seconds: float, where: Path | None) -> None:

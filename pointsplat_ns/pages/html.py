@@ -38,7 +38,7 @@ def page(template: str, scripts: tuple[str, ...] = (), **values: Any) -> str:
     Args:
         template: name of a template that extends ``base.html``.
         scripts: names of the scripts to put in, in this order.
-        values: what the template shows. Texts are escaped.
+        values: what the template shows. Texts are escaped; bytes of a file's name that are no characters become "?".
 
     Raises:
         ValueError: if a value that the template gives to a script is NaN or infinite.
@@ -57,11 +57,9 @@ def page(template: str, scripts: tuple[str, ...] = (), **values: Any) -> str:
             "form-action 'none'",
         )
     )
-    return (
-        _environment()
-        .get_template(template)
-        .render(style=_as_it_is(style), script=_as_it_is(script), policy=policy, version=__version__, **values)
-    )
+    fixed = {"style": _as_it_is(style), "script": _as_it_is(script), "policy": policy, "version": __version__}
+    text = _environment().get_template(template).render(**fixed, **values)
+    return text.encode("utf-8", "replace").decode("utf-8")
 
 
 def _source(name: str) -> str:

@@ -7,16 +7,12 @@ import io
 import random
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.files import one_line
 from pointsplat_ns.system.progress import Progress, tracked
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
 
 LEVELS = (90, 82, 74, 66, 58, 50, 42, 34)
 """WebP qualities to try, best first."""
@@ -91,7 +87,9 @@ def error_colors() -> np.ndarray:
     """The colours of error maps, (256, 3) uint8: a ramp that gets brighter all the way, as an amount should."""
     stops = np.array([[0, 0, 0], [70, 20, 90], [190, 50, 70], [250, 140, 40], [255, 235, 150], [255, 255, 255]])
     places = np.linspace(0, 255, len(stops))
-    return np.stack([np.interp(np.arange(256), places, channel) for channel in stops.T], axis=1).round().astype(np.uint8)
+    return (
+        np.stack([np.interp(np.arange(256), places, channel) for channel in stops.T], axis=1).round().astype(np.uint8)
+    )
 
 
 def fit(
@@ -124,14 +122,16 @@ def fit(
                 if left < 0:
                     break
             else:
-                return uris, f"WebP of quality {level}" + ("" if side is None else f", at most {side} pixels wide or high")
+                return uris, f"WebP of quality {level}" + (
+                    "" if side is None else f", at most {side} pixels wide or high"
+                )
     raise DataError(f"{len(pictures)} pictures do not fit into {limit / 1e6:.1f} MB; expected fewer points or views")
 
 
 def _uri(pixels: np.ndarray, level: int, side: int | None) -> str:
     from PIL import Image
 
-    picture: Image = Image.fromarray(pixels)
+    picture = Image.fromarray(pixels)
     if side is not None:
         picture.thumbnail((side, side))
     stream = io.BytesIO()

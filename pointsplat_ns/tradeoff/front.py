@@ -67,5 +67,7 @@ def fastest_above(points: Sequence[Point], db: float) -> Point | None:
 
 def _fastest(points: Sequence[Point], reference: Reference, least: float) -> Point | None:
     # 1e-9: a difference of two decimal numbers is not exact, and 0.5 dB less than 30.1 is not 29.6.
-    good = (p for p in fastest_first(points) if (q := quality_of(p, reference, "psnr")) is not None and q >= least - 1e-9)
+    good = (
+        p for p in fastest_first(points) if (q := quality_of(p, reference, "psnr")) is not None and q >= least - 1e-9
+    )
     return next(good, None)

@@ -133,14 +133,16 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
         "views": views,
         "references": REFERENCES if has_photos else REFERENCES[:1],
         "metrics": METRICS if has_lpips else METRICS[:2],
-        "recommended": fastest_within(sweep.points, WITHIN_DB) or fastest_above(sweep.points, ABOVE_DB) or sweep.points[0],
+        "recommended": fastest_within(sweep.points, WITHIN_DB)
+        or fastest_above(sweep.points, ABOVE_DB)
+        or sweep.points[0],
         "rows": [_row(point) for point in sweep.points],
         "columns": _columns(has_photos, has_lpips, any(point.peak_bytes is not None for point in sweep.points)),
         "amplified": AMPLIFIED,
         "full_level": math.ceil(255 / AMPLIFIED),
         "within_db": WITHIN_DB,
         "above_db": ABOVE_DB,
-        "ramp": ["#%02x%02x%02x" % tuple(color) for color in error_colors()[::17].tolist()],
+        "ramp": ["#" + bytes(color).hex() for color in error_colors()[::17].tolist()],
     }
 
 
@@ -187,7 +189,13 @@ def _finite(value: float | None) -> float | str | None:
 
 def _columns(has_photos: bool, has_lpips: bool, has_peak: bool) -> list[tuple[str, str]]:
     """Names in :func:`_row` and titles of the table's columns."""
-    columns = [("share", "kept"), ("gaussians", "Gaussians"), ("sh_degree", "SH"), ("bytes", "MB"), ("frame_ms", "ms a frame")]
+    columns = [
+        ("share", "kept"),
+        ("gaussians", "Gaussians"),
+        ("sh_degree", "SH"),
+        ("bytes", "MB"),
+        ("frame_ms", "ms a frame"),
+    ]
     for reference, title in zip(REFERENCES[: 1 + has_photos], ("renders", "photos"), strict=False):
         names = (("psnr", "PSNR dB"), ("ssim", "SSIM"), ("lpips", "LPIPS"))[: 2 + has_lpips]
         columns += [(f"{reference}_{metric}", f"{name}, {title}") for metric, name in names]

@@ -65,7 +65,7 @@ class Tradeoff:
     """Size of the views, in pixels."""
     points: tuple[Point, ...]
     notes: tuple[str, ...] = ()
-    """Lines of text for the reader: that the machine was busy and times are not to be trusted, that LPIPS is missing."""
+    """Lines for the reader: that the machine was busy and times are not to be trusted, that LPIPS is missing."""
 
 
 def picture_path(folder: Path, view: int, what: str) -> Path:

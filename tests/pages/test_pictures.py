@@ -28,7 +28,8 @@ def test_a_png_is_read_exactly(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "found"), [(None, "No such file"), (b"GIF89a", "not a PNG"), ("cut", "cannot be read"), ("wide", "48 x 64")]
+    ("content", "found"),
+    [(None, "No such file"), (b"GIF89a", "not a PNG"), ("cut", "cannot be read"), ("wide", "48 x 64")],
 )
 def test_a_picture_that_cannot_be_used_is_one_line_with_its_path(tmp_path, content, found):
     path = tmp_path / "a.png"

@@ -44,7 +44,8 @@ def quality(images: Sequence[Tensor], references: Sequence[Tensor]) -> Quality:
     """Means over views. LPIPS is left out: it needs weights."""
     pairs = list(zip(images, references, strict=True))
     return Quality(
-        statistics.fmean(float(ps.psnr(a, b)) for a, b in pairs), statistics.fmean(float(ps.ssim(a, b)) for a, b in pairs)
+        statistics.fmean(float(ps.psnr(a, b)) for a, b in pairs),
+        statistics.fmean(float(ps.ssim(a, b)) for a, b in pairs),
     )
 
 

@@ -83,7 +83,6 @@ function drawChart(svg, { points, front, selected, marked, threshold, xTitle, yT
   const line = front.map((index) => `${x(points[index].x)} ${y(points[index].y)}`);
   if (line.length > 1) element(axes, "path", { d: `M${line.join("L")}`, class: "front" });
   const order = [...points.keys()].sort((a, b) => points[a].x - points[b].x || points[a].y - points[b].y);
-  const marks = new Map();
   const behindFirst = [...order].sort((a, b) => front.includes(a) - front.includes(b) || (a === selected) - (b === selected));
   for (const index of behindFirst) {
     const point = points[index], onFront = front.includes(index);
@@ -102,12 +101,17 @@ function drawChart(svg, { points, front, selected, marked, threshold, xTitle, yT
     element(mark, "circle", { r: 16, class: "target" });
     if (index === marked) element(mark, "circle", { r: 11, class: "ring" });
     element(mark, "path", { d: SHAPES[point.group % SHAPES.length](index === selected ? 7 : onFront ? 5.5 : 4.5), class: "shape" });
-    mark.addEventListener("click", () => onSelect(index));
-    mark.addEventListener("pointerenter", () => onPoint(index, x(point.x), y(point.y)));
+    const show = () => onPoint(index, x(point.x), y(point.y));
+    mark.addEventListener("click", () => {
+      onSelect(index);
+      show();
+    });
+    mark.addEventListener("pointermove", (event) => {
+      if (event.movementX || event.movementY) show(); // else only the chart has changed below a pointer at rest
+    });
     mark.addEventListener("pointerleave", () => onPoint(null));
-    mark.addEventListener("focus", () => onPoint(index, x(point.x), y(point.y)));
+    mark.addEventListener("focus", show);
     mark.addEventListener("blur", () => onPoint(null));
-    marks.set(index, mark);
   }
   svg.onkeydown = (event) => {
     const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
