@@ -98,19 +98,21 @@ def test_page_keeps_photos_and_dense_renders_apart(tmp_path):
 def test_page_of_a_malformed_evaluation_is_shown_or_one_error(tmp_path, monkeypatch):
     monkeypatch.setattr("pointsplat_ns.nerfstudio_plugin.pointsplat.report.show_report", lambda results: None)
     whole, shown, refused = evaluation(), 0, 0
+    of_others = {"b", "refined", "average", "average_seen", "average_unseen"}  # read as the first scene is
     for place in places(whole):
         for wrong in (*WRONG, math.nan, math.inf, 1e308, -1e308, 0, 5e-324, "\ud800"):
+            if of_others & {*place}:
+                continue
             broken = json.loads(json.dumps(whole))
             node = broken
             for key in place[:-1]:
                 node = node[key]
             node[place[-1]] = wrong
-            if "b" not in place and "average" not in place:  # they are as the first scene is
-                try:
-                    ps.report(write(tmp_path, broken), tmp_path / "eval.html")
-                    shown += 1
-                except ps.DataError:
-                    refused += 1
+            try:
+                ps.report(write(tmp_path, broken), tmp_path / "eval.html")
+                shown += 1
+            except ps.DataError:
+                refused += 1
     assert shown > 100 and refused > 100
 
 

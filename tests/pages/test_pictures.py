@@ -92,9 +92,9 @@ def test_pictures_are_compressed_no_more_than_needed():
 
 
 def test_pictures_are_made_smaller_where_quality_alone_is_not_enough():
-    big = np.random.default_rng(SEED).integers(0, 256, (600, 800, 3), dtype=np.uint8)
-    [uri], how = fit([lambda: big], 60_000)
-    assert decoded(uri).size == (320, 240) and how.endswith("at most 320 pixels wide or high")
+    big = np.random.default_rng(SEED).integers(0, 256, (300, 400, 3), dtype=np.uint8)
+    [uri], how = fit([lambda: big], 45_000)
+    assert decoded(uri).size == (160, 120) and how.endswith("at most 160 pixels wide or high")
 
 
 def test_pictures_that_cannot_fit_are_an_error():

@@ -220,3 +220,20 @@ def test_page_without_photos_or_with_strange_names_works(browser, make_page, swe
     one(browser, "#stop").send_keys(Keys.END)
     assert shown(browser)["name"] == HOSTILE + "dense"
     assert complaints(browser) == [] and browser.title != "run"
+
+
+def test_page_of_the_dense_scene_alone_works(browser, make_page, sweep):
+    browser.get(make_page(points=sweep[0].points[:1]).as_uri())
+    choose(browser, "reference", "renders")
+    assert shown(browser)["name"] == "dense" and len(browser.find_elements(By.CSS_SELECTOR, "#chart .point")) == 1
+    assert complaints(browser) == []
+
+
+def test_pointer_shows_what_a_point_is(opened, sweep):
+    [mark] = opened.find_elements(By.CSS_SELECTOR, f".point[data-key='{sweep[0].points[2].key}']")
+    opened.execute_script("arguments[0].scrollIntoView({block: 'center'})", mark)
+    ActionChains(opened).move_to_element(mark.find_element(By.CSS_SELECTOR, ".shape")).move_by_offset(1, 1).perform()
+    assert one(opened, ".tip strong").text == sweep[0].points[2].label
+    mark.find_element(By.CSS_SELECTOR, ".shape").click()
+    assert shown(opened)["name"] == sweep[0].points[2].label
+    assert one(opened, ".tip").is_displayed()
