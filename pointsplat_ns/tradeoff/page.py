@@ -211,7 +211,10 @@ def _row(point: Point) -> dict[str, Any]:
         "gaussians": (point.gaussians, f"{point.gaussians:,}"),
         "sh_degree": (point.sh_degree, str(point.sh_degree)),
         "bytes": (point.bytes, f"{point.bytes / 1e6:.2f}"),
-        "frame_ms": (point.frame_ms, f"{point.frame_ms:.1f} ({point.frame_ms_low:.1f}–{point.frame_ms_high:.1f})"),
+        "frame_ms": (
+            point.frame_ms,
+            f"{_time(point.frame_ms)} ({_time(point.frame_ms_low)}–{_time(point.frame_ms_high)})",
+        ),
         "seconds": (point.seconds, f"{point.seconds:.1f}"),
         "peak_bytes": (point.peak_bytes, "–" if point.peak_bytes is None else f"{point.peak_bytes / 1e9:.2f}"),
     }
@@ -221,3 +224,7 @@ def _row(point: Point) -> dict[str, Any]:
             text = "–" if value is None else "identical" if value == math.inf else f"{value:.{digits}f}"
             cells[f"{reference}_{metric}"] = (value, text)
     return {"key": point.key, "label": point.label, "cells": cells}
+
+
+def _time(ms: float) -> str:
+    return f"{ms:,.0f}" if ms >= 100 else f"{ms:.1f}"

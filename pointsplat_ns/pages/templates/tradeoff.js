@@ -25,6 +25,7 @@ const short = (value) => (value >= 1e6 ? `${+(value / 1e6).toPrecision(3)} M` : 
 const times = (ratio) => `${ratio < 10 ? ratio.toFixed(1) : ratio.toFixed(0)}×`;
 const percent = (share) => `${+(100 * share).toPrecision(3)} %`;
 const megabytes = (bytes) => `${+(bytes / 1e6).toPrecision(3)} MB`;
+const milliseconds = (time) => `${(+time.toPrecision(3)).toLocaleString("en")} ms`;
 const withUnit = (value, metric) =>
   value === null ? "not measured" : value === Infinity ? "identical" : value.toFixed(DIGITS[metric]) + (metric === "psnr" ? " dB" : "");
 
@@ -81,7 +82,7 @@ function showChart() {
   const { point: best, least } = recommended();
   const tip = byId("chart").querySelector(".tip");
   const figuresOf = (point) =>
-    `${withUnit(qualityOf(point), state.metric)}, ${point.frame_ms.toPrecision(3)} ms, ` +
+    `${withUnit(qualityOf(point), state.metric)}, ${milliseconds(point.frame_ms)}, ` +
     `${point.gaussians.toLocaleString("en")} Gaussians, ${megabytes(point.bytes)}`;
   drawChart(byId("chart").querySelector("svg"), {
     points: shown.map((point) => ({
@@ -139,7 +140,7 @@ function showPoint() {
   slider.value = keys.indexOf(state.key);
   slider.setAttribute("aria-valuetext", name);
   byId("stop-name").textContent = name;
-  fillFacts(byId("shown-facts"), [...factsOf(point), ["a frame", `${point.frame_ms.toPrecision(3)} ms`]]);
+  fillFacts(byId("shown-facts"), [...factsOf(point), ["a frame", milliseconds(point.frame_ms)]]);
   fillCommand(byId("shown-command"), point.command);
   const reference = state.reference === "photos" && pictures.photo ? "photos" : "renders";
   const what = `view ${state.view + 1}`;
