@@ -27,6 +27,9 @@ SHIPPED = (
     "pointsplat_ns/examples/room.ply",
     "pointsplat_ns/refiner/pretrained/refiner.safetensors",
     "pointsplat_ns/refiner/pretrained/CARD.md",
+    "pointsplat_ns/pages/templates/base.html",
+    "pointsplat_ns/pages/templates/style.css",
+    "pointsplat_ns/pages/templates/tradeoff.js",
     "method_configs/methods.py",
 )
 """What is needed and is not found by following imports."""

@@ -46,20 +46,43 @@ def check_outputs(scene: Path | None, picture: Path | None, force: bool) -> None
     Raises:
         SceneError: if a path has another suffix, is a folder, or is a file that must not be overwritten.
     """
-    from pointsplat_ns.errors import SceneError
     from pointsplat_ns.io.formats import format_to_write
 
     if scene is not None:
         format_to_write(scene)
-    if picture is not None and picture.suffix.lower() != ".png":
+        _check_free(scene, force)
+    check_output(picture, ".png", force)
+
+
+def check_output(path: Path | None, kind: str, force: bool) -> None:
+    """Check the path of one file to write that is no scene.
+
+    Args:
+        path: the file; None for none.
+        kind: the suffix that its name must have.
+        force: whether an existing file may be overwritten.
+
+    Raises:
+        SceneError: if it has another suffix, is a folder, or is a file that must not be overwritten.
+    """
+    from pointsplat_ns.errors import SceneError
+
+    if path is None:
+        return
+    if path.suffix.lower() != kind:
         raise SceneError(
-            f"{picture}: cannot write a {picture.suffix or 'nameless'} file; expected a name that ends in .png"
+            f"{path}: cannot write a {path.suffix or 'nameless'} file; expected a name that ends in {kind}"
         )
-    for path in (scene, picture):
-        if path is not None and path.is_dir():
-            raise SceneError(f"{path}: is a folder; expected the name of a file to write")
-        if path is not None and path.exists() and not force:
-            raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
+    _check_free(path, force)
+
+
+def _check_free(path: Path, force: bool) -> None:
+    from pointsplat_ns.errors import SceneError
+
+    if path.is_dir():
+        raise SceneError(f"{path}: is a folder; expected the name of a file to write")
+    if path.exists() and not force:
+        raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
 
 
 def in_format_of(keep: str, output: Path) -> str:

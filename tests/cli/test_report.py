@@ -6,28 +6,10 @@ import json
 
 import pytest
 
+from evaluations import WRONG, evaluation, places
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.pointsplat.report import report
-
-
-def evaluation(lpips: float | None = 0.25) -> dict:
-    def row(psnr: float, count: int) -> dict:
-        return {"psnr": psnr, "ssim": 0.9, "lpips": lpips, "gaussians": count, "megabytes": count * 236e-6, "fps": 12.0}
-
-    rows = {"dense": row(30.0, 1000), "pruned": row(20.0, 100), "refined": row(25.0, 100)}
-    return {
-        "results": {
-            "settings": {"keep": 0.1, "by": "paper", "size": "tiny"},
-            "average": rows,
-            "average_unseen": rows,
-            "average_seen": rows,
-            "scenes": {
-                "a": {"seen_in_training": True, "views": 3, **rows},
-                "b": {"seen_in_training": False, "views": 3, **rows},
-            },
-        }
-    }
 
 
 def test_report_shows_every_scene_and_variant(tmp_path, capsys):
@@ -94,7 +76,6 @@ def test_report_of_something_else_is_one_line_and_status_1(tmp_path, capsys, con
 
 
 DEEP = "[" * 100_000
-WRONG = [None, [], {}, "text", [1], 10**400, {"psnr": "high"}]
 
 
 @pytest.mark.parametrize("content", [DEEP, '{"results":' * 50_000, "9" * 5000, "\ud800", "null", '{"results": null}'])
@@ -105,14 +86,6 @@ def test_report_of_json_that_is_deep_or_odd_is_one_line_and_status_1(tmp_path, c
         main(["report", str(path)])
     error = capsys.readouterr().err
     assert end.value.code == 1 and f"{path}: not an evaluation" in error and error.count("\n") == 1
-
-
-def places(node, path=()):
-    """The path to every entry of nested dictionaries."""
-    for key, value in node.items():
-        yield (*path, key)
-        if isinstance(value, dict):
-            yield from places(value, (*path, key))
 
 
 def test_results_that_are_malformed_anywhere_are_shown_or_one_error(tmp_path, capsys):
@@ -133,6 +106,15 @@ def test_results_that_are_malformed_anywhere_are_shown_or_one_error(tmp_path, ca
             except DataError:
                 refused += 1
     assert refused > 300 and shown > 0
+
+
+def test_a_name_that_holds_half_a_character_is_one_error(tmp_path):
+    content = evaluation()
+    content["results"]["scenes"]["\ud800"] = content["results"]["scenes"].pop("b")
+    path = tmp_path / "eval.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(DataError, match="not an evaluation"):
+        report(path)
 
 
 def test_names_of_scenes_are_shown_as_they_are(tmp_path, capsys):

@@ -1,10 +1,11 @@
-"""Prints the evaluation of a refiner as a table. nerfstudio is not imported."""
+"""Prints the evaluation of a refiner as a table, and writes it as a page. nerfstudio is not imported."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+from pointsplat_ns.nerfstudio_plugin.pointsplat.report_page import COLUMNS, Block, write_report_page
 from pointsplat_ns.nerfstudio_plugin.pointsplat.results import VARIANTS, read_evaluation
 
 PHOTOS = "photos"
@@ -14,16 +15,18 @@ NAMES = {PHOTOS: "held-out photos", "dense renders": "the dense scenes' own rend
 """Texts for the table, by reference."""
 
 
-def report(evaluation: str | Path) -> None:
+def report(evaluation: str | Path, html: str | Path | None = None) -> None:
     """Print the results that ``ns-eval`` wrote for a ``pointsplat`` run: dense, pruned and refined scenes side by side.
 
     PSNR is in dB, fps is one over the median time of a frame, and megabytes are 10^6 bytes of float32 parameters.
 
     Args:
         evaluation: the JSON file.
+        html: file to write the same to with charts, as one page that loads nothing; None for none.
 
     Raises:
         DataError: if the file is missing or is not such an evaluation.
+        SceneError: if the page cannot be written.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -33,7 +36,11 @@ def report(evaluation: str | Path) -> None:
         pointsplat_ns.errors.DataError: evaluation.json: cannot be read (No such file or directory); expected what \
 ns-eval wrote
     """
-    show_report(read_evaluation(Path(evaluation)))
+    results = read_evaluation(Path(evaluation))
+    show_report(results)
+    if html is not None:
+        parts = [(_reference(part), _blocks(results, part)) for part in _parts(results)]
+        write_report_page(Path(evaluation).stem, _settings(results), parts, _note(results), Path(html))
 
 
 def show_report(results: dict[str, Any]) -> None:
@@ -42,16 +49,51 @@ def show_report(results: dict[str, Any]) -> None:
 
     for table in report_tables(results):
         Console().print(table)
-    if "lpips_note" in results:
-        print(f"no LPIPS: {results['lpips_note']}")
+    if note := _note(results):
+        print(note)
 
 
 def report_tables(results: dict[str, Any]) -> list:
     """A rich table for the scenes compared with photos, and one for those compared with dense renders. No average mixes
     the two."""
+    return [_table(results, part) for part in _parts(results)]
+
+
+def _parts(results: dict[str, Any]) -> list[dict[str, Any]]:
+    """The parts of an evaluation, one per reference."""
     other = results.get("against_dense_renders")
-    parts = [results] if other is None else [results, other]
-    return [_table(results, part) for part in parts]
+    return [results] if other is None else [results, other]
+
+
+def _reference(part: dict[str, Any]) -> str:
+    """Text that says what a part was compared with."""
+    reference = part.get("reference", PHOTOS)
+    return NAMES.get(reference, reference)
+
+
+def _settings(results: dict[str, Any]) -> str:
+    """Text that says how the scenes were pruned and refined."""
+    settings = results.get("settings", {})
+    return f"keep {settings.get('keep')}, by {settings.get('by')}, refiner {settings.get('size')}"
+
+
+def _note(results: dict[str, Any]) -> str:
+    """The reason if LPIPS is missing; else an empty text."""
+    return f"no LPIPS: {results['lpips_note']}" if "lpips_note" in results else ""
+
+
+def _blocks(results: dict[str, Any], part: dict[str, Any]) -> list[Block]:
+    """The scenes of a part, then the averages if there are several scenes."""
+    reference = part.get("reference", PHOTOS)
+    blocks = [
+        Block(name, "yes" if scene["seen_in_training"] else "never", scene)
+        for name, scene in results["scenes"].items()
+        if scene.get("reference", PHOTOS) == reference
+    ]
+    if len(blocks) > 1:
+        averages = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
+        blocks += [Block("average", seen, part[key], is_average=True) for seen, key in averages if key in part]
+    return blocks
 
 
 def _table(results: dict[str, Any], part: dict[str, Any]):
@@ -59,36 +101,19 @@ def _table(results: dict[str, Any], part: dict[str, Any]):
     from rich.markup import escape
     from rich.table import Table
 
-    settings = results.get("settings", {})
-    reference = part.get("reference", PHOTOS)
-    title = f"keep {settings.get('keep')}, by {settings.get('by')}, refiner {settings.get('size')}"
-    table = Table(title=escape(f"{title}; compared with {NAMES.get(reference, reference)}"))
+    table = Table(title=escape(f"{_settings(results)}; compared with {_reference(part)}"))
     table.add_column("scene")
     table.add_column("seen")
     table.add_column("variant")
-    for name in ("PSNR dB", "SSIM", "LPIPS", "splats", "MB", "fps"):
+    for _, name, _ in COLUMNS:
         table.add_column(name, justify="right")
-    blocks = [
-        (name, "yes" if scene["seen_in_training"] else "never", scene)
-        for name, scene in results["scenes"].items()
-        if scene.get("reference", PHOTOS) == reference
-    ]
-    if len(blocks) > 1:
-        averages = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
-        blocks += [("average", seen, part[key]) for seen, key in averages if key in part]
-    for title, seen, block in blocks:
+    for block in _blocks(results, part):
         for i, row in enumerate(VARIANTS):
-            values = block[row]
             table.add_row(
-                escape(title) if i == 0 else "",
-                seen if i == 0 else "",
+                escape(block.name) if i == 0 else "",
+                block.seen if i == 0 else "",
                 row,
-                _number(values["psnr"], 2),
-                _number(values["ssim"], 3),
-                _number(values["lpips"], 3),
-                _number(values["gaussians"], 0),
-                _number(values["megabytes"], 2),
-                _number(values["fps"], 1),
+                *(_number(block.variants[row][column], digits) for column, _, digits in COLUMNS),
                 end_section=i == len(VARIANTS) - 1,
             )
     return table

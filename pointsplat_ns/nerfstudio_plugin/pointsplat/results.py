@@ -33,6 +33,7 @@ def read_evaluation(path: Path) -> dict[str, Any]:
             raise ValueError(f"more than {MAX_BYTES} bytes")
         results = json.loads(path.read_text("utf-8"))["results"]
         _check(results)
+        json.dumps(results, ensure_ascii=False).encode("utf-8")  # halves of characters could not be shown
         return results
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); expected what ns-eval wrote") from error

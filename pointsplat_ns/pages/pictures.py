@@ -1,0 +1,139 @@
+"""Pictures for a page: read from PNG files, compressed together to a number of bytes."""
+
+from __future__ import annotations
+
+import base64
+import io
+import random
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.io.files import one_line
+from pointsplat_ns.system.progress import Progress, tracked
+
+LEVELS = (90, 82, 74, 66, 58, 50, 42, 34)
+"""WebP qualities to try, best first."""
+
+SIDES = (None, 480, 320, 160)
+"""Longest sides in pixels to try, best first; None leaves a picture as it is."""
+
+SAMPLE = 24
+"""Number of pictures that tell whether a quality is worth trying on all."""
+
+METHOD = 2
+"""WebP's effort: three times as fast as its default of 4, for 5 % more bytes."""
+
+AMPLIFIED = 8
+"""Factor by which error maps show the difference, so that 32 of 255 levels have the brightest colour."""
+
+
+def read_png(path: Path, width: int, height: int) -> np.ndarray:
+    """The pixels of a PNG file, (height, width, 3) uint8.
+
+    Args:
+        path: the file.
+        width: expected width in pixels. It is checked before the pixels are read.
+        height: expected height in pixels.
+
+    Raises:
+        DataError: if the file is missing, is no PNG, is damaged, or has another size.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    expected = f"expected a PNG picture of {width} x {height} pixels"
+    try:
+        with Image.open(path, formats=["PNG"]) as picture:
+            if picture.size != (width, height):
+                raise DataError(f"{path}: has {picture.width} x {picture.height} pixels; {expected}")
+            return np.asarray(picture.convert("RGB"))
+    except UnidentifiedImageError as error:
+        raise DataError(f"{path}: not a PNG picture; {expected}") from error
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        found = error.strerror if isinstance(error, OSError) and error.strerror else one_line(error)
+        raise DataError(f"{path}: cannot be read ({found}); {expected}") from error
+
+
+def error_map(picture: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """The difference of two pictures at half their size, as colours from black over red to white.
+
+    Of the three channels, the one that differs most counts. Its difference is averaged over 2 x 2 pixels, which takes a
+    fifth of the bytes, and amplified :data:`AMPLIFIED` times.
+
+    Args:
+        picture: (H, W, 3) uint8.
+        reference: the same shape.
+
+    Returns:
+        (ceil(H / 2), ceil(W / 2), 3) uint8; a last odd row or column is averaged with itself.
+
+    Example:
+        >>> import numpy as np
+        >>> grey = np.full((2, 6, 3), 100, np.uint8)
+        >>> other = grey + np.repeat([0, 10, 40], 2).astype(np.uint8)[None, :, None]
+        >>> error_map(other, grey).sum(axis=2).tolist()
+        [[0, 254, 765]]
+    """
+    difference = np.abs(picture.astype(np.int16) - reference.astype(np.int16)).max(axis=2)
+    height, width = difference.shape
+    even = np.pad(difference, ((0, height % 2), (0, width % 2)), mode="edge")
+    mean = even.reshape((height + 1) // 2, 2, (width + 1) // 2, 2).mean(axis=(1, 3))
+    return error_colors()[np.minimum(AMPLIFIED * mean, 255).round().astype(np.uint8)]
+
+
+def error_colors() -> np.ndarray:
+    """The colours of error maps, (256, 3) uint8: a ramp that gets brighter all the way, as an amount should."""
+    stops = np.array([[0, 0, 0], [70, 20, 90], [190, 50, 70], [250, 140, 40], [255, 235, 150], [255, 255, 255]])
+    places = np.linspace(0, 255, len(stops))
+    return (
+        np.stack([np.interp(np.arange(256), places, channel) for channel in stops.T], axis=1).round().astype(np.uint8)
+    )
+
+
+def fit(
+    pictures: Sequence[Callable[[], np.ndarray]], limit: int, progress: bool | Progress = False
+) -> tuple[list[str], str]:
+    """Data URIs of pictures as WebP, at the best quality at which all of them together fit.
+
+    Args:
+        pictures: functions that give (H, W, 3) uint8. They are called anew for each quality that is tried, so that only
+            one picture at a time takes memory.
+        limit: maximum of the sum of the URIs' lengths, in bytes.
+        progress: show a progress bar.
+
+    Returns:
+        One URI for each picture, and a text that says how they were compressed.
+
+    Raises:
+        DataError: if they do not fit at the lowest quality either.
+    """
+    # Drawn at random: every twelfth picture may be of one kind.
+    sample = random.Random(0).sample(pictures, min(SAMPLE, len(pictures)))
+    for side in SIDES:
+        for level in LEVELS:
+            if sum(len(_uri(picture(), level, side)) for picture in sample) * len(pictures) > limit * len(sample):
+                continue
+            uris, left = [], limit
+            for picture in tracked(pictures, f"compressing pictures, quality {level}", len(pictures), progress):
+                uris.append(_uri(picture(), level, side))
+                left -= len(uris[-1])
+                if left < 0:
+                    break
+            else:
+                return uris, f"WebP of quality {level}" + (
+                    "" if side is None else f", at most {side} pixels wide or high"
+                )
+    raise DataError(f"{len(pictures)} pictures do not fit into {limit / 1e6:.1f} MB; expected fewer points or views")
+
+
+def _uri(pixels: np.ndarray, level: int, side: int | None) -> str:
+    from PIL import Image
+
+    picture = Image.fromarray(pixels)
+    if side is not None:
+        picture.thumbnail((side, side))
+    stream = io.BytesIO()
+    picture.save(stream, format="WEBP", quality=level, method=METHOD)
+    return "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode("ascii")

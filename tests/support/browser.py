@@ -1,0 +1,43 @@
+"""A headless Chromium that opens pages from disk."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from selenium.webdriver import Chrome
+
+PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+
+
+@contextmanager
+def chromium() -> Iterator[Chrome]:
+    """A browser of its own, closed at the end. The test is skipped where Chromium or its driver is missing."""
+    selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    program = next(filter(None, map(shutil.which, PROGRAMS)), None)
+    driver = shutil.which("chromedriver")
+    if program is None or driver is None:
+        pytest.skip("no Chromium with chromedriver on the path, so no page can be opened")
+    options = selenium.ChromeOptions()
+    options.binary_location = program
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    for argument in ("--headless=new", "--disable-gpu", "--disable-dev-shm-usage", "--window-size=1200,900"):
+        options.add_argument(argument)
+    if hasattr(os, "geteuid") and os.geteuid() == 0:
+        options.add_argument("--no-sandbox")  # Chromium has none for root
+    browser = selenium.Chrome(options=options, service=selenium.ChromeService(driver))
+    try:
+        yield browser
+    finally:
+        browser.quit()
+
+
+def complaints(browser: Chrome) -> list[str]:
+    """What the browser has logged since the last call: errors of scripts, and what the policy of a page forbade."""
+    return [entry["message"] for entry in browser.get_log("browser")]

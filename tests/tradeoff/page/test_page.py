@@ -1,0 +1,184 @@
+"""The page of a trade as a file: what is in it, what is not, how large it is."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import math
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from html_parts import hashed, names_nothing_outside, parts_of, policy_of
+from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.pages import pictures
+from pointsplat_ns.tradeoff import page as page_module
+from pointsplat_ns.tradeoff.front import fastest_within
+from pointsplat_ns.tradeoff.page import write_page
+from pointsplat_ns.tradeoff.points import Quality, picture_path
+
+HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(1)>\"'&</title>"
+
+
+@pytest.fixture(scope="module")
+def written(make_page) -> Path:
+    return make_page()
+
+
+def test_page_names_nothing_outside_of_itself(written):
+    names_nothing_outside(written)
+
+
+def test_policy_lets_only_the_scripts_and_styles_of_the_page_run(written):
+    parts = parts_of(written)
+    assert policy_of(parts) == {
+        "default-src": "'none'",
+        "img-src": "data:",
+        "style-src": hashed(parts.inside["style"][0]),
+        "script-src": hashed(parts.inside["script"][1]),
+        "base-uri": "'none'",
+        "form-action": "'none'",
+    }
+
+
+def test_texts_of_strangers_are_shown_and_never_run(make_page, sweep):
+    measured, _ = sweep
+    points = [replace(p, label=HOSTILE, command=HOSTILE, by=HOSTILE, repair=HOSTILE) for p in measured.points]
+    path = make_page(scene=HOSTILE, machine=HOSTILE, views_origin=HOSTILE, notes=(HOSTILE,), points=tuple(points))
+    parts = parts_of(path)
+    assert len(parts.inside["script"]) == 2 and all("onerror" not in attributes for _, attributes in parts.elements)
+    assert parts.data["points"][1]["command"] == HOSTILE, "scripts read the text as it is"
+    text = path.read_text("utf-8")
+    assert HOSTILE not in text and "<script>alert" not in text
+    assert text.count(str(html.escape(HOSTILE).replace("&quot;", "&#34;").replace("&#x27;", "&#39;"))) >= 5
+
+
+def test_a_name_that_is_no_text_is_shown_as_well_as_can_be(make_page):
+    assert "<h1>caf?</h1>" in make_page(scene="caf\udce9").read_text("utf-8")  # as Python reads such a file's name
+
+
+def test_page_has_every_point_and_view(written, sweep):
+    measured, folder = sweep
+    parts, keys = parts_of(written), [p.key for p in measured.points]
+    assert [a["data-key"] for tag, a in parts.elements if tag == "tr" and "data-key" in a] == keys
+    assert [p["key"] for p in parts.data["points"]] == keys
+    assert len(parts.data["pictures"]) == 2
+    expected = {"photo", *keys, *(f"renders:{k}" for k in keys if k != "dense"), *(f"photos:{k}" for k in keys)}
+    for view, shown in enumerate(parts.data["pictures"]):
+        assert set(shown) == expected
+        for key in ("photo", *keys):
+            original = np.asarray(Image.open(picture_path(folder, view, key)), dtype=float)
+            packed = np.asarray(decoded(shown[key]), dtype=float)
+            assert packed.shape == (48, 64, 3) and np.abs(packed - original).mean() < 8, (
+                "the noise of photos is not kept"
+            )
+
+
+def decoded(uri: str) -> Image.Image:
+    return Image.open(io.BytesIO(base64.b64decode(uri.partition("base64,")[2], validate=True)))
+
+
+def test_error_maps_are_those_of_the_lossless_pictures(sweep, tmp_path, monkeypatch):
+    measured, folder = sweep
+    monkeypatch.setattr(page_module, "fit", lambda sources, *_: ([str(int(s().sum())) for s in sources], "sums"))
+    [shown, *_] = parts_of(write_page(measured, folder, tmp_path / "sums.html")).data["pictures"]
+    for point in measured.points[1:]:
+        for reference, other in (("renders", "dense"), ("photos", "photo")):
+            a, b = (pictures.read_png(picture_path(folder, 0, key), 64, 48) for key in (point.key, other))
+            assert shown[f"{reference}:{point.key}"] == str(pictures.error_map(a, b).sum())
+
+
+def test_without_scripts_the_page_says_what_is_recommended(written, sweep):
+    text = written.read_text("utf-8").partition("<noscript>")[2].partition("</noscript>")[0]
+    point = fastest_within(sweep[0].points, 0.5)
+    assert f"0.5 dB against held-out photos is\n{point.label}: <code>{point.command}</code>" in text
+
+
+def test_scripts_are_given_what_was_measured(written, sweep):
+    points = parts_of(written).data["points"]
+    for point, shown in zip(sweep[0].points, points, strict=True):
+        assert float(shown["renders"]["psnr"]) == point.against_dense.psnr
+        assert shown["photos"]["psnr"] == point.against_photos.psnr and shown["photos"]["lpips"] is None
+    assert points[0]["renders"]["psnr"] == "Infinity", "JSON has no infinite numbers"
+
+
+def test_page_without_photos_and_with_lpips(sweep, tmp_path):
+    measured, folder = sweep
+    bare = tmp_path / "bare"
+    shutil.copytree(folder, bare, ignore=shutil.ignore_patterns("*_photo.png"))
+    points = [
+        replace(p, against_photos=None, against_dense=replace(p.against_dense, lpips=1 - p.share))
+        for p in measured.points
+    ]
+    parts = parts_of(write_page(replace(measured, points=tuple(points)), bare, tmp_path / "bare.html"))
+    radios = {(a["name"], a["value"]) for tag, a in parts.elements if tag == "input" and a.get("type") == "radio"}
+    assert ("metric", "lpips") in radios and not [name for name, _ in radios if name == "reference"]
+    assert not [name for view in parts.data["pictures"] for name in view if "photo" in name]
+    assert "photos" not in " ".join(header_of(tmp_path / "bare.html"))
+    assert "at least 36.1 dB against the dense scene's renders" in (tmp_path / "bare.html").read_text("utf-8")
+    assert "LPIPS, renders" in header_of(tmp_path / "bare.html")
+
+
+def header_of(path: Path) -> list[str]:
+    head = path.read_text("utf-8").partition("<thead>")[2].partition("</thead>")[0]
+    return re.findall(r"<button[^>]*>(.*?)</button>", head)
+
+
+def test_page_without_lpips_does_not_offer_it(written):
+    radios = {a["value"] for tag, a in parts_of(written).elements if tag == "input" and a.get("name") == "metric"}
+    assert radios == {"psnr", "ssim"} and not [title for title in header_of(written) if "LPIPS" in title]
+
+
+def test_table_says_what_is_infinite_and_what_is_unknown(make_page, sweep):
+    first, second, *others = sweep[0].points
+    unknown = replace(second, against_photos=None, against_dense=Quality(math.nan, 0.9))
+    text = make_page(points=(first, unknown, *others)).read_text("utf-8")
+    rows = dict(re.findall(r'<tr data-key="([^"]*)">(.*?)</tr>', text, flags=re.DOTALL))
+    assert '<td data-value="inf">identical</td>' in rows["dense"]
+    assert rows[second.key].count('<td data-value="">–</td>') == 3
+
+
+def test_peak_memory_is_a_column_where_it_was_measured(make_page, sweep):
+    assert "peak memory, GB" not in header_of(make_page())
+    first, *others = sweep[0].points
+    path = make_page(points=(replace(first, peak_bytes=1_234_000_000), *others))
+    assert "peak memory, GB" in header_of(path) and ">1.23</td>" in path.read_text("utf-8")
+
+
+def test_page_takes_no_more_bytes_than_it_may(sweep, tmp_path, monkeypatch):
+    measured, folder = sweep
+    whole = write_page(measured, folder, tmp_path / "whole.html").stat().st_size
+    monkeypatch.setattr(page_module, "MAX_BYTES", whole - 5_000)
+    less = write_page(measured, folder, tmp_path / "less.html")
+    assert less.stat().st_size <= whole - 5_000 and parts_of(less).data["pictures"][1]["photo"].startswith("data:")
+
+
+def test_the_limit_is_ten_megabytes():
+    assert page_module.MAX_BYTES == 10_000_000
+
+
+def test_a_missing_picture_is_one_line_with_its_path(sweep, tmp_path):
+    measured, folder = sweep
+    broken = tmp_path / "broken"
+    shutil.copytree(folder, broken)
+    missing = picture_path(broken, 1, measured.points[2].key)
+    missing.unlink()
+    with pytest.raises(DataError, match=re.escape(f"{missing}: cannot be read (No such file or directory)")):
+        write_page(measured, broken, tmp_path / "page.html")
+    with pytest.raises(DataError, match="no such file; expected pictures of at least one view"):
+        write_page(measured, tmp_path / "nowhere", tmp_path / "page.html")
+    with pytest.raises(DataError, match="nothing was measured"):
+        write_page(replace(measured, points=()), folder, tmp_path / "page.html")
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_page_that_cannot_be_written_is_an_error_of_the_scene(sweep, tmp_path):
+    (tmp_path / "folder.html").mkdir()
+    with pytest.raises(SceneError, match="is a folder"):
+        write_page(*sweep, tmp_path / "folder.html")
