@@ -159,7 +159,7 @@ def plain_page(monkeypatch) -> list[Path]:
     for."""
     asked: list[Path] = []
 
-    def write_page(sweep, folder: Path, output: Path) -> Path:
+    def write_page(sweep, folder: Path, output: Path, progress=None) -> Path:
         asked.append(folder)
         output.write_text(" ".join(point.key for point in sweep.points))
         return output

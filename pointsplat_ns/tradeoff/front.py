@@ -41,33 +41,42 @@ def pareto_front(points: Sequence[Point], cost: Cost, reference: Reference, metr
     return front
 
 
-def fastest_first(points: Sequence[Point]) -> list[Point]:
-    """The points by their time of a frame; of those as fast, the smaller file first."""
-    return sorted(points, key=lambda point: (point.frame_ms, point.bytes))
+def fastest_first(points: Sequence[Point], trusted: bool = True) -> list[Point]:
+    """The points by their time of a frame; of those as fast, the fewer Gaussians and the smaller file first.
+
+    Args:
+        points: any points.
+        trusted: whether times mean anything. If not, they go by their Gaussians, as these are what drawing takes time
+            for.
+    """
+    return sorted(points, key=lambda point: (point.frame_ms if trusted else 0.0, point.gaussians, point.bytes))
 
 
-def fastest_within(points: Sequence[Point], db: float) -> Point | None:
-    """The fastest point whose PSNR against photos is at most ``db`` below that of the first point, the dense scene.
+def fastest_within(points: Sequence[Point], db: float, trusted: bool = True) -> Point | None:
+    """The fastest point whose PSNR against photos is at most ``db`` below that of the first point, the dense scene;
+    ``trusted`` as for :func:`fastest_first`.
 
     Returns:
         The point; None where there are no photos.
     """
     dense = quality_of(points[0], "photos", "psnr")
-    return None if dense is None else _fastest(points, "photos", dense - db)
+    return None if dense is None else _fastest(points, "photos", dense - db, trusted)
 
 
-def fastest_above(points: Sequence[Point], db: float) -> Point | None:
-    """The fastest point that has at least ``db`` of PSNR against the dense scene's own renders.
+def fastest_above(points: Sequence[Point], db: float, trusted: bool = True) -> Point | None:
+    """The fastest point that has at least ``db`` of PSNR against the dense scene's own renders; ``trusted`` as for
+    :func:`fastest_first`.
 
     Returns:
         The point; None only if there is none, as the dense scene itself has an infinite PSNR.
     """
-    return _fastest(points, "renders", db)
+    return _fastest(points, "renders", db, trusted)
 
 
-def _fastest(points: Sequence[Point], reference: Reference, least: float) -> Point | None:
+def _fastest(points: Sequence[Point], reference: Reference, least: float, trusted: bool) -> Point | None:
     # 1e-9: a difference of two decimal numbers is not exact, and 0.5 dB less than 30.1 is not 29.6.
-    good = (
-        p for p in fastest_first(points) if (q := quality_of(p, reference, "psnr")) is not None and q >= least - 1e-9
-    )
-    return next(good, None)
+    for point in fastest_first(points, trusted):
+        quality = quality_of(point, reference, "psnr")
+        if quality is not None and quality >= least - 1e-9:
+            return point
+    return None

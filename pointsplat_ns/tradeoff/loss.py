@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from pointsplat_ns.tradeoff.front import fastest_above, fastest_within
 from pointsplat_ns.tradeoff.points import Point
 
 PHOTO_PSNR = 27.0
@@ -50,12 +51,10 @@ def recommend(points: Sequence[Point], within: float, trusted: bool = True) -> t
     Args:
         points: the dense scene, then others.
         within: the largest loss, dB.
-        trusted: whether times mean anything. If not, it is the point with the fewest Gaussians, as these are what
-            drawing takes time for.
+        trusted: as for :func:`~pointsplat_ns.tradeoff.front.fastest_first`.
     """
     dense = points[0]
-    fit = [point for point in points if loss_of(point, dense) <= within]
-    best = min(fit, key=lambda point: (point.frame_ms if trusted else 0.0, point.gaussians, point.bytes))
+    best = fastest_within(points, within, trusted) or fastest_above(points, psnr_within(within), trusted) or dense
     if dense.against_photos is not None:
         limit = f"within {within:g} dB of the dense scene's {dense.against_photos.psnr:.1f} dB against held-out photos"
     else:

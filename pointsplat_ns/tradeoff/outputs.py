@@ -7,6 +7,7 @@ import dataclasses
 from pathlib import Path
 
 from pointsplat_ns.io.files import replacing
+from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.tradeoff.journal import write_json
 from pointsplat_ns.tradeoff.plots import plot
 from pointsplat_ns.tradeoff.points import Point, Quality, Tradeoff
@@ -18,12 +19,13 @@ PLOTS = {"ms": "tradeoff_ms.png", "mb": "tradeoff_mb.png", "count": "tradeoff_co
 OUTPUTS = (TABLE, JSON, PAGE, *PLOTS.values())
 
 
-def write_outputs(sweep: Tradeoff, folder: Path) -> None:
+def write_outputs(sweep: Tradeoff, folder: Path, progress: Progress = silent) -> None:
     """Write the table, the JSON, the plots and the page of a sweep.
 
     Args:
         sweep: what was measured.
         folder: of the sweep, with the pictures.
+        progress: called while pictures are compressed for the page.
 
     Raises:
         SceneError: if a file cannot be written.
@@ -34,7 +36,7 @@ def write_outputs(sweep: Tradeoff, folder: Path) -> None:
     _write_table(sweep, folder / TABLE)
     for against, name in PLOTS.items():
         plot(sweep, against, folder / name)
-    write_page(sweep, folder, folder / PAGE)
+    write_page(sweep, folder, folder / PAGE, progress)
 
 
 def _write_table(sweep: Tradeoff, path: Path) -> None:

@@ -27,14 +27,17 @@ from pointsplat_ns.tradeoff.front import (
     pareto_front,
     quality_of,
 )
+from pointsplat_ns.tradeoff.loss import psnr_within
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, picture_path
 
 MAX_BYTES = 10_000_000
 """Size of the page, at most: what goes through mail and opens at once."""
 
-WITHIN_DB, ABOVE_DB = 0.5, 36.1
-"""What the page asks at first, in dB: PSNR to lose against photos; PSNR to have against renders of the dense scene. The
-second costs a scene that is 27 dB from its photos the first, as independent squared errors add up."""
+WITHIN_DB = 0.5
+"""PSNR in dB to lose against photos, as the page asks at first."""
+
+ABOVE_DB = round(psnr_within(WITHIN_DB), 1)
+"""The same where there are no photos: PSNR to have against renders of the dense scene."""
 
 
 def write_page(sweep: Tradeoff, folder: Path, output: Path, progress: bool | Progress = False) -> Path:
@@ -134,8 +137,8 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
         "views": views,
         "references": REFERENCES if has_photos else REFERENCES[:1],
         "metrics": METRICS if has_lpips else METRICS[:2],
-        "recommended": fastest_within(sweep.points, WITHIN_DB)
-        or fastest_above(sweep.points, ABOVE_DB)
+        "recommended": fastest_within(sweep.points, WITHIN_DB, sweep.times_trusted)
+        or fastest_above(sweep.points, ABOVE_DB, sweep.times_trusted)
         or sweep.points[0],
         "rows": [_row(point) for point in sweep.points],
         "columns": _columns(has_photos, has_lpips, any(point.peak_bytes is not None for point in sweep.points)),
@@ -173,7 +176,7 @@ def _data(sweep: Tradeoff) -> dict[str, Any]:
             }
             for reference in REFERENCES
         },
-        "fastest": [point.key for point in fastest_first(sweep.points)],
+        "fastest": [point.key for point in fastest_first(sweep.points, sweep.times_trusted)],
     }
 
 

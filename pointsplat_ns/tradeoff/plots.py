@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.io.files import replacing
+from pointsplat_ns.tradeoff.front import Cost, pareto_front
 from pointsplat_ns.tradeoff.points import Point, Tradeoff
 from pointsplat_ns.tradeoff.settings import DENSE
 
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
 
 AXES = {"ms": "milliseconds a frame", "mb": "size of the file, MB", "count": "Gaussians"}
 """What quality is plotted against."""
+
+_COSTS: dict[str, Cost] = {"ms": "frame_ms", "mb": "bytes", "count": "gaussians"}
 
 _MARKERS = {"none": "o", "refiner": "v", "quick": "s", "thorough": "D"}
 
@@ -46,21 +49,8 @@ def plot(sweep: Tradeoff, against: str, path: Path) -> None:
 
 def cost(point: Point, against: str) -> float:
     """What a point costs, in the units of :data:`AXES`."""
-    return {"ms": point.frame_ms, "mb": point.bytes / 1e6, "count": float(point.gaussians)}[against]
-
-
-def front(costs: list[float], values: list[float]) -> list[int]:
-    """Indices of the points that no other beats in both, from the cheapest on.
-
-    Example:
-        >>> front([3.0, 1.0, 2.0, 4.0], [30.0, 20.0, 31.0, 33.0])
-        [1, 2, 3]
-    """
-    best: list[int] = []
-    for index in sorted(range(len(costs)), key=lambda i: (costs[i], -values[i])):
-        if not best or values[index] > values[best[-1]]:
-            best.append(index)
-    return best
+    value: float = getattr(point, _COSTS[against])
+    return value / 1e6 if against == "mb" else value
 
 
 def _draw(axis: Axes, sweep: Tradeoff, against: str, photos: bool) -> None:
@@ -70,7 +60,8 @@ def _draw(axis: Axes, sweep: Tradeoff, against: str, photos: bool) -> None:
     qualities = [(point, point.against_photos if photos else point.against_dense) for point in others]
     found = [(point, quality.psnr) for point, quality in qualities if quality is not None]
     costs, values = [cost(point, against) for point, _ in found], [value for _, value in found]
-    best = front(costs, values)
+    joined = pareto_front([point for point, _ in found], _COSTS[against], "photos" if photos else "renders", "psnr")
+    best = [[point for point, _ in found].index(point) for point in joined]
     axis.plot([costs[i] for i in best], [values[i] for i in best], color="0.6", linewidth=1, zorder=1)
     groups: dict[str, list[int]] = {}
     for i, (point, _) in enumerate(found):

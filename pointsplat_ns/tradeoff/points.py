@@ -79,6 +79,8 @@ class Tradeoff:
     notes: tuple[str, ...] = ()
     """Lines of text for the reader: that the machine was busy and times are not to be trusted, that LPIPS is
     missing."""
+    times_trusted: bool = True
+    """Whether other programs left the machine alone while frames were timed."""
     recommended: str = ""
     """``key`` of the recommended point, or of the one found for targets."""
     why: str = ""

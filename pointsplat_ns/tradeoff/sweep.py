@@ -258,6 +258,7 @@ class Sweep:
             height=views.height,
             points=points,
             notes=(*busy, *self._notes),
+            times_trusted=not busy,
             recommended=recommended.key,
             why=why,
         )
@@ -266,7 +267,7 @@ class Sweep:
         """Write and give the result; arguments as for :meth:`result`."""
         self.progress("writing results", 0.0)
         result = self.result(recommended, why)
-        write_outputs(result, self.folder)
+        write_outputs(result, self.folder, self.progress)
         return result
 
     def finish_early(self) -> None:

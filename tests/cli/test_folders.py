@@ -74,7 +74,7 @@ def test_a_scene_that_fails_ends_it_with_status_1_after_the_others(folder, tmp_p
         (("compact", "rooms", "-o", "rooms"), "rooms: holds the scenes themselves"),
         (("compact", "rooms/room1.ply", "--jobs", "2"), "one scene; --jobs and --shard are for a folder"),
         (("compact", "empty"), "empty: no scene below it"),
-        (("prune", "rooms"), "rooms: a folder without config.yml, so no run; expected a 3DGS .ply"),
+        (("prune", "rooms"), "rooms: a folder without config.yml, so no run; expected a scene"),
         (("lod", "rooms"), "of the commands, compact takes a folder of scenes"),
     ],
 )

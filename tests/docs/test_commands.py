@@ -280,7 +280,10 @@ def test_readme_is_short():
 def test_options_named_in_text_exist(monkeypatch, capsys):
     programs = [
         ("pointsplat", name)
-        for name in "prune compact lod tradeoff convert info export report rooms make-refiner make-feedback demo".split()
+        for name in (
+            *("prune", "compact", "lod", "tradeoff", "convert", "info", "export", "report", "rooms"),
+            *("make-refiner", "make-feedback", "demo"),
+        )
     ]
     programs += [
         ("ns-train", "pointsplat"),

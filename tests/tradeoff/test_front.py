@@ -81,3 +81,9 @@ def test_nothing_is_recommended_by_photos_that_are_not_there():
 def test_of_two_as_fast_the_smaller_is_recommended():
     twin = replace(POINTS[3], key="twin", bytes=20)
     assert fastest_above([*POINTS, twin], 35).key == "twin"
+
+
+def test_where_times_are_not_to_be_trusted_the_fewest_gaussians_are_recommended():
+    slow = replace(POINTS[1], key="few", frame_ms=1e6, gaussians=1)
+    assert fastest_within([*POINTS, slow], 100, trusted=False).key == "few"
+    assert fastest_within([*POINTS, slow], 100).key != "few"

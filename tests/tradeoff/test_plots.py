@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from matplotlib.image import imread
 
-from pointsplat_ns.tradeoff.plots import AXES, front, plot
+from pointsplat_ns.tradeoff.plots import AXES, plot
 from pointsplat_ns.tradeoff.points import Tradeoff
 from pointsplat_ns.tradeoff.settings import DENSE, REPAIRS, Setting
 from trades import point
@@ -20,12 +20,6 @@ def sweep(photos: float | None, repairs=REPAIRS) -> Tradeoff:
         lower = None if photos is None else photos - 1 - number
         points.append(point(Setting(10_000 - 100 * number, 3 - number % 2, repair), 30.0 - number, 10 + number, lower))
     return Tradeoff("room", "a machine", "given views", 64, 48, tuple(points), recommended=points[-1].key)
-
-
-def test_the_front_is_what_no_other_point_beats():
-    costs, values = [1.0, 2.0, 2.0, 3.0, 4.0, 5.0], [20.0, 25.0, 24.0, 25.0, 22.0, 30.0]
-    assert front(costs, values) == [0, 1, 5]
-    assert front([], []) == []
 
 
 @pytest.mark.parametrize("against", AXES)
