@@ -50,7 +50,9 @@ def read_scene(path: Path | str) -> Gaussians:
         return read_checkpoint(open_run(path, need_data=False).checkpoint)
     kind = format_to_read(path)
     if kind is None or kind.read is None:
-        what = f"a folder without {CONFIG_NAME} or meta.json" if path.is_dir() else f"a {path.suffix or 'nameless'} file"
+        what = (
+            f"a folder without {CONFIG_NAME} or meta.json" if path.is_dir() else f"a {path.suffix or 'nameless'} file"
+        )
         raise SceneError(f"{path}: {what}; expected {ACCEPTED}")
     return kind.read(path)
 
