@@ -33,7 +33,14 @@ OPACITY_BINS = 10
 
 @dataclass(frozen=True)
 class SceneInfo:
-    """What :func:`info` finds."""
+    """What :func:`pointsplat_ns.info` finds.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> found = ps.info(ps.example_room()[:100])
+        >>> sum(found.opacities), found.suspicious
+        (100, {})
+    """
 
     gaussians: int
     sh_degree: int

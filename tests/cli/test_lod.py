@@ -119,4 +119,4 @@ def test_what_cannot_be_done_is_refused_in_one_line_and_writes_nothing(arguments
 def test_what_is_no_scene_is_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):
         run("lod", tmp_path / "gone.ply")
-    assert "gone.ply: no such file; expected a 3DGS .ply" in capsys.readouterr().err
+    assert "gone.ply: no such file; expected a scene (.compressed.ply, .ply" in capsys.readouterr().err
