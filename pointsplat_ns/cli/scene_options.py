@@ -50,7 +50,8 @@ def check_outputs(scene: Path | None, picture: Path | None, force: bool) -> None
 
     if scene is not None:
         format_to_write(scene)
-        _check_free(scene, force)
+        for name in _file_names(scene):
+            _check_free(scene.with_name(name), force)
     check_output(picture, ".png", force)
 
 
@@ -108,10 +109,14 @@ def warn_if_larger(keep: str | None, output: Path) -> None:
 
 def file_bytes(path: Path) -> int:
     """Size of a scene's file; of a SOG folder, which its meta.json stands for, of its parts together."""
+    return sum(part.stat().st_size for part in map(path.with_name, _file_names(path)) if part.exists())
+
+
+def _file_names(path: Path) -> tuple[str, ...]:
+    """Names of the files that a scene is written to: of a SOG folder, which its meta.json stands for, all parts."""
     from pointsplat_ns.io.formats import SOG_META, SOG_PARTS
 
-    names = (path.name, *SOG_PARTS) if path.name == SOG_META else (path.name,)
-    return sum(part.stat().st_size for part in map(path.with_name, names) if part.exists())
+    return (path.name, *SOG_PARTS) if path.name == SOG_META else (path.name,)
 
 
 def print_result(what: str, before: int, scene: Gaussians, seconds: float, where: Path | None) -> None:

@@ -53,6 +53,13 @@ def test_convert_writes_spz_of_either_version(scene, tmp_path):
     assert (tmp_path / "b.spz").read_bytes()[:4] == b"NGSP"
 
 
+def test_no_image_of_another_sog_folder_is_overwritten(scene, tmp_path, capsys):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "sh0.webp").write_bytes(b"a picture")
+    assert "sh0.webp: exists already" in fails(capsys, "convert", scene, tmp_path / "folder" / "meta.json")
+    assert (tmp_path / "folder" / "sh0.webp").read_bytes() == b"a picture"
+
+
 def test_convert_overwrites_nothing_and_names_what_it_can_write(scene, tmp_path, capsys):
     assert "exists already" in fails(capsys, "convert", scene, scene)
     assert ".spz, .sog" in fails(capsys, "convert", scene, tmp_path / "a.ksplat")

@@ -8,6 +8,7 @@ from making import cloud
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import find_runs, read_scene, write_ply
 from pointsplat_ns.io.discovery import RESULTS_NAME, find_scenes
+from pointsplat_ns.io.scene import is_folder_of_scenes, save
 
 POINTS = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
 
@@ -51,3 +52,11 @@ def test_a_run_no_folder_and_a_folder_without_scenes_are_refused(make_run, tmp_p
     ):
         with pytest.raises(SceneError, match=said):
             find_scenes(folder)
+
+
+def test_files_of_every_format_are_scenes_and_a_sog_folder_is_one_scene(tmp_path):
+    for name in ("a.spz", "b.sog", "c.splat", "d.compressed.ply", "e.glb", "folder/meta.json"):
+        save(cloud(50, 0, 1), tmp_path / name)
+    assert [scene.name for scene in find_scenes(tmp_path)] == ["a", "b", "c", "d.compressed"]
+    assert is_folder_of_scenes(tmp_path) and not is_folder_of_scenes(tmp_path / "folder")
+    assert not is_folder_of_scenes(tmp_path / "a.spz")
