@@ -32,7 +32,7 @@ from rich.console import Console
 from scaling import print_score_times, scaling_rows, scaling_table, slope_table, slopes
 from splat_transform import NAME, peers_of
 
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
 from pointsplat_ns.io import read_scene, write_ply
 from pointsplat_ns.metrics import psnr
 from pointsplat_ns.metrics.lpips import Lpips
@@ -158,6 +158,7 @@ def main(
     scaling: bool = False,
     gaussians: tuple[int, ...] = (),
     sh_degree: int = 3,
+    sh: int = MAX_SH_DEGREE,
     json_path: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
     resume: bool = False,
 ) -> None:
@@ -178,6 +179,7 @@ def main(
         scaling: only time and memory of merging to a tenth, on synthetic Gaussians of several numbers.
         gaussians: these numbers; by default 1 million for the speed, and 100,000 to 10 million for the scaling.
         sh_degree: of the synthetic Gaussians.
+        sh: cut scenes to this SH degree first.
         json_path: write all rows there, after each scene.
         resume: take up the rows of that file: scenes that it has are not measured again.
     """
@@ -198,6 +200,7 @@ def main(
     programs = [*([] if in_process else map(pointsplat_prune, methods)), *peers]
     ways = ["sweep"] if sweep else [*inside, *(program.label for program in programs)]
     settings = {"keep": keep, "methods": ways, "views": views, "in_process": in_process, "lpips": network is not None}
+    settings |= {"sh": sh} if sh < MAX_SH_DEGREE else {}
     results = Results(json_path, settings, resume)
     shown: list[Row] = []
     for name, path in zip(names, scenes, strict=True):
@@ -205,7 +208,7 @@ def main(
         if rows:
             print(f"{name}: as {json_path} has it")
         else:
-            scene = load(path, views)
+            scene = load(path, views, sh)
             against = f", dense against photos {_dense_psnr(scene):.2f} dB" if scene.photos else ""
             print(f"{name}: {len(scene.dense):,} Gaussians, {len(scene.renders)} views{against}", flush=True)
             if sweep:

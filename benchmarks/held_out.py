@@ -10,11 +10,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
 from pointsplat_ns.io import open_run, read_scene
 from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
+from pointsplat_ns.pruning import cut_sh
 from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.rasterizer import render, render_depth
 from pointsplat_ns.views import View, Views
@@ -46,9 +47,11 @@ class Scene:
 
 
 @torch.no_grad()
-def load(path: Path, count: int) -> Scene:
-    """A run with at most ``count`` of its held-out photos, or a PLY with ``count`` sampled views."""
+def load(path: Path, count: int, sh: int = MAX_SH_DEGREE) -> Scene:
+    """A run with at most ``count`` of its held-out photos, or a PLY with ``count`` sampled views; without the SH bands
+    above a degree ``sh``."""
     dense = read_scene(path)
+    dense = cut_sh(dense, sh) if dense.sh_degree > sh else dense
     photos = None
     if path.suffix == ".ply":
         name, views = path.stem, sample_views(dense, count)

@@ -1,8 +1,10 @@
-"""Do the SH of a scene tell where its photos were taken? Runs know; their Gaussians are asked.
+"""Does a scene tell where its photos were taken? Runs know; their Gaussians are asked.
 
     python benchmarks/photo_places.py RUN... [--picture photo_places.jpg]
+    python benchmarks/photo_places.py RUN... --sh 0      # by sizes, as if there were no SH
 
-For each run: how well photos from the best of the places compared explain the SH (below 2 the scene has not told);
+For each run: how well photos from the best of the places compared explain the SH (below 2 the scene has not told),
+without SH how sizes and distances from it correlate (below 0.48 it has not);
 how far from a training pose the places found are, by their shares, and any place of the same box is, in shares of the
 content's diagonal; how often a training pose explains more than any place does; and the correlation, over the Gaussians
 that photos show, of the logarithms of how large they are in photos and of the weights that merging gives them without
@@ -22,8 +24,10 @@ from torch import Tensor
 
 import pointsplat_ns as ps
 from pointsplat_ns.compression.view_source import MERGED_FROM
+from pointsplat_ns.gaussians import MAX_SH_DEGREE
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.pruning import cut_sh
 from pointsplat_ns.pruning.content import content_size, positions_in_units, views_in_units
 from pointsplat_ns.pruning.merge import Merging
 from pointsplat_ns.pruning.traces import Witnesses, photo_places
@@ -51,13 +55,14 @@ class Map:
 
 
 @torch.no_grad()
-def asked(run: Path) -> Map:
-    """Print a row about a run, and give its map."""
+def asked(run: Path, sh: int) -> Map:
+    """Print a row about a run, of at most an SH degree, and give its map."""
     dense, poses = ps.load(run), dataset_views(run, "train")
+    dense = cut_sh(dense, sh) if dense.sh_degree > sh else dense
     eyes = invert_rigid(poses.viewmats.double())[:, :3, 3]
     witnesses = Witnesses.of(dense, torch.Generator().manual_seed(0))
     if len(witnesses.means) == 0:
-        raise SystemExit(f"{run} has no SH beyond degree 0")
+        raise SystemExit(f"{run} has no opaque Gaussian")
     size = content_size(dense)[1]
     anywhere = witnesses.places(ANY, torch.Generator().manual_seed(0))
     found = photo_places(dense)
@@ -110,16 +115,17 @@ def draw(maps: list[Map], path: Path) -> None:
     figure.savefig(path, dpi=100)
 
 
-def main(runs: tyro.conf.Positional[tuple[Path, ...]], /, picture: Path | None = None) -> None:
+def main(runs: tyro.conf.Positional[tuple[Path, ...]], /, picture: Path | None = None, sh: int = MAX_SH_DEGREE) -> None:
     """Print a table, and draw maps if asked to.
 
     Args:
         runs: trained runs whose data is at hand.
         picture: file to draw the maps into.
+        sh: cut scenes to this SH degree first.
     """
     print("| | explained, best place | from a pose | any place | poses explain more | weights alike |")
     print("|---|---|---|---|---|---|")
-    maps = [asked(run) for run in runs]
+    maps = [asked(run, sh) for run in runs]
     if picture is not None:
         draw(maps, picture)
 
