@@ -164,7 +164,9 @@ def _lpips(image: Tensor) -> tuple[Lpips | None, str]:
     try:
         lpips = load_lpips("alex", download=False).to(image.device)
         lpips(image, image)
-    except (LpipsUnavailable, ImageError) as error:  # no weights, or an image too small for the network
+    except LpipsUnavailable:  # of which the reason names folders, and the page is there to be sent
+        return None, "LPIPS is missing: its weights are not at hand; see docs/training.md on POINTSPLAT_LPIPS_WEIGHTS"
+    except ImageError as error:  # an image too small for the network
         return None, f"LPIPS is missing: {error}"
     return lpips, ""
 
