@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
 from pointsplat_ns.io import open_run, read_scene
-from pointsplat_ns.metrics import psnr, ssim
+from pointsplat_ns.metrics import finite_psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
 from pointsplat_ns.pruning import cut_sh
@@ -23,9 +23,6 @@ from pointsplat_ns.views import View, Views
 COLUMNS = ("psnr", "ssim", "lpips")
 REFERENCES = ("photo", "dense")
 """What renders are compared with: held-out photos, and the dense scene's own renders of the same views."""
-
-MOST_PSNR = 100.0
-"""In place of the infinite PSNR of equal pictures, so that means stay finite."""
 
 HALVES = ("dense_near_psnr", "dense_far_psnr")
 """PSNR against the dense renders over the nearer half of the pixels (see :func:`nearer_half`), and over the others."""
@@ -95,11 +92,11 @@ def compare(scene: Scene, small: Gaussians, lpips: Lpips | None) -> dict[str, fl
         image = render(small, scene.views[i])
         for name, pixels in zip(HALVES, (scene.nearer[i], ~scene.nearer[i]), strict=True):
             if bool(pixels.any()):
-                values.setdefault(name, []).append(_psnr(image[pixels][None], dense_render[pixels][None]))
+                values.setdefault(name, []).append(finite_psnr(image[pixels][None], dense_render[pixels][None]))
         values.setdefault(BRIGHTNESS, []).append(255 * float((image.double() - dense_render.double()).mean()))
         targets = {"dense": dense_render} | ({"photo": scene.photos[i]} if scene.photos else {})
         for against, target in targets.items():
-            values.setdefault(f"{against}_psnr", []).append(_psnr(image, target))
+            values.setdefault(f"{against}_psnr", []).append(finite_psnr(image, target))
             values.setdefault(f"{against}_ssim", []).append(float(ssim(image, target)))
             if lpips is not None:
                 values.setdefault(f"{against}_lpips", []).append(float(lpips(image, target)))
@@ -109,12 +106,8 @@ def compare(scene: Scene, small: Gaussians, lpips: Lpips | None) -> dict[str, fl
 
 @torch.no_grad()
 def mean_psnr(scene: Gaussians, views: Views, pictures: list[Tensor]) -> float:
-    """Mean PSNR of a scene's renders against one picture (H, W, 3) a view, dB, each at most :data:`MOST_PSNR`."""
-    return fmean(_psnr(render(scene, view), picture) for view, picture in zip(views, pictures, strict=True))
-
-
-def _psnr(image: Tensor, target: Tensor) -> float:
-    return min(float(psnr(image, target)), MOST_PSNR)
+    """Mean PSNR of a scene's renders against one picture (H, W, 3) a view, dB, each at most 100."""
+    return fmean(finite_psnr(render(scene, view), picture) for view, picture in zip(views, pictures, strict=True))
 
 
 def lpips_or_none(wanted: bool) -> Lpips | None:

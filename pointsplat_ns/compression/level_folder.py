@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import content_hash, open_run, write_ply
-from pointsplat_ns.io.files import replacing
+from pointsplat_ns.io.files import replacing, write_json
 from pointsplat_ns.pruning.content import content_box
 from pointsplat_ns.rasterizer import render
 
@@ -129,9 +128,7 @@ class LevelFolder:
                 for files, level in zip(self._written, levels, strict=True)
             ],
         }
-        text = json.dumps(_without_infinities(content), indent=2, allow_nan=False)
-        with replacing(self.folder / MANIFEST) as part:
-            part.write_text(text + "\n", encoding="utf-8")
+        write_json(content, self.folder / MANIFEST)
 
     def write_picture(self, levels: Levels) -> None:
         """Draw one view of the dense scene and of every level, if there is a view.
@@ -206,15 +203,6 @@ def _level(level: Level, whole: int) -> dict[str, Any]:
 
 def _farther(psnrs: dict[int, float]) -> list[dict[str, Any]]:
     return [{"times": times, "psnr": psnr} for times, psnr in psnrs.items()]
-
-
-def _without_infinities(value: Any) -> Any:
-    """The same with None for numbers that JSON does not have."""
-    if isinstance(value, dict):
-        return {key: _without_infinities(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_without_infinities(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @torch.no_grad()

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.quaternions import quaternions_of
 from pointsplat_ns.io.runs import Run, may_be_run, open_run
 from pointsplat_ns.pruning.view_sampling import estimated_up
 from pointsplat_ns.refiner.augmentation import Transform
@@ -36,7 +37,7 @@ class Similarity:
     def apply(self, scene: Gaussians) -> Gaussians:
         """The scene in its new place, its SH turned with it. Mirroring a scene mirrors what its SH show."""
         mirrored = bool(torch.linalg.det(self.matrix) < 0)
-        quat = _quaternion(-self.matrix if mirrored else self.matrix)
+        quat = quaternions_of(-self.matrix if mirrored else self.matrix)
         turn = Transform(quat, mirrored, torch.ones(3, dtype=torch.float64), torch.arange(3))
         turned = turn.apply(scene.to(dtype=torch.float64))
         return turned.replace(
@@ -135,11 +136,3 @@ def _turn(start: Tensor, end: Tensor) -> Tensor:
     x, y, z = cross.tolist()
     skew = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
     return torch.eye(3, dtype=torch.float64) + skew + skew @ skew / (1 + cosine)
-
-
-def _quaternion(matrix: Tensor) -> Tensor:
-    """The quaternion (4,) wxyz of a rotation matrix."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(matrix.numpy()).as_quat()
-    return torch.tensor([w, x, y, z], dtype=torch.float64)

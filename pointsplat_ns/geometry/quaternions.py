@@ -38,6 +38,13 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return rotation_components(unit.T).permute(2, 0, 1)
 
 
+def quaternions_of(matrices: Tensor) -> Tensor:
+    """Quaternions (..., 4) wxyz, float64, of rotation matrices (..., 3, 3) on the CPU."""
+    from scipy.spatial.transform import Rotation
+
+    return torch.from_numpy(Rotation.from_matrix(matrices.double().numpy()).as_quat())[..., [3, 0, 1, 2]]
+
+
 def zero_as_identity(quats: Tensor) -> Tensor:
     """Quaternions (N, 4), with the identity in place of each that is zero or shorter than :data:`SHORTEST`."""
     largest = quats.detach().abs().amax(dim=1, keepdim=True)

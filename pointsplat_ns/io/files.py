@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
+import math
 import os
 import re
 import stat
@@ -11,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
@@ -143,6 +146,25 @@ def _part_name(name: str) -> str:
     """A name for the unfinished file, no longer than file systems allow (255 bytes), however long ``name`` is."""
     start = name.encode("utf-8", "surrogateescape")[:200].decode("utf-8", "ignore")
     return f".{start}.{os.getpid()}.part"
+
+
+def write_json(content: Any, path: Path | str) -> None:
+    """Write JSON, with null for numbers that it does not have.
+
+    Raises:
+        SceneError: if it cannot be written.
+    """
+    text = json.dumps(_without_infinities(content), indent=2, allow_nan=False)
+    with replacing(path) as part:
+        part.write_text(text + "\n", encoding="utf-8")
+
+
+def _without_infinities(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_infinities(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_infinities(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: dict[str, str]) -> None:

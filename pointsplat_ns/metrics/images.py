@@ -64,6 +64,15 @@ def psnr(pred: Tensor, target: Tensor) -> Tensor:
     return per_image(-10 * torch.log10((a - b).square().mean(dim=(1, 2, 3))), pred)
 
 
+MOST_PSNR = 100.0
+"""In place of the infinite PSNR of equal images, so that means over views stay finite."""
+
+
+def finite_psnr(pred: Tensor, target: Tensor) -> float:
+    """PSNR of one image (H, W, 3), dB, at most :data:`MOST_PSNR`."""
+    return min(float(psnr(pred, target)), MOST_PSNR)
+
+
 def ssim(pred: Tensor, target: Tensor) -> Tensor:
     """Structural similarity (Wang et al. 2004), data range 1.
 

@@ -9,7 +9,7 @@ from pointsplat_ns.compression.level_folder import source_file
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import BudgetError, SceneError
 from pointsplat_ns.io.files import file_stem
-from pointsplat_ns.io.runs import open_run, scene_name
+from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
 from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
 from pointsplat_ns.system.progress import Progress, progress_bar
@@ -85,14 +85,13 @@ def measure_tradeoff(
     path, folder = Path(scene), Path(folder)
     dense = read_scene(path)
     check_folder(folder, force)
-    is_ply = path.suffix.lower() == ".ply"
     subject = Subject(
         dense=dense,
         path=path,
         name=_name(path),
         sha256=source_file(path).sha256,
         new_views=lambda: ViewSource(dense, run=path, dataset_views=dataset_views),
-        held_out=None if is_ply else functools.partial(dataset_photos, path, "test"),
+        held_out=functools.partial(dataset_photos, path, "test") if may_be_run(path) else None,
     )
     with progress_bar(progress) as report:
         sweep = Sweep(subject, folder, options, report)
@@ -115,7 +114,7 @@ def measure_tradeoff(
 
 def _name(path: Path) -> str:
     """The name of a scene: that of a run, or of a file."""
-    if path.suffix.lower() != ".ply":
+    if may_be_run(path):
         try:
             return scene_name(open_run(path, need_data=False))
         except SceneError:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from statistics import fmean
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.metrics import psnr
+from pointsplat_ns.metrics import finite_psnr
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views
 
@@ -26,9 +26,6 @@ for larger merged ones: at 160 pixels, what was chosen on real scenes lost up to
 DEEPENINGS = (0.0, 0.15, 0.3)
 SPREADS = (-0.1, 0.0, 0.05)
 """Values of :class:`Finish` that are tried first."""
-
-MOST_PSNR = 100.0
-"""In place of the infinite PSNR of equal images."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,7 @@ class Reference:
     def psnr(self, scene: Gaussians) -> float:
         """Mean PSNR of a scene's renders, dB."""
         pairs = zip(self.views, self.renders, strict=True)
-        return fmean(min(float(psnr(render(scene, view), target)), MOST_PSNR) for view, target in pairs)
+        return fmean(finite_psnr(render(scene, view), target) for view, target in pairs)
 
     def best(self, make: Callable[[Finish], Gaussians]) -> Finish:
         """The best finish of those tried: first the deepening, then the spread, each at the top of the parabola through

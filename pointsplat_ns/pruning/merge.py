@@ -23,6 +23,7 @@ from torch import Tensor
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
+from pointsplat_ns.geometry.quaternions import quaternions_of
 from pointsplat_ns.pruning.content import content_size, in_units, positions_in_units, views_in_units
 from pointsplat_ns.pruning.covariance import TINY, unpack
 from pointsplat_ns.pruning.coverage import curve_keys, unit_cells
@@ -330,12 +331,10 @@ def deepened(alphas: Tensor, sizes: Tensor, power: float) -> Tensor:
 
 def _axes(cov: Tensor) -> tuple[Tensor, Tensor]:
     """Log-scales (n, 3) and quaternions (n, 4) of covariances (n, 6)."""
-    from scipy.spatial.transform import Rotation
-
     scales, quats = torch.empty(len(cov), 3, dtype=torch.float64), torch.empty(len(cov), 4, dtype=torch.float64)
     for these in torch.arange(len(cov)).split(CHUNK):
         variances, axes = torch.linalg.eigh(unpack(cov[these]))
         axes[:, :, 0] *= torch.linalg.det(axes).sign()[:, None]
         scales[these] = 0.5 * variances.clamp_min(TINY).log()
-        quats[these] = torch.from_numpy(Rotation.from_matrix(axes.numpy()).as_quat())[:, [3, 0, 1, 2]]
+        quats[these] = quaternions_of(axes)
     return scales, quats

@@ -206,9 +206,7 @@ def log_norms(offsets: Tensor) -> Tensor:
 
 def correlation(a: Tensor, b: Tensor) -> Tensor:
     """Pearson's correlation coefficient of a (n,) and b (n,), a scalar; 0 if either is constant."""
-    a, b = a - a.mean(), b - b.mean()
-    spread = a.norm() * b.norm()
-    return torch.where(spread > 0, (a @ b) / spread, 0.0)
+    return torch.corrcoef(torch.stack([a, b]))[0, 1].nan_to_num(0.0)
 
 
 def explained(offsets: Tensor, rest: Tensor) -> Tensor:

@@ -1,7 +1,8 @@
-"""Pieces of work on several threads."""
+"""Pieces of work on several threads, and the cores that there are for them."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -9,6 +10,11 @@ from typing import TypeVar
 import torch
 
 Item = TypeVar("Item")
+
+
+def cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def in_threads(function: Callable[[Item], object], items: Sequence[Item]) -> None:

@@ -19,6 +19,8 @@ from typing import Any, Generic, TypeVar
 
 import torch
 
+from pointsplat_ns.system.threads import cores
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -38,8 +40,7 @@ def threads_for(jobs: int) -> int:
     else its share of the cores."""
     if "OMP_NUM_THREADS" in os.environ:
         return torch.get_num_threads()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // jobs)
+    return max(1, cores() // jobs)
 
 
 def in_turn(function: Callable[[Item], Result | None], items: Sequence[Item]) -> Generator[Result, None, None]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.io.files import one_line, replacing
+from pointsplat_ns.io.files import one_line, write_json
 from pointsplat_ns.tradeoff.points import Point, Quality
 from pointsplat_ns.tradeoff.settings import DENSE, Setting, setting_of
 
@@ -83,25 +83,6 @@ class Journal:
                 )
         for point in points:
             self._take(point)
-
-
-def write_json(content: Any, path: Path) -> None:
-    """Write JSON, with null for numbers that it does not have.
-
-    Raises:
-        SceneError: if it cannot be written.
-    """
-    text = json.dumps(_without_infinities(content), indent=1, allow_nan=False)
-    with replacing(path) as part:
-        part.write_text(text + "\n", encoding="utf-8")
-
-
-def _without_infinities(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_infinities(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_without_infinities(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _point(values: dict[str, Any]) -> Point:

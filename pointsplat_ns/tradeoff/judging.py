@@ -14,8 +14,8 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import replacing
-from pointsplat_ns.metrics import SSIM_WINDOW, ImageError, psnr, ssim
+from pointsplat_ns.io.pictures import write_picture
+from pointsplat_ns.metrics import SSIM_WINDOW, ImageError, finite_psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.tradeoff.machine import OtherPrograms
@@ -27,9 +27,6 @@ ROUNDS = 3
 
 SHOWN_VIEWS = 6
 """Largest number of views of which pictures are kept."""
-
-MOST_PSNR = 100.0
-"""In place of the infinite PSNR of equal pictures, so that means over views stay finite."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +122,9 @@ class Judge:
     @torch.no_grad()
     def psnr(self, scene: Gaussians) -> float:
         """Mean PSNR of a scene against the dense scene's renders, dB."""
-        return fmean(_psnr(render(scene, view), target) for view, target in zip(self.views, self.renders, strict=True))
+        return fmean(
+            finite_psnr(render(scene, view), target) for view, target in zip(self.views, self.renders, strict=True)
+        )
 
     def pictures(self, key: str) -> list[Path]:
         """Where the pictures of a point lie."""
@@ -133,15 +132,11 @@ class Judge:
 
     def _quality(self, image: Tensor, target: Tensor) -> Quality:
         lpips = None if self.lpips is None else float(self.lpips(image, target))
-        return Quality(_psnr(image, target), float(ssim(image, target)), lpips)
+        return Quality(finite_psnr(image, target), float(ssim(image, target)), lpips)
 
     def _write(self, images: list[Tensor], key: str) -> None:
-        from PIL import Image
-
         for path, image in zip(self.pictures(key), images, strict=True):
-            pixels = (255 * image.clamp(0, 1)).round().to(torch.uint8).cpu().numpy()
-            with replacing(path) as part:
-                Image.fromarray(pixels).save(part, format="png")
+            write_picture(image, path)
 
 
 def _timed(scene: Gaussians, views: Views, index: int) -> float:
@@ -169,10 +164,6 @@ def _lpips(image: Tensor) -> tuple[Lpips | None, str]:
     except ImageError as error:  # an image too small for the network
         return None, f"LPIPS is missing: {error}"
     return lpips, ""
-
-
-def _psnr(image: Tensor, target: Tensor) -> float:
-    return min(float(psnr(image, target)), MOST_PSNR)
 
 
 def _mean(values: list[Quality]) -> Quality:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import tempfile
 import time
@@ -13,6 +12,7 @@ from pathlib import Path
 import torch
 
 from pointsplat_ns.system.progress import Progress
+from pointsplat_ns.system.threads import cores
 
 LOCK = "pointsplat-measuring.lock"
 """Name of the file, in the folder for temporary files, that whoever measures holds locked."""
@@ -90,11 +90,6 @@ class OtherPrograms:
         """Mean number of cores in use by others."""
         seconds, used, own = (after - before for after, before in zip(self._read(), self._before, strict=True))
         return max(0.0, used - own) / seconds if seconds > 0 else 0.0
-
-
-def cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def is_busy(others: float) -> bool:

@@ -6,9 +6,8 @@ import csv
 import dataclasses
 from pathlib import Path
 
-from pointsplat_ns.io.files import replacing
+from pointsplat_ns.io.files import replacing, write_json
 from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.tradeoff.journal import write_json
 from pointsplat_ns.tradeoff.plots import plot
 from pointsplat_ns.tradeoff.points import Point, Quality, Tradeoff
 

@@ -16,10 +16,11 @@ from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import cut_sh, method_named, need_usable, ply_bytes
 from pointsplat_ns.system.progress import Progress
+from pointsplat_ns.system.threads import cores
 from pointsplat_ns.tradeoff.journal import POINTS, Journal
 from pointsplat_ns.tradeoff.judging import Judge, Judged, LookedAt
 from pointsplat_ns.tradeoff.loss import recommend
-from pointsplat_ns.tradeoff.machine import cores, is_busy, machine_text, one_at_a_time
+from pointsplat_ns.tradeoff.machine import is_busy, machine_text, one_at_a_time
 from pointsplat_ns.tradeoff.making import Made, make
 from pointsplat_ns.tradeoff.outputs import OUTPUTS, write_outputs
 from pointsplat_ns.tradeoff.points import Point, Tradeoff

@@ -11,9 +11,10 @@ from PIL import Image
 
 import pointsplat_ns as ps
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.metrics import MOST_PSNR
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.tradeoff import judging
-from pointsplat_ns.tradeoff.judging import MOST_PSNR, Judge, LookedAt
+from pointsplat_ns.tradeoff.judging import Judge, LookedAt
 from pointsplat_ns.tradeoff.points import picture_path
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.files import replacing
+from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.metrics import psnr
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ class EarlyLook:
         photo, image = self._look()
         path = self._folder / f"step-{step:09d}.jpg"
         try:
-            _write(torch.cat([photo, image], dim=1), path)
+            write_picture(torch.cat([photo, image], dim=1), path)
         except SceneError as error:
             self._due.clear()
             CONSOLE.log(f"no more pictures: {error}")
@@ -184,11 +184,3 @@ def duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
-
-
-def _write(image: Tensor, path: Path) -> None:
-    """Write an image (H, W, 3) in [0, 1] as a JPEG."""
-    from PIL import Image
-
-    with replacing(path) as part:
-        Image.fromarray((255 * image).round().to(torch.uint8).cpu().numpy()).save(part, format="JPEG", quality=90)

@@ -1,0 +1,28 @@
+"""Writes images of scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.io.files import replacing
+
+JPEG_QUALITY = 90
+
+
+def write_picture(picture: Tensor, path: Path) -> None:
+    """Write an image (H, W, 3), clamped to [0, 1], as a PNG; as a JPEG if the path ends in ``.jpg``.
+
+    Raises:
+        SceneError: if it cannot be written.
+    """
+    from PIL import Image
+
+    image = Image.fromarray((255 * picture.clamp(0, 1)).round().to(torch.uint8).cpu().numpy())
+    with replacing(path) as part:
+        if path.suffix == ".jpg":
+            image.save(part, format="JPEG", quality=JPEG_QUALITY)
+        else:
+            image.save(part, format="PNG")
