@@ -8,12 +8,13 @@ without SH how sizes and distances from it correlate (below 0.48 it has not);
 how far from a training pose the places found are, by their shares, and any place of the same box is, in shares of the
 content's diagonal; how often a training pose explains more than any place does; and the correlation, over the Gaussians
 that photos show, of the logarithms of how large they are in photos and of the weights that merging gives them without
-poses. The picture shows what explains the SH, from above, at the height of the training poses, these in red, and some
+poses; and how far the scene's estimated up is from that of its cameras, which people hold level. The picture shows what explains the SH, from above, at the height of the training poses, these in red, and some
 Gaussians.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +32,7 @@ from pointsplat_ns.pruning import cut_sh
 from pointsplat_ns.pruning.content import content_size, positions_in_units, views_in_units
 from pointsplat_ns.pruning.merge import Merging
 from pointsplat_ns.pruning.traces import Witnesses, photo_places
+from pointsplat_ns.pruning.view_sampling import estimated_up
 from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, weights_seen
 
 ANY = 500
@@ -78,8 +80,18 @@ def asked(run: Path, sh: int) -> Map:
     if found is not None:
         distance = f"{float((found[1] * torch.cdist(found[0], eyes).amin(1)).sum()) / size:.1%}"
     best = float(torch.cat([at_eyes, at_any]).max())
-    print(f"| {name_of(run)} | {best:.2f} | {distance} | {away:.1%} | {more:.0%} | {alike:.2f} |", flush=True)
+    off = math.degrees(math.acos(max(-1.0, min(1.0, float(estimated_up(dense) @ up_of_cameras(poses))))))
+    print(
+        f"| {name_of(run)} | {best:.2f} | {distance} | {away:.1%} | {more:.0%} | {alike:.2f} | {off:.0f} |", flush=True
+    )
     return mapped(name_of(run), witnesses, eyes)
+
+
+def up_of_cameras(poses: ps.Views) -> Tensor:
+    """The direction (3,) that the cameras' sideways axes lie most nearly across, on the side of their tops, float64."""
+    rotations = poses.viewmats[:, :3, :3].double()
+    axis = torch.linalg.svd(rotations[:, 0], full_matrices=True).Vh[2]
+    return axis if float(axis @ rotations[:, 1].mean(0)) < 0 else -axis
 
 
 def log_sizes(scene: ps.Gaussians, poses: ps.Views, centre: Tensor, size: float) -> Tensor:
@@ -123,8 +135,10 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]], /, picture: Path | None =
         picture: file to draw the maps into.
         sh: cut scenes to this SH degree first.
     """
-    print("| | explained, best place | from a pose | any place | poses explain more | weights alike |")
-    print("|---|---|---|---|---|---|")
+    print(
+        "| | explained, best place | from a pose | any place | poses explain more | weights alike | up, degrees off |"
+    )
+    print("|---|---|---|---|---|---|---|")
     maps = [asked(run, sh) for run in runs]
     if picture is not None:
         draw(maps, picture)

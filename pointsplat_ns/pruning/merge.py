@@ -24,7 +24,7 @@ from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.geometry.quaternions import quaternions_of
-from pointsplat_ns.pruning.content import content_size, in_units, positions_in_units, views_in_units
+from pointsplat_ns.pruning.content import content_size, in_units, positions_in_units, thinned, views_in_units
 from pointsplat_ns.pruning.covariance import TINY, unpack
 from pointsplat_ns.pruning.coverage import curve_keys, unit_cells
 from pointsplat_ns.pruning.duplicates import Copies, Reduced
@@ -33,6 +33,7 @@ from pointsplat_ns.pruning.matching import cheapest_pairs
 from pointsplat_ns.pruning.merge_state import CHUNK, OPAQUE, start
 from pointsplat_ns.pruning.pair_costs import costs_of
 from pointsplat_ns.pruning.traces import how_much_seen, photo_places
+from pointsplat_ns.pruning.view_sampling import PROBED, is_room
 from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, viewpoints, weights_seen, weights_seen_from
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
 from pointsplat_ns.views import Views
@@ -47,6 +48,11 @@ worse: the cost of a pair does not include earlier losses of its members, and ev
 FEWEST_SEEN, MOST_SEEN = 2_000, 2_000_000
 """Smallest and largest number of Gaussians of a scene that is looked at and rendered to choose the numbers of
 :class:`Finish`. Smaller ones are merged in less time than that takes."""
+
+UNTOLD = 0.25
+"""Exponent of how much photos showed of a place, in rooms that do not tell where these were taken. In held-out poses of
+three rooms it gains 0.1 to 0.5 dB, in sampled views of another it loses 0.1; larger ones gain and lose more. Of what is
+looked at from outside, sampled views gain nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +272,10 @@ class Merging:
         elif self.photos is not None:
             weights = weights_seen_from(means, *self.photos)
         else:
-            return weights_seen(means, self.views)
+            weights = weights_seen(means, self.views)
+            if not is_room(thinned(self.scene, PROBED), None):
+                return weights
+            return weights * how_much_seen(self.scene, self.members) ** UNTOLD
         return weights * how_much_seen(self.scene, self.members)
 
     def _see(self) -> None:

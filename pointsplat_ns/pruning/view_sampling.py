@@ -166,12 +166,13 @@ def views_about(
             raise DataError(f"up is {up.tolist()}; expected three numbers, not all 0")
         up = up / up.norm()
     centre, diagonal, surface = _content_surface(scene)
-    box, inside = _upright(surface, up)
+    photos = _places_in_units(photos, centre, diagonal)
+    box, inside = _upright(surface, photos, up)
     small = in_units(thinned(scene, PROBED), centre, diagonal)
     generator = torch.Generator().manual_seed(seed)
     kinds: list[tuple[bool, tuple[Tensor, Tensor] | None]] = [(inside, None), (not inside, None)]
     if photos is not None:
-        kinds.insert(0, (inside, (positions_in_units(photos[0], centre, diagonal), photos[1])))
+        kinds.insert(0, (inside, photos))
     for kind, about in kinds:
         taken = _Search(small, surface, box, kind, width, height, generator, about).views(count)
         if len(taken) >= (1 if about is None else 0.5 * count):
@@ -193,7 +194,30 @@ def estimated_up(scene: Gaussians) -> Tensor:
     Raises:
         DataError: if nothing of the scene is visible.
     """
-    return _upright(_content_surface(scene)[2])[0].up
+    return _stood_up(scene, photo_places(scene))[0].up
+
+
+@torch.no_grad()
+def is_room(scene: Gaussians, photos: tuple[Tensor, Tensor] | None) -> bool:
+    """Whether :func:`sample_views` looks at a scene from inside; ``photos`` as :func:`views_about` takes it.
+
+    Raises:
+        DataError: if nothing of the scene is visible.
+    """
+    return _stood_up(scene, photos)[1]
+
+
+def _stood_up(scene: Gaussians, photos: tuple[Tensor, Tensor] | None) -> tuple[UprightBox, bool]:
+    """As :func:`_upright`, of a scene and places in its own unit."""
+    centre, diagonal, surface = _content_surface(scene)
+    return _upright(surface, _places_in_units(photos, centre, diagonal))
+
+
+def _places_in_units(
+    photos: tuple[Tensor, Tensor] | None, centre: Tensor, diagonal: float
+) -> tuple[Tensor, Tensor] | None:
+    """Places of photos and their shares, in units of the content."""
+    return None if photos is None else (positions_in_units(photos[0], centre, diagonal), photos[1])
 
 
 def _content_surface(scene: Gaussians) -> tuple[Tensor, float, Surface]:
@@ -204,9 +228,11 @@ def _content_surface(scene: Gaussians) -> tuple[Tensor, float, Surface]:
     return centre, diagonal, Surface.of(scene, centre, diagonal)
 
 
-def _upright(surface: Surface, up: Tensor | None = None) -> tuple[UprightBox, bool]:
+def _upright(
+    surface: Surface, photos: tuple[Tensor, Tensor] | None, up: Tensor | None = None
+) -> tuple[UprightBox, bool]:
     """The upright box of a scene, by the direction ``up`` (3,) if it is known, and whether the scene is a room."""
-    axis = upright_axis(surface) if up is None else up
+    axis = upright_axis(surface, photos) if up is None else up
     inside = _is_room(surface, UprightBox.of(surface, axis))
     return UprightBox.of(surface, pointing_up(surface, axis, inside) if up is None else up), inside
 

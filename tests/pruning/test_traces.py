@@ -6,13 +6,14 @@ import math
 
 import pytest
 import torch
+from upright_scenes import room
 
 from making import EYES, ball, normal_scene, photographed
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.pruning.merge import merge
 from pointsplat_ns.pruning.traces import MOST_FACTOR, correlation, how_much_seen, log_norms, photo_places
-from pointsplat_ns.pruning.view_sampling import look_at, sample_views, views_about
+from pointsplat_ns.pruning.view_sampling import is_room, look_at, sample_views, views_about
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.views import Views
@@ -219,6 +220,18 @@ def test_merging_keeps_more_where_photos_showed_more():
     both = Views(viewmats, K, 64, 48, torch.zeros(3))
     kept, even = (merge(halves(factor), 400, views=both).scene.means[:, 0] < 50 for factor in (10.0, 1.0))
     assert int(kept.sum()) > 1.2 * int(even.sum())
+
+
+def test_merging_keeps_more_of_what_is_flat_in_a_room_that_tells_nothing_else():
+    walls = room()
+    left = walls.means[:, 0] < 0
+    flat, round_ = walls.scales.clone(), walls.scales.clone()
+    thinner = torch.where(left, math.log(0.005), math.log(0.05))[:, None]
+    half = torch.where(flat < math.log(0.05), thinner.expand_as(flat), flat)
+    even = torch.where(round_ < math.log(0.05), math.log(0.02), round_)
+    assert is_room(walls, None) and photo_places(walls.replace(scales=half)) is None
+    kept = [float((merge(walls.replace(scales=s), 500).scene.means[:, 0] < 0).float().mean()) for s in (half, even)]
+    assert kept[0] > kept[1] + 0.02
 
 
 def test_merging_keeps_more_where_sh_tell_that_photos_looked():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,9 +13,11 @@ from upright_scenes import TURNS, plates, room, tower, turned
 from making import ball, box_room
 from pointsplat_ns.pruning.content import content_size
 from pointsplat_ns.pruning.surface import Surface
-from pointsplat_ns.pruning.upright import UprightBox, level_directions, pointing_up, upright_axis
+from pointsplat_ns.pruning.upright import UprightBox, level_directions, levelness, pointing_up, upright_axis
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+PLACES = torch.linspace(0, 2 * math.pi, 61)[:60]
+EDGES = [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
 
 
 def degrees_between(a: torch.Tensor, b: torch.Tensor) -> float:
@@ -87,3 +90,43 @@ def test_a_wall_hides_what_is_behind_it():
     assert float(seen[1, ~first].float().mean()) > 0.95
     assert bool((around < 0.2).all())
     assert float(surface.clearance(torch.zeros(1, 3).double())) == pytest.approx(1.0, abs=0.1)
+
+
+def test_places_lie_level_across_the_axis_that_they_do_not_spread_along():
+    ring = torch.stack([PLACES.cos(), PLACES.sin(), torch.zeros(60)], dim=1).double() + 5
+    shares = torch.full((60,), 1 / 60)
+    found = levelness(torch.eye(3).double(), ring, shares)
+    assert torch.allclose(found, torch.tensor([0.0, 0.0, 1.0]).double(), atol=0.1)
+    # a place that counts for nothing says nothing
+    far = torch.cat([ring, torch.tensor([[5.0, 5.0, 1e6]]).double()])
+    assert torch.allclose(levelness(torch.eye(3).double(), far, torch.cat([shares, torch.zeros(1)])), found)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-200, 1e-30, 1e30])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_levelness_is_a_share_for_places_of_any_spread(size, dtype):
+    places = (size * torch.stack([PLACES.cos(), PLACES.sin(), 0.1 * PLACES], dim=1).double()).to(dtype)
+    for some in (places, places[:1]):
+        found = levelness(torch.eye(3).double(), some, torch.full((len(some),), 1 / len(some)))
+        assert bool(((found >= 0) & (found <= 1)).all())
+
+
+def test_where_photos_were_taken_decides_between_axes_that_suit_alike():
+    """A cube has three; photos were taken from all around it, at about one height."""
+    cube = plates(*(((side * x, side * y, side * z), (1 - x, 1 - y, 1 - z)) for x, y, z in EDGES for side in (-1, 1)))
+    surface = Surface.of(cube, *content_size(cube))
+    for axis in range(3):
+        ring = torch.zeros(60, 3).double()
+        ring[:, (axis + 1) % 3], ring[:, (axis + 2) % 3] = 8 * PLACES.cos().double(), 8 * PLACES.sin().double()
+        found = upright_axis(surface, (ring, torch.full((60,), 1 / 60)))
+        assert float(found[axis].abs()) > math.cos(math.radians(3))
+
+
+def test_what_photos_showed_says_which_end_is_up():
+    """Two floors, one of which photos showed much."""
+    scene = plates(((0, 0, -1), (2, 2, 0)), ((0, 0, 1), (2, 2, 0)))
+    surface = Surface.of(scene, *content_size(scene))
+    above = surface.points[:, 2] > 0
+    for shown_below, up in ((9.0, UP), (1 / 9, -UP)):
+        seen = replace(surface, shown=torch.where(above, 1.0, shown_below))
+        assert torch.equal(pointing_up(seen, UP, True), up)
