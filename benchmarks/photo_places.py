@@ -4,12 +4,12 @@
     python benchmarks/photo_places.py RUN... --sh 0      # by sizes, as if there were no SH
 
 For each run: how well photos from the best of the places compared explain the SH (below 2 the scene has not told),
-without SH how sizes and distances from it correlate (below 0.48 it has not);
-how far from a training pose the places found are, by their shares, and any place of the same box is, in shares of the
-content's diagonal; how often a training pose explains more than any place does; and the correlation, over the Gaussians
-that photos show, of the logarithms of how large they are in photos and of the weights that merging gives them without
-poses; and how far the scene's estimated up is from that of its cameras, which people hold level. The picture shows what explains the SH, from above, at the height of the training poses, these in red, and some
-Gaussians.
+without SH how sizes and distances from it correlate (below 0.48 it has not); how far from a training pose the places
+found are, by their shares, and any place of the same box is, in shares of the content's diagonal; how often a
+training pose explains more than any place does; and the correlation, over the Gaussians that photos show, of the
+logarithms of how large they are in photos and of the weights that merging gives them without poses; and how far the
+scene's estimated up is from that of its cameras, which people hold level. The picture shows what explains the SH,
+from above, at the height of the training poses, these in red, and some Gaussians.
 """
 
 from __future__ import annotations
