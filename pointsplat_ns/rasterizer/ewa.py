@@ -133,14 +133,16 @@ class Project(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, means, quats, scales, opacities, view, centre, lens: Lens):
+        wide, view = view, view.to(means.dtype)
         # the centre in two parts: at 1e6 from the origin float32 alone would move the camera by 0.03 units
         near_centre = centre.to(means.dtype)
         remainder = (centre - near_centre).to(means.dtype)
-        directions = means - near_centre
-        points = torch.addmm(-(view @ remainder)[:, None], view, directions.T)  # (3, N)
+        points = torch.addmm(-(view @ remainder)[:, None], view, (means - near_centre).T)  # (3, N)
         ids = _candidates(points, scales, opacities, lens)
 
-        points = points.index_select(1, ids)
+        # What may be seen, in float64: x and y of what is far from the camera are small sums of large products.
+        directions = means.index_select(0, ids).double() - centre
+        points = (wide @ directions.T).to(means.dtype)
         rz = points[2].reciprocal()
         slopes = points[:2] * rz
         unit, inverse_length = unit_rows(quats.index_select(0, ids).T.contiguous())
@@ -168,14 +170,14 @@ class Project(torch.autograd.Function):
         level = 2.0 * (alphas / ALPHA_MIN).log()  # squared Mahalanobis distance of the 1/255 ellipse
         half_x, half_y = (level * xx).clamp_min(0).sqrt(), (level * yy).clamp_min(0).sqrt()
         keep = meaningful & (level > 0) & (level < torch.inf) & det.isfinite() & (det > 0) & (radii > lens.radius_clip)
-        keep &= mx.isfinite() & my.isfinite()
+        keep &= mx.isfinite() & my.isfinite() & (points[2] > lens.near) & (points[2] < lens.far)
         keep &= (mx + half_x >= 0.5) & (mx - half_x <= lens.width - 0.5)
         keep &= (my + half_y >= 0.5) & (my - half_y <= lens.height - 0.5)
         kept = keep.nonzero()[:, 0]
 
         ids = ids.index_select(0, kept)
         rows = torch.stack([mx, my, points[2], xx, xy, yy, det, alphas, radii]).index_select(1, kept)
-        directions = directions.index_select(0, ids) - remainder
+        directions = directions.index_select(0, kept).to(means.dtype)
         ctx.lens, ctx.count = lens, means.shape[0]
         if any(ctx.needs_input_grad):
             state = torch.cat([slopes, rz[None], unit, inverse_length[None], std, ratio[None]])

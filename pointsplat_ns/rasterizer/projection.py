@@ -119,6 +119,6 @@ def project(
         raise ValueError(f"K is {K.tolist()}; expected no skew: zeros but for fx, fy, cx, cy and the 1 of the last row")
     lens = Lens(fx, fy, cx, cy, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased)
     ids, means2d, depths, cov2d, det, alphas, directions, radii = Project.apply(
-        means, quats, scales, opacities, viewmat[:3, :3].to(means.dtype), centre, lens
+        means, quats, scales, opacities, viewmat[:3, :3].double(), centre, lens
     )
     return Projected(ids, means2d, depths, cov2d, det, alphas, directions, radii)
