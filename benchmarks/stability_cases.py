@@ -53,8 +53,7 @@ class Case:
     def views(self, count: int = 3) -> Views:
         """This camera and others a little beside it."""
         viewmats = self.viewmat.repeat(count, 1, 1)
-        step = 0.1 * self.means.std() * (self.K[0, 0] > 0)
-        viewmats[:, 0, 3] += step * torch.arange(count)
+        viewmats[:, 0, 3] += 0.2 * self.means.std(0).max() * torch.arange(count)
         return Views(
             viewmats=viewmats,
             Ks=self.K.repeat(count, 1, 1),

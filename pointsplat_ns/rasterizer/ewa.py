@@ -140,9 +140,11 @@ class Project(torch.autograd.Function):
         points = torch.addmm(-(view @ remainder)[:, None], view, (means - near_centre).T)  # (3, N)
         ids = _candidates(points, scales, opacities, lens)
 
-        # What may be seen, in float64: x and y of what is far from the camera are small sums of large products.
+        # What may be seen, in float64: of what is far from the camera, x and y are small sums of large products, and
+        # depths differ by little.
         directions = means.index_select(0, ids).double() - centre
-        points = (wide @ directions.T).to(means.dtype)
+        exact = wide @ directions.T
+        points = exact.to(means.dtype)
         rz = points[2].reciprocal()
         slopes = points[:2] * rz
         unit, inverse_length = unit_rows(quats.index_select(0, ids).T.contiguous())
@@ -178,18 +180,21 @@ class Project(torch.autograd.Function):
         ids = ids.index_select(0, kept)
         rows = torch.stack([mx, my, points[2], xx, xy, yy, det, alphas, radii]).index_select(1, kept)
         directions = directions.index_select(0, kept).to(means.dtype)
+        exact_depths = exact[2].index_select(0, kept)
+        beyond = (exact_depths - exact_depths.amin() if len(kept) else exact_depths).to(means.dtype)
         ctx.lens, ctx.count = lens, means.shape[0]
         if any(ctx.needs_input_grad):
             state = torch.cat([slopes, rz[None], unit, inverse_length[None], std, ratio[None]])
             ctx.save_for_backward(ids, state.index_select(1, kept), directions, view, opacities)
         radii = rows[8].ceil().clamp_max_(2**30).to(torch.int32)
-        ctx.mark_non_differentiable(ids, radii)
-        return ids, rows[:2].T.contiguous(), rows[2], rows[3:6].T.contiguous(), rows[6], rows[7], directions, radii
+        ctx.mark_non_differentiable(ids, radii, beyond)
+        cov2d = rows[3:6].T.contiguous()
+        return ids, rows[:2].T.contiguous(), rows[2], cov2d, rows[6], rows[7], directions, radii, beyond
 
     @staticmethod
     @once_differentiable
     @full_precision
-    def backward(ctx, _ids, grad_means2d, grad_depths, grad_cov2d, grad_det, grad_alphas, grad_directions, _radii):
+    def backward(ctx, _ids, grad_means2d, grad_depths, grad_cov2d, grad_det, grad_alphas, grad_directions, *_):
         ids, state, directions, view, opacities = ctx.saved_tensors
         lens = ctx.lens
         slopes, rz, unit, inverse_length, std, ratio = state.split([2, 1, 4, 1, 3, 1])
