@@ -37,7 +37,7 @@ class Case:
     antialiased: bool = False
 
     def rounded(self, dtype: torch.dtype) -> Case:
-        """The same, as far as ``dtype`` holds it; a camera is never held to less than float32."""
+        """The same, as far as ``dtype`` holds it; the camera is never held to less than float32."""
         camera = torch.promote_types(dtype, torch.float32)
         gaussians = (self.means, self.quats, self.scales, self.opacities, self.sh)
         means, quats, scales, opacities, sh = (value.to(dtype).double() for value in gaussians)
@@ -46,11 +46,10 @@ class Case:
 
     def gaussians(self, dtype: torch.dtype) -> Gaussians:
         """The scene with logarithms and logits, rounded to ``dtype``."""
-        return Gaussians(
-            self.means, self.scales.log(), self.quats, torch.logit(self.opacities)[:, None], self.sh[:, 0], self.sh[:, 1:]
-        ).to(dtype)
+        logits = torch.logit(self.opacities)[:, None]
+        return Gaussians(self.means, self.scales.log(), self.quats, logits, self.sh[:, 0], self.sh[:, 1:]).to(dtype)
 
-    def views(self, count: int = 3) -> Views:
+    def views(self, count: int = 2) -> Views:
         """This camera and others a little beside it."""
         viewmats = self.viewmat.repeat(count, 1, 1)
         viewmats[:, 0, 3] += 0.2 * self.means.std(0).max() * torch.arange(count)
@@ -133,7 +132,7 @@ def needles(aspect: float) -> Case:
     case = usual()
     scales = torch.full_like(case.scales, 0.3 * PIXEL)
     scales[:, 0] *= aspect
-    return replace(case, scales=scales, antialiased=True, opacities=_opacities_against_compensation(case))
+    return replace(case, scales=scales, antialiased=True)
 
 
 def discs(aspect: float) -> Case:
@@ -144,17 +143,23 @@ def discs(aspect: float) -> Case:
     return replace(case, scales=scales, antialiased=True, opacities=0.3 * case.opacities)
 
 
-def _opacities_against_compensation(case: Case) -> Tensor:
-    return case.opacities
-
-
 def layers(count: float) -> Case:
     """As many Gaussians, the fainter the more there are, but for a twentieth."""
     n = round(count)
     case = usual(n)
     faint = case.opacities * min(1.0, 30.0 / n) + 0.005
-    faint[:: 20] = case.opacities[:: 20]
+    faint[::20] = case.opacities[::20]
     return replace(case, opacities=faint)
+
+
+def in_precision(epsilon: float) -> Case:
+    """The usual scene, whatever the precision that it is handed over in."""
+    return usual()
+
+
+_TYPES = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
+PRECISIONS = {torch.finfo(dtype).eps: dtype for dtype in _TYPES}
+"""Types by their relative rounding."""
 
 
 @dataclass(frozen=True)
@@ -163,23 +168,30 @@ class Sweep:
 
     name: str
     label: str
-    decades: tuple[float, ...]  # log10 of the values
+    values: tuple[float, ...]  # ascending
     case: Callable[[float], Case]
-    usual: float = 0.0
-    """The decade of a common scene, from which limits are looked for on either side."""
+    usual: float = 1.0
+    """The value of a common scene, from which limits are looked for on either side."""
+    input_precision: bool = False
+    """The values are relative roundings of the type that the scene is handed over in, see :data:`PRECISIONS`."""
+
+    def dtype(self, value: float) -> torch.dtype:
+        """What the scene is handed over in."""
+        return PRECISIONS[value] if self.input_precision else torch.float32
 
 
-def _every(step: float, first: float, last: float) -> tuple[float, ...]:
-    return tuple(first + step * i for i in range(round((last - first) / step) + 1))
+def _decades(first: float, last: float, step: float = 1) -> tuple[float, ...]:
+    return tuple(10.0 ** (first + step * i) for i in range(round((last - first) / step) + 1))
 
 
 SWEEPS = (
-    Sweep("scale", "unit of length, times the usual", _every(3, -36, 36), in_other_units),
-    Sweep("origin", "distance from the origin, scene units", _every(1, 0, 8), from_the_origin),
-    Sweep("camera", "distance from the camera, times the usual", _every(1, 0, 8), from_the_camera),
-    Sweep("opacity", "opacity / (1 - opacity)", _every(1, -2, 8), of_opacity),
-    Sweep("size", "size of Gaussians, pixels", _every(1, -3, 8), as_large_as),
-    Sweep("needles", "length / width of needles", _every(1, 0, 7), needles),
-    Sweep("discs", "width / thickness of discs", _every(1, 0, 8), discs),
-    Sweep("count", "Gaussians", _every(1, 1, 4), layers, 2.0),
+    Sweep("scale", "unit of length, times the usual", _decades(-36, 36, 6), in_other_units),
+    Sweep("origin", "distance from the origin, scene units", _decades(0, 8), from_the_origin),
+    Sweep("camera", "distance from the camera and focal length, times the usual", _decades(0, 8), from_the_camera),
+    Sweep("opacity", "opacity / (1 - opacity)", _decades(-2, 8), of_opacity),
+    Sweep("size", "size of Gaussians, pixels", _decades(-3, 8), as_large_as),
+    Sweep("needles", "length / width of needles 0.3 pixels wide", _decades(0, 7), needles),
+    Sweep("discs", "width / thickness of discs 20 pixels wide", _decades(0, 8), discs),
+    Sweep("count", "Gaussians", _decades(1, 3, 0.5), layers, 10.0),
+    Sweep("precision", "relative rounding of the input's type", tuple(PRECISIONS), in_precision, input_precision=True),
 )
