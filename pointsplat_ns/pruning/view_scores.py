@@ -57,6 +57,7 @@ def lightgaussian_score(
         raise ScoreError(f"beta is {beta}; expected 0 or more")
     _need_a_view(views)
     usable = scene.usable()
+    scene = scene.to(torch.promote_types(scene.dtype, torch.float32))  # as the rasterizer does
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
 
     def passed(block: PixelBlock) -> Tensor:
