@@ -125,7 +125,7 @@ class Case:
         return count_pairs(seen, footprints.tiles(footprints.whole), self.width, self.height)
 
     def footprints_of(self, seen: Projected) -> Footprints:
-        geometry = (t.detach() for t in (seen.means2d, seen.cov2d, seen.det, seen.opacities, seen.depths))
+        geometry = (t.detach() for t in (seen.means2d, seen.cov2d, seen.det, seen.opacities, seen.beyond))
         return Footprints(*geometry, torch.zeros_like(seen.ids), 1, self.width, self.height)
 
     def time_stages(self) -> dict[str, float]:

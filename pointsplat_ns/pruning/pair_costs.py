@@ -81,15 +81,16 @@ AXES, TO_SHADOW = _projections()
 SIDES = _sides()
 
 
-def costs_of(state: State, near: Tensor) -> Tensor:
+def costs_of(state: State, near: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     """Expected change of images by merging each Gaussian with each of its neighbours.
 
     Args:
         state: n Gaussians.
         near: (n, k) indices of the neighbours of each.
+        dtype: what pairs are computed in; Gaussians are projected in float64.
 
     Returns:
-        (n, k) float32: squared colour units times solid angle, with the surroundings of the first of each pair.
+        (n, k): squared colour units times solid angle, with the surroundings of the first of each pair.
     """
     n = len(state)
     means, cov = _scaled(state)
@@ -102,16 +103,16 @@ def costs_of(state: State, near: Tensor) -> Tensor:
         ways[these] = SIDES[areas.argmax(1)].to(torch.uint8)
 
     in_threads(choose, everywhere)
-    alphas, costs = state.alphas.float(), torch.zeros(near.shape)
+    alphas, colours, costs = state.alphas.to(dtype), state.colours.to(dtype), torch.zeros(near.shape, dtype=dtype)
     for way in range(len(DIRECTIONS)):
         here = (ways == way).any(1).nonzero()[:, 0]
         if len(here) == 0:
             continue
-        centres, shadows = (means @ AXES[way]).float(), (cov @ TO_SHADOW[way]).float()
+        centres, shadows = (means @ AXES[way]).to(dtype), (cov @ TO_SHADOW[way]).to(dtype)
         spread = THINNEST * (shadows[:, 0] + shadows[:, 2]) + NARROWEST**2
         shadows[:, 0] += spread
         shadows[:, 2] += spread
-        seen = Seen.of(centres, shadows, alphas, state.colours)
+        seen = Seen.of(centres, shadows, alphas, colours)
 
         def add(these: Tensor, seen: Seen = seen) -> None:
             costs[these] += seen.costs(these, near[these])

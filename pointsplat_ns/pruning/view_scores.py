@@ -26,6 +26,11 @@ LIGHTGAUSSIAN_LARGEST = 0.9
 """Rank of the normalising volume, as a share of all Gaussians sorted by descending volume."""
 
 
+LEAST_DETERMINED = 1e-9
+"""Lower bound of the eigenvalues of a Hessian block of unit diagonal (PUP-3DGS). What no view determines has eigenvalues
+of 0, whose computed values and logarithms are rounding errors; with this bound the score tells what the others are."""
+
+
 def lightgaussian_score(
     scene: Gaussians, views: Views, beta: float = LIGHTGAUSSIAN_BETA, progress: Callable[[float], None] | None = None
 ) -> Tensor:
@@ -52,6 +57,7 @@ def lightgaussian_score(
         raise ScoreError(f"beta is {beta}; expected 0 or more")
     _need_a_view(views)
     usable = scene.usable()
+    scene = scene.to(torch.promote_types(scene.dtype, torch.float32))  # as the rasterizer does
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
 
     def passed(block: PixelBlock) -> Tensor:
@@ -85,8 +91,9 @@ def pup_score(scene: Gaussians, views: Views, progress: Callable[[float], None] 
         progress: called with the share done, in [0, 1].
 
     Returns:
-        Scores (N,), float64: -Inf where the views do not determine all six parameters (as where no view sees the
-        Gaussian), NaN where it cannot be drawn.
+        Scores (N,), float64: -Inf where the picture does not depend on one of the six parameters (as where no view sees
+        the Gaussian), NaN where it cannot be drawn. What the views leave undetermined together counts as determined a
+        little, see :data:`LEAST_DETERMINED`.
 
     Raises:
         DataError: if there is no view.
@@ -98,6 +105,9 @@ def sensitivity(scene: Gaussians, views: Views, progress: Callable[[float], None
     """The 6 x 6 Hessian blocks of :func:`pup_score`, (N, 6, 6) float64: mean x, y, z, then the standard
     deviations, per scene unit squared."""
     _need_a_view(views)
+    # All of it in float64: in float32 small eigenvalues, and so the scores of what views hardly determine, are rounding
+    # errors. In a room a quarter of the better half were others.
+    scene = scene.to(torch.float64)
     total = torch.zeros(len(scene), 6, 6, dtype=torch.float64, device=scene.device)
     for index in _indices(views, progress):
         means, stds = (value.detach().requires_grad_() for value in (scene.means, scene.stds))
@@ -117,18 +127,18 @@ def sensitivity(scene: Gaussians, views: Views, progress: Callable[[float], None
 
 
 def log_determinant(blocks: Tensor) -> Tensor:
-    """Logarithm of the determinants of symmetric positive semi-definite blocks, (N, D, D) to (N,); -Inf if singular.
+    """Logarithm of the determinants of symmetric positive semi-definite blocks, (N, D, D) to (N,); -Inf where the
+    diagonal has a zero.
 
-    Each block is first scaled to a unit diagonal, so that neither 1e-30 nor 1e30 under- or overflows.
+    Each block is first scaled to a unit diagonal, so that neither 1e-30 nor 1e30 under- or overflows. Its eigenvalues are
+    then bounded by :data:`LEAST_DETERMINED`.
     """
     diagonal = blocks.diagonal(dim1=-2, dim2=-1)
     ok = (diagonal > 0).all(-1) & blocks.isfinite().all(-1).all(-1)
     root = torch.where(ok[:, None], diagonal, 1.0).sqrt()
     unit = torch.where(ok[:, None, None], blocks, torch.eye(blocks.shape[-1]).to(blocks))
     values = torch.linalg.eigvalsh(unit / root[:, :, None] / root[:, None, :])
-    # An eigenvalue below the rounding error of the block counts as zero.
-    ok &= values[:, 0] > 16 * torch.finfo(blocks.dtype).eps
-    result = values.clamp_min(torch.finfo(blocks.dtype).tiny).log().sum(-1) + 2 * root.log().sum(-1)
+    result = values.clamp_min(LEAST_DETERMINED).log().sum(-1) + 2 * root.log().sum(-1)
     return torch.where(ok, result, -math.inf)
 
 
@@ -184,11 +194,12 @@ def _project(means: Tensor, stds: Tensor, scene: Gaussians, views: Views, index:
         scene.quats.detach(),
         stds,
         scene.alphas.detach(),
-        views.viewmats[index].to(means),
+        views.viewmats[index].to(means.device),
         views.Ks[index].to(means),
         views.width,
         views.height,
         near_plane=views.near_plane,
+        far_plane=math.inf,
         antialiased=views.rasterize_mode == "antialiased",
     )
 

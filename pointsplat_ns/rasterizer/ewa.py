@@ -133,14 +133,18 @@ class Project(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, means, quats, scales, opacities, view, centre, lens: Lens):
+        wide, view = view, view.to(means.dtype)
         # the centre in two parts: at 1e6 from the origin float32 alone would move the camera by 0.03 units
         near_centre = centre.to(means.dtype)
         remainder = (centre - near_centre).to(means.dtype)
-        directions = means - near_centre
-        points = torch.addmm(-(view @ remainder)[:, None], view, directions.T)  # (3, N)
+        points = torch.addmm(-(view @ remainder)[:, None], view, (means - near_centre).T)  # (3, N)
         ids = _candidates(points, scales, opacities, lens)
 
-        points = points.index_select(1, ids)
+        # What may be seen, in float64: of what is far from the camera, x and y are small sums of large products, and
+        # depths differ by little.
+        directions = means.index_select(0, ids).double() - centre
+        exact = wide @ directions.T
+        points = exact.to(means.dtype)
         rz = points[2].reciprocal()
         slopes = points[:2] * rz
         unit, inverse_length = unit_rows(quats.index_select(0, ids).T.contiguous())
@@ -168,26 +172,29 @@ class Project(torch.autograd.Function):
         level = 2.0 * (alphas / ALPHA_MIN).log()  # squared Mahalanobis distance of the 1/255 ellipse
         half_x, half_y = (level * xx).clamp_min(0).sqrt(), (level * yy).clamp_min(0).sqrt()
         keep = meaningful & (level > 0) & (level < torch.inf) & det.isfinite() & (det > 0) & (radii > lens.radius_clip)
-        keep &= mx.isfinite() & my.isfinite()
+        keep &= mx.isfinite() & my.isfinite() & (points[2] > lens.near) & (points[2] < lens.far)
         keep &= (mx + half_x >= 0.5) & (mx - half_x <= lens.width - 0.5)
         keep &= (my + half_y >= 0.5) & (my - half_y <= lens.height - 0.5)
         kept = keep.nonzero()[:, 0]
 
         ids = ids.index_select(0, kept)
         rows = torch.stack([mx, my, points[2], xx, xy, yy, det, alphas, radii]).index_select(1, kept)
-        directions = directions.index_select(0, ids) - remainder
+        directions = directions.index_select(0, kept).to(means.dtype)
+        exact_depths = exact[2].index_select(0, kept)
+        beyond = (exact_depths - exact_depths.amin() if len(kept) else exact_depths).to(means.dtype)
         ctx.lens, ctx.count = lens, means.shape[0]
         if any(ctx.needs_input_grad):
             state = torch.cat([slopes, rz[None], unit, inverse_length[None], std, ratio[None]])
             ctx.save_for_backward(ids, state.index_select(1, kept), directions, view, opacities)
         radii = rows[8].ceil().clamp_max_(2**30).to(torch.int32)
-        ctx.mark_non_differentiable(ids, radii)
-        return ids, rows[:2].T.contiguous(), rows[2], rows[3:6].T.contiguous(), rows[6], rows[7], directions, radii
+        ctx.mark_non_differentiable(ids, radii, beyond)
+        cov2d = rows[3:6].T.contiguous()
+        return ids, rows[:2].T.contiguous(), rows[2], cov2d, rows[6], rows[7], directions, radii, beyond
 
     @staticmethod
     @once_differentiable
     @full_precision
-    def backward(ctx, _ids, grad_means2d, grad_depths, grad_cov2d, grad_det, grad_alphas, grad_directions, _radii):
+    def backward(ctx, _ids, grad_means2d, grad_depths, grad_cov2d, grad_det, grad_alphas, grad_directions, *_):
         ids, state, directions, view, opacities = ctx.saved_tensors
         lens = ctx.lens
         slopes, rz, unit, inverse_length, std, ratio = state.split([2, 1, 4, 1, 3, 1])

@@ -24,6 +24,7 @@ class Projected:
     opacities: Tensor  # [M] in (0, 1], compensation included
     directions: Tensor  # [M, 3] from the camera centre, world space
     radii: Tensor  # [M] int32, pixels, 3 standard deviations of the longest axis
+    beyond: Tensor  # [M] how much farther than the nearest, along the optical axis: what they are sorted by
 
     @property
     def conics(self) -> Tensor:
@@ -118,7 +119,4 @@ def project(
     if not _close((skew, below, *last), (0.0, 0.0, 0.0, 0.0, 1.0)):
         raise ValueError(f"K is {K.tolist()}; expected no skew: zeros but for fx, fy, cx, cy and the 1 of the last row")
     lens = Lens(fx, fy, cx, cy, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased)
-    ids, means2d, depths, cov2d, det, alphas, directions, radii = Project.apply(
-        means, quats, scales, opacities, viewmat[:3, :3].to(means.dtype), centre, lens
-    )
-    return Projected(ids, means2d, depths, cov2d, det, alphas, directions, radii)
+    return Projected(*Project.apply(means, quats, scales, opacities, viewmat[:3, :3].double(), centre, lens))

@@ -199,7 +199,9 @@ def rasterization(
         channels.append(depths[:, None])
 
     level = quality if isinstance(quality, Quality) else QUALITIES[quality]
-    footprints = Footprints(means2d, cov2d, det, alphas, depths, camera_ids, cameras, width, height, level.alpha_min)
+    footprints = Footprints(
+        means2d, cov2d, det, alphas, packed_of("beyond"), camera_ids, cameras, width, height, level.alpha_min
+    )
 
     def keep_absgrad(values: Tensor) -> None:
         if not packed:

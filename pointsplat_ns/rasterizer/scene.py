@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -41,12 +43,13 @@ def render(scene: Gaussians, views: View | Views) -> Tensor:
         scales=scene.stds,
         opacities=scene.alphas,
         colors=scene.sh,
-        viewmats=views.viewmat[None].to(scene.means),
+        viewmats=views.viewmat[None].to(scene.device),  # float32 would move a camera that is far from the origin
         Ks=views.K[None].to(scene.means),
         width=views.width,
         height=views.height,
         sh_degree=scene.sh_degree,
         near_plane=views.near_plane,
+        far_plane=math.inf,  # the unit of length may be small
         rasterize_mode=views.rasterize_mode,
     )
     return (image[0] + (1 - alpha[0]) * views.background.to(image)).clamp(0, 1)
@@ -68,12 +71,13 @@ def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
         scales=scene.stds,
         opacities=scene.alphas,
         colors=scene.means,  # any colours: only depths are rendered
-        viewmats=view.viewmat[None].to(scene.means),
+        viewmats=view.viewmat[None].to(scene.device),
         Ks=view.K[None].to(scene.means),
         width=view.width,
         height=view.height,
         render_mode="ED",
         near_plane=view.near_plane,
+        far_plane=math.inf,
         rasterize_mode=view.rasterize_mode,
     )
     return depth[0, ..., 0], alpha[0, ..., 0]

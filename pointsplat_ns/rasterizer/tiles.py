@@ -84,7 +84,7 @@ class Footprints:
         cov2d: Tensor,  # [M, 3] xx, xy, yy
         det: Tensor,  # [M]
         opacities: Tensor,  # [M]
-        depths: Tensor,  # [M]
+        depths: Tensor,  # [M] from any plane, which may be another for each camera
         camera_ids: Tensor,  # [M] int64
         cameras: int,
         width: int,

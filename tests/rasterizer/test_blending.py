@@ -180,12 +180,7 @@ def test_gsplat_on_a_cpu_is_refused_in_one_line_and_auto_draws_with_torch():
 
 
 @pytest.mark.skipif(shutil.which(os.environ.get("CXX", "g++")) is None, reason="there is no C++ compiler")
-def test_compiled_kernels_equal_eager_ones(monkeypatch):
-    """Of four Gaussians at once instead of 16: a loop unrolled so many times takes the compiler minutes."""
-    for module in (blending, compiled, frame):
-        monkeypatch.setattr(module, "CHUNK", 4)
-    monkeypatch.setattr(compiled, "kernels", functools.cache(compiled.kernels.__wrapped__))
-    monkeypatch.setattr(frame, "kernels", compiled.kernels)
+def test_compiled_kernels_equal_eager_ones(kernels_of_four):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         warnings.filterwarnings("ignore", module="torch")

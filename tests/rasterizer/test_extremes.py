@@ -3,6 +3,7 @@
 Input is rounded to float32 first, so that what is compared is the arithmetic, not what float32 can hold.
 """
 
+import dataclasses
 import functools
 import math
 
@@ -10,7 +11,9 @@ import pytest
 import torch
 
 from making import camera_askew, splats_in_view
-from pointsplat_ns.rasterizer import rasterization, rasterize_reference
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.rasterizer import rasterization, rasterize_reference, render, render_depth
+from pointsplat_ns.views import View
 
 F64 = torch.float64
 NAMES = ("means", "quats", "scales", "opacities", "colors")
@@ -34,7 +37,7 @@ def draw(scene, view, K, size, dtype, near=0.01, mode="classic", sh_degree=3, sl
         )  # fmt: skip
         image, alpha = image[0], alpha[0]
     g = torch.Generator().manual_seed(1)
-    pixels = torch.cat([image[..., :3], alpha, image[..., 3:] / scene[0].abs().max()], -1)
+    pixels = torch.cat([image[..., :3], alpha, image[..., 3:] / torch.stack([scene[0].abs().max(), view[:3, 3].norm()]).max()], -1)
     weights = torch.rand(pixels.shape, generator=g, dtype=F64).to(dtype)
     total = (pixels * weights).sum()
     if total.requires_grad:
@@ -219,6 +222,40 @@ def test_float64_cameras_beside_float32_gaussians_place_the_camera_exactly():
     assert got.dtype == torch.float32
     assert ((got - want).abs() > 1e-4).double().mean() < 0.01
     assert ((rounded - want).abs() > 1e-4).double().mean() > 0.1
+
+
+@pytest.mark.parametrize("times", [1e2, 1e4])
+def test_a_long_lens_far_away_sees_what_a_short_one_sees_near(times):
+    # as from an aeroplane or a satellite: x and y before the camera are small sums of products of the distance
+    scene = make_scene(50)
+    view, K = camera_askew(focal=40 * times)
+    view[2, 3] += 3.0 * (times - 1)
+    check(scene, (view, K))
+
+
+def test_views_in_float64_place_the_camera_exactly_and_any_unit_of_length_is_drawn():
+    parts = make_scene(50)
+    scene = Gaussians(parts[0], parts[2].log(), parts[1], torch.logit(parts[3])[:, None], parts[4][:, 0], parts[4][:, 1:])
+    view, K = camera_askew()
+    plain = View(view, K, 37, 29, torch.zeros(3))
+    want, depth = render(scene, plain), render_depth(scene, plain)[0]
+    assert want.max() > 0.3
+
+    shift = torch.tensor([1e6, -7e5, 4e5], dtype=F64)
+    placed = scene.replace(means=scene.means * 64 + shift, scales=scene.scales + math.log(64)).to(torch.float32)
+    view = view.clone()
+    view[:3, 3] = view[:3, 3] * 64 - view[:3, :3] @ shift
+    there = dataclasses.replace(plain, viewmat=view, near_plane=0.64)
+    got, exact = render(placed, there), render(placed.to(F64), there)
+    assert got.dtype == torch.float32 and ((got - exact).abs() > 1e-4).double().mean() < 0.01
+
+    # nothing of this is nearer than gsplat's far plane of 1e10
+    vast = scene.replace(means=scene.means * 1e12, scales=scene.scales + math.log(1e12))
+    view = plain.viewmat.clone()
+    view[:3, 3] *= 1e12
+    there = dataclasses.replace(plain, viewmat=view, near_plane=1e10)
+    assert (render(vast, there) - want).abs().max() < 1e-9
+    assert (render_depth(vast, there)[0] / 1e12 - depth).abs().max() < 1e-9
 
 
 @pytest.mark.parametrize("focal", [1.0, 1e5])

@@ -1,0 +1,200 @@
+"""Small scenes whose images and gradients, by the float64 reference, are kept in ``tests/rasterizer/golden.npz``.
+
+A change of these files needs a reason:
+
+    python tests/support/golden.py --reason "why the pictures change"
+
+draws them anew and adds the reason, with the hash of the new file, to ``tests/rasterizer/golden.md``. A test compares
+that hash with the file's, so that neither changes alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import torch
+from torch import Tensor
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+GOLDEN = REPOSITORY / "tests" / "rasterizer" / "golden.npz"
+REASONS = GOLDEN.with_suffix(".md")
+
+WIDTH, HEIGHT = 26, 18  # twelve tiles, some of them cut off: compiled kernels are used from eight on
+COUNT = 16
+NAMES = ("means", "quats", "scales", "opacities", "colors")
+
+
+@dataclass(frozen=True)
+class Golden:
+    """What a scene is like and how it is drawn."""
+
+    seed: int
+    sh_degree: int | None = 3
+    channels: int = 3
+    mode: str = "classic"
+    render_mode: str = "RGB"
+    background: tuple[float, ...] | None = None
+    principal: tuple[float, float] = (13.5, 8.4)
+    focal: tuple[float, float] = (24.0, 25.0)
+    change: Callable[[dict[str, Tensor]], None] = field(default=lambda scene: None)
+
+
+def _needles(scene: dict[str, Tensor]) -> None:
+    scene["scales"][:, 0], scene["scales"][:, 1:] = 2.0, 1e-3
+
+
+def _opaque(scene: dict[str, Tensor]) -> None:
+    scene["opacities"][:] = 1.0
+    scene["scales"] *= 2.5
+
+
+def _below_a_pixel(scene: dict[str, Tensor]) -> None:
+    scene["scales"] *= 0.1
+    scene["opacities"][:] = 1.0
+
+
+def _large_and_faint(scene: dict[str, Tensor]) -> None:
+    scene["scales"] *= 8
+    scene["opacities"] *= 0.3
+
+
+def _around_the_camera(scene: dict[str, Tensor]) -> None:
+    scene["means"][::2, 2] -= 2.9  # some behind it, some before the near plane, some beside the field of view
+    scene["scales"] *= 0.5
+
+
+SCENES = {
+    "colours": Golden(0, sh_degree=None),
+    "degree 0 over a background": Golden(1, sh_degree=0, background=(0.9, 0.5, 0.1)),
+    "degree 1": Golden(2, sh_degree=1),
+    "degree 2 with depth": Golden(3, sh_degree=2, render_mode="RGB+D"),
+    "degree 3 with expected depth": Golden(4, render_mode="RGB+ED", background=(0.2, 0.3, 0.4)),
+    "seven channels": Golden(5, sh_degree=None, channels=7, background=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)),
+    "antialiased": Golden(6, mode="antialiased"),
+    "antialiased below a pixel": Golden(7, mode="antialiased", change=_below_a_pixel),
+    "needles": Golden(8, sh_degree=1, change=_needles),
+    "opaque": Golden(9, sh_degree=1, background=(1.0, 1.0, 1.0), change=_opaque),
+    "large and faint": Golden(10, sh_degree=2, mode="antialiased", change=_large_and_faint),
+    "around the camera": Golden(11, sh_degree=None, principal=(30.0, -4.0), focal=(15.0, 22.0), change=_around_the_camera),
+}
+
+
+def made(golden: Golden) -> dict[str, Tensor]:
+    """The tensors of a scene, in numbers that float32 holds."""
+    random = np.random.RandomState(golden.seed)  # whose numbers never change
+
+    def normal(*shape: int) -> Tensor:
+        return torch.from_numpy(random.standard_normal(shape))
+
+    depth = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
+    coefficients = (0 if golden.sh_degree is None else golden.sh_degree) + 1
+    colors = torch.rand(0) if golden.sh_degree is None else 0.3 * normal(COUNT, coefficients**2, 3)
+    if golden.sh_degree is None:
+        colors = torch.from_numpy(random.uniform(size=(COUNT, golden.channels)))
+    scene = {
+        "means": normal(COUNT, 3) * torch.tensor([0.9, 0.6, 0.5], dtype=torch.float64) + depth,
+        "quats": normal(COUNT, 4),
+        "scales": torch.exp(0.6 * normal(COUNT, 3) - 1.6),
+        "opacities": torch.from_numpy(random.uniform(0.2, 0.98, COUNT)),
+        "colors": colors,
+    }
+    golden.change(scene)
+    angle = 0.15
+    view = torch.eye(4, dtype=torch.float64)
+    view[0, 0] = view[2, 2] = math.cos(angle)
+    view[0, 2], view[2, 0] = math.sin(angle), -math.sin(angle)
+    view[:3, 3] = torch.tensor([-0.4, 0.05, 0.1], dtype=torch.float64)
+    K = torch.eye(3, dtype=torch.float64)
+    K[0, 0], K[1, 1] = golden.focal
+    K[0, 2], K[1, 2] = golden.principal
+    return {name: value.float().double() for name, value in {**scene, "viewmat": view, "K": K}.items()}
+
+
+def total(renders: Tensor, alphas: Tensor) -> Tensor:
+    """A sum over the image whose gradients are kept; neither symmetric nor of one sign."""
+    both = torch.cat([renders, alphas], dim=-1)
+    weights = torch.cos(torch.arange(both.numel(), dtype=torch.float64)).view(both.shape)
+    return (both * weights.to(both)).sum()
+
+
+def drawn_by_reference(golden: Golden, scene: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Image (H, W, channels), alphas (H, W, 1) and the gradients of :func:`total`, float64."""
+    from pointsplat_ns.rasterizer import rasterize_reference
+
+    leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
+    image, alphas, depths = rasterize_reference(
+        *leaves.values(), scene["viewmat"], scene["K"], WIDTH, HEIGHT,
+        sh_degree=golden.sh_degree, antialiased=golden.mode == "antialiased",
+    )  # fmt: skip
+    if golden.background is not None:
+        image = image + (1 - alphas) * torch.tensor(golden.background, dtype=torch.float64)
+    if golden.render_mode == "RGB+D":
+        image = torch.cat([image, depths], dim=-1)
+    if golden.render_mode == "RGB+ED":
+        image = torch.cat([image, depths / alphas.clamp_min(1e-10)], dim=-1)
+    grads = torch.autograd.grad(total(image, alphas), list(leaves.values()), materialize_grads=True)
+    of_names = {f"grad of {name}": grad for name, grad in zip(NAMES, grads, strict=True)}
+    return {"image": image.detach(), "alphas": alphas.detach(), **of_names}
+
+
+def far_from_thresholds(golden: Golden, scene: dict[str, Tensor]) -> bool:
+    """Whether no pixel changes when the thresholds of alpha and transmittance move by 1e-4 of their size.
+
+    Then no rounding of float32 changes what is drawn, and images can be compared closely.
+    """
+    from pointsplat_ns.rasterizer import reference
+
+    images = []
+    for factor in (1 - 1e-4, 1 + 1e-4):
+        names = {name: getattr(reference, name) * factor for name in ("ALPHA_MIN", "TRANSMITTANCE_MIN")}
+        with mock.patch.multiple(reference, **names):
+            images.append(drawn_by_reference(golden, scene)["image"])
+    return torch.equal(*images)
+
+
+def digest() -> str:
+    """SHA-256 of the stored file."""
+    return hashlib.sha256(GOLDEN.read_bytes()).hexdigest()
+
+
+def stored() -> dict[str, dict[str, Tensor]]:
+    """For each scene its tensors, image, alphas and gradients, float64 (kept in float32)."""
+    with np.load(GOLDEN) as file:
+        values = {key: torch.from_numpy(file[key]).double() for key in file.files}
+    scenes: dict[str, dict[str, Tensor]] = {}
+    for key, value in values.items():
+        scene, name = key.split("/")
+        scenes.setdefault(scene, {})[name] = value
+    return scenes
+
+
+def main() -> None:
+    """Draw all scenes by the reference and write them, with the reason for doing so."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--reason", required=True, help="why the pictures change, one sentence")
+    reason = " ".join(parser.parse_args().reason.split())
+    if len(reason) < 20:
+        sys.exit(f"the reason is {reason!r}; expected a sentence that tells what changed, and why it may")
+    values: dict[str, np.ndarray] = {}
+    for name, golden in SCENES.items():
+        scene = made(golden)
+        if not far_from_thresholds(golden, scene):
+            sys.exit(f"{name}: a pixel of the scene of seed {golden.seed} is at a threshold; expected none: try another")
+        for key, value in {**scene, **drawn_by_reference(golden, scene)}.items():
+            values[f"{name}/{key}"] = value.numpy().astype(np.float32)
+    np.savez_compressed(GOLDEN, **values)  # type: ignore[arg-type]
+    with REASONS.open("a", encoding="utf-8") as file:
+        file.write(f"\n- `{digest()}`\n  {reason}\n")
+    print(f"{GOLDEN}: {len(SCENES)} scenes, {GOLDEN.stat().st_size:,} bytes; the reason stands in {REASONS}")
+
+
+if __name__ == "__main__":
+    main()
