@@ -36,7 +36,7 @@ SHARE = 0.03
 TRIES, USUAL = 5, 5
 """Number of steps that another number of threads is tried in, and of latest steps that these are compared with."""
 
-GAIN = 0.85
+GAIN = 0.8
 """Another number of threads is kept if its median step takes less than this share of the usual one; so that noise does
 not make it go to and fro."""
 
@@ -46,9 +46,10 @@ MOST_PATIENCE = 16
 LOOK_SECONDS = 0.5
 """Least time between looks."""
 
-CLEAR = 3
-"""Number of looks in a row after which threads that have stalled no longer do: with a core that is shared with another
-program, some looks find nothing."""
+CLEAR, MOST_CLEAR = 3, 48
+"""Number of looks in a row that must find nothing before threads that have stalled are used again, as some find nothing
+on a busy machine. It is doubled, up to the second number, each time that they then stall again, and is back at the first
+after so many that found nothing."""
 
 STALL = 1.5
 """Threads stall if an operation shared between them takes this many times as long as on one of them."""
@@ -69,6 +70,7 @@ class Stalls:
     def __init__(self, shared: Callable[[int, float], float], clock: Clock = time.perf_counter):
         self._shared, self._clock = shared, clock
         self._good: dict[int, int] = {}  # looks in a row that found nothing, by number of threads
+        self._needed: dict[int, int] = {}  # and how many of them are needed
         self._next: dict[int, float] = {}  # when the next look is due
         self._bad, self._told = 0, False
 
@@ -79,7 +81,7 @@ class Stalls:
         due = CLEAR if count not in self._next else math.ceil((self._clock() - self._next[count]) / LOOK_SECONDS)
         for _ in range(min(due, CLEAR)):
             self._look(count)
-        return self._good[count] < CLEAR
+        return self._good[count] < self._needed.get(count, CLEAR)
 
     def _look(self, count: int) -> None:
         start = self._clock()
@@ -87,7 +89,14 @@ class Stalls:
         stalled = self._shared(count, STALL * alone) > STALL * alone
         end = self._clock()
         self._next[count] = end + max(LOOK_SECONDS, (end - start) / SHARE)
-        self._good[count] = 0 if stalled else self._good.get(count, 0) + 1
+        good, again = self._good.get(count, 0), count in self._needed
+        if stalled and again and good >= self._needed[count]:
+            self._needed[count] = min(2 * self._needed[count], MOST_CLEAR)
+        elif stalled and not again:
+            self._needed[count] = CLEAR
+        elif good >= MOST_CLEAR:
+            self._needed.pop(count, None)
+        self._good[count] = 0 if stalled else good + 1
         self._bad = self._bad + 1 if stalled else 0
         if self._bad == CLEAR and not self._told:
             self._told = True
@@ -191,7 +200,8 @@ class ThreadChoice:
         self._stalls, self._clock = stalls, clock
         self._free = threading.Lock()
         self._most = 0
-        self._at = 1
+        self._best = 1  # the number that steps have shown to be the best
+        self._at = 0  # the largest up to that which does not stall
         self._trying: int | None = None
         self._usual: deque[float] = deque(maxlen=USUAL)  # costs of the latest steps with the number kept
         self._tried: list[float] = []  # and with the one tried
@@ -199,6 +209,11 @@ class ThreadChoice:
         self._spent, self._seconds = 0.0, 0.0  # what the last try cost; what the last step took
         self._patience = 1
         self._upwards = False  # where the next try goes
+
+    @property
+    def count(self) -> int:
+        """The number of threads that is kept for now."""
+        return self._at
 
     @contextmanager
     def step(self, items: float = 1.0, device: torch.device | None = None) -> Iterator[None]:
@@ -227,17 +242,15 @@ class ThreadChoice:
 
     def _next(self, most: int) -> int:
         """The number of threads of the next step."""
-        new = most != self._most
-        if new:
-            self._most, self._at = most, most
-        unstalled = _unstalled(self._at, self._stalls)
-        if new or unstalled < self._at:
-            self._keep(unstalled, [])
-            if unstalled < most:
-                self._since = -math.inf  # more threads are tried as soon as they no longer stall
+        if most != self._most:
+            self._most = self._best = most
+        at = _unstalled(self._best, self._stalls)
+        if at != self._at:
+            self._at = at
+            self._begin([])
         if self._trying is not None and self._stalls(self._trying):
             self._give_up()
-        if self._trying is None:
+        if self._trying is None and self._at == self._best:
             self._trying = self._to_try()
         return self._at if self._trying is None else self._trying
 
@@ -260,7 +273,8 @@ class ThreadChoice:
         cost = seconds / items
         if count == self._at:
             if len(self._usual) == USUAL and min(cost, self._usual[-1]) > median(self._usual) / GAIN**2:
-                self._since = -math.inf  # two such steps in a row: something has changed
+                self._begin([self._usual[-1]])  # two such steps in a row: something has changed
+                self._since = -math.inf
             self._usual.append(cost)
             self._seconds = seconds
             return
@@ -272,13 +286,16 @@ class ThreadChoice:
         if (enough and median(tried) < GAIN * usual and below >= TRIES - 1) or (
             len(tried) > 1 and max(tried) < 0.5 * min(self._usual)
         ):
-            self._keep(count, tried)
+            self._upwards = count > self._at  # and on in this direction
+            self._best = self._at = count
+            self._begin(tried)
+            self._since = -math.inf
         elif enough or min(tried) > max(self._usual) / GAIN or (len(tried) > 1 and min(tried) > usual / GAIN):
             self._give_up()
 
-    def _keep(self, count: int, costs: list[float]) -> None:
-        """Stay with a number of threads, whose latest steps had these costs."""
-        self._at, self._trying, self._patience, self._since = count, None, 1, self._clock()
+    def _begin(self, costs: list[float]) -> None:
+        """Begin with a number of threads whose latest steps had these costs."""
+        self._trying, self._patience, self._since = None, 1, self._clock()
         self._usual = deque(costs, maxlen=USUAL)
 
     def _give_up(self) -> None:
