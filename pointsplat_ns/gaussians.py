@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.system.threads import one_thread
 
 SH_C0 = 0.28209479177387814
 """The constant band of the real spherical harmonics, 1 / (2 sqrt(pi))."""
@@ -172,8 +171,7 @@ class Gaussians:
     @property
     def alphas(self) -> Tensor:
         """Opacities in [0, 1], (N,)."""
-        with one_thread():  # where threads' shares end, torch's sigmoid is rounded in another way
-            return torch.sigmoid(self.opacities[:, 0])
+        return torch.sigmoid(self.opacities[:, 0])
 
     @property
     def stds(self) -> Tensor:

@@ -8,6 +8,7 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.rendering import rasterization
 from pointsplat_ns.system.thread_choice import ThreadChoice
+from pointsplat_ns.system.threads import one_thread
 from pointsplat_ns.views import View, Views
 
 _RENDERS = ThreadChoice()
@@ -43,7 +44,7 @@ def render(scene: Gaussians, views: View | Views) -> Tensor:
             means=scene.means,
             quats=scene.quats,
             scales=scene.stds,
-            opacities=scene.alphas,
+            opacities=_alphas(scene),
             colors=scene.sh,
             viewmats=views.viewmat[None].to(scene.means),
             Ks=views.K[None].to(scene.means),
@@ -71,7 +72,7 @@ def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
             means=scene.means,
             quats=scene.quats,
             scales=scene.stds,
-            opacities=scene.alphas,
+            opacities=_alphas(scene),
             colors=scene.means,  # any colours: only depths are rendered
             viewmats=view.viewmat[None].to(scene.means),
             Ks=view.K[None].to(scene.means),
@@ -87,3 +88,9 @@ def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
 def _work(scene: Gaussians, view: View) -> int:
     """How much work an image is, roughly: Gaussians are projected, and pixels blended."""
     return len(scene) + view.width * view.height
+
+
+def _alphas(scene: Gaussians) -> Tensor:
+    """Opacities (N,). Where the shares of threads end, torch rounds a sigmoid in another way: so one computes all."""
+    with one_thread():
+        return scene.alphas
