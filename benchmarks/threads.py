@@ -1,5 +1,5 @@
-"""What choosing the number of threads is worth beside other programs: seconds of a merge, and of a step of a repair and of
-a ``splatfacto-cpu`` training, on all threads, on one, and on as many as are chosen.
+"""What choosing the number of threads is worth beside other programs: seconds of a merge, and of a step of a repair and
+of a ``splatfacto-cpu`` training, on all threads, on one, and on as many as are chosen.
 
     python benchmarks/threads.py --busy 0 1 2 --seconds 10
 
@@ -29,7 +29,7 @@ from pointsplat_ns.system.cores import cores
 Work = Literal["merge", "repair", "training"]
 
 TITLES: dict[Work, str] = {
-    "merge": "merge to a tenth, s",
+    "merge": "merge to 10 %, s",
     "repair": "repair, s a step",
     "training": "training, s a step",
 }

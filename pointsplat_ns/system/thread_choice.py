@@ -48,8 +48,8 @@ LOOK_SECONDS = 0.5
 
 CLEAR, MOST_CLEAR = 3, 48
 """Number of looks in a row that must find nothing before threads that have stalled are used again, as some find nothing
-on a busy machine. It is doubled, up to the second number, each time that they then stall again, and is back at the first
-after so many that found nothing."""
+on a busy machine. It is doubled, up to the second number, each time that they then stall again, and is back at the
+first after so many that found nothing."""
 
 STALL = 1.5
 """Threads stall if an operation shared between them takes this many times as long as on one of them."""
