@@ -36,6 +36,7 @@ def compact(
     force: bool = False,
     jobs: int | None = None,
     shard: str | None = None,
+    threads: int | None = None,
 ) -> None:
     """Make any scene smaller and repair it, or all scenes of a folder. No photos are needed.
 
@@ -67,15 +68,19 @@ def compact(
         jobs: of a folder: number of processes that share its scenes and the cores; by default 1.
         shard: of a folder: only a part of its scenes; 2/5 is the second of five. Under torchrun each process takes its
             part.
+        threads: how many to use, in each process. By default the number is chosen while the work
+            goes on, and is lower while other programs keep the machine busy. It does not change the result.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.io.scene import is_folder_of_scenes
+    from pointsplat_ns.system.threads import fixed_threads
 
     if is_folder_of_scenes(scene):
-        compact_folder(
-            scene, output, picture, dry_run, keep=keep, refiner=refiner, by=by, sh=sh, clean=clean, effort=effort,
-            seconds=seconds, jobs=1 if jobs is None else jobs, shard=shard, force=force,
-        )  # fmt: skip
+        with fixed_threads(threads):
+            compact_folder(
+                scene, output, picture, dry_run, keep=keep, refiner=refiner, by=by, sh=sh, clean=clean, effort=effort,
+                seconds=seconds, jobs=1 if jobs is None else jobs, shard=shard, force=force,
+            )  # fmt: skip
         return
     if jobs is not None or shard is not None:
         raise ps.SceneError(f"{scene}: one scene; --jobs and --shard are for a folder of scenes")
@@ -89,10 +94,11 @@ def compact(
     trained = ps.load_refiner(refiner)
     resolve_options(trained, keep, by, sh)
     RepairBudget(effort, seconds)
-    dense = read_scene(scene)
-    result = ps.compact(
-        dense, keep, trained, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds, views=scene, progress=True
-    )
+    with fixed_threads(threads):
+        dense = read_scene(scene)
+        result = ps.compact(
+            dense, keep, trained, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds, views=scene, progress=True
+        )
     if not dry_run:
         ps.save(result.scene, output, progress=True)
         warn_if_larger(keep, output)

@@ -18,6 +18,7 @@ def lod(
     output: Output = None,
     sh: Bands = "all",
     force: bool = False,
+    threads: int | None = None,
 ) -> None:
     """Make levels of detail: the scene merged to fewer and fewer Gaussians in one pass, the error of each measured.
 
@@ -33,12 +34,16 @@ def lod(
             picture lod.png; by default beside the scene: room_lod for room.ply, lod in the folder of a run.
         sh: SH bands of every level: all, up to a degree, or auto, those without which renders stay within 40 dB.
         force: overwrite existing files.
+        threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
+            programs keep the machine busy. It does not change the result.
     """
     import pointsplat_ns as ps
+    from pointsplat_ns.system.threads import fixed_threads
 
     need_one_scene(scene)
     folder = output or output_beside(scene, "lod").with_suffix("")
-    made = ps.lod(scene, levels, sh=sh, folder=folder, force=force, progress=True)
+    with fixed_threads(threads):
+        made = ps.lod(scene, levels, sh=sh, folder=folder, force=force, progress=True)
     _print_table(made, folder)
 
 

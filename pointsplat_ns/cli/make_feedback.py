@@ -15,6 +15,7 @@ def make_feedback(
     updates: int = 1000,
     at_once: int = 4,
     seed: int = 0,
+    threads: int | None = None,
 ) -> None:
     """Train the network that sets the steps of `compact`'s repairs, on scenes and what is merged of them; no photos.
 
@@ -27,6 +28,9 @@ def make_feedback(
         updates: number of updates of the network.
         at_once: number of repairs in an update.
         seed: seed of the initial weights and of all choices.
+        threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
+            programs keep the machine busy. Another number
+            sums in another order.
     """
     import functools
 
@@ -35,12 +39,14 @@ def make_feedback(
     import pointsplat_ns as ps
     from pointsplat_ns.compression.feedback_training import TrainingScene, train_feedback
     from pointsplat_ns.system.progress import progress_bar, tracked
+    from pointsplat_ns.system.threads import fixed_threads
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
     ready = []
-    for path in tracked(scenes, "merging scenes", len(scenes)):
-        ready.append(TrainingScene.of(path.stem, ps.load(path).to(device), keep))
-        print(f"{path}: {len(ready[-1].dense):,} Gaussians, {len(ready[-1].views)} views")
-    with progress_bar() as show:
-        train_feedback(ready, updates, at_once, seed, output, functools.partial(show, "training"))
+    with fixed_threads(threads):
+        for path in tracked(scenes, "merging scenes", len(scenes)):
+            ready.append(TrainingScene.of(path.stem, ps.load(path).to(device), keep))
+            print(f"{path}: {len(ready[-1].dense):,} Gaussians, {len(ready[-1].views)} views")
+        with progress_bar() as show:
+            train_feedback(ready, updates, at_once, seed, output, functools.partial(show, "training"))
     print(f"{output}: the network")

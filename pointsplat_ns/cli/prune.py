@@ -31,6 +31,7 @@ def prune(
     plot: Path | None = None,
     dry_run: bool = False,
     force: bool = False,
+    threads: int | None = None,
 ) -> None:
     """Make a scene smaller: keep the Gaussians that matter, or merge them, from the scene alone.
 
@@ -54,22 +55,26 @@ def prune(
         plot: a .png file for a plot of the distributions of opacity and volume, before and after.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
+        threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
+            programs keep the machine busy. It does not change the result.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.compression.prune import check_options
     from pointsplat_ns.io import read_scene
+    from pointsplat_ns.system.threads import fixed_threads
 
     need_one_scene(scene)
     output = output or output_beside(scene, "pruned")
     check_outputs(None if dry_run else output, plot, force)
     keep = in_format_of(keep, output)
     check_options(keep, by, sh, opacity_weight, fine_tune)
-    dense = read_scene(scene)
-    start = time.perf_counter()
-    small = ps.prune(
-        dense, keep, by, sh=sh, opacity_weight=opacity_weight, clean=clean, fine_tune=fine_tune, views=scene,
-        progress=True,
-    )  # fmt: skip
+    with fixed_threads(threads):
+        dense = read_scene(scene)
+        start = time.perf_counter()
+        small = ps.prune(
+            dense, keep, by, sh=sh, opacity_weight=opacity_weight, clean=clean, fine_tune=fine_tune, views=scene,
+            progress=True,
+        )  # fmt: skip
     seconds = time.perf_counter() - start
     if not dry_run:
         ps.save(small, output, progress=True)

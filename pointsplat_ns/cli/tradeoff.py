@@ -23,6 +23,7 @@ def tradeoff(
     target_ms: float | None = None,
     target_mb: float | None = None,
     force: bool = False,
+    threads: int | None = None,
 ) -> None:
     """Measure how a scene trades quality for frame time, size and count, on this machine.
 
@@ -46,14 +47,18 @@ def tradeoff(
         target_ms: and of at most so many milliseconds a frame. Without --target-db, find the best within the limits.
         target_mb: and of at most so many megabytes.
         force: start over, and overwrite results in the folder.
+        threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
+            programs keep the machine busy. Frames are timed on all.
     """
     import pointsplat_ns as ps
+    from pointsplat_ns.system.threads import fixed_threads
 
     folder = output or output_beside(scene, "tradeoff").with_suffix("")
-    found = ps.measure_tradeoff(
-        scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, side=side,
-        target_db=target_db, target_ms=target_ms, target_mb=target_mb, force=force, progress=True,
-    )  # fmt: skip
+    with fixed_threads(threads):
+        found = ps.measure_tradeoff(
+            scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, side=side,
+            target_db=target_db, target_ms=target_ms, target_mb=target_mb, force=force, progress=True,
+        )  # fmt: skip
     _print_table(found)
     for note in found.notes:
         print(f"note: {note}")

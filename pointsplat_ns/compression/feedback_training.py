@@ -25,6 +25,7 @@ from pointsplat_ns.pruning import prune
 from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, save_feedback_refiner
+from pointsplat_ns.system.thread_choice import ThreadChoice
 from pointsplat_ns.views import Views
 
 STEPS = (FEWEST_STEPS, 12, 24, MOST_STEPS)
@@ -120,14 +121,16 @@ def train_feedback(
         network = FeedbackRefiner().to(scenes[0].dense.device)
     adam = torch.optim.Adam(network.parameters(), lr=RATE, betas=(0.9, 0.99))
     metadata = {"scenes": [scene.name for scene in scenes], "keep": [*scenes[0].pruned], "repairs_per_update": at_once}
-    saved = time.monotonic()
+    saved, threads = time.monotonic(), ThreadChoice()
     for update in range(updates):
         adam.param_groups[0]["lr"] = RATE * min(1, (update + 1) / WARM_UP) * share_of_rates(update / updates)
         adam.zero_grad()
         for _ in range(at_once):
             scene = generator.choice(scenes)
             pruned = generator.choice(list(scene.pruned.values()))
-            (-roll_out(network, scene, pruned, generator.choice(STEPS), generator) / at_once).backward()
+            steps = generator.choice(STEPS)
+            with threads.step(steps, pruned.device):
+                (-roll_out(network, scene, pruned, steps, generator) / at_once).backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0, error_if_nonfinite=True)
         adam.step()
         if output is not None and (time.monotonic() - saved > SAVED_EVERY or update == updates - 1):

@@ -9,6 +9,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.metrics import SSIM_WINDOW
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.system.threads import one_thread
 from pointsplat_ns.views import View
 
 RATES = {
@@ -67,8 +68,9 @@ class Optimiser:
 def extent(scene: Gaussians) -> float:
     """How far the Gaussians of a scene reach from their mean position, but for the farthest tenth, scene units; 1 if
     they are all in one place."""
-    centred = scene.means.detach().double() - scene.means.detach().double().mean(0)
-    return float(centred.norm(dim=1).quantile(0.9)) or 1.0
+    with one_thread():
+        centred = scene.means.detach().double() - scene.means.detach().double().mean(0)
+        return float(centred.norm(dim=1).quantile(0.9)) or 1.0
 
 
 def gradients_of(scene: Gaussians, view: View, target: Tensor) -> dict[str, Tensor]:
@@ -95,7 +97,8 @@ def _finite_gradient(value: Tensor) -> Tensor:
 def seen_rms(gradient: Tensor) -> float:
     """Root mean square of the gradients that are not 0, in float64; 0 if all are."""
     seen = gradient[gradient != 0].double()
-    return float(seen.square().mean().sqrt()) if seen.numel() else 0.0
+    with one_thread():
+        return float(seen.square().mean().sqrt()) if seen.numel() else 0.0
 
 
 def _loss(image: Tensor, target: Tensor) -> Tensor:

@@ -18,6 +18,8 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, shipped_feedback_refiner
+from pointsplat_ns.system.thread_choice import ThreadChoice
+from pointsplat_ns.system.threads import one_thread
 
 Effort = Literal["instant", "quick", "thorough"]
 
@@ -110,16 +112,17 @@ def repair(
     if network == "shipped":
         network = shipped_feedback_refiner(scene.device)
     feedback = Feedback(scene, len(dense))
-    examples = views.others()
+    examples, threads = views.others(), ThreadChoice()
     steps, done, interrupted = 0, 0.0, False
     try:
         while done < 1 and not budget.empty:
-            view = next(examples)
-            with torch.no_grad():
-                target = render(dense, view)
-            feedback.observe(gradients_of(scene, view, target))
-            learned = _learned(network, feedback, scene, done, budget.steps_in_all(steps, done))
-            scene = feedback.moved(scene, share_of_rates(done), *learned)
+            with threads.step(device=scene.device):
+                view = next(examples)
+                with torch.no_grad():
+                    target = render(dense, view)
+                feedback.observe(gradients_of(scene, view, target))
+                learned = _learned(network, feedback, scene, done, budget.steps_in_all(steps, done))
+                scene = feedback.moved(scene, share_of_rates(done), *learned)
             steps += 1
             done = budget.share_done(steps, time.perf_counter() - start)
             if progress is not None:
@@ -140,5 +143,5 @@ def _learned(
     """Factors and offsets of the next step; None without a network, or if there are more steps than it is good for."""
     if network is None or steps > LONGEST:
         return None, None
-    with torch.no_grad():
+    with torch.no_grad(), one_thread():  # a small network: shared, its sums would be rounded by the number of threads
         return network(feedback.features(scene, done, steps))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pointsplat_ns.system.threads import most_threads
+
 CHUNK = 1 << 17
 """Number of points asked for at once, to save memory."""
 
@@ -36,7 +38,7 @@ def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
     # The ranks are listed, because k = 1 would drop their axis.
     ranks = list(range(1, min(k, n) + 1))
     tree = cKDTree(array, balanced_tree=False)
-    distances, indices = tree.query(array, k=ranks, workers=torch.get_num_threads())
+    distances, indices = tree.query(array, k=ranks, workers=most_threads())
     return torch.from_numpy(distances), torch.from_numpy(indices).long()
 
 
@@ -63,7 +65,7 @@ def other_neighbours(points: Tensor, k: int) -> Tensor:
     ranks = list(range(1, min(k + 1, n) + 1))
     crowded = []
     for these in torch.arange(n).split(CHUNK):
-        distances, found = tree.query(array[these[0] : these[-1] + 1], k=ranks, workers=torch.get_num_threads())
+        distances, found = tree.query(array[these[0] : these[-1] + 1], k=ranks, workers=most_threads())
         indices = torch.from_numpy(found)
         # The point itself is the first, or, among coincident ones, anywhere or missing: the first takes its place.
         indices = indices.where(indices != these[:, None], indices[:, :1])

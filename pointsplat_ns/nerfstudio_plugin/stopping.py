@@ -7,27 +7,44 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Literal, NoReturn
+from typing import Any, Literal, NoReturn
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.engine.trainer import Trainer
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.system.memory import keep_freed_memory
+from pointsplat_ns.system.thread_choice import ThreadChoice
+from pointsplat_ns.system.threads import fixed_threads
+
+
+@dataclass
+class StoppableTrainerConfig(TrainerConfig):
+    """nerfstudio's trainer config, with the number of threads"""
+
+    threads: int | None = None
+    """Number of threads of a training on a CPU. By default it is chosen while the training goes on, and is lower while
+    other programs keep the machine busy; the environment variable OMP_NUM_THREADS has the same effect as this."""
 
 
 class StoppableTrainer(Trainer):
     """nerfstudio's trainer. It removes the run folder if the input cannot be used, and reuses freed memory on a CPU.
+
+    Steps on a CPU use the number of threads that suits them
+    (:class:`~pointsplat_ns.system.thread_choice.ThreadChoice`).
 
     Ctrl-C and SIGTERM end it after the step at hand, with a checkpoint of that step, and with the status of an
     interrupted program: in the middle of densification, parameters are of different numbers. A second one ends it at
     once.
     """
 
+    config: StoppableTrainerConfig
     _asked: int | None = None
     """Number of the signal that asked it to stop."""
     _between_steps = False
@@ -49,6 +66,7 @@ class StoppableTrainer(Trainer):
             raise
         except KeyboardInterrupt:
             _interrupted(signal.SIGINT)
+        self._thread_choice = ThreadChoice()
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         self.callbacks.append(TrainingCallback(before, self._stop_if_asked, update_every_num_iters=1))
 
@@ -58,8 +76,12 @@ class StoppableTrainer(Trainer):
 
         Raises:
             SystemExit: if it is interrupted.
+            PointSplatError: if the number of threads is below 1.
         """
-        with self._signals_noted():
+        threads = self.config.threads
+        if threads is None and getattr(self.config.pipeline.model, "compiled", False):
+            threads = torch.get_num_threads()  # compiled kernels are made for one number, and again for each other
+        with fixed_threads(threads), self._signals_noted():
             try:
                 super().train()
             except KeyboardInterrupt:
@@ -70,6 +92,15 @@ class StoppableTrainer(Trainer):
                         f"{self.checkpoint_dir}"
                     )
                 _interrupted(self._asked or signal.SIGINT)
+
+    def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
+        """One step, with the number of threads that suits it."""
+        with self._thread_choice.step(device=torch.device(self.device)):
+            return self.one_step(step)
+
+    def one_step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
+        """One step: the loss, its parts, and other numbers. As nerfstudio's."""
+        return super().train_iteration(step)
 
     @contextmanager
     def _signals_noted(self) -> Iterator[None]:

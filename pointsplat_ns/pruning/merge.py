@@ -6,6 +6,9 @@ the projection), centre, covariance and colour. The cost of a pair is the expect
 :mod:`~pointsplat_ns.pruning.viewpoints` and :mod:`~pointsplat_ns.pruning.traces`. Two numbers of the result are chosen
 by small renders, see :mod:`~pointsplat_ns.pruning.finishing`.
 
+Everything is computed on one thread each, in pieces that several threads take: so the result is the same bits on any
+number of threads, and no thread waits for another within an operation.
+
 Memory: besides the scene itself about 0.4 kB a Gaussian. SH coefficients are read twice, in pieces: for the principal
 axes of colours, and at the end for the means of members.
 """
@@ -36,6 +39,7 @@ from pointsplat_ns.pruning.traces import how_much_seen, photo_places
 from pointsplat_ns.pruning.view_sampling import PROBED, is_room
 from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, viewpoints, weights_seen, weights_seen_from
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
+from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import Views
 
 NEIGHBOURS = 8
@@ -135,18 +139,22 @@ def _levels(
     if not counts:
         return
     dense = scene.to(device="cpu")
-    copies = Copies(dense, _visible(dense, counts[0]))
+    with one_thread_each():
+        copies = Copies(dense, _visible(dense, counts[0]))
     first, last = len(copies), counts[-1]
     reduced: Reduced | None = None
     for k in counts:
         left = max(k, copies.distinct)
         if reduced is None or left < len(reduced.members):
-            reduced = copies.reduced(left)
-            merging = Merging(reduced.scene, reduced.members, views)
+            with one_thread_each():
+                reduced = copies.reduced(left)
+                merging = Merging(reduced.scene, reduced.members, views)
         while len(merging) > k:
-            merging.round(k)
+            with one_thread_each():
+                merging.round(k)
             report(0.95 * (first - len(merging)) / max(first - last, 1))
-        merged = merging.level()
+        with one_thread_each():
+            merged = merging.level()
         if k == last:
             report(1.0)
         assignment = merged.assignment[reduced.index]

@@ -16,8 +16,9 @@ from pointsplat_ns.rasterizer.constants import ALPHA_MAX, CHUNK, EXACT, TILE, Qu
 from pointsplat_ns.rasterizer.quadratics import PIXELS, basis_of, table_of
 from pointsplat_ns.rasterizer.tiles import Footprints, Region
 
-_BLOCK_PAIRS = 2**12  # pairs evaluated at once, for each thread of a CPU: 1 MB a work array in float32
-_BLOCK_PAIRS_COMPILED = 2**11  # compiled kernels have no calls to save, and fit the cache better
+_BLOCK_PAIRS = 2**13  # pairs evaluated at once: 2 MB a work array in float32. Not by the number of threads: how lists
+# are cut decides how sums are rounded, and an image must not depend on how many threads are free
+_BLOCK_PAIRS_COMPILED = 2**12  # compiled kernels have no calls to save, and fit the cache better
 _BLOCK_PAIRS_GPU = 2**18
 _LONGEST_CHUNK = 1024
 
@@ -70,8 +71,7 @@ class Frame:
         self.sorted = Tiles(ids, x, y, tiles.offsets[ids], tiles.offsets[ids + 1])
         self.pairs_count = tiles.gaussians.numel()
         self.gaussians = F.pad(tiles.gaussians, (0, 1), value=tiles.order.numel())  # the last pair is padding
-        pairs = _BLOCK_PAIRS_COMPILED if compiled else _BLOCK_PAIRS
-        pairs = _BLOCK_PAIRS_GPU if lengths.is_cuda else pairs * torch.get_num_threads()
+        pairs = _BLOCK_PAIRS_GPU if lengths.is_cuda else _BLOCK_PAIRS_COMPILED if compiled else _BLOCK_PAIRS
         self.block = max(1, min(pairs // CHUNK, self.occupied))  # tiles
         self.capacity = pairs
 

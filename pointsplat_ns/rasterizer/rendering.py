@@ -87,9 +87,8 @@ def rasterization(
     colour above 6e30, whose gradients float32 could not hold) is not drawn, gets a zero gradient and is
     counted in ``meta["skipped"]``.
 
-    The same input gives the same bits, forward and backward, on the same machine with the same number of
-    threads. Another number of threads sums gradients in another order (1 and 2 were seen to give the same
-    image and gradients 6e-7 apart); so may another machine, device or version of torch.
+    The same input gives the same bits, forward and backward, on the same machine, on any number of threads.
+    Another machine, device or version of torch may sum in another order.
 
     Args:
         means: centres, world space.

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from pointsplat_ns.refiner.config import RefinerConfig
 from pointsplat_ns.refiner.normalize import Features
+from pointsplat_ns.system.threads import one_thread
 
 
 class BatchNorm(nn.BatchNorm1d):
@@ -49,7 +50,8 @@ class SceneNorm(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         if x.shape[0] < 2:
             return (x - x) * self.weight + self.bias
-        return nn.functional.batch_norm(x, None, None, self.weight, self.bias, True, 0.0, self.eps)
+        with one_thread():  # shared between threads, its sums are rounded by their number
+            return nn.functional.batch_norm(x, None, None, self.weight, self.bias, True, 0.0, self.eps)
 
 
 def make_norm(kind: str, channels: int) -> nn.Module:

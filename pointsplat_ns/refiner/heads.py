@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import torch
 from torch import Tensor, nn
 
 from pointsplat_ns.refiner.config import RefinerConfig
+from pointsplat_ns.system.threads import one_thread
 
 CPU_ROWS = 4096
 """Rows that a CPU computes at a time, so that hidden layers fit into its cache (a quarter faster)."""
@@ -36,7 +39,9 @@ class ResidualHeads(nn.Module):
     def _forward(self, x: Tensor) -> dict[str, Tensor]:
         out = {}
         for name, mlp in self.mlps.items():
-            residual = mlp(x)
+            # A matrix times one column is shared between threads in a way that rounds by their number.
+            with one_thread() if name == "opacities" else nullcontext():
+                residual = mlp(x)
             out[name] = residual.tanh() * self.means_reach if name == "means" else residual
         return out
 

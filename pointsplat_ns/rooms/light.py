@@ -6,8 +6,6 @@ coarser grid, together with the visible share of each light, which the highlight
 """
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +14,7 @@ from torch import Tensor
 from pointsplat_ns.rooms.building import Light, RoomSpec
 from pointsplat_ns.rooms.raycast import CHARTS, chart_points, chart_size, dot, occluded, surface, trace, unit
 from pointsplat_ns.rooms.textures import Canvas
+from pointsplat_ns.system.threads import one_thread
 
 TEXEL = 0.0075  # metres: a pixel of a 320 x 240 picture with 78 degrees covers that at 1.5 m
 LUMEL = 0.12  # metres between points where light is computed
@@ -94,21 +93,6 @@ class BakedRoom:
     shininess: Tensor
     emission: Tensor
     exposure: float
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Runs torch's kernels on the calling thread.
-
-    The work is cut to the cache's size, too little per kernel to share: with two threads on a machine
-    busy with other work, waiting for each other made it ten times slower.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def bake(spec: RoomSpec) -> BakedRoom:

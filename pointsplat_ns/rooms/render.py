@@ -4,9 +4,10 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.rooms.building import Light
-from pointsplat_ns.rooms.light import BakedRoom, one_thread
+from pointsplat_ns.rooms.light import BakedRoom
 from pointsplat_ns.rooms.raycast import dot, surface, trace_camera, unit
 from pointsplat_ns.rooms.room import Room
+from pointsplat_ns.system.threads import one_thread
 
 SUBPIXELS = 2  # rays per pixel and axis
 _BAND = 1 << 15  # rays of a band of rows

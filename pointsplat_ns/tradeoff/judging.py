@@ -18,6 +18,7 @@ from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.metrics import SSIM_WINDOW, ImageError, finite_psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.system.threads import fixed_threads
 from pointsplat_ns.tradeoff.machine import OtherPrograms
 from pointsplat_ns.tradeoff.points import Quality, picture_path
 from pointsplat_ns.views import Views, spread_indices
@@ -112,7 +113,8 @@ class Judge:
             progress((i + 1) / (passes * len(self.views)))
         self._write(pictures, key)
         others = OtherPrograms()
-        times = [[_timed(scene, self.views, i) for i in range(len(self.views))] for _ in range(ROUNDS)]
+        with fixed_threads(torch.get_num_threads()):  # else each could be timed on another number
+            times = [[_timed(scene, self.views, i) for i in range(len(self.views))] for _ in range(ROUNDS)]
         per_view = [1000 * min(rounds) for rounds in zip(*times, strict=True)]
         low, middle, high = (float(value) for value in np.quantile(per_view, (0.25, 0.5, 0.75)))
         progress(1.0)

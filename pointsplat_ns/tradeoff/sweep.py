@@ -15,8 +15,8 @@ from pointsplat_ns.compression.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import cut_sh, method_named, need_usable, ply_bytes
+from pointsplat_ns.system.cores import cores
 from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.system.threads import cores
 from pointsplat_ns.tradeoff.journal import POINTS, Journal
 from pointsplat_ns.tradeoff.judging import Judge, Judged, LookedAt
 from pointsplat_ns.tradeoff.loss import recommend

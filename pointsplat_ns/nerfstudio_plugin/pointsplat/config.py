@@ -19,6 +19,7 @@ from pointsplat_ns.io.runs import REFINER_METHOD, step_of
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
+from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainerConfig
 
 RATES = {
     "encoder": 1e-4,
@@ -53,7 +54,7 @@ WARM_UP = 0.05
 
 
 @dataclass
-class PointSplatTrainerConfig(TrainerConfig):
+class PointSplatTrainerConfig(StoppableTrainerConfig):
     """nerfstudio's trainer, with the learning-rate schedules fitted to the length of the run"""
 
     _target: type = field(default_factory=lambda: PointSplatTrainer)

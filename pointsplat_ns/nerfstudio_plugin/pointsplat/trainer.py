@@ -83,7 +83,7 @@ class PointSplatTrainer(StoppableTrainer):
             raise PointSplatError(f"--max-skipped-steps {self.config.max_skipped_steps}: expected at least 0")
         return AveragingOptimizers(self.config.optimizers.copy(), groups, self.pipeline.training_state.counted)
 
-    def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
+    def one_step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
         """As nerfstudio's, but skips a step whose loss or gradients are not finite.
 
         With a gradient scaler (``--mixed-precision``), the scaler handles gradients that overflow.

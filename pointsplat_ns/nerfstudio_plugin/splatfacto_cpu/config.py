@@ -18,7 +18,7 @@ from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConf
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.early_look import EarlyLook
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig, SplatfactoCpuPipelineConfig
-from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainer
+from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainer, StoppableTrainerConfig
 
 SPLATFACTO_STEPS = 30_000
 """Training steps that Splatfacto's schedules were chosen for."""
@@ -48,7 +48,7 @@ class SplatfactoCpuTrainer(StoppableTrainer):
 
 
 @dataclass
-class SplatfactoCpuTrainerConfig(TrainerConfig):
+class SplatfactoCpuTrainerConfig(StoppableTrainerConfig):
     """nerfstudio's trainer, with Splatfacto's schedules fitted to the length of the run"""
 
     _target: type = field(default_factory=lambda: SplatfactoCpuTrainer)

@@ -36,6 +36,7 @@ from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND, RasterizerOptions
+from pointsplat_ns.system.threads import one_thread
 
 LONE_POINT_SCALE = 0.01
 """Standard deviation, in scene units, of the first Gaussian of a scene with a single seed point."""
@@ -243,13 +244,13 @@ class SplatfactoCpuModel(SplatfactoModel):
             colors = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
             degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
         else:
-            colors, degree = torch.sigmoid(params["features_dc"]), None
+            colors, degree = _sigmoid(params["features_dc"]), None
         return self.config.rasterize(
             training=self.training,
             means=params["means"],
             quats=params["quats"],
             scales=torch.exp(params["scales"]),
-            opacities=torch.sigmoid(params["opacities"][:, 0]),
+            opacities=_sigmoid(params["opacities"][:, 0]),
             colors=colors,
             viewmats=viewmats_from_opengl(camera_to_worlds),
             Ks=intrinsics,
@@ -350,3 +351,9 @@ class SplatfactoCpuPipeline(VanillaPipeline):
         if lpips.reason is not None:
             report |= {"lpips": None, "lpips_note": lpips.reason}
         return report
+
+
+def _sigmoid(values: Tensor) -> Tensor:
+    """torch's, whose rounding depends on the number of threads, on one."""
+    with one_thread():
+        return torch.sigmoid(values)
