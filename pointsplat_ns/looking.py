@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pointsplat_ns.api import Source, load
 from pointsplat_ns.compression.view_source import ViewSource
@@ -17,6 +18,9 @@ from pointsplat_ns.viewing.camera_path import Shot, camera_path
 from pointsplat_ns.viewing.film import Cast, Split, frames_of
 from pointsplat_ns.viewing.video import check_output, write_frames
 from pointsplat_ns.views import RasterizeMode, Views
+
+if TYPE_CHECKING:
+    from pointsplat_ns.viewing.viewer import Viewer
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -88,6 +92,43 @@ def render_path(
     logger.info("%d frames of %d x %d: %s", len(chosen.views), chosen.views.width, chosen.views.height, chosen.origin)
     frames = tracked(frames_of(cast, chosen.views, chosen.fps), "rendering", len(chosen.views), progress)
     return write_frames(frames, output, chosen.fps, force)
+
+
+def open_viewer(scene: Source, other: Source | None = None, *, host: str = "127.0.0.1", port: int = 7007) -> Viewer:
+    """Show a scene, or two from the same camera, in the browser. Everything is drawn by this machine, on a CPU if it
+    has nothing else.
+
+    It opens upright: at the first of the dataset's poses if there are any, else at a sampled view.
+
+    Args:
+        scene: N Gaussians, or where to read them.
+        other: a second scene in the same place, to compare with; by default the first is compared with all of itself.
+        host: the address to listen on; by default only this machine is answered. Whoever reaches another one may look.
+        port: the first port that is tried; 0 takes any that is free.
+
+    Returns:
+        The viewer, to be closed, or used in a ``with`` block; ``url`` says where it is.
+
+    Raises:
+        SceneError: if a scene is not usable.
+        DataError: if there is no place to look from.
+        PointSplatError: if the port cannot be listened on.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> with ps.open_viewer(ps.example_room()[::20], port=0) as viewer:
+        ...     viewer.url.startswith("http://127.0.0.1:")
+        True
+    """
+    from pointsplat_ns.viewing.viewer import Exhibit, Viewer
+
+    exhibits = []
+    for index, source in enumerate([scene] if other is None else [scene, other]):
+        loaded = source if isinstance(source, Gaussians) else load(source)
+        exhibits.append(
+            Exhibit(_name(source, index), loaded, _source(source, loaded, None), _mode(source, "classic"))
+        )
+    return Viewer(exhibits, host, port)
 
 
 def _source(scene: Source, loaded: Gaussians, given: Views | None) -> ViewSource:
