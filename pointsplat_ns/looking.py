@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.api import Source, load
+from pointsplat_ns.compression.placing import axis_named
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.runs import may_be_run, open_run
+from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.system.progress import Progress, tracked
 from pointsplat_ns.viewing.camera_path import Shot, camera_path
@@ -33,6 +35,7 @@ def render_path(
     path: str | Path | Views = "auto",
     split: Split = "side-by-side",
     labels: Sequence[str] | None = None,
+    up: str | None = None,
     width: int | None = None,
     height: int | None = None,
     fps: float | None = None,
@@ -52,6 +55,7 @@ def render_path(
             else "walk". Or a camera path that nerfstudio's viewer saved (JSON), or views to go through.
         split: two scenes are shown "side-by-side", or with a line that wipes ("wipe") from one to the other.
         labels: what is written on two scenes; by default their names and counts. An empty list writes nothing.
+        up: the axis that is up in the scene ("z", "-y"), for walks and orbits; by default it is estimated.
         width: of the picture of one scene, pixels; by default that of the dataset or the saved path, at most 960.
         height: of the same.
         fps: frames a second; by default 24, or what the saved path says.
@@ -78,11 +82,13 @@ def render_path(
     if split not in ("side-by-side", "wipe"):
         raise PointSplatError(f"split is {split!r}; expected side-by-side or wipe")
     shot = Shot(width, height, fps, seconds)
+    upward = None if up is None else axis_named(up)
     kind = check_output(output, force)
     sources = [scene] if other is None else [scene, other]
     loaded = [source if isinstance(source, Gaussians) else load(source) for source in sources]
     views = _source(scene, loaded[0], path if isinstance(path, Views) else None)
-    chosen = camera_path(loaded[0], views, "dataset" if isinstance(path, Views) else path, shot, kind == "picture")
+    way = "dataset" if isinstance(path, Views) else path
+    chosen = camera_path(loaded[0], views, way, shot, kind == "picture", upward)
     modes = [_mode(source, chosen.views.rasterize_mode) for source in sources]
     if labels is None:
         labels = [f"{_name(s, i)}, {len(g):,} Gaussians" for i, (s, g) in enumerate(zip(sources, loaded, strict=True))]
@@ -94,7 +100,14 @@ def render_path(
     return write_frames(frames, output, chosen.fps, force)
 
 
-def open_viewer(scene: Source, other: Source | None = None, *, host: str = "127.0.0.1", port: int = 7007) -> Viewer:
+def open_viewer(
+    scene: Source,
+    other: Source | None = None,
+    *,
+    up: str | None = None,
+    host: str = "127.0.0.1",
+    port: int = 7007,
+) -> Viewer:
     """Show a scene, or two from the same camera, in the browser. Everything is drawn by this machine, on a CPU if it
     has nothing else.
 
@@ -103,6 +116,7 @@ def open_viewer(scene: Source, other: Source | None = None, *, host: str = "127.
     Args:
         scene: N Gaussians, or where to read them.
         other: a second scene in the same place, to compare with; by default the first is compared with all of itself.
+        up: the axis that is up in the scene ("z", "-y"); by default it is estimated.
         host: the address to listen on; by default only this machine is answered. Whoever reaches another one may look.
         port: the first port that is tried; 0 takes any that is free.
 
@@ -122,13 +136,13 @@ def open_viewer(scene: Source, other: Source | None = None, *, host: str = "127.
     """
     from pointsplat_ns.viewing.viewer import Exhibit, Viewer
 
-    exhibits = []
+    upward, exhibits = None if up is None else axis_named(up), []
     for index, source in enumerate([scene] if other is None else [scene, other]):
         loaded = source if isinstance(source, Gaussians) else load(source)
-        exhibits.append(
-            Exhibit(_name(source, index), loaded, _source(source, loaded, None), _mode(source, "classic"))
-        )
-    return Viewer(exhibits, host, port)
+        path = None if isinstance(source, Gaussians) else Path(source)
+        views, mode = _source(source, loaded, None), _mode(source, "classic")
+        exhibits.append(Exhibit(_name(source, index), path, loaded, views, mode))
+    return Viewer(exhibits, host, port, upward)
 
 
 def _source(scene: Source, loaded: Gaussians, given: Views | None) -> ViewSource:
@@ -148,4 +162,10 @@ def _mode(scene: Source, usual: RasterizeMode) -> RasterizeMode:
 
 
 def _name(scene: Source, index: int) -> str:
-    return ("first", "second")[index] if isinstance(scene, Gaussians) else Path(scene).resolve().name
+    """What a scene is called: by its run's experiment, or its file."""
+    if isinstance(scene, Gaussians):
+        return ("first", "second")[index]
+    if may_be_run(scene):
+        with suppress(SceneError):
+            return scene_name(open_run(scene, need_data=False))
+    return Path(scene).resolve().name

@@ -139,3 +139,38 @@ def test_picture_is_the_first_frame(scene, tmp_path):
     shown = np.asarray(Image.open(tmp_path / "one.png"))
     best = ps.sample_views(scene, 12, 64, 48)[0]
     assert np.abs(shown - pixels_of(ps.render(scene, best)).astype(int)).max() <= 2
+
+
+def test_up_may_be_said(scene, tmp_path):
+    """Turned over, the same walk shows what is up below."""
+    ps.render_path(scene, tmp_path / "up.png", up="-y", **SMALL)
+    ps.render_path(scene, tmp_path / "down.png", up="y", **SMALL)
+    assert (tmp_path / "up.png").read_bytes() != (tmp_path / "down.png").read_bytes()
+    with pytest.raises(ps.PointSplatError, match="up is 'w'; expected x, y, z, -x, -y or -z"):
+        ps.render_path(scene, tmp_path / "none.png", up="w")
+    with ps.open_viewer(scene, up="-y", port=0) as viewer:
+        assert viewer._up.tolist() == [0, -1, 0]
+
+
+def test_viewer_begins_with_the_poses_of_a_run(trained_walls):
+    run = run_of(trained_walls, "wall-b")
+    with ps.open_viewer(run, port=0) as viewer:
+        assert viewer.origin == "poses of the dataset"
+        assert torch.equal(viewer._starts[0].viewmat, ps.dataset_views(run)[0].viewmat)
+        assert viewer._exhibits[0].mode == "antialiased" and viewer._exhibits[0].name == "wall-b"
+
+
+def test_address_that_cannot_be_listened_on_ends_the_command_in_one_line(files, capsys):
+    with pytest.raises(SystemExit):
+        main(["view", str(files / "ball.ply"), "--host", "192.0.2.1"])
+    assert capsys.readouterr().err.startswith("error: cannot listen on 192.0.2.1, port 7007")
+
+
+def test_news_of_merging_does_not_begin_pictures_anew(scene, monkeypatch):
+    with ps.open_viewer(scene, port=0) as viewer:
+        begun = []
+        monkeypatch.setattr(viewer, "_redraw", lambda: begun.append(viewer))
+        viewer._changed(False)
+        assert not begun
+        viewer._changed(True)
+        assert begun == [viewer]

@@ -18,6 +18,7 @@ def render(
     path: str = "auto",
     split: Literal["side-by-side", "wipe"] = "side-by-side",
     labels: tuple[str, ...] | None = None,
+    up: str | None = None,
     width: int | None = None,
     height: int | None = None,
     fps: float | None = None,
@@ -38,6 +39,8 @@ def render(
             (.json).
         split: how two scenes are shown.
         labels: what is written on two scenes; by default their names and counts. "" writes nothing on one.
+        up: the axis that is up in the scene, for walks and orbits: x, y, z, -x, -y or -z; by default it is estimated.
+            Write --up=-y for a negative axis.
         width: of the picture of one scene, pixels; by default that of the dataset or the saved path, at most 960.
         height: of the same.
         fps: frames a second; by default 24, or what the saved path says.
@@ -49,8 +52,8 @@ def render(
     start = time.perf_counter()
     output = output or _beside(scene)
     count = ps.render_path(
-        scene, output, other, path=path, split=split, labels=labels, width=width, height=height, fps=fps,
-        seconds=seconds, force=force, progress=True,
+        scene, output, other, path=path, split=split, labels=labels, up=up, width=width, height=height,
+        fps=fps, seconds=seconds, force=force, progress=True,
     )  # fmt: skip
     files = output.iterdir() if output.is_dir() else [output]
     size = sum(file.stat().st_size for file in files) / 1e6

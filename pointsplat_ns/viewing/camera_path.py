@@ -6,10 +6,13 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
+from torch import Tensor
+
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.content import content_box
+from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.viewing.saved_path import MOST_FRAMES, MOST_PIXELS, read_path
 from pointsplat_ns.viewing.trajectories import STOPS, along, fitted, orbit, walk
 from pointsplat_ns.views import Views
@@ -60,7 +63,14 @@ class CameraPath:
     """Text that says what the path is made of."""
 
 
-def camera_path(scene: Gaussians, source: ViewSource, path: str | Path, shot: Shot, one: bool = False) -> CameraPath:
+def camera_path(
+    scene: Gaussians,
+    source: ViewSource,
+    path: str | Path,
+    shot: Shot,
+    one: bool = False,
+    up: Tensor | None = None,
+) -> CameraPath:
     """The cameras of a film of a scene.
 
     Args:
@@ -71,6 +81,7 @@ def camera_path(scene: Gaussians, source: ViewSource, path: str | Path, shot: Sh
             viewer saved.
         shot: size, speed and length.
         one: of only one picture, the first.
+        up: (3,) of length 1, which way is up in a walk or an orbit; by default as the views have it, or as is estimated.
 
     Raises:
         DataError: if there are no views, or the file is no camera path.
@@ -96,12 +107,25 @@ def camera_path(scene: Gaussians, source: ViewSource, path: str | Path, shot: Sh
         views = along(_sized(known, shot), frames)
         skipped = f", {len(known) - frames} of {len(known)} left out" if frames < len(known) and not one else ""
         return CameraPath(views, fps, f"along the {source.origin}{skipped}")
-    stops = known.spread(2 * STOPS) if known is not None else source.views(STOPS)
+    stops = known.spread(2 * STOPS) if known is not None else views_upright(scene, source, STOPS, up)
     stops = _sized(stops, shot, None if known is not None else SIZE)
     if path == "orbit":
         low, high = content_box(scene)
-        return CameraPath(orbit(stops, frames, 0.5 * (low + high).cpu()), fps, f"a turn, by {source.origin}")
-    return CameraPath(walk(stops, frames), fps, f"a walk past {source.origin}")
+        return CameraPath(orbit(stops, frames, 0.5 * (low + high).cpu(), up), fps, f"a turn, by {source.origin}")
+    return CameraPath(walk(stops, frames, up), fps, f"a walk past {source.origin}")
+
+
+def views_upright(scene: Gaussians, source: ViewSource, count: int, up: Tensor | None) -> Views:
+    """At most ``count`` views of a scene, sampled with ``up`` (3,) up if that is said and no poses are known.
+
+    Raises:
+        DataError: if there are none.
+    """
+    if up is None or source.known(1) is not None:
+        return source.views(count)
+    usual = source.views(1)
+    sampled = sample_views(scene, count, up=up)
+    return dataclasses.replace(sampled, rasterize_mode=usual.rasterize_mode)
 
 
 def _frames(seconds: float, fps: float) -> int:

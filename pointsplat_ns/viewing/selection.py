@@ -56,12 +56,12 @@ class Selection:
     Args:
         scene: N Gaussians. Those that cannot be drawn are left out.
         source: where its views come from: merging looks from those of its dataset.
-        changed: called, from any thread, when another scene is shown or there is news of the merging.
+        changed: called, from any thread, with True when another scene is shown, with False when there is only news.
         rest: seconds that a budget has to stay before it is merged.
     """
 
     def __init__(
-        self, scene: Gaussians, source: ViewSource, changed: Callable[[], None], rest: float = REST_SECONDS
+        self, scene: Gaussians, source: ViewSource, changed: Callable[[bool], None], rest: float = REST_SECONDS
     ):
         self.scene = keep_usable(scene, "the scene")
         """All Gaussians that can be drawn."""
@@ -90,7 +90,7 @@ class Selection:
             self._wanted = percent = min(max(round(percent), 1), 100)
             self.shown, self.news = self._at(percent), ""
             self._changed.notify_all()
-        self._report()
+        self._report(True)
 
     def close(self, timeout: float = 5.0) -> None:
         """Stop merging, and wait until that has stopped, for so many seconds."""
@@ -135,7 +135,7 @@ class Selection:
                 self._keep(wanted, merged)
                 if wanted == self._wanted:
                     self.shown, self.news = merged, ""
-            self._report()
+            self._report(True)
 
     def _merge(self, percent: int) -> Shown:
         def report(share: float) -> None:
@@ -144,7 +144,7 @@ class Selection:
             news = f"merging, {100 * share:.0f} %"
             if news != self.news:
                 self.news = news
-                self._report()
+                self._report(False)
 
         report(0.0)
         views = self._source.known(MERGED_FROM)

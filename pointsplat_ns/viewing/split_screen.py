@@ -22,8 +22,8 @@ from pointsplat_ns.views import RasterizeMode, View
 if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont
 
-LINE = 2
-"""Width of the line between two scenes, pixels."""
+_THICK = 640
+"""Pictures from this width on have a line of two pixels, others of one."""
 
 _TEXT = 0.03
 """Height of labels, as a share of the picture's."""
@@ -88,9 +88,10 @@ def with_line(pixels: np.ndarray, column: int) -> np.ndarray:
     if not 0 < column < pixels.shape[1]:
         return pixels
     pixels = pixels.copy()
-    left = max(column - LINE // 2, 0)
-    pixels[:, max(left - 1, 0) : left + LINE + 1] //= 3
-    pixels[:, left : left + LINE] = 255
+    thick = 2 if pixels.shape[1] >= _THICK else 1
+    left = column - thick // 2
+    pixels[:, max(left - 1, 0) : left + thick + 1] //= 3
+    pixels[:, left : left + thick] = 255
     return pixels
 
 

@@ -60,12 +60,13 @@ def along(views: Views, frames: int) -> Views:
     return _posed(views, viewmats, np.interp(np.arange(frames), knots, range(len(knots))), knots)
 
 
-def walk(views: Views, frames: int) -> Views:
+def walk(views: Views, frames: int, up: Tensor | None = None) -> Views:
     """A smooth, upright walk past some views of a scene, in an order that makes it short. Cameras do not lean.
 
     Args:
         views: C cameras; at most 12 of them, evenly spread, are passed.
         frames: number of frames, at least 1.
+        up: (3,) of length 1, which way is up; by default as the views have it.
 
     Returns:
         ``frames`` cameras, float64.
@@ -78,7 +79,7 @@ def walk(views: Views, frames: int) -> Views:
     order = _tour(_distances(places, turns))
     views, places, turns = views[order], places[order], turns[order]
     knots = _knots(_lengths(places, turns), frames)
-    up = up_of(views)
+    up = up_of(views) if up is None else up
     yaw, pitch = _angles(torch.from_numpy(turns[:, :, 2]), up)
     angles = np.stack([np.unwrap(yaw.numpy()), pitch.numpy()], axis=1)
     angles = angles.repeat(frames, axis=0) if len(views) == 1 else _smooth(knots, angles, frames)
@@ -87,7 +88,7 @@ def walk(views: Views, frames: int) -> Views:
     return _posed(views, viewmats, np.interp(np.arange(frames), knots, range(len(knots))), knots)
 
 
-def orbit(views: Views, frames: int, centre: Tensor) -> Views:
+def orbit(views: Views, frames: int, centre: Tensor, up: Tensor | None = None) -> Views:
     """A turn about what views look at, at their usual distance and height; it ends where it began.
 
     Where no view is on some side, the path swings to and fro over the others. In a room, where views look away from
@@ -97,6 +98,7 @@ def orbit(views: Views, frames: int, centre: Tensor) -> Views:
         views: C cameras.
         frames: number of frames, at least 1.
         centre: (3,) of the content of the scene, which decides where the views do not.
+        up: (3,) of length 1, which way is up; by default as the views have it.
 
     Returns:
         ``frames`` cameras, float64.
@@ -106,7 +108,7 @@ def orbit(views: Views, frames: int, centre: Tensor) -> Views:
     """
     _check(views, frames)
     places, turns = (torch.from_numpy(values) for values in _poses(views))
-    ahead, up = turns[:, :, 2], up_of(views)
+    ahead, up = turns[:, :, 2], up_of(views) if up is None else up
     focus = _looked_at(places, ahead, centre.double())
     time = 2 * math.pi * torch.arange(frames, dtype=torch.float64) / frames
     still = np.zeros(frames)

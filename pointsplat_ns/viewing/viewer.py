@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
+import shlex
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from pointsplat_ns.geometry.quaternions import rotation_matrices
 from pointsplat_ns.pruning.content import thinned
 from pointsplat_ns.pruning.view_sampling import PROBED
 from pointsplat_ns.rasterizer import render_depth
+from pointsplat_ns.viewing.camera_path import views_upright
 from pointsplat_ns.viewing.painter import Camera, Painter, Sight
 from pointsplat_ns.viewing.schedule import FULL_SIDE, Step
 from pointsplat_ns.viewing.selection import Selection, Shown
@@ -39,6 +42,8 @@ class Exhibit:
     """A scene to show."""
 
     name: str
+    path: Path | None
+    """Where it was read from."""
     scene: Gaussians
     source: ViewSource
     """Where views of it come from."""
@@ -56,13 +61,13 @@ class Viewer:
         ...     viewer.wait()
     """
 
-    def __init__(self, exhibits: Sequence[Exhibit], host: str, port: int):
+    def __init__(self, exhibits: Sequence[Exhibit], host: str, port: int, up: Tensor | None = None):
         first = exhibits[0]
         self._exhibits = exhibits
-        self._starts = first.source.views(STARTS)
+        self._starts = views_upright(first.scene, first.source, STARTS, up)
         self.origin = first.source.origin
         """Text that says where the first view comes from."""
-        self._up = up_of(self._starts)
+        self._up = up_of(self._starts) if up is None else up
         self._small = thinned(first.scene, PROBED)
         self._painters: dict[int, Painter] = {}
         self._notes: dict[int, Any] = {}
@@ -70,7 +75,9 @@ class Viewer:
         # It logs each page that is closed before it has loaded, with a traceback.
         logging.getLogger("websockets").setLevel(logging.CRITICAL + 1)
         self._server = start_server(host, port, "pointsplat")
-        self._selections = [Selection(e.scene, e.source, self._redraw) for e in exhibits]
+        self._selections: list[Selection] = []
+        for exhibit in exhibits:
+            self._selections.append(Selection(exhibit.scene, exhibit.source, self._changed))
         self._build()
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._disconnected)
@@ -104,7 +111,7 @@ class Viewer:
         """The panel beside the picture."""
         gui = self._server.gui
         gui.configure_theme(dark_mode=True, show_logo=False)  # without its share button viser 0.2.7 shows nothing
-        self._server.scene.set_up_direction(tuple(self._up.tolist()))
+        self._server.scene.set_up_direction(self._up.numpy())
         self._budgets = []
         for exhibit, selection in zip(self._exhibits, self._selections, strict=True):
             gui.add_markdown(f"**{_code(exhibit.name)}**")
@@ -118,7 +125,8 @@ class Viewer:
         self._side = gui.add_slider("Pixels", 240, 1920, 80, FULL_SIDE, hint="longer side of the picture at rest")
         self._side.on_update(lambda _: self._redraw())
         gui.add_button("Next view").on_click(lambda event: self._next(event.client))
-        gui.add_button("Upright", hint="the view again, level").on_click(lambda event: self._put(event.client))
+        gui.add_button("This view, level").on_click(lambda event: self._put(event.client))
+        gui.add_button("Turn over", hint="if the scene is upside down").on_click(lambda event: self._turn(event.client))
         self._describe()
 
     def _describe(self) -> None:
@@ -128,13 +136,18 @@ class Viewer:
             lines = [f"{len(shown.scene):,} of {whole:,} Gaussians, {shown.how}"]
             if selection.news:
                 lines.append(selection.news)
-            elif selection.percent < 100:
-                lines.append(_code(f"pointsplat prune {exhibit.name} --keep {selection.percent}%"))
+            elif exhibit.path is not None and selection.percent < 100:
+                command = ["pointsplat", "prune", str(exhibit.path), "--keep", f"{selection.percent}%"]
+                lines.append(_code(shlex.join(command)))
             note.content = "  \n".join(lines)
 
-    def _redraw(self) -> None:
-        """Something but a camera has changed."""
+    def _changed(self, picture: bool) -> None:
+        """A selection has changed, or there is news of it. News alone must not begin pictures anew."""
         self._describe()
+        if picture:
+            self._redraw()
+
+    def _redraw(self) -> None:
         for client in self._server.get_clients().values():
             self._look(client)
 
@@ -179,6 +192,11 @@ class Viewer:
 
     def _next(self, client: Any) -> None:
         self._at = (self._at + 1) % len(self._starts)
+        self._put(client)
+
+    def _turn(self, client: Any) -> None:
+        self._up = -self._up
+        self._server.scene.set_up_direction(self._up.numpy())
         self._put(client)
 
     def _put(self, client: Any) -> None:

@@ -26,7 +26,7 @@ class News:
     def __init__(self) -> None:
         self.changed = threading.Condition()
 
-    def __call__(self) -> None:
+    def __call__(self, picture: bool) -> None:
         with self.changed:
             self.changed.notify_all()
 
