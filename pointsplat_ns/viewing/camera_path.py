@@ -81,7 +81,7 @@ def camera_path(
             viewer saved.
         shot: size, speed and length.
         one: of only one picture, the first.
-        up: (3,) of length 1, which way is up in a walk or an orbit; by default as the views have it, or as is estimated.
+        up: (3,) of length 1, which way is up in a walk or an orbit; by default as the views have it, or is estimated.
 
     Raises:
         DataError: if there are no views, or the file is no camera path.

@@ -112,7 +112,8 @@ class Painter:
     def _drawn(self, step: Step[Sight]) -> np.ndarray | None:
         """The picture of a step; None if it is not wanted any more."""
         pixels = None
-        for pixels in self._paint(step):
+        for part in self._paint(step):
             if self.schedule.outdated(step):
                 return None
+            pixels = part
         return pixels

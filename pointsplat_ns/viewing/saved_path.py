@@ -104,7 +104,9 @@ def _camera(camera: Any, index: int, height: int, path: Path) -> tuple[Tensor, f
     if not bool((off <= _RIGID) & (last <= _RIGID) & (torch.linalg.det(turn) > 0)):  # NaN fails too
         raise DataError(f"{path}: the pose of camera {index} is no rigid motion; expected a rotation and a position")
     if float(pose[:3, 3].abs().max()) > _FARTHEST:
-        raise DataError(f"{path}: camera {index} is farther than {_FARTHEST:g} units from the origin; expected it nearer")
+        raise DataError(
+            f"{path}: camera {index} is farther than {_FARTHEST:g} units from the origin; expected it nearer"
+        )
     fov = _number(camera.get("fov"))
     if fov is None or not 0.1 <= fov <= 179:
         raise DataError(f"{path}: fov of camera {index} is {str(camera.get('fov'))[:40]}; expected 0.1 to 179 degrees")

@@ -120,11 +120,11 @@ class Selection:
                 while not self._closed and (self._wanted == 100 or self._wanted in self._merged):
                     self._changed.wait()
                 wanted = self._wanted
-                self._changed.wait_for(lambda at=wanted: self._closed or self._wanted != at, self._rest)
+                self._changed.wait(self._rest)
                 if self._closed:
                     return
                 if wanted != self._wanted:
-                    continue
+                    continue  # or woken for nothing: then it rested less, which is no harm
             try:
                 merged = self._merge(wanted)
             except Stopped:

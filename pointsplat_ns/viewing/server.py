@@ -12,15 +12,19 @@ import http
 import io
 import socket
 from collections.abc import Iterator, Mapping
+from importlib.metadata import version
 from typing import Any
 
 import viser
-import websockets.server
+import websockets.server as websockets_server
 
 from pointsplat_ns.errors import PointSplatError
 
 TRIED = 20
 """Number of ports that are tried, the one that is asked for first."""
+
+_SERVER: Any = websockets_server
+"""viser starts its server by ``serve`` of this module, which has it under an old name only."""
 
 POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
@@ -53,7 +57,7 @@ def start_server(host: str, port: int, label: str) -> Server:
         server = Server(host=host, port=port, label=label, verbose=False)
     if not served:
         server.stop()
-        raise PointSplatError(f"viser {viser.__version__} cannot be made safe; expected viser 0.2.7")
+        raise PointSplatError(f"viser {version('viser')} cannot be made safe; expected viser 0.2.7")
     return server
 
 
@@ -103,7 +107,7 @@ def refusal(path: str, headers: Mapping[str, str], hosts: tuple[str, ...] | None
 @contextlib.contextmanager
 def _guarded(hosts: tuple[str, ...] | None) -> Iterator[list[bool]]:
     """While this is open, servers that are started refuse what :func:`refusal` says. The list then holds one."""
-    plain, served = websockets.server.serve, []
+    plain, served = _SERVER.serve, []
 
     def serve(handler: Any, host: str, port: int, *, process_request: Any, **options: Any) -> Any:
         async def guarded(path: str, headers: Any) -> Any:
@@ -116,8 +120,8 @@ def _guarded(hosts: tuple[str, ...] | None) -> Iterator[list[bool]]:
         served.append(True)
         return plain(handler, host, port, process_request=guarded, **options)
 
-    websockets.server.serve = serve
+    _SERVER.serve = serve
     try:
         yield served
     finally:
-        websockets.server.serve = plain
+        _SERVER.serve = plain

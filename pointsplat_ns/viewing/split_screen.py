@@ -1,4 +1,4 @@
-"""Two scenes in one picture, seen from the same camera: side by side, or with a line that wipes from one to the other."""
+"""Two scenes in one picture, seen from the same camera: the line between them, and labels."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ _FACING = 0.7
 """Least share of the views that have what all look at before them, for a scene that is looked at from outside."""
 
 _OPEN = math.radians(100)
-"""A gap this wide between the sides that a scene is seen from, radians, is not crossed: nobody has looked from there."""
+"""A gap this wide between the sides that a scene is seen from, radians, is not crossed: nobody looked from there."""
 
 _ALIKE = 0.01
 """Mean squares of horizontal axes along two directions that differ by less do not tell one from the other."""

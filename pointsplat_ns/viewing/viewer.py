@@ -6,7 +6,7 @@ import logging
 import math
 import shlex
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -116,7 +116,7 @@ class Viewer:
         for exhibit, selection in zip(self._exhibits, self._selections, strict=True):
             gui.add_markdown(f"**{_code(exhibit.name)}**")
             slider = gui.add_slider("Kept, %", 1, 100, 1, 100, hint="Gaussians that are shown of this scene")
-            slider.on_update(lambda _, chosen=selection, slider=slider: chosen.choose(slider.value))
+            slider.on_update(_chooser(selection))
             self._budgets.append(gui.add_markdown(""))
         two = len(self._exhibits) == 2
         hint = "left of the line the first scene" if two else "left of the line what is kept, right of it all"
@@ -217,6 +217,15 @@ class Viewer:
         seen = depth[alpha > 0.5]
         far = float(seen.median()) if len(seen) else 1.0
         return pose[:3, 3], pose[:3, 2] * max(far, 10 * view.near_plane)
+
+
+def _chooser(selection: Selection) -> Callable[[Any], None]:
+    """What a budget's slider does."""
+
+    def choose(event: Any) -> None:
+        selection.choose(event.target.value)
+
+    return choose
 
 
 def _code(text: str) -> str:

@@ -138,6 +138,7 @@ def test_parts_for_moving_cameras_cover_as_much(scene, news, monkeypatch):
     made.close()
     part = made.shown.part(0.3)
     assert 50 <= len(part) <= 120 and made.shown.part(0.31) is part and made.shown.part(1.0) is made.shown.scene
+
     def area(some: ps.Gaussians) -> float:
         return float(some.stds.square().sum())
 

@@ -41,7 +41,9 @@ def test_page_is_served_and_asks_nobody_else(viewer):
     assert "default-src 'self'" in policy and "http" not in policy and "*" not in policy
 
 
-@pytest.mark.parametrize("path", ["/../__init__.py", "/assets/../../../_viser.py", "/../../../../../../../../etc/passwd"])
+@pytest.mark.parametrize(
+    "path", ["/../__init__.py", "/assets/../../../_viser.py", "/../../../../../../../../etc/passwd"]
+)
 def test_no_other_files_are_served(path, viewer):
     status, body, _ = answer(viewer, path)
     assert status == 404 and body == b""
