@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.folders import compact_folder
     from pointsplat_ns.gaussians import Gaussians
     from pointsplat_ns.io.scene import save
+    from pointsplat_ns.looking import open_viewer, render_path
     from pointsplat_ns.metrics import psnr, ssim
     from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
     from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import measure_tradeoff
@@ -60,6 +61,7 @@ _PUBLIC = {
     "pointsplat_ns.folders": ("compact_folder",),
     "pointsplat_ns.gaussians": ("Gaussians",),
     "pointsplat_ns.io.scene": ("save",),
+    "pointsplat_ns.looking": ("open_viewer", "render_path"),
     "pointsplat_ns.metrics": ("psnr", "ssim"),
     "pointsplat_ns.nerfstudio_plugin.dataset_views": ("dataset_views",),
     "pointsplat_ns.nerfstudio_plugin.measure_tradeoff": ("measure_tradeoff",),
@@ -99,6 +101,7 @@ __all__ = [
     "lpips",
     "make_refiner",
     "measure_tradeoff",
+    "open_viewer",
     "place",
     "plot_comparison",
     "plot_distributions",
@@ -107,6 +110,7 @@ __all__ = [
     "rasterization",
     "refine",
     "render",
+    "render_path",
     "report",
     "sample_views",
     "save",

@@ -94,9 +94,11 @@ def main(args: list[str] | None = None) -> None:
     from pointsplat_ns.cli.make_feedback import make_feedback
     from pointsplat_ns.cli.make_refiner import make_refiner
     from pointsplat_ns.cli.prune import prune
+    from pointsplat_ns.cli.render import render
     from pointsplat_ns.cli.report import report
     from pointsplat_ns.cli.rooms import rooms
     from pointsplat_ns.cli.tradeoff import tradeoff
+    from pointsplat_ns.cli.view import view
     from pointsplat_ns.errors import PointSplatError
     from pointsplat_ns.system.memory import keep_freed_memory
 
@@ -108,6 +110,8 @@ def main(args: list[str] | None = None) -> None:
         "tradeoff": tradeoff,
         "convert": convert,
         "info": info,
+        "view": view,
+        "render": render,
         "export": export,
         "report": report,
         "rooms": rooms,

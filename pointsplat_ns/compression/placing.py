@@ -119,6 +119,17 @@ def _directions(up: str) -> tuple[Tensor | None, Tensor]:
     return (None if match[1] is None else _axis(match[1])), _axis(match[2])
 
 
+def axis_named(text: str) -> Tensor:
+    """A world axis (3,), float64, by its name, such as "z" or "-y".
+
+    Raises:
+        PointSplatError: if there is no such axis.
+    """
+    if not re.fullmatch(r"[+-]?[xyz]", text.strip().lower()):
+        raise PointSplatError(f"up is {text!r}; expected x, y, z, -x, -y or -z")
+    return _axis(text.strip().lower())
+
+
 def _axis(text: str) -> Tensor:
     axis = torch.zeros(3, dtype=torch.float64)
     axis[_AXES[text[-1]]] = -1.0 if text[0] == "-" else 1.0

@@ -49,7 +49,8 @@ class ViewSource:
         self._scene, self._given, self._run, self._dataset_views = scene, given, run, dataset_views
         self.origin = ""
         """Text that says where views came from; empty until there are some."""
-        self._missing = ""
+        self.missing = ""
+        """Text in brackets that says why a run's dataset gives no poses; empty if it does, or was not looked for."""
         self._rasterize_mode: RasterizeMode = "classic"
 
     @property
@@ -68,7 +69,7 @@ class ViewSource:
         try:
             return self._dataset_views(self._run)
         except (SceneError, DataError) as error:
-            self._missing = f" (no dataset: {error})"
+            self.missing = f" (no dataset: {error})"
             return None
 
     def views(self, count: int) -> Views:
@@ -88,7 +89,7 @@ class ViewSource:
             return self._of_dataset.spread(count)
         views = views_about(self._scene, self._photos, count)
         where = "in free space" if self._photos is None else "about where photos were taken, as the Gaussians tell"
-        self.origin = f"poses sampled {where}{self._missing}"
+        self.origin = f"poses sampled {where}{self.missing}"
         return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
 
     @cached_property

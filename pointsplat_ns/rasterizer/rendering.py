@@ -25,7 +25,7 @@ def _cat(tensors: list[Tensor]) -> Tensor:
     return tensors[0] if len(tensors) == 1 else torch.cat(tensors)
 
 
-def _finite_colors(seen: Projected, *rest) -> tuple[Projected, Tensor, Tensor]:
+def finite_colors(seen: Projected, *rest) -> tuple[Projected, Tensor, Tensor]:
     """What a camera sees without the Gaussians whose colour is NaN or too large, the colours, and the ids dropped."""
     colors = _colors_of(seen, *rest)
     dropped = seen.ids[:0]
@@ -170,7 +170,7 @@ def rasterization(
     skipped = count_meaningless(means, quats, scales, opacities)
     channels = []
     if render_mode.startswith("RGB"):
-        colored = [_finite_colors(s, colors, c, per_camera, sh_degree) for c, s in enumerate(seen)]
+        colored = [finite_colors(s, colors, c, per_camera, sh_degree) for c, s in enumerate(seen)]
         seen = [projected for projected, _, _ in colored]
         channels.append(_cat([values for _, values, _ in colored]))
         skipped += torch.cat([bad for _, _, bad in colored]).unique().numel()

@@ -1,0 +1,69 @@
+"""``pointsplat render``: a film of one scene, or of two."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from pointsplat_ns.cli.scene_options import Scene
+
+
+def render(
+    scene: Scene,
+    other: tyro.conf.Positional[Path | None] = None,
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None,
+    path: str = "auto",
+    split: Literal["side-by-side", "wipe"] = "side-by-side",
+    labels: tuple[str, ...] | None = None,
+    up: str | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    fps: float | None = None,
+    seconds: float | None = None,
+    force: bool = False,
+) -> None:
+    """Film a scene along a camera path, or two scenes from the same cameras, on any machine.
+
+    For example: pointsplat render room.ply room_pruned.ply --split wipe -o room.mp4
+
+    Args:
+        scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
+        other: a second scene in the same place, to compare with.
+        output: .mp4 for a video, a folder for PNG frames, .png for the first frame alone; by default a video beside the
+            scene: room.mp4 for room.ply, render.mp4 in the folder of a run. It appears when it is complete.
+        path: dataset (exactly through the poses of the run's dataset), walk (past sampled views), orbit (about what
+            they show), auto (dataset if there is one, else walk), or a camera path that nerfstudio's viewer saved
+            (.json).
+        split: how two scenes are shown.
+        labels: what is written on two scenes; by default their names and counts. "" writes nothing on one.
+        up: the axis that is up in the scene, for walks and orbits: x, y, z, -x, -y or -z; by default it is estimated.
+            Write --up=-y for a negative axis.
+        width: of the picture of one scene, pixels; by default that of the dataset or the saved path, at most 960.
+        height: of the same.
+        fps: frames a second; by default 24, or what the saved path says.
+        seconds: how long; by default 10, or as long as it takes to show every pose of the dataset or the saved path.
+        force: overwrite what is there.
+    """
+    import pointsplat_ns as ps
+
+    start = time.perf_counter()
+    output = output or _beside(scene)
+    count = ps.render_path(
+        scene, output, other, path=path, split=split, labels=labels, up=up, width=width, height=height,
+        fps=fps, seconds=seconds, force=force, progress=True,
+    )  # fmt: skip
+    files = output.iterdir() if output.is_dir() else [output]
+    size = sum(file.stat().st_size for file in files) / 1e6
+    frames = "1 frame" if count == 1 else f"{count} frames"
+    print(f"{output}: {frames}, {size:.2f} MB, in {time.perf_counter() - start:.1f} s")
+
+
+def _beside(scene: Path) -> Path:
+    """The default video: beside a file, in the folder of a run."""
+    from pointsplat_ns.cli.scene_options import output_beside
+
+    beside = output_beside(scene, "render")
+    return beside.with_name(f"{scene.stem}.mp4" if beside.stem.endswith("_render") else "render.mp4")

@@ -1,0 +1,40 @@
+"""``pointsplat view``: scenes in the browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import tyro
+
+from pointsplat_ns.cli.scene_options import Scene
+
+
+def view(
+    scene: Scene,
+    other: tyro.conf.Positional[Path | None] = None,
+    up: str | None = None,
+    host: str = "127.0.0.1",
+    port: int = 7007,
+) -> None:
+    """Look at a scene in the browser, or at two from the same camera. It is drawn by this machine, on a CPU if it has
+    nothing else: small while the camera moves, whole once it is still. Ctrl-C ends it.
+
+    For example: pointsplat view room.ply room_pruned.ply
+
+    Args:
+        scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
+        other: a second scene in the same place, to compare with; by default the first is compared with all of itself.
+        up: the axis that is up in the scene: x, y, z, -x, -y or -z; by default it is estimated. Write --up=-y for a
+            negative axis.
+        host: the address to listen on; by default only this machine is answered. Whoever reaches another one may look.
+        port: the first port that is tried; 0 takes any that is free.
+    """
+    import pointsplat_ns as ps
+
+    with ps.open_viewer(scene, other, up=up, host=host, port=port) as viewer:
+        print(f"{viewer.url}: open it in a browser; Ctrl-C ends it")
+        print(f"it begins at {viewer.origin}", flush=True)
+        try:
+            viewer.wait()
+        except KeyboardInterrupt:
+            print("ended")

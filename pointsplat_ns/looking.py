@@ -1,0 +1,171 @@
+"""The public functions to look at scenes: films along camera paths, and a viewer in the browser."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pointsplat_ns.api import Source, load
+from pointsplat_ns.compression.placing import axis_named
+from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.system.progress import Progress, tracked
+from pointsplat_ns.viewing.camera_path import Shot, camera_path
+from pointsplat_ns.viewing.film import Cast, Split, frames_of
+from pointsplat_ns.viewing.video import check_output, write_frames
+from pointsplat_ns.views import RasterizeMode, Views
+
+if TYPE_CHECKING:
+    from pointsplat_ns.viewing.viewer import Viewer
+
+logger = logging.getLogger("pointsplat_ns")
+
+
+def render_path(
+    scene: Source,
+    output: str | Path,
+    other: Source | None = None,
+    *,
+    path: str | Path | Views = "auto",
+    split: Split = "side-by-side",
+    labels: Sequence[str] | None = None,
+    up: str | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    fps: float | None = None,
+    seconds: float | None = None,
+    force: bool = False,
+    progress: bool | Progress = False,
+) -> int:
+    """Film a scene, or two from the same cameras, along a path.
+
+    Args:
+        scene: N Gaussians, or where to read them.
+        output: ``.mp4`` for a video (H.264), a folder for PNG frames, ``.png`` for the first frame alone. It appears
+            when it is complete.
+        other: a second scene in the same place, to compare with.
+        path: "dataset" goes exactly through the poses of the run's dataset; "walk" past sampled views, smoothly and
+            upright; "orbit" about what they show, or round on the spot in a room; "auto" is "dataset" if there is one,
+            else "walk". Or a camera path that nerfstudio's viewer saved (JSON), or views to go through.
+        split: two scenes are shown "side-by-side", or with a line that wipes ("wipe") from one to the other.
+        labels: what is written on two scenes; by default their names and counts. An empty list writes nothing.
+        up: the axis that is up in the scene ("z", "-y"), for walks and orbits; by default it is estimated.
+        width: of the picture of one scene, pixels; by default that of the dataset or the saved path, at most 960.
+        height: of the same.
+        fps: frames a second; by default 24, or what the saved path says.
+        seconds: how long; by default 10, or as long as it takes to show every pose of a dataset or a saved path.
+        force: overwrite what is there.
+        progress: True shows a bar with the time left; a function is called with the share done.
+
+    Returns:
+        The number of frames written.
+
+    Raises:
+        SceneError: if a scene is not usable, or the output cannot be written.
+        DataError: if there are no views to make a path of, or the saved path is not usable.
+        PointSplatError: if a size, speed or length means nothing.
+
+    Example:
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> room = ps.example_room()[::20]
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ps.render_path(room, f"{folder}/walk.mp4", width=64, height=48, fps=10, seconds=0.5)
+        5
+    """
+    if split not in ("side-by-side", "wipe"):
+        raise PointSplatError(f"split is {split!r}; expected side-by-side or wipe")
+    shot = Shot(width, height, fps, seconds)
+    upward = None if up is None else axis_named(up)
+    kind = check_output(output, force)
+    sources = [scene] if other is None else [scene, other]
+    loaded = [source if isinstance(source, Gaussians) else load(source) for source in sources]
+    views = _source(scene, loaded[0], path if isinstance(path, Views) else None)
+    way = "dataset" if isinstance(path, Views) else path
+    chosen = camera_path(loaded[0], views, way, shot, kind == "picture", upward)
+    modes = [_mode(source, chosen.views.rasterize_mode) for source in sources]
+    if labels is None:
+        labels = [f"{_name(s, i)}, {len(g):,} Gaussians" for i, (s, g) in enumerate(zip(sources, loaded, strict=True))]
+    cast = Cast(
+        loaded[0], loaded[1] if other is not None else None, (modes[0], modes[-1]), split, labels if other else ()
+    )
+    logger.info("%d frames of %d x %d: %s", len(chosen.views), chosen.views.width, chosen.views.height, chosen.origin)
+    frames = tracked(frames_of(cast, chosen.views, chosen.fps), "rendering", len(chosen.views), progress)
+    return write_frames(frames, output, chosen.fps, force)
+
+
+def open_viewer(
+    scene: Source,
+    other: Source | None = None,
+    *,
+    up: str | None = None,
+    host: str = "127.0.0.1",
+    port: int = 7007,
+) -> Viewer:
+    """Show a scene, or two from the same camera, in the browser. Everything is drawn by this machine, on a CPU if it
+    has nothing else.
+
+    It opens upright: at the first of the dataset's poses if there are any, else at a sampled view.
+
+    Args:
+        scene: N Gaussians, or where to read them.
+        other: a second scene in the same place, to compare with; by default the first is compared with all of itself.
+        up: the axis that is up in the scene ("z", "-y"); by default it is estimated.
+        host: the address to listen on; by default only this machine is answered. Whoever reaches another one may look.
+        port: the first port that is tried; 0 takes any that is free.
+
+    Returns:
+        The viewer, to be closed, or used in a ``with`` block; ``url`` says where it is.
+
+    Raises:
+        SceneError: if a scene is not usable.
+        DataError: if there is no place to look from.
+        PointSplatError: if the port cannot be listened on.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> with ps.open_viewer(ps.example_room()[::20], port=0) as viewer:
+        ...     viewer.url.startswith("http://127.0.0.1:")
+        True
+    """
+    from pointsplat_ns.viewing.viewer import Exhibit, Viewer
+
+    upward, exhibits = None if up is None else axis_named(up), []
+    for index, source in enumerate([scene] if other is None else [scene, other]):
+        loaded = source if isinstance(source, Gaussians) else load(source)
+        path = None if isinstance(source, Gaussians) else Path(source)
+        views, mode = _source(source, loaded, None), _mode(source, "classic")
+        exhibits.append(Exhibit(_name(source, index), path, loaded, views, mode))
+    return Viewer(exhibits, host, port, upward)
+
+
+def _source(scene: Source, loaded: Gaussians, given: Views | None) -> ViewSource:
+    if isinstance(scene, Gaussians):
+        return ViewSource(loaded, given=given)
+    return ViewSource(loaded, given=given, run=scene, dataset_views=dataset_views)
+
+
+def _mode(scene: Source, usual: RasterizeMode) -> RasterizeMode:
+    """How a scene was trained to be drawn; ``usual`` if it does not say."""
+    if isinstance(scene, Gaussians) or not may_be_run(scene):
+        return usual
+    try:
+        return open_run(scene, need_data=False).rasterize_mode
+    except SceneError:
+        return usual
+
+
+def _name(scene: Source, index: int) -> str:
+    """What a scene is called: by its run's experiment, or its file."""
+    if isinstance(scene, Gaussians):
+        return ("first", "second")[index]
+    if may_be_run(scene):
+        with suppress(SceneError):
+            return scene_name(open_run(scene, need_data=False))
+    return Path(scene).resolve().name

@@ -1,0 +1,85 @@
+"""A view of a scene that is projected once and drawn region by region, so that drawing can stop in between."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.rasterizer.blending import Blend
+from pointsplat_ns.rasterizer.constants import QUALITIES, TILE
+from pointsplat_ns.rasterizer.frame import BlendOptions
+from pointsplat_ns.rasterizer.projection import project
+from pointsplat_ns.rasterizer.rendering import QualityName, finite_colors
+from pointsplat_ns.rasterizer.tiles import Footprints, Region
+from pointsplat_ns.views import View
+
+
+class Drawing:
+    """One view of a scene, projected. :meth:`draw` gives any part of what :func:`~pointsplat_ns.render` gives, to
+    rounding; nothing is differentiable.
+
+    Args:
+        scene: N Gaussians, on any device.
+        view: the camera.
+        quality: what to give up for speed, as for :func:`~pointsplat_ns.rasterization`.
+
+    Raises:
+        ValueError: if the camera is not finite or has no focal length.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> room = ps.example_room()
+        >>> drawing = Drawing(room, ps.sample_views(room, 1, width=64, height=48)[0])
+        >>> drawing.rows, drawing.columns, tuple(drawing.draw(Region(0, 2, 0, drawing.columns)).shape)
+        (6, 8, (16, 64, 3))
+    """
+
+    @torch.no_grad()
+    def __init__(self, scene: Gaussians, view: View, quality: QualityName = "exact"):
+        seen = project(
+            scene.means, scene.quats, scene.stds, scene.alphas, view.viewmat, view.K, view.width, view.height,
+            view.near_plane, antialiased=view.rasterize_mode == "antialiased",
+        )  # fmt: skip
+        seen, self._colors, _ = finite_colors(seen, scene.sh, 0, False, scene.sh_degree)
+        level = QUALITIES[quality]
+        self._seen, self._options = seen, BlendOptions(level)
+        self._footprints = Footprints(
+            seen.means2d, seen.cov2d, seen.det, seen.opacities, seen.depths, torch.zeros_like(seen.ids), 1,
+            view.width, view.height, level.alpha_min,
+        )  # fmt: skip
+        self._width, self._height = view.width, view.height
+        self._background = view.background.to(self._colors)
+
+    @property
+    def rows(self) -> int:
+        """Rows of tiles of 8 pixels."""
+        return self._footprints.rows
+
+    @property
+    def columns(self) -> int:
+        """Columns of tiles of 8 pixels."""
+        return self._footprints.columns
+
+    @torch.no_grad()
+    def draw(self, region: Region) -> Tensor:
+        """The pixels of some tiles, colours in [0, 1] over the view's background: (h, w, 3), cut at the image's edge.
+
+        Args:
+            region: rectangle of tiles in the image, not empty.
+        """
+        seen = self._seen
+        image, through = Blend.apply(
+            seen.means2d, seen.cov2d, seen.det, seen.opacities, self._colors, self._footprints, region, False,
+            self._options, None,
+        )  # fmt: skip
+        height = min(region.bottom * TILE, self._height) - region.top * TILE
+        width = min(region.right * TILE, self._width) - region.left * TILE
+        color, left = (self._untiled(values, region)[:height, :width] for values in (image, through))
+        return (color + left * self._background).clamp_(0, 1)
+
+    @staticmethod
+    def _untiled(values: Tensor, region: Region) -> Tensor:
+        """Pixels (H, W, D) of tiles (tiles, [D,] 64)."""
+        tiles = values.view(region.rows, region.columns, -1, TILE, TILE)
+        return tiles.permute(0, 3, 1, 4, 2).reshape(region.rows * TILE, region.columns * TILE, -1)

@@ -1,0 +1,1 @@
+"""Looking at scenes: camera paths, pictures of two scenes in one, videos, and the viewer in a browser."""

@@ -1,0 +1,138 @@
+"""Two scenes in one picture, seen from the same camera: the line between them, and labels."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.rasterizer.constants import TILE
+from pointsplat_ns.rasterizer.drawing import Drawing
+from pointsplat_ns.rasterizer.rendering import QualityName
+from pointsplat_ns.rasterizer.tiles import Region
+from pointsplat_ns.views import RasterizeMode, View
+
+if TYPE_CHECKING:
+    from PIL.ImageFont import FreeTypeFont
+
+_THICK = 640
+"""Pictures from this width on have a line of two pixels, others of one."""
+
+_TEXT = 0.03
+"""Height of labels, as a share of the picture's."""
+
+_SMALLEST_TEXT = 11
+"""Least height of labels, pixels."""
+
+
+class Wipe:
+    """The picture of one or two scenes from one view: the first left of a column, the second from there on. What is not
+    seen of a scene is not drawn.
+
+    Args:
+        first: N Gaussians.
+        second: Gaussians; None leaves the picture to the first.
+        view: the camera of both.
+        column: where the second begins, pixels from 0 to the view's width.
+        modes: the rasterize modes of both; by default the view's.
+        quality: what to give up for speed.
+    """
+
+    def __init__(
+        self,
+        first: Gaussians,
+        second: Gaussians | None,
+        view: View,
+        column: int = 0,
+        modes: tuple[RasterizeMode, RasterizeMode] | None = None,
+        quality: QualityName = "exact",
+    ):
+        self.column = view.width if second is None else min(max(column, 0), view.width)
+        """Where the second scene begins, pixels."""
+        left, right = modes or (view.rasterize_mode, view.rasterize_mode)
+        self._first = Drawing(first, replace(view, rasterize_mode=left), quality) if self.column > 0 else None
+        self._second = None
+        if second is not None and self.column < view.width:
+            self._second = Drawing(second, replace(view, rasterize_mode=right), quality)
+        self.rows = -(-view.height // TILE)
+        """Rows of tiles of 8 pixels."""
+
+    def draw(self, top: int, bottom: int) -> Tensor:
+        """Rows ``top`` to ``bottom`` - 1 of tiles, colours in [0, 1]: (h, width, 3)."""
+        parts = []
+        if self._first is not None:
+            end = -(-self.column // TILE)
+            parts.append(self._first.draw(Region(top, bottom, 0, end))[:, : self.column])
+        if self._second is not None:
+            begin = self.column // TILE
+            part = self._second.draw(Region(top, bottom, begin, self._second.columns))
+            parts.append(part[:, self.column - begin * TILE :])
+        return torch.cat(parts, dim=1)
+
+
+def pixels_of(picture: Tensor) -> np.ndarray:
+    """A picture (H, W, 3) in [0, 1] as uint8."""
+    return (255 * picture.clamp(0, 1)).round().to(torch.uint8).cpu().numpy()
+
+
+def with_line(pixels: np.ndarray, column: int) -> np.ndarray:
+    """A picture (H, W, 3) uint8 with a thin line before a column: white, dark at its sides so that it shows on white.
+    At either end of the picture there is none."""
+    if not 0 < column < pixels.shape[1]:
+        return pixels
+    pixels = pixels.copy()
+    thick = 2 if pixels.shape[1] >= _THICK else 1
+    left = column - thick // 2
+    pixels[:, max(left - 1, 0) : left + thick + 1] //= 3
+    pixels[:, left : left + thick] = 255
+    return pixels
+
+
+def with_labels(pixels: np.ndarray, labels: Sequence[str], column: int) -> np.ndarray:
+    """A picture (H, W, 3) uint8 with labels on dark ground: at the top left, and at the top right if there are two.
+
+    Each is shortened to half of the picture, and is left out where its side of ``column`` is too narrow for it.
+    """
+    from PIL import Image, ImageDraw
+
+    height, width = pixels.shape[:2]
+    size = max(round(_TEXT * height), _SMALLEST_TEXT)
+    image = Image.fromarray(pixels)
+    draw = ImageDraw.Draw(image, "RGBA")
+    font, pad = _font(size), size // 2
+    for index, label in enumerate(labels):
+        text = _shortened(label, font, width // len(labels) - 4 * pad)
+        long = int(font.getlength(text))
+        room = column if index == 0 else width - column
+        if not text or long + 3 * pad > room:
+            continue
+        left = pad if index == 0 else width - long - 3 * pad
+        draw.rectangle((left, pad, left + long + 2 * pad, 2 * pad + size + pad // 2), fill=(0, 0, 0, 150))
+        draw.text((left + pad, pad + pad // 2), text, font=font, fill=(255, 255, 255, 255))
+    return np.asarray(image)
+
+
+@functools.lru_cache(4)
+def _font(size: int) -> FreeTypeFont:
+    import matplotlib
+    from PIL import ImageFont
+
+    # It has the letters of most languages; Pillow's own has only Latin ones.
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
+
+
+def _shortened(text: str, font: FreeTypeFont, longest: int) -> str:
+    """The text, its end replaced by dots if it is longer than so many pixels; empty if nothing fits."""
+    text = " ".join(text.split())
+    if font.getlength(text) <= longest:
+        return text
+    while text and font.getlength(text + "...") > longest:
+        text = text[:-1]
+    return text and text + "..."

@@ -1,0 +1,154 @@
+"""Writes pictures one after another: an MP4 video, a folder of PNG files, or one PNG. Nothing is left half-written."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.io.files import one_line, replacing
+
+Kind = Literal["video", "frames", "picture"]
+
+CRF = 18
+"""x264's constant rate factor: at 18 most people see no loss."""
+
+_FRAME = re.compile(r"frame_\d{5,}\.png")
+
+
+def kind_of(output: Path | str) -> Kind:
+    """What a path asks for: a video (.mp4), one picture (.png), or a folder of pictures (no suffix).
+
+    Raises:
+        SceneError: if it has another suffix.
+    """
+    path = Path(output)
+    kinds: dict[str, Kind] = {".mp4": "video", ".png": "picture", "": "frames"}
+    kind = "frames" if path.is_dir() else kinds.get(path.suffix.lower())
+    if kind is None:
+        raise SceneError(
+            f"{path}: cannot write a {path.suffix} file; expected a video (.mp4), a picture (.png) or a folder, whose "
+            "name has no dot"
+        )
+    return kind
+
+
+def check_output(output: Path | str, force: bool) -> Kind:
+    """What a path asks for, checked before the long work.
+
+    Raises:
+        SceneError: as :func:`kind_of`, or if there is something that must not be overwritten.
+    """
+    path, kind = Path(output), kind_of(output)
+    if kind == "frames" and path.exists():
+        found = sorted(item.name for item in path.iterdir()) if path.is_dir() else [path.name]
+        others = [name for name in found if not _FRAME.fullmatch(name)]
+        if others or not path.is_dir():
+            raise SceneError(f"{path}: holds {(others or found)[0]}; expected a new folder, or one of frames")
+        if found and not force:
+            raise SceneError(f"{path}: holds frames already; name another folder, or overwrite them with --force")
+    elif path.exists() and not force:
+        raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
+    return kind
+
+
+def write_frames(frames: Iterable[np.ndarray], output: Path | str, fps: float, force: bool = False) -> int:
+    """Write pictures to what ``output`` names, all or none of them.
+
+    Args:
+        frames: (H, W, 3) uint8 each, of one size; of even width and height for a video. One for a picture.
+        output: a file that ends in .mp4 or .png, or a folder.
+        fps: frames a second, of a video.
+        force: overwrite what is there.
+
+    Returns:
+        The number of frames.
+
+    Raises:
+        SceneError: if it cannot be written.
+    """
+    path, kind = Path(output), check_output(output, force)
+    if kind == "video":
+        return _write_video(frames, path, fps)
+    if kind == "picture":
+        [pixels] = frames
+        with replacing(path) as part:
+            _write_png(pixels, part)
+        return 1
+    return _write_folder(frames, path)
+
+
+def _write_png(pixels: np.ndarray, path: Path) -> None:
+    from PIL import Image
+
+    Image.fromarray(pixels).save(path, format="PNG")
+
+
+def _write_folder(frames: Iterable[np.ndarray], folder: Path) -> int:
+    with _folder_replacing(folder) as part:
+        count = 0
+        for pixels in frames:
+            _write_png(pixels, part / f"frame_{count:05d}.png")
+            count += 1
+    return count
+
+
+@contextmanager
+def _folder_replacing(folder: Path) -> Iterator[Path]:
+    """A temporary folder beside ``folder``, whose files take the place of those in ``folder`` when the block ends
+    without an error; else it is removed."""
+    part: Path | None = None
+    try:
+        folder.absolute().parent.mkdir(parents=True, exist_ok=True)
+        part = Path(tempfile.mkdtemp(prefix=f".{folder.name[:40]}.", dir=folder.absolute().parent))
+        yield part
+        folder.mkdir(exist_ok=True)
+        for old in folder.iterdir():
+            if _FRAME.fullmatch(old.name) and not (part / old.name).exists():
+                old.unlink()
+        for new in sorted(part.iterdir()):
+            new.replace(folder / new.name)
+    except OSError as error:
+        raise SceneError(f"{folder}: cannot be written ({error.strerror or one_line(error)})") from error
+    finally:
+        if part is not None:
+            shutil.rmtree(part, ignore_errors=True)
+
+
+def _write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
+    import av
+    from av.video.reformatter import ColorRange, Colorspace
+
+    count = 0
+    with replacing(path) as part:
+        try:
+            with av.open(str(part), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+                rate = Fraction(fps).limit_denominator(1001)
+                stream = container.add_stream("libx264", rate=rate, options={"crf": str(CRF)})
+                for pixels in frames:
+                    if count == 0:
+                        stream.height, stream.width = pixels.shape[:2]
+                        stream.pix_fmt = "yuv420p"
+                        stream.gop_size = max(round(fps), 1)  # so that players find any second quickly
+                        context = stream.codec_context
+                        context.colorspace = context.color_primaries = context.color_trc = 1  # BT.709, said in the file
+                        context.color_range = ColorRange.MPEG
+                    frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
+                    frame = frame.reformat(
+                        format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
+                    )
+                    frame.pts = count
+                    container.mux(stream.encode(frame))
+                    count += 1
+                container.mux(stream.encode())
+        except av.FFmpegError as error:  # for one, of a full disk
+            raise OSError(one_line(error)) from error
+    return count

@@ -1,0 +1,233 @@
+"""The viewer: viser's page, with pictures that are drawn here."""
+
+from __future__ import annotations
+
+import logging
+import math
+import shlex
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.geometry.quaternions import rotation_matrices
+from pointsplat_ns.pruning.content import thinned
+from pointsplat_ns.pruning.view_sampling import PROBED
+from pointsplat_ns.rasterizer import render_depth
+from pointsplat_ns.viewing.camera_path import views_upright
+from pointsplat_ns.viewing.painter import Camera, Painter, Sight
+from pointsplat_ns.viewing.schedule import FULL_SIDE, Step
+from pointsplat_ns.viewing.selection import Selection, Shown
+from pointsplat_ns.viewing.server import start_server
+from pointsplat_ns.viewing.trajectories import up_of
+from pointsplat_ns.views import RasterizeMode, View, Views
+
+STARTS = 12
+"""Number of views that the camera can be put at."""
+
+_QUALITY = {True: 75, False: 95}
+"""JPEG's, of pictures while the camera moves and of others."""
+
+
+@dataclass(frozen=True, eq=False)
+class Exhibit:
+    """A scene to show."""
+
+    name: str
+    path: Path | None
+    """Where it was read from."""
+    scene: Gaussians
+    source: ViewSource
+    """Where views of it come from."""
+    mode: RasterizeMode
+    """How it was trained to be drawn."""
+
+
+class Viewer:
+    """Shows one or two scenes in the browser, until it is closed.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> with ps.open_viewer(ps.example_room()[::10], port=0) as viewer:  # doctest: +SKIP
+        ...     print(viewer.url)
+        ...     viewer.wait()
+    """
+
+    def __init__(self, exhibits: Sequence[Exhibit], host: str, port: int, up: Tensor | None = None):
+        first = exhibits[0]
+        self._exhibits = exhibits
+        self._starts = views_upright(first.scene, first.source, STARTS, up)
+        self.origin = first.source.origin
+        """Text that says where the first view comes from."""
+        self._up = up_of(self._starts) if up is None else up
+        self._small = thinned(first.scene, PROBED)
+        self._painters: dict[int, Painter] = {}
+        self._notes: dict[int, Any] = {}
+        self._at = 0
+        # It logs each page that is closed before it has loaded, with a traceback.
+        logging.getLogger("websockets").setLevel(logging.CRITICAL + 1)
+        self._server = start_server(host, port, "pointsplat")
+        self._selections: list[Selection] = []
+        for exhibit in exhibits:
+            self._selections.append(Selection(exhibit.scene, exhibit.source, self._changed))
+        self._build()
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(self._disconnected)
+
+    @property
+    def url(self) -> str:
+        """Where it is seen."""
+        host = self._server.get_host()
+        host = "127.0.0.1" if host in ("", "0.0.0.0") else host
+        return f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
+
+    def wait(self) -> None:
+        """Wait until Ctrl-C."""
+        threading.Event().wait()
+
+    def close(self) -> None:
+        """End the server and all drawing."""
+        for painter in list(self._painters.values()):
+            painter.close()
+        for selection in self._selections:
+            selection.close()
+        self._server.stop()
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _build(self) -> None:
+        """The panel beside the picture."""
+        gui = self._server.gui
+        gui.configure_theme(dark_mode=True, show_logo=False)  # without its share button viser 0.2.7 shows nothing
+        self._server.scene.set_up_direction(self._up.numpy())
+        self._budgets = []
+        for exhibit, selection in zip(self._exhibits, self._selections, strict=True):
+            gui.add_markdown(f"**{_code(exhibit.name)}**")
+            slider = gui.add_slider("Kept, %", 1, 100, 1, 100, hint="Gaussians that are shown of this scene")
+            slider.on_update(_chooser(selection))
+            self._budgets.append(gui.add_markdown(""))
+        two = len(self._exhibits) == 2
+        hint = "left of the line the first scene" if two else "left of the line what is kept, right of it all"
+        self._line = gui.add_slider("Wipe, %", 0, 100, 1, 50 if two else 100, hint=hint)
+        self._line.on_update(lambda _: self._redraw())
+        self._side = gui.add_slider("Pixels", 240, 1920, 80, FULL_SIDE, hint="longer side of the picture at rest")
+        self._side.on_update(lambda _: self._redraw())
+        gui.add_button("Next view").on_click(lambda event: self._next(event.client))
+        gui.add_button("This view, level").on_click(lambda event: self._put(event.client))
+        gui.add_button("Turn over", hint="if the scene is upside down").on_click(lambda event: self._turn(event.client))
+        self._describe()
+
+    def _describe(self) -> None:
+        """What is shown of each scene, and the command that writes it."""
+        for exhibit, selection, note in zip(self._exhibits, self._selections, self._budgets, strict=True):
+            shown, whole = selection.shown, len(selection.scene)
+            lines = [f"{len(shown.scene):,} of {whole:,} Gaussians, {shown.how}"]
+            if selection.news:
+                lines.append(selection.news)
+            elif exhibit.path is not None and selection.percent < 100:
+                command = ["pointsplat", "prune", str(exhibit.path), "--keep", f"{selection.percent}%"]
+                lines.append(_code(shlex.join(command)))
+            note.content = "  \n".join(lines)
+
+    def _changed(self, picture: bool) -> None:
+        """A selection has changed, or there is news of it. News alone must not begin pictures anew."""
+        self._describe()
+        if picture:
+            self._redraw()
+
+    def _redraw(self) -> None:
+        for client in self._server.get_clients().values():
+            self._look(client)
+
+    def _connected(self, client: Any) -> None:
+        self._notes[client.client_id] = client.gui.add_markdown("drawing")
+
+        def show(pixels: np.ndarray, step: Step[Sight], seconds: float) -> None:
+            client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=_QUALITY[step.moving])
+            size = f"{pixels.shape[1]} x {pixels.shape[0]}"
+            share = "" if step.share == 1 else f", {step.share:.0%} of the Gaussians"
+            state = "moving: " if step.moving else ""
+            self._notes[client.client_id].content = f"{state}{size}, {1000 * seconds:.0f} ms a frame{share}"
+
+        self._painters[client.client_id] = Painter(show)
+        self._put(client)
+        client.camera.on_update(lambda _: self._look(client))
+        self._look(client)
+
+    def _disconnected(self, client: Any) -> None:
+        painter = self._painters.pop(client.client_id, None)
+        self._notes.pop(client.client_id, None)
+        if painter is not None:
+            painter.schedule.close()  # without waiting, as the server's own thread calls this
+
+    def _look(self, client: Any) -> None:
+        """Draw what a client's camera sees."""
+        painter = self._painters.get(client.client_id)
+        if painter is None:
+            return
+        start, camera = self._starts[self._at], client.camera
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = rotation_matrices(torch.tensor(np.asarray(camera.wxyz, np.float64))[None])[0]
+        pose[:3, 3] = torch.tensor(np.asarray(camera.position, np.float64))
+        seen = Camera(
+            invert_rigid(pose[None])[0], float(camera.fov), float(camera.aspect), start.background, start.near_plane
+        )
+        first = self._selections[0]
+        second: Shown | None = self._selections[1].shown if len(self._selections) == 2 else first.whole
+        modes = self._exhibits[0].mode, self._exhibits[-1].mode
+        sight = Sight(seen, first.shown, second, self._line.value / 100, modes)
+        painter.schedule.submit(sight, int(self._side.value))
+
+    def _next(self, client: Any) -> None:
+        self._at = (self._at + 1) % len(self._starts)
+        self._put(client)
+
+    def _turn(self, client: Any) -> None:
+        self._up = -self._up
+        self._server.scene.set_up_direction(self._up.numpy())
+        self._put(client)
+
+    def _put(self, client: Any) -> None:
+        """Put a client's camera at the current view, upright."""
+        view = self._starts[self._at]
+        place, ahead = self._pose(view)
+        with client.atomic():
+            client.camera.fov = 2 * math.atan(0.5 * view.height / float(view.K[1, 1]))
+            client.camera.up_direction = self._up.numpy()
+            client.camera.position = place.numpy()
+            client.camera.look_at = (place + ahead).numpy()
+
+    def _pose(self, view: View) -> tuple[Tensor, Tensor]:
+        """The place (3,) of a view, and the way (3,) to what is in its middle, about which the camera will turn."""
+        pose = invert_rigid(view.viewmat[None].double())[0]
+        one = Views(view.viewmat[None], view.K[None], view.width, view.height, view.background).resized(48)[0]
+        depth, alpha = render_depth(self._small, one)
+        seen = depth[alpha > 0.5]
+        far = float(seen.median()) if len(seen) else 1.0
+        return pose[:3, 3], pose[:3, 2] * max(far, 10 * view.near_plane)
+
+
+def _chooser(selection: Selection) -> Callable[[Any], None]:
+    """What a budget's slider does."""
+
+    def choose(event: Any) -> None:
+        selection.choose(event.target.value)
+
+    return choose
+
+
+def _code(text: str) -> str:
+    """A text as it is: the page would run what stands in braces."""
+    return "`" + "".join(sign if sign.isprintable() and sign != "`" else "?" for sign in text) + "`"

@@ -1,0 +1,176 @@
+"""Films of scenes, as users make them."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import pointsplat_ns as ps
+from making import ball, run_of
+from pointsplat_ns.cli import main
+from pointsplat_ns.geometry.cameras import viewmats_to_opengl
+from pointsplat_ns.viewing.split_screen import pixels_of
+
+SMALL = {"width": 64, "height": 48, "fps": 10}
+
+
+@pytest.fixture(scope="module")
+def scene() -> ps.Gaussians:
+    return ball(700)
+
+
+@pytest.fixture(scope="module")
+def files(scene, tmp_path_factory) -> Path:
+    """A folder with a scene and one that is half as large."""
+    folder = tmp_path_factory.mktemp("scenes")
+    ps.save(scene, folder / "ball.ply")
+    ps.save(scene[::2], folder / "half.splat")
+    return folder
+
+
+def frames_in(folder: Path) -> list[np.ndarray]:
+    return [np.asarray(Image.open(path)) for path in sorted(folder.iterdir())]
+
+
+@pytest.mark.parametrize("path", ["auto", "walk", "orbit"])
+def test_film_of_a_scene_moves(path, scene, tmp_path):
+    assert ps.render_path(scene, tmp_path / "frames", path=path, seconds=0.6, **SMALL) == 6
+    frames = frames_in(tmp_path / "frames")
+    assert len(frames) == 6 and all(frame.shape == (48, 64, 3) for frame in frames)
+    assert all((a != b).mean() > 0.1 for a, b in zip(frames, frames[1:], strict=False))
+    assert all(frame.std() > 10 for frame in frames)
+
+
+def test_film_through_given_views_shows_each_of_them(scene, tmp_path):
+    views = ps.sample_views(scene, 3, 64, 48)
+    ps.render_path(scene, tmp_path / "frames", path=views, fps=10, seconds=0.7)
+    frames = frames_in(tmp_path / "frames")
+    for view in views:
+        shown = pixels_of(ps.render(scene, view)).astype(int)
+        assert min(np.abs(frame - shown).max() for frame in frames) <= 1
+
+
+def test_film_of_a_run_goes_exactly_through_its_photos(trained_walls, tmp_path, caplog):
+    run = run_of(trained_walls, "wall-b")
+    with caplog.at_level("INFO", "pointsplat_ns"):
+        count = ps.render_path(run, tmp_path / "frames", fps=2)
+    views, frames = ps.dataset_views(run), frames_in(tmp_path / "frames")
+    assert count == len(frames) == 20 and "along the poses of the dataset" in caplog.text
+    for view in views:  # antialiased, over white
+        shown = pixels_of(ps.render(ps.load(run), view)).astype(int)
+        assert min(np.abs(frame - shown).max() for frame in frames) <= 1
+
+
+def test_video_shows_two_scenes(files, tmp_path):
+    import av
+
+    ps.render_path(files / "ball.ply", tmp_path / "two.mp4", files / "half.splat", seconds=0.3, labels=[], **SMALL)
+    with av.open(str(tmp_path / "two.mp4")) as container:
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    ps.render_path(files / "ball.ply", tmp_path / "two", files / "half.splat", seconds=0.3, labels=[], **SMALL)
+    for shown, drawn in zip(frames, frames_in(tmp_path / "two"), strict=True):
+        assert shown.shape == (48, 128, 3)
+        # blobs of a few pixels lose most to the halved resolution of colours; luminance does not
+        weights = [0.2126, 0.7152, 0.0722]
+        assert 10 * np.log10(255**2 / np.square((shown - drawn.astype(float)) @ weights).mean()) > 30
+
+
+def test_saved_path_gives_size_speed_and_cameras(scene, tmp_path):
+    views = ps.sample_views(scene, 2, 64, 48)
+    poses = torch.cat([viewmats_to_opengl(views.viewmats), torch.tensor([[[0.0, 0, 0, 1]]] * 2)], dim=1)
+    fov = float(2 * torch.rad2deg(torch.atan(24 / views.Ks[0, 1, 1])))
+    cameras = [{"camera_to_world": pose.flatten().tolist(), "fov": fov} for pose in poses]
+    saved = {"render_width": 64, "render_height": 48, "fps": 30, "camera_path": cameras}
+    (tmp_path / "path.json").write_text(json.dumps(saved))
+    assert ps.render_path(scene, tmp_path / "frames", path=tmp_path / "path.json") == 2
+    for frame, view in zip(frames_in(tmp_path / "frames"), views, strict=True):
+        assert np.abs(frame - pixels_of(ps.render(scene, view)).astype(int)).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"path": "dataset"}, "no poses of a dataset"),
+        ({"path": "nowhere.json"}, "nowhere.json: no such file"),
+        ({"path": "spiral"}, "spiral: no such file; expected a camera path"),
+        ({"split": "diagonal"}, "expected side-by-side or wipe"),
+        ({"width": 1}, "width is 1; expected 2 to 16384"),
+        ({"height": 10**6}, "height is 1000000"),
+        ({"fps": 0}, "fps is 0"),
+        ({"fps": float("nan")}, "fps is nan"),
+        ({"seconds": -1}, "seconds are -1"),
+        ({"seconds": 1e9}, "seconds are 1e.09"),
+    ],
+)
+def test_what_means_nothing_is_refused(options, message, scene, tmp_path):
+    with pytest.raises(ps.PointSplatError, match=message):
+        ps.render_path(scene, tmp_path / "frames", **options)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_command_writes_what_the_function_writes(files, tmp_path, capsys):
+    options = ["--width", "64", "--height", "48", "--fps", "10", "--seconds", "0.3", "--split", "wipe"]
+    scenes = [str(files / "ball.ply"), str(files / "half.splat")]
+    main(["render", *scenes, "-o", str(tmp_path / "by_command"), *options])
+    assert re.search(r"by_command: 3 frames, \d\.\d\d MB, in ", capsys.readouterr().out)
+    ps.render_path(scenes[0], tmp_path / "by_function", scenes[1], split="wipe", seconds=0.3, **SMALL)
+    pairs = zip(frames_in(tmp_path / "by_command"), frames_in(tmp_path / "by_function"), strict=True)
+    assert all((one == other).all() for one, other in pairs)
+
+
+def test_command_writes_a_video_beside_the_scene_and_overwrites_nothing(files, tmp_path, capsys):
+    (tmp_path / "ball.ply").write_bytes((files / "ball.ply").read_bytes())
+    words = ["render", str(tmp_path / "ball.ply"), "--width", "33", "--height", "25", "--fps", "2", "--seconds", "1"]
+    main(words)
+    assert (tmp_path / "ball.mp4").stat().st_size > 500
+    with pytest.raises(SystemExit):
+        main(words)
+    assert "ball.mp4: exists already" in capsys.readouterr().err
+
+
+def test_picture_is_the_first_frame(scene, tmp_path):
+    ps.render_path(scene, tmp_path / "one.png", **SMALL)
+    shown = np.asarray(Image.open(tmp_path / "one.png"))
+    best = ps.sample_views(scene, 12, 64, 48)[0]
+    assert np.abs(shown - pixels_of(ps.render(scene, best)).astype(int)).max() <= 2
+
+
+def test_up_may_be_said(scene, tmp_path):
+    """Turned over, the same walk shows what is up below."""
+    ps.render_path(scene, tmp_path / "up.png", up="-y", **SMALL)
+    ps.render_path(scene, tmp_path / "down.png", up="y", **SMALL)
+    assert (tmp_path / "up.png").read_bytes() != (tmp_path / "down.png").read_bytes()
+    with pytest.raises(ps.PointSplatError, match="up is 'w'; expected x, y, z, -x, -y or -z"):
+        ps.render_path(scene, tmp_path / "none.png", up="w")
+    with ps.open_viewer(scene, up="-y", port=0) as viewer:
+        assert viewer._up.tolist() == [0, -1, 0]
+
+
+def test_viewer_begins_with_the_poses_of_a_run(trained_walls):
+    run = run_of(trained_walls, "wall-b")
+    with ps.open_viewer(run, port=0) as viewer:
+        assert viewer.origin == "poses of the dataset"
+        assert torch.equal(viewer._starts[0].viewmat, ps.dataset_views(run)[0].viewmat)
+        assert viewer._exhibits[0].mode == "antialiased" and viewer._exhibits[0].name == "wall-b"
+
+
+def test_address_that_cannot_be_listened_on_ends_the_command_in_one_line(files, capsys):
+    with pytest.raises(SystemExit):
+        main(["view", str(files / "ball.ply"), "--host", "192.0.2.1"])
+    assert capsys.readouterr().err.startswith("error: cannot listen on 192.0.2.1, port 7007")
+
+
+def test_news_of_merging_does_not_begin_pictures_anew(scene, monkeypatch):
+    with ps.open_viewer(scene, port=0) as viewer:
+        begun = []
+        monkeypatch.setattr(viewer, "_redraw", lambda: begun.append(viewer))
+        viewer._changed(False)
+        assert not begun
+        viewer._changed(True)
+        assert begun == [viewer]

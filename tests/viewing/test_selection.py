@@ -1,0 +1,145 @@
+"""A budget acts at once by a score, and is merged once it stays."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from making import ball, same
+from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.viewing import selection as module
+from pointsplat_ns.viewing.selection import Selection
+
+
+@pytest.fixture(scope="module")
+def scene() -> ps.Gaussians:
+    return ball(400)
+
+
+class News:
+    """Counts changes, and waits for what shall come of them."""
+
+    def __init__(self) -> None:
+        self.changed = threading.Condition()
+
+    def __call__(self, picture: bool) -> None:
+        with self.changed:
+            self.changed.notify_all()
+
+    def wait(self, until: Callable[[], bool]) -> None:
+        with self.changed:
+            assert self.changed.wait_for(until, 30)
+
+
+@pytest.fixture()
+def news() -> News:
+    return News()
+
+
+@pytest.fixture()
+def selection(scene, news) -> Iterator[Selection]:
+    made = Selection(scene, ViewSource(scene), news, rest=0.01)
+    yield made
+    made.close()
+
+
+@pytest.fixture()
+def patient(scene, news) -> Iterator[Selection]:
+    """It does not merge while a test lasts."""
+    made = Selection(scene, ViewSource(scene), news, rest=1000.0)
+    yield made
+    made.close()
+
+
+def test_all_is_shown_first(patient, scene):
+    assert same(patient.shown.scene, scene) and patient.shown.how == "all"
+
+
+@pytest.mark.parametrize("percent", [1, 10, 77, 99])
+def test_budget_acts_at_once_by_coverage(patient, scene, percent):
+    patient.choose(percent)
+    assert same(patient.shown.scene, ps.prune(scene, percent / 100, by="coverage"))
+    assert patient.shown.how == "chosen by coverage"
+
+
+def test_budget_that_stays_is_merged_as_prune_does(selection, scene, news):
+    selection.choose(20)
+    news.wait(lambda: selection.shown.how == "merged")
+    assert same(selection.shown.scene, ps.prune(scene, "20%"))
+    assert selection.news == ""
+    selection.choose(100)
+    assert same(selection.shown.scene, scene)
+    selection.choose(20)
+    assert selection.shown.how == "merged", "it is kept"
+
+
+def test_merging_is_stopped_by_another_budget(selection, scene, news, monkeypatch):
+    stopped, begun = threading.Event(), threading.Event()
+
+    def slow(scene, count, views, progress):
+        try:
+            while True:
+                begun.set()
+                progress(0.5)
+        except BaseException:
+            stopped.set()
+            raise
+
+    monkeypatch.setattr(module, "prune", slow)
+    selection.choose(30)
+    assert begun.wait(30)
+    news.wait(lambda: selection.news == "merging, 50 %")
+    monkeypatch.setattr(module, "prune", lambda scene, count, **_: scene[:count])
+    selection.choose(10)
+    assert stopped.wait(30)
+    news.wait(lambda: selection.shown.how == "merged")
+    assert len(selection.shown.scene) == 40
+
+
+def test_failed_merge_leaves_what_was_chosen_and_says_why(selection, news, monkeypatch):
+    def fails(*args, **options):
+        raise ps.BudgetError("no such thing")
+
+    monkeypatch.setattr(module, "prune", fails)
+    selection.choose(50)
+    news.wait(lambda: "no such thing" in selection.shown.how)
+    assert len(selection.shown.scene) == 200
+
+
+def test_merged_scenes_take_no_more_memory_than_the_scene(selection, news, monkeypatch):
+    monkeypatch.setattr(module, "prune", lambda scene, count, **_: scene[:count])
+    for percent in (60, 50, 40, 30):
+        selection.choose(percent)
+        news.wait(lambda: selection.shown.how == "merged")
+    assert list(selection._merged) == [40, 30]
+
+
+def test_close_ends_the_thread(scene, news):
+    made = Selection(scene, ViewSource(scene), news, rest=0.0)
+    made.choose(10)
+    made.close()
+    assert not made._thread.is_alive()
+
+
+def test_gaussians_that_cannot_be_drawn_are_left_out(scene, news):
+    broken = scene.replace(means=scene.means.index_fill(0, torch.tensor([0, 7]), torch.nan))
+    made = Selection(broken, ViewSource(broken), news)
+    made.close()
+    assert len(made.scene) == 398
+
+
+def test_parts_for_moving_cameras_cover_as_much(scene, news, monkeypatch):
+    monkeypatch.setattr(module, "_SMALLEST_PART", 50)
+    made = Selection(scene, ViewSource(scene), news)
+    made.close()
+    part = made.shown.part(0.3)
+    assert 50 <= len(part) <= 120 and made.shown.part(0.31) is part and made.shown.part(1.0) is made.shown.scene
+
+    def area(some: ps.Gaussians) -> float:
+        return float(some.stds.square().sum())
+
+    assert area(part) == pytest.approx(area(scene), rel=0.3)

@@ -1,0 +1,162 @@
+"""Camera paths go through the views they are made of, smoothly, upright, and where somebody has looked from."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.pruning.view_sampling import look_at
+from pointsplat_ns.viewing.trajectories import along, fitted, orbit, up_of, walk
+
+
+def views_at(eyes: torch.Tensor, targets: torch.Tensor, up: torch.Tensor | None = None) -> ps.Views:
+    K = torch.tensor([[50.0, 0.0, 33.0], [0.0, 52.0, 24.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    return ps.Views(look_at(eyes, targets, up), K.repeat(len(eyes), 1, 1), 64, 48, torch.zeros(3))
+
+
+def ring(angles: torch.Tensor, radius: float = 3.0, height: float = 1.0) -> ps.Views:
+    """Cameras about (1, 2, 0) that look at it."""
+    middle = torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64)
+    angles = angles.double()
+    eyes = middle + torch.stack([radius * angles.cos(), radius * angles.sin(), height + 0 * angles], dim=1)
+    return views_at(eyes, middle.expand(len(eyes), 3))
+
+
+def captured(count: int = 9, seed: int = 0) -> ps.Views:
+    """Poses by hand: uneven steps, tilted, some turned far."""
+    generator = torch.Generator().manual_seed(seed)
+    eyes = torch.rand(count, 3, generator=generator, dtype=torch.float64).cumsum(0)
+    targets = eyes + torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    return views_at(eyes, targets, torch.tensor([0.2, -0.9, 0.1]))
+
+
+def places(views: ps.Views) -> torch.Tensor:
+    return invert_rigid(views.viewmats.double())[:, :3, 3]
+
+
+def axes(views: ps.Views, column: int) -> torch.Tensor:
+    return invert_rigid(views.viewmats.double())[:, :3, column]
+
+
+def assert_rigid(views: ps.Views) -> None:
+    turns = views.viewmats[:, :3, :3]
+    eye = torch.eye(3, dtype=torch.float64).expand_as(turns)
+    torch.testing.assert_close(turns @ turns.transpose(1, 2), eye, rtol=0, atol=1e-9)
+    assert bool((torch.linalg.det(turns) > 0).all())
+
+
+@pytest.mark.parametrize("frames", [9, 10, 57, 200])
+def test_path_goes_exactly_through_every_pose(frames):
+    views = captured()
+    path = along(views, frames)
+    assert len(path) == frames
+    found = [(path.viewmats == viewmat).all((1, 2)).nonzero() for viewmat in views.viewmats]
+    assert all(len(frame) for frame in found), "each pose is a frame, to the bit"
+    at = torch.cat(found).flatten()
+    assert at[0] == 0 and at[-1] == frames - 1 and bool((at.diff() > 0).all())
+    assert torch.equal(path.Ks[at], views.Ks)
+    assert_rigid(path)
+
+
+def test_path_of_fewer_frames_than_poses_takes_some_of_them():
+    views = captured()
+    assert torch.equal(along(views, 4).viewmats, views.spread(4).viewmats)
+    assert torch.equal(along(views, 1).viewmats, views[:1].viewmats)
+    assert torch.equal(along(views[:1], 3).viewmats, views.viewmats[:1].repeat(3, 1, 1))
+
+
+def test_path_is_smooth():
+    path = along(captured(), 400)
+    for values in (places(path), path.viewmats[:, :3, :3].flatten(1)):
+        steps = values.diff(dim=0).norm(dim=1)
+        jumps = values.diff(n=2, dim=0).norm(dim=1)
+        assert float(jumps.max()) < 0.5 * float(steps.max())
+        assert float(steps.max()) < 12 * float(steps.mean())
+
+
+def test_positions_stay_between_those_given():
+    views = captured()
+    path, given = places(along(views, 300)), places(views)
+    assert bool((path >= given.amin(0) - 1e-9).all() & (path <= given.amax(0) + 1e-9).all())
+
+
+def test_poses_that_are_all_the_same_are_taken():
+    views = captured()[[3, 3, 3]]
+    for path in (along(views, 7), walk(views, 7), orbit(views, 7, torch.zeros(3))):
+        assert len(path) == 7 and bool(path.viewmats.isfinite().all())
+
+
+@pytest.mark.parametrize("up", [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.6, 0.0, 0.8]])
+def test_up_is_that_of_cameras_that_were_held_level(up):
+    up = torch.tensor(up, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(1)
+    eyes = torch.randn(20, 3, generator=generator, dtype=torch.float64)
+    level = torch.randn(20, 3, generator=generator, dtype=torch.float64)
+    targets = eyes + level - (level @ up)[:, None] * up - 0.2 * up
+    torch.testing.assert_close(up_of(views_at(eyes, targets, up)), up, rtol=0, atol=1e-6)
+
+
+def test_up_of_cameras_that_all_look_alike_is_up_in_their_pictures():
+    views = ring(torch.tensor([0.3, 0.3]))[:1]
+    assert float(up_of(views) @ -axes(views, 1)[0]) > 0.99
+
+
+def test_walk_never_leans_and_passes_the_views():
+    views = ring(torch.tensor([0.0, 2.0, 0.7, 1.4, 2.6]))
+    path = walk(views, 101)
+    assert float(axes(path, 0)[:, 2].abs().max()) < 1e-9, "what is right in the picture is level"
+    for viewmat in views.viewmats:
+        assert float((path.viewmats - viewmat).abs().amax((1, 2)).min()) < 1e-9
+    length = float(places(path).diff(dim=0).norm(dim=1).sum())
+    assert length < 1.1 * 3 * 2.6, "along the ring and not to and fro"
+    assert_rigid(path)
+
+
+def test_orbit_goes_all_around_what_is_looked_at():
+    views = ring(torch.arange(0, 6.2, 0.7))
+    path = orbit(views, 36, torch.tensor([9.0, 9.0, 9.0]))
+    apart = places(path) - torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64)
+    # The content's centre draws the middle a little to itself.
+    assert bool(((apart[:, :2].norm(dim=1) - 3).abs() < 0.6).all())
+    steps = torch.atan2(apart[:, 1], apart[:, 0]).sort().values.diff()
+    assert float(steps.max()) < 1.6 * 2 * math.pi / 36
+    assert bool(((axes(path, 2) * apart).sum(1) < 0).all())
+    assert_rigid(path)
+
+
+def test_orbit_of_what_was_seen_from_one_side_stays_there():
+    path = orbit(ring(torch.linspace(0.2, 1.2, 6)), 50, torch.tensor([1.0, 2.0, 0.0]))
+    apart = places(path) - torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64)
+    sides = torch.atan2(apart[:, 1], apart[:, 0])
+    assert 0.15 < float(sides.min()) < 0.3 and 1.1 < float(sides.max()) < 1.25
+
+
+def test_orbit_in_a_room_is_a_turn_on_the_spot():
+    angles = torch.arange(0, 6.2, 0.7, dtype=torch.float64)
+    outward = torch.stack([angles.cos(), angles.sin(), 0 * angles - 0.1], dim=1)
+    views = views_at(0.5 * outward, 2 * outward)
+    path = orbit(views, 24, torch.zeros(3))
+    assert float(places(path).std(0).max()) < 1e-9
+    ahead = axes(path, 2)
+    yaw = torch.atan2(ahead[:, 1], ahead[:, 0]).sort().values
+    torch.testing.assert_close(yaw.diff(), torch.full((23,), 2 * math.pi / 24).double(), rtol=0, atol=1e-6)
+
+
+def test_another_size_shows_as_much_from_top_to_bottom():
+    views = captured()
+    wide = fitted(views, 192, 96)
+    assert (wide.width, wide.height) == (192, 96)
+    assert wide.Ks[0].tolist() == [[100, 0, 98], [0, 104, 48], [0, 0, 1]]
+    assert torch.equal(fitted(views, 64, 48).Ks, views.Ks)
+
+
+@pytest.mark.parametrize("path", [along, walk, lambda *a: orbit(*a, torch.zeros(3))])
+def test_no_views_or_frames_are_refused(path):
+    with pytest.raises(ps.DataError, match="expected at least one"):
+        path(captured()[:0], 5)
+    with pytest.raises(ps.DataError, match="0 frames; expected at least 1"):
+        path(captured(), 0)
