@@ -1,0 +1,123 @@
+"""One scene, or two to compare, as an HTML file to fly through."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import logger, replacing
+from pointsplat_ns.pages.flight import SCRIPTS, Stage
+from pointsplat_ns.pages.html import page
+from pointsplat_ns.pruning import ply_bytes
+from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.views import Views
+
+LIMIT_MB = 60.0
+"""Size of a page, at most, unless another is asked for: what a browser opens at once and a mail program may still send."""
+
+
+def write_page(
+    scenes: Gaussians | Sequence[Gaussians],
+    path: str | Path,
+    names: Sequence[str] | None = None,
+    *,
+    title: str | None = None,
+    notes: Sequence[str] = (),
+    views: Views | None = None,
+    limit_mb: float = LIMIT_MB,
+    progress: bool | Progress = False,
+) -> Path:
+    """Write one HTML file that opens offline and shows a scene to fly through, or two with a wipe between them.
+
+    The file has everything in it and loads nothing. A browser with WebGL 2 draws the scenes by the same formulas as
+    :func:`~pointsplat_ns.render`. They are in it as SPZ, a fortieth to a third of the bytes of a PLY; what that loses
+    stands in docs/formats.md. Where two scenes would make the file too large, the larger one is left out, which the
+    page and a warning say.
+
+    Args:
+        scenes: one scene, or two: the first is on the left of the wipe.
+        path: the file to write.
+        names: a name for each scene; by default the number of its Gaussians.
+        title: of the page; by default the name of the file.
+        notes: lines of text for the reader.
+        views: where to begin, and where further views lead; by default sampled from the first scene. Their background
+            is behind the scenes, and they say whether the scenes were trained with antialiasing.
+        limit_mb: size of the file, at most, in units of 10^6 bytes.
+        progress: True shows a bar; a function is called with what is being done and the share done of it.
+
+    Returns:
+        ``path``.
+
+    Raises:
+        PointSplatError: if there are no scenes or more than two, names do not fit them, or one alone is too large.
+        SceneError: if no Gaussian of a scene can be drawn, or the file cannot be written.
+        DataError: if nothing of the first scene is visible.
+
+    Example:
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> room = ps.example_room()[::20]
+        >>> small = ps.prune(room, keep="30%", by="coverage")
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     page = ps.write_page([room, small], f"{folder}/room.html", ["all", "three tenths"])
+        ...     page.stat().st_size < 300_000
+        True
+    """
+    path = Path(path)
+    scenes = [scenes] if isinstance(scenes, Gaussians) else list(scenes)
+    names = [f"{len(scene):,} Gaussians" for scene in scenes] if names is None else list(names)
+    if not 1 <= len(scenes) <= 2:
+        raise PointSplatError(f"{len(scenes)} scenes for {path}; expected one or two")
+    if len(names) != len(scenes):
+        raise PointSplatError(f"{len(names)} names for {len(scenes)} scenes; expected one each")
+    if not limit_mb > 0:
+        raise PointSplatError(f"a page of at most {limit_mb:g} MB; expected a number above 0")
+    with progress_bar(progress) as report:
+        report("looking for views", 0.0)
+        stage = Stage.of(scenes[0], views)
+        rows = [_row(name, scene) for name, scene in zip(names, scenes, strict=True)]
+        shown = [
+            (name, stage.packed(scene, lambda _, share, name=name: report(f"compressing {name}", share)))
+            for name, scene in zip(names, scenes, strict=True)
+        ]
+        notes = list(notes)
+        while True:
+            data = {"flight": stage.data(shown)}
+            values = {"rows": rows, "title": title or path.stem, "notes": notes, "flight": data["flight"]}
+            text = page("scene.html", (*SCRIPTS, "scene.js"), with_workers=True, data=data, **values).encode("utf-8")
+            if len(text) <= 1e6 * limit_mb:
+                break
+            shown, left_out = _without_the_largest(shown, path, len(text), limit_mb)
+            notes.append(left_out)
+            logger.warning("%s: %s", path, left_out)
+    with replacing(path) as part:
+        part.write_bytes(text)
+    return path
+
+
+def _without_the_largest(
+    shown: list[tuple[str, str]], path: Path, size: int, limit_mb: float
+) -> tuple[list[tuple[str, str]], str]:
+    """The other scenes, and a line of text on the one that is left out.
+
+    Raises:
+        PointSplatError: if there is no other.
+    """
+    excess = f"the page would have {size / 1e6:.1f} MB, more than the {limit_mb:g} MB allowed"
+    if len(shown) == 1:
+        raise PointSplatError(f"{path}: {excess}; expected a larger limit, or fewer Gaussians")
+    name, _ = largest = max(shown, key=lambda scene: len(scene[1]))
+    return [scene for scene in shown if scene is not largest], f"{name} is left out: with it {excess}"
+
+
+def _row(name: str, scene: Gaussians) -> dict[str, Any]:
+    """A scene for the table of the page."""
+    return {
+        "name": name,
+        "gaussians": f"{len(scene):,}",
+        "sh_degree": scene.sh_degree,
+        "ply": f"{ply_bytes(len(scene), scene.sh_degree) / 1e6:.2f}",
+    }
