@@ -73,8 +73,7 @@ def write_page(
         raise PointSplatError(f"{len(scenes)} scenes for {path}; expected one or two")
     if len(names) != len(scenes):
         raise PointSplatError(f"{len(names)} names for {len(scenes)} scenes; expected one each")
-    if not limit_mb > 0:
-        raise PointSplatError(f"a page of at most {limit_mb:g} MB; expected a number above 0")
+    check_limit(limit_mb)
     with progress_bar(progress) as report:
         report("looking for views", 0.0)
         stage = Stage.of(scenes[0], views)
@@ -96,6 +95,16 @@ def write_page(
     with replacing(path) as part:
         part.write_bytes(text)
     return path
+
+
+def check_limit(limit_mb: float) -> None:
+    """Refuse, before the long computations, a limit that no page could keep.
+
+    Raises:
+        PointSplatError: if it is not above 0.
+    """
+    if not limit_mb > 0:
+        raise PointSplatError(f"a page of at most {limit_mb:g} MB; expected a number above 0")
 
 
 def _without_the_largest(
