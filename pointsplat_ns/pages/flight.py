@@ -19,7 +19,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import encode_spz
-from pointsplat_ns.pruning import need_usable
+from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.pruning.content import (
     content_box,
     content_diagonal,
@@ -67,8 +67,8 @@ class Stage:
 
         Args:
             scene: N Gaussians.
-            views: where to look from; at most :data:`VIEWS` of them are taken, and the first is where a flight begins.
-                By default they are sampled.
+            views: where to look from; at most :data:`VIEWS` of them are taken. By default they are sampled. A flight
+                begins at the one that has most Gaussians in its picture.
 
         Raises:
             SceneError: if no Gaussian can be drawn.
@@ -81,33 +81,38 @@ class Stage:
         if views is None or len(views) == 0:
             views = _sampled(scene, centre, size, up)
         views = views_in_units(views.spread(VIEWS), centre, size)
+        views = views[_in_picture(positions_in_units(scene.means, centre, size).cpu(), views).argsort(descending=True)]
         if float((-views.viewmats[:, 1, :3] @ up).sum()) < 0:  # whoever took photos held the camera upright
             up = -up
         half = positions_in_units(high, centre, size).cpu().abs()
         return Stage(centre, size, up, views, bool((_eyes(views)[0].abs() < half).all()))
 
-    def packed(self, scene: Gaussians, progress: Progress = silent) -> str:
-        """A scene for the page: SPZ of version 3, in units of the content, as base64.
+    def packed(self, scene: Gaussians, name: str, progress: Progress = silent) -> dict[str, str]:
+        """A scene for the page: its name, how much it is, and itself as SPZ of version 3 in units of the content, base64.
 
         Args:
             scene: N Gaussians.
+            name: for people.
             progress: called while compressing.
         """
         placed = in_units(scene.detach(), self.centre.to(scene.device), self.size).to("cpu", torch.float32)
         near = placed.usable() & (placed.means.abs() <= REACH).all(1)
         if not bool(near.all()):
-            logger.warning("the page leaves out %d Gaussians that cannot be drawn or are very far away", int((~near).sum()))
-        return base64.b64encode(encode_spz(placed[near], progress, level=GZIP_LEVEL)).decode("ascii")
+            left_out = int((~near).sum())
+            logger.warning("%s: the page leaves out %d Gaussians that are very far away or without meaning", name, left_out)
+        spz = base64.b64encode(encode_spz(placed[near], progress, level=GZIP_LEVEL)).decode("ascii")
+        megabytes = ply_bytes(len(scene), scene.sh_degree) / 1e6
+        return {"name": name, "amount": f"{len(scene):,} Gaussians, {megabytes:.2f} MB as .ply", "spz": spz}
 
-    def data(self, packed: Sequence[tuple[str, str]]) -> dict[str, Any]:
+    def data(self, packed: Sequence[dict[str, str]]) -> dict[str, Any]:
         """What ``flight.js`` reads.
 
         Args:
-            packed: names and what :meth:`packed` gives, of one or two scenes; the first is shown on the left.
+            packed: what :meth:`packed` gives of one or two scenes; the first is shown on the left.
         """
         fov = 2 * torch.atan(0.5 * max(self.views.width, self.views.height) / self.views.Ks[:, 0, 0].abs())
         return {
-            "scenes": [{"name": name, "spz": spz} for name, spz in packed],
+            "scenes": list(packed),
             "views": [
                 {"eye": eye, "fov": angle, **dict(zip(("right", "down", "ahead"), viewmat[:3], strict=False))}
                 for eye, angle, viewmat in zip(
@@ -125,6 +130,16 @@ class Stage:
 def _eyes(views: Views) -> Tensor:
     """Positions (C, 3) of cameras."""
     return -(views.viewmats[:, :3, :3].mT @ views.viewmats[:, :3, 3:])[..., 0]
+
+
+def _in_picture(points: Tensor, views: Views) -> Tensor:
+    """How many of some points (N, 3), at most a few thousand of them, views (C) have in their pictures, (C,)."""
+    points = points[:: max(1, len(points) // 4096)]
+    x, y, z = (views.viewmats[:, :3, :3] @ points.T + views.viewmats[:, :3, 3:]).unbind(1)
+    u = x / z * views.Ks[:, 0, :1] + views.Ks[:, 0, 2:]
+    v = y / z * views.Ks[:, 1, 1:2] + views.Ks[:, 1, 2:]
+    seen = (z > views.near_plane) & (u > 0) & (u < views.width) & (v > 0) & (v < views.height)
+    return seen.sum(1)
 
 
 def _sampled(scene: Gaussians, centre: Tensor, size: float, up: Tensor) -> Views:

@@ -40,11 +40,12 @@ def write_page(
     Args:
         scenes: one scene, or two: the first is on the left of the wipe.
         path: the file to write.
-        names: a name for each scene; by default the number of its Gaussians.
+        names: a name for each scene; by default the title, or "left" and "right".
         title: of the page; by default the name of the file.
         notes: lines of text for the reader.
-        views: where to begin, and where further views lead; by default sampled from the first scene. Their background
-            is behind the scenes, and they say whether the scenes were trained with antialiasing.
+        views: where buttons of the page lead; by default sampled from the first scene. It opens at the one with most
+            Gaussians in its picture. Their background is behind the scenes, and they say whether the scenes were
+            trained with antialiasing.
         limit_mb: size of the file, at most, in units of 10^6 bytes.
         progress: True shows a bar; a function is called with what is being done and the share done of it.
 
@@ -68,30 +69,32 @@ def write_page(
     """
     path = Path(path)
     scenes = [scenes] if isinstance(scenes, Gaussians) else list(scenes)
-    names = [f"{len(scene):,} Gaussians" for scene in scenes] if names is None else list(names)
+    title = path.stem if title is None else title
+    names = ([title] if len(scenes) == 1 else ["left", "right"]) if names is None else list(names)
     if not 1 <= len(scenes) <= 2:
         raise PointSplatError(f"{len(scenes)} scenes for {path}; expected one or two")
     if len(names) != len(scenes):
-        raise PointSplatError(f"{len(names)} names for {len(scenes)} scenes; expected one each")
+        raise PointSplatError(f"{len(names)} names for {len(scenes)} scenes; expected one for each")
     check_limit(limit_mb)
+    rows = [_row(name, scene) for name, scene in zip(names, scenes, strict=True)]
     with progress_bar(progress) as report:
         report("looking for views", 0.0)
         stage = Stage.of(scenes[0], views)
-        rows = [_row(name, scene) for name, scene in zip(names, scenes, strict=True)]
         shown = [
-            (name, stage.packed(scene, lambda _, share, name=name: report(f"compressing {name}", share)))
+            stage.packed(scene, name, lambda _, share, name=name: report(f"compressing {name}", share))  # type: ignore
             for name, scene in zip(names, scenes, strict=True)
         ]
-        notes = list(notes)
+        missing = ""
         while True:
-            data = {"flight": stage.data(shown)}
-            values = {"rows": rows, "title": title or path.stem, "notes": notes, "flight": data["flight"]}
-            text = page("scene.html", (*SCRIPTS, "scene.js"), with_workers=True, data=data, **values).encode("utf-8")
+            flight = stage.data(shown)
+            values = {"title": title, "rows": rows, "notes": notes, "missing": missing, "flight": flight}
+            text = page(
+                "scene.html", (*SCRIPTS, "scene.js"), with_workers=True, **values, data={"flight": flight}
+            ).encode("utf-8")  # fmt: skip
             if len(text) <= 1e6 * limit_mb:
                 break
-            shown, left_out = _without_the_largest(shown, path, len(text), limit_mb)
-            notes.append(left_out)
-            logger.warning("%s: %s", path, left_out)
+            shown, missing = _without_the_largest(shown, path, len(text), limit_mb)
+            logger.warning("%s: %s", path, missing)
     with replacing(path) as part:
         part.write_bytes(text)
     return path
@@ -108,8 +111,8 @@ def check_limit(limit_mb: float) -> None:
 
 
 def _without_the_largest(
-    shown: list[tuple[str, str]], path: Path, size: int, limit_mb: float
-) -> tuple[list[tuple[str, str]], str]:
+    shown: list[dict[str, str]], path: Path, size: int, limit_mb: float
+) -> tuple[list[dict[str, str]], str]:
     """The other scenes, and a line of text on the one that is left out.
 
     Raises:
@@ -118,15 +121,16 @@ def _without_the_largest(
     excess = f"the page would have {size / 1e6:.1f} MB, more than the {limit_mb:g} MB allowed"
     if len(shown) == 1:
         raise PointSplatError(f"{path}: {excess}; expected a larger limit, or fewer Gaussians")
-    name, _ = largest = max(shown, key=lambda scene: len(scene[1]))
-    return [scene for scene in shown if scene is not largest], f"{name} is left out: with it {excess}"
+    largest = max(shown, key=lambda scene: len(scene["spz"]))
+    return [scene for scene in shown if scene is not largest], f"{largest['name']} is left out: with it {excess}"
 
 
 def _row(name: str, scene: Gaussians) -> dict[str, Any]:
     """A scene for the table of the page."""
+    megabytes = ply_bytes(len(scene), scene.sh_degree) / 1e6
     return {
         "name": name,
         "gaussians": f"{len(scene):,}",
         "sh_degree": scene.sh_degree,
-        "ply": f"{ply_bytes(len(scene), scene.sh_degree) / 1e6:.2f}",
+        "ply": f"{megabytes:.2f}",
     }

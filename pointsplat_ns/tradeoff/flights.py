@@ -37,10 +37,10 @@ def keep_flight(stage: Stage, scene: Gaussians, name: str, path: Path) -> bool:
     """
     if ply_bytes(len(scene), scene.sh_degree) > _LEAST_RATIO * MAX_BYTES:
         return False
-    packed = stage.packed(scene)
-    if len(packed) > 0.99 * MAX_BYTES:  # the views take some as well
+    packed = stage.packed(scene, name)
+    if len(packed["spz"]) > 0.99 * MAX_BYTES:  # the views take some as well
         return False
-    write_json(stage.data([(name, packed)]), path)
+    write_json(stage.data([packed]), path)
     return True
 
 
