@@ -11,7 +11,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger, replacing
 from pointsplat_ns.pages.flight import SCRIPTS, Stage
 from pointsplat_ns.pages.html import page
-from pointsplat_ns.pruning import ply_bytes
+from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.views import Views
 
@@ -76,6 +76,8 @@ def write_page(
     if len(names) != len(scenes):
         raise PointSplatError(f"{len(names)} names for {len(scenes)} scenes; expected one for each")
     check_limit(limit_mb)
+    for scene in scenes:
+        need_usable(scene)
     rows = [_row(name, scene) for name, scene in zip(names, scenes, strict=True)]
     with progress_bar(progress) as report:
         report("looking for views", 0.0)
