@@ -92,8 +92,8 @@ def test_a_page_to_fly_through_both_scenes_is_written(ply, helps, tmp_path, caps
     said = capsys.readouterr().out
     assert f"{shown}: {shown.stat().st_size / 1e6:.2f} MB, to fly through in a browser" in said
     text = shown.read_text("utf-8")
-    psnr = re.search(r"(?m)^refinement: [\d.]+ -> ([\d.]+) dB", said)[1][:-1]
-    assert f"The compact scene has {psnr}" in text and "<h1>room</h1>" in text
+    psnr = re.search(r"(?m)^refinement: [\d.]+ -> ([\d.]+) dB", said)[1]
+    assert f"The compact scene has {psnr} dB PSNR" in text and "<h1>room</h1>" in text
     flight = parts_of(shown).data["flight"]
     assert [(scene["name"], scene["amount"].split(",")[0]) for scene in flight["scenes"]] == [
         ("dense", "150 Gaussians"),

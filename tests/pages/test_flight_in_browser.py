@@ -226,6 +226,18 @@ def test_shift_shifts_and_the_wheel_comes_nearer_once_the_picture_was_clicked(op
     settle(opened)
 
 
+def test_what_is_upside_down_is_turned_over_and_stays_so(opened):
+    opened.execute_script("flight.setWipe(1)")
+    before, up = picture(opened), opened.execute_script("return flight.camera.up")
+    opened.find_element(By.CSS_SELECTOR, "[data-flight='over']").click()
+    for lead in ("", "flight.goTo(0)"):
+        opened.execute_script(lead)
+        assert ps.psnr(picture(opened).flip(0, 1), before) > 50
+        assert np.allclose(opened.execute_script("return flight.camera.up"), np.negative(up))
+    opened.find_element(By.TAG_NAME, "canvas").send_keys("t")
+    assert torch.equal(picture(opened), before)
+
+
 def test_steep_looks_stop_before_up_changes_sides(opened):
     for _ in range(3):
         opened.execute_script("flight.setDrag('look'); for (let i = 0; i < 40; i++) flight.camera.turn(0.1, 0.1)")

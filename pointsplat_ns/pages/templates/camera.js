@@ -16,13 +16,9 @@ const STEEPEST = 0.99; // cosine between the camera's direction and up: farther,
 const NEAREST = 0.1; // to what the camera circles about
 
 class Camera {
-  constructor(up) {
-    this.up = up;
-  }
-
   // Go to a view: its place `eye`, its axes and its field of view. It circles about what is ahead, level with the middle.
-  goTo({ eye, right, down, ahead, fov }) {
-    Object.assign(this, { eye, right, down, ahead, fov });
+  goTo({ eye, right, down, ahead, fov }, up) {
+    Object.assign(this, { eye, right, down, ahead, fov, up });
     const middle = -dot(eye, ahead);
     this.reach = middle > 1 ? middle : 2;
   }
@@ -41,6 +37,11 @@ class Camera {
     this.ahead = unit(ahead); // rounding would add up
     this.right = unit(cross(down, this.ahead));
     this.down = cross(this.ahead, this.right);
+  }
+
+  // Look at the same, upside down.
+  turnOver() {
+    for (const axis of ["up", "right", "down"]) this[axis] = plus([0, 0, 0], this[axis], -1);
   }
 
   // Circle about what is ahead: turn, and go aside by as much.

@@ -11,11 +11,11 @@ class Flight {
     this.data = data;
     this.part = Object.fromEntries([...root.querySelectorAll("[data-flight]")].map((part) => [part.dataset.flight, part]));
     this.canvas = this.part.canvas;
-    this.camera = new Camera(data.up);
-    this.camera.goTo(data.views[0]);
+    this.camera = new Camera();
+    this.camera.goTo(data.views[0], data.up);
     this.controls = new Controls(this.canvas, this.camera, () => this.change());
     this.scenes = [];
-    this.opened = false;
+    this.opened = this.over = false;
     this.wipe = 0.5;
     this.detail = 1; // share of the pixels each way while it moves
     this.times = []; // of the last frames of a movement
@@ -63,6 +63,7 @@ class Flight {
     this.setDrag(this.data.drag);
     part.drag.addEventListener("change", (event) => this.setDrag(event.target.value));
     part.reset.addEventListener("click", () => this.reset());
+    part.over.addEventListener("click", () => this.turnOver());
     part.full.addEventListener("click", () => this.fill());
     part.views.querySelectorAll("button").forEach((button, index) => button.addEventListener("click", () => this.goTo(index)));
     this.canvas.addEventListener("keydown", (event) => this.press(event));
@@ -89,6 +90,7 @@ class Flight {
     const number = Number(event.key);
     if (number >= 1 && number <= this.data.views.length) this.goTo(number - 1);
     else if (event.code === "KeyR") this.reset();
+    else if (event.code === "KeyT") this.turnOver();
     else if (event.code === "KeyF") this.fill();
     else if (event.key === "[" || event.key === "]") this.setWipe(this.wipe + (event.key === "[" ? -0.05 : 0.05));
   }
@@ -108,7 +110,15 @@ class Flight {
   }
 
   goTo(index) {
-    this.camera.goTo(this.data.views[index]);
+    this.camera.goTo(this.data.views[index], this.data.up);
+    if (this.over) this.camera.turnOver();
+    this.change();
+  }
+
+  // Which way is up was estimated, and may be wrong.
+  turnOver() {
+    this.over = !this.over;
+    this.camera.turnOver();
     this.change();
   }
 
