@@ -113,7 +113,9 @@ def compact(
     if picture is not None:
         print(ps.plot_comparison(dense, result, picture))
     if html is not None:
-        notes = [] if result.psnr is None else [f"The compact scene has {result.psnr:.2f} dB PSNR against the dense scene's renders."]
+        notes = []
+        if result.psnr is not None:
+            notes.append(f"The compact scene has {result.psnr:.2f} dB PSNR against the dense scene's renders.")
         ps.write_page(
             [dense, result.scene], html, ["dense", "compact"], title=name_of(scene), notes=notes, views=result.views,
             limit_mb=html_limit, progress=True,

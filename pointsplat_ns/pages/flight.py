@@ -27,8 +27,8 @@ from pointsplat_ns.pruning.content import (
     positions_in_units,
     views_in_units,
 )
-from pointsplat_ns.pruning.view_sampling import NEAR_PLANE, estimated_up, look_at, sample_views
 from pointsplat_ns.pruning.upright import level_directions
+from pointsplat_ns.pruning.view_sampling import NEAR_PLANE, estimated_up, look_at, sample_views
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.views import Views
 
@@ -41,10 +41,11 @@ VIEWS = 6
 """Number of views, at most, that a page leads to."""
 
 REACH = 2047.0
-"""Gaussians farther from the middle of the content (units, 10 to its diagonal) are left out: positions in SPZ have steps
-of 1/4096 of a unit only up to there."""
+"""Gaussians farther from the middle of the content (units, 10 to its diagonal) are left out: up to there, positions in
+SPZ have steps of 1/4096 of a unit."""
 
 GZIP_LEVEL = 6
+"""A tenth of the time of 9, for 3 % more bytes."""
 
 _SIZE = (960, 600)
 """Size of sampled views: the shape of the stage."""
@@ -88,7 +89,7 @@ class Stage:
         return Stage(centre, size, up, views, bool((_eyes(views)[0].abs() < half).all()))
 
     def packed(self, scene: Gaussians, name: str, progress: Progress = silent) -> dict[str, str]:
-        """A scene for the page: its name, how much it is, and itself as SPZ of version 3 in units of the content, base64.
+        """A scene for the page: its name, how much it is, and itself, in units of the content, as base64 of SPZ 3.
 
         Args:
             scene: N Gaussians.
@@ -97,9 +98,9 @@ class Stage:
         """
         placed = in_units(scene.detach(), self.centre.to(scene.device), self.size).to("cpu", torch.float32)
         near = placed.usable() & (placed.means.abs() <= REACH).all(1)
-        if not bool(near.all()):
-            left_out = int((~near).sum())
-            logger.warning("%s: the page leaves out %d Gaussians that are very far away or without meaning", name, left_out)
+        left_out = int((~near).sum())
+        if left_out:
+            logger.warning("%s: %d Gaussians, very far away or without meaning, are not in the page", name, left_out)
         spz = base64.b64encode(encode_spz(placed[near], progress, level=GZIP_LEVEL)).decode("ascii")
         megabytes = ply_bytes(len(scene), scene.sh_degree) / 1e6
         return {"name": name, "amount": f"{len(scene):,} Gaussians, {megabytes:.2f} MB as .ply", "spz": spz}

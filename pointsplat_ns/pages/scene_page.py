@@ -16,7 +16,7 @@ from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.views import Views
 
 LIMIT_MB = 60.0
-"""Size of a page, at most, unless another is asked for: what a browser opens at once and a mail program may still send."""
+"""Size of a page, at most, unless another is asked for: two million Gaussians, which a browser opens within seconds."""
 
 
 def write_page(
@@ -82,10 +82,11 @@ def write_page(
     with progress_bar(progress) as report:
         report("looking for views", 0.0)
         stage = Stage.of(scenes[0], views)
-        shown = [
-            stage.packed(scene, name, lambda _, share, name=name: report(f"compressing {name}", share))  # type: ignore
-            for name, scene in zip(names, scenes, strict=True)
-        ]
+
+        def packed(name: str, scene: Gaussians) -> dict[str, str]:
+            return stage.packed(scene, name, lambda _, share: report(f"compressing {name}", share))
+
+        shown = [packed(name, scene) for name, scene in zip(names, scenes, strict=True)]
         missing = ""
         while True:
             flight = stage.data(shown)

@@ -101,9 +101,8 @@ def test_too_large_a_page_leaves_the_larger_scene_out_and_says_so(written, rooms
     assert f'<p class="note">{sentence}.</p>' in path.read_text("utf-8") and sentence in caplog.text
     assert [len(scene) for scene in scenes_in(path, tmp_path)] == [len(rooms[1])]
     assert f"<td>{len(rooms[0]):,}</td>" in path.read_text("utf-8"), "the table still has both"
-    assert ps.write_page(rooms, path, ["dense", "compact"], views=room_views(), limit_mb=both + 0.01).stat().st_size == (
-        written.stat().st_size - len("room</title>room</h1>") + len("less</title>less</h1>")
-    )
+    ps.write_page(rooms, path, ["dense", "compact"], title="room", views=room_views(), limit_mb=both + 0.01)
+    assert path.read_bytes() == written.read_bytes()
 
 
 def test_a_scene_that_alone_is_too_large_is_refused_and_nothing_is_written(rooms, tmp_path):
@@ -122,7 +121,7 @@ def test_a_scene_that_alone_is_too_large_is_refused_and_nothing_is_written(rooms
         ([ball(9)], {"limit_mb": math.nan}, ps.PointSplatError, "a page of at most nan MB"),
         ([ball(9)[:0]], {}, ps.SceneError, "none of the 0 Gaussians can be drawn"),
         ([ball(9).map(lambda v: v * math.nan)], {}, ps.SceneError, "none of the 9 Gaussians can be drawn"),
-        ([ball(9).replace(opacities=torch.full((9, 1), -math.inf))], {}, ps.DataError, "nothing of the scene can be seen"),
+        ([ball(9).replace(opacities=torch.full((9, 1), -math.inf))], {}, ps.DataError, "nothing .* can be seen"),
         ([ball(9), ball(9)[:0]], {}, ps.SceneError, "none of the 0 Gaussians can be drawn"),
     ],
 )  # fmt: skip
@@ -144,7 +143,7 @@ def test_what_is_very_far_away_or_has_no_meaning_is_left_out_and_counted(tmp_pat
     means[3], means[7], means[9] = 1e6, math.nan, torch.tensor([0.0, -1e9, 0.0])
     with caplog.at_level(logging.WARNING):
         path = ps.write_page(scene.replace(means=means), tmp_path / "page.html", ["the ball"])
-    assert "the ball: the page leaves out 3 Gaussians that are very far away or without meaning" in caplog.text
+    assert "the ball: 3 Gaussians, very far away or without meaning, are not in the page" in caplog.text
     [shown] = scenes_in(path, tmp_path)
     assert len(shown) == 197 and shown.means.abs().max() < REACH
 

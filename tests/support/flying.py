@@ -56,9 +56,7 @@ def view_on(stage: Stage, index: int, image: Tensor) -> ps.View:
     view = stage.views[index]
     focal = float(view.K[0, 0]) * max(width, height) / max(view.width, view.height)
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-    return ps.View(
-        view.viewmat.float(), K, width, height, view.background, view.rasterize_mode, view.near_plane
-    )
+    return ps.View(view.viewmat.float(), K, width, height, view.background, view.rasterize_mode, view.near_plane)
 
 
 def camera(browser) -> dict[str, list[float]]:

@@ -15,7 +15,6 @@ from pointsplat_ns.tradeoff.page import write_page
 from pointsplat_ns.tradeoff.points import Tradeoff, flight_path
 from sweeps import measured_room, room_views
 
-
 FLOWN = "0.1_coverage"
 """Key of the one point whose scene is kept to fly through. No point is recommended."""
 
