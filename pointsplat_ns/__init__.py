@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import measure_tradeoff
     from pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner import make_refiner
     from pointsplat_ns.nerfstudio_plugin.pointsplat.report import report
+    from pointsplat_ns.pages.scene_page import write_page
     from pointsplat_ns.pruning.view_sampling import sample_views
     from pointsplat_ns.rasterizer import rasterization, render
     from pointsplat_ns.rooms import write_room
@@ -56,6 +57,7 @@ _PUBLIC = {
     "pointsplat_ns.compression.scene_info": ("SceneInfo", "info"),
     "pointsplat_ns.compression.scene_task": ("SceneResult",),
     "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner"),
+    "pointsplat_ns.pages.scene_page": ("write_page",),
     "pointsplat_ns.pruning.view_sampling": ("sample_views",),
     "pointsplat_ns.errors": ("BudgetError", "DataError", "PointSplatError", "SceneError"),
     "pointsplat_ns.folders": ("compact_folder",),
@@ -115,6 +117,7 @@ __all__ = [
     "sample_views",
     "save",
     "ssim",
+    "write_page",
     "write_room",
 ]
 

@@ -30,6 +30,8 @@ SHIPPED = (
     "pointsplat_ns/pages/templates/base.html",
     "pointsplat_ns/pages/templates/style.css",
     "pointsplat_ns/pages/templates/tradeoff.js",
+    "pointsplat_ns/pages/templates/splats.js",
+    "pointsplat_ns/pages/templates/flight.html",
     "method_configs/methods.py",
 )
 """What is needed and is not found by following imports."""

@@ -12,7 +12,9 @@ from pointsplat_ns.cli.scene_options import (
     Bands,
     Output,
     Scene,
+    check_output,
     check_outputs,
+    file_bytes,
     in_format_of,
     output_beside,
     print_distributions,
@@ -32,6 +34,8 @@ def compact(
     effort: Literal["instant", "quick", "thorough"] = "quick",
     seconds: float | None = None,
     picture: Path | None = None,
+    html: Path | None = None,
+    html_limit: float = 60.0,
     dry_run: bool = False,
     force: bool = False,
     jobs: int | None = None,
@@ -63,6 +67,9 @@ def compact(
         effort: how long to repair then: not at all (instant), 32 steps (quick, about as long as merging takes), or 400.
         seconds: repair for so many seconds, instead of a fixed effort. Ctrl-C ends it earlier and loses nothing.
         picture: a .png file for images of some views: dense, before and after the repair, side by side.
+        html: an .html file that opens offline in a browser, to fly through the scene before and after, with a wipe
+            between them.
+        html_limit: size of that file, at most, in MB. Where both scenes take more, the dense one is left out.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
         jobs: of a folder: number of processes that share its scenes and the cores; by default 1.
@@ -78,8 +85,8 @@ def compact(
     if is_folder_of_scenes(scene):
         with fixed_threads(threads):
             compact_folder(
-                scene, output, picture, dry_run, keep=keep, refiner=refiner, by=by, sh=sh, clean=clean, effort=effort,
-                seconds=seconds, jobs=1 if jobs is None else jobs, shard=shard, force=force,
+                scene, output, picture, html, dry_run, keep=keep, refiner=refiner, by=by, sh=sh, clean=clean,
+                effort=effort, seconds=seconds, jobs=1 if jobs is None else jobs, shard=shard, force=force,
             )  # fmt: skip
         return
     if jobs is not None or shard is not None:
@@ -87,9 +94,13 @@ def compact(
     from pointsplat_ns.compression.compact import resolve_options
     from pointsplat_ns.compression.repair import RepairBudget
     from pointsplat_ns.io import read_scene
+    from pointsplat_ns.io.runs import name_of
+    from pointsplat_ns.pages.scene_page import check_limit
 
     output = output or output_beside(scene, "compact")
     check_outputs(None if dry_run else output, picture, force)
+    check_output(html, ".html", force)
+    check_limit(html_limit)
     keep = None if keep is None else in_format_of(keep, output)
     trained = ps.load_refiner(refiner)
     resolve_options(trained, keep, by, sh)
@@ -107,3 +118,12 @@ def compact(
     print_distributions(dense, result.scene)
     if picture is not None:
         print(ps.plot_comparison(dense, result, picture))
+    if html is not None:
+        notes = []
+        if result.psnr is not None:
+            notes.append(f"The compact scene has {result.psnr:.2f} dB PSNR against the dense scene's renders.")
+        ps.write_page(
+            [dense, result.scene], html, ["dense", "compact"], title=name_of(scene), notes=notes, views=result.views,
+            limit_mb=html_limit, progress=True,
+        )  # fmt: skip
+        print(f"{html}: {file_bytes(html) / 1e6:.2f} MB, to fly through in a browser")

@@ -25,13 +25,15 @@ def need_one_scene(path: Path) -> None:
         )
 
 
-def compact_folder(folder: Path, output: Path | None, picture: Path | None, dry_run: bool, **options) -> None:
+def compact_folder(
+    folder: Path, output: Path | None, picture: Path | None, html: Path | None, dry_run: bool, **options
+) -> None:
     """Compact every scene of a folder, and print a table of them.
 
     Args:
         folder: the folder.
         output: the folder for results.
-        picture, dry_run: what is refused here.
+        picture, html, dry_run: what is refused here.
         options: further ones of :func:`pointsplat_ns.compact_folder`.
 
     Raises:
@@ -42,7 +44,7 @@ def compact_folder(folder: Path, output: Path | None, picture: Path | None, dry_
     from pointsplat_ns.compression.scene_folder import TABLE_NAME, output_folder
     from pointsplat_ns.folders import torchrun_rank
 
-    for name, given in (("--picture", picture is not None), ("--dry-run", dry_run)):
+    for name, given in (("--picture", picture is not None), ("--html", html is not None), ("--dry-run", dry_run)):
         if given:
             raise ps.SceneError(f"{name} is for one scene; {folder} is a folder of scenes")
     target = output or output_folder(folder, "compact")

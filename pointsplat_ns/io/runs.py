@@ -146,6 +146,16 @@ def scene_name(run: Run) -> str:
     return file_stem(name)
 
 
+def name_of(path: Path) -> str:
+    """The name of a scene that can be a file name: that of its run, or else of its file."""
+    if may_be_run(path):
+        try:
+            return scene_name(open_run(path, need_data=False))
+        except SceneError:
+            pass  # a checkpoint outside a run
+    return file_stem(path.stem)
+
+
 def _tagged(parent: Tagged, name: str, path: Path) -> Tagged:
     value = parent.fields.get(name)
     if not isinstance(value, Tagged):

@@ -7,9 +7,8 @@ from pathlib import Path
 
 from pointsplat_ns.compression.level_folder import source_file
 from pointsplat_ns.compression.view_source import ViewSource
-from pointsplat_ns.errors import BudgetError, SceneError
-from pointsplat_ns.io.files import file_stem
-from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
+from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.io.runs import may_be_run, name_of
 from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
 from pointsplat_ns.system.progress import Progress, progress_bar
@@ -88,7 +87,7 @@ def measure_tradeoff(
     subject = Subject(
         dense=dense,
         path=path,
-        name=_name(path),
+        name=name_of(path),
         sha256=source_file(path).sha256,
         new_views=lambda: ViewSource(dense, run=path, dataset_views=dataset_views),
         held_out=functools.partial(dataset_photos, path, "test") if may_be_run(path) else None,
@@ -110,13 +109,3 @@ def measure_tradeoff(
         if not output.exists() or force:
             save(sweep.scene(found.setting), output)
         return sweep.finish(found.point, f"{found.why}; written to {output}")
-
-
-def _name(path: Path) -> str:
-    """The name of a scene: that of a run, or of a file."""
-    if may_be_run(path):
-        try:
-            return scene_name(open_run(path, need_data=False))
-        except SceneError:
-            pass  # a checkpoint outside a run
-    return file_stem(path.stem)

@@ -29,7 +29,7 @@ def _environment() -> Environment:
     return environment
 
 
-def page(template: str, scripts: tuple[str, ...] = (), **values: Any) -> str:
+def page(template: str, scripts: tuple[str, ...] = (), *, with_workers: bool = False, **values: Any) -> str:
     """One HTML page with its style, scripts and data in it.
 
     Its policy (CSP) lets a browser run and apply the script and style that are named by their hashes and show pictures
@@ -38,6 +38,7 @@ def page(template: str, scripts: tuple[str, ...] = (), **values: Any) -> str:
     Args:
         template: name of a template that extends ``base.html``.
         scripts: names of the scripts to put in, in this order.
+        with_workers: let the scripts start workers, whose programs are parts of them.
         values: what the template shows. Texts are escaped; bytes of a file's name that are no characters become "?".
 
     Raises:
@@ -47,17 +48,16 @@ def page(template: str, scripts: tuple[str, ...] = (), **values: Any) -> str:
 
     style = _source("style.css")
     script = "\n".join(_source(name) for name in scripts)
-    policy = "; ".join(
-        (
-            "default-src 'none'",
-            "img-src data:",
-            f"style-src '{_hash(style)}'",
-            f"script-src '{_hash(script)}'" if script else "script-src 'none'",
-            "base-uri 'none'",
-            "form-action 'none'",
-        )
+    rules = (
+        "default-src 'none'",
+        "img-src data:",
+        f"style-src '{_hash(style)}'",
+        f"script-src '{_hash(script)}'" if script else "script-src 'none'",
+        *(("worker-src blob:",) if with_workers else ()),
+        "base-uri 'none'",
+        "form-action 'none'",
     )
-    fixed = {"style": _as_it_is(style), "script": _as_it_is(script), "policy": policy, "version": __version__}
+    fixed = {"style": _as_it_is(style), "script": _as_it_is(script), "policy": "; ".join(rules), "version": __version__}
     text = _environment().get_template(template).render(**fixed, **values)
     return text.encode("utf-8", "replace").decode("utf-8")
 

@@ -14,9 +14,11 @@ import numpy as np
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.files import replacing
+from pointsplat_ns.pages.flight import SCRIPTS
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.pages.pictures import AMPLIFIED, error_colors, error_map, fit, read_png
 from pointsplat_ns.system.progress import Progress
+from pointsplat_ns.tradeoff.flights import read_flight
 from pointsplat_ns.tradeoff.front import (
     COSTS,
     METRICS,
@@ -28,7 +30,7 @@ from pointsplat_ns.tradeoff.front import (
     quality_of,
 )
 from pointsplat_ns.tradeoff.loss import psnr_within
-from pointsplat_ns.tradeoff.points import Point, Tradeoff, picture_path
+from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, picture_path
 
 MAX_BYTES = 10_000_000
 """Size of the page, at most: what goes through mail and opens at once."""
@@ -46,7 +48,8 @@ def write_page(sweep: Tradeoff, folder: Path, output: Path, progress: bool | Pro
     It has the points' quality against their cost with the Pareto front, a slider along the front that shows every view
     at each point beside the dense scene and the photo with an error map and a wipe, the fastest point that is good
     enough with the command that makes it, and a table of all points. Views are those of which there is a picture of the
-    dense scene.
+    dense scene. The recommended scene is there to fly through, if it is at
+    :func:`~pointsplat_ns.tradeoff.points.flight_path`.
 
     Args:
         sweep: what was measured. Its first point is the dense scene.
@@ -66,11 +69,16 @@ def write_page(sweep: Tradeoff, folder: Path, output: Path, progress: bool | Pro
     if not sweep.points:
         raise DataError(f"{folder}: nothing was measured; expected the dense scene and at least one smaller one")
     pictures = _Pictures.of(sweep, folder)
-    values, data = _values(sweep, len(pictures.names)), _data(sweep)
+    flight = read_flight(flight_path(folder, sweep.recommended))
+    values, data = _values(sweep, len(pictures.names)), {**_data(sweep), "flight": flight}
+    scripts = ("chart.js", *(SCRIPTS if flight else ()), "tradeoff.js")
 
     def filled(uris: list[str], compressed: str) -> str:
         shown = {**data, "pictures": pictures.placed(uris)}
-        return page("tradeoff.html", ("chart.js", "tradeoff.js"), **values, data=shown, compressed=compressed)
+        return page(
+            "tradeoff.html", scripts, with_workers=flight is not None, **values, flight=flight, data=shown,
+            compressed=compressed,
+        )  # fmt: skip
 
     empty = filled([""] * len(pictures.sources), " " * 100)  # of how pictures were compressed is said in fewer letters
     text = filled(*fit(pictures.sources, MAX_BYTES - len(empty.encode("utf-8")), progress))

@@ -104,3 +104,13 @@ def picture_path(folder: Path, view: int, what: str) -> Path:
         what: a point's ``key``, or ``photo``.
     """
     return folder / "pictures" / f"{view:02d}_{what}.png"
+
+
+def flight_path(folder: Path, key: str) -> Path:
+    """Where a point's scene lies, as the page shows it to fly through, if it is small enough for that.
+
+    Args:
+        folder: the folder of the sweep.
+        key: the point's.
+    """
+    return folder / "scenes" / f"{key}.json"

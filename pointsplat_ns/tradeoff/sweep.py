@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 from torch import Tensor
@@ -14,16 +15,18 @@ from torch import Tensor
 from pointsplat_ns.compression.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.pages.flight import Stage
 from pointsplat_ns.pruning import cut_sh, method_named, need_usable, ply_bytes
 from pointsplat_ns.system.cores import cores
 from pointsplat_ns.system.progress import Progress
+from pointsplat_ns.tradeoff.flights import keep_flight
 from pointsplat_ns.tradeoff.journal import POINTS, Journal
 from pointsplat_ns.tradeoff.judging import Judge, Judged, LookedAt
 from pointsplat_ns.tradeoff.loss import recommend
 from pointsplat_ns.tradeoff.machine import is_busy, machine_text, one_at_a_time
 from pointsplat_ns.tradeoff.making import Made, make
 from pointsplat_ns.tradeoff.outputs import OUTPUTS, write_outputs
-from pointsplat_ns.tradeoff.points import Point, Tradeoff
+from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path
 from pointsplat_ns.tradeoff.settings import DENSE, REPAIRS, Naming, Repair, Setting, check_repairs
 from pointsplat_ns.tradeoff.walk import Plan, walk
 from pointsplat_ns.views import Views
@@ -216,12 +219,22 @@ class Sweep:
                 made = make(self.dense, setting, self.subject.new_views, show)
                 judged = self.judge.judge(made.scene, key, lambda share: show("", share))
             self._made = (setting, made.scene)
+            if self._stage is not None:
+                keep_flight(self._stage, made.scene, label, flight_path(self.folder, key))
             point = self._point(setting, made, judged, key, label, self.naming.command(setting))
             self._take(point, time.perf_counter() - start, alone, of)
             if not self._shown:  # the first useful picture, early
                 self._shown = True
                 write_outputs(self.result(), self.folder)
         return self.journal.points[setting]
+
+    @cached_property
+    def _stage(self) -> Stage | None:
+        """Where the page begins to fly through a scene; None if nothing of the dense one is visible."""
+        try:
+            return Stage.of(self.dense, self.looked_at.views)
+        except DataError:
+            return None
 
     def scene(self, setting: Setting) -> Gaussians:
         """The scene of a setting, made anew unless it was the last one made."""

@@ -11,6 +11,7 @@ import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 import pointsplat_ns.compression.compact as compact_module
+from html_parts import parts_of
 from making import ball, same
 from pointsplat_ns import api
 from pointsplat_ns.cli import main
@@ -83,6 +84,25 @@ def test_refinement_that_helps_is_written_and_shown(ply, helps, tmp_path, capsys
     height, width, _ = matplotlib.image.imread(tmp_path / "shown.png").shape
     assert width == 1600 and height > 1200  # three columns and rows of 4 to 3, and a line of titles
     assert [p.name for p in output.parent.iterdir()] == ["small.ply"]
+
+
+def test_a_page_to_fly_through_both_scenes_is_written(ply, helps, tmp_path, capsys):
+    output, shown = tmp_path / "small.ply", tmp_path / "shown.html"
+    run("compact", ply, "--refiner", helps, "-o", output, "--html", shown)
+    said = capsys.readouterr().out
+    assert f"{shown}: {shown.stat().st_size / 1e6:.2f} MB, to fly through in a browser" in said
+    text = shown.read_text("utf-8")
+    psnr = re.search(r"(?m)^refinement: [\d.]+ -> ([\d.]+) dB", said)[1]
+    assert f"The compact scene has {psnr} dB PSNR" in text and "<h1>room</h1>" in text
+    flight = parts_of(shown).data["flight"]
+    assert [(scene["name"], scene["amount"].split(",")[0]) for scene in flight["scenes"]] == [
+        ("dense", "150 Gaussians"),
+        ("compact", "75 Gaussians"),
+    ]
+    assert len(flight["views"]) == 6
+    run("compact", ply, "--refiner", helps, "--dry-run", "--html", shown, "--html-limit", "0.0545", "--force")
+    assert "dense is left out" in shown.read_text("utf-8")
+    assert [scene["name"] for scene in parts_of(shown).data["flight"]["scenes"]] == ["compact"]
 
 
 def test_refinement_that_harms_is_left_out_and_it_is_said(ply, harms, tmp_path, capsys):
@@ -186,6 +206,9 @@ def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
     assert "keep is 'half'" in refusal(capsys, output, ply, "--refiner", helps, "--keep", "half")
     assert ".spz, .sog" in refusal(capsys, tmp_path / "small.obj", ply, "--refiner", helps)
     assert "ends in .png" in refusal(capsys, output, ply, "--refiner", helps, "--picture", tmp_path / "shown.jpg")
+    assert "ends in .html" in refusal(capsys, output, ply, "--refiner", helps, "--html", tmp_path / "shown.png")
+    said = refusal(capsys, output, ply, "--refiner", helps, "--html", tmp_path / "shown.html", "--html-limit", "0")
+    assert "a page of at most 0 MB" in said
     write_ply(room()[:0], tmp_path / "empty.ply")
     assert "Gaussians" in refusal(capsys, output, tmp_path / "empty.ply", "--refiner", helps)
     refiner = Refiner(preset("tiny", sh_degree=0))
@@ -210,6 +233,9 @@ def test_files_that_exist_are_only_overwritten_by_force(ply, helps, tmp_path, ca
     said = refusal(capsys, tmp_path / "other.ply", ply, "--refiner", helps, "--picture", shown)
     assert f"{shown}: exists already" in said and "--force" in said
     assert output.read_text() == shown.read_text() == "precious"
+    page = tmp_path / "page.html"
+    page.write_text("precious")
+    assert f"{page}: exists already" in refusal(capsys, tmp_path / "other.ply", ply, "--refiner", helps, "--html", page)
     run("compact", ply, "--refiner", helps, "-o", output, "--picture", shown, "--force")
     assert len(read_ply(output)) == 75 and shown.read_bytes().startswith(b"\x89PNG")
 

@@ -67,6 +67,7 @@ def test_a_scene_that_fails_ends_it_with_status_1_after_the_others(folder, tmp_p
     "words, said",
     [
         (("compact", "rooms", "--picture", "a.png"), "--picture is for one scene; rooms is a folder of scenes"),
+        (("compact", "rooms", "--html", "a.html"), "--html is for one scene; rooms is a folder of scenes"),
         (("compact", "rooms", "--dry-run"), "--dry-run is for one scene"),
         (("compact", "rooms", "--jobs", "0"), "jobs is 0; expected 1 or more"),
         (("compact", "rooms", "--shard", "3/2"), "shard 3/2; expected 1/2 to 2/2"),

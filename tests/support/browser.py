@@ -27,7 +27,8 @@ def chromium() -> Iterator[Chrome]:
     options = selenium.ChromeOptions()
     options.binary_location = program
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    for argument in ("--headless=new", "--disable-gpu", "--disable-dev-shm-usage", "--window-size=1200,900"):
+    arguments = ("--headless=new", "--disable-gpu", "--disable-dev-shm-usage", "--window-size=1200,900")
+    for argument in (*arguments, "--enable-unsafe-swiftshader"):  # WebGL without a GPU
         options.add_argument(argument)
     if hasattr(os, "geteuid") and os.geteuid() == 0:
         options.add_argument("--no-sandbox")  # Chromium has none for root
@@ -39,5 +40,7 @@ def chromium() -> Iterator[Chrome]:
 
 
 def complaints(browser: Chrome) -> list[str]:
-    """What the browser has logged since the last call: errors of scripts, and what the policy of a page forbade."""
-    return [entry["message"] for entry in browser.get_log("browser")]
+    """What the browser has logged since the last call: errors of scripts, and what the policy of a page forbade. What a
+    graphics driver says of its speed is left out."""
+    messages = (entry["message"] for entry in browser.get_log("browser"))
+    return [message for message in messages if "GL Driver Message (OpenGL, Performance" not in message]

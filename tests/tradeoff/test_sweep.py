@@ -31,7 +31,7 @@ def names(folder):
 def test_a_sweep_leaves_tables_plots_pictures_and_a_page(new_sweep, tmp_path, plain_page, monkeypatch):
     result = new_sweep(tmp_path, points=2).run()
     assert [point.key for point in result.points] == ["dense", "10pct_sh1"]
-    assert names(tmp_path) == sorted([*OUTPUTS, POINTS, "pictures"])
+    assert names(tmp_path) == sorted([*OUTPUTS, POINTS, "pictures", "scenes"])
     with (tmp_path / TABLE).open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [row["key"] for row in rows] == [point.key for point in result.points]

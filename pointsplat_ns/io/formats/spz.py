@@ -105,7 +105,11 @@ def read_spz(path: Path | str) -> Gaussians:
 
 
 def encode_spz(
-    scene: Gaussians, progress: Progress = silent, version: Version = 3, sh_bits: tuple[int, int] = SH_BITS
+    scene: Gaussians,
+    progress: Progress = silent,
+    version: Version = 3,
+    sh_bits: tuple[int, int] = SH_BITS,
+    level: int = 9,
 ) -> bytes:
     """The bytes of an SPZ file.
 
@@ -114,6 +118,7 @@ def encode_spz(
         progress: called while compressing.
         version: 3, which most viewers read, or 4, which loads sooner.
         sh_bits: bits of SH coefficients, 1 to 8: of degree 1, and of the others.
+        level: of gzip in version 3, 1 to 9. 6 takes a tenth of the time of 9, for 3 % more bytes.
 
     Raises:
         SceneError: if the scene is too large for the format, or there are no such bits.
@@ -125,7 +130,7 @@ def encode_spz(
     parts = _encode(scene, bits, sh_bits)
     if version == 3:
         head = _HEADER.pack(_MAGIC, 3, n, scene.sh_degree, bits, flags, 0)
-        packer = zlib.compressobj(9, zlib.DEFLATED, 31)
+        packer = zlib.compressobj(level, zlib.DEFLATED, 31)
         packed = [packer.compress(head)]
         for index, part in enumerate(parts):
             progress("compressing", index / len(parts))

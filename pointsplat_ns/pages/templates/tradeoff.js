@@ -275,3 +275,4 @@ function start() {
 }
 
 start();
+const flight = data.flight && new Flight(byId("flight"), data.flight);

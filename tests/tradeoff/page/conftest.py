@@ -9,16 +9,23 @@ from pathlib import Path
 import pytest
 
 import pointsplat_ns as ps
+from pointsplat_ns.pages.flight import Stage
+from pointsplat_ns.tradeoff.flights import keep_flight
 from pointsplat_ns.tradeoff.page import write_page
-from pointsplat_ns.tradeoff.points import Tradeoff
-from sweeps import measured_room
+from pointsplat_ns.tradeoff.points import Tradeoff, flight_path
+from sweeps import measured_room, room_views
+
+FLOWN = "0.1_coverage"
+"""Key of the one point whose scene is kept to fly through. No point is recommended."""
 
 
 @pytest.fixture(scope="session")
 def sweep(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tradeoff, Path]:
     """A trade with photos, and its folder; shared by all tests, so do not write there. Its times are made up."""
     folder = tmp_path_factory.mktemp("sweep")
-    measured = measured_room(folder, ps.example_room())
+    room = ps.example_room()
+    measured = measured_room(folder, room)
+    assert keep_flight(Stage.of(room, room_views()), room[::10], "a tenth", flight_path(folder, FLOWN))
     # The one that opacity chose is slower and worse than the larger one.
     times = [95.0 if p.by == "opacity" else 100 * p.share for p in measured.points]
     timed = [

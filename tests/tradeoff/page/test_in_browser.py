@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from browser import chromium, complaints
+from flying import message, picture, shrink
 from pointsplat_ns.tradeoff.front import fastest_above, fastest_within, pareto_front
 
 pytest.importorskip("selenium", reason="selenium is not installed")
@@ -237,3 +238,15 @@ def test_pointer_shows_what_a_point_is(opened, sweep):
     mark.find_element(By.CSS_SELECTOR, ".shape").click()
     assert shown(opened)["name"] == sweep[0].points[2].label
     assert one(opened, ".tip").is_displayed()
+
+
+def test_the_recommended_scene_is_flown_through_beside_all_else(browser, make_page):
+    browser.get(make_page(recommended="0.1_coverage").as_uri())
+    shrink(browser)
+    first = picture(browser)
+    assert message(browser) == "" and first.std() > 0.05
+    one(browser, "#flight [aria-label='View 2']").click()
+    assert (picture(browser) - first).abs().mean() > 0.02
+    one(browser, "#stop").send_keys(Keys.END)
+    assert shown(browser)["name"] == "dense"
+    assert complaints(browser) == []

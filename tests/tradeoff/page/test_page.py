@@ -15,13 +15,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import pointsplat_ns as ps
 from html_parts import hashed, names_nothing_outside, parts_of, policy_of
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.pages import pictures
+from pointsplat_ns.pages.flight import Stage
+from pointsplat_ns.tradeoff import flights
 from pointsplat_ns.tradeoff import page as page_module
 from pointsplat_ns.tradeoff.front import fastest_within
 from pointsplat_ns.tradeoff.page import write_page
-from pointsplat_ns.tradeoff.points import Quality, picture_path
+from pointsplat_ns.tradeoff.points import Quality, flight_path, picture_path
+from sweeps import room_views
 
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(1)>\"'&</title>"
 
@@ -157,6 +161,42 @@ def test_page_takes_no_more_bytes_than_it_may(sweep, tmp_path, monkeypatch):
     monkeypatch.setattr(page_module, "MAX_BYTES", whole - 5_000)
     less = write_page(measured, folder, tmp_path / "less.html")
     assert less.stat().st_size <= whole - 5_000 and parts_of(less).data["pictures"][1]["photo"].startswith("data:")
+
+
+def test_the_recommended_scene_is_in_the_page_to_fly_through(make_page, sweep, written):
+    assert parts_of(written).data["flight"] is None and "data-flight" not in written.read_text("utf-8")
+    path = make_page(recommended="0.1_coverage")
+    parts = parts_of(path)
+    [scene] = parts.data["flight"]["scenes"]
+    assert scene["name"] == "a tenth" and len(scene["spz"]) > 50_000 and len(parts.data["flight"]["views"]) == 2
+    assert "Fly through: a tenth" in path.read_text("utf-8")
+    names_nothing_outside(path)
+    assert policy_of(parts)["worker-src"] == "blob:" and "worker-src" not in policy_of(parts_of(written))
+    assert path.stat().st_size < page_module.MAX_BYTES
+    other = make_page(recommended=sweep[0].points[1].key)
+    assert parts_of(other).data["flight"] is None, "it was not kept"
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'{"scenes": []}', b"\xff" * 9, b" " * 4_000_001])
+def test_what_is_no_scene_to_fly_through_is_left_out(sweep, tmp_path, content):
+    measured, folder = sweep
+    shutil.copytree(folder, tmp_path / "copy")
+    flight_path(tmp_path / "copy", "dense").write_bytes(content)
+    page = write_page(replace(measured, recommended="dense"), tmp_path / "copy", tmp_path / "page.html")
+    assert parts_of(page).data["flight"] is None
+
+
+def test_scenes_that_take_too_much_of_a_page_are_not_kept(tmp_path, monkeypatch):
+    room = ps.example_room()[::20]
+    stage, path = Stage.of(room, room_views()), tmp_path / "new" / "scene.json"
+    monkeypatch.setattr(flights, "MAX_BYTES", 30_000)  # its PLY has 330 kB, and its SPZ in base64 80 kB
+    assert not flights.keep_flight(stage, room, "room", path) and not path.parent.exists()
+    monkeypatch.setattr(flights, "MAX_BYTES", 60_000)
+    assert not flights.keep_flight(stage, room, "room", path) and not path.parent.exists()
+    monkeypatch.setattr(flights, "MAX_BYTES", 120_000)
+    assert flights.keep_flight(stage, room, "room", path) and flights.read_flight(path)["drag"] == "look"
+    monkeypatch.setattr(flights, "MAX_BYTES", 60_000)
+    assert flights.read_flight(path) is None
 
 
 def test_the_limit_is_ten_megabytes():

@@ -1,0 +1,186 @@
+// The stage of a page: one scene to fly through, or two that a wipe parts, drawn by splats.js as the camera of camera.js
+// sees them. It draws only when something has changed; while it moves, with fewer pixels if the machine is slow.
+
+const SLOW = 60; // milliseconds a frame, from which on fewer pixels are drawn while it moves
+const COARSEST = 0.25;
+const MOST_PIXELS = 2; // of the screen for each of the page, each way
+
+class Flight {
+  // `data` is what pointsplat_ns/pages/flight.py gives. The stage says why where nothing can be drawn.
+  constructor(root, data) {
+    this.data = data;
+    this.part = Object.fromEntries([...root.querySelectorAll("[data-flight]")].map((part) => [part.dataset.flight, part]));
+    this.canvas = this.part.canvas;
+    this.camera = new Camera();
+    this.camera.goTo(data.views[0], data.up);
+    this.controls = new Controls(this.canvas, this.camera, () => this.change());
+    this.scenes = [];
+    this.opened = this.over = false;
+    this.wipe = 0.5;
+    this.detail = 1; // share of the pixels each way while it moves
+    this.times = []; // of the last frames of a movement
+    this.frame = this.settling = 0;
+    this.ready = this.open();
+  }
+
+  async open() {
+    try {
+      if (!window.DecompressionStream) throw new Error("This browser is too old to unpack the scene.");
+      this.drawer = new Drawer(this.canvas);
+      this.canvas.addEventListener("webglcontextlost", () => this.say("The graphics driver has stopped. Load the page again."));
+      for (const { name, spz } of this.data.scenes) {
+        this.say(`Unpacking ${name} …`);
+        await new Promise((done) => setTimeout(done)); // the text is seen
+        const unpacked = await unpackSpz(spz).catch((error) => {
+          throw new Error(`The scene in this page is damaged: ${error.message}`);
+        });
+        const scene = this.drawer.add(unpacked);
+        scene.sorting = new Sorting(unpacked.positions, (order) => {
+          scene.setOrder(order);
+          this.request();
+        });
+        this.scenes.push(scene);
+      }
+    } catch (error) {
+      this.scenes = [];
+      return this.say(error.message);
+    }
+    this.say("");
+    this.opened = true;
+    this.listen();
+    this.change();
+  }
+
+  say(text) {
+    this.part.message.textContent = text;
+    this.part.message.hidden = !text;
+  }
+
+  listen() {
+    const { part } = this;
+    new ResizeObserver(() => this.resize()).observe(this.canvas);
+    this.resize();
+    this.setDrag(this.data.drag);
+    part.drag.addEventListener("change", (event) => this.setDrag(event.target.value));
+    part.reset.addEventListener("click", () => this.reset());
+    part.over.addEventListener("click", () => this.turnOver());
+    part.full.addEventListener("click", () => this.fill());
+    part.views.querySelectorAll("button").forEach((button, index) => button.addEventListener("click", () => this.goTo(index)));
+    this.canvas.addEventListener("keydown", (event) => this.press(event));
+    if (this.scenes.length > 1) this.listenToWipe();
+  }
+
+  listenToWipe() {
+    const { wipe } = this.part;
+    const follow = (event) => {
+      const { left, width } = this.canvas.getBoundingClientRect();
+      this.setWipe((event.clientX - left) / width);
+    };
+    wipe.addEventListener("pointerdown", (event) => wipe.setPointerCapture(event.pointerId));
+    wipe.addEventListener("pointermove", (event) => event.buttons && follow(event));
+    wipe.addEventListener("keydown", ({ key }) => {
+      const places = { Home: 0, End: 1, ArrowLeft: this.wipe - 0.05, ArrowRight: this.wipe + 0.05 };
+      if (key in places) this.setWipe(places[key]);
+    });
+    this.setWipe(0.5);
+  }
+
+  press(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const number = Number(event.key);
+    if (number >= 1 && number <= this.data.views.length) this.goTo(number - 1);
+    else if (event.code === "KeyR") this.reset();
+    else if (event.code === "KeyT") this.turnOver();
+    else if (event.code === "KeyF") this.fill();
+    else if (event.key === "[" || event.key === "]") this.setWipe(this.wipe + (event.key === "[" ? -0.05 : 0.05));
+  }
+
+  // Parts at a share of the width, from the left.
+  setWipe(share) {
+    if (this.scenes.length < 2) return;
+    this.wipe = Math.max(0, Math.min(1, share));
+    this.part.wipe.style.left = `${100 * this.wipe}%`;
+    this.part.wipe.setAttribute("aria-valuenow", Math.round(100 * this.wipe));
+    this.request();
+  }
+
+  setDrag(drag) {
+    this.controls.orbits = drag === "orbit";
+    for (const input of this.part.drag.querySelectorAll("input")) input.checked = input.value === drag;
+  }
+
+  goTo(index) {
+    this.camera.goTo(this.data.views[index], this.data.up);
+    if (this.over) this.camera.turnOver();
+    this.change();
+  }
+
+  // Which way is up was estimated, and may be wrong.
+  turnOver() {
+    this.over = !this.over;
+    this.camera.turnOver();
+    this.change();
+  }
+
+  reset() {
+    this.goTo(0);
+    this.setWipe(0.5);
+  }
+
+  fill() {
+    if (document.fullscreenElement) document.exitFullscreen();
+    else this.part.stage.requestFullscreen?.().catch(() => {}); // a page that is shown inside another may not
+    this.canvas.focus();
+  }
+
+  resize() {
+    const scale = Math.min(devicePixelRatio, MOST_PIXELS), { clientWidth, clientHeight } = this.canvas;
+    const [width, height] = [clientWidth, clientHeight].map((side) => Math.max(1, Math.round(side * scale)));
+    if (width === this.canvas.width && height === this.canvas.height) return;
+    [this.canvas.width, this.canvas.height] = [width, height];
+    this.request();
+  }
+
+  // The camera is another one: sort anew, and count frames until it stands still.
+  change() {
+    for (const { sorting } of this.scenes) sorting.sort({ ...this.camera.state, near: this.data.near });
+    clearTimeout(this.settling);
+    this.settling = setTimeout(() => {
+      this.settling = 0;
+      this.times = [];
+      this.request();
+    }, 200);
+    this.request();
+  }
+
+  request() {
+    this.frame ||= requestAnimationFrame((now) => this.show(now));
+  }
+
+  // Whether what is seen is what will be seen if nobody moves anything.
+  get still() {
+    return this.opened && !this.frame && !this.settling && !this.scenes.some(({ sorting }) => sorting.busy);
+  }
+
+  show(now) {
+    this.frame = 0;
+    const last = this.times.at(-1) ?? now;
+    if (this.controls.step(Math.min(0.1, (now - last) / 1000))) this.change();
+    this.paint();
+    if (!this.settling) return;
+    this.times = [...this.times, now].slice(-30);
+    const [first, frames] = [this.times[0], this.times.length - 1];
+    if (frames < 4) return;
+    const mean = (now - first) / frames;
+    this.part.rate.textContent = `${Math.round(1000 / mean)} frames/s`;
+    if (mean > SLOW && this.detail > COARSEST) {
+      this.detail /= 2;
+      this.times = [];
+    }
+  }
+
+  paint() {
+    const [left, right] = this.scenes, parts = right ? [[left, 0, this.wipe], [right, this.wipe, 1]] : [[left, 0, 1]];
+    if (left) this.drawer.draw(this.camera, this.data, parts, this.settling ? this.detail : 1);
+  }
+}

@@ -1,0 +1,332 @@
+"""Scenes in a page, opened from disk in headless Chromium, drawn and flown through.
+
+Pictures are compared with those of the package's own rasterizer.
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from browser import chromium, complaints
+from flying import camera, message, picture, settle, shrink, view_on
+from making import ball, cloud
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.formats.spz import read_spz
+from pointsplat_ns.pages.flight import Stage
+from pointsplat_ns.pruning.content import in_units
+from pointsplat_ns.pruning.view_sampling import look_at
+from sweeps import room_views
+
+pytest.importorskip("selenium", reason="selenium is not installed")
+from selenium.webdriver.common.action_chains import ActionChains  # noqa: E402
+from selenium.webdriver.common.by import By  # noqa: E402
+from selenium.webdriver.common.keys import Keys  # noqa: E402
+
+pytestmark = pytest.mark.xdist_group("flight")  # one process starts Chromium for all tests of this file
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator:
+    with chromium() as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def rooms() -> list[Gaussians]:
+    """The example room with a tenth of its Gaussians, and with a fiftieth."""
+    return [ps.example_room()[::10], ps.example_room()[::50]]
+
+
+@pytest.fixture(scope="module")
+def path(rooms, tmp_path_factory) -> Path:
+    return ps.write_page(
+        rooms, tmp_path_factory.mktemp("flight") / "room.html", ["dense", "compact"], views=room_views()
+    )
+
+
+@pytest.fixture()
+def opened(browser, path) -> Iterator:
+    """The page of both rooms, just opened and small. Nothing may be complained of while a test uses it."""
+    browser.get(path.as_uri())
+    shrink(browser)
+    yield browser
+    assert complaints(browser) == []
+
+
+@contextmanager
+def before_pages_load(browser, script: str) -> Iterator[None]:
+    """Run a script in every page before its own."""
+    added = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": script})
+    try:
+        yield
+    finally:
+        browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
+
+
+def ring_of_views(**changes) -> ps.Views:
+    """Three views from around the origin, one of them from near it."""
+    eyes = torch.tensor([[3.5, 0.0, 0.5], [-2.0, 2.0, 1.0], [0.3, -0.4, 0.1]])
+    K = torch.tensor([[45.0, 0.0, 32.0], [0.0, 45.0, 20.0], [0.0, 0.0, 1.0]])
+    viewmats = look_at(eyes, torch.tensor([[0.2, 0.1, 0.0]]).expand(3, 3))
+    return replace(ps.Views(viewmats, K.repeat(3, 1, 1), 64, 40, torch.zeros(3)), **changes)
+
+
+SCENES = {
+    "SH degree 0": (lambda: ball(400, 0), ring_of_views()),
+    "SH degree 1": (lambda: cloud(400, sh_degree=1), ring_of_views()),
+    "SH degree 2": (lambda: cloud(400, sh_degree=2), ring_of_views()),
+    "SH degree 3": (lambda: strong_sh(cloud(400, sh_degree=3)), ring_of_views()),
+    "antialiased over grey": (
+        lambda: ball(2000, 3, log_size=-4.5),
+        ring_of_views(rasterize_mode="antialiased", background=torch.tensor([0.2, 0.5, 0.7])),
+    ),
+    "far from the origin and small": (lambda: moved(ball(400, 1), 300.0, 1e-3), None),
+    "needles": (lambda: needles(cloud(400)), ring_of_views()),
+}
+
+
+def strong_sh(scene: Gaussians) -> Gaussians:
+    return scene.replace(features_rest=3 * scene.features_rest)
+
+
+def needles(scene: Gaussians) -> Gaussians:
+    return scene.replace(scales=scene.scales + torch.tensor([2.0, -2.0, -5.0]))
+
+
+def moved(scene: Gaussians, by: float, scale: float) -> Gaussians:
+    return scene.replace(means=scale * scene.means + by * scale, scales=scene.scales + np.log(scale))
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_pictures_are_those_of_the_rasterizer(browser, tmp_path, name):
+    make, views = SCENES[name]
+    scene = make()
+    browser.get(ps.write_page(scene, tmp_path / "scene.html", views=views).as_uri())
+    shrink(browser)
+    stage = Stage.of(scene, views)
+    (tmp_path / "scene.spz").write_bytes(base64.b64decode(stage.packed(scene, "scene")["spz"]))
+    as_written, as_given = read_spz(tmp_path / "scene.spz"), in_units(scene, stage.centre, stage.size)
+    for index in range(min(3, len(stage.views))):
+        browser.execute_script("flight.goTo(arguments[0])", index)
+        shown = picture(browser)
+        view = view_on(stage, index, shown)
+        assert shown.std() > 0.02, "there is something in the picture"
+        # Rounding to 8 bits alone leaves 58.9 dB; sums of 16-bit floats take some of that.
+        assert ps.psnr(shown, ps.render(as_written, view)) > 52, index
+        assert ps.psnr(shown, ps.render(as_given, view)) > 38, index
+    assert complaints(browser) == []
+
+
+def test_the_room_is_that_of_the_rasterizer_in_its_own_units(opened, rooms):
+    stage = Stage.of(rooms[0], room_views())
+    for wipe, room in ((1, rooms[0]), (0, rooms[1])):
+        opened.execute_script("flight.setWipe(arguments[0])", wipe)
+        shown = picture(opened)
+        own = replace(room_views(), width=shown.shape[1], height=shown.shape[0])
+        assert abs(own.width / own.height - 1.6) < 0.02
+        best = max(float(ps.psnr(shown, ps.render(room, replace(view, K=view_on(stage, 0, shown).K)))) for view in own)
+        assert best > 40
+
+
+def test_wipe_parts_the_scenes(opened):
+    whole = []
+    for wipe in (1, 0):
+        opened.execute_script("flight.setWipe(arguments[0])", wipe)
+        whole.append(picture(opened))
+    dense, compact = whole
+    assert (dense - compact).abs().mean() > 0.02
+    handle = opened.find_element(By.CSS_SELECTOR, "[data-flight='wipe']")
+    for key, expected in ((Keys.END, 1.0), (Keys.HOME, 0.0), (Keys.ARROW_RIGHT, 0.05)):
+        handle.send_keys(key)
+        assert opened.execute_script("return flight.wipe") == expected
+        assert handle.get_attribute("aria-valuenow") == str(round(100 * expected))
+    opened.execute_script("flight.setWipe(0.5)")
+    settle(opened)
+    ActionChains(opened).drag_and_drop_by_offset(handle, 48, 0).perform()
+    share = opened.execute_script("return flight.wipe")
+    assert share == pytest.approx(0.75, abs=0.02)
+    shown, border = picture(opened), round(192 * share)
+    assert torch.equal(shown[:, :border], dense[:, :border]) and torch.equal(shown[:, border:], compact[:, border:])
+
+
+def test_keys_go_turn_and_lead_back(opened):
+    canvas, start = opened.find_element(By.TAG_NAME, "canvas"), camera(opened)
+    opened.execute_script("flight.setDrag('look')")
+    for key, axis, sign in (("w", "ahead", 1), ("s", "ahead", -1), ("d", "right", 1), ("a", "right", -1),
+                            ("e", "down", -1), ("q", "down", 1)):  # fmt: skip
+        canvas.send_keys("r")
+        hold(opened, key)
+        moved = np.subtract(camera(opened)["eye"], start["eye"])
+        assert sign * moved @ start[axis] == pytest.approx(np.linalg.norm(moved), rel=1e-6) and np.abs(moved).max() > 0
+    canvas.send_keys("r")
+    hold(opened, Keys.ARROW_RIGHT)
+    after = camera(opened)
+    assert after["eye"] == start["eye"] and np.dot(after["ahead"], start["right"]) > 0
+    canvas.send_keys("2")
+    assert camera(opened) != start
+    canvas.send_keys("r")
+    assert camera(opened) == start
+    canvas.send_keys("[")
+    assert opened.execute_script("return flight.wipe") == pytest.approx(0.45)
+    settle(opened)
+
+
+def hold(browser, key: str) -> None:
+    """Press a key until it has an effect."""
+    before = camera(browser)
+    ActionChains(browser).key_down(key).perform()
+    for _ in range(200):
+        if camera(browser) != before:
+            break
+        ActionChains(browser).pause(0.02).perform()
+    ActionChains(browser).key_up(key).perform()
+    assert camera(browser) != before, key
+
+
+@pytest.mark.parametrize("drag", ["look", "orbit"])
+def test_drags_move_what_is_seen_with_the_pointer(opened, drag):
+    opened.execute_script("flight.setDrag(arguments[0])", drag)
+    start, canvas = camera(opened), opened.find_element(By.TAG_NAME, "canvas")
+    reach = opened.execute_script("return flight.camera.reach")
+    pointer = ActionChains(opened).move_to_element_with_offset(canvas, 40, 20).click_and_hold()
+    pointer.move_by_offset(20, 0).release().perform()
+    after = camera(opened)
+    turn = np.dot(after["ahead"], start["right"])
+    if drag == "look":
+        assert turn < 0 and after["eye"] == start["eye"], "the camera turns to the left"
+    else:
+        middles = [np.add(state["eye"], np.multiply(reach, state["ahead"])) for state in (start, after)]
+        assert turn > 0 and np.allclose(*middles), "the camera goes to the left, about what is ahead"
+    level = [abs(np.dot(state["right"], opened.execute_script("return flight.camera.up"))) for state in (start, after)]
+    assert level[1] == pytest.approx(level[0], abs=1e-6), "the horizon stays level"
+    settle(opened)
+
+
+def test_shift_shifts_and_the_wheel_comes_nearer_once_the_picture_was_clicked(opened):
+    start, canvas = camera(opened), opened.find_element(By.TAG_NAME, "canvas")
+    wheel = "arguments[0].dispatchEvent(new WheelEvent('wheel', {deltaY: -90, cancelable: true, bubbles: true}))"
+    opened.execute_script("arguments[0].blur()", canvas)
+    assert opened.execute_script("return " + wheel, canvas) and camera(opened) == start, "the page is scrolled"
+    opened.execute_script("arguments[0].focus()", canvas)
+    assert not opened.execute_script("return " + wheel, canvas)
+    nearer = np.subtract(camera(opened)["eye"], start["eye"])
+    assert np.dot(nearer, start["ahead"]) == pytest.approx(np.linalg.norm(nearer)) and np.abs(nearer).max() > 0
+    chain = ActionChains(opened).key_down(Keys.SHIFT).move_to_element_with_offset(canvas, 40, 20)
+    before = camera(opened)
+    chain.click_and_hold().move_by_offset(0, 20).release().key_up(Keys.SHIFT).perform()
+    shifted = np.subtract(camera(opened)["eye"], before["eye"])
+    assert np.dot(shifted, before["down"]) == pytest.approx(-np.linalg.norm(shifted)) and np.abs(shifted).max() > 0
+    settle(opened)
+
+
+def test_what_is_upside_down_is_turned_over_and_stays_so(opened):
+    opened.execute_script("flight.setWipe(1)")
+    before, up = picture(opened), opened.execute_script("return flight.camera.up")
+    opened.find_element(By.CSS_SELECTOR, "[data-flight='over']").click()
+    for lead in ("", "flight.goTo(0)"):
+        opened.execute_script(lead)
+        assert ps.psnr(picture(opened).flip(0, 1), before) > 50
+        assert np.allclose(opened.execute_script("return flight.camera.up"), np.negative(up))
+    opened.find_element(By.TAG_NAME, "canvas").send_keys("t")
+    assert torch.equal(picture(opened), before)
+
+
+def test_steep_looks_stop_before_up_changes_sides(opened):
+    for _ in range(3):
+        opened.execute_script("flight.setDrag('look'); for (let i = 0; i < 40; i++) flight.camera.turn(0.1, 0.1)")
+        state = camera(opened)
+        up = opened.execute_script("return flight.camera.up")
+        assert 0.9 < np.dot(state["ahead"], up) <= 0.99 + 1e-9 and np.dot(state["down"], up) < 0
+        assert np.allclose(np.cross(state["down"], state["ahead"]), state["right"], atol=1e-12)
+
+
+def test_a_browser_without_workers_or_floats_draws_the_same(browser, path, opened):
+    expected = picture(opened)
+    without = """
+      Worker = class { constructor() { throw new Error("no worker") } };
+      const original = WebGL2RenderingContext.prototype.getExtension;
+      WebGL2RenderingContext.prototype.getExtension = function (name) {
+        return name.includes("float") ? null : original.call(this, name);
+      };"""
+    with before_pages_load(browser, without):
+        browser.get(path.as_uri())
+        shrink(browser)
+        plain = picture(browser)
+        assert browser.execute_script("return flight.drawer.format === flight.drawer.gl.RGBA8")
+        assert browser.execute_script("return flight.scenes.every(({ sorting }) => !sorting.worker)")
+    # Sums of 8-bit numbers are rounded at each Gaussian.
+    assert ps.psnr(plain, expected) > 35
+
+
+def test_a_browser_without_webgl_says_so(browser, path):
+    with before_pages_load(browser, "HTMLCanvasElement.prototype.getContext = () => null"):
+        browser.get(path.as_uri())
+        browser.execute_async_script("flight.ready.then(arguments[0])")
+        assert message(browser).startswith("This browser offers no WebGL 2")
+    assert complaints(browser) == []
+
+
+@pytest.mark.parametrize("damage", ["cut", "garbled", "another", "no base64"])
+def test_a_damaged_scene_is_one_sentence(browser, path, tmp_path, damage):
+    text = path.read_text("utf-8")
+    [first, *_] = re.findall(r'"spz":"([^"]*)"', text)
+    packed = base64.b64decode(first)
+    changed = {
+        "cut": base64.b64encode(packed[: len(packed) // 2]).decode(),
+        "garbled": base64.b64encode(packed[:2000] + b"garbled!" * 10 + packed[2080:]).decode(),
+        "another": base64.b64encode(Path(__file__).read_bytes()).decode(),
+        "no base64": "@" * 100,
+    }[damage]
+    (tmp_path / "damaged.html").write_text(text.replace(first, changed), encoding="utf-8")
+    browser.get((tmp_path / "damaged.html").as_uri())
+    browser.execute_async_script("flight.ready.then(arguments[0])")
+    assert message(browser).startswith("The scene in this page is damaged: ")
+    assert complaints(browser) == []
+
+
+def test_page_fits_a_phone_follows_the_colours_of_the_reader_and_names_its_controls(opened):
+    size = {"width": 360, "height": 740, "deviceScaleFactor": 1, "mobile": True}
+    opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        assert opened.execute_script("return document.documentElement.scrollWidth") == 360
+        colors = []
+        for scheme in ("light", "dark"):
+            feature = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+            opened.execute_cdp_cmd("Emulation.setEmulatedMedia", feature)
+            colors.append(opened.execute_script("return getComputedStyle(document.body).backgroundColor"))
+        assert colors == ["rgb(247, 247, 245)", "rgb(18, 21, 24)"]
+    finally:
+        opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    script = """return [...document.querySelectorAll("button, input, canvas, [role]:not([role='status'])")]
+      .filter((e) => !(e.getAttribute("aria-label") || e.getAttribute("aria-labelledby")))
+      .filter((e) => !(e.labels?.length || e.innerText)).map((e) => e.outerHTML)"""
+    assert opened.execute_script(script) == []
+    names = [name.text for name in opened.find_elements(By.CSS_SELECTOR, ".flight-name strong")]
+    assert names == ["dense", "compact"]
+
+
+def test_frames_are_counted_while_it_moves_and_fewer_pixels_drawn_where_that_is_slow(opened):
+    script = """const done = arguments[0];
+      let left = 12;
+      const again = () => {
+        flight.camera.turn(0.02, 0);
+        flight.change();
+        left-- ? requestAnimationFrame(again) : done();
+      };
+      again();"""
+    opened.execute_async_script(script)
+    assert re.fullmatch(r"\d+ frames/s", opened.find_element(By.CSS_SELECTOR, ".flight-rate").text)
+    opened.execute_script("flight.detail = 0.25; flight.change(); flight.paint()")
+    assert opened.execute_script("return flight.drawer.width") == 48
+    settle(opened)
+    assert opened.execute_script("return flight.drawer.width") == 192

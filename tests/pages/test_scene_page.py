@@ -1,0 +1,193 @@
+"""The page of one or two scenes as a file: what is in it, how large it is, and what cannot be shown."""
+
+from __future__ import annotations
+
+import base64
+import logging
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from html_parts import hashed, names_nothing_outside, parts_of, policy_of
+from making import ball, box_room
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.formats.spz import read_spz
+from pointsplat_ns.pages.flight import REACH, VIEWS, Stage
+from pointsplat_ns.pruning.content import in_units
+from pointsplat_ns.pruning.view_sampling import look_at
+from sweeps import room_views
+
+HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(1)>\"'&</title>"
+
+
+@pytest.fixture(scope="module")
+def rooms() -> list[Gaussians]:
+    return [ps.example_room()[::10], ps.example_room()[::50]]
+
+
+@pytest.fixture(scope="module")
+def written(rooms, tmp_path_factory) -> Path:
+    return ps.write_page(rooms, tmp_path_factory.mktemp("page") / "room.html", ["dense", "compact"], views=room_views())
+
+
+def scenes_in(path: Path, folder: Path) -> list[Gaussians]:
+    """The scenes of a page, in the units of their content."""
+    scenes = []
+    for scene in parts_of(path).data["flight"]["scenes"]:
+        (folder / "scene.spz").write_bytes(base64.b64decode(scene["spz"], validate=True))
+        scenes.append(read_spz(folder / "scene.spz"))
+    return scenes
+
+
+def test_page_names_nothing_outside_of_itself_and_lets_only_its_own_scripts_run(written):
+    names_nothing_outside(written)
+    parts = parts_of(written)
+    assert policy_of(parts) == {
+        "default-src": "'none'",
+        "img-src": "data:",
+        "style-src": hashed(parts.inside["style"][0]),
+        "script-src": hashed(parts.inside["script"][1]),
+        "worker-src": "blob:",
+        "base-uri": "'none'",
+        "form-action": "'none'",
+    }
+
+
+def test_page_holds_the_scenes_as_exactly_as_spz_can(written, rooms, tmp_path):
+    stage = Stage.of(rooms[0], room_views())
+    for found, room in zip(scenes_in(written, tmp_path), rooms, strict=True):
+        given = in_units(room, stage.centre, stage.size)
+        assert len(found) == len(room) and found.sh_degree == room.sh_degree
+        assert (found.means - given.means).abs().max() <= 0.51 / 4096
+        assert (found.alphas - given.alphas).abs().max() < 0.6 / 255
+
+
+def test_page_is_little_more_than_its_scenes(written):
+    text = written.read_text("utf-8")
+    packed = sum(len(scene["spz"]) for scene in parts_of(written).data["flight"]["scenes"])
+    assert packed > 50_000 and len(text) - packed < 100_000
+
+
+def test_page_says_how_much_each_scene_is(written, rooms):
+    text = written.read_text("utf-8")
+    for name, room in zip(("dense", "compact"), rooms, strict=True):
+        ply = (104 * len(room) + 1e3) / 1e6  # 26 numbers each, and a header of some hundred bytes
+        assert f'<th scope="row">{name}</th><td>{len(room):,}</td><td>1</td><td>{ply:.2f}</td>' in text
+        assert f"<strong>{name}</strong> {len(room):,} Gaussians, {ply:.2f} MB as .ply" in text
+
+
+def test_texts_of_strangers_are_shown_and_never_run(tmp_path):
+    scene = ball(50)
+    path = ps.write_page([scene, scene], tmp_path / "page.html", [HOSTILE, HOSTILE], title=HOSTILE, notes=[HOSTILE])
+    parts, text = parts_of(path), path.read_text("utf-8")
+    assert len(parts.inside["script"]) == 2 and all("onerror" not in attributes for _, attributes in parts.elements)
+    assert [scene["name"] for scene in parts.data["flight"]["scenes"]] == [HOSTILE] * 2
+    assert HOSTILE not in text and "<script>alert" not in text
+
+
+def test_one_scene_has_the_name_of_the_file_and_no_wipe(tmp_path):
+    text = ps.write_page(ball(50), tmp_path / "my ball.html").read_text("utf-8")
+    assert "<h1>my ball</h1>" in text and "<strong>my ball</strong> 50 Gaussians" in text
+    assert 'data-flight="wipe"' not in text and "<kbd>[</kbd>" not in text
+
+
+def test_too_large_a_page_leaves_the_larger_scene_out_and_says_so(written, rooms, tmp_path, caplog):
+    both = written.stat().st_size / 1e6
+    path = ps.write_page(rooms, tmp_path / "less.html", ["dense", "compact"], views=room_views(), limit_mb=both - 0.01)
+    sentence = f"dense is left out: with it the page would have {both:.1f} MB, more than the {both - 0.01:g} MB allowed"
+    assert f'<p class="note">{sentence}.</p>' in path.read_text("utf-8") and sentence in caplog.text
+    assert [len(scene) for scene in scenes_in(path, tmp_path)] == [len(rooms[1])]
+    assert f"<td>{len(rooms[0]):,}</td>" in path.read_text("utf-8"), "the table still has both"
+    ps.write_page(rooms, path, ["dense", "compact"], title="room", views=room_views(), limit_mb=both + 0.01)
+    assert path.read_bytes() == written.read_bytes()
+
+
+def test_a_scene_that_alone_is_too_large_is_refused_and_nothing_is_written(rooms, tmp_path):
+    with pytest.raises(ps.PointSplatError, match=r"the page would have 0\.\d MB, more than the 0.05 MB allowed"):
+        ps.write_page(rooms, tmp_path / "page.html", views=room_views(), limit_mb=0.05)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "scenes, options, error, words",
+    [
+        ([], {}, ps.PointSplatError, "0 scenes for .*; expected one or two"),
+        ([ball(9)] * 3, {}, ps.PointSplatError, "3 scenes for .*; expected one or two"),
+        ([ball(9)] * 2, {"names": ["one"]}, ps.PointSplatError, "1 names for 2 scenes; expected one for each"),
+        ([ball(9)], {"limit_mb": 0}, ps.PointSplatError, "a page of at most 0 MB; expected a number above 0"),
+        ([ball(9)], {"limit_mb": math.nan}, ps.PointSplatError, "a page of at most nan MB"),
+        ([ball(9)[:0]], {}, ps.SceneError, "none of the 0 Gaussians can be drawn"),
+        ([ball(9).map(lambda v: v * math.nan)], {}, ps.SceneError, "none of the 9 Gaussians can be drawn"),
+        ([ball(9).replace(opacities=torch.full((9, 1), -math.inf))], {}, ps.DataError, "nothing .* can be seen"),
+        ([ball(9), ball(9)[:0]], {}, ps.SceneError, "none of the 0 Gaussians can be drawn"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_shown_is_refused_in_one_line(scenes, options, error, words, tmp_path):
+    with pytest.raises(error, match=words) as caught:
+        ps.write_page(scenes, tmp_path / "page.html", **options)
+    assert "\n" not in str(caught.value) and list(tmp_path.iterdir()) == []
+
+
+def test_a_page_that_cannot_be_written_is_an_error_of_the_scene(tmp_path):
+    (tmp_path / "folder.html").mkdir()
+    with pytest.raises(ps.SceneError, match="is a folder"):
+        ps.write_page(ball(9), tmp_path / "folder.html")
+
+
+def test_what_is_very_far_away_or_has_no_meaning_is_left_out_and_counted(tmp_path, caplog):
+    scene = ball(200)
+    means = scene.means.clone()
+    means[3], means[7], means[9] = 1e6, math.nan, torch.tensor([0.0, -1e9, 0.0])
+    with caplog.at_level(logging.WARNING):
+        path = ps.write_page(scene.replace(means=means), tmp_path / "page.html", ["the ball"])
+    assert "the ball: 3 Gaussians, very far away or without meaning, are not in the page" in caplog.text
+    [shown] = scenes_in(path, tmp_path)
+    assert len(shown) == 197 and shown.means.abs().max() < REACH
+
+
+def test_flight_begins_where_most_is_seen_and_leads_to_a_few_views():
+    scene = ball(300)
+    eyes = torch.tensor([[6.0, 0.0, 0.0]]).repeat(8, 1)
+    targets = torch.tensor([[12.0, 0.0, 0.0]]).repeat(8, 1)
+    targets[7] = 0  # one camera looks at the ball, the others away from it
+    K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 20.0], [0.0, 0.0, 1.0]]).repeat(8, 1, 1)
+    views = ps.Views(look_at(eyes, targets), K, 64, 40, torch.tensor([1.0, 0.5, 0.0]), "antialiased")
+    stage = Stage.of(scene, views)
+    data = stage.data([])
+    assert len(data["views"]) == VIEWS
+    first = data["views"][0]
+    assert torch.allclose(torch.tensor(first["ahead"]), torch.tensor([-1.0, 0.0, 0.0]))
+    expected = (torch.tensor([6.0, 0.0, 0.0]) - stage.centre) * 10 / stage.size
+    assert torch.allclose(torch.tensor(first["eye"]), expected.float(), atol=1e-4)
+    assert first["fov"] == pytest.approx(2 * math.atan(32 / 60), rel=1e-6)
+    assert data["antialiased"] is True and data["background"] == [1.0, 0.5, 0.0] and data["drag"] == "orbit"
+    assert data["near"] == pytest.approx(0.01 * 10 / stage.size)
+
+
+def test_rooms_are_looked_around_in_and_up_is_where_cameras_have_it():
+    room = box_room(0, 400)
+    data = Stage.of(room, ps.sample_views(room, 2, 48, 36)).data([])
+    assert data["drag"] == "look"
+    upside_down = look_at(torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([0.0, 0.0, -1.0]))
+    K = torch.tensor([[[30.0, 0.0, 24.0], [0.0, 30.0, 18.0], [0.0, 0.0, 1.0]]])
+    turned = Stage.of(room, ps.Views(upside_down, K, 48, 36, torch.zeros(3)))
+    assert float(turned.up @ torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)) == pytest.approx(1.0)
+
+
+def test_a_scene_without_a_free_place_is_seen_from_outside(monkeypatch):
+    def nowhere(*args, **kwargs):
+        raise ps.DataError("no free place")
+
+    monkeypatch.setattr("pointsplat_ns.pages.flight.sample_views", nowhere)
+    scene = ball(300)
+    stage = Stage.of(scene)
+    picture = ps.render(in_units(scene, stage.centre, stage.size), stage.views[0])
+    assert len(stage.views) == 1 and 0.1 < float((picture.amax(2) > 0.05).float().mean()) < 0.9
+
+
+def test_the_same_scenes_give_the_same_page(written, rooms, tmp_path):
+    again = ps.write_page(rooms, tmp_path / "room.html", ["dense", "compact"], views=room_views())
+    assert again.read_bytes() == written.read_bytes()

@@ -1,0 +1,64 @@
+"""Pages with scenes to fly through, in a browser."""
+
+from __future__ import annotations
+
+import base64
+import io
+import time
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+import pointsplat_ns as ps
+from pointsplat_ns.pages.flight import Stage
+
+PATIENCE = 60.0
+"""Seconds after which a picture that is still changing is a failure. Without a GPU and beside other programs, a frame
+may take one."""
+
+
+def settle(browser) -> None:
+    """Wait until the picture does not change any more."""
+    end = time.monotonic() + PATIENCE
+    while not browser.execute_script("return flight.still"):
+        assert time.monotonic() < end, f"still moving; it says {message(browser)!r}"
+        time.sleep(0.02)
+
+
+def message(browser) -> str:
+    """What is written in place of a picture; empty if nothing is."""
+    return browser.execute_script("return flight.part.message.hidden ? '' : flight.part.message.textContent")
+
+
+def shrink(browser, width: int = 192) -> None:
+    """Give the picture a width in pixels: drawing takes long without a GPU."""
+    browser.execute_script("flight.part.stage.style.width = `${arguments[0]}px`", width)
+    end = time.monotonic() + PATIENCE
+    while browser.execute_script("return flight.canvas.width") != width:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    settle(browser)
+
+
+def picture(browser) -> Tensor:
+    """The picture (H, W, 3) in [0, 1], once it has settled."""
+    settle(browser)
+    uri = browser.execute_script("flight.paint(); return flight.canvas.toDataURL('image/png')")
+    pixels = Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2])))
+    return torch.from_numpy(np.asarray(pixels.convert("RGB")).copy()).float() / 255
+
+
+def view_on(stage: Stage, index: int, image: Tensor) -> ps.View:
+    """A view of a stage, in its units, with the size of an image; the field of view is that along the longer side."""
+    height, width = image.shape[:2]
+    view = stage.views[index]
+    focal = float(view.K[0, 0]) * max(width, height) / max(view.width, view.height)
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return ps.View(view.viewmat.float(), K, width, height, view.background, view.rasterize_mode, view.near_plane)
+
+
+def camera(browser) -> dict[str, list[float]]:
+    """Where the camera is and how it is turned."""
+    return browser.execute_script("return flight.camera.state")
