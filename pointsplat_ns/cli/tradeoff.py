@@ -70,19 +70,24 @@ def _print_table(found: Tradeoff) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from pointsplat_ns.tradeoff.points import speed_of
+
     photos = found.points[0].against_photos is not None
     print(f"{found.scene}: {len(found.points)} points, {found.width} x {found.height} pixels, {found.views_origin}")
     print(found.machine)
-    table = Table(box=SIMPLE, caption="*: recommended; dB of PSNR; ms a frame: median and quartiles over views")
+    caption = "*: recommended; times as fast as the dense scene: median and quartiles over views; dB of PSNR"
+    table = Table(box=SIMPLE, caption=caption)
     table.add_column("")
-    for name in ["Gaussians", "MB", "ms a frame", "dB,\nrenders", *(["dB,\nphotos"] if photos else []), "made in"]:
+    for name in ["Gaussians", "MB", "times as fast", "ms a\nframe", "dB,\nrenders", *(["dB,\nphotos"] if photos else []), "made in"]:
         table.add_column(name, justify="right", no_wrap=True)
     for point in found.points:
+        speed = speed_of(point, found.points[0])
         table.add_row(
             point.label + (" *" if point.key == found.recommended else ""),
             f"{point.gaussians:,}",
             f"{point.bytes / 1e6:.2f}",
-            f"{_ms(point.frame_ms)} ({_ms(point.frame_ms_low)}-{_ms(point.frame_ms_high)})",
+            f"{speed.median:.2f} ({speed.low:.2f}-{speed.high:.2f})",
+            _ms(point.frame_ms),
             f"{point.against_dense.psnr:.2f}",
             *([_psnr(point.against_photos)] if photos else []),
             f"{point.seconds:.1f} s",

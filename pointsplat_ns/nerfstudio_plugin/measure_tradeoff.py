@@ -13,8 +13,9 @@ from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
 from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
 from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.tradeoff.measuring import Subject
 from pointsplat_ns.tradeoff.points import Tradeoff
-from pointsplat_ns.tradeoff.sweep import Options, Subject, Sweep, check_folder
+from pointsplat_ns.tradeoff.sweep import Options, Sweep, check_folder
 from pointsplat_ns.tradeoff.targets import Search, Targets
 
 
@@ -99,7 +100,7 @@ def measure_tradeoff(
             return sweep.run()
         sweep.measure_dense()
         try:
-            found = Search(targets, sweep.plan, sweep.measure, sweep.cut_psnr).run()
+            found = Search(targets, sweep.plan, sweep.measure, sweep.measurer.cut_psnr).run()
         except BudgetError:
             sweep.finish()  # what was measured on the way
             raise

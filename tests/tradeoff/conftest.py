@@ -13,7 +13,8 @@ from pointsplat_ns.compression import repair
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.tradeoff import machine, outputs
-from pointsplat_ns.tradeoff.sweep import Options, Subject, Sweep
+from pointsplat_ns.tradeoff.measuring import Subject
+from pointsplat_ns.tradeoff.sweep import Options, Sweep
 from pointsplat_ns.views import Views
 
 

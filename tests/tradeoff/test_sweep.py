@@ -14,7 +14,7 @@ from making import same_bits
 from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
-from pointsplat_ns.tradeoff import making, sweep
+from pointsplat_ns.tradeoff import judging, making, measuring, sweep
 from pointsplat_ns.tradeoff.journal import POINTS
 from pointsplat_ns.tradeoff.outputs import OUTPUTS, PAGE, PLOTS, TABLE
 from pointsplat_ns.tradeoff.plots import AXES
@@ -95,14 +95,14 @@ def test_an_interruption_leaves_what_was_measured_and_the_next_call_goes_on(new_
         made.append(setting)
         return make(dense, setting, *args)
 
-    monkeypatch.setattr(sweep, "make", interrupted)
+    monkeypatch.setattr(measuring, "make", interrupted)
     with pytest.raises(KeyboardInterrupt):
         new_sweep(tmp_path, points=4, repairs=("none",)).run()
     content = json.loads((tmp_path / "tradeoff.json").read_text())
     assert len(content["points"]) == 1 + after
     assert any("interrupted" in note for note in content["notes"])
     made.clear()
-    monkeypatch.setattr(sweep, "make", lambda *args: (made.append(args[1]), make(*args))[1])
+    monkeypatch.setattr(measuring, "make", lambda *args: (made.append(args[1]), make(*args))[1])
     resumed = new_sweep(tmp_path, points=4, repairs=("none",)).run()
     assert len(resumed.points) == 4 and len(made) == 3 - after, "nothing is measured twice"
     whole = new_sweep(tmp_path / "whole", points=4, repairs=("none",)).run()
@@ -158,7 +158,7 @@ def test_where_photos_cannot_be_had_it_says_why_and_goes_on_without(new_sweep, t
 
 @pytest.mark.parametrize("others, said", [(50.0, True), (0.0, False)])
 def test_a_busy_machine_is_said_to_be_one(new_sweep, tmp_path, monkeypatch, others, said):
-    monkeypatch.setattr(sweep.Judge, "psnr", lambda self, scene: 0.0)
+    monkeypatch.setattr(judging.Judge, "psnr", lambda self, scene: 0.0)
     monkeypatch.setattr("pointsplat_ns.tradeoff.machine.OtherPrograms.cores", lambda self: others)
     monkeypatch.setattr("pointsplat_ns.tradeoff.machine.cores", lambda: torch.get_num_threads())
     result = new_sweep(tmp_path, points=2, repairs=("none",)).run()
@@ -175,7 +175,7 @@ def test_progress_never_goes_back_and_ends(new_sweep, tmp_path):
 def test_points_of_another_scene_are_refused_before_anything_is_measured(new_sweep, tmp_path, room, room_views):
     new_sweep(tmp_path, points=2).run()
     dense = ps.load(room)
-    other = sweep.Subject(dense, room, "room", "another sum", lambda: ViewSource(dense, given=room_views))
+    other = measuring.Subject(dense, room, "room", "another sum", lambda: ViewSource(dense, given=room_views))
     with pytest.raises(SceneError, match="its points are of another sweep"):
         sweep.Sweep(other, tmp_path, Options(), lambda what, share: None)
 
