@@ -29,6 +29,7 @@ def measure_tradeoff(
     repairs: tuple[str, ...] = ("none", "quick"),
     views: int = 10,
     side: int = 640,
+    drawn: tuple[str, ...] = ("exact", "fast", "half"),
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: float | None = None,
@@ -45,13 +46,15 @@ def measure_tradeoff(
     Args:
         scene: a PLY, a checkpoint, or a Splatfacto run, whose held-out photos are then used where they are found.
         folder: where points, pictures, tables, plots, the page and the found scene go.
-        points: largest number of points of a sweep, the dense scene among them.
+        points: largest number of scenes of a sweep, the dense one among them.
         within: the recommended point is the fastest that loses at most so much, dB: against photos, or as much as is
             expected of its renders (:mod:`~pointsplat_ns.tradeoff.loss`).
         by: methods, as for :func:`pointsplat_ns.prune`; the first one is walked, others are measured at three budgets.
         repairs: some of "none", "refiner", "quick" and "thorough", the efforts of :func:`pointsplat_ns.compact`.
         views: largest number of views; without photos at most 12.
         side: largest side of their images, pixels; photos are reduced.
+        drawn: how frames may be drawn: "exact", of all scenes; "fast" and "half" (so, and at half the resolution), of a
+            few where that may pay. A search for targets draws exactly.
         target_db: least PSNR against the dense scene's renders, dB, mean over views.
         target_ms: longest time of a frame, milliseconds.
         target_mb: largest file, in units of 10^6 bytes.
@@ -79,7 +82,7 @@ def measure_tradeoff(
         >>> found.point(found.recommended).bytes <= 10_000
         True
     """
-    options = Options(points, within, tuple(by), tuple(repairs), views, side)
+    options = Options(points, within, tuple(by), tuple(repairs), views, side, tuple(drawn))
     targets = None
     if any(target is not None for target in (target_db, target_ms, target_mb)):
         targets = Targets(target_db, target_ms, target_mb)

@@ -25,7 +25,8 @@ from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.tradeoff.machine import OtherPrograms
 from pointsplat_ns.tradeoff.points import Quality, picture_path
-from pointsplat_ns.views import Views, spread_indices
+from pointsplat_ns.tradeoff.settings import Drawn, draw
+from pointsplat_ns.views import View, Views, spread_indices
 
 ROUNDS = 3
 """Times that each view is drawn and timed, of the dense scene and of the one judged in turn."""
@@ -99,7 +100,9 @@ class Judge:
             self._write([self.photos[i] for i in self.shown], "photo")
 
     @torch.no_grad()
-    def judge(self, scene: Gaussians, key: str, progress: Callable[[float], None], timed: bool = True) -> Judged:
+    def judge(
+        self, scene: Gaussians, key: str, progress: Callable[[float], None], timed: bool = True, drawn: Drawn = "exact"
+    ) -> Judged:
         """Render a scene, write pictures of it, and time it.
 
         Args:
@@ -107,13 +110,14 @@ class Judge:
             key: of its point.
             progress: called with the share done, in [0, 1].
             timed: whether to time it. If not, times are NaN.
+            drawn: how its frames are drawn; those of the dense scene always are drawn exactly.
         """
         against_dense: list[Quality] = []
         against_photos: list[Quality] = []
         pictures = []
         passes = 1 + 2 * ROUNDS * timed
         for i, view in enumerate(self.views):
-            image = render(scene, view)
+            image = draw(scene, view, drawn)
             against_dense.append(self._quality(image, self.renders[i]))
             if self.photos is not None:
                 against_photos.append(self._quality(image, self.photos[i].to(image)))
@@ -122,19 +126,19 @@ class Judge:
             progress((i + 1) / (passes * len(self.views)))
         self._write(pictures, key)
         photos = _mean(against_photos) if against_photos else None
-        times = self._time(scene) if timed else _UNTIMED
+        times = self._time(scene, drawn) if timed else _UNTIMED
         progress(1.0)
         return Judged(_mean(against_dense), photos, **times)
 
-    def _time(self, scene: Gaussians) -> dict[str, float]:
+    def _time(self, scene: Gaussians, drawn: Drawn) -> dict[str, float]:
         """The times of :class:`Judged`: those of the dense scene's reference times the ratio that was measured now."""
         others = OtherPrograms()
-        rounds = np.array(
-            [
-                [(_timed(self.dense, self.views, i), _timed(scene, self.views, i)) for i in range(len(self.views))]
-                for _ in range(ROUNDS)
-            ]
-        )  # [ROUNDS, views, 2], seconds
+        pairs = [
+            (_timed(self.dense, view, "exact"), _timed(scene, view, drawn))
+            for _ in range(ROUNDS)
+            for view in self.views
+        ]
+        rounds = np.array(pairs).reshape(ROUNDS, len(self.views), 2)  # seconds
         dense_ms, clock_ms = (1000 * float(np.median(rounds.min(axis=0)[:, which])) for which in (0, 1))
         if self.dense_ms is None:
             self.dense_ms = dense_ms
@@ -173,11 +177,11 @@ class Judge:
 _UNTIMED = dict.fromkeys(("frame_ms", "frame_ms_low", "frame_ms_high", "clock_ms", "others_cores"), math.nan)
 
 
-def _timed(scene: Gaussians, views: Views, index: int) -> float:
-    """Seconds that drawing one view takes."""
+def _timed(scene: Gaussians, view: View, drawn: Drawn) -> float:
+    """Seconds that drawing a view takes."""
     _wait_for(scene.device)
     start = time.perf_counter()
-    render(scene, views[index])
+    draw(scene, view, drawn)
     _wait_for(scene.device)
     return time.perf_counter() - start
 

@@ -65,7 +65,13 @@ class Measurer:
     """
 
     def __init__(
-        self, subject: Subject, views: int, side: int, progress: Progress, folder: Path | None = None, timed: bool = True
+        self,
+        subject: Subject,
+        views: int,
+        side: int,
+        progress: Progress,
+        folder: Path | None = None,
+        timed: bool = True,
     ):
         need_usable(subject.dense)
         self.subject, self.dense, self.folder, self.timed = subject, subject.dense, folder, timed
@@ -74,8 +80,7 @@ class Measurer:
         was measured earlier goes here before anything is judged."""
         self.notes: dict[str, None] = {}
         self.naming = Naming(subject.path, subject.name, len(self.dense), self.dense.sh_degree)
-        self.last: tuple[Setting, Made] | None = None
-        """What was made last."""
+        self._kept: dict[Setting, Made] = {}
         self._progress = progress
         progress("looking for views", 0.0)
         self.looked_at = self._look(views).resized(side)
@@ -126,15 +131,18 @@ class Measurer:
         naming = self.naming
         names = (naming.key(setting), naming.label(setting), naming.command(setting))
         with self._alone():
-            made = make(self.dense, setting, self.subject.new_views, show, self.subject.refiner)
-            self.last = (setting, made)
-            return self._point(setting, made, *names, show)
+            return self._point(setting, self.made(setting, show), *names, show)
 
     def made(self, setting: Setting, show: Progress = silent) -> Made:
-        """The scene of a setting, made anew unless it was the last one made."""
-        if self.last is None or self.last[0] != setting:
-            self.last = (setting, make(self.dense, setting, self.subject.new_views, show, self.subject.refiner))
-        return self.last[1]
+        """The scene of a setting, made anew unless it is kept: the latest ones are, of no more Gaussians in all than the
+        dense scene has."""
+        setting = setting.scene
+        if setting not in self._kept:
+            made = make(self.dense, setting, self.subject.new_views, show, self.subject.refiner)
+            self._kept[setting] = made
+            while len(self._kept) > 1 and sum(len(kept.scene) for kept in self._kept.values()) > len(self.dense):
+                self._kept.pop(next(iter(self._kept)))
+        return self._kept[setting]
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
@@ -148,7 +156,7 @@ class Measurer:
 
     def _point(self, setting: Setting, made: Made, key: str, label: str, command: str, show: Progress) -> Point:
         size, scene = through_file(made.scene, self.subject.suffix)
-        judged = self.judge.judge(scene, key, lambda share: show("", share), self.timed)
+        judged = self.judge.judge(scene, key, lambda share: show("", share), self.timed, setting.drawn)
         return Point(
             key=key,
             label=label,
@@ -168,4 +176,5 @@ class Measurer:
             peak_bytes=made.peak_bytes,
             others_cores=judged.others_cores,
             clock_ms=judged.clock_ms,
+            drawn=setting.drawn,
         )

@@ -184,7 +184,8 @@ def _group(point: Point) -> str:
     """What points of one colour have in common."""
     if point.by == "dense":
         return "the dense scene"
-    return f"{point.by}, " + ("not repaired" if point.repair == "none" else f"repaired ({point.repair})")
+    group = f"{point.by}, " + ("not repaired" if point.repair == "none" else f"repaired ({point.repair})")
+    return group if point.drawn == "exact" else f"{group}, drawn {point.drawn}"
 
 
 def _finite(value: float | None) -> float | str | None:

@@ -56,6 +56,8 @@ class Point:
     clock_ms: float | None = None
     """Median time of one frame over views, in milliseconds, as the clock said it when this point was measured; None
     where it was not measured."""
+    drawn: str = "exact"
+    """How its frames were drawn, for pictures and times: ``exact``, ``fast``, ``half``."""
 
 
 class Speed(NamedTuple):

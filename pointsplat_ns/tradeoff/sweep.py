@@ -19,10 +19,11 @@ from pointsplat_ns.tradeoff.machine import is_busy, machine_text
 from pointsplat_ns.tradeoff.measuring import Measurer, Subject
 from pointsplat_ns.tradeoff.outputs import OUTPUTS, write_outputs
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, speed_of
-from pointsplat_ns.tradeoff.settings import DENSE, REPAIRS, Repair, Setting, check_repairs
-from pointsplat_ns.tradeoff.walk import Plan, walk
+from pointsplat_ns.tradeoff.settings import DENSE, DRAWN, REPAIRS, Drawn, Setting, check_drawn, check_repairs
+from pointsplat_ns.tradeoff.walk import MOST_DRAWINGS, Plan, drawings, walk
 
 logger = logging.getLogger("pointsplat_ns")
+
 
 @dataclass(frozen=True)
 class Options:
@@ -33,7 +34,7 @@ class Options:
     """
 
     points: int = 12
-    """Largest number of points, the dense scene among them."""
+    """Largest number of scenes, the dense one among them."""
     within: float = 0.5
     """Loss, dB, that the recommended point may have."""
     methods: tuple[str, ...] = ("merge",)
@@ -42,6 +43,8 @@ class Options:
     """Largest number of views."""
     side: int = 640
     """Largest side of their images, pixels."""
+    drawn: tuple[str, ...] = DRAWN
+    """Ways to draw frames; of the other ways than the exact one, few scenes are measured."""
 
     def __post_init__(self) -> None:
         if self.points < 2:
@@ -55,11 +58,17 @@ class Options:
         for method in self.methods:
             method_named(method)
         check_repairs(self.repairs)
+        check_drawn(self.drawn)
+
+    @property
+    def drawings(self) -> tuple[Drawn, ...]:
+        """``drawn`` without the exact way, in which all is measured."""
+        return tuple(way for way in check_drawn(self.drawn) if way != "exact")
 
     def plan(self, dense: Gaussians) -> Plan:
         """What may be tried of a scene."""
         methods = tuple(dict.fromkeys(self.methods))
-        return Plan(len(dense), dense.sh_degree, methods, check_repairs(self.repairs), self.within)
+        return Plan(len(dense), dense.sh_degree, methods, check_repairs(self.repairs), self.within, self.drawings)
 
 
 def check_folder(folder: Path, force: bool) -> None:
@@ -124,14 +133,18 @@ class Sweep:
         Raises:
             KeyboardInterrupt, SystemExit: of Ctrl-C or another signal, after results of what was measured were written.
         """
-        dense = self.measure_dense(self.options.points)
+        most = self.options.points + (MOST_DRAWINGS if self.options.drawings else 0)
+        dense, points = self.measure_dense(most), self.journal.points
         try:
-            for setting in walk(self.plan, self.journal.points, dense, self.measurer.cut_psnr):
-                if setting in self.journal.points:
+            for setting in walk(self.plan, points, dense, self.measurer.cut_psnr):
+                if setting in points:
                     continue
-                if 1 + len(self.journal.points) >= self.options.points:
+                if 1 + sum(measured.drawn == "exact" for measured in points) >= self.options.points:
                     break
-                self.measure(setting, self.options.points)
+                self.measure(setting, most)
+            for setting in drawings(self.plan, points, dense):
+                self.measure(setting, most)
+            self.progress("measuring", 1.0)
         except (KeyboardInterrupt, SystemExit):
             self.finish_early()
             raise
@@ -175,11 +188,11 @@ class Sweep:
         """
         dense = self.journal.dense
         assert dense is not None
-        others = sorted(
-            self.journal.points.values(),
-            key=lambda p: (-p.gaussians, -p.sh_degree, REPAIRS.index(_repair(p)), p.by),
+        settings = sorted(
+            self.journal.points,
+            key=lambda s: (-s.count, -s.sh_degree, REPAIRS.index(s.repair), s.by, DRAWN.index(s.drawn)),
         )
-        points = (dense, *others)
+        points = (dense, *(self.journal.points[setting] for setting in settings))
         busy = self._busy_note(points)
         if recommended is None:
             recommended, why = recommend(points, self.options.within, trusted=not busy)
@@ -261,7 +274,3 @@ class Sweep:
             minutes = (of - done) * sum(self._seconds) / len(self._seconds) / 60
             left = f" ({done} of at most {of}; {max(1, math.ceil(minutes))} min left at most)"
         logger.info("%s: %s%s", point.label, ", ".join(figures), left)
-
-
-def _repair(point: Point) -> Repair:
-    return check_repairs((point.repair,))[0]

@@ -56,16 +56,17 @@ def test_equal_pictures_do_not_make_means_infinite(dense, room_views, tmp_path, 
 
 
 @pytest.fixture()
-def clock(dense, monkeypatch):
+def clock(dense, room_views, monkeypatch):
     """Views of the dense scene take 10, 40 and 20 ms, those of others a half, a quarter and a fifth of it. The list is
     by how much the machine slows both down in each round; further rounds are not slowed down."""
     slow = [1.0] * judging.ROUNDS
     drawn = []
 
-    def timed(scene, views, index):
-        drawn.append((scene is dense, index))
+    def timed(scene, view, way):
+        index = next(i for i, known in enumerate(room_views) if torch.equal(known.viewmat, view.viewmat))
+        drawn.append((scene is dense, way, index))
         share = 1.0 if scene is dense else (1 / 2, 1 / 4, 1 / 5)[index]
-        frames = 2 * len(views)
+        frames = 2 * len(room_views)
         return slow[(len(drawn) - 1) // frames % judging.ROUNDS] * share * (0.010, 0.040, 0.020)[index]
 
     monkeypatch.setattr(judging, "_timed", timed)
@@ -92,9 +93,10 @@ def test_a_machine_that_slows_down_changes_what_the_clock_says_and_not_the_times
 
 
 def test_each_frame_is_timed_right_after_the_same_one_of_the_dense_scene(dense, room_views, no_lpips, clock):
-    judged(Judge(dense, LookedAt(room_views, None, ""), None), ps.prune(dense, 200, by="opacity"))
-    views = range(len(room_views))
-    assert clock[1] == [(of_dense, view) for _ in range(judging.ROUNDS) for view in views for of_dense in (True, False)]
+    judge = Judge(dense, LookedAt(room_views, None, ""), None)
+    judge.judge(dense[:300], "some", lambda share: None, drawn="fast")
+    views, pair = range(len(room_views)), ((True, "exact"), (False, "fast"))
+    assert clock[1] == [(*scene, view) for _ in range(judging.ROUNDS) for view in views for scene in pair]
 
 
 def test_a_reference_that_was_measured_before_is_kept(dense, room_views, no_lpips, clock):
@@ -103,10 +105,19 @@ def test_a_reference_that_was_measured_before_is_kept(dense, room_views, no_lpip
 
 
 def test_the_dense_scene_is_as_fast_as_itself(dense, room_views, no_lpips, monkeypatch):
-    monkeypatch.setattr(judging, "_timed", lambda scene, views, index, seconds=iter(range(1, 1000)): float(next(seconds)))
+    seconds = iter(range(1, 1000))
+    monkeypatch.setattr(judging, "_timed", lambda *args: float(next(seconds)))
     judge = Judge(dense, LookedAt(room_views, None, ""), None)
     got = judged(judge, dense)
     assert got.frame_ms == judge.dense_ms and got.frame_ms_low < got.frame_ms < got.frame_ms_high
+
+
+@pytest.mark.parametrize("drawn, options", [("fast", ("fast", 1)), ("half", ("fast", 2))])
+def test_other_ways_to_draw_are_judged_by_what_is_seen(dense, room_views, no_lpips, drawn, options):
+    judge = Judge(dense, LookedAt(room_views, None, ""), None)
+    got = judge.judge(dense, "some", lambda share: None, timed=False, drawn=drawn).against_dense
+    wanted = ps.psnr(render(dense, room_views, *options), render(dense, room_views))
+    assert got.psnr == pytest.approx(fmean(wanted.tolist()), abs=1e-4) and got.psnr < 60
 
 
 def test_what_is_not_timed_has_no_times(dense, room_views, no_lpips, monkeypatch):
