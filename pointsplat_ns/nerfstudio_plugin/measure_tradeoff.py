@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from pathlib import Path
 
 from pointsplat_ns.compression.level_folder import source_file
+from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import BudgetError, SceneError
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import file_stem
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
 from pointsplat_ns.io.scene import read_scene, save
@@ -16,7 +19,8 @@ from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.tradeoff.measuring import Subject
 from pointsplat_ns.tradeoff.points import Tradeoff
 from pointsplat_ns.tradeoff.sweep import Options, Sweep, check_folder
-from pointsplat_ns.tradeoff.targets import Search, Targets
+from pointsplat_ns.tradeoff.targets import Search, targets_of
+from pointsplat_ns.views import Views
 
 
 def measure_tradeoff(
@@ -83,20 +87,11 @@ def measure_tradeoff(
         True
     """
     options = Options(points, within, tuple(by), tuple(repairs), views, side, tuple(drawn))
-    targets = None
-    if any(target is not None for target in (target_db, target_ms, target_mb)):
-        targets = Targets(target_db, target_ms, target_mb)
+    targets = targets_of(target_db, target_ms, target_mb)
     path, folder = Path(scene), Path(folder)
     dense = read_scene(path)
     check_folder(folder, force)
-    subject = Subject(
-        dense=dense,
-        path=path,
-        name=_name(path),
-        sha256=source_file(path).sha256,
-        new_views=lambda: ViewSource(dense, run=path, dataset_views=dataset_views),
-        held_out=functools.partial(dataset_photos, path, "test") if may_be_run(path) else None,
-    )
+    subject = replace(subject_of(dense, path), name=_name(path), sha256=source_file(path).sha256)
     with progress_bar(progress) as report:
         sweep = Sweep(subject, folder, options, report)
         if targets is None:
@@ -114,6 +109,35 @@ def measure_tradeoff(
         if not output.exists() or force:
             save(sweep.scene(found.setting), output)
         return sweep.finish(found.point, f"{found.why}; written to {output}")
+
+
+def subject_of(
+    dense: Gaussians,
+    path: Path | None,
+    views: Views | None = None,
+    refiner: TrainedRefiner | None = None,
+    suffix: str = ".ply",
+) -> Subject:
+    """A scene to be measured, with the views that its commands have and its held-out photos.
+
+    Args:
+        dense: the scene.
+        path: where it was read from, or the run whose dataset has the poses; None if it is in memory only.
+        views: given ones, in place of any others; there are no photos of them.
+        refiner: what repairs begin with; by default the one that ships.
+        suffix: of the format that smaller scenes are written in.
+    """
+    photos = path is not None and views is None and may_be_run(path)
+    return Subject(
+        dense=dense,
+        path=path or Path("scene.ply"),
+        name="scene",
+        sha256="",
+        new_views=lambda: ViewSource(dense, given=views, run=path, dataset_views=dataset_views),
+        held_out=functools.partial(dataset_photos, path, "test") if path is not None and photos else None,
+        refiner=refiner,
+        suffix=suffix,
+    )
 
 
 def _name(path: Path) -> str:

@@ -1,7 +1,7 @@
 """Judges scenes: against the dense scene's renders and photos, and by the time that a frame takes.
 
-On a shared machine a frame may take twice as long in one minute as in the next. So each frame is timed beside one of the
-dense scene in the same view: what slows one down slows down the other, and the ratio of their times stays.
+On a shared machine a frame may take twice as long in one minute as in the next. So each frame is timed beside one of
+the dense scene in the same view: what slows one down slows down the other, and the ratio of their times stays.
 """
 
 from __future__ import annotations

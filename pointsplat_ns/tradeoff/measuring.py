@@ -134,8 +134,8 @@ class Measurer:
             return self._point(setting, self.made(setting, show), *names, show)
 
     def made(self, setting: Setting, show: Progress = silent) -> Made:
-        """The scene of a setting, made anew unless it is kept: the latest ones are, of no more Gaussians in all than the
-        dense scene has."""
+        """The scene of a setting, made anew unless it is kept: the latest ones are, of no more Gaussians in all than
+        the dense scene has."""
         setting = setting.scene
         if setting not in self._kept:
             made = make(self.dense, setting, self.subject.new_views, show, self.subject.refiner)

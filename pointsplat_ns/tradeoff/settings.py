@@ -25,6 +25,12 @@ REPAIRS: tuple[Repair, ...] = get_args(Repair)
 EFFORTS: dict[Repair, Effort] = {"refiner": "instant", "quick": "quick", "thorough": "thorough"}
 """The effort of ``compact`` that each repair is."""
 
+
+def repairs_of(effort: Effort) -> tuple[Repair, Repair]:
+    """None, or the repair that is an effort of ``compact``."""
+    return "none", next(repair for repair, known in EFFORTS.items() if known == effort)
+
+
 Drawn = Literal["exact", "fast", "half"]
 """How frames are drawn: as they are; with ``quality="fast"``, that leaves out what is nearly transparent; or so and at
 half the resolution, enlarged."""

@@ -12,10 +12,9 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import method_named
 from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.system.threads import cores
 from pointsplat_ns.tradeoff.journal import POINTS, Journal
 from pointsplat_ns.tradeoff.loss import recommend
-from pointsplat_ns.tradeoff.machine import is_busy, machine_text
+from pointsplat_ns.tradeoff.machine import busy_note, machine_text
 from pointsplat_ns.tradeoff.measuring import Measurer, Subject
 from pointsplat_ns.tradeoff.outputs import OUTPUTS, write_outputs
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, speed_of
@@ -193,7 +192,7 @@ class Sweep:
             key=lambda s: (-s.count, -s.sh_degree, REPAIRS.index(s.repair), s.by, DRAWN.index(s.drawn)),
         )
         points = (dense, *(self.journal.points[setting] for setting in settings))
-        busy = self._busy_note(points)
+        busy = busy_note([p.others_cores for p in points if p.others_cores is not None])
         if recommended is None:
             recommended, why = recommend(points, self.options.within, trusted=not busy)
         views = self.measurer.looked_at.views
@@ -204,7 +203,7 @@ class Sweep:
             width=views.width,
             height=views.height,
             points=points,
-            notes=(*busy, *self.measurer.notes),
+            notes=(*([busy] if busy else []), *self.measurer.notes),
             times_trusted=not busy,
             recommended=recommended.key,
             why=why,
@@ -222,15 +221,6 @@ class Sweep:
         if self.journal.dense is not None:
             self.measurer.note("the sweep was interrupted: the same command goes on with it")
             self.finish()
-
-    def _busy_note(self, points: tuple[Point, ...]) -> list[str]:
-        disturbed = [p.others_cores for p in points if p.others_cores is not None and is_busy(p.others_cores)]
-        if not disturbed:
-            return []
-        return [
-            f"the machine was busy: while {len(disturbed)} of {len(points)} points were timed, other programs took up "
-            f"to {max(disturbed):.1f} of {cores()} cores; times are not to be trusted"
-        ]
 
     def _forget_those_without_pictures(self) -> None:
         """Points whose pictures somebody has removed are measured again: the page shows all of them."""
