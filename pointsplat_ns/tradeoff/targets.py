@@ -137,7 +137,7 @@ class Search:
         return self._smallest() if self.targets.db is not None else self._best()
 
     def so_far(self) -> Found | None:
-        """The cheapest of what was tried that meets all targets, for a search that is interrupted; None if none does."""
+        """The cheapest of what was tried that meets all targets, if the search was interrupted; None if none does."""
         meeting = {s: point for s, point in self.tried.items() if not self.targets.missed(point)}
         if not meeting:
             return None
