@@ -26,11 +26,16 @@ from pointsplat_ns.compression.trained_refiner import (
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.runs import REFINER_METHOD, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.tradeoff.finding import find_scene
+from pointsplat_ns.tradeoff.settings import repairs_of
+from pointsplat_ns.tradeoff.targets import targets_of
 from pointsplat_ns.views import Views
 
 logger = logging.getLogger("pointsplat_ns")
@@ -185,6 +190,10 @@ def compact(
     clean: bool = False,
     effort: Effort = "quick",
     seconds: float | None = None,
+    target_db: float | None = None,
+    target_ms: float | None = None,
+    target_mb: float | None = None,
+    target_format: str = ".ply",
     views: Views | str | Path | None = None,
     progress: bool | Progress = False,
 ) -> Compacted:
@@ -192,6 +201,9 @@ def compact(
 
     A trained refiner repairs it in one pass. Then learned steps bring it closer to the given scene's own renders, no
     photos, for as long as ``effort`` or ``seconds`` says. What does not bring renders closer is left out.
+
+    With targets, count, SH degree and whether to repair are decided by what the scene needs: the smallest file that has
+    ``target_db`` and is within the limits of time and size; among limits alone, the best within them.
 
     Args:
         scene: N Gaussians, or where to read them: a PLY, a checkpoint, or a Splatfacto run.
@@ -203,16 +215,22 @@ def compact(
         clean: as for :func:`prune`.
         effort: "instant" is only the refiner; "quick" and "thorough" take 32 and 400 steps.
         seconds: repair for so long, instead; Ctrl-C ends it earlier, and what has been reached is kept.
+        target_db: least PSNR against the given scene's renders, dB, mean over views; those of held-out photos where the
+            run's are found.
+        target_ms: longest time of a frame, milliseconds, drawn by this package in these views.
+        target_mb: largest file, in units of 10^6 bytes.
+        target_format: of the file whose size counts, as the end of its name: ".ply", ".spz", ".sog", ...
         views: where renders are compared, as for :func:`prune`; at most 12 are taken. If there are more than twice as
             many, the scene is repaired from the others, else on views sampled in free space.
         progress: True shows a bar; a function is called with what is being done and the share done of it.
 
     Returns:
         ``.scene``, ``.accepted`` (whether the refiner is in it), ``.psnr`` (dB against the given scene's renders),
-        ``.seconds``, ``.verdict`` (all of that in a line), and more: see :class:`Compacted`.
+        ``.seconds``, ``.verdict`` (all of that in a line), and more: see :class:`Compacted`. ``.target`` says what was
+        found for targets, and what the next cheaper scene would have missed.
 
     Raises:
-        BudgetError: if no such scene can be made.
+        BudgetError: if no such scene can be made; of targets, the text says what can.
         SceneError: if no Gaussian can be drawn, the file is not usable, or the SH degree exceeds the refiner's.
         DataError: if the budget or ``sh`` needs views and none can be had.
         PointSplatError: if there is no such method or effort, or the time is negative.
@@ -225,11 +243,19 @@ def compact(
     """
     refiner = refiner or load_refiner()
     budget = RepairBudget(effort, seconds)
-    resolve_options(refiner, keep, by, sh)  # before the scene is read
+    _, method = resolve_options(refiner, keep, by, sh)  # before the scene is read
+    bands = None if sh == "all" else sh
+    targets = targets_of(target_db, target_ms, target_mb, keep=keep, sh=bands, clean=clean or None, seconds=seconds)
+    format_to_write(target_format)
     dense, source = _read(scene, views)
     with progress_bar(progress) as report:
-        result = compact_scene(dense, refiner, keep, by, sh, source, report, clean, budget)
-    _log((*result.verdict.splitlines(), *result.notes))
+        if targets is None:
+            result = compact_scene(dense, refiner, keep, by, sh, source, report, clean, budget)
+        else:
+            given = views if isinstance(views, Views) else None
+            subject = subject_of(dense, _run_of(scene, views), given, refiner, target_format)
+            result = find_scene(subject, targets, method, repairs_of(effort), report)
+    _log((*result.target.splitlines(), *result.verdict.splitlines(), *result.notes))
     return result
 
 
@@ -325,8 +351,13 @@ def _read(scene: Source, views: Views | str | Path | None) -> tuple[Gaussians, V
     dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
     if isinstance(views, Views):
         return dense, ViewSource(dense, given=views)
-    run = views if views is not None else None if isinstance(scene, Gaussians) else scene
-    return dense, ViewSource(dense, run=run, dataset_views=dataset_views)
+    return dense, ViewSource(dense, run=_run_of(scene, views), dataset_views=dataset_views)
+
+
+def _run_of(scene: Source, views: Views | str | Path | None) -> Path | None:
+    """The file or folder whose dataset may have the poses."""
+    named = scene if views is None else views
+    return Path(named) if isinstance(named, (str, Path)) else None
 
 
 def _is_refiner_run(path: str | Path) -> bool:

@@ -19,9 +19,13 @@ from pointsplat_ns.compression.trained_refiner import load_refiner
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
 from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import gathered
 from pointsplat_ns.pruning import Keep
-from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.system.progress import Progress, progress_bar, silent
+from pointsplat_ns.tradeoff.finding import find_scene
+from pointsplat_ns.tradeoff.settings import Repair, repairs_of
+from pointsplat_ns.tradeoff.targets import Targets, targets_of
 
 FOREVER = datetime.timedelta(days=1000)
 """How long processes of ``torchrun`` wait for one another; the last scene of one may take long."""
@@ -38,6 +42,9 @@ def compact_folder(
     clean: bool = False,
     effort: Effort = "quick",
     seconds: float | None = None,
+    target_db: float | None = None,
+    target_ms: float | None = None,
+    target_mb: float | None = None,
     jobs: int = 1,
     shard: str | None = None,
     force: bool = False,
@@ -60,6 +67,7 @@ def compact_folder(
         clean: as for :func:`compact`.
         effort: as for :func:`compact`.
         seconds: of repairing each scene, as for :func:`compact`.
+        target_db, target_ms, target_mb: what each scene has to meet, as for :func:`compact`.
         jobs: number of processes. More than one share the cores; a program that asks for them must be a file, with what
             it does under ``if __name__ == "__main__":``, as for any Python program that starts processes.
         shard: only a part of the scenes: "2/5" is the second of five.
@@ -96,6 +104,8 @@ def compact_folder(
     trained = _refiner_on(refiner, device)
     repair = RepairBudget(effort, seconds)
     budget, method = resolve_options(trained, keep, by, sh)
+    bands = None if sh == "all" else sh
+    targets = targets_of(target_db, target_ms, target_mb, keep=keep, sh=bands, clean=clean or None, seconds=seconds)
     options: Options = {
         "keep": str(budget),
         "refiner": source_file(trained.source).sha256,
@@ -105,7 +115,11 @@ def compact_folder(
         "effort": effort if seconds is None else None,
         "seconds": seconds,
     }
-    make = functools.partial(_compacted, refiner, device, budget, method, sh, clean, repair)
+    if targets is not None:
+        options = {**options, "keep": None, "target_db": target_db, "target_ms": target_ms, "target_mb": target_mb}
+        make = functools.partial(_found, refiner, device, targets, method, repairs_of(effort))
+    else:
+        make = functools.partial(_compacted, refiner, device, budget, method, sh, clean, repair)
     with progress_bar(progress if rank == 0 else False) as report:
         results = settle_folder(
             folder, target, Command("compact", make, options), jobs, part.within(rank, world_size), force, report
@@ -132,6 +146,18 @@ def _compacted(
     result = compact_scene(dense, _refiner_on(refiner, device), keep, by, sh, source, clean=clean, budget=budget)
     if result.repaired is not None and result.repaired.interrupted:
         raise KeyboardInterrupt  # which is meant for all scenes, not for the repair of this one
+    return Made(result.scene, len(dense), result.psnr)
+
+
+def _found(
+    refiner: str | Path | None, device: str, targets: Targets, by: str, repairs: tuple[Repair, ...], path: Path
+) -> Made:
+    """The cheapest of a scene of a folder that meets targets."""
+    dense = read_scene(path)
+    subject = subject_of(dense, path, refiner=_refiner_on(refiner, device))
+    result = find_scene(subject, targets, by, repairs, silent)
+    if result.interrupted:
+        raise KeyboardInterrupt  # which is meant for all scenes, not for the search of this one
     return Made(result.scene, len(dense), result.psnr)
 
 

@@ -33,6 +33,9 @@ def compact(
     clean: bool = False,
     effort: Literal["instant", "quick", "thorough"] = "quick",
     seconds: float | None = None,
+    target_db: float | None = None,
+    target_ms: float | None = None,
+    target_mb: float | None = None,
     picture: Path | None = None,
     html: Path | None = None,
     html_limit: float = 60.0,
@@ -66,6 +69,10 @@ def compact(
         clean: as for prune: first remove what cannot be drawn and what is seen from nowhere.
         effort: how long to repair then: not at all (instant), 32 steps (quick, about as long as merging takes), or 400.
         seconds: repair for so many seconds, instead of a fixed effort. Ctrl-C ends it earlier and loses nothing.
+        target_db: find the smallest file of at least this PSNR against the dense scene's renders, in place of --keep
+            and --sh: count, SH degree and whether to repair are decided by what the scene needs.
+        target_ms: and of at most so many milliseconds a frame. Without --target-db, find the best within the limits.
+        target_mb: and of at most so many megabytes, in the format of the output.
         picture: a .png file for images of some views: dense, before and after the repair, side by side.
         html: an .html file that opens offline in a browser, to fly through the scene before and after, with a wipe
             between them.
@@ -86,7 +93,8 @@ def compact(
         with fixed_threads(threads):
             compact_folder(
                 scene, output, picture, html, dry_run, keep=keep, refiner=refiner, by=by, sh=sh, clean=clean,
-                effort=effort, seconds=seconds, jobs=1 if jobs is None else jobs, shard=shard, force=force,
+                effort=effort, seconds=seconds, target_db=target_db, target_ms=target_ms, target_mb=target_mb,
+                jobs=1 if jobs is None else jobs, shard=shard, force=force,
             )  # fmt: skip
         return
     if jobs is not None or shard is not None:
@@ -94,8 +102,10 @@ def compact(
     from pointsplat_ns.compression.compact import resolve_options
     from pointsplat_ns.compression.repair import RepairBudget
     from pointsplat_ns.io import read_scene
+    from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.io.runs import name_of
     from pointsplat_ns.pages.scene_page import check_limit
+    from pointsplat_ns.tradeoff.targets import targets_of
 
     output = output or output_beside(scene, "compact")
     check_outputs(None if dry_run else output, picture, force)
@@ -105,11 +115,15 @@ def compact(
     trained = ps.load_refiner(refiner)
     resolve_options(trained, keep, by, sh)
     RepairBudget(effort, seconds)
+    bands = None if sh == "all" else sh
+    targets_of(target_db, target_ms, target_mb, keep=keep, sh=bands, clean=clean or None, seconds=seconds)
     with fixed_threads(threads):
         dense = read_scene(scene)
         result = ps.compact(
-            dense, keep, trained, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds, views=scene, progress=True
-        )
+            dense, keep, trained, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds, target_db=target_db,
+            target_ms=target_ms, target_mb=target_mb, target_format=format_to_write(output).budget_suffix,
+            views=scene, progress=True,
+        )  # fmt: skip
     if not dry_run:
         ps.save(result.scene, output, progress=True)
         warn_if_larger(keep, output)

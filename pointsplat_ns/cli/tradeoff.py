@@ -19,6 +19,7 @@ def tradeoff(
     repairs: tuple[Literal["none", "refiner", "quick", "thorough"], ...] = ("none", "quick"),
     views: int = 10,
     side: int = 640,
+    drawn: tuple[Literal["exact", "fast", "half"], ...] = ("exact", "fast", "half"),
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: float | None = None,
@@ -36,13 +37,14 @@ def tradeoff(
             used where they are found.
         output: the folder for points, pictures, tables, plots and the page; by default beside the scene: room_tradeoff
             for room.ply, tradeoff in the folder of a run.
-        points: largest number of points, the dense scene among them.
+        points: largest number of scenes, the dense one among them.
         within: the recommended point is the fastest that loses at most so many dB against photos; without photos, as
             much as is expected of its renders.
         by: methods of prune; the first one is walked, others are measured at three budgets.
         repairs: what may repair: nothing, the refiner alone, or compact's efforts quick and thorough.
         views: largest number of views; without photos at most 12.
         side: largest side of their images, pixels; photos are reduced.
+        drawn: how frames may be drawn: exact, of all scenes; fast and half (so, and at half the resolution) of a few.
         target_db: find the smallest scene of at least this PSNR against the dense scene's renders.
         target_ms: and of at most so many milliseconds a frame. Without --target-db, find the best within the limits.
         target_mb: and of at most so many megabytes.
@@ -56,7 +58,7 @@ def tradeoff(
     folder = output or output_beside(scene, "tradeoff").with_suffix("")
     with fixed_threads(threads):
         found = ps.measure_tradeoff(
-            scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, side=side,
+            scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, side=side, drawn=drawn,
             target_db=target_db, target_ms=target_ms, target_mb=target_mb, force=force, progress=True,
         )  # fmt: skip
     _print_table(found)
@@ -75,19 +77,32 @@ def _print_table(found: Tradeoff) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from pointsplat_ns.tradeoff.points import speed_of
+
     photos = found.points[0].against_photos is not None
     print(f"{found.scene}: {len(found.points)} points, {found.width} x {found.height} pixels, {found.views_origin}")
     print(found.machine)
-    table = Table(box=SIMPLE, caption="*: recommended; dB of PSNR; ms a frame: median and quartiles over views")
+    caption = "*: recommended; times as fast as the dense scene: median and quartiles over views; dB of PSNR"
+    table = Table(box=SIMPLE, caption=caption)
     table.add_column("")
-    for name in ["Gaussians", "MB", "ms a frame", "dB,\nrenders", *(["dB,\nphotos"] if photos else []), "made in"]:
+    for name in [
+        "Gaussians",
+        "MB",
+        "times as fast",
+        "ms a\nframe",
+        "dB,\nrenders",
+        *(["dB,\nphotos"] if photos else []),
+        "made in",
+    ]:
         table.add_column(name, justify="right", no_wrap=True)
     for point in found.points:
+        speed = speed_of(point, found.points[0])
         table.add_row(
             point.label + (" *" if point.key == found.recommended else ""),
             f"{point.gaussians:,}",
             f"{point.bytes / 1e6:.2f}",
-            f"{_ms(point.frame_ms)} ({_ms(point.frame_ms_low)}-{_ms(point.frame_ms_high)})",
+            f"{speed.median:.2f} ({speed.low:.2f}-{speed.high:.2f})",
+            _ms(point.frame_ms),
             f"{point.against_dense.psnr:.2f}",
             *([_psnr(point.against_photos)] if photos else []),
             f"{point.seconds:.1f} s",

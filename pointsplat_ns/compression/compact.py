@@ -66,6 +66,10 @@ class Compacted:
     """The scene after optimisation against the dense scene's renders; None if there was no time for it."""
     after_repair: Closeness | None = None
     """Errors of the repaired scene; None if there is none."""
+    target: str = ""
+    """What a search for targets found: at what cost, and what the next cheaper scene would have missed; else empty."""
+    interrupted: bool = False
+    """Whether that search was interrupted."""
 
     @property
     def repair_accepted(self) -> bool:
@@ -171,6 +175,20 @@ def compact_scene(
         *(scene, pruned, refined, strength, accepted, verdict, notes, reference, before, after, seconds),
         *(repaired, after_repair),
     )
+
+
+def as_compacted(dense: Gaussians, pruned: Gaussians, views: ViewSource, notes: tuple[str, ...]) -> Compacted:
+    """What :func:`compact_scene` gives of a scene that is best left as it was pruned.
+
+    Args:
+        dense: the scene before.
+        pruned: the scene after.
+        views: views that renders are compared in.
+        notes: of how it was pruned.
+    """
+    reference = DenseReference(dense, views.compared())
+    verdict, before = "not repaired", reference.closeness(pruned)
+    return Compacted(pruned, pruned, pruned, 1.0, False, verdict, notes, reference, before, None, 0.0)
 
 
 def resolve_options(refiner: TrainedRefiner, keep: Keep | str | None, by: str | None, sh: str) -> tuple[Keep, str]:

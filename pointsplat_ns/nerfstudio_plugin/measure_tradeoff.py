@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from pathlib import Path
 
 from pointsplat_ns.compression.level_folder import source_file
+from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, name_of
 from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
 from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.tradeoff.measuring import Subject
 from pointsplat_ns.tradeoff.points import Tradeoff
-from pointsplat_ns.tradeoff.sweep import Options, Subject, Sweep, check_folder
-from pointsplat_ns.tradeoff.targets import Search, Targets
+from pointsplat_ns.tradeoff.sweep import Options, Sweep, check_folder
+from pointsplat_ns.tradeoff.targets import Search, targets_of
+from pointsplat_ns.views import Views
 
 
 def measure_tradeoff(
@@ -27,6 +32,7 @@ def measure_tradeoff(
     repairs: tuple[str, ...] = ("none", "quick"),
     views: int = 10,
     side: int = 640,
+    drawn: tuple[str, ...] = ("exact", "fast", "half"),
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: float | None = None,
@@ -43,13 +49,15 @@ def measure_tradeoff(
     Args:
         scene: a PLY, a checkpoint, or a Splatfacto run, whose held-out photos are then used where they are found.
         folder: where points, pictures, tables, plots, the page and the found scene go.
-        points: largest number of points of a sweep, the dense scene among them.
+        points: largest number of scenes of a sweep, the dense one among them.
         within: the recommended point is the fastest that loses at most so much, dB: against photos, or as much as is
             expected of its renders (:mod:`~pointsplat_ns.tradeoff.loss`).
         by: methods, as for :func:`pointsplat_ns.prune`; the first one is walked, others are measured at three budgets.
         repairs: some of "none", "refiner", "quick" and "thorough", the efforts of :func:`pointsplat_ns.compact`.
         views: largest number of views; without photos at most 12.
         side: largest side of their images, pixels; photos are reduced.
+        drawn: how frames may be drawn: "exact", of all scenes; "fast" and "half" (so, and at half the resolution), of a
+            few where that may pay. A search for targets draws exactly.
         target_db: least PSNR against the dense scene's renders, dB, mean over views.
         target_ms: longest time of a frame, milliseconds.
         target_mb: largest file, in units of 10^6 bytes.
@@ -77,28 +85,19 @@ def measure_tradeoff(
         >>> found.point(found.recommended).bytes <= 10_000
         True
     """
-    options = Options(points, within, tuple(by), tuple(repairs), views, side)
-    targets = None
-    if any(target is not None for target in (target_db, target_ms, target_mb)):
-        targets = Targets(target_db, target_ms, target_mb)
+    options = Options(points, within, tuple(by), tuple(repairs), views, side, tuple(drawn))
+    targets = targets_of(target_db, target_ms, target_mb)
     path, folder = Path(scene), Path(folder)
     dense = read_scene(path)
     check_folder(folder, force)
-    subject = Subject(
-        dense=dense,
-        path=path,
-        name=name_of(path),
-        sha256=source_file(path).sha256,
-        new_views=lambda: ViewSource(dense, run=path, dataset_views=dataset_views),
-        held_out=functools.partial(dataset_photos, path, "test") if may_be_run(path) else None,
-    )
+    subject = replace(subject_of(dense, path), name=name_of(path), sha256=source_file(path).sha256)
     with progress_bar(progress) as report:
         sweep = Sweep(subject, folder, options, report)
         if targets is None:
             return sweep.run()
         sweep.measure_dense()
         try:
-            found = Search(targets, sweep.plan, sweep.measure, sweep.cut_psnr).run()
+            found = Search(targets, sweep.plan, sweep.measure, sweep.measurer.cut_psnr).run()
         except BudgetError:
             sweep.finish()  # what was measured on the way
             raise
@@ -109,3 +108,32 @@ def measure_tradeoff(
         if not output.exists() or force:
             save(sweep.scene(found.setting), output)
         return sweep.finish(found.point, f"{found.why}; written to {output}")
+
+
+def subject_of(
+    dense: Gaussians,
+    path: Path | None,
+    views: Views | None = None,
+    refiner: TrainedRefiner | None = None,
+    suffix: str = ".ply",
+) -> Subject:
+    """A scene to be measured, with the views that its commands have and its held-out photos.
+
+    Args:
+        dense: the scene.
+        path: where it was read from, or the run whose dataset has the poses; None if it is in memory only.
+        views: given ones, in place of any others; there are no photos of them.
+        refiner: what repairs begin with; by default the one that ships.
+        suffix: of the format that smaller scenes are written in.
+    """
+    photos = path is not None and views is None and may_be_run(path)
+    return Subject(
+        dense=dense,
+        path=path or Path("scene.ply"),
+        name="scene",
+        sha256="",
+        new_views=lambda: ViewSource(dense, given=views, run=path, dataset_views=dataset_views),
+        held_out=functools.partial(dataset_photos, path, "test") if path is not None and photos else None,
+        refiner=refiner,
+        suffix=suffix,
+    )

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.rasterizer.rendering import rasterization
+from pointsplat_ns.rasterizer.rendering import QualityName, rasterization
 from pointsplat_ns.system.thread_choice import ThreadChoice
 from pointsplat_ns.system.threads import one_thread
 from pointsplat_ns.views import View, Views
@@ -16,19 +18,22 @@ from pointsplat_ns.views import View, Views
 _RENDERS = ThreadChoice()
 
 
-def render(scene: Gaussians, views: View | Views) -> Tensor:
+def render(scene: Gaussians, views: View | Views, quality: QualityName = "exact", reduced: int = 1) -> Tensor:
     """What a scene looks like from one view or several, over the views' background. Differentiable in the scene.
 
     Args:
         scene: N Gaussians, on any device; the picture is rendered there.
         views: a :class:`~pointsplat_ns.View`, or :class:`~pointsplat_ns.Views`, whose pictures are then drawn one after
             the other.
+        quality: what to give up for speed: "exact", "balanced" or "fast", as for :func:`pointsplat_ns.rasterization`.
+        reduced: draw this factor fewer pixels a side, and enlarge the picture (bicubic): faster, and blurred.
 
     Returns:
         Colours in [0, 1]: (H, W, 3) for a view, (C, H, W, 3) for C views.
 
     Raises:
-        ValueError: if a camera is not finite or has no focal length.
+        ValueError: if a camera is not finite or has no focal length, there is no such quality, or ``reduced`` is less
+            than 1.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -40,7 +45,11 @@ def render(scene: Gaussians, views: View | Views) -> Tensor:
     if isinstance(views, Views):
         if len(views) == 0:
             return scene.means.new_zeros(0, views.height, views.width, 3)
-        return torch.stack([render(scene, view) for view in views])
+        return torch.stack([render(scene, view, quality, reduced) for view in views])
+    if reduced < 1:
+        raise ValueError(f"reduced is {reduced}; expected 1 or more")
+    if reduced > 1:
+        return _enlarged(render(scene, _smaller(views, reduced), quality), views)
     with _RENDERS.step(_work(scene, views), scene.device):
         image, alpha, _ = rasterization(
             means=scene.means,
@@ -56,8 +65,22 @@ def render(scene: Gaussians, views: View | Views) -> Tensor:
             near_plane=views.near_plane,
             far_plane=math.inf,  # the unit of length may be small
             rasterize_mode=views.rasterize_mode,
+            quality=quality,
         )
         return (image[0] + (1 - alpha[0]) * views.background.to(image)).clamp(0, 1)
+
+
+def _smaller(view: View, factor: int) -> View:
+    """The same view with a factor fewer pixels a side, rounded up."""
+    width, height = -(-view.width // factor), -(-view.height // factor)
+    stretch = view.K.new_tensor([[width / view.width], [height / view.height], [1.0]])
+    return replace(view, K=view.K * stretch, width=width, height=height)
+
+
+def _enlarged(picture: Tensor, view: View) -> Tensor:
+    """A picture (h, w, 3) at the size of a view, (H, W, 3)."""
+    channels_first = picture.permute(2, 0, 1)[None]
+    return F.interpolate(channels_first, (view.height, view.width), mode="bicubic")[0].permute(1, 2, 0).clamp(0, 1)
 
 
 def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:

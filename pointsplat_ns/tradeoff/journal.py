@@ -16,7 +16,8 @@ from pointsplat_ns.tradeoff.settings import DENSE, Setting, setting_of
 
 POINTS = "points.json"
 
-FORMAT, VERSION = "pointsplat-tradeoff-points", 1
+FORMAT, VERSION = "pointsplat-tradeoff-points", 2
+"""Version 1 timed each point alone, as the clock said it: its times do not compare with those of today."""
 
 MOST_BYTES = 16_000_000
 """Largest journal that is read; a thousand points take one megabyte."""
@@ -67,14 +68,20 @@ class Journal:
             if self.path.stat().st_size > MOST_BYTES:
                 raise ValueError(f"larger than {MOST_BYTES:,} bytes")
             content = json.loads(self.path.read_text("utf-8"))
-            if (content["format"], content["version"]) != (FORMAT, VERSION):
-                raise ValueError(f"of format {content['format']} {content['version']}")
-            of, points = dict(content["of"]), [_point(values) for values in content["points"]]
+            if content["format"] != FORMAT:
+                raise ValueError(f"of format {content['format']}")
+            version, of = content["version"], dict(content["of"])
+            points = [_point(values) for values in content["points"]] if version == VERSION else []
         except (OSError, ValueError, TypeError, KeyError, RecursionError, PointSplatError) as error:
             why = f"lacks {error}" if isinstance(error, KeyError) else one_line(error, 80)
             raise SceneError(
                 f"{self.path}: not the points of a sweep ({why}); name another folder, or start over with --force"
             ) from error
+        if version != VERSION:
+            raise SceneError(
+                f"{self.path}: its points are of version {version!r:.20}, and this program's of {VERSION}, which "
+                "times frames otherwise; name another folder, or start over with --force"
+            )
         for name, value in self._identity.items():
             if of.get(name) != value:
                 raise SceneError(

@@ -1,7 +1,12 @@
-"""Judges scenes: against the dense scene's renders and photos, and by the time that a frame takes."""
+"""Judges scenes: against the dense scene's renders and photos, and by the time that a frame takes.
+
+On a shared machine a frame may take twice as long in one minute as in the next. So each frame is timed beside one of
+the dense scene in the same view: what slows one down slows down the other, and the ratio of their times stays.
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,10 +26,11 @@ from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.threads import fixed_threads
 from pointsplat_ns.tradeoff.machine import OtherPrograms
 from pointsplat_ns.tradeoff.points import Quality, picture_path
-from pointsplat_ns.views import Views, spread_indices
+from pointsplat_ns.tradeoff.settings import Drawn, draw
+from pointsplat_ns.views import View, Views, spread_indices
 
 ROUNDS = 3
-"""Times that each view is drawn and timed. The least of a view is what was disturbed least."""
+"""Times that each view is drawn and timed, of the dense scene and of the one judged in turn."""
 
 SHOWN_VIEWS = 6
 """Largest number of views of which pictures are kept."""
@@ -61,6 +67,7 @@ class Judged:
     frame_ms: float
     frame_ms_low: float
     frame_ms_high: float
+    clock_ms: float
     others_cores: float
 
 
@@ -70,7 +77,9 @@ class Judge:
     Args:
         dense: the dense scene.
         looked_at: in which views.
-        folder: of the sweep: pictures are written to it.
+        folder: of the sweep: pictures are written to it; None writes none.
+        dense_ms: time of a frame of the dense scene, milliseconds, that times are given in proportion to; by default as
+            measured beside the first scene that is timed.
 
     Raises:
         DataError: if the views are too small for SSIM.
@@ -78,8 +87,9 @@ class Judge:
     """
 
     @torch.no_grad()
-    def __init__(self, dense: Gaussians, looked_at: LookedAt, folder: Path):
+    def __init__(self, dense: Gaussians, looked_at: LookedAt, folder: Path | None, dense_ms: float | None = None):
         self.views, self.photos, self.folder = looked_at.views, looked_at.photos, folder
+        self.dense, self.dense_ms = dense, dense_ms
         if min(self.views.width, self.views.height) < SSIM_WINDOW:
             raise DataError(
                 f"views are {self.views.width} x {self.views.height} pixels; expected at least {SSIM_WINDOW} a side"
@@ -91,20 +101,24 @@ class Judge:
             self._write([self.photos[i] for i in self.shown], "photo")
 
     @torch.no_grad()
-    def judge(self, scene: Gaussians, key: str, progress: Callable[[float], None]) -> Judged:
+    def judge(
+        self, scene: Gaussians, key: str, progress: Callable[[float], None], timed: bool = True, drawn: Drawn = "exact"
+    ) -> Judged:
         """Render a scene, write pictures of it, and time it.
 
         Args:
             scene: what is judged.
             key: of its point.
             progress: called with the share done, in [0, 1].
+            timed: whether to time it. If not, times are NaN.
+            drawn: how its frames are drawn; those of the dense scene always are drawn exactly.
         """
         against_dense: list[Quality] = []
         against_photos: list[Quality] = []
         pictures = []
-        passes = 1 + ROUNDS
+        passes = 1 + 2 * ROUNDS * timed
         for i, view in enumerate(self.views):
-            image = render(scene, view)
+            image = draw(scene, view, drawn)
             against_dense.append(self._quality(image, self.renders[i]))
             if self.photos is not None:
                 against_photos.append(self._quality(image, self.photos[i].to(image)))
@@ -112,14 +126,34 @@ class Judge:
                 pictures.append(image)
             progress((i + 1) / (passes * len(self.views)))
         self._write(pictures, key)
+        photos = _mean(against_photos) if against_photos else None
+        times = self._time(scene, drawn) if timed else _UNTIMED
+        progress(1.0)
+        return Judged(_mean(against_dense), photos, **times)
+
+    def _time(self, scene: Gaussians, drawn: Drawn) -> dict[str, float]:
+        """The times of :class:`Judged`: those of the dense scene's reference times the ratio that was measured now."""
         others = OtherPrograms()
         with fixed_threads(torch.get_num_threads()):  # else each could be timed on another number
-            times = [[_timed(scene, self.views, i) for i in range(len(self.views))] for _ in range(ROUNDS)]
-        per_view = [1000 * min(rounds) for rounds in zip(*times, strict=True)]
-        low, middle, high = (float(value) for value in np.quantile(per_view, (0.25, 0.5, 0.75)))
-        progress(1.0)
-        photos = _mean(against_photos) if against_photos else None
-        return Judged(_mean(against_dense), photos, middle, low, high, others.cores())
+            pairs = [
+                (_timed(self.dense, view, "exact"), _timed(scene, view, drawn))
+                for _ in range(ROUNDS)
+                for view in self.views
+            ]
+        rounds = np.array(pairs).reshape(ROUNDS, len(self.views), 2)  # seconds
+        dense_ms, clock_ms = (1000 * float(np.median(rounds.min(axis=0)[:, which])) for which in (0, 1))
+        if self.dense_ms is None:
+            self.dense_ms = dense_ms
+        shares = np.median(rounds[..., 1] / rounds[..., 0], axis=0)  # of each view
+        low, middle, high = (float(value) for value in np.quantile(shares, (0.25, 0.5, 0.75)))
+        unit = self.dense_ms / (middle if scene is self.dense else 1.0)  # the dense scene is as fast as itself
+        return {
+            "frame_ms": middle * unit,
+            "frame_ms_low": low * unit,
+            "frame_ms_high": high * unit,
+            "clock_ms": clock_ms,
+            "others_cores": others.cores(),
+        }
 
     @torch.no_grad()
     def psnr(self, scene: Gaussians) -> float:
@@ -130,22 +164,26 @@ class Judge:
 
     def pictures(self, key: str) -> list[Path]:
         """Where the pictures of a point lie."""
-        return [picture_path(self.folder, number, key) for number in range(len(self.shown))]
+        folder = self.folder
+        return [] if folder is None else [picture_path(folder, number, key) for number in range(len(self.shown))]
 
     def _quality(self, image: Tensor, target: Tensor) -> Quality:
         lpips = None if self.lpips is None else float(self.lpips(image, target))
         return Quality(finite_psnr(image, target), float(ssim(image, target)), lpips)
 
     def _write(self, images: list[Tensor], key: str) -> None:
-        for path, image in zip(self.pictures(key), images, strict=True):
+        for path, image in zip(self.pictures(key), images, strict=self.folder is not None):
             write_picture(image, path)
 
 
-def _timed(scene: Gaussians, views: Views, index: int) -> float:
-    """Seconds that drawing one view takes."""
+_UNTIMED = dict.fromkeys(("frame_ms", "frame_ms_low", "frame_ms_high", "clock_ms", "others_cores"), math.nan)
+
+
+def _timed(scene: Gaussians, view: View, drawn: Drawn) -> float:
+    """Seconds that drawing a view takes."""
     _wait_for(scene.device)
     start = time.perf_counter()
-    render(scene, views[index])
+    draw(scene, view, drawn)
     _wait_for(scene.device)
     return time.perf_counter() - start
 

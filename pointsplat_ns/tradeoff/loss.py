@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 
 from pointsplat_ns.tradeoff.front import fastest_above, fastest_within
-from pointsplat_ns.tradeoff.points import Point
+from pointsplat_ns.tradeoff.points import Point, speed_of
 
 PHOTO_PSNR = 27.0
 """PSNR in dB of a trained scene against held-out photos, where it is not known: about what 3DGS reaches on the captures
@@ -67,5 +67,5 @@ def recommend(points: Sequence[Point], within: float, trusted: bool = True) -> t
         return dense, f"the {what} {limit} is the dense scene itself"
     figures = f"{best.gaussians:,} Gaussians, {best.bytes / 1e6:.2f} MB"
     if trusted:
-        figures += f", {best.frame_ms:.3g} ms a frame in place of {dense.frame_ms:.3g}"
+        figures += f", {speed_of(best, dense)}: {best.frame_ms:.3g} ms a frame in place of {dense.frame_ms:.3g}"
     return best, f"the {what} {limit}: {best.label}, {figures}"

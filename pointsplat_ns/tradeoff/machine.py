@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -95,3 +95,18 @@ class OtherPrograms:
 def is_busy(others: float) -> bool:
     """Whether others use so many cores that too few are left for torch's threads."""
     return others + torch.get_num_threads() > cores() + BUSY_CORES
+
+
+def busy_note(others: Sequence[float]) -> str:
+    """A line of text if other programs were in the way of measurements; else empty.
+
+    Args:
+        others: cores that other programs kept busy in each of them.
+    """
+    disturbed = [cores_used for cores_used in others if is_busy(cores_used)]
+    if not disturbed:
+        return ""
+    return (
+        f"the machine was busy: while {len(disturbed)} of {len(others)} points were timed, other programs took up "
+        f"to {max(disturbed):.1f} of {cores()} cores; times are not to be trusted"
+    )

@@ -9,7 +9,7 @@ from pathlib import Path
 from pointsplat_ns.io.files import replacing, write_json
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.tradeoff.plots import plot
-from pointsplat_ns.tradeoff.points import Point, Quality, Tradeoff
+from pointsplat_ns.tradeoff.points import Point, Quality, Tradeoff, speed_of
 
 TABLE, JSON, PAGE = "tradeoff.csv", "tradeoff.json", "tradeoff.html"
 PLOTS = {"ms": "tradeoff_ms.png", "mb": "tradeoff_mb.png", "count": "tradeoff_count.png"}
@@ -31,7 +31,9 @@ def write_outputs(sweep: Tradeoff, folder: Path, progress: Progress = silent) ->
     """
     from pointsplat_ns.tradeoff.page import write_page
 
-    write_json(dataclasses.asdict(sweep), folder / JSON)
+    dense = sweep.points[0]
+    points = [{**dataclasses.asdict(point), "speed": speed_of(point, dense)._asdict()} for point in sweep.points]
+    write_json({**dataclasses.asdict(sweep), "points": points}, folder / JSON)
     _write_table(sweep, folder / TABLE)
     for against, name in PLOTS.items():
         plot(sweep, against, folder / name)
@@ -39,15 +41,15 @@ def write_outputs(sweep: Tradeoff, folder: Path, progress: Progress = silent) ->
 
 
 def _write_table(sweep: Tradeoff, path: Path) -> None:
-    rows = [_row(point) for point in sweep.points]
+    rows = [_row(point, sweep.points[0]) for point in sweep.points]
     with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
 
 
-def _row(point: Point) -> dict[str, object]:
-    """A point as a row of the table: qualities take a column for each number."""
+def _row(point: Point, dense: Point) -> dict[str, object]:
+    """A point as a row of the table: qualities and its speed take a column for each number."""
     row: dict[str, object] = {}
     for field in dataclasses.fields(point):
         value = getattr(point, field.name)
@@ -56,4 +58,4 @@ def _row(point: Point) -> dict[str, object]:
                 row[f"{field.name}_{number.name}"] = None if value is None else getattr(value, number.name)
         else:
             row[field.name] = value
-    return row
+    return row | {f"speed_{name}": value for name, value in speed_of(point, dense)._asdict().items()}

@@ -30,7 +30,7 @@ from pointsplat_ns.tradeoff.front import (
     quality_of,
 )
 from pointsplat_ns.tradeoff.loss import psnr_within
-from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, picture_path
+from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, picture_path, speed_of
 
 MAX_BYTES = 10_000_000
 """Size of the page, at most: what goes through mail and opens at once."""
@@ -148,7 +148,7 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
         "recommended": fastest_within(sweep.points, WITHIN_DB, sweep.times_trusted)
         or fastest_above(sweep.points, ABOVE_DB, sweep.times_trusted)
         or sweep.points[0],
-        "rows": [_row(point) for point in sweep.points],
+        "rows": [_row(point, sweep.points[0]) for point in sweep.points],
         "columns": _columns(has_photos, has_lpips, any(point.peak_bytes is not None for point in sweep.points)),
         "amplified": AMPLIFIED,
         "full_level": math.ceil(255 / AMPLIFIED),
@@ -192,7 +192,8 @@ def _group(point: Point) -> str:
     """What points of one colour have in common."""
     if point.by == "dense":
         return "the dense scene"
-    return f"{point.by}, " + ("not repaired" if point.repair == "none" else f"repaired ({point.repair})")
+    group = f"{point.by}, " + ("not repaired" if point.repair == "none" else f"repaired ({point.repair})")
+    return group if point.drawn == "exact" else f"{group}, drawn {point.drawn}"
 
 
 def _finite(value: float | None) -> float | str | None:
@@ -206,6 +207,7 @@ def _columns(has_photos: bool, has_lpips: bool, has_peak: bool) -> list[tuple[st
         ("gaussians", "Gaussians"),
         ("sh_degree", "SH"),
         ("bytes", "MB"),
+        ("speed", "times as fast"),
         ("frame_ms", "ms a frame"),
     ]
     for reference, title in zip(REFERENCES[: 1 + has_photos], ("renders", "photos"), strict=False):
@@ -215,17 +217,16 @@ def _columns(has_photos: bool, has_lpips: bool, has_peak: bool) -> list[tuple[st
     return columns + ([("peak_bytes", "peak memory, GB")] if has_peak else [])
 
 
-def _row(point: Point) -> dict[str, Any]:
+def _row(point: Point, dense: Point) -> dict[str, Any]:
     """A point for the table: by column, a number to sort by (None: unknown) and its text."""
+    speed = speed_of(point, dense)
     cells: dict[str, tuple[float | None, str]] = {
         "share": (point.share, f"{100 * point.share:.3g} %"),
         "gaussians": (point.gaussians, f"{point.gaussians:,}"),
         "sh_degree": (point.sh_degree, str(point.sh_degree)),
         "bytes": (point.bytes, f"{point.bytes / 1e6:.2f}"),
-        "frame_ms": (
-            point.frame_ms,
-            f"{_time(point.frame_ms)} ({_time(point.frame_ms_low)}–{_time(point.frame_ms_high)})",
-        ),
+        "speed": (speed.median, f"{speed.median:.2f} ({speed.low:.2f}–{speed.high:.2f})"),
+        "frame_ms": (point.frame_ms, _time(point.frame_ms)),
         "seconds": (point.seconds, f"{point.seconds:.1f}"),
         "peak_bytes": (point.peak_bytes, "–" if point.peak_bytes is None else f"{point.peak_bytes / 1e9:.2f}"),
     }

@@ -106,4 +106,5 @@ def _plain_logarithmic(axis: Axes) -> None:
 def _group(point: Point, dense: Point) -> str:
     """What the points of one marker and colour have in common."""
     words = [point.by] + ([] if point.repair == "none" else [point.repair])
+    words += [] if point.drawn == "exact" else [f"drawn {point.drawn}"]
     return ", ".join(words + ([] if point.sh_degree == dense.sh_degree else [f"SH degree {point.sh_degree}"]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 
 @dataclass(frozen=True)
@@ -40,16 +41,44 @@ class Point:
     against_photos: Quality | None
     """Against held-out photos; None where there are none."""
     frame_ms: float
-    """Median time of one frame, in milliseconds, after a warm-up."""
+    """Time of one frame, in milliseconds: that of the dense scene when the sweep began, times the median over views of
+    the share of it that a frame takes. Both were drawn in turn, so that points that are measured while the machine is
+    slower compare with others."""
     frame_ms_low: float
     frame_ms_high: float
-    """Quartiles of it over views."""
+    """The same with the quartiles over views."""
     seconds: float
     """Time that making it took."""
     peak_bytes: int | None = None
     """Peak memory of the process that made it; None where it was not measured."""
     others_cores: float | None = None
     """Cores that other programs kept busy while frames were timed; None where it was not measured."""
+    clock_ms: float | None = None
+    """Median time of one frame over views, in milliseconds, as the clock said it when this point was measured; None
+    where it was not measured."""
+    drawn: str = "exact"
+    """How its frames were drawn, for pictures and times: ``exact``, ``fast``, ``half``."""
+
+
+class Speed(NamedTuple):
+    """How many times as fast as the dense scene frames are drawn: median over views, and quartiles.
+
+    Example:
+        >>> print(Speed(2.13, 1.94, 2.31))
+        2.1 times as fast (1.9 to 2.3)
+    """
+
+    median: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.median:.2g} times as fast ({self.low:.2g} to {self.high:.2g})"
+
+
+def speed_of(point: Point, dense: Point) -> Speed:
+    """How many times as fast as the dense scene a point is drawn."""
+    return Speed(*(dense.frame_ms / ms for ms in (point.frame_ms, point.frame_ms_high, point.frame_ms_low)))
 
 
 @dataclass(frozen=True)

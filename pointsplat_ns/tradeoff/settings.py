@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
+from torch import Tensor
+
 from pointsplat_ns.compression.repair import Effort
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import method_named, ply_bytes
+from pointsplat_ns.rasterizer import render
 from pointsplat_ns.tradeoff.points import Point
+from pointsplat_ns.views import View
 
 Repair = Literal["none", "refiner", "quick", "thorough"]
 """Nothing; the refiner alone; the refiner and 32 steps; the refiner and 400 steps."""
@@ -19,6 +24,18 @@ REPAIRS: tuple[Repair, ...] = get_args(Repair)
 
 EFFORTS: dict[Repair, Effort] = {"refiner": "instant", "quick": "quick", "thorough": "thorough"}
 """The effort of ``compact`` that each repair is."""
+
+
+def repairs_of(effort: Effort) -> tuple[Repair, Repair]:
+    """None, or the repair that is an effort of ``compact``."""
+    return "none", next(repair for repair, known in EFFORTS.items() if known == effort)
+
+
+Drawn = Literal["exact", "fast", "half"]
+"""How frames are drawn: as they are; with ``quality="fast"``, that leaves out what is nearly transparent; or so and at
+half the resolution, enlarged."""
+
+DRAWN: tuple[Drawn, ...] = get_args(Drawn)
 
 DENSE = "dense"
 """Key and method of the scene as it is."""
@@ -33,6 +50,12 @@ class Setting:
     sh_degree: int
     repair: Repair = "none"
     by: str = "merge"
+    drawn: Drawn = "exact"
+
+    @property
+    def scene(self) -> Setting:
+        """The setting of the same scene, drawn exactly."""
+        return replace(self, drawn="exact")
 
     @property
     def bytes(self) -> int:
@@ -44,9 +67,22 @@ def setting_of(point: Point) -> Setting:
     """The setting that a point, other than the dense scene, was measured with.
 
     Raises:
-        PointSplatError: if there is no such repair or method.
+        PointSplatError: if there is no such repair, method or way to draw.
     """
-    return Setting(point.gaussians, point.sh_degree, check_repairs((point.repair,))[0], method_named(point.by).name)
+    repair, drawn = check_repairs((point.repair,))[0], check_drawn((point.drawn,))[0]
+    return Setting(point.gaussians, point.sh_degree, repair, method_named(point.by).name, drawn)
+
+
+def draw(scene: Gaussians, view: View, drawn: Drawn) -> Tensor:
+    """The picture (H, W, 3) of a view."""
+    return render(scene, view, "exact" if drawn == "exact" else "fast", 2 if drawn == "half" else 1)
+
+
+_CALLS: dict[Drawn, str] = {
+    "fast": 'ps.render(scene, views, quality="fast")',
+    "half": 'ps.render(scene, views, quality="fast", reduced=2)',
+}
+"""How a user draws so."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +110,7 @@ class Naming:
         words = [f"{100 * setting.count / self.count:.4g}pct", f"sh{setting.sh_degree}"]
         words += [] if setting.repair == "none" else [setting.repair]
         words += [] if setting.by == "merge" else [setting.by]
+        words += [] if setting.drawn == "exact" else [setting.drawn]
         return "_".join(words)
 
     def label(self, setting: Setting) -> str:
@@ -82,10 +119,12 @@ class Naming:
         words += [] if setting.sh_degree == self.sh_degree else [f"SH degree {setting.sh_degree}"]
         repaired = "refined" if setting.repair == "refiner" else f"repaired ({setting.repair})"
         words += [] if setting.repair == "none" else [repaired]
+        words += {"exact": [], "fast": ["drawn fast"], "half": ["drawn at half the size"]}[setting.drawn]
         return ", ".join(words)
 
     def command(self, setting: Setting) -> str:
-        """The command that makes the scene. Counts are exact, as percentages may be rounded."""
+        """The command that makes the scene, with a comment on how it is drawn if not exactly. Counts are exact, as
+        percentages may be rounded."""
         program = "prune" if setting.repair == "none" else "compact"
         words = ["pointsplat", program, str(self.path), "--keep", str(setting.count)]
         if program == "compact" or setting.by != "merge":
@@ -94,7 +133,8 @@ class Naming:
             words += ["--sh", str(setting.sh_degree)]
         if program == "compact":
             words += ["--effort", EFFORTS[setting.repair]]
-        return shlex.join([*words, "-o", f"{self.name}_{self.key(setting)}.ply"])
+        command = shlex.join([*words, "-o", f"{self.name}_{self.key(setting.scene)}.ply"])
+        return command if setting.drawn == "exact" else f"{command}  # drawn by {_CALLS[setting.drawn]}"
 
 
 def check_repairs(repairs: tuple[str, ...]) -> tuple[Repair, ...]:
@@ -107,3 +147,15 @@ def check_repairs(repairs: tuple[str, ...]) -> tuple[Repair, ...]:
     if unknown or not repairs:
         raise PointSplatError(f"repairs are {', '.join(repairs) or 'empty'}; expected some of {', '.join(REPAIRS)}")
     return tuple(repair for repair in REPAIRS if repair in repairs)
+
+
+def check_drawn(drawn: tuple[str, ...]) -> tuple[Drawn, ...]:
+    """Ways to draw, each once, in the order of :data:`DRAWN`.
+
+    Raises:
+        PointSplatError: if there is no such one.
+    """
+    unknown = [way for way in drawn if way not in DRAWN]
+    if unknown:
+        raise PointSplatError(f"frames drawn {', '.join(unknown)}; expected some of {', '.join(DRAWN)}")
+    return tuple(way for way in DRAWN if way in drawn)

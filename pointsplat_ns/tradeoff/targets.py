@@ -6,22 +6,29 @@ it to within :data:`PRECISION`. A way whose largest count that would still be ch
 try. Limits of time and size are then checked on what was found: more Gaussians would only be slower and larger.
 
 With limits only, the cheapest would be one Gaussian; what is found is the best quality within them.
+
+Sizes are those of the files of the format that is asked for. Where only writing a scene tells its size, counts are
+guessed from the dense scene's file, and corrected by what the files of scenes weigh.
 """
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from pointsplat_ns.errors import BudgetError
-from pointsplat_ns.pruning import Megabytes, ply_bytes, resolve_keep
+from pointsplat_ns.pruning import ply_bytes, resolve_keep
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import Setting
 from pointsplat_ns.tradeoff.walk import Plan
 
 PRECISION = 1.1
 """The search of a way ends when a count that meets the targets is at most this factor from one that does not."""
+
+SIZE_CLOSE, SIZE_TRIES = 0.95, 3
+"""A file whose size only writing tells is large enough at this share of the limit; and so many counts are tried."""
 
 FEWEST = 1e-3
 """Share of the Gaussians below which no scene is tried for a limit of time: almost nothing is left to be drawn."""
@@ -62,6 +69,27 @@ class Targets:
         return words
 
 
+def targets_of(db: float | None, ms: float | None, mb: float | None, **decided: object) -> Targets | None:
+    """Targets of which any may be missing; None if all are.
+
+    Args:
+        db, ms, mb: of :class:`Targets`.
+        decided: further options, by name, that say what the search decides; None for one that was not given.
+
+    Raises:
+        BudgetError: if a target means nothing, or such an option was given beside one.
+    """
+    if db is ms is mb is None:
+        return None
+    names = [name for name, value in decided.items() if value is not None]
+    if names:
+        raise BudgetError(
+            f"{', '.join(names)} cannot be given with a target: how many Gaussians and SH bands are kept, and how they "
+            "are repaired, is decided by what the scene needs"
+        )
+    return Targets(db, ms, mb)
+
+
 @dataclass(frozen=True)
 class Found:
     """What the search found."""
@@ -80,12 +108,22 @@ class Search:
         plan: what may be tried; only the first method is.
         measure: from a setting to its point; the same each time.
         cut_psnr: as for :func:`~pointsplat_ns.tradeoff.walk.walk`.
+        size: of a file, bytes, by count and SH degree; an estimate where only writing a scene tells it. By default that
+            of a PLY.
+        exact: whether files give scenes back as they are, as a PLY does.
     """
 
     def __init__(
-        self, targets: Targets, plan: Plan, measure: Callable[[Setting], Point], cut_psnr: Callable[[int], float]
+        self,
+        targets: Targets,
+        plan: Plan,
+        measure: Callable[[Setting], Point],
+        cut_psnr: Callable[[int], float],
+        size: Callable[[int, int], int] = ply_bytes,
+        exact: bool = True,
     ):
         self.targets, self.plan = targets, plan
+        self._size, self._exact = size, exact
         self.tried: dict[Setting, Point] = {}
         self._measure, self._cut_psnr = measure, cut_psnr
         self._slope: float | None = None  # dB for each e-fold of the count, as seen in the way before
@@ -97,6 +135,18 @@ class Search:
             BudgetError: if no scene meets all targets; the text says which one is the obstacle, and what is reachable.
         """
         return self._smallest() if self.targets.db is not None else self._best()
+
+    def so_far(self) -> Found | None:
+        """The cheapest of what was tried that meets all targets, if the search was interrupted; None if none does."""
+        meeting = {s: point for s, point in self.tried.items() if not self.targets.missed(point)}
+        if not meeting:
+            return None
+        if self.targets.db is not None:
+            best = min(meeting, key=lambda setting: meeting[setting].bytes)
+        else:
+            best = max(meeting, key=lambda setting: meeting[setting].against_dense.psnr)
+        found = self._found(best)
+        return replace(found, why=f"{found.why}; the search was interrupted, and might have found a better one")
 
     def _point(self, setting: Setting) -> Point:
         if setting not in self.tried:
@@ -112,17 +162,19 @@ class Search:
         assert wanted is not None
         ends: list[Setting] = []  # the smallest that reaches it, of each way
         best: Setting | None = None
+        size = math.inf  # of its file
         repair = self.plan.repairs[0]
 
         def attempt(way: Setting) -> bool:
-            nonlocal best
-            end = self._reaching(way, wanted, self.plan.count if best is None else _fewer_bytes(way, best.bytes))
+            nonlocal best, size
+            end = self._reaching(way, wanted, self._most(way, math.inf if best is None else size))
             if end is None:
                 return False
             ends.append(end)
-            if self.targets.missed(self._point(end)):
+            point = self._point(end)
+            if self.targets.missed(point) or point.bytes >= size:
                 return False
-            best = end
+            best, size = end, point.bytes
             return True
 
         for index, name in enumerate(self.plan.repairs):
@@ -140,7 +192,12 @@ class Search:
         """The setting of a way with the fewest Gaussians, at most ``most``, that reaches a PSNR; None if none does."""
 
         def margin(count: int) -> float:
-            if count == self.plan.count and way.repair == "none" and way.sh_degree == self.plan.sh_degree:
+            if (
+                self._exact
+                and count == self.plan.count
+                and way.repair == "none"
+                and way.sh_degree == self.plan.sh_degree
+            ):
                 return math.inf  # the dense scene itself
             return self._point(replace(way, count=count)).against_dense.psnr - wanted
 
@@ -178,7 +235,7 @@ class Search:
             BudgetError: if none is.
         """
         n, limit = self.plan.count, self.targets.ms
-        high = n if self.targets.mb is None else resolve_keep(n, Megabytes(self.targets.mb), way.sh_degree)
+        high = n if self.targets.mb is None else self._fitting(way, math.floor(1e6 * self.targets.mb))
         if limit is None:
             return replace(way, count=high)
 
@@ -198,14 +255,48 @@ class Search:
             high, low = low, max(1, round(low / 4))
         return replace(way, count=_crossing(low, high, margin)[0])
 
+    def _most(self, way: Setting, size: float) -> int:
+        """The most Gaussians of a way whose file should be smaller than ``size`` bytes; 0 if none is."""
+        if size == math.inf:
+            return self.plan.count
+        counts = range(1, self.plan.count + 1)
+        return bisect_left(counts, size, key=lambda count: self._size(count, way.sh_degree))
+
+    def _fitting(self, way: Setting, limit: int) -> int:
+        """The most Gaussians of a way whose file has at most ``limit`` bytes, nearly.
+
+        Raises:
+            BudgetError: if not even one fits.
+        """
+        fits, tries, count = 0, 0, self._most(way, limit + 1)
+        while count > fits:
+            tries += 1
+            expected = self._size(count, way.sh_degree)
+            size = self._point(replace(way, count=count)).bytes
+            if size <= limit:
+                fits = count
+                if size == expected or size >= SIZE_CLOSE * limit or count == self.plan.count:
+                    return fits
+            if fits and tries >= SIZE_TRIES:
+                return fits
+            closer = self._most(way, 0.99 * limit * expected / size)
+            count = closer if size <= limit else min(closer, count - 1)
+        if not fits:
+            raise BudgetError(
+                f"--target-mb is {limit / 1e6:g}, too small for one Gaussian of SH degree {way.sh_degree}; expected at "
+                f"least {self._size(1, way.sh_degree) / 1e6:g}"
+            )
+        return fits
+
     def _psnr(self, setting: Setting) -> float:
         return self._point(setting).against_dense.psnr
 
     def _found(self, setting: Setting) -> Found:
         point = self._point(setting)
+        time = "" if math.isnan(point.frame_ms) else f"{point.frame_ms:.3g} ms a frame, "
         figures = (
-            f"{point.against_dense.psnr:.2f} dB against the dense scene's renders, {point.frame_ms:.3g} ms a frame, "
-            f"{point.bytes / 1e6:.2f} MB, {point.gaussians:,} Gaussians"
+            f"{point.against_dense.psnr:.2f} dB against the dense scene's renders, {time}{point.bytes / 1e6:.2f} MB, "
+            f"{point.gaussians:,} Gaussians"
         )
         why = f"{point.label}: {figures}; {len(self.tried)} scenes tried"
         failed = [other for other in self.tried.values() if self.targets.missed(other)]
@@ -223,6 +314,12 @@ class Search:
 
     def _obstacle(self, ends: list[Setting]) -> str:
         """Why no scene meets all targets, given the smallest of each way that reach the wanted quality."""
+        if not ends:
+            best = max(self.tried.values(), key=lambda point: point.against_dense.psnr)
+            return (
+                f"no scene reaches --target-db {self.targets.db:g} in this format: the best tried has "
+                f"{best.against_dense.psnr:.2f} dB ({best.label})"
+            )
         points = [self._point(end) for end in ends]
         size, ms = min(p.bytes for p in points) / 1e6, min(p.frame_ms for p in points)
         obstacles = []
@@ -231,20 +328,12 @@ class Search:
         if self.targets.ms is not None and ms > self.targets.ms:
             obstacles.append(f"takes {ms:.3g} ms a frame, over --target-ms {self.targets.ms:g}")
         obstacle = " and ".join(obstacles) or "is either too large or too slow"
-        within = Search(replace(self.targets, db=None), self.plan, self._point, self._cut_psnr).run().point
+        limits = replace(self.targets, db=None)
+        within = Search(limits, self.plan, self._point, self._cut_psnr, self._size, self._exact).run().point
         return (
             f"no scene meets all targets: what reaches {self.targets.db:g} dB {obstacle}; the best within the limits "
             f"has {within.against_dense.psnr:.2f} dB ({within.label}), so ask for less than that"
         )
-
-
-def _fewer_bytes(way: Setting, size: int) -> int:
-    """The most Gaussians of a way whose file is smaller than ``size`` bytes; 0 if none is."""
-    each = ply_bytes(2, way.sh_degree) - ply_bytes(1, way.sh_degree)
-    count = min(way.count, size // each)
-    while count > 0 and ply_bytes(count, way.sh_degree) >= size:
-        count -= 1
-    return count
 
 
 def _crossing(

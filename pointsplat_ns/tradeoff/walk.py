@@ -14,6 +14,8 @@ loss in dB (:mod:`~pointsplat_ns.tradeoff.loss`), which is the same at each run,
    differ most is halved, in the logarithm of the number of Gaussians. The gap that the wanted loss lies in counts
    :data:`AT_LIMIT` times. Other gaps of less than :data:`FLAT`, and all of counts within :data:`CLOSE`, are left; the
    walk ends when all are.
+
+Then follow :func:`drawings`: some of these scenes, drawn faster.
 """
 
 from __future__ import annotations
@@ -26,9 +28,9 @@ import numpy as np
 
 from pointsplat_ns.compression.compact import MIN_GAIN
 from pointsplat_ns.pruning import resolve_keep
-from pointsplat_ns.tradeoff.loss import loss_of
+from pointsplat_ns.tradeoff.loss import loss_of, recommend
 from pointsplat_ns.tradeoff.points import Point
-from pointsplat_ns.tradeoff.settings import Repair, Setting
+from pointsplat_ns.tradeoff.settings import DRAWN, Drawn, Repair, Setting, setting_of
 
 TRIAL, OTHERS = 0.1, (0.3, 0.03)
 """Share of the Gaussians at which ways are tried, and further shares that each way is measured at."""
@@ -38,6 +40,12 @@ FLAT = 0.25
 
 CLOSE = 1.1
 """Ratio of counts below which a gap is not halved."""
+
+HALVINGS = 2
+"""Scenes that are made to find the fewest Gaussians within the wanted loss when drawn fast."""
+
+MOST_DRAWINGS = 1 + HALVINGS + 2
+"""Largest number of settings that :func:`drawings` yields."""
 
 AT_LIMIT = 6
 """Weight of the gap that the wanted loss lies in: what is recommended is known the better for it."""
@@ -54,6 +62,7 @@ class Plan:
     repairs: tuple[Repair, ...] = ("none", "quick")
     within: float = 0.5
     """The wanted loss, dB."""
+    drawn: tuple[Drawn, ...] = DRAWN
 
 
 def walk(
@@ -100,6 +109,42 @@ def walk(
             yield replace(way, by=method, count=count)
     while (setting := _steepest(ways, measured, dense, plan)) is not None:
         yield setting
+
+
+def drawings(plan: Plan, measured: Mapping[Setting, Point], dense: Point) -> Iterator[Setting]:
+    """The settings to draw in other ways when the walk is over, at most :data:`MOST_DRAWINGS`.
+
+    Of the scenes that are within the wanted loss, the one with the fewest Gaussians is drawn fast. If this loses too
+    much, up to :data:`HALVINGS` larger ones are tried. At half the resolution nothing is sharp, which shows least where
+    little is left: the best scenes of a tenth and three tenths are drawn so.
+
+    Args:
+        plan, measured, dense: as for :func:`walk`.
+
+    Yields:
+        Settings, each once.
+    """
+    exact = {setting: point for setting, point in measured.items() if setting.drawn == "exact"}
+    fewest, _ = recommend([dense, *exact.values()], plan.within, trusted=False)
+    if "fast" in plan.drawn and fewest is not dense:
+        setting = replace(setting_of(fewest), drawn="fast")
+        low, high = setting.count, plan.count
+        yield setting
+        for _ in range(HALVINGS):
+            if loss_of(measured[setting], dense) <= plan.within:
+                high = setting.count
+            else:
+                low = setting.count
+            middle = round(math.sqrt(low * high))
+            if high < CLOSE * low or middle in (low, high):
+                break
+            setting = replace(setting, count=middle)
+            yield setting
+    if "half" in plan.drawn:
+        for count in sorted({resolve_keep(plan.count, share) for share in (TRIAL, OTHERS[0])}):
+            scenes = [setting for setting in exact if setting.count == count]
+            if scenes:
+                yield replace(min(scenes, key=lambda setting: loss_of(exact[setting], dense)), drawn="half")
 
 
 def _degree_worth_trying(degree: int, tried: Point, cut_psnr: Callable[[int], float]) -> int | None:

@@ -17,8 +17,10 @@ from pointsplat_ns.refiner import save_refiner
 
 PROGRAMS = (
     "compaction",
+    "drawing",
     "example_room",
     "formats",
+    "frame_times",
     "photo_places",
     "quality",
     "rasterizer",

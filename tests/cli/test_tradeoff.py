@@ -19,7 +19,7 @@ from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.tradeoff import judging, machine, outputs
 from pointsplat_ns.tradeoff.journal import POINTS
 
-FEW = ("--views", "2", "--repairs", "none")
+FEW = ("--views", "2", "--repairs", "none", "--drawn", "exact")
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def ply(tmp_path, views, plain_page, no_lpips, monkeypatch) -> Path:
     times are as counts are."""
     monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, **options: views[:count])
     monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
-    monkeypatch.setattr(judging, "_timed", lambda scene, views, index: 1e-5 * len(scene))
+    monkeypatch.setattr(judging, "_timed", lambda scene, view, drawn: 1e-5 * len(scene))
     monkeypatch.setattr(machine, "LOCK", str(tmp_path / "lock"))
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     ps.save(box_room(0, 400), tmp_path / "room.ply")
@@ -60,7 +60,7 @@ def test_a_sweep_is_written_beside_the_scene_and_printed(ply, capsys):
     for point in content["points"]:
         rows = {re.split(r" *\*?  +", line.strip())[0]: line for line in said.splitlines()}
         row = rows[point["label"]]
-        assert f"{point['gaussians']:,}" in row and f"{point['frame_ms']:.3g} (" in row
+        assert f"{point['gaussians']:,}" in row and f"{point['speed']['median']:.2f} (" in row
     assert content["why"] in said and str(folder / "tradeoff.html") in said
 
 

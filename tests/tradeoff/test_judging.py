@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from statistics import fmean
 
@@ -54,17 +55,75 @@ def test_equal_pictures_do_not_make_means_infinite(dense, room_views, tmp_path, 
     assert judged(Judge(dense, LookedAt(room_views, None, ""), tmp_path), dense).against_dense.psnr == MOST_PSNR
 
 
-def test_times_are_medians_over_views_between_their_quartiles(dense, room_views, tmp_path, no_lpips, monkeypatch):
-    """Views take 1, 3 and 2 ms; two rounds of three are disturbed."""
-    asked: list[int] = []
+@pytest.fixture()
+def clock(dense, room_views, monkeypatch):
+    """Views of the dense scene take 10, 40 and 20 ms, those of others a half, a quarter and a fifth of it. The list is
+    by how much the machine slows both down in each round; further rounds are not slowed down."""
+    slow = [1.0] * judging.ROUNDS
+    drawn = []
 
-    def timed(scene, views, index):
-        asked.append(index)
-        return (0.9 if len(asked) <= 2 * len(views) else 0.0) + (0.001, 0.003, 0.002)[index]
+    def timed(scene, view, way):
+        index = next(i for i, known in enumerate(room_views) if torch.equal(known.viewmat, view.viewmat))
+        drawn.append((scene is dense, way, index))
+        share = 1.0 if scene is dense else (1 / 2, 1 / 4, 1 / 5)[index]
+        frames = 2 * len(room_views)
+        return slow[(len(drawn) - 1) // frames % judging.ROUNDS] * share * (0.010, 0.040, 0.020)[index]
 
     monkeypatch.setattr(judging, "_timed", timed)
-    got = judged(Judge(dense, LookedAt(room_views, None, ""), tmp_path), dense)
-    assert (got.frame_ms_low, got.frame_ms, got.frame_ms_high) == pytest.approx((1.5, 2.0, 2.5))
+    return slow, drawn
+
+
+def test_times_are_the_dense_scenes_times_the_median_share_between_its_quartiles(dense, room_views, no_lpips, clock):
+    judge = Judge(dense, LookedAt(room_views, None, ""), None)
+    got = judged(judge, ps.prune(dense, 200, by="opacity"))
+    assert judge.dense_ms == pytest.approx(20.0)
+    assert (got.frame_ms_low, got.frame_ms, got.frame_ms_high) == pytest.approx((4.5, 5.0, 7.5))
+    assert got.clock_ms == pytest.approx(5.0)
+
+
+def test_a_machine_that_slows_down_changes_what_the_clock_says_and_not_the_times(dense, room_views, no_lpips, clock):
+    small, (slow, _) = ps.prune(dense, 200, by="opacity"), clock
+    judge = Judge(dense, LookedAt(room_views, None, ""), None)
+    before = judged(judge, small)
+    slow[:] = [2.0, 1.5, 7.0]
+    after = judged(judge, small)
+    assert after.clock_ms == pytest.approx(1.5 * before.clock_ms)
+    for name in ("frame_ms", "frame_ms_low", "frame_ms_high"):
+        assert getattr(after, name) == pytest.approx(getattr(before, name))
+
+
+def test_each_frame_is_timed_right_after_the_same_one_of_the_dense_scene(dense, room_views, no_lpips, clock):
+    judge = Judge(dense, LookedAt(room_views, None, ""), None)
+    judge.judge(dense[:300], "some", lambda share: None, drawn="fast")
+    views, pair = range(len(room_views)), ((True, "exact"), (False, "fast"))
+    assert clock[1] == [(*scene, view) for _ in range(judging.ROUNDS) for view in views for scene in pair]
+
+
+def test_a_reference_that_was_measured_before_is_kept(dense, room_views, no_lpips, clock):
+    got = judged(Judge(dense, LookedAt(room_views, None, ""), None, dense_ms=100.0), dense[:300])
+    assert got.frame_ms == pytest.approx(25.0) and got.clock_ms == pytest.approx(5.0)
+
+
+def test_the_dense_scene_is_as_fast_as_itself(dense, room_views, no_lpips, monkeypatch):
+    seconds = iter(range(1, 1000))
+    monkeypatch.setattr(judging, "_timed", lambda *args: float(next(seconds)))
+    judge = Judge(dense, LookedAt(room_views, None, ""), None)
+    got = judged(judge, dense)
+    assert got.frame_ms == judge.dense_ms and got.frame_ms_low < got.frame_ms < got.frame_ms_high
+
+
+@pytest.mark.parametrize("drawn, options", [("fast", ("fast", 1)), ("half", ("fast", 2))])
+def test_other_ways_to_draw_are_judged_by_what_is_seen(dense, room_views, no_lpips, drawn, options):
+    judge = Judge(dense, LookedAt(room_views, None, ""), None)
+    got = judge.judge(dense, "some", lambda share: None, timed=False, drawn=drawn).against_dense
+    wanted = ps.psnr(render(dense, room_views, *options), render(dense, room_views))
+    assert got.psnr == pytest.approx(fmean(wanted.tolist()), abs=1e-4) and got.psnr < 60
+
+
+def test_what_is_not_timed_has_no_times(dense, room_views, no_lpips, monkeypatch):
+    monkeypatch.setattr(judging, "_timed", lambda *args: pytest.fail("timed"))
+    got = Judge(dense, LookedAt(room_views, None, ""), None).judge(dense, "some", lambda share: None, timed=False)
+    assert math.isnan(got.frame_ms) and math.isnan(got.clock_ms)
 
 
 def test_pictures_are_what_was_rendered_and_the_photos(dense, room_views, photos, tmp_path, no_lpips):

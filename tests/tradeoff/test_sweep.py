@@ -14,7 +14,7 @@ from making import same_bits
 from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
-from pointsplat_ns.tradeoff import making, sweep
+from pointsplat_ns.tradeoff import judging, making, measuring, sweep
 from pointsplat_ns.tradeoff.journal import POINTS
 from pointsplat_ns.tradeoff.outputs import OUTPUTS, PAGE, PLOTS, TABLE
 from pointsplat_ns.tradeoff.plots import AXES
@@ -95,14 +95,14 @@ def test_an_interruption_leaves_what_was_measured_and_the_next_call_goes_on(new_
         made.append(setting)
         return make(dense, setting, *args)
 
-    monkeypatch.setattr(sweep, "make", interrupted)
+    monkeypatch.setattr(measuring, "make", interrupted)
     with pytest.raises(KeyboardInterrupt):
         new_sweep(tmp_path, points=4, repairs=("none",)).run()
     content = json.loads((tmp_path / "tradeoff.json").read_text())
     assert len(content["points"]) == 1 + after
     assert any("interrupted" in note for note in content["notes"])
     made.clear()
-    monkeypatch.setattr(sweep, "make", lambda *args: (made.append(args[1]), make(*args))[1])
+    monkeypatch.setattr(measuring, "make", lambda *args: (made.append(args[1]), make(*args))[1])
     resumed = new_sweep(tmp_path, points=4, repairs=("none",)).run()
     assert len(resumed.points) == 4 and len(made) == 3 - after, "nothing is measured twice"
     whole = new_sweep(tmp_path / "whole", points=4, repairs=("none",)).run()
@@ -158,24 +158,48 @@ def test_where_photos_cannot_be_had_it_says_why_and_goes_on_without(new_sweep, t
 
 @pytest.mark.parametrize("others, said", [(50.0, True), (0.0, False)])
 def test_a_busy_machine_is_said_to_be_one(new_sweep, tmp_path, monkeypatch, others, said):
-    monkeypatch.setattr(sweep.Judge, "psnr", lambda self, scene: 0.0)
+    monkeypatch.setattr(judging.Judge, "psnr", lambda self, scene: 0.0)
     monkeypatch.setattr("pointsplat_ns.tradeoff.machine.OtherPrograms.cores", lambda self: others)
     monkeypatch.setattr("pointsplat_ns.tradeoff.machine.cores", lambda: torch.get_num_threads())
     result = new_sweep(tmp_path, points=2, repairs=("none",)).run()
     assert any("times are not to be trusted" in note for note in result.notes) == said
 
 
-def test_progress_never_goes_back_and_ends(new_sweep, tmp_path):
+def test_scenes_drawn_otherwise_come_on_top_and_are_not_made_again(new_sweep, tmp_path, monkeypatch):
+    made, make = [], making.make
+    monkeypatch.setattr(measuring, "make", lambda *args: (made.append(args[1]), make(*args))[1])
+    options = {"points": 3, "repairs": ("none",), "drawn": ("exact", "half")}
+    first = new_sweep(tmp_path, **options).run().points
+    ways = [(p.gaussians, p.drawn) for p in first[1:]]
+    assert ways == [(120, "exact"), (120, "half"), (40, "exact"), (40, "half")]
+    assert [(s.count, s.drawn) for s in made] == [(40, "exact"), (120, "exact")]
+    assert first[1].bytes == first[2].bytes and first[1].against_dense != first[2].against_dense
+    assert first[2].command == f'{first[1].command}  # drawn by ps.render(scene, views, quality="fast", reduced=2)'
+    assert new_sweep(tmp_path, **options).run().points == first and len(made) == 2, "nothing is measured twice"
+
+
+def test_no_more_scenes_are_kept_in_memory_than_the_dense_one_weighs(new_sweep, tmp_path):
+    running = new_sweep(tmp_path)
+    for count in (100, 200, 150, 390):
+        running.scene(Setting(count, 1))
+    assert [*running.measurer._kept] == [Setting(390, 1)]
+    running.scene(Setting(5, 1))
+    running.scene(Setting(5, 1, drawn="fast"))
+    assert [*running.measurer._kept] == [Setting(390, 1), Setting(5, 1)]
+
+
+@pytest.mark.parametrize("drawn", [("exact",), ("exact", "fast", "half")])
+def test_progress_never_goes_back_and_ends(new_sweep, tmp_path, drawn):
     shares = []
     keep = lambda what, share: shares.append(share) if what == "measuring" else None  # noqa: E731
-    new_sweep(tmp_path, progress=keep, points=3).run()
+    new_sweep(tmp_path, progress=keep, points=3, drawn=drawn).run()
     assert shares == sorted(shares) and shares[-1] == 1.0
 
 
 def test_points_of_another_scene_are_refused_before_anything_is_measured(new_sweep, tmp_path, room, room_views):
     new_sweep(tmp_path, points=2).run()
     dense = ps.load(room)
-    other = sweep.Subject(dense, room, "room", "another sum", lambda: ViewSource(dense, given=room_views))
+    other = measuring.Subject(dense, room, "room", "another sum", lambda: ViewSource(dense, given=room_views))
     with pytest.raises(SceneError, match="its points are of another sweep"):
         sweep.Sweep(other, tmp_path, Options(), lambda what, share: None)
 
@@ -213,6 +237,7 @@ def test_points_are_listed_by_size_the_dense_scene_first(new_sweep, tmp_path):
         ({"methods": ()}, "no method is named"),
         ({"methods": ("magic",)}, "no method is called 'magic'"),
         ({"repairs": ("magic",)}, "repairs are magic"),
+        ({"drawn": ("exact", "magic")}, "frames drawn magic; expected some of exact, fast, half"),
     ],
 )
 def test_options_that_mean_nothing_are_refused(options, said):

@@ -11,7 +11,7 @@ import pytest
 from pointsplat_ns.tradeoff.loss import loss_of, psnr_within
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import Setting
-from pointsplat_ns.tradeoff.walk import CLOSE, FLAT, Plan, walk
+from pointsplat_ns.tradeoff.walk import CLOSE, FLAT, MOST_DRAWINGS, Plan, drawings, walk
 from trades import Trade
 
 
@@ -114,3 +114,57 @@ def test_photos_go_before_renders():
         measured[setting] = replace(made, against_photos=replace(made.against_dense, psnr=30.0 + kept))
     assert max(setting.count for setting in measured) == 30_000
     assert len(measured) > 6
+
+
+def drawn_after(trade: Trade, plan: Plan) -> list[Setting]:
+    """What is drawn in other ways after a whole walk, in order."""
+    measured = walked(trade, plan)
+    found = []
+    for setting in drawings(plan, measured, trade.dense):
+        found.append(setting)
+        measured[setting] = trade.measure(setting)
+    assert len(found) <= MOST_DRAWINGS and len(set(found)) == len(found)
+    return found
+
+
+PLAIN = Trade(gains={}, cuts={0: 1.0, 1: 1.0, 2: 1.0})
+
+
+def test_the_smallest_scene_within_the_loss_is_drawn_fast_and_larger_ones_until_one_is_within_it():
+    plan = Plan(100_000, 3, repairs=("none",), drawn=("fast",))
+    exact = [setting for setting, p in walked(PLAIN, plan).items() if p.against_dense.psnr >= psnr_within(plan.within)]
+    first, *others = drawn_after(PLAIN, plan)
+    assert first == replace(min(exact, key=lambda setting: setting.count), drawn="fast")
+    assert others and all(setting.count > first.count for setting in others)
+    assert any(PLAIN.psnr(setting) >= psnr_within(plan.within) for setting in others)
+
+
+def test_one_that_is_drawn_fast_at_no_loss_is_enough():
+    trade = replace(PLAIN, drawings={"fast": 90.0}, at_all=36.2)  # nothing smaller is within the loss
+    plan = Plan(100_000, 3, repairs=("none",), within=0.6, drawn=("fast",))
+    first, *_ = drawn_after(trade, plan)
+    assert trade.psnr(first) >= psnr_within(plan.within)
+
+
+def test_the_best_of_a_tenth_and_three_tenths_are_drawn_at_half_the_size():
+    plan = Plan(100_000, 3, drawn=("half",))
+    found = drawn_after(Trade(), plan)
+    assert [(s.count, s.repair, s.drawn) for s in found] == [(10_000, "quick", "half"), (30_000, "quick", "half")]
+
+
+def test_nothing_is_drawn_otherwise_where_nobody_asked_or_nothing_is_within_the_loss():
+    assert drawn_after(PLAIN, Plan(100_000, 3, drawn=())) == []
+    assert drawn_after(replace(PLAIN, at_all=20.0), Plan(100_000, 3, repairs=("none",), drawn=("fast",))) == []
+
+
+def test_what_was_drawn_otherwise_does_not_change_the_walk():
+    plan = Plan(100_000, 3)
+    known = walked(PLAIN, plan, most=6)
+    half = [*drawings(replace(plan, drawn=("half",)), known, PLAIN.dense)]
+    asked = []
+    for measured in ({**known}, {**known, **{setting: PLAIN.measure(setting) for setting in half}}):
+        asked.append([])
+        for setting in walk(plan, measured, PLAIN.dense, PLAIN.cut):
+            asked[-1].append(setting)
+            measured[setting] = PLAIN.measure(setting)
+    assert half and asked[0] == asked[1]

@@ -1,0 +1,62 @@
+"""Whether a point of a trade comes out the same when it is measured again: quality to the bit, times within the spread.
+
+    python benchmarks/frame_times.py SCENE --keep 30% --times 10
+
+The same smaller scene is judged again and again, as ``pointsplat tradeoff`` judges it. Beside times in proportion to the
+dense scene's, which is drawn in turn, stands what the clock says.
+"""
+
+from __future__ import annotations
+
+import statistics
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+import pointsplat_ns as ps
+from pointsplat_ns.tradeoff.judging import Judge, LookedAt
+
+
+def main(
+    scene: Path, /, keep: str = "30%", times: int = 10, views: int = 6, size: tuple[int, int] = (320, 240)
+) -> None:
+    """Judge one smaller scene several times.
+
+    Args:
+        scene: what pointsplat_ns.load takes.
+        keep: how much of it.
+        times: how often.
+        views: number of views.
+        size: width and height, pixels.
+    """
+    dense = ps.load(scene)
+    small = ps.prune(dense, keep)
+    judge = Judge(dense, LookedAt(ps.sample_views(dense, views, *size), None, ""), None)
+    table = Table("", "PSNR, dB", "times as fast (quartiles)", "ms a frame by the clock", "cores used by others")
+    found, speeds = [], []
+    for number in range(times):
+        judged = judge.judge(small, "", lambda share: None)
+        assert judge.dense_ms is not None
+        low, speed, high = (
+            judge.dense_ms / ms for ms in (judged.frame_ms_high, judged.frame_ms, judged.frame_ms_low)
+        )  # fmt: skip
+        found.append(judged)
+        speeds.append((low, speed, high))
+        table.add_row(
+            str(number + 1), f"{judged.against_dense.psnr:.6f}", f"{speed:.2f} ({low:.2f} to {high:.2f})",
+            f"{judged.clock_ms:.1f}", f"{judged.others_cores:.1f}",
+        )  # fmt: skip
+    Console().print(table)
+    same = all(judged.against_dense == found[0].against_dense for judged in found)
+    middle, clock = [speed for _, speed, _ in speeds], [judged.clock_ms for judged in found]
+    pairs = [(low <= other <= high) for low, _, high in speeds for other in middle]
+    print(f"quality is {'the same to the bit' if same else 'NOT the same'} in all {times}")
+    print(f"times as fast: from {min(middle):.2f} to {max(middle):.2f}, a factor of {max(middle) / min(middle):.2f}")
+    print(f"by the clock: from {min(clock):.1f} to {max(clock):.1f} ms, a factor of {max(clock) / min(clock):.2f}")
+    print(f"within the quartiles of another one: {statistics.fmean(pairs):.0%} of all pairs")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

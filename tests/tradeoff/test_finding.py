@@ -1,0 +1,150 @@
+"""The cheapest scene for targets, as ``compact`` finds it: in any format, as it is read from the file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import pointsplat_ns as ps
+from making import box_room, same_bits
+from pointsplat_ns import api, folders
+from pointsplat_ns.compression import repair, view_source
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
+from pointsplat_ns.tradeoff import finding, judging
+from pointsplat_ns.tradeoff.finding import find_scene
+from pointsplat_ns.tradeoff.measuring import Measurer
+from pointsplat_ns.tradeoff.targets import Targets
+
+
+@pytest.fixture(autouse=True)
+def quick(room_views, no_lpips, monkeypatch):
+    """Three small views of any scene, no repairs, which take long, and times as counts are."""
+    monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, **options: room_views[:count])
+    for module in (api, folders):
+        monkeypatch.setattr(module, "repairs_of", lambda effort: ("none",))
+    monkeypatch.setattr(judging, "_timed", lambda scene, view, drawn: 1e-5 * len(scene))
+
+
+@pytest.fixture()
+def dense(room):
+    return ps.load(room)
+
+
+def mean_psnr(scene, dense, views) -> float:
+    return float(ps.psnr(ps.render(scene, views), ps.render(dense, views)).mean())
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".compressed.ply"])
+def test_the_file_that_is_written_has_the_quality(dense, room_views, tmp_path, suffix):
+    found = ps.compact(dense, by="opacity", target_db=25.0, target_format=suffix)
+    ps.save(found.scene, tmp_path / f"found{suffix}")
+    assert mean_psnr(ps.load(tmp_path / f"found{suffix}"), dense, room_views) >= 25 - 1e-3  # sums in another order
+    size = (tmp_path / f"found{suffix}").stat().st_size
+    assert f", {size / 1e6:.2f} MB, {len(found.scene):,} Gaussians" in found.target
+    assert "the next cheaper, " in found.target and "dB where 25 are wanted" in found.target
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".splat"])
+def test_the_file_that_is_written_fits_and_leaves_little_unused(dense, tmp_path, suffix):
+    ps.save(dense, tmp_path / f"whole{suffix}")
+    limit = 0.5e-6 * (tmp_path / f"whole{suffix}").stat().st_size
+    found = ps.compact(dense, by="opacity", target_mb=limit, target_format=suffix)
+    ps.save(found.scene, tmp_path / f"found{suffix}")
+    assert 0.8 * limit < (tmp_path / f"found{suffix}").stat().st_size / 1e6 <= limit
+
+
+def test_it_is_the_scene_that_a_sweep_finds(room, tmp_path, plain_page, plain_plots, monkeypatch):
+    monkeypatch.setattr(api, "repairs_of", lambda effort: ("none", effort))
+    monkeypatch.setitem(repair.STEPS, "quick", 2)
+    targets = {"target_mb": 0.01}
+    sweep = ps.measure_tradeoff(room, tmp_path, **targets)
+    [written] = tmp_path.glob("*.ply")
+    found = ps.compact(room, **targets)
+    assert same_bits(found.scene, ps.load(written))
+    assert found.target.split(":")[0] == sweep.why.split(":")[0]
+
+
+def test_only_a_target_of_time_has_frames_timed(dense, monkeypatch):
+    found = ps.compact(dense, by="opacity", target_ms=2.0)
+    assert 2.0 >= 1e-2 * len(found.scene) > 2.0 / 1.2 and "ms a frame" in found.target
+    monkeypatch.setattr(judging, "_timed", lambda *args: pytest.fail("timed"))
+    assert "ms a frame" not in ps.compact(dense, by="opacity", target_mb=0.01).target
+
+
+def test_a_scene_that_needs_no_repair_is_given_as_it_was_pruned(dense, tmp_path):
+    found = find_scene(subject_of(dense, None), Targets(mb=0.01), "opacity", ("none",), lambda what, share: None)
+    assert found.scene is found.pruned and not found.accepted and not found.repair_accepted
+    assert found.psnr > 10 and len(found.views) == 3 and found.seconds > 0
+    assert "side by side" in ps.plot_comparison(dense, found, tmp_path / "shown.png")
+
+
+@pytest.mark.parametrize("after, found", [(0, False), (9, True)])
+def test_ctrl_c_gives_the_best_so_far(dense, monkeypatch, after, found):
+    measure, points = Measurer.measure, []
+
+    def interrupted(self, *args):
+        if sum(point.against_dense.psnr >= 20 for point in points) > 0 or len(points) == after:
+            raise KeyboardInterrupt
+        points.append(measure(self, *args))
+        return points[-1]
+
+    monkeypatch.setattr(Measurer, "measure", interrupted)
+    if not found:
+        with pytest.raises(KeyboardInterrupt):
+            ps.compact(dense, by="opacity", target_db=20.0)
+        return
+    result = ps.compact(dense, by="opacity", target_db=20.0)
+    assert result.interrupted and "interrupted" in result.target
+    assert len(result.scene) == points[-1].gaussians
+
+
+def test_a_busy_machine_is_noted_with_a_target_of_time(dense, monkeypatch):
+    monkeypatch.setattr(finding, "busy_note", lambda others: f"busy {len(others) > 0}")
+    assert "busy True" in ps.compact(dense, by="opacity", target_ms=2.0).notes
+    assert not any("busy" in note for note in ps.compact(dense, by="opacity", target_mb=0.01).notes)
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        ({"target_db": 30.0, "target_mb": 0.002}, "over --target-mb 0.002; the best within the limits has"),
+        ({"target_db": 90.0, "target_format": ".spz"}, "no scene reaches --target-db 90 in this format"),
+        ({"target_mb": 1e-6}, "too small for one Gaussian"),
+        ({"target_mb": 1e-6, "target_format": ".spz"}, "too small for one Gaussian"),
+        ({"target_ms": 1e-9}, "no scene meets --target-ms 1e-09"),
+        ({"target_db": math.nan}, "--target-db is nan"),
+        ({"target_db": 30.0, "keep": "10%", "sh": "0", "seconds": 3.0}, "keep, sh, seconds cannot be given"),
+        ({"target_db": 30.0, "clean": True}, "clean cannot be given with a target"),
+        ({"target_db": 30.0, "target_format": ".bmp"}, "bmp"),
+    ],
+)  # fmt: skip
+def test_targets_that_cannot_be_met_or_mean_nothing_are_refused(dense, options, said):
+    with pytest.raises(PointSplatError, match=said):
+        ps.compact(dense, by="opacity", **options)
+
+
+def test_scenes_of_a_folder_each_meet_the_target(tmp_path, dense, room_views):
+    for name, scene in (("a", dense), ("b", box_room(1, 300))):
+        ps.save(scene, tmp_path / "rooms" / f"{name}.ply")
+    results = ps.compact_folder(tmp_path / "rooms", by="opacity", target_db=24.0)
+    assert [result.status for result in results] == ["done", "done"]
+    for result in results:
+        whole, small = ps.load(result.source), ps.load(Path(result.output))
+        assert mean_psnr(small, whole, room_views) >= 24
+        assert 1e6 * result.megabytes == Path(result.output).stat().st_size < Path(result.source).stat().st_size
+    again = ps.compact_folder(tmp_path / "rooms", by="opacity", target_db=24.0)
+    assert [replace(result, seconds=0) for result in again] == [
+        replace(result, status="done before", seconds=0) for result in results
+    ]
+    with pytest.raises(PointSplatError, match="other options .*target_db: 24.0, now 25.0"):
+        ps.compact_folder(tmp_path / "rooms", by="opacity", target_db=25.0)
+
+
+def test_a_folder_with_a_target_that_no_scene_meets_says_so_for_each(tmp_path, dense):
+    ps.save(dense, tmp_path / "rooms" / "a.ply")
+    [result] = ps.compact_folder(tmp_path / "rooms", by="opacity", target_db=30.0, target_mb=0.002)
+    assert result.status == "failed" and "the best within the limits has" in result.error
