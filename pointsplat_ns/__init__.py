@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.io.scene import save
     from pointsplat_ns.metrics import psnr, ssim
     from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+    from pointsplat_ns.nerfstudio_plugin.measure_tables import measure_tables
     from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import measure_tradeoff
     from pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner import make_refiner
     from pointsplat_ns.nerfstudio_plugin.pointsplat.report import report
@@ -62,6 +63,7 @@ _PUBLIC = {
     "pointsplat_ns.io.scene": ("save",),
     "pointsplat_ns.metrics": ("psnr", "ssim"),
     "pointsplat_ns.nerfstudio_plugin.dataset_views": ("dataset_views",),
+    "pointsplat_ns.nerfstudio_plugin.measure_tables": ("measure_tables",),
     "pointsplat_ns.nerfstudio_plugin.measure_tradeoff": ("measure_tradeoff",),
     "pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner": ("make_refiner",),
     "pointsplat_ns.nerfstudio_plugin.pointsplat.report": ("report",),
@@ -98,6 +100,7 @@ __all__ = [
     "lod",
     "lpips",
     "make_refiner",
+    "measure_tables",
     "measure_tradeoff",
     "place",
     "plot_comparison",

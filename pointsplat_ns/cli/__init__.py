@@ -96,6 +96,7 @@ def main(args: list[str] | None = None) -> None:
     from pointsplat_ns.cli.prune import prune
     from pointsplat_ns.cli.report import report
     from pointsplat_ns.cli.rooms import rooms
+    from pointsplat_ns.cli.tables import tables
     from pointsplat_ns.cli.tradeoff import tradeoff
     from pointsplat_ns.errors import PointSplatError
     from pointsplat_ns.system.memory import keep_freed_memory
@@ -106,6 +107,7 @@ def main(args: list[str] | None = None) -> None:
         "compact": compact,
         "lod": lod,
         "tradeoff": tradeoff,
+        "tables": tables,
         "convert": convert,
         "info": info,
         "export": export,

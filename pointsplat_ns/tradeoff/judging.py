@@ -69,7 +69,7 @@ class Judge:
     Args:
         dense: the dense scene.
         looked_at: in which views.
-        folder: of the sweep: pictures are written to it.
+        folder: of the sweep: pictures are written to it; None for no pictures.
 
     Raises:
         DataError: if the views are too small for SSIM.
@@ -77,7 +77,7 @@ class Judge:
     """
 
     @torch.no_grad()
-    def __init__(self, dense: Gaussians, looked_at: LookedAt, folder: Path):
+    def __init__(self, dense: Gaussians, looked_at: LookedAt, folder: Path | None = None):
         self.views, self.photos, self.folder = looked_at.views, looked_at.photos, folder
         if min(self.views.width, self.views.height) < SSIM_WINDOW:
             raise DataError(
@@ -91,7 +91,7 @@ class Judge:
 
     @torch.no_grad()
     def judge(self, scene: Gaussians, key: str, progress: Callable[[float], None]) -> Judged:
-        """Render a scene, write pictures of it, and time it.
+        """Render a scene, write pictures of it if there is a folder, and time it.
 
         Args:
             scene: what is judged.
@@ -127,7 +127,9 @@ class Judge:
         )
 
     def pictures(self, key: str) -> list[Path]:
-        """Where the pictures of a point lie."""
+        """Where the pictures of a point lie; nowhere without a folder."""
+        if self.folder is None:
+            return []
         return [picture_path(self.folder, number, key) for number in range(len(self.shown))]
 
     def _quality(self, image: Tensor, target: Tensor) -> Quality:
@@ -135,6 +137,8 @@ class Judge:
         return Quality(finite_psnr(image, target), float(ssim(image, target)), lpips)
 
     def _write(self, images: list[Tensor], key: str) -> None:
+        if self.folder is None:
+            return
         for path, image in zip(self.pictures(key), images, strict=True):
             write_picture(image, path)
 
