@@ -60,6 +60,7 @@ def plot_figure(groups: Sequence[Group], path: Path) -> None:
             if both is not None:
                 _stairs(left, both[0], _OPACITIES, way)
                 _stairs(right, both[1], _VOLUMES, way)
+        right.set_xlim(*_extent(group))
         left.set_xlabel("opacity")
         right.set_xlabel("log10 of the volume, scene units cubed")
         left.set_ylabel("% of the Gaussians in a bin")
@@ -72,6 +73,13 @@ def plot_figure(groups: Sequence[Group], path: Path) -> None:
 
 def _shown() -> list[tuple[str, float]]:
     return [(DENSE_WAY.name, 1.0), *((way.name, FIGURE_SHARE) for way in FIGURE_4)]
+
+
+def _extent(group: Group) -> tuple[float, float]:
+    """Where the volumes are that are not too rare to be seen."""
+    found = [both[1] for way, share in _shown() if (both := densities(group, way, share)) is not None]
+    seen: np.ndarray = np.flatnonzero(np.max(found, axis=0) > 1e-3) if found else np.empty(0, int)
+    return (_VOLUMES[seen[0]], _VOLUMES[seen[-1] + 1]) if len(seen) else VOLUME_SPAN
 
 
 def _stairs(axis: Axes, shares: np.ndarray, edges: np.ndarray, way: str) -> None:

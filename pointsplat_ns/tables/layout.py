@@ -142,14 +142,13 @@ class Layout:
                     why = self.missing.get(cell_key(scene.about.name, way, share), "nobody has asked for it yet")
                     names = rows.setdefault(why, {}).setdefault(way.label, [])
                     names += [] if scene.about.name in names else [scene.about.name]
-        notes = []
+        everywhere, notes = len(self.group.scenes), []
         for why, by_label in rows.items():
-            of: dict[str, list[str]] = {}
+            labels_by_place: dict[str, list[str]] = {}
             for label, names in by_label.items():
-                of.setdefault("" if len(names) == len(self.group.scenes) else " on " + ", ".join(names), []).append(
-                    label
-                )
-            notes += [f"Not measured{where}: {'; '.join(labels)}: {why}" for where, labels in of.items()]
+                place = "" if len(names) == everywhere else f" on {', '.join(names)}"
+                labels_by_place.setdefault(place, []).append(label)
+            notes += [f"Not measured{where}: {'; '.join(labels)}: {why}" for where, labels in labels_by_place.items()]
         return tuple(notes)
 
 

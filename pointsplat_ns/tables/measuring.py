@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from statistics import fmean
 
 import torch
 
@@ -77,7 +78,7 @@ class Measuring:
             )
         self.missing: dict[str, str] = {}
         """Why cells could not be measured, by key."""
-        self._seconds: list[float] = []
+        self._seconds: dict[str, list[float]] = {}
 
     def run(self) -> None:
         """Measure. A cell that cannot be made is left out, with the reason in :attr:`missing`.
@@ -96,13 +97,13 @@ class Measuring:
                 for other in self._work:
                     if other is not work:
                         other.close()
-                self._measure(work, way, share, done, len(wanted))
+                self._measure(work, way, share, done, [later.name for _, later, _ in wanted[done + 1 :]])
         finally:
             for work in self._work:
                 work.close()
 
-    def _measure(self, work: _SceneWork, way: Way, share: float, done: int, of: int) -> None:
-        furthest = 0.0
+    def _measure(self, work: _SceneWork, way: Way, share: float, done: int, later: list[str]) -> None:
+        furthest, of = 0.0, done + 1 + len(later)
 
         def show(what: str, part: float) -> None:
             # Making a scene has several tasks that each begin at 0; the whole never goes back.
@@ -119,11 +120,16 @@ class Measuring:
             self.missing[key] = str(error)
             logger.warning("%s: left out: %s", key, error)
             return
-        self._seconds.append(time.perf_counter() - start)
+        self._seconds.setdefault(way.name, []).append(time.perf_counter() - start)
         again = "" if before is None else f"; {_difference(before, cell)}"
-        minutes = (of - done - 1) * sum(self._seconds) / len(self._seconds) / 60
-        left = f" ({done + 1} of {of}; {max(1, math.ceil(minutes))} min left)" if done + 1 < of else ""
+        left = f" ({done + 1} of {of}; {self._minutes(later)} min left)" if later else ""
         logger.info("%s: %s%s%s", key, _figures(cell.point), again, left)
+
+    def _minutes(self, later: list[str]) -> int:
+        """How long more cells may take: as long as others of the same way, or of any."""
+        usual = fmean(seconds for measured in self._seconds.values() for seconds in measured)
+        expected = sum(fmean(self._seconds[name]) if name in self._seconds else usual for name in later)
+        return max(1, math.ceil(expected / 60))
 
 
 class _SceneWork:
