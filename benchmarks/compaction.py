@@ -27,17 +27,19 @@ import tyro
 from compaction_tables import PAIRS, Row, averages, lead_table, leads, table
 from held_out import Scene, compare, load, lpips_or_none, name_of
 from options import write_whole
-from processes import Reducer, Usage, pointsplat_prune
+from processes import pointsplat_prune
 from rich.console import Console
 from scaling import print_score_times, scaling_rows, scaling_table, slope_table, slopes
-from splat_transform import NAME, peers_of
+from splat_transform import peers_of
 
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
 from pointsplat_ns.io import read_scene, write_ply
 from pointsplat_ns.metrics import psnr
 from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.pruning import METHODS, prune
+from pointsplat_ns.system.programs import Usage
 from pointsplat_ns.system.progress import tracked
+from pointsplat_ns.tables.splat_transform import NAME, Reducer
 
 NEED_NO_VIEWS = tuple(name for name, method in METHODS.items() if not method.needs_views)
 SWEEP = tuple(round(0.1 * i, 1) for i in range(1, 10))

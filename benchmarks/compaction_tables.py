@@ -8,7 +8,8 @@ from typing import Any
 
 from held_out import BRIGHTNESS, COLUMNS, HALVES
 from rich.table import Table
-from splat_transform import NAME
+
+from pointsplat_ns.tables.splat_transform import NAME
 
 Row = dict[str, Any]
 

@@ -18,11 +18,11 @@ from pathlib import Path
 
 import torch
 import tyro
-from splat_transform import NAME, SplatTransform
 
 import pointsplat_ns as ps
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.pruning import ply_bytes
+from pointsplat_ns.tables.splat_transform import NAME, SplatTransform
 
 VIEWS, SEED = 12, 1
 """What is judged in. ``compact`` samples its own views with seed 0."""

@@ -12,12 +12,13 @@ from typing import Any
 
 import psutil
 import torch
-from processes import ProgramFailed, Reducer
 from rich.table import Table
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.pruning import METHODS, ply_bytes
+from pointsplat_ns.system.programs import ProgramFailed
+from pointsplat_ns.tables.splat_transform import Reducer
 
 Row = dict[str, Any]
 

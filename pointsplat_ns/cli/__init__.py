@@ -97,6 +97,7 @@ def main(args: list[str] | None = None) -> None:
     from pointsplat_ns.cli.render import render
     from pointsplat_ns.cli.report import report
     from pointsplat_ns.cli.rooms import rooms
+    from pointsplat_ns.cli.tables import tables
     from pointsplat_ns.cli.tradeoff import tradeoff
     from pointsplat_ns.cli.view import view
     from pointsplat_ns.errors import PointSplatError
@@ -108,6 +109,7 @@ def main(args: list[str] | None = None) -> None:
         "compact": compact,
         "lod": lod,
         "tradeoff": tradeoff,
+        "tables": tables,
         "convert": convert,
         "info": info,
         "view": view,

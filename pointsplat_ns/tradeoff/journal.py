@@ -1,26 +1,104 @@
-"""``points.json``: every point, written as soon as it is measured, so that a sweep goes on where it was interrupted."""
+"""Journals: everything measured is written as soon as it is, so that an interrupted command goes on where it was.
+
+``points.json`` is that of a sweep; :mod:`pointsplat_ns.tables` keeps its cells in files of the same shape.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io.files import one_line, write_json
 from pointsplat_ns.tradeoff.points import Point, Quality
 from pointsplat_ns.tradeoff.settings import DENSE, Setting, setting_of
 
-POINTS = "points.json"
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
-FORMAT, VERSION = "pointsplat-tradeoff-points", 2
-"""Version 1 timed each point alone, as the clock said it: its times do not compare with those of today."""
+Identity = Mapping[str, str | int]
+"""What all records of a journal have in common; texts and whole numbers by name."""
+
+T = TypeVar("T")
 
 MOST_BYTES = 16_000_000
 """Largest journal that is read; a thousand points take one megabyte."""
+
+
+@dataclass(frozen=True)
+class Form:
+    """A kind of journal."""
+
+    name: str
+    version: int
+    records: str
+    """Name of the list of records: what they are, in the plural."""
+    of: str
+    """What they are of, in the singular."""
+
+    def write(self, path: Path, identity: Identity, records: Sequence[DataclassInstance]) -> None:
+        """Write all records.
+
+        Raises:
+            SceneError: if they cannot be written.
+        """
+        rows = [dataclasses.asdict(record) for record in records]
+        content = {"format": self.name, "version": self.version, "of": dict(identity), self.records: rows}
+        write_json(content, path)
+
+    def read(self, path: Path, restored: Callable[[dict[str, Any]], T]) -> tuple[dict[str, Any], list[T]]:
+        """The identity and the records of a file, which may come from anybody.
+
+        Args:
+            path: the file.
+            restored: makes a record of what :func:`dataclasses.asdict` made of it; see :func:`check_types`.
+
+        Raises:
+            SceneError: if the file is not such a journal, or damaged.
+        """
+        try:
+            if path.stat().st_size > MOST_BYTES:
+                raise ValueError(f"larger than {MOST_BYTES:,} bytes")
+            content = json.loads(path.read_text("utf-8"))
+            if content["format"] != self.name:
+                raise ValueError(f"of format {content['format']}")
+            if content["version"] != self.version:
+                raise ValueError(f"of version {content['version']!r:.20}, this program's are of {self.version}")
+            return dict(content["of"]), [restored(values) for values in content[self.records]]
+        except (OSError, ValueError, TypeError, KeyError, RecursionError, PointSplatError) as error:
+            why = f"lacks {error}" if isinstance(error, KeyError) else one_line(error, 80)
+            raise SceneError(
+                f"{path}: not the {self.records} of {self.of} ({why}); name another folder, or start over with --force"
+            ) from error
+
+    def check(self, path: Path, of: Identity, identity: Identity) -> None:
+        """Check that the records of a file are those wanted.
+
+        Args:
+            path: the file, for the error.
+            of: its identity.
+            identity: what it must have in common with it.
+
+        Raises:
+            SceneError: if they differ.
+        """
+        for name, value in identity.items():
+            if of.get(name) != value:
+                raise SceneError(
+                    f"{path}: its {self.records} are of another {self.of.removeprefix('a ')} ({name}: "
+                    f"{of.get(name)!r}, now {value!r}); name another folder, or start over with --force"
+                )
+
+
+POINTS = "points.json"
+
+POINTS_FORM = Form("pointsplat-tradeoff-points", 2, "points", "a sweep")
+"""Version 1 timed each point alone, as the clock said it: its times do not compare with those of today."""
 
 
 class Journal:
@@ -49,13 +127,7 @@ class Journal:
         """
         self._take(point)
         points = ([self.dense] if self.dense is not None else []) + [*self.points.values()]
-        content = {
-            "format": FORMAT,
-            "version": VERSION,
-            "of": self._identity,
-            "points": [dataclasses.asdict(point) for point in points],
-        }
-        write_json(content, self.path)
+        POINTS_FORM.write(self.path, self._identity, points)
 
     def _take(self, point: Point) -> None:
         if point.by == DENSE:
@@ -64,45 +136,28 @@ class Journal:
             self.points[setting_of(point)] = point
 
     def _read(self) -> None:
-        try:
-            if self.path.stat().st_size > MOST_BYTES:
-                raise ValueError(f"larger than {MOST_BYTES:,} bytes")
-            content = json.loads(self.path.read_text("utf-8"))
-            if content["format"] != FORMAT:
-                raise ValueError(f"of format {content['format']}")
-            version, of = content["version"], dict(content["of"])
-            points = [_point(values) for values in content["points"]] if version == VERSION else []
-        except (OSError, ValueError, TypeError, KeyError, RecursionError, PointSplatError) as error:
-            why = f"lacks {error}" if isinstance(error, KeyError) else one_line(error, 80)
-            raise SceneError(
-                f"{self.path}: not the points of a sweep ({why}); name another folder, or start over with --force"
-            ) from error
-        if version != VERSION:
-            raise SceneError(
-                f"{self.path}: its points are of version {version!r:.20}, and this program's of {VERSION}, which "
-                "times frames otherwise; name another folder, or start over with --force"
-            )
-        for name, value in self._identity.items():
-            if of.get(name) != value:
-                raise SceneError(
-                    f"{self.path}: its points are of another sweep ({name}: {of.get(name)!r}, now {value!r}); name "
-                    "another folder, or start over with --force"
-                )
+        of, points = POINTS_FORM.read(self.path, _point_of_sweep)
+        POINTS_FORM.check(self.path, of, self._identity)
         for point in points:
             self._take(point)
 
 
-def _point(values: dict[str, Any]) -> Point:
+def _point_of_sweep(values: dict[str, Any]) -> Point:
+    point = restored_point(values)
+    if point.by != DENSE:
+        setting_of(point)
+    return point
+
+
+def restored_point(values: dict[str, Any]) -> Point:
     """A point from what :func:`dataclasses.asdict` made of it.
 
     Raises:
-        ValueError, TypeError, KeyError, PointSplatError: if it is none.
+        ValueError, TypeError, KeyError: if it is none.
     """
     qualities = {name: _quality(values[name]) for name in ("against_dense", "against_photos")}
     point = Point(**{**values, **qualities})
-    _check(point)
-    if point.by != DENSE:
-        setting_of(point)
+    check_types(point)
     return point
 
 
@@ -110,19 +165,32 @@ def _quality(values: dict[str, Any] | None) -> Quality | None:
     if values is None:
         return None
     quality = Quality(**{**values, "psnr": math.inf if values["psnr"] is None else values["psnr"]})
-    _check(quality)
+    check_types(quality)
     return quality
 
 
-def _check(of: Point | Quality) -> None:
-    """Whether the values have the types that the fields say."""
+def check_types(of: DataclassInstance) -> None:
+    """Check that the values of a record have the types that its fields say.
+
+    Raises:
+        ValueError: if one has not.
+    """
     for field in dataclasses.fields(of):
         value, kind = getattr(of, field.name), str(field.type)
-        fits = {
-            "str": isinstance(value, str),
-            "int": type(value) is int and value >= 0,
-            "float": type(value) in (int, float) and not math.isnan(value),
-            "Quality": isinstance(value, Quality),
-        }[kind.removesuffix(" | None")]
-        if not fits and not (value is None and kind.endswith("None")):
+        if not _FITS[kind.removesuffix(" | None")](value) and not (value is None and kind.endswith("None")):
             raise ValueError(f"{field.name} is {value!r}")
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and value >= 0
+
+
+_FITS: dict[str, Callable[[Any], bool]] = {
+    "str": lambda value: isinstance(value, str),
+    "int": _is_count,
+    "float": lambda value: type(value) in (int, float) and not math.isnan(value),
+    "Quality": lambda value: isinstance(value, Quality),
+    "Point": lambda value: isinstance(value, Point),
+    "tuple[int, ...]": lambda value: isinstance(value, tuple) and all(map(_is_count, value)),
+}
+"""Whether a value fits, by the annotation of its field."""

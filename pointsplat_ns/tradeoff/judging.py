@@ -77,7 +77,7 @@ class Judge:
     Args:
         dense: the dense scene.
         looked_at: in which views.
-        folder: of the sweep: pictures are written to it; None writes none.
+        folder: of the sweep: pictures are written to it; None for none.
         dense_ms: time of a frame of the dense scene, milliseconds, that times are given in proportion to; by default as
             measured beside the first scene that is timed.
 
@@ -87,7 +87,9 @@ class Judge:
     """
 
     @torch.no_grad()
-    def __init__(self, dense: Gaussians, looked_at: LookedAt, folder: Path | None, dense_ms: float | None = None):
+    def __init__(
+        self, dense: Gaussians, looked_at: LookedAt, folder: Path | None = None, dense_ms: float | None = None
+    ):
         self.views, self.photos, self.folder = looked_at.views, looked_at.photos, folder
         self.dense, self.dense_ms = dense, dense_ms
         if min(self.views.width, self.views.height) < SSIM_WINDOW:
@@ -163,16 +165,19 @@ class Judge:
         )
 
     def pictures(self, key: str) -> list[Path]:
-        """Where the pictures of a point lie."""
-        folder = self.folder
-        return [] if folder is None else [picture_path(folder, number, key) for number in range(len(self.shown))]
+        """Where the pictures of a point lie; nowhere without a folder."""
+        if self.folder is None:
+            return []
+        return [picture_path(self.folder, number, key) for number in range(len(self.shown))]
 
     def _quality(self, image: Tensor, target: Tensor) -> Quality:
         lpips = None if self.lpips is None else float(self.lpips(image, target))
         return Quality(finite_psnr(image, target), float(ssim(image, target)), lpips)
 
     def _write(self, images: list[Tensor], key: str) -> None:
-        for path, image in zip(self.pictures(key), images, strict=self.folder is not None):
+        if self.folder is None:
+            return
+        for path, image in zip(self.pictures(key), images, strict=True):
             write_picture(image, path)
 
 

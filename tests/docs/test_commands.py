@@ -281,7 +281,8 @@ def test_options_named_in_text_exist(monkeypatch, capsys):
     programs = [
         ("pointsplat", name)
         for name in (
-            *("prune", "compact", "lod", "tradeoff", "convert", "info", "view", "render", "export", "report", "rooms"),
+            *("prune", "compact", "lod", "tradeoff", "tables", "convert", "info", "view", "render", "export", "report"),
+            "rooms",
             *("make-refiner", "make-feedback", "demo"),
         )
     ]

@@ -111,7 +111,7 @@ def test_points_of_another_version_are_refused_in_one_line(written, version):
     content["points"][1].pop("frame_ms")
     (written / POINTS).write_text(json.dumps(content))
     with pytest.raises(
-        SceneError, match=f"{POINTS}: its points are of version .*, and this program's of 2.*--force"
+        SceneError, match=f"{POINTS}: not the points of a sweep .of version .*, this program's are of 2.*--force"
     ) as e:
         Journal(written, OF)
     assert len(str(e.value).splitlines()) == 1 and len(str(e.value)) < 400

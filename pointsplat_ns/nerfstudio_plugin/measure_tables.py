@@ -1,0 +1,204 @@
+"""Measures the paper's tables on any scenes."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+
+from pointsplat_ns.compression.level_folder import source_file
+from pointsplat_ns.compression.view_source import COMPARED_VIEWS, ViewSource
+from pointsplat_ns.errors import DataError, PointSplatError, SceneError
+from pointsplat_ns.io.files import file_stem, logger
+from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
+from pointsplat_ns.io.scene import read_scene
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
+from pointsplat_ns.nerfstudio_plugin.paper_datasets import paper_dataset
+from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.tables.cells import CELLS
+from pointsplat_ns.tables.making import Tools
+from pointsplat_ns.tables.means import Group
+from pointsplat_ns.tables.measuring import Measuring
+from pointsplat_ns.tables.outputs import OUTPUTS, write_tables
+from pointsplat_ns.tables.refiners import Refiners
+from pointsplat_ns.tables.scene import Opened, TableOptions, TableScene
+from pointsplat_ns.tables.ways import SHARES
+from pointsplat_ns.tradeoff.judging import LookedAt
+
+TRAINING_PHOTOS = 60
+"""Largest number of photos that fine-tuning sees. All of them are in memory, at first in their full size."""
+
+
+def measure_tables(
+    scenes: Sequence[str | Path],
+    folder: str | Path,
+    *,
+    keeps: Sequence[float] = SHARES,
+    refiners: Sequence[str | Path] = (),
+    groups: Sequence[str] = (),
+    only: Sequence[str] = (),
+    views: int = 10,
+    side: int = 640,
+    scoring_views: int = 40,
+    fine_tune: int = 300,
+    splat_transform: str | None = None,
+    force: bool = False,
+    progress: bool | Progress = False,
+) -> list[Group]:
+    """Measure the paper's Tables 1 to 4 and Figure 4 on any scenes, with our methods and splat-transform beside.
+
+    Each cell, one scene made smaller in one way, is saved as soon as it is measured: the same call goes on after an
+    interruption. The tables are of all scenes in the folder, also those of earlier calls. Rows whose weights or program
+    are not at hand say so.
+
+    Args:
+        scenes: Splatfacto runs, whose held-out photos are then used where they are found; or files of scenes.
+        folder: where cells and tables go.
+        keeps: shares of the Gaussians in Tables 1 and 2.
+        refiners: weights for the rows with a network, as for :func:`load_refiner`; each row takes those that were
+            trained for it, by what they say of themselves.
+        groups: NAME=SCENE,SCENE...; means are taken over groups. By default scenes of Replica and of ScanNet++ are a
+            group each, and the others are "scenes".
+        only: names or patterns of cells, such as ``fox/merge/10%``, to measure again, and no others.
+        views: largest number of held-out views of a scene.
+        side: largest side of all images, pixels; photos are reduced.
+        scoring_views: largest number of training poses that LightGaussian and PUP-3DGS score from.
+        fine_tune: steps of fine-tuning, against at most 60 training photos.
+        splat_transform: the program; by default the one that npx finds, if any.
+        force: start over.
+        progress: True shows a bar; a function is called with what is being done and the share done of it.
+
+    Returns:
+        The scenes of the folder in groups, with all cells.
+
+    Raises:
+        SceneError: if a scene or the folder is not usable, or the folder holds cells of other scenes, views or another
+            machine.
+        DataError: if there is no view.
+        WeightsError: if weights are none.
+        PointSplatError: if two scenes have the same name, nothing matches ``only``, or a number means nothing.
+        KeyboardInterrupt: after the tables of what was measured were written.
+
+    Example:
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ps.save(ps.example_room()[::200][:300], f"{folder}/room.ply")
+        ...     [group] = ps.measure_tables(
+        ...         [f"{folder}/room.ply"], f"{folder}/tables", only=["room/paper/10%"], views=2, side=64
+        ...     )
+        >>> group.name, group.mean("paper", 0.1).gaussians
+        ('scenes', 30.0)
+    """
+    folder = Path(folder)
+    options = TableOptions(views, side, scoring_views, fine_tune)
+    shares = tuple(dict.fromkeys(keeps))
+    if not all(0 < share < 1 for share in shares):
+        raise PointSplatError(f"keeps are {', '.join(f'{share:g}' for share in shares)}; expected shares such as 0.1")
+    if not scenes:
+        raise PointSplatError("no scene is named; expected Splatfacto runs, or files of scenes")
+    opened = [_table_scene(Path(path)) for path in scenes]
+    opened = _grouped(opened, groups)
+    _check_folder(folder, opened, force)
+    tools = Tools(options, Refiners([Path(path) for path in refiners]), splat_transform)
+    with progress_bar(progress) as report:
+        measuring = Measuring(opened, folder, shares, tools, only, report)
+        try:
+            measuring.run()
+        except (KeyboardInterrupt, SystemExit):
+            if any(folder.glob(f"*/{CELLS}")):
+                write_tables(folder, shares, measuring.missing)
+            raise
+        return write_tables(folder, shares, measuring.missing)
+
+
+def _check_folder(folder: Path, scenes: Sequence[TableScene], force: bool) -> None:
+    """Check that tables may be written to a folder; with ``force``, remove older cells of the scenes.
+
+    Raises:
+        SceneError: if it is a file, or holds tables without the cells that they are of.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise SceneError(f"{folder}: is a file; expected the name of a folder")
+    if force:
+        for scene in scenes:
+            (folder / scene.name / CELLS).unlink(missing_ok=True)
+    elif not any(folder.glob(f"*/{CELLS}")):
+        for name in OUTPUTS:
+            if (folder / name).exists():
+                raise SceneError(
+                    f"{folder / name}: exists already, without the cells that it is of; name another folder, or "
+                    "overwrite it with --force"
+                )
+
+
+def _grouped(scenes: Sequence[TableScene], groups: Sequence[str]) -> list[TableScene]:
+    """Scenes with the groups that the user wants.
+
+    Raises:
+        PointSplatError: if a group is not understood, or names an unknown scene.
+    """
+    wanted: dict[str, str] = {}
+    for text in groups:
+        name, equals, members = text.partition("=")
+        if not (name.strip() and equals and members.strip()):
+            raise PointSplatError(f"group {text!r}: expected NAME=SCENE,SCENE, such as rooms=room201,room202")
+        wanted |= {member.strip(): name.strip() for member in members.split(",")}
+    unknown = sorted(set(wanted) - {scene.name for scene in scenes})
+    if unknown:
+        names = ", ".join(scene.name for scene in scenes)
+        raise PointSplatError(f"groups name {', '.join(unknown)}; expected some of the scenes {names}")
+    return [dataclasses.replace(scene, group=wanted.get(scene.name)) for scene in scenes]
+
+
+def _table_scene(path: Path) -> TableScene:
+    """A scene, of which nothing is read but the hash of its file and, of a run, its settings."""
+    sha256, name, dataset = source_file(path).sha256, file_stem(path.stem), ""
+    if may_be_run(path):
+        try:
+            run = open_run(path, need_data=False)
+            name = scene_name(run)
+            dataset = _dataset(path)
+        except SceneError:
+            pass  # a checkpoint outside a run
+    return TableScene(name, path, sha256, dataset, None, functools.partial(_open, path))
+
+
+def _dataset(path: Path) -> str:
+    """The paper's dataset that a run belongs to; empty if none, or its data is gone."""
+    try:
+        return paper_dataset(open_run(path))
+    except SceneError:
+        return ""
+
+
+def _open(path: Path, options: TableOptions) -> Opened:
+    """Read a scene, its views, and its photos if there are any."""
+    dense = read_scene(path)
+
+    def new_views() -> ViewSource:
+        return ViewSource(dense, run=path, dataset_views=dataset_views)
+
+    held_out, training = _looked_at(path, options) or _sampled(new_views(), options)
+    return Opened(dense, held_out.resized(options.side), training.resized(options.side), new_views)
+
+
+def _looked_at(path: Path, options: TableOptions) -> tuple[LookedAt, LookedAt] | None:
+    """Held-out photos, and photos to train on; None if there are none."""
+    if not may_be_run(path):
+        return None
+    try:
+        held_out = LookedAt(*dataset_photos(path, "test", options.views), "held-out photos")
+        count = max(TRAINING_PHOTOS, options.scoring_views)
+        return held_out, LookedAt(*dataset_photos(path, "train", count), "training photos")
+    except (SceneError, DataError) as error:
+        logger.warning("%s: no photos to compare with: %s", path, error)
+        return None
+
+
+def _sampled(source: ViewSource, options: TableOptions) -> tuple[LookedAt, LookedAt]:
+    """Views alone. Those to judge in are those that ``compact`` compares in, on which nothing is optimised."""
+    held_out = source.compared().spread(min(options.views, COMPARED_VIEWS))
+    training = source.views(max(TRAINING_PHOTOS, options.scoring_views))
+    return LookedAt(held_out, None, source.origin), LookedAt(training, None, source.origin)

@@ -1,0 +1,96 @@
+"""Figure 4: distributions of opacity and volume of what methods keep at half the Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pointsplat_ns.io.files import replacing
+from pointsplat_ns.tables.cells import OPACITY_BINS, VOLUME_BINS, VOLUME_SPAN
+from pointsplat_ns.tables.means import Group
+from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_4, FIGURE_SHARE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_COLOURS = {"lightgaussian": "tab:orange", "pup": "gray", "paper": "tab:blue", "merge": "tab:green", "dense": "black"}
+"""The first three as in the paper."""
+
+_OPACITIES = np.linspace(0.0, 1.0, OPACITY_BINS + 1)
+_VOLUMES = np.linspace(*VOLUME_SPAN, VOLUME_BINS + 1)
+
+
+def medians(group: Group) -> dict[str, tuple[float, float]]:
+    """Medians of opacity and of log10 of the volume (scene units cubed), by way, interpolated within bins; every scene
+    has the same weight. Ways that were not measured are left out."""
+    found = {}
+    for way, share in _shown():
+        both = densities(group, way, share)
+        if both is not None:
+            found[way] = (_median(both[0], _OPACITIES), _median(both[1], _VOLUMES))
+    return found
+
+
+def densities(group: Group, way: str, share: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Shares of the Gaussians in each bin of opacity and of volume, means over scenes; None if there are none."""
+    opacities, volumes = [], []
+    for scene in group.scenes:
+        cell = scene.cells.get((way, share))
+        if cell is not None and cell.opacities and cell.volumes and sum(cell.opacities) and sum(cell.volumes):
+            opacities.append(np.array(cell.opacities) / sum(cell.opacities))
+            volumes.append(np.array(cell.volumes) / sum(cell.volumes))
+    return (np.mean(opacities, axis=0), np.mean(volumes, axis=0)) if opacities else None
+
+
+def plot_figure(groups: Sequence[Group], path: Path) -> None:
+    """Draw Figure 4, a row for each group.
+
+    Raises:
+        SceneError: if the file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.6 * len(groups)), layout="constrained")
+    for group, (left, right) in zip(groups, figure.subplots(len(groups), 2, squeeze=False), strict=True):
+        for way, share in _shown():
+            both = densities(group, way, share)
+            if both is not None:
+                _stairs(left, both[0], _OPACITIES, way)
+                _stairs(right, both[1], _VOLUMES, way)
+        right.set_xlim(*_extent(group))
+        left.set_xlabel("opacity")
+        right.set_xlabel("log10 of the volume, scene units cubed")
+        left.set_ylabel("% of the Gaussians in a bin")
+        left.set_title(f"{group.name}, {100 * FIGURE_SHARE:g} % kept", fontsize=10)
+        if left.has_data():
+            right.legend(fontsize=8)
+    with replacing(path) as part:
+        figure.savefig(part, dpi=110, format="png")
+
+
+def _shown() -> list[tuple[str, float]]:
+    return [(DENSE_WAY.name, 1.0), *((way.name, FIGURE_SHARE) for way in FIGURE_4)]
+
+
+def _extent(group: Group) -> tuple[float, float]:
+    """Where the volumes are that are not too rare to be seen."""
+    found = [both[1] for way, share in _shown() if (both := densities(group, way, share)) is not None]
+    seen: np.ndarray = np.flatnonzero(np.max(found, axis=0) > 1e-3) if found else np.empty(0, int)
+    return (_VOLUMES[seen[0]], _VOLUMES[seen[-1] + 1]) if len(seen) else VOLUME_SPAN
+
+
+def _stairs(axis: Axes, shares: np.ndarray, edges: np.ndarray, way: str) -> None:
+    labels = {known.name: known.label for known in (DENSE_WAY, *FIGURE_4)}
+    style = "--" if way == DENSE_WAY.name else "-"
+    axis.stairs(100 * shares, edges, color=_COLOURS[way], linestyle=style, label=labels[way], linewidth=1.4)
+
+
+def _median(shares: np.ndarray, edges: np.ndarray) -> float:
+    total = np.concatenate([[0.0], np.cumsum(shares)])
+    index = int(np.searchsorted(total, 0.5 * total[-1], side="right")) - 1
+    index = min(index, len(shares) - 1)
+    inside = (0.5 * total[-1] - total[index]) / shares[index] if shares[index] > 0 else 0.5
+    return float(edges[index] + inside * (edges[index + 1] - edges[index]))

@@ -1,0 +1,193 @@
+"""Lays means out as the paper's tables: rows of text, which are then written as Markdown and as LaTeX."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from pointsplat_ns.tables.means import Group, Mean
+from pointsplat_ns.tables.paper import published
+from pointsplat_ns.tables.ways import (
+    ABLATED,
+    DENSE_WAY,
+    FIGURE_SHARE,
+    IMAGE_DRIVEN,
+    OURS,
+    PEERS,
+    POINTSPLAT,
+    TABLE_1,
+    TABLE_3,
+    TABLE_4,
+    Way,
+    cell_key,
+)
+from pointsplat_ns.tradeoff.points import Quality
+
+NOTHING = "-"
+"""Where there is no figure."""
+
+Row = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Table:
+    """One of the paper's tables for one group of scenes."""
+
+    number: int
+    title: str
+    header: Row
+    sections: tuple[tuple[Row, ...], ...]
+    """Rows, in parts that a line divides."""
+    notes: tuple[str, ...] = ()
+    """Below the table: what was not measured, and why."""
+
+
+class Layout:
+    """Makes the tables of a group.
+
+    Args:
+        group: the scenes.
+        shares: of Tables 1 and 2; those of cells that are there are added.
+        missing: why cells could not be measured, by key.
+    """
+
+    def __init__(self, group: Group, shares: Sequence[float], missing: Mapping[str, str]):
+        self.group, self.missing = group, missing
+        names = {way.name for way in TABLE_1} - {way.name for way in TABLE_4}  # of which some are in other tables, too
+        there = {share for scene in group.scenes for way, share in scene.cells if way in names}
+        self.shares = sorted({*shares, *there}, reverse=True)
+
+    def tables(self) -> list[Table]:
+        """Tables 1 to 4."""
+        return [self._table_1(), self._table_2(), self._table_3(), self._table_4()]
+
+    def _table_1(self) -> Table:
+        blocks = [[(DENSE_WAY, 1.0)], *([(way, share) for way in TABLE_1] for share in self.shares)]
+        sections = [[((_percent(share), way.label), way, share) for way, share in block] for block in blocks]
+        return self._of_quality(1, "What is left at a number of Gaussians", ("kept", "method"), sections)
+
+    def _table_2(self) -> Table:
+        header = ("kept", "method", "Gaussians", "frames a second", "MB", "scenes")
+        ways = (IMAGE_DRIVEN[1], IMAGE_DRIVEN[3], POINTSPLAT, *OURS, *PEERS)
+        blocks = [[(DENSE_WAY, 1.0)], *([(way, share) for way in ways] for share in self.shares)]
+        sections = []
+        for block in blocks:
+            rows = []
+            for way, share in block:
+                mean = self.group.mean(way.name, share)
+                figures: Row = ("not measured", NOTHING, NOTHING, NOTHING)
+                if mean is not None:
+                    figures = (f"{mean.gaussians:,.0f}", _fps(mean.fps), f"{mean.megabytes:.2f}", self._scenes(mean))
+                rows.append((_percent(share), way.label, *figures))
+            sections.append(tuple(rows))
+        notes = self._reasons([pair for block in blocks for pair in block])
+        return Table(2, self._title("Efficiency"), header, tuple(sections), notes)
+
+    def _table_3(self) -> Table:
+        rows = [((f"{weight:g}", way.label), way, ABLATED) for weight, way in TABLE_3]
+        sections = [rows[i : i + 2] for i in range(0, len(rows), 2)]
+        title = f"Lambda of the paper's score, {_percent(ABLATED)} kept"
+        return self._of_quality(3, title, ("lambda", "method"), sections)
+
+    def _table_4(self) -> Table:
+        branches = (("", "", ""), ("yes", "", ""), ("yes", "", "yes"), ("yes", "yes", ""), ("yes", "yes", "yes"))
+        rows = [
+            ((number, *used), way, ABLATED)
+            for number, used, way in zip(("I", "II", "III", "IV", "V"), branches, TABLE_4, strict=True)
+        ]
+        first = ("model", "geometry", "appearance", "position")
+        return self._of_quality(4, f"The dual-branch encoder, {_percent(ABLATED)} kept", first, [rows])
+
+    def _of_quality(
+        self, number: int, title: str, first: Row, sections: Sequence[Sequence[tuple[Row, Way, float]]]
+    ) -> Table:
+        """A table of PSNR, SSIM and LPIPS, with the paper's where the dataset is the same."""
+        cells = [(way, share) for section in sections for _, way, share in section]
+        dataset = self.group.dataset
+        with_paper = any(published(number, dataset, way.name, share) for way, share in cells)
+        metrics = ("PSNR", "SSIM", "LPIPS")
+        header = first
+        header += metrics if self.group.has_photos else ()
+        header += tuple(f"{name} (renders)" for name in metrics)
+        header += ("loses most", "scenes")
+        header += tuple(f"{name} (paper)" for name in metrics) if with_paper else ()
+
+        def row(words: Row, way: Way, share: float) -> Row:
+            mean = self.group.mean(way.name, share)
+            if mean is None:
+                figures: Row = ("not measured",) + (NOTHING,) * (7 if self.group.has_photos else 4)
+            else:
+                figures = _quality(mean.photos) if self.group.has_photos else ()
+                figures += (*_quality(mean.renders), _worst(mean), self._scenes(mean))
+            theirs = _quality(published(number, dataset, way.name, share)) if with_paper else ()
+            return (*words, *figures, *theirs)
+
+        rows = tuple(tuple(row(*entry) for entry in section) for section in sections)
+        return Table(number, self._title(title), header, rows, self._reasons(cells))
+
+    def _title(self, what: str) -> str:
+        return f"{what}: {self.group.name}, {_scenes_text(len(self.group.scenes))}"
+
+    def _scenes(self, mean: Mean) -> str:
+        count = len(self.group.scenes)
+        return f"{count}" if mean.scenes == count else f"{mean.scenes} of {count}"
+
+    def _reasons(self, cells: Sequence[tuple[Way, float]]) -> tuple[str, ...]:
+        """Why rows are empty or have fewer scenes, each reason once."""
+        rows: dict[str, dict[str, list[str]]] = {}
+        for way, share in cells:
+            for scene in self.group.scenes:
+                if (way.name, share) not in scene.cells:
+                    why = self.missing.get(cell_key(scene.about.name, way, share), "nobody has asked for it yet")
+                    names = rows.setdefault(why, {}).setdefault(way.label, [])
+                    names += [] if scene.about.name in names else [scene.about.name]
+        everywhere, notes = len(self.group.scenes), []
+        for why, by_label in rows.items():
+            labels_by_place: dict[str, list[str]] = {}
+            for label, names in by_label.items():
+                place = "" if len(names) == everywhere else f" on {', '.join(names)}"
+                labels_by_place.setdefault(place, []).append(label)
+            notes += [f"Not measured{where}: {'; '.join(labels)}: {why}" for where, labels in labels_by_place.items()]
+        return tuple(notes)
+
+
+def figure_medians(group: Group, ways: Sequence[Way], medians: Mapping[str, tuple[float, float]]) -> Table:
+    """The medians of Figure 4 as a table.
+
+    Args:
+        group: the scenes.
+        ways: of the rows.
+        medians: of opacity and of the logarithm of the volume, by name of the way.
+    """
+    rows = tuple(
+        (way.label, f"{medians[way.name][0]:.2f}", f"{medians[way.name][1]:.1f}") for way in ways if way.name in medians
+    )
+    title = f"Medians of Figure 4: {group.name}, {_percent(FIGURE_SHARE)} kept"
+    return Table(0, title, ("method", "opacity", "log10 of the volume"), (rows,))
+
+
+def _scenes_text(count: int) -> str:
+    return f"{count} scene{'s' if count != 1 else ''}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:g} %"
+
+
+def _quality(quality: Quality | None) -> Row:
+    if quality is None:
+        return (NOTHING,) * 3
+    psnr = NOTHING if math.isinf(quality.psnr) else f"{quality.psnr:.2f}"
+    return psnr, f"{quality.ssim:.3f}", NOTHING if quality.lpips is None else f"{quality.lpips:.3f}"
+
+
+def _worst(mean: Mean) -> str:
+    if math.isinf(mean.worst_psnr):
+        return NOTHING
+    lost = "" if mean.worst_loss is None or mean.worst_loss == 0 else f" ({-mean.worst_loss:+.2f})"
+    return f"{mean.worst} {mean.worst_psnr:.2f}{lost}"
+
+
+def _fps(value: float) -> str:
+    return f"{value:.3g}" if value < 100 else f"{value:.0f}"

@@ -1,0 +1,124 @@
+"""Means of cells over the scenes of a group, with the scene that loses most."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.tables.cells import CELLS, About, Cell, CellJournal
+from pointsplat_ns.tables.paper import DATASETS
+from pointsplat_ns.tables.ways import DENSE_WAY
+from pointsplat_ns.tradeoff.points import Point, Quality
+
+
+@dataclass(frozen=True, eq=False)
+class SceneCells:
+    """All cells of a scene."""
+
+    about: About
+    cells: dict[tuple[str, float], Cell]
+    """By way and share."""
+
+    def loss(self, point: Point) -> float | None:
+        """What a point loses of the dense scene's PSNR against photos, dB; None where it is not known."""
+        dense = self.cells.get((DENSE_WAY.name, 1.0))
+        if point.against_photos is None or dense is None or dense.point.against_photos is None:
+            return None
+        return dense.point.against_photos.psnr - point.against_photos.psnr
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A row of a table: means over the scenes that have it."""
+
+    photos: Quality | None
+    """None unless all of them have held-out photos."""
+    renders: Quality
+    gaussians: float
+    megabytes: float
+    fps: float
+    """Frames a second."""
+    scenes: int
+    """Number of scenes that it is the mean of."""
+    worst: str
+    """The scene that loses most."""
+    worst_psnr: float
+    """Its PSNR, dB: against photos, or against the dense scene's renders where there are none."""
+    worst_loss: float | None
+    """Its loss of PSNR against photos, dB, compared to the dense scene; None where it is not known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Scenes that means are taken over."""
+
+    name: str
+    scenes: tuple[SceneCells, ...]
+
+    @property
+    def dataset(self) -> str:
+        """The dataset of the paper that all scenes belong to; empty if there is none."""
+        datasets = {scene.about.dataset for scene in self.scenes}
+        return datasets.pop() if len(datasets) == 1 and datasets <= {*DATASETS} else ""
+
+    @property
+    def has_photos(self) -> bool:
+        """Whether some cells were compared with photos."""
+        return any(cell.point.against_photos is not None for scene in self.scenes for cell in scene.cells.values())
+
+    def mean(self, way: str, share: float) -> Mean | None:
+        """The mean of a cell over the scenes that have it; None if none has."""
+        found = [(scene, scene.cells[way, share].point) for scene in self.scenes if (way, share) in scene.cells]
+        if not found:
+            return None
+        points = [point for _, point in found]
+        photos = [point.against_photos for point in points if point.against_photos is not None]
+        worst, point = max(found, key=lambda pair: _badness(*pair))
+        return Mean(
+            photos=_mean(photos) if len(photos) == len(points) else None,
+            renders=_mean([point.against_dense for point in points]),
+            gaussians=fmean(point.gaussians for point in points),
+            megabytes=fmean(point.bytes / 1e6 for point in points),
+            fps=fmean(1000 / point.frame_ms if point.frame_ms > 0 else math.inf for point in points),
+            scenes=len(points),
+            worst=worst.about.name,
+            worst_psnr=(point.against_photos or point.against_dense).psnr,
+            worst_loss=worst.loss(point),
+        )
+
+
+def _badness(scene: SceneCells, point: Point) -> tuple[float, float]:
+    """The larger, the worse: by the loss, or else by the PSNR."""
+    loss, quality = scene.loss(point), point.against_photos or point.against_dense
+    return -quality.psnr if loss is None else loss, -quality.psnr
+
+
+def read_groups(folder: Path) -> list[Group]:
+    """All scenes below a folder of tables, in groups; the paper's datasets first, the others by name.
+
+    Raises:
+        SceneError: if a journal cannot be read, or there is none.
+    """
+    scenes: dict[str, list[SceneCells]] = {}
+    for path in sorted(folder.glob(f"*/{CELLS}")):
+        journal = CellJournal(folder, path.parent.name)
+        if journal.about is None or journal.about.name != path.parent.name:
+            raise SceneError(f"{path}: not the cells of {path.parent.name}; put its folder's name back, or remove it")
+        scenes.setdefault(journal.about.group, []).append(SceneCells(journal.about, journal.cells))
+    if not scenes:
+        raise SceneError(f"{folder}: no scene with cells in it; nothing has been measured yet")
+    groups = [Group(name, tuple(members)) for name, members in sorted(scenes.items())]
+    return sorted(groups, key=lambda group: DATASETS.index(group.dataset) if group.dataset else len(DATASETS))
+
+
+def _mean(values: Sequence[Quality]) -> Quality:
+    lpips = [value.lpips for value in values if value.lpips is not None]
+    return Quality(
+        fmean(value.psnr for value in values),
+        fmean(value.ssim for value in values),
+        fmean(lpips) if len(lpips) == len(values) else None,
+    )

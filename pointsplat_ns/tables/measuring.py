@@ -1,0 +1,259 @@
+"""Measures the cells of tables, one after the other, and keeps each as soon as it is known."""
+
+from __future__ import annotations
+
+import fnmatch
+import logging
+import math
+import shlex
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from statistics import fmean
+
+import torch
+
+from pointsplat_ns import __version__
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.pruning import need_usable, ply_bytes
+from pointsplat_ns.system.progress import Progress
+from pointsplat_ns.system.source_version import source_commit
+from pointsplat_ns.tables.cells import About, Cell, CellJournal, distributions, identity
+from pointsplat_ns.tables.making import Maker, Tools
+from pointsplat_ns.tables.scene import Opened, TableScene
+from pointsplat_ns.tables.ways import SEED, Way, all_cells, cell_key
+from pointsplat_ns.tradeoff.judging import Judge, Judged
+from pointsplat_ns.tradeoff.machine import machine_text, one_at_a_time
+from pointsplat_ns.tradeoff.making import Made
+from pointsplat_ns.tradeoff.points import Point
+from pointsplat_ns.tradeoff.settings import DENSE
+
+logger = logging.getLogger("pointsplat_ns")
+
+OTHERS = "scenes"
+"""The group of scenes of no dataset of the paper's, unless the user names another."""
+
+
+class Measuring:
+    """Measures what is not there yet of some scenes' cells.
+
+    Args:
+        scenes: of different names.
+        folder: of all tables.
+        shares: of Table 1.
+        tools: weights, programs and options.
+        only: patterns of keys, as ``fox/merge/10%`` or ``*/merge/*``. If there are any, only cells that match one are
+            measured, and those again if they are there.
+        progress: called with what is being done and the share of it that is done, in [0, 1].
+
+    Raises:
+        SceneError: if the folder holds cells of other scenes, views or another machine, or what is no journal.
+        PointSplatError: if two scenes have one name, or nothing matches ``only``.
+    """
+
+    def __init__(
+        self,
+        scenes: Sequence[TableScene],
+        folder: Path,
+        shares: Sequence[float],
+        tools: Tools,
+        only: Sequence[str],
+        progress: Progress,
+    ):
+        self.progress, self._again = progress, bool(only)
+        _need_different_names(scenes)
+        machine = machine_text(torch.device("cpu"))
+        self._work = [_SceneWork(scene, folder, tools, machine) for scene in scenes]
+        self._cells = [
+            (work, way, share)
+            for work in self._work
+            for way, share in all_cells(shares)
+            if not only or any(fnmatch.fnmatchcase(work.key(way, share), pattern) for pattern in only)
+        ]
+        if not self._cells:
+            raise PointSplatError(
+                f"{', '.join(only)}: no such cell; expected a name such as fox/merge/10%, or a pattern"
+            )
+        self.missing: dict[str, str] = {}
+        """Why cells could not be measured, by key."""
+        self._seconds: dict[str, list[float]] = {}
+
+    def run(self) -> None:
+        """Measure. A cell that cannot be made is left out, with the reason in :attr:`missing`.
+
+        Raises:
+            KeyboardInterrupt: what was measured is on disk.
+        """
+        wanted = []
+        for work, way, share in self._cells:
+            if why := work.missing(way, share):
+                self.missing[work.key(way, share)] = why
+            elif self._again or not work.has(way, share):
+                wanted.append((work, way, share))
+        try:
+            for done, (work, way, share) in enumerate(wanted):
+                for other in self._work:
+                    if other is not work:
+                        other.close()
+                self._measure(work, way, share, done, [later.name for _, later, _ in wanted[done + 1 :]])
+        finally:
+            for work in self._work:
+                work.close()
+
+    def _measure(self, work: _SceneWork, way: Way, share: float, done: int, later: list[str]) -> None:
+        furthest, of = 0.0, done + 1 + len(later)
+
+        def show(what: str, part: float) -> None:
+            # Making a scene has several tasks that each begin at 0; the whole never goes back.
+            nonlocal furthest
+            furthest = max(furthest, 0.7 * part if what else 0.7 + 0.3 * part)
+            self.progress("measuring", (done + furthest) / of)
+
+        key, start = work.key(way, share), time.perf_counter()
+        before = work.journal.cells.get((way.name, share))
+        try:
+            with one_at_a_time(self.progress):
+                cell = work.measure(way, share, show)
+        except PointSplatError as error:  # of this way alone: the others go on
+            self.missing[key] = str(error)
+            logger.warning("%s: left out: %s", key, error)
+            return
+        self._seconds.setdefault(way.name, []).append(time.perf_counter() - start)
+        again = "" if before is None else f"; {_difference(before, cell)}"
+        left = f" ({done + 1} of {of}; {self._minutes(later)} min left)" if later else ""
+        logger.info("%s: %s%s%s", key, _figures(cell.point), again, left)
+
+    def _minutes(self, later: list[str]) -> int:
+        """How long more cells may take: as long as others of the same way, or of any."""
+        usual = fmean(seconds for measured in self._seconds.values() for seconds in measured)
+        expected = sum(fmean(self._seconds[name]) if name in self._seconds else usual for name in later)
+        return max(1, math.ceil(expected / 60))
+
+
+class _SceneWork:
+    """One scene, which is read when its first cell is measured."""
+
+    def __init__(self, scene: TableScene, folder: Path, tools: Tools, machine: str):
+        self.scene, self.folder, self.tools, self.machine = scene, folder, tools, machine
+        self.journal = CellJournal(folder, scene.name)
+        self.identity = identity(scene, tools.options, machine)
+        self.journal.check(self.identity)
+        if scene.group is not None:
+            self.journal.regroup(scene.group)
+
+    def key(self, way: Way, share: float) -> str:
+        return cell_key(self.scene.name, way, share)
+
+    def missing(self, way: Way, share: float) -> str:
+        return self.tools.missing(way, share, self.scene.name)
+
+    def has(self, way: Way, share: float) -> bool:
+        """Whether a cell that can be measured has been, with the same weights, program and steps."""
+        cell = self.journal.cells.get((way.name, share))
+        return cell is not None and cell.made_with == self.tools.made_with(way, share, self.scene.name)
+
+    @cached_property
+    def _opened(self) -> tuple[Opened, Maker, Judge]:
+        opened = self.scene.open(self.tools.options)
+        need_usable(opened.dense)
+        judge = Judge(opened.dense, opened.held_out)
+        if judge.no_lpips:
+            logger.warning("%s: %s", self.scene.name, judge.no_lpips)
+        return opened, Maker(opened, self.scene.name, self.tools), judge
+
+    def close(self) -> None:
+        """Forget what has been read, which takes memory."""
+        if "_opened" in vars(self):
+            self._opened[1].close()
+            del self._opened
+
+    def measure(self, way: Way, share: float, show: Progress) -> Cell:
+        """Measure a cell and keep it."""
+        _, maker, judge = self._opened
+        made = maker.make(way, share, show)
+        judged = judge.judge(made.scene, self.key(way, share), lambda part: show("", part))
+        if way.name == DENSE:
+            judged = replace(judged, against_dense=replace(judged.against_dense, psnr=math.inf))
+        opacities, volumes = distributions(made.scene, way.name, share)
+        cell = Cell(
+            way=way.name,
+            point=self._point(way, share, made, judged),
+            made_with=self.tools.made_with(way, share, self.scene.name),
+            seed=SEED,
+            version=__version__,
+            commit=source_commit(),
+            opacities=opacities,
+            volumes=volumes,
+        )
+        self.journal.add(cell, self._about, self.identity)
+        return cell
+
+    @property
+    def _about(self) -> About:
+        held_out = self._opened[0].held_out
+        known = self.journal.about.group if self.journal.about is not None else self.scene.dataset or OTHERS
+        return About(
+            name=self.scene.name,
+            path=str(self.scene.path),
+            dataset=self.scene.dataset,
+            group=known if self.scene.group is None else self.scene.group,
+            origin=held_out.origin,
+            machine=self.machine,
+            views=len(held_out.views),
+            width=held_out.views.width,
+            height=held_out.views.height,
+        )
+
+    def _point(self, way: Way, share: float, made: Made, judged: Judged) -> Point:
+        command = ["pointsplat", "tables", str(self.scene.path), "-o", str(self.folder)]
+        command += ["--only", self.key(way, share), *self.tools.words(way, share, self.scene.name)]
+        repairs = {"fine-tuned": way.fine_tuned, "refiner": way.network is not None}
+        return Point(
+            key=self.key(way, share),
+            label=way.label,
+            command=shlex.join(command),
+            by=way.by or way.name,
+            share=share,
+            gaussians=len(made.scene),
+            sh_degree=made.scene.sh_degree,
+            repair=next((name for name, used in repairs.items() if used), way.repair),
+            bytes=ply_bytes(len(made.scene), made.scene.sh_degree),
+            against_dense=judged.against_dense,
+            against_photos=judged.against_photos,
+            frame_ms=judged.frame_ms,
+            frame_ms_low=judged.frame_ms_low,
+            frame_ms_high=judged.frame_ms_high,
+            seconds=made.seconds,
+            peak_bytes=made.peak_bytes,
+            others_cores=judged.others_cores,
+        )
+
+
+def _need_different_names(scenes: Sequence[TableScene]) -> None:
+    by_name: dict[str, Path] = {}
+    for scene in scenes:
+        other = by_name.setdefault(scene.name, scene.path)
+        if other is not scene.path:
+            raise PointSplatError(
+                f"{other} and {scene.path}: both are called {scene.name}; leave one out, or use another folder for it"
+            )
+
+
+def _figures(point: Point) -> str:
+    words = (
+        [] if math.isinf(point.against_dense.psnr) else [f"{point.against_dense.psnr:.2f} dB against the dense scene"]
+    )
+    words += [f"{point.against_photos.psnr:.2f} dB against photos"] if point.against_photos is not None else []
+    return ", ".join([*words, f"{point.gaussians:,} Gaussians", f"made in {point.seconds:.1f} s"])
+
+
+def _difference(before: Cell, now: Cell) -> str:
+    """Whether a cell that was measured again came out the same."""
+    same = ("against_dense", "against_photos", "gaussians")
+    if all(getattr(before.point, name) == getattr(now.point, name) for name in same):
+        return "the same quality as before"
+    if before.made_with != now.made_with:
+        return f"before, it was made with {before.made_with}"
+    return f"before, it was {_figures(before.point)}"

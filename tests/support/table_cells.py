@@ -1,0 +1,73 @@
+"""Cells of tables that are known in advance."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from pointsplat_ns.tables.cells import OPACITY_BINS, VOLUME_BINS, About, Cell, CellJournal
+from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_CELLS, Way, all_cells, cell_key
+from pointsplat_ns.tradeoff.points import Point, Quality
+
+IDENTITY = {"file": "abc", "machine": "a machine", "most views": 3}
+
+
+def about(name: str, group: str = "scenes", dataset: str = "") -> About:
+    """A scene judged in three views."""
+    return About(name, f"outputs/{name}", dataset, group, "held-out photos", "a machine", 3, 64, 48)
+
+
+def cell(name: str, way: Way, share: float, psnr: float, photos: float | None) -> Cell:
+    """A cell of a scene of 1,000 Gaussians, of a PSNR against renders and, if there are any, photos."""
+    shown = (way.name, share) in FIGURE_CELLS
+    middle = (*(0 for _ in range(9)), 7)
+    point = Point(
+        key=cell_key(name, way, share),
+        label=way.label,
+        command=f"pointsplat tables outputs/{name} -o tables --only {cell_key(name, way, share)}",
+        by=way.by or way.name,
+        share=share,
+        gaussians=round(1000 * share),
+        sh_degree=3,
+        repair="none",
+        bytes=round(248_000 * share),
+        against_dense=Quality(psnr, 0.9, 0.1),
+        against_photos=None if photos is None else Quality(photos, 0.8, 0.2),
+        frame_ms=10 * share,
+        frame_ms_low=9 * share,
+        frame_ms_high=12 * share,
+        seconds=1.5,
+    )
+    opacities = (*middle, *(0 for _ in range(OPACITY_BINS - 10))) if shown else None
+    volumes = (*middle, *(0 for _ in range(VOLUME_BINS - 10))) if shown else None
+    return Cell(way.name, point, "", 0, "0.1.0", "0123456789ab", opacities, volumes)
+
+
+def write_scene(
+    folder: Path,
+    name: str,
+    group: str = "scenes",
+    dataset: str = "",
+    worse: float = 0.0,
+    photos: bool = True,
+    without: tuple[str, ...] = (),
+) -> CellJournal:
+    """Write the cells of a scene at 30 and 10 %, in all ways but those without.
+
+    Args:
+        folder: of the tables.
+        name: of the scene.
+        group, dataset: of it.
+        worse: dB that all but the dense scene lose more than usual.
+        photos: whether there are photos.
+        without: names of ways that were not measured.
+    """
+    journal = CellJournal(folder, name)
+    for number, (way, share) in enumerate(all_cells((0.3, 0.1))):
+        dense = way == DENSE_WAY
+        lost = 0.0 if dense else 1 + worse + 0.1 * number
+        against = 30.0 - lost if photos else None
+        if way.name not in without:
+            made = cell(name, way, share, math.inf if dense else 40 - lost, against)
+            journal.add(made, about(name, group, dataset), IDENTITY)
+    return journal

@@ -1,0 +1,80 @@
+"""Time and memory of other programs, and that none is left behind."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import psutil
+import pytest
+
+from pointsplat_ns.system.programs import ProgramFailed, run_measured
+
+PARENT, CHILD = 2**30, 200_000_000
+"""Bytes held by the process that measures, and by the one that is measured."""
+
+
+def python(code: str) -> list[str]:
+    return [sys.executable, "-I", "-S", "-c", code]
+
+
+def test_peak_memory_is_the_childs_own_and_not_its_parents():
+    held = b"x" * PARENT
+    small = run_measured(python("pass")).peak_bytes
+    large = run_measured(python(f"held = b'x' * {CHILD}")).peak_bytes
+    assert len(held) == PARENT
+    assert small < CHILD / 4  # an interpreter alone takes about 10 MB
+    assert large - small == pytest.approx(CHILD, rel=0.02)  # pages, and what the allocator adds
+
+
+def test_peak_memory_is_that_of_the_largest_process():
+    code = f"import subprocess, sys; subprocess.run([sys.executable, '-c', 'held = b\"x\" * {CHILD}'], check=True)"
+    assert run_measured(python(code)).peak_bytes > CHILD
+
+
+BUSY = "import time\nwhile time.process_time() < 0.3: pass"
+
+
+def test_cpu_seconds_count_threads_and_processes_that_were_waited_for():
+    code = f"import subprocess, sys; [subprocess.run([sys.executable, '-c', {BUSY!r}]) for _ in range(2)]"
+    assert run_measured(python(BUSY)).cpu_seconds >= 0.29  # the clocks differ by a tick of 4 ms or so
+    assert run_measured(python(code)).cpu_seconds >= 0.58
+
+
+@pytest.mark.parametrize(
+    "code, said",
+    [
+        ("import sys; sys.exit('no such scene')", "ended with status 1: no such scene"),
+        ("import os; os.kill(os.getpid(), 9)", "was killed by signal 9"),
+    ],
+)
+def test_a_program_that_fails_is_an_error_with_what_it_said(code, said):
+    with pytest.raises(ProgramFailed, match=said):
+        run_measured(python(code))
+
+
+def test_a_program_that_is_not_there_is_an_error_that_names_it():
+    with pytest.raises(ProgramFailed, match="/no/such/program.*FileNotFoundError|No such file"):
+        run_measured(["/no/such/program"])
+
+
+def test_a_program_that_takes_too_long_is_ended_with_what_it_started(tmp_path):
+    started = tmp_path / "started"
+    code = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {WAITS!r}, {str(started)!r}])"
+    with pytest.raises(ProgramFailed, match="took more than 3 s and was ended"):
+        run_measured(python(code), timeout=3)
+    number = int(started.read_text())
+    for _ in range(100):  # until the system has taken it away
+        if not psutil.pid_exists(number) or psutil.Process(number).status() == psutil.STATUS_ZOMBIE:
+            return
+        time.sleep(0.05)
+    pytest.fail(f"process {number} is still there")
+
+
+WAITS = "import os, sys, time; open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"
+
+
+def test_the_error_of_a_failed_program_is_one_line():
+    with pytest.raises(ProgramFailed) as failed:
+        run_measured(python("import sys; sys.exit('no\\nsuch\\nscene')"))
+    assert str(failed.value).endswith("ended with status 1: no such scene")

@@ -1,0 +1,105 @@
+"""A small room whose tables are measured within seconds."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from making import box_room
+from pointsplat_ns.compression import repair, view_source
+from pointsplat_ns.pruning.view_sampling import sample_views
+from pointsplat_ns.refiner import Refiner, preset
+from pointsplat_ns.refiner.weights import save_refiner
+from pointsplat_ns.tables import measuring, outputs
+from pointsplat_ns.tables.ways import all_cells
+from pointsplat_ns.tradeoff import machine
+
+PEER = """#!{python}
+import re, sys
+if "--version" in sys.argv:
+    print("{says}")
+    sys.exit()
+overwrite, device, cpu, source, option, count, target = sys.argv[1:]
+if "{fails}" == option:
+    sys.exit("out of luck")
+header, found, rows = open(source, "rb").read().partition(b"end_header\\n")
+size, count = 4 * header.count(b"property float"), int(count)
+rows = rows[: count * size] if option == "--decimate" else rows[-count * size :]
+header = re.sub(rb"element vertex \\d+", b"element vertex %d" % count, header)
+open(target, "wb").write(header + found + rows)
+"""
+"""Stands for splat-transform, a Node package: keeps the first or the last Gaussians, or fails in one mode."""
+
+
+@pytest.fixture()
+def peer(tmp_path) -> Callable[..., str]:
+    """A function that writes such a program and gives its path."""
+
+    def write(says: str = "splat-transform v3.7.0 (0123abc)", fails: str = "") -> str:
+        path = tmp_path / "peer"
+        path.write_text(PEER.format(python=sys.executable, says=says, fails=fails))
+        path.chmod(0o755)
+        return str(path)
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def weights(tmp_path_factory) -> Callable[..., Path]:
+    """A function that writes a refiner that makes everything more opaque, and gives its path."""
+    folder = tmp_path_factory.mktemp("weights")
+
+    def write(name: str, metadata: dict, **changes) -> Path:
+        torch.manual_seed(7)
+        network = Refiner(preset("tiny", **changes))
+        with torch.no_grad():
+            [*network.heads.mlps["opacities"].modules()][-1].bias.fill_(0.5)
+        path = folder / f"{name}.safetensors"
+        save_refiner(network, path, metadata)
+        return path
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def room_views() -> ps.Views:
+    """Three small views of the room."""
+    return sample_views(box_room(0, 400), 3, 48, 36)
+
+
+@pytest.fixture()
+def room(tmp_path, room_views, no_lpips, monkeypatch) -> Path:
+    """A closed box of 400 Gaussians as a file, looked at from three views; repairs take two steps, figures are
+    none. Tests wait neither for one another nor for anything else on this machine."""
+    monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, **options: room_views[:count])
+    monkeypatch.setattr(machine, "LOCK", str(tmp_path / "lock"))
+    monkeypatch.setattr(machine, "TURN", 0.0)
+    monkeypatch.setattr(outputs, "plot_figure", lambda groups, path: path.write_text("a figure"))
+    monkeypatch.setitem(repair.STEPS, "quick", 2)
+    ps.save(box_room(0, 400), tmp_path / "room.ply")
+    return tmp_path / "room.ply"
+
+
+@pytest.fixture()
+def measured(room, tmp_path) -> Callable[..., list]:
+    """A function that measures the room's tables in a folder, at 30 %, with two steps of fine-tuning."""
+
+    def measure(*scenes: Path, folder: Path = tmp_path / "tables", **options):
+        usual = {"keeps": (0.3,), "views": 2, "fine_tune": 2, "splat_transform": "/no/such/program"}
+        return ps.measure_tables(scenes or (room,), folder, **{**usual, **options})
+
+    return measure
+
+
+@pytest.fixture()
+def few_ways(monkeypatch) -> None:
+    """Tables that have no more than the dense scene, the paper's selection at its lambda, and LightGaussian."""
+    few = ("dense", "paper", "lightgaussian", "lightgaussian-tuned")
+    monkeypatch.setattr(
+        measuring, "all_cells", lambda shares: [cell for cell in all_cells(shares) if cell[0].name in few]
+    )

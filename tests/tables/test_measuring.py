@@ -1,0 +1,237 @@
+"""Tables of a small room, really measured: every way, what cannot be measured, and going on."""
+
+from __future__ import annotations
+
+import json
+import logging
+
+import pytest
+
+import pointsplat_ns as ps
+from making import box_room
+from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.tables import making
+from pointsplat_ns.tables.cells import CELLS
+from pointsplat_ns.tables.ways import FIGURE_CELLS, Network, all_cells
+from pointsplat_ns.tradeoff.judging import Judge
+
+
+def cells_of(group) -> dict:
+    """Cells of the only scene of a group, by way and share."""
+    [scene] = group.scenes
+    return scene.cells
+
+
+def qualities(group) -> dict:
+    return {key: (cell.point.against_dense, cell.point.gaussians) for key, cell in cells_of(group).items()}
+
+
+@pytest.fixture()
+def all_weights(weights):
+    """Weights for every row."""
+    wanted = {way.network for way, _ in all_cells((0.3,)) if way.network}
+    return [
+        weights(
+            f"{network.encoder}-{network.by}-{network.opacity_weight}-{network.use_appearance:d}{network.use_position:d}",
+            {"by": network.by, "keep": 0.1, "opacity_weight": network.opacity_weight},
+            encoder=network.encoder,
+            use_appearance=network.use_appearance,
+            use_position=network.use_position,
+        )
+        for network in wanted
+    ]
+
+
+def test_every_cell_can_be_measured_and_says_by_what(measured, all_weights, peer, tmp_path):
+    [group] = measured(refiners=all_weights, splat_transform=peer())
+    cells = cells_of(group)
+    assert [*cells] == [(way.name, share) for way, share in all_cells((0.3,))]
+    dense = cells["dense", 1.0].point
+    for (way, share), cell in cells.items():
+        assert cell.point.gaussians == round(400 * share) and cell.point.key == f"room/{way}/{100 * share:g}%"
+        assert cell.point.command.startswith("pointsplat tables ") and f"--only {cell.point.key}" in cell.point.command
+        assert cell.version == ps.__version__ and cell.seed == 0
+        assert cell.point.against_photos is None and (cell.point.against_dense.psnr < 100 or cell.point == dense)
+        assert (cell.opacities is not None) == ((way, share) in FIGURE_CELLS)
+    psnr = {way: cell.point.against_dense.psnr for (way, share), cell in cells.items() if share == 0.3}
+    assert psnr["lightgaussian-tuned"] != psnr["lightgaussian"] and psnr["pointsplat"] != psnr["paper"]
+    assert psnr["splat-transform"] != psnr["splat-transform-adaptive"]
+    assert cells["splat-transform", 0.3].made_with == "splat-transform 3.7.0 -d"
+    assert cells["pup-tuned", 0.3].made_with == "2 steps"
+    assert cells["pointsplat", 0.3].made_with.endswith(
+        "(dual encoder, trained on scenes pruned by paper, lambda 0.3, keep 0.1)"
+    )
+    assert "--refiners" in cells["pointsplat", 0.3].point.command and "--fine-tune 2" in cells["pup", 0.3].point.command
+    content = json.loads((tmp_path / "tables" / "tables.json").read_text())
+    assert len(content["cells"]) == len(cells) and content["not_measured"] == {} and content["paper"] == {}
+    assert "not measured" not in (tmp_path / "tables" / "tables.md").read_text()
+
+
+def test_a_cell_is_what_the_functions_of_the_package_make(measured, room):
+    [group] = measured(only=["room/paper-0.7/*", "room/merge/*"])
+    dense = ps.load(room)
+    for way, share, small in (
+        ("paper-0.7", 0.1, ps.prune(dense, 0.1, "paper", opacity_weight=0.7)),
+        ("merge", 0.3, ps.prune(dense, 0.3)),
+    ):
+        views = ps.sample_views(dense, 3, 48, 36)[[0, 2]]
+        errors = [float(ps.psnr(ps.render(small, view), ps.render(dense, view))) for view in views]
+        assert cells_of(group)[way, share].point.against_dense.psnr == pytest.approx(sum(errors) / 2, abs=1e-4)
+
+
+def test_what_cannot_be_measured_is_not_and_says_why(measured, tmp_path, weights):
+    """Weights that ship, or that were trained for another selection, stand in for nobody's."""
+    other = weights("merged", {"by": "merge", "keep": 0.1})
+    [group] = measured(refiners=[other], only=["room/dense/*", "room/p*/*", "room/splat*/*"])
+    ways = {way for way, _ in cells_of(group)}
+    assert not ways & {"pointsplat", "pointsplat-0.1", "paper-splatformer", "splat-transform"} and "paper" in ways
+    said = json.loads((tmp_path / "tables" / "tables.json").read_text())["not_measured"]
+    assert said["room/pointsplat/30%"].startswith("no weights were given (--refiners) of a dual encoder, trained on")
+    assert said["room/splat-transform/30%"] == "splat-transform cannot be run (/no/such/program: FileNotFoundError)"
+    rows = [line for line in (tmp_path / "tables" / "tables.md").read_text().splitlines() if "| PointSplat |" in line]
+    assert rows and all("| not measured | - |" in line for line in rows)
+
+
+def test_weights_that_know_the_scene_do_not_test_it(measured, weights, tmp_path):
+    knows = weights("knows", {"by": "paper", "keep": 0.3, "scenes": ["hall", "room"]})
+    measured(refiners=[knows], only=["room/pointsplat/*", "room/paper/*"])
+    said = json.loads((tmp_path / "tables" / "tables.json").read_text())["not_measured"]
+    assert "were trained on this scene" in said["room/pointsplat/30%"]
+
+
+def test_of_several_weights_those_of_the_nearest_budget_are_taken(weights):
+    from pointsplat_ns.tables.refiners import Refiners
+
+    paths = [weights(f"keep{keep}", {"by": "paper", "keep": keep}) for keep in (0.1, 0.3, 500)]
+    refiners = Refiners(paths)
+    for share, path in ((0.1, paths[0]), (0.15, paths[0]), (0.2, paths[1]), (0.5, paths[1])):
+        assert refiners.find(Network(), share, "room")[0].path == path
+
+
+def test_a_program_that_fails_leaves_out_its_own_cell_alone(measured, peer, tmp_path, caplog):
+    [group] = measured(splat_transform=peer(fails="--decimate"), only=["room/splat*/*"])
+    assert [*cells_of(group)] == [("splat-transform-adaptive", 0.3)]
+    said = json.loads((tmp_path / "tables" / "tables.json").read_text())["not_measured"]["room/splat-transform/30%"]
+    assert "ended with status 1: out of luck" in said and "room/splat-transform/30%: left out: " in caplog.text
+
+
+def test_an_interrupted_run_goes_on_and_loses_nothing(measured, few_ways, tmp_path, monkeypatch):
+    judge, asked = Judge.judge, []
+
+    def interrupted(self, scene, key, progress):
+        asked.append(key)
+        if len(asked) == 4:
+            raise KeyboardInterrupt
+        return judge(self, scene, key, progress)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Judge, "judge", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            measured()
+    journal = tmp_path / "tables" / "room" / CELLS
+    before = json.loads(journal.read_text())["cells"]
+    assert (
+        [cell["point"]["key"] for cell in before]
+        == asked[:3]
+        == ["room/dense/100%", "room/paper/10%", "room/paper/30%"]
+    )
+    assert "3DGS (dense)" in (tmp_path / "tables" / "tables.md").read_text()
+    measured()
+    assert json.loads(journal.read_text())["cells"][:3] == before  # also their times: they are not measured again
+    monkeypatch.setattr(Judge, "judge", lambda *args: pytest.fail("nothing is left to be measured"))
+    measured()
+
+
+def test_measuring_a_cell_again_gives_the_same_quality_to_the_bit(measured, caplog):
+    again = ["room/lightgaussian-tuned/30%", "room/dense/100%", "room/compact/30%"]
+    [first] = measured(only=again)
+    with caplog.at_level(logging.INFO, "pointsplat_ns"):
+        [second] = measured(only=again)
+    assert qualities(first) == qualities(second)
+    assert caplog.text.count("the same quality as before") == 3
+    assert cells_of(first)["compact", 0.3].point.seconds != cells_of(second)["compact", 0.3].point.seconds
+
+
+def test_more_steps_are_measured_and_other_cells_left_alone(measured, few_ways):
+    [first] = measured()
+    [second] = measured(fine_tune=3)
+    assert cells_of(second)["lightgaussian-tuned", 0.3].made_with == "3 steps"
+    unchanged = [key for key, cell in cells_of(first).items() if cell == cells_of(second)[key]]
+    assert unchanged == [("dense", 1.0), ("paper", 0.1), ("paper", 0.3), ("lightgaussian", 0.3)]
+
+
+def test_scores_are_computed_once_for_all_budgets(measured, few_ways, monkeypatch):
+    scored, score_of = [], making.score_of
+
+    def counted(scene, method, *args):
+        scored.append(method.name)
+        return score_of(scene, method, *args)
+
+    monkeypatch.setattr(making, "score_of", counted)
+    measured(keeps=(0.5, 0.3))
+    assert scored == ["paper", "lightgaussian"]
+
+
+def test_tables_are_of_all_scenes_of_the_folder(measured, tmp_path, room):
+    ps.save(box_room(1, 300), tmp_path / "hall.ply")
+    only = ["*/paper/30%", "*/dense/*"]
+    measured(only=only, groups=["halls=room"])
+    groups = measured(tmp_path / "hall.ply", only=only)
+    assert [(group.name, [scene.about.name for scene in group.scenes]) for group in groups] == [
+        ("halls", ["room"]),
+        ("scenes", ["hall"]),
+    ]
+    groups = measured(tmp_path / "hall.ply", room, only=only, groups=["both=room,hall"])
+    assert [group.name for group in groups] == ["both"]
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        ({"only": ["room/magic/10%"]}, "room/magic/10%: no such cell; expected a name such as fox/merge/10%"),
+        ({"keeps": (0.3, 1.5)}, "keeps are 0.3, 1.5; expected shares"),
+        ({"views": 0}, "views: 0; expected at least 1"),
+        ({"fine_tune": -1}, "fine tune: -1; expected at least 1"),
+        ({"groups": ["rooms"]}, "group 'rooms': expected NAME=SCENE,SCENE"),
+        ({"groups": ["rooms=hall"]}, "groups name hall; expected some of the scenes room"),
+        ({"refiners": ["/no/such.safetensors"]}, "no such file"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(measured, options, said):
+    with pytest.raises(PointSplatError, match=said):
+        measured(**options)
+
+
+def test_two_scenes_of_one_name_are_refused(measured, room, tmp_path):
+    (tmp_path / "other").mkdir()
+    ps.save(box_room(1, 300), tmp_path / "other" / "room.ply")
+    with pytest.raises(PointSplatError, match="both are called room"):
+        measured(room, tmp_path / "other" / "room.ply")
+
+
+def test_no_scene_is_refused(tmp_path):
+    with pytest.raises(PointSplatError, match="no scene is named"):
+        ps.measure_tables([], tmp_path / "tables")
+
+
+def test_cells_of_another_scene_or_of_other_views_are_refused_unless_forced(measured, room):
+    only = ["room/dense/*"]
+    measured(only=only)
+    with pytest.raises(SceneError, match="largest side"):
+        measured(only=only, side=40)
+    ps.save(box_room(5, 200), room)
+    with pytest.raises(SceneError, match="are of another scene's tables .file"):
+        measured(only=only)
+    [group] = measured(only=only, force=True)
+    assert cells_of(group)["dense", 1.0].point.gaussians == 200
+
+
+def test_files_of_others_are_not_overwritten(measured, tmp_path):
+    (tmp_path / "tables").mkdir()
+    (tmp_path / "tables" / "tables.md").write_text("mine")
+    with pytest.raises(SceneError, match="tables.md: exists already"):
+        measured()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SceneError, match="is a file"):
+        measured(folder=tmp_path / "file")
+    assert (tmp_path / "tables" / "tables.md").read_text() == "mine"

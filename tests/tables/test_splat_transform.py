@@ -1,0 +1,1 @@
+"""splat-transform, as far as it can be tested without Node."""

@@ -1,0 +1,86 @@
+"""Names of cells and rows, and the paper's figures."""
+
+from __future__ import annotations
+
+import shlex
+
+import pytest
+
+from pointsplat_ns.pruning import METHODS
+from pointsplat_ns.tables import paper
+from pointsplat_ns.tables.paper import DATASETS, published
+from pointsplat_ns.tables.ways import (
+    SHARES,
+    TABLE_1,
+    TABLE_3,
+    TABLE_4,
+    Network,
+    all_cells,
+    cell_key,
+    selected,
+)
+from pointsplat_ns.tradeoff.points import Quality
+
+CELLS = all_cells(SHARES)
+
+
+def test_no_two_cells_have_one_name_and_a_shell_reads_each_as_it_is():
+    keys = [cell_key("fox", way, share) for way, share in CELLS]
+    assert len(set(keys)) == len(keys) and shlex.split(" ".join(keys)) == keys
+    assert "fox/merge/10%" in keys and "fox/dense/100%" in keys
+
+
+def test_every_row_has_a_cell():
+    cells = {(way.name, share) for way, share in CELLS}
+    assert {(way.name, share) for way in TABLE_1 for share in SHARES} <= cells
+    assert {(way.name, 0.1) for way in (*TABLE_4, *(way for _, way in TABLE_3))} <= cells
+
+
+def test_every_row_is_made_in_exactly_one_way():
+    for way in {way for way, _ in CELLS if way.name != "dense"}:
+        assert (way.by in METHODS) != (way.mode is not None), way
+        assert sum([way.fine_tuned, way.network is not None, way.repair != "none", way.mode is not None]) <= 1, way
+
+
+def test_networks_are_told_apart_by_all_that_tables_vary():
+    wanted = {way.network for way, _ in CELLS if way.network}
+    assert len(wanted) == 2 + 5 + 3  # SplatFormer's two, five lambdas, and the ablations of Table 4
+    text = str(Network(use_appearance=False, use_position=False))
+    assert text.startswith("dual encoder without appearance branch and position encoding, trained on scenes pruned by")
+
+
+def test_the_middle_lambda_is_the_row_of_table_1():
+    assert selected(0.3) in TABLE_1 and selected(0.5) not in TABLE_1
+
+
+def test_every_figure_of_the_paper_has_a_row():
+    cells = {(way.name, share) for way, share in CELLS}
+    assert {*paper._TABLE_1} <= cells and {*paper._TABLE_3} <= cells
+    assert [way.name for way in TABLE_4] == [*paper._TABLE_4]
+    assert len(paper._TABLE_1) == 1 + 8 * 3 and len(paper._TABLE_3) == 10
+
+
+@pytest.mark.parametrize(
+    "table, dataset, way, share, expected",
+    [
+        (1, "ScanNet++", "dense", 1.0, Quality(29.73, 0.925, 0.165)),
+        (1, "Replica", "splatformer", 0.1, Quality(8.37, 0.388, 0.677)),
+        (1, "ScanNet++", "pup-tuned", 0.3, Quality(30.85, 0.931, 0.172)),
+        (3, "Replica", "pointsplat-0.9", 0.1, Quality(26.58, 0.882, 0.290)),
+        (4, "ScanNet++", "pointsplat-iii", 0.1, Quality(22.76, 0.847, 0.385)),
+        (4, "Replica", "pointsplat-iii", 0.1, None),
+        (1, "Replica", "merge", 0.1, None),
+    ],
+)
+def test_figures_are_the_papers(table, dataset, way, share, expected):
+    assert published(table, dataset, way, share) == expected
+
+
+def test_of_other_datasets_the_paper_has_nothing():
+    assert not any(
+        published(table, dataset, way.name, share)
+        for table in (1, 3, 4)
+        for dataset in ("", "replica", "rooms", "scenes")
+        for way, share in CELLS
+        if dataset not in DATASETS
+    )
