@@ -13,7 +13,7 @@ from typing import Literal
 from torch import Tensor
 
 from pointsplat_ns.compression.compact import Compacted, compact_scene, resolve_options
-from pointsplat_ns.compression.level_folder import check_folder, source_file
+from pointsplat_ns.compression.level_folder import check_folder
 from pointsplat_ns.compression.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
 from pointsplat_ns.compression.prune import check_options, prune_scene
 from pointsplat_ns.compression.repair import Effort, RepairBudget
@@ -29,6 +29,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.runs import REFINER_METHOD, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
+from pointsplat_ns.io.source import source_file
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
 from pointsplat_ns.pruning import Keep

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import content_hash, open_run, write_ply
+from pointsplat_ns.io import content_hash, write_ply
 from pointsplat_ns.io.files import replacing, write_json
 from pointsplat_ns.pruning.content import content_box
 from pointsplat_ns.rasterizer import render
@@ -28,28 +27,6 @@ MANIFEST, PICTURE = "lod.json", "lod.png"
 
 _COLUMNS = 3
 """Images side by side in the picture."""
-
-
-@dataclass(frozen=True)
-class SourceFile:
-    """The file that a dense scene was read from."""
-
-    name: str
-    bytes: int
-    sha256: str
-
-
-def source_file(path: Path | str) -> SourceFile:
-    """The file that :func:`~pointsplat_ns.io.read_scene` reads a scene from: for a run, its checkpoint.
-
-    Raises:
-        SceneError: if there is none, or it cannot be read.
-    """
-    path = Path(path)
-    if path.is_dir() or path.suffix.lower() in (".yml", ".yaml"):
-        path = open_run(path, need_data=False).checkpoint
-    digest = content_hash(path)
-    return SourceFile(path.name, path.stat().st_size, digest)
 
 
 def file_names(index: int) -> tuple[str, str]:

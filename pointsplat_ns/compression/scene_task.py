@@ -19,11 +19,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pointsplat_ns.compression.level_folder import source_file
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import content_hash, logger, one_line, replacing
 from pointsplat_ns.io.ply import write_ply
+from pointsplat_ns.io.source import source_file
 from pointsplat_ns.system.claims import claim
 
 Status = Literal["done", "done before", "failed", "open"]

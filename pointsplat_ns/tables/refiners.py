@@ -9,8 +9,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pointsplat_ns.compression.level_folder import source_file
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
+from pointsplat_ns.io.source import source_file
 from pointsplat_ns.pruning import method_named
 from pointsplat_ns.pruning.scores import DEFAULT_OPACITY_WEIGHT
 from pointsplat_ns.refiner import read_metadata

@@ -1,0 +1,55 @@
+"""The file that a scene is read from, by what it holds: what is made of it names it, and knows it again."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.io.files import content_hash, one_line
+from pointsplat_ns.io.formats import SOG_META
+from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, open_run
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """The file that a dense scene was read from. Of a SOG folder, ``bytes`` are those of all its files, and ``sha256``
+    is that of the lines "name hash" of each, by name."""
+
+    name: str
+    bytes: int
+    sha256: str
+
+
+def source_file(path: Path | str) -> SourceFile:
+    """The file that :func:`~pointsplat_ns.io.read_scene` reads a scene from: for a run, its checkpoint.
+
+    Args:
+        path: as for ``read_scene``.
+
+    Raises:
+        SceneError: if there is none, or it cannot be read.
+    """
+    path = Path(path)
+    parts = _sog_parts(path)
+    if parts:
+        hashes = "".join(f"{part.name} {content_hash(part)}\n" for part in parts)
+        total = sum(part.stat().st_size for part in parts)
+        return SourceFile(parts[0].parent.resolve().name, total, hashlib.sha256(hashes.encode()).hexdigest())
+    if path.is_dir() or path.suffix.lower() in RUN_SUFFIXES:
+        path = open_run(path, need_data=False).checkpoint
+    digest = content_hash(path)
+    return SourceFile(path.name, path.stat().st_size, digest)
+
+
+def _sog_parts(path: Path) -> list[Path]:
+    """The files of a SOG folder, by name: its ``meta.json`` and its images; none if the path is no such folder."""
+    folder = path.parent if path.name == SOG_META else path
+    if not (folder / SOG_META).is_file() or (folder / CONFIG_NAME).is_file():
+        return []
+    try:
+        names = sorted(part for part in folder.iterdir() if part.name == SOG_META or part.suffix.lower() == ".webp")
+        return [part for part in names if part.is_file()]
+    except OSError as error:
+        raise SceneError(f"{folder}: cannot be read ({error.strerror or one_line(error)})") from error
