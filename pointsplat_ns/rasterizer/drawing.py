@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -39,13 +41,13 @@ class Drawing:
     def __init__(self, scene: Gaussians, view: View, quality: QualityName = "exact"):
         seen = project(
             scene.means, scene.quats, scene.stds, scene.alphas, view.viewmat, view.K, view.width, view.height,
-            view.near_plane, antialiased=view.rasterize_mode == "antialiased",
+            view.near_plane, far_plane=math.inf, antialiased=view.rasterize_mode == "antialiased",
         )  # fmt: skip
         seen, self._colors, _ = finite_colors(seen, scene.sh, 0, False, scene.sh_degree)
         level = QUALITIES[quality]
         self._seen, self._options = seen, BlendOptions(level)
         self._footprints = Footprints(
-            seen.means2d, seen.cov2d, seen.det, seen.opacities, seen.depths, torch.zeros_like(seen.ids), 1,
+            seen.means2d, seen.cov2d, seen.det, seen.opacities, seen.beyond, torch.zeros_like(seen.ids), 1,
             view.width, view.height, level.alpha_min,
         )  # fmt: skip
         self._width, self._height = view.width, view.height
