@@ -29,7 +29,7 @@ def cpu_quota(root: Path = Path("/")) -> float | None:
         return None
     found = []
     for line in lines:
-        _, controllers, group = line.split(":", 2)
+        _, controllers, group = (line.split(":", 2) + ["", ""])[:3]
         if controllers == "":  # version 2
             top, limit_of = root / "sys/fs/cgroup", _limit_v2
         elif "cpu" in controllers.split(","):

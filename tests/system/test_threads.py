@@ -1,13 +1,17 @@
-"""Pieces of work on several threads."""
+"""Pieces of work on several threads, and the cores that there are for them."""
 
 from __future__ import annotations
 
+import os
 import threading
+from pathlib import Path
 
 import pytest
 import torch
 
-from pointsplat_ns.system.threads import in_threads
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.system.cores import cores, cpu_quota
+from pointsplat_ns.system.threads import fixed_threads, in_threads
 
 
 @pytest.mark.parametrize("threads", [1, 3])
@@ -38,3 +42,50 @@ def test_an_error_reaches_the_caller(monkeypatch):
 
     with pytest.raises(ValueError, match="item 0"):
         in_threads(fail, range(5))
+
+
+@pytest.mark.parametrize("variable", [None, "7"])
+def test_a_fixed_number_of_threads_is_that_of_torch_and_of_programs_that_are_started(monkeypatch, variable):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if variable is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", variable)
+    before = torch.get_num_threads()
+    with pytest.raises(KeyError), fixed_threads(before + 2):
+        assert torch.get_num_threads() == before + 2
+        assert os.environ["OMP_NUM_THREADS"] == str(before + 2)
+        raise KeyError
+    assert torch.get_num_threads() == before and os.environ.get("OMP_NUM_THREADS") == variable
+
+
+def test_less_than_one_thread_is_refused():
+    with pytest.raises(PointSplatError, match="0 threads; expected at least 1"), fixed_threads(0):
+        pass
+
+
+def machine(root: Path, cgroup: str, **files: str) -> Path:
+    """A folder with what Linux says of a process's control groups; ``files`` by their paths below sys/fs/cgroup."""
+    for name, text in {"proc/self/cgroup": cgroup, **{f"sys/fs/cgroup/{k}": v for k, v in files.items()}}.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text, "utf-8")
+    return root
+
+
+def test_quotas_of_control_groups_are_read(tmp_path):
+    nested = {"cpu.max": "max 100000", "a/cpu.max": "150000 100000\n", "a/b/cpu.max": "400000 100000"}
+    assert cpu_quota(machine(tmp_path / "v2", "0::/a/b\n", **nested)) == 1.5
+    assert cpu_quota(machine(tmp_path / "none", "0::/a\n", **{"a/cpu.max": "max 100000\n"})) is None
+    inside = machine(tmp_path / "container", "0::/as/the/host/sees/it\n", **{"cpu.max": "300000 100000"})
+    assert cpu_quota(inside) == 3
+    old = {"cpu,cpuacct/a/cpu.cfs_quota_us": "250000", "cpu,cpuacct/a/cpu.cfs_period_us": "100000"}
+    assert cpu_quota(machine(tmp_path / "v1", "3:cpuset:/a\n2:cpu,cpuacct:/a\n", **old)) == 2.5
+    unlimited = {"cpu/a/cpu.cfs_quota_us": "-1", "cpu/a/cpu.cfs_period_us": "100000"}
+    assert cpu_quota(machine(tmp_path / "v1 free", "2:cpu:/a\n", **unlimited)) is None
+    assert cpu_quota(tmp_path / "another system") is None
+    assert cpu_quota(machine(tmp_path / "broken", "what is this\n0::/a\n", **{"a/cpu.max": "0 0"})) is None
+
+
+@pytest.mark.parametrize(("quota", "expected"), [(None, 4), (1.5, 1), (0.2, 1), (3.0, 3), (64.0, 4)])
+def test_cores_are_those_of_the_affinity_and_the_quota(monkeypatch, quota, expected):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 2, 4, 6}, raising=False)
+    monkeypatch.setattr("pointsplat_ns.system.cores.cpu_quota", lambda: quota)
+    assert cores() == expected
