@@ -139,7 +139,7 @@ class Layout:
         for way, share in cells:
             for scene in self.group.scenes:
                 if (way.name, share) not in scene.cells:
-                    why = self.missing.get(cell_key(scene.about.name, way, share), "nobody has asked for it yet")
+                    why = self.missing.get(cell_key(scene.about.name, way, share), "not yet")
                     names = rows.setdefault(why, {}).setdefault(way.label, [])
                     names += [] if scene.about.name in names else [scene.about.name]
         everywhere, notes = len(self.group.scenes), []
@@ -189,5 +189,7 @@ def _worst(mean: Mean) -> str:
     return f"{mean.worst} {mean.worst_psnr:.2f}{lost}"
 
 
-def _fps(value: float) -> str:
+def _fps(value: float | None) -> str:
+    if value is None:
+        return "busy"
     return f"{value:.3g}" if value < 100 else f"{value:.0f}"

@@ -12,6 +12,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.tables.cells import CELLS, About, Cell, CellJournal
 from pointsplat_ns.tables.paper import DATASETS
 from pointsplat_ns.tables.ways import DENSE_WAY
+from pointsplat_ns.tradeoff.machine import is_busy
 from pointsplat_ns.tradeoff.points import Point, Quality
 
 
@@ -40,8 +41,8 @@ class Mean:
     renders: Quality
     gaussians: float
     megabytes: float
-    fps: float
-    """Frames a second."""
+    fps: float | None
+    """Frames a second; None if other programs kept the machine busy while they were timed."""
     scenes: int
     """Number of scenes that it is the mean of."""
     worst: str
@@ -83,12 +84,17 @@ class Group:
             renders=_mean([point.against_dense for point in points]),
             gaussians=fmean(point.gaussians for point in points),
             megabytes=fmean(point.bytes / 1e6 for point in points),
-            fps=fmean(1000 / point.frame_ms if point.frame_ms > 0 else math.inf for point in points),
+            fps=None if any(map(_disturbed, points)) else fmean(1000 / point.frame_ms for point in points),
             scenes=len(points),
             worst=worst.about.name,
             worst_psnr=(point.against_photos or point.against_dense).psnr,
             worst_loss=worst.loss(point),
         )
+
+
+def _disturbed(point: Point) -> bool:
+    """Whether the time of a frame means nothing."""
+    return not 0 < point.frame_ms < math.inf or (point.others_cores is not None and is_busy(point.others_cores))
 
 
 def _badness(scene: SceneCells, point: Point) -> tuple[float, float]:

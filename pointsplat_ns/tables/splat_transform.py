@@ -76,7 +76,7 @@ class SplatTransform:
         except (OSError, subprocess.TimeoutExpired) as error:
             self.missing = f"{self.command[0]}: {error.__class__.__name__}"
             return
-        version = re.search(r"(?:^|\s)v((\d{1,6})[.\w+-]*)", found.stdout + found.stderr)
+        version = re.search(r"(?:^|\s)v((\d{1,6})\.[\w.+-]{1,40})(?=\s|$)", found.stdout + found.stderr)
         if found.returncode != 0 or version is None:
             self.missing = f"{' '.join(self.command)} ended with {found.returncode}; is Node's package installed?"
             return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -131,6 +132,15 @@ def test_means_are_over_scenes_and_name_the_one_that_loses_most(tmp_path):
     alone = rooms.mean("merge", 0.1)
     assert alone.photos is None and alone.worst_loss is None and alone.worst == "a_room"
     assert scenes.mean("merge", 0.77) is None
+
+
+def test_frames_that_were_timed_on_a_busy_machine_do_not_count(tmp_path):
+    journal = write_scene(tmp_path, "fox")
+    one = journal.cells["merge", 0.1]
+    for changes in ({"others_cores": 100.0}, {"frame_ms": 0.0}):
+        journal.add(replace(one, point=replace(one.point, **changes)), journal.about, IDENTITY)
+        [group] = read_groups(tmp_path)
+        assert group.mean("merge", 0.1).fps is None and group.mean("paper", 0.1).fps == pytest.approx(1000)
 
 
 def test_a_mean_of_photos_needs_photos_of_all_scenes(tmp_path):

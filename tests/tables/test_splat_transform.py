@@ -1,1 +1,58 @@
 """splat-transform, as far as it can be tested without Node."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+import pointsplat_ns as ps
+from making import box_room
+from pointsplat_ns.system.programs import ProgramFailed
+from pointsplat_ns.tables.splat_transform import Reducer, SplatTransform
+
+
+def test_each_mode_makes_a_smaller_scene(peer, tmp_path):
+    found = SplatTransform(peer())
+    assert (found.version, found.missing) == ("3.7.0", "")
+    ps.save(box_room(0, 60), tmp_path / "room.ply")
+    before = sorted(tmp_path.iterdir())
+    small = [mode.reduce(tmp_path / "room.ply", 20) for mode in found.modes]
+    assert [len(scene) for scene, _ in small] == [20, 20] and small[0][1].seconds > 0
+    assert not (small[0][0].means == small[1][0].means).all()
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    "says, version, modes",
+    [
+        ("splat-transform v2.7.1", "2.7.1", 1),
+        ("v10.0.0-beta.1", "10.0.0-beta.1", 2),
+        ("warning: old\nv3.0.0", "3.0.0", 2),
+    ],
+)
+def test_versions_are_told_apart(peer, says, version, modes):
+    found = SplatTransform(peer(says.replace("\n", "\\n")))
+    assert found.version == version and len(found.modes) == modes
+
+
+@pytest.mark.parametrize("says", ["", "no version", "vx.y", "v" + "9" * 5000])
+def test_what_is_no_version_is_none(peer, says):
+    found = SplatTransform(peer(says))
+    assert found.modes == () and "ended with 0; is Node's package installed?" in found.missing
+
+
+def test_a_program_that_is_not_there_is_named():
+    assert SplatTransform("/no/such/program").missing == "/no/such/program: FileNotFoundError"
+
+
+def test_a_program_that_writes_nothing_is_an_error(tmp_path):
+    reducer = Reducer("idle", lambda source, count, target: [sys.executable, "-I", "-S", "-c", "pass"])
+    with pytest.raises(ProgramFailed, match="wrote no file"):
+        reducer.reduce(tmp_path / "room.ply", 10)
+
+
+def test_a_program_that_hangs_is_ended(tmp_path):
+    waits = [sys.executable, "-I", "-S", "-c", "import time; time.sleep(600)"]
+    with pytest.raises(ProgramFailed, match="took more than 1 s"):
+        Reducer("hangs", lambda source, count, target: waits).reduce(tmp_path / "room.ply", 10, timeout=1)

@@ -1,0 +1,72 @@
+"""Tables of trained runs, against their held-out photos; and which runs are of the paper's datasets."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
+from pointsplat_ns.nerfstudio_plugin.paper_datasets import paper_dataset
+from pointsplat_ns.tables import outputs
+from pointsplat_ns.tradeoff import machine
+
+
+def test_a_run_is_judged_by_its_held_out_photos_and_tuned_on_the_others(trained_walls, tmp_path, no_lpips, monkeypatch):
+    monkeypatch.setattr(machine, "LOCK", str(tmp_path / "lock"))
+    monkeypatch.setattr(outputs, "plot_figure", lambda groups, path: path.write_text("a figure"))
+    (config,) = (trained_walls / "wall-b").rglob("config.yml")
+    only = ["wall-b/dense/*", "wall-b/lightgaussian/50%", "wall-b/lightgaussian-tuned/50%"]
+    [group] = ps.measure_tables([config.parent], tmp_path / "tables", only=only, fine_tune=8)
+    [scene] = group.scenes
+    views, photos = dataset_photos(config.parent, "test", 10)
+    dense = ps.load(config.parent)
+    errors = torch.stack([ps.psnr(ps.render(dense, view), photo) for view, photo in zip(views, photos, strict=True)])
+    points = {way: cell.point for (way, _), cell in scene.cells.items()}
+    assert points["dense"].against_photos.psnr == pytest.approx(float(errors.mean()), abs=1e-4)
+    assert points["lightgaussian-tuned"].against_photos.psnr > points["lightgaussian"].against_photos.psnr
+    assert points["lightgaussian-tuned"].against_dense.psnr < 100 and scene.about.origin == "held-out photos"
+    assert scene.about.dataset == "" and group.name == "scenes"
+    written = json.loads((tmp_path / "tables" / "tables.json").read_text())
+    assert written["cells"][0]["point"]["against_photos"]["psnr"] == points["dense"].against_photos.psnr
+
+
+def replica(folder: Path, name: str, size: tuple[int, int] = (1200, 680), frames: int = 2000) -> SimpleNamespace:
+    """A run of a scene in the Replica layout whose photos are empty files."""
+    scene = folder / name
+    (scene / "results").mkdir(parents=True)
+    for number in range(frames):
+        (scene / "results" / f"frame{number:06d}.jpg").touch()
+    (scene / "traj.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n" * frames)
+    camera = {"w": size[0], "h": size[1], "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}
+    (scene / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    return run(scene, "pointsplat_ns.nerfstudio_plugin.replica.dataparser.ReplicaDataParserConfig")
+
+
+def run(data: Path, parser: str) -> SimpleNamespace:
+    return SimpleNamespace(data=data, dataparser_class=parser)
+
+
+SCANNETPP = "nerfstudio.data.dataparsers.scannetpp_dataparser.ScanNetppDataParserConfig"
+
+
+def test_the_papers_replica_is_known_by_name_size_and_number_of_photos(tmp_path):
+    assert paper_dataset(replica(tmp_path, "office2")) == "Replica"
+    assert paper_dataset(replica(tmp_path, "kitchen", frames=3)) == ""
+    assert paper_dataset(replica(tmp_path / "few", "office2", frames=3)) == ""
+    # The rooms that this package makes are of the same layout and may be called the same.
+    assert paper_dataset(replica(tmp_path / "made", "room0", (320, 240), frames=80)) == ""
+    assert paper_dataset(replica(tmp_path / "small", "room0", (320, 240))) == ""
+
+
+def test_scannetpp_is_known_by_the_names_of_its_scenes(tmp_path):
+    for name in ("0a5c013435", "fox"):
+        (tmp_path / name / "dslr").mkdir(parents=True)
+    assert paper_dataset(run(tmp_path / "0a5c013435", SCANNETPP)) == "ScanNet++"
+    assert paper_dataset(run(tmp_path / "fox", SCANNETPP)) == ""
+    assert paper_dataset(run(tmp_path / "0a5c013436", SCANNETPP)) == ""
+    assert paper_dataset(run(tmp_path / "0a5c013435", "nerfstudio.NerfstudioDataParserConfig")) == ""
