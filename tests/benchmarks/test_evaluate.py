@@ -26,6 +26,7 @@ PROGRAMS = (
     "refiner",
     "repair",
     "sampled_views",
+    "stability",
 )
 
 
