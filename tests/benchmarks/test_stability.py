@@ -40,7 +40,8 @@ def test_the_classic_formulas_are_those_of_the_reference(cases, measures, name):
         ("in_other_units", 1e30, True),
         ("from_the_origin", 1e7, True),
         ("needles", 1e5, True),
-        ("from_the_camera", 1e6, False),
+        ("from_the_camera", 1e6, True),
+        ("as_large_as", 1e6, False),
     ],
 )
 def test_the_rasterizer_holds_where_the_classic_formulas_may_not(cases, measures, make, value, fails):

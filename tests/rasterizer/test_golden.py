@@ -78,9 +78,7 @@ def test_the_reference_is_what_it_was(name, stored):
     compare(golden.drawn_by_reference(golden.SCENES[name], stored[name]), stored[name], STORED, STORED)
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"packed": False}, {"memory_budget": 4000}], ids=["packed", "dense", "regions"]
-)
+@pytest.mark.parametrize("options", PATHS.values(), ids=PATHS)
 @pytest.mark.parametrize("dtype", [F32, F64])
 @pytest.mark.parametrize("name", golden.SCENES)
 def test_the_fast_path_draws_the_stored_images(name, dtype, options, stored):
