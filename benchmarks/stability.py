@@ -3,9 +3,9 @@
     OMP_NUM_THREADS=1 python benchmarks/stability.py --output outputs/stability
 
 Small scenes are driven to extremes of one property each (:mod:`stability_cases`), and the errors that this makes are
-measured (:mod:`stability_measures`), beside the formulas of gsplat as they are published (:mod:`classic_splatting`). What
-is compared has the same input, rounded to float32 first: the error is that of the arithmetic. The truth of images and
-gradients is the package's per-pixel reference in float64.
+measured (:mod:`stability_measures`), beside the formulas of gsplat as they are published (:mod:`classic_splatting`).
+What is compared has the same input, rounded to float32 first: the error is that of the arithmetic. The truth of images
+and gradients is the package's per-pixel reference in float64.
 """
 
 from __future__ import annotations

@@ -89,9 +89,7 @@ def in_other_units(factor: float) -> Case:
     case = usual()
     view = case.viewmat.clone()
     view[:3, 3] *= factor
-    return replace(
-        case, means=case.means * factor, scales=case.scales * factor, viewmat=view, near=case.near * factor
-    )
+    return replace(case, means=case.means * factor, scales=case.scales * factor, viewmat=view, near=case.near * factor)
 
 
 def from_the_origin(distance: float) -> Case:

@@ -33,6 +33,7 @@ LEAST_GRADIENT = 1e-3
 """A kind of parameter whose gradient is below this share of the largest kind's, as that of the rotation of a ball, is
 judged by that share: there is nothing to be right about."""
 
+
 @dataclass(frozen=True)
 class Row:
     """One error."""
@@ -63,10 +64,10 @@ class Picture:
 def measured(sweep: Sweep, value: float, compiled: bool) -> Iterator[Row]:
     """All errors of a case.
 
-    Images: largest difference of a pixel, relative to the largest value of its channel. Gradients: of a fixed random sum
-    of the image, norm of the difference relative to the norm, of the worst kind of parameter. Scores: largest difference
-    relative to their range. Costs of merging: the same, relative to each cost; pairs: share of those chosen that differ.
-    Residuals of the refiner, and the gradients of its weights: as gradients.
+    Images: largest difference of a pixel, relative to the largest value of its channel. Gradients: of a fixed random
+    sum of the image, norm of the difference relative to the norm, of the worst kind of parameter. Scores: largest
+    difference relative to their range. Costs of merging: the same, relative to each cost; pairs: share of those chosen
+    that differ. Residuals of the refiner, and the gradients of its weights: as gradients.
 
     Args:
         sweep, value: which case.

@@ -82,7 +82,10 @@ def limits(rows: Sequence[Row], sweep: Sweep) -> tuple[str, bool]:
 
 
 def _number(value: float) -> str:
-    return f"{value:.0f}" if 1 <= value < 1000 else f"{value:.0e}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
+    if 1 <= value < 1000:
+        return f"{value:.0f}"
+    mantissa, exponent = f"{value:.0e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
 
 
 def curve(rows: Sequence[Row], sweep: str, what: str, quantity: str) -> list[Row]:

@@ -1,4 +1,4 @@
-"""The same again: the same seed gives the same selection, the same losses and the same bytes, and two threads nearly so.
+"""The same again: a seed gives the same selection, the same losses and the same bytes, and two threads nearly so.
 
 Threads: sums are added up in another order, so numbers differ in the last digits, and a training carries that on.
 """

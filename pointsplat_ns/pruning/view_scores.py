@@ -27,8 +27,9 @@ LIGHTGAUSSIAN_LARGEST = 0.9
 
 
 LEAST_DETERMINED = 1e-9
-"""Lower bound of the eigenvalues of a Hessian block of unit diagonal (PUP-3DGS). What no view determines has eigenvalues
-of 0, whose computed values and logarithms are rounding errors; with this bound the score tells what the others are."""
+"""Lower bound of the eigenvalues of a Hessian block of unit diagonal (PUP-3DGS). What no view determines has
+eigenvalues of 0, whose computed values and logarithms are rounding errors; with this bound the score tells what the
+others are."""
 
 
 def lightgaussian_score(
@@ -130,8 +131,8 @@ def log_determinant(blocks: Tensor) -> Tensor:
     """Logarithm of the determinants of symmetric positive semi-definite blocks, (N, D, D) to (N,); -Inf where the
     diagonal has a zero.
 
-    Each block is first scaled to a unit diagonal, so that neither 1e-30 nor 1e30 under- or overflows. Its eigenvalues are
-    then bounded by :data:`LEAST_DETERMINED`.
+    Each block is first scaled to a unit diagonal, so that neither 1e-30 nor 1e30 under- or overflows. Its eigenvalues
+    are then bounded by :data:`LEAST_DETERMINED`.
     """
     diagonal = blocks.diagonal(dim1=-2, dim2=-1)
     ok = (diagonal > 0).all(-1) & blocks.isfinite().all(-1).all(-1)

@@ -28,6 +28,7 @@ PROGRAMS = (
     "refiner",
     "repair",
     "sampled_views",
+    "stability",
     "threads",
 )
 

@@ -7,7 +7,13 @@ import torch
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.view_scores import LEAST_DETERMINED, lightgaussian_score, log_determinant, pup_score, sensitivity
+from pointsplat_ns.pruning.view_scores import (
+    LEAST_DETERMINED,
+    lightgaussian_score,
+    log_determinant,
+    pup_score,
+    sensitivity,
+)
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from pointsplat_ns.rasterizer.projection import project
@@ -202,7 +208,9 @@ def test_what_is_undetermined_is_ranked_by_the_rest():
     wanted = torch.linalg.eigvalsh(unit)[:, 3:].log().sum(1) + 3 * math.log(LEAST_DETERMINED) + diagonal.log().sum(1)
     assert torch.allclose(log_determinant(singular), wanted, rtol=1e-9)
     # seen twice as brightly, worth more; with the rounding errors themselves that is a matter of luck
-    assert torch.allclose(log_determinant(4 * singular) - log_determinant(singular), torch.tensor(6 * math.log(4.0)).double())
+    assert torch.allclose(
+        log_determinant(4 * singular) - log_determinant(singular), torch.tensor(6 * math.log(4.0)).double()
+    )
 
 
 def test_bad_requests_are_said():

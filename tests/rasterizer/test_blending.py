@@ -1,6 +1,5 @@
 """Options of blending that must not change the image, or change it by what they say."""
 
-import functools
 import os
 import shutil
 import subprocess

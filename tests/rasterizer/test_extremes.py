@@ -37,7 +37,8 @@ def draw(scene, view, K, size, dtype, near=0.01, mode="classic", sh_degree=3, sl
         )  # fmt: skip
         image, alpha = image[0], alpha[0]
     g = torch.Generator().manual_seed(1)
-    pixels = torch.cat([image[..., :3], alpha, image[..., 3:] / torch.stack([scene[0].abs().max(), view[:3, 3].norm()]).max()], -1)
+    far = max(float(scene[0].abs().max()), float(view[:3, 3].norm()))
+    pixels = torch.cat([image[..., :3], alpha, image[..., 3:] / far], -1)
     weights = torch.rand(pixels.shape, generator=g, dtype=F64).to(dtype)
     total = (pixels * weights).sum()
     if total.requires_grad:
@@ -234,8 +235,8 @@ def test_a_long_lens_far_away_sees_what_a_short_one_sees_near(times):
 
 
 def test_views_in_float64_place_the_camera_exactly_and_any_unit_of_length_is_drawn():
-    parts = make_scene(50)
-    scene = Gaussians(parts[0], parts[2].log(), parts[1], torch.logit(parts[3])[:, None], parts[4][:, 0], parts[4][:, 1:])
+    means, quats, scales, opacities, sh = make_scene(50)
+    scene = Gaussians(means, scales.log(), quats, torch.logit(opacities)[:, None], sh[:, 0], sh[:, 1:])
     view, K = camera_askew()
     plain = View(view, K, 37, 29, torch.zeros(3))
     want, depth = render(scene, plain), render_depth(scene, plain)[0]

@@ -27,6 +27,9 @@ GRADIENT_32 = 1e-4
 """Of a gradient's norm, for float32: ten times what was seen; a gradient is a sum over pixels that partly cancel."""
 
 
+PATHS = {"packed": {}, "dense": {"packed": False}, "regions": {"memory_budget": 4000}}
+
+
 @pytest.fixture(scope="module")
 def stored():
     return golden.stored()
@@ -56,7 +59,9 @@ def draw(scene, shape, dtype, **options):
     )  # fmt: skip
     grads = torch.autograd.grad(golden.total(renders[0], alphas[0]), list(leaves.values()), materialize_grads=True)
     of_names = {f"grad of {name}": grad for name, grad in zip(golden.NAMES, grads, strict=True)}
-    return {name: value.detach().to(F64) for name, value in {"image": renders[0], "alphas": alphas[0], **of_names}.items()}
+    return {
+        name: value.detach().to(F64) for name, value in {"image": renders[0], "alphas": alphas[0], **of_names}.items()
+    }
 
 
 def compare(got, wanted, image, gradient):
@@ -73,7 +78,7 @@ def test_the_reference_is_what_it_was(name, stored):
     compare(golden.drawn_by_reference(golden.SCENES[name], stored[name]), stored[name], STORED, STORED)
 
 
-@pytest.mark.parametrize("options", [{}, {"packed": False}, {"memory_budget": 4000}], ids=["packed", "dense", "regions"])
+@pytest.mark.parametrize("options", PATHS.values(), ids=PATHS)
 @pytest.mark.parametrize("dtype", [F32, F64])
 @pytest.mark.parametrize("name", golden.SCENES)
 def test_the_fast_path_draws_the_stored_images(name, dtype, options, stored):

@@ -83,7 +83,9 @@ SCENES = {
     "needles": Golden(8, sh_degree=1, change=_needles),
     "opaque": Golden(9, sh_degree=1, background=(1.0, 1.0, 1.0), change=_opaque),
     "large and faint": Golden(10, sh_degree=2, mode="antialiased", change=_large_and_faint),
-    "around the camera": Golden(11, sh_degree=None, principal=(30.0, -4.0), focal=(15.0, 22.0), change=_around_the_camera),
+    "around the camera": Golden(
+        11, sh_degree=None, principal=(30.0, -4.0), focal=(15.0, 22.0), change=_around_the_camera
+    ),
 }
 
 
@@ -187,7 +189,9 @@ def main() -> None:
     for name, golden in SCENES.items():
         scene = made(golden)
         if not far_from_thresholds(golden, scene):
-            sys.exit(f"{name}: a pixel of the scene of seed {golden.seed} is at a threshold; expected none: try another")
+            sys.exit(
+                f"{name}: a pixel of the scene of seed {golden.seed} is at a threshold; expected none: try another"
+            )
         for key, value in {**scene, **drawn_by_reference(golden, scene)}.items():
             values[f"{name}/{key}"] = value.numpy().astype(np.float32)
     np.savez_compressed(GOLDEN, **values)  # type: ignore[arg-type]
