@@ -199,6 +199,7 @@ class Sweep:
             itself = replace(judged.against_dense, psnr=math.inf)
             setting = Setting(len(self.dense), self.dense.sh_degree, by=DENSE)
             made = Made(self.dense, 0.0, None)
+            self._keep_flight(self.dense, DENSE, DENSE)
             point = self._point(setting, made, replace(judged, against_dense=itself), DENSE, DENSE, "")
             self._take(point, time.perf_counter() - start, alone, of)
         assert self.journal.dense is not None
@@ -219,8 +220,7 @@ class Sweep:
                 made = make(self.dense, setting, self.subject.new_views, show)
                 judged = self.judge.judge(made.scene, key, lambda share: show("", share))
             self._made = (setting, made.scene)
-            if self._stage is not None:
-                keep_flight(self._stage, made.scene, label, flight_path(self.folder, key))
+            self._keep_flight(made.scene, key, label)
             point = self._point(setting, made, judged, key, label, self.naming.command(setting))
             self._take(point, time.perf_counter() - start, alone, of)
             if not self._shown:  # the first useful picture, early
@@ -228,9 +228,14 @@ class Sweep:
                 write_outputs(self.result(), self.folder)
         return self.journal.points[setting]
 
+    def _keep_flight(self, scene: Gaussians, key: str, label: str) -> None:
+        """Keep a scene for the page, to fly through."""
+        if self._stage is not None:
+            keep_flight(self._stage, scene, label, flight_path(self.folder, key))
+
     @cached_property
     def _stage(self) -> Stage | None:
-        """Where the page begins to fly through a scene; None if nothing of the dense one is visible."""
+        """Where flights through scenes begin; None if nothing of the dense one is visible."""
         try:
             return Stage.of(self.dense, self.looked_at.views)
         except DataError:
