@@ -14,8 +14,8 @@ from pointsplat_ns.pruning import ply_bytes
 MAX_BYTES = 4_000_000
 """Of the page, at most, for scenes to fly through; the rest is for its pictures."""
 
-_LEAST_RATIO = 10
-"""A scene takes more than this share of the bytes of its PLY in a page, so a larger one need not be compressed."""
+_RATIO = 20
+"""A PLY of so many times the bytes that there are is not tried: in a page, scenes have a tenth of its bytes or more."""
 
 _KEYS = {"scenes", "views", "up", "near", "background", "antialiased", "drag"}
 
@@ -35,7 +35,7 @@ def keep_flight(stage: Stage, scene: Gaussians, name: str, path: Path) -> bool:
     Raises:
         SceneError: if it cannot be written.
     """
-    if ply_bytes(len(scene), scene.sh_degree) > _LEAST_RATIO * MAX_BYTES:
+    if ply_bytes(len(scene), scene.sh_degree) > _RATIO * MAX_BYTES:
         return False
     packed = stage.packed(scene, name)
     if len(packed["spz"]) > 0.99 * MAX_BYTES:  # the views take some as well

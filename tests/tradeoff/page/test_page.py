@@ -205,7 +205,7 @@ def test_what_is_no_scene_to_fly_through_is_left_out(sweep, tmp_path, content):
 def test_scenes_that_take_too_much_of_a_page_are_not_kept(tmp_path, monkeypatch):
     room = ps.example_room()[::20]
     stage, path = Stage.of(room, room_views()), tmp_path / "new" / "scene.json"
-    monkeypatch.setattr(flights, "MAX_BYTES", 30_000)  # its PLY has 330 kB, and its SPZ in base64 80 kB
+    monkeypatch.setattr(flights, "MAX_BYTES", 15_000)  # its PLY has 330 kB, and its SPZ in base64 80 kB
     assert not flights.keep_flight(stage, room, "room", path) and not path.parent.exists()
     monkeypatch.setattr(flights, "MAX_BYTES", 60_000)
     assert not flights.keep_flight(stage, room, "room", path) and not path.parent.exists()
