@@ -34,8 +34,8 @@ def write_page(
 
     The file has everything in it and loads nothing. A browser with WebGL 2 draws the scenes by the same formulas as
     :func:`~pointsplat_ns.render`. They are in it as SPZ, written as text, with a tenth to a quarter of the bytes of a
-    PLY; what that loses stands in docs/formats.md. Where two scenes would make the file too large, the larger one is left out, which the
-    page and a warning say.
+    PLY; what that loses stands in docs/formats.md. Where two scenes would make the file too large, the larger one is
+    left out, which the page and a warning say.
 
     Args:
         scenes: one scene, or two: the first is on the left of the wipe.
