@@ -82,7 +82,8 @@ class Stage:
         if views is None or len(views) == 0:
             views = _sampled(scene, centre, size, up)
         views = views_in_units(views.spread(VIEWS), centre, size)
-        views = views[_in_picture(positions_in_units(scene.means, centre, size).cpu(), views).argsort(descending=True)]
+        shown = _in_picture(positions_in_units(scene.means, centre, size).cpu(), views)
+        views = views[shown.argsort(descending=True, stable=True)]
         if float((-views.viewmats[:, 1, :3] @ up).sum()) < 0:  # whoever took photos held the camera upright
             up = -up
         half = positions_in_units(high, centre, size).cpu().abs()

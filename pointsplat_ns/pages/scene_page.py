@@ -16,7 +16,7 @@ from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.views import Views
 
 LIMIT_MB = 60.0
-"""Size of a page, at most, unless another is asked for: two million Gaussians, which a browser opens within seconds."""
+"""Size of a page, at most, unless another is asked for: about two million Gaussians of SH degree 3."""
 
 
 def write_page(
@@ -33,9 +33,9 @@ def write_page(
     """Write one HTML file that opens offline and shows a scene to fly through, or two with a wipe between them.
 
     The file has everything in it and loads nothing. A browser with WebGL 2 draws the scenes by the same formulas as
-    :func:`~pointsplat_ns.render`. They are in it as SPZ, a fortieth to a third of the bytes of a PLY; what that loses
-    stands in docs/formats.md. Where two scenes would make the file too large, the larger one is left out, which the
-    page and a warning say.
+    :func:`~pointsplat_ns.render`. They are in it as SPZ, written as text, with a tenth to a quarter of the bytes of a
+    PLY; what that loses stands in docs/formats.md. Where two scenes would make the file too large, the larger one is
+    left out, which the page and a warning say.
 
     Args:
         scenes: one scene, or two: the first is on the left of the wipe.

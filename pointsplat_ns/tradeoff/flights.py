@@ -12,10 +12,10 @@ from pointsplat_ns.pages.flight import Stage
 from pointsplat_ns.pruning import ply_bytes
 
 MAX_BYTES = 4_000_000
-"""Of the page, at most, for the scene to fly through; the rest is for its pictures."""
+"""Of the page, at most, for scenes to fly through; the rest is for its pictures."""
 
-_LEAST_RATIO = 10
-"""A scene takes more than this share of the bytes of its PLY in a page, so a larger one need not be compressed."""
+_RATIO = 20
+"""A PLY of so many times the bytes that there are is not tried: in a page, scenes have a tenth of its bytes or more."""
 
 _KEYS = {"scenes", "views", "up", "near", "background", "antialiased", "drag"}
 
@@ -35,7 +35,7 @@ def keep_flight(stage: Stage, scene: Gaussians, name: str, path: Path) -> bool:
     Raises:
         SceneError: if it cannot be written.
     """
-    if ply_bytes(len(scene), scene.sh_degree) > _LEAST_RATIO * MAX_BYTES:
+    if ply_bytes(len(scene), scene.sh_degree) > _RATIO * MAX_BYTES:
         return False
     packed = stage.packed(scene, name)
     if len(packed["spz"]) > 0.99 * MAX_BYTES:  # the views take some as well
@@ -52,4 +52,20 @@ def read_flight(path: Path) -> dict[str, Any] | None:
         flight = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    return flight if isinstance(flight, dict) and flight.keys() == _KEYS else None
+    return flight if isinstance(flight, dict) and flight.keys() == _KEYS and flight["scenes"] else None
+
+
+def read_flight_beside(path: Path, dense: Path) -> dict[str, Any] | None:
+    """What :func:`keep_flight` wrote of a scene, with the dense scene on the left if both fit; None as for
+    :func:`read_flight`.
+
+    Args:
+        path: of the scene.
+        dense: of the dense scene, which may be the same.
+    """
+    flight = read_flight(path)
+    beside = read_flight(dense) if dense != path else None
+    if flight is None or beside is None:
+        return flight
+    scenes = [*beside["scenes"], *flight["scenes"]]
+    return {**flight, "scenes": scenes} if sum(len(scene["spz"]) for scene in scenes) <= MAX_BYTES else flight

@@ -18,7 +18,7 @@ from pointsplat_ns.pages.flight import SCRIPTS
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.pages.pictures import AMPLIFIED, error_colors, error_map, fit, read_png
 from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.tradeoff.flights import read_flight
+from pointsplat_ns.tradeoff.flights import read_flight_beside
 from pointsplat_ns.tradeoff.front import (
     COSTS,
     METRICS,
@@ -49,7 +49,7 @@ def write_page(sweep: Tradeoff, folder: Path, output: Path, progress: bool | Pro
     at each point beside the dense scene and the photo with an error map and a wipe, the fastest point that is good
     enough with the command that makes it, and a table of all points. Views are those of which there is a picture of the
     dense scene. The recommended scene is there to fly through, if it is at
-    :func:`~pointsplat_ns.tradeoff.points.flight_path`.
+    :func:`~pointsplat_ns.tradeoff.points.flight_path`, beside the dense one if both fit.
 
     Args:
         sweep: what was measured. Its first point is the dense scene.
@@ -69,7 +69,8 @@ def write_page(sweep: Tradeoff, folder: Path, output: Path, progress: bool | Pro
     if not sweep.points:
         raise DataError(f"{folder}: nothing was measured; expected the dense scene and at least one smaller one")
     pictures = _Pictures.of(sweep, folder)
-    flight = read_flight(flight_path(folder, sweep.recommended))
+    dense, recommended = sweep.points[0].key, sweep.recommended
+    flight = read_flight_beside(flight_path(folder, recommended), flight_path(folder, dense))
     values, data = _values(sweep, len(pictures.names)), {**_data(sweep), "flight": flight}
     scripts = ("chart.js", *(SCRIPTS if flight else ()), "tradeoff.js")
 

@@ -157,6 +157,7 @@ class Sweep:
         if self.journal.dense is None:
             start = time.perf_counter()
             point = self.measurer.measure_dense(self._shower(0, of))
+            self._keep_flight(self.measurer.dense, DENSE, DENSE)
             self._take(point, time.perf_counter() - start, of)
         assert self.journal.dense is not None
         return self.journal.dense
@@ -171,17 +172,21 @@ class Sweep:
         if setting not in self.journal.points:
             start = time.perf_counter()
             point = self.measurer.measure(setting, self._shower(1 + len(self.journal.points), of))
-            if self._stage is not None:
-                keep_flight(self._stage, self.scene(setting), point.label, flight_path(self.folder, point.key))
+            self._keep_flight(self.scene(setting), point.key, point.label)
             self._take(point, time.perf_counter() - start, of)
             if not self._shown:  # the first useful picture, early
                 self._shown = True
                 write_outputs(self.result(), self.folder)
         return self.journal.points[setting]
 
+    def _keep_flight(self, scene: Gaussians, key: str, label: str) -> None:
+        """Keep a scene for the page, to fly through."""
+        if self._stage is not None:
+            keep_flight(self._stage, scene, label, flight_path(self.folder, key))
+
     @cached_property
     def _stage(self) -> Stage | None:
-        """Where the page begins to fly through a scene; None if nothing of the dense one is visible."""
+        """Where flights through scenes begin; None if nothing of the dense one is visible."""
         try:
             return Stage.of(self.measurer.dense, self.measurer.looked_at.views)
         except DataError:

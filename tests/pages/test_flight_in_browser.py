@@ -229,6 +229,27 @@ def test_shift_shifts_and_the_wheel_comes_nearer_once_the_picture_was_clicked(op
     settle(opened)
 
 
+def test_two_fingers_shift_and_come_nearer(opened):
+    opened.execute_script("flight.setDrag('orbit'); scrollTo(0, 0)")
+    left, top = opened.execute_script("const { x, y } = flight.canvas.getBoundingClientRect(); return [x, y]")
+
+    def touch(kind: str, *places: tuple[float, float]) -> None:
+        points = [{"x": left + x, "y": top + y, "id": number} for number, (x, y) in enumerate(places)]
+        opened.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    start, reach = camera(opened), opened.execute_script("return flight.camera.reach")
+    touch("touchStart", (20, 60), (40, 60))
+    touch("touchMove", (20, 60), (60, 60))
+    nearer = opened.execute_script("return flight.camera.reach")
+    assert nearer == pytest.approx(reach / 2), "fingers twice as far apart"
+    touch("touchMove", (20, 80), (60, 80))
+    touch("touchEnd")
+    moved = np.subtract(camera(opened)["eye"], start["eye"])
+    assert camera(opened)["ahead"] == start["ahead"] and np.dot(moved, start["down"]) < 0, "what is seen goes down"
+    assert opened.execute_script("return flight.controls.pointers.size") == 0
+    settle(opened)
+
+
 def test_what_is_upside_down_is_turned_over_and_stays_so(opened):
     opened.execute_script("flight.setWipe(1)")
     before, up = picture(opened), opened.execute_script("return flight.camera.up")

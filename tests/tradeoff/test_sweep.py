@@ -42,6 +42,7 @@ def test_a_sweep_leaves_tables_plots_pictures_and_a_page(new_sweep, tmp_path, pl
     assert [(tmp_path / name).read_text() for name in PLOTS.values()] == [*AXES]
     for shown in result.points:
         assert all(picture_path(tmp_path, view, shown.key).is_file() for view in range(3))
+    assert names(tmp_path / "scenes") == ["10pct_sh1.json", "dense.json"]
     assert (tmp_path / PAGE).read_text().split() == [point.key for point in result.points]
 
 

@@ -78,9 +78,11 @@ class Flight {
     };
     wipe.addEventListener("pointerdown", (event) => wipe.setPointerCapture(event.pointerId));
     wipe.addEventListener("pointermove", (event) => event.buttons && follow(event));
-    wipe.addEventListener("keydown", ({ key }) => {
+    wipe.addEventListener("keydown", (event) => {
       const places = { Home: 0, End: 1, ArrowLeft: this.wipe - 0.05, ArrowRight: this.wipe + 0.05 };
-      if (key in places) this.setWipe(places[key]);
+      if (!(event.key in places)) return;
+      event.preventDefault();
+      this.setWipe(places[event.key]);
     });
     this.setWipe(0.5);
   }

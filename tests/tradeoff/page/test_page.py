@@ -177,6 +177,22 @@ def test_the_recommended_scene_is_in_the_page_to_fly_through(make_page, sweep, w
     assert parts_of(other).data["flight"] is None, "it was not kept"
 
 
+def test_the_dense_scene_is_beside_the_recommended_one_if_both_fit(sweep, tmp_path, monkeypatch):
+    measured, folder = sweep
+    shutil.copytree(folder, tmp_path / "copy")
+    room = ps.example_room()
+    flights.keep_flight(Stage.of(room, room_views()), room[::5], "dense", flight_path(tmp_path / "copy", "dense"))
+
+    def names(recommended: str) -> list[str]:
+        page = write_page(replace(measured, recommended=recommended), tmp_path / "copy", tmp_path / "page.html")
+        return [scene["name"] for scene in parts_of(page).data["flight"]["scenes"]]
+
+    assert names("0.1_coverage") == ["dense", "a tenth"] and names("dense") == ["dense"]
+    size = flight_path(tmp_path / "copy", "dense").stat().st_size
+    monkeypatch.setattr(flights, "MAX_BYTES", size)
+    assert names("0.1_coverage") == ["a tenth"] and names("dense") == ["dense"]
+
+
 @pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'{"scenes": []}', b"\xff" * 9, b" " * 4_000_001])
 def test_what_is_no_scene_to_fly_through_is_left_out(sweep, tmp_path, content):
     measured, folder = sweep
@@ -189,7 +205,7 @@ def test_what_is_no_scene_to_fly_through_is_left_out(sweep, tmp_path, content):
 def test_scenes_that_take_too_much_of_a_page_are_not_kept(tmp_path, monkeypatch):
     room = ps.example_room()[::20]
     stage, path = Stage.of(room, room_views()), tmp_path / "new" / "scene.json"
-    monkeypatch.setattr(flights, "MAX_BYTES", 30_000)  # its PLY has 330 kB, and its SPZ in base64 80 kB
+    monkeypatch.setattr(flights, "MAX_BYTES", 15_000)  # its PLY has 330 kB, and its SPZ in base64 80 kB
     assert not flights.keep_flight(stage, room, "room", path) and not path.parent.exists()
     monkeypatch.setattr(flights, "MAX_BYTES", 60_000)
     assert not flights.keep_flight(stage, room, "room", path) and not path.parent.exists()
