@@ -56,7 +56,7 @@ def render_path(
         split: two scenes are shown "side-by-side", or with a line that wipes ("wipe") from one to the other.
         labels: what is written on two scenes; by default their names and counts. An empty list writes nothing.
         up: the axis that is up in the scene ("z", "-y"), for walks and orbits; by default it is estimated.
-        width: of the picture of one scene, pixels; by default that of the dataset or the saved path, at most 960.
+        width: of the picture of one scene, pixels; by default that of the saved path, or of the photos, at most 960.
         height: of the same.
         fps: frames a second; by default 24, or what the saved path says.
         seconds: how long; by default 10, or as long as it takes to show every pose of a dataset or a saved path.

@@ -166,6 +166,13 @@ def test_address_that_cannot_be_listened_on_ends_the_command_in_one_line(files, 
     assert capsys.readouterr().err.startswith("error: cannot listen on 192.0.2.1, port 7007")
 
 
+def test_given_views_keep_their_size_and_photos_are_reduced(scene, tmp_path):
+    ps.render_path(scene, tmp_path / "given.png", path=ps.sample_views(scene, 1, 1001, 50))
+    assert Image.open(tmp_path / "given.png").size == (1000, 50)
+    ps.render_path(scene, tmp_path / "narrow.png", path=ps.sample_views(scene, 1, 1001, 50), width=80)
+    assert Image.open(tmp_path / "narrow.png").size == (80, 4)
+
+
 def test_news_of_merging_does_not_begin_pictures_anew(scene, monkeypatch):
     with ps.open_viewer(scene, port=0) as viewer:
         begun = []

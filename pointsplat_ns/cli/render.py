@@ -41,7 +41,7 @@ def render(
         labels: what is written on two scenes; by default their names and counts. "" writes nothing on one.
         up: the axis that is up in the scene, for walks and orbits: x, y, z, -x, -y or -z; by default it is estimated.
             Write --up=-y for a negative axis.
-        width: of the picture of one scene, pixels; by default that of the dataset or the saved path, at most 960.
+        width: of the picture of one scene, pixels; by default that of the saved path, or of the photos, at most 960.
         height: of the same.
         fps: frames a second; by default 24, or what the saved path says.
         seconds: how long; by default 10, or as long as it takes to show every pose of the dataset or the saved path.

@@ -26,7 +26,7 @@ SIZE = (960, 540)
 """Width and height of pictures where no dataset or saved path has one, pixels."""
 
 LONGEST_SIDE = 960
-"""Maximum of the pictures' longer side if no size is asked for, pixels."""
+"""Maximum of the longer side of pictures from the poses of photos if no size is asked for, pixels."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def camera_path(
         fps = shot.fps or saved.fps or FPS
         frames = 1 if one else len(saved.views) if shot.seconds is None else _frames(shot.seconds, fps)
         known = source.known(1)
-        views = _sized(saved.views, shot)
+        views = _sized(saved.views, shot, (saved.views.width, saved.views.height))
         if known is not None:
             views = dataclasses.replace(views, background=known.background, rasterize_mode=known.rasterize_mode)
         return CameraPath(views if frames == len(views) else along(views, frames), fps, f"the path of {path}")
@@ -104,11 +104,12 @@ def camera_path(
     if known is not None and path in ("auto", "dataset"):
         if shot.seconds is None and not one:
             frames = max(frames, len(known))
-        views = along(_sized(known, shot), frames)
+        usual = (known.width, known.height) if source.given is not None else _reduced(known)
+        views = along(_sized(known, shot, usual), frames)
         skipped = f", {len(known) - frames} of {len(known)} left out" if frames < len(known) and not one else ""
         return CameraPath(views, fps, f"along the {source.origin}{skipped}")
     stops = known.spread(2 * STOPS) if known is not None else views_upright(scene, source, STOPS, up)
-    stops = _sized(stops, shot, None if known is not None else SIZE)
+    stops = _sized(stops, shot, SIZE if known is None else _reduced(known))
     if path == "orbit":
         low, high = content_box(scene)
         return CameraPath(orbit(stops, frames, 0.5 * (low + high).cpu(), up), fps, f"a turn, by {source.origin}")
@@ -132,12 +133,15 @@ def _frames(seconds: float, fps: float) -> int:
     return min(max(round(seconds * fps), 1), MOST_FRAMES)
 
 
-def _sized(views: Views, shot: Shot, usual: tuple[int, int] | None = None) -> Views:
-    """The views at the size that is asked for, or of at most 960 pixels; even, as videos need it."""
+def _reduced(views: Views) -> tuple[int, int]:
+    """Width and height of photos, their longer side at most 960 pixels."""
+    factor = min(1.0, LONGEST_SIDE / max(views.width, views.height))
+    return round(views.width * factor), round(views.height * factor)
+
+
+def _sized(views: Views, shot: Shot, usual: tuple[int, int]) -> Views:
+    """The views at the size that is asked for, or at the usual width and height; even, as videos need it."""
     width, height = shot.width, shot.height
-    if usual is None:
-        factor = min(1.0, LONGEST_SIDE / max(views.width, views.height))
-        usual = round(views.width * factor), round(views.height * factor)
     if width is None:
         width = usual[0] if height is None else round(usual[0] * height / usual[1])
     if height is None:

@@ -18,6 +18,9 @@ from pointsplat_ns.io.files import one_line, replacing
 
 Kind = Literal["video", "frames", "picture"]
 
+ENCODER = "libx264"
+"""ffmpeg's encoder of H.264; PyAV's wheels have it, builds of one's own may lack it."""
+
 CRF = 18
 """x264's constant rate factor: at 18 most people see no loss."""
 
@@ -125,6 +128,7 @@ def _folder_replacing(folder: Path) -> Iterator[Path]:
 
 def _write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
     import av
+    from av.codec.codec import UnknownCodecError
     from av.video.reformatter import ColorRange, Colorspace
 
     count = 0
@@ -132,7 +136,7 @@ def _write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
         try:
             with av.open(str(part), "w", format="mp4", options={"movflags": "+faststart"}) as container:
                 rate = Fraction(fps).limit_denominator(1001)
-                stream = container.add_stream("libx264", rate=rate, options={"crf": str(CRF)})
+                stream = container.add_stream(ENCODER, rate=rate, options={"crf": str(CRF)})
                 for pixels in frames:
                     if count == 0:
                         stream.height, stream.width = pixels.shape[:2]
@@ -149,6 +153,11 @@ def _write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
                     container.mux(stream.encode(frame))
                     count += 1
                 container.mux(stream.encode())
+        except UnknownCodecError as error:
+            raise SceneError(
+                f"{path}: PyAV {av.__version__} has no {ENCODER}; expected its wheel (pip install --force-reinstall "
+                "--only-binary av av), or write frames: a name without a dot"
+            ) from error
         except av.FFmpegError as error:  # for one, of a full disk
             raise OSError(one_line(error)) from error
     return count

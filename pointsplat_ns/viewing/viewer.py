@@ -72,6 +72,7 @@ class Viewer:
         self._painters: dict[int, Painter] = {}
         self._notes: dict[int, Any] = {}
         self._at = 0
+        self._closed = False
         # It logs each page that is closed before it has loaded, with a traceback.
         logging.getLogger("websockets").setLevel(logging.CRITICAL + 1)
         self._server = start_server(host, port, "pointsplat")
@@ -94,7 +95,10 @@ class Viewer:
         threading.Event().wait()
 
     def close(self) -> None:
-        """End the server and all drawing."""
+        """End the server and all drawing. A second call does nothing."""
+        if self._closed:
+            return
+        self._closed = True
         for painter in list(self._painters.values()):
             painter.close()
         for selection in self._selections:

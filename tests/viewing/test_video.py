@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 import pointsplat_ns as ps
+from pointsplat_ns.viewing import video
 from pointsplat_ns.viewing.video import write_frames
 
 
@@ -115,3 +116,10 @@ def test_folders_of_others_are_left_alone(tmp_path):
         write_frames(drawn(1), tmp_path / "film.avi", 12)
     with pytest.raises(ps.SceneError, match="cannot be written"):
         write_frames(drawn(1), tmp_path / "file" / "film.mp4", 12)
+
+
+def test_missing_encoder_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(video, "ENCODER", "h264_of_nobody")
+    with pytest.raises(ps.SceneError, match="has no h264_of_nobody; expected its wheel"):
+        write_frames(drawn(1), tmp_path / "film.mp4", 12)
+    assert not [*tmp_path.iterdir()]
