@@ -73,7 +73,9 @@ def targets_of(db: float | None, ms: float | None, mb: float | None, **decided: 
     """Targets of which any may be missing; None if all are.
 
     Args:
-        db, ms, mb: of :class:`Targets`.
+        db: least PSNR, dB; see :class:`Targets`.
+        ms: longest time of a frame, milliseconds.
+        mb: largest file, in units of 10^6 bytes.
         decided: further options, by name, that say what the search decides; None for one that was not given.
 
     Raises:
