@@ -106,8 +106,7 @@ def compact_folder(
     trained = _refiner_on(refiner, device)
     repair = RepairBudget(effort, seconds)
     budget, method = resolve_options(trained, keep, by, sh)
-    bands = None if sh == "all" else sh
-    targets = targets_of(target_db, target_ms, target_mb, keep=keep, sh=bands, clean=clean or None, seconds=seconds)
+    targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
     options: Options = {
         "keep": str(budget),
         "refiner": source_file(trained.source).sha256,
