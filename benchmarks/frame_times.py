@@ -2,8 +2,8 @@
 
     python benchmarks/frame_times.py SCENE --keep 30% --times 10
 
-The same smaller scene is judged again and again, as ``pointsplat tradeoff`` judges it. Beside times in proportion to the
-dense scene's, which is drawn in turn, stands what the clock says.
+The same smaller scene is judged again and again, as ``pointsplat tradeoff`` judges it. Beside times in proportion to
+those of the dense scene, which is drawn in turn, stands what the clock says.
 """
 
 from __future__ import annotations

@@ -245,8 +245,7 @@ def compact(
     refiner = refiner or load_refiner()
     budget = RepairBudget(effort, seconds)
     _, method = resolve_options(refiner, keep, by, sh)  # before the scene is read
-    bands = None if sh == "all" else sh
-    targets = targets_of(target_db, target_ms, target_mb, keep=keep, sh=bands, clean=clean or None, seconds=seconds)
+    targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
     format_to_write(target_format)
     dense, source = _read(scene, views)
     with progress_bar(progress) as report:

@@ -67,7 +67,9 @@ def compact_folder(
         clean: as for :func:`compact`.
         effort: as for :func:`compact`.
         seconds: of repairing each scene, as for :func:`compact`.
-        target_db, target_ms, target_mb: what each scene has to meet, as for :func:`compact`.
+        target_db: what each scene has to reach, as for :func:`compact`.
+        target_ms: as for :func:`compact`.
+        target_mb: as for :func:`compact`; of PLY files.
         jobs: number of processes. More than one share the cores; a program that asks for them must be a file, with what
             it does under ``if __name__ == "__main__":``, as for any Python program that starts processes.
         shard: only a part of the scenes: "2/5" is the second of five.
@@ -104,8 +106,7 @@ def compact_folder(
     trained = _refiner_on(refiner, device)
     repair = RepairBudget(effort, seconds)
     budget, method = resolve_options(trained, keep, by, sh)
-    bands = None if sh == "all" else sh
-    targets = targets_of(target_db, target_ms, target_mb, keep=keep, sh=bands, clean=clean or None, seconds=seconds)
+    targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
     options: Options = {
         "keep": str(budget),
         "refiner": source_file(trained.source).sha256,

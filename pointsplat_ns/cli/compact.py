@@ -115,8 +115,7 @@ def compact(
     trained = ps.load_refiner(refiner)
     resolve_options(trained, keep, by, sh)
     RepairBudget(effort, seconds)
-    bands = None if sh == "all" else sh
-    targets_of(target_db, target_ms, target_mb, keep=keep, sh=bands, clean=clean or None, seconds=seconds)
+    targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
     with fixed_threads(threads):
         dense = read_scene(scene)
         result = ps.compact(

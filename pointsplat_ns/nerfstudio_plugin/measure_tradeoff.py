@@ -126,14 +126,14 @@ def subject_of(
         refiner: what repairs begin with; by default the one that ships.
         suffix: of the format that smaller scenes are written in.
     """
-    photos = path is not None and views is None and may_be_run(path)
+    has_photos = path is not None and views is None and may_be_run(path)
     return Subject(
         dense=dense,
         path=path or Path("scene.ply"),
         name="scene",
         sha256="",
         new_views=lambda: ViewSource(dense, given=views, run=path, dataset_views=dataset_views),
-        held_out=functools.partial(dataset_photos, path, "test") if path is not None and photos else None,
+        held_out=functools.partial(dataset_photos, path, "test") if path is not None and has_photos else None,
         refiner=refiner,
         suffix=suffix,
     )

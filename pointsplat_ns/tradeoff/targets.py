@@ -69,19 +69,33 @@ class Targets:
         return words
 
 
-def targets_of(db: float | None, ms: float | None, mb: float | None, **decided: object) -> Targets | None:
+def targets_of(
+    db: float | None,
+    ms: float | None,
+    mb: float | None,
+    keep: object = None,
+    sh: str = "all",
+    clean: bool = False,
+    seconds: float | None = None,
+) -> Targets | None:
     """Targets of which any may be missing; None if all are.
 
     Args:
-        db, ms, mb: of :class:`Targets`.
-        decided: further options, by name, that say what the search decides; None for one that was not given.
+        db: least PSNR, dB; see :class:`Targets`.
+        ms: longest time of a frame, milliseconds.
+        mb: largest file, in units of 10^6 bytes.
+        keep: this and the others are options of ``compact`` that say what the search decides.
+        sh: as above.
+        clean: as above.
+        seconds: as above.
 
     Raises:
         BudgetError: if a target means nothing, or such an option was given beside one.
     """
     if db is ms is mb is None:
         return None
-    names = [name for name, value in decided.items() if value is not None]
+    decided = {"keep": keep is not None, "sh": sh != "all", "clean": clean, "seconds": seconds is not None}
+    names = [name for name, given in decided.items() if given]
     if names:
         raise BudgetError(
             f"{', '.join(names)} cannot be given with a target: how many Gaussians and SH bands are kept, and how they "

@@ -11,6 +11,7 @@ import pytest
 import pointsplat_ns as ps
 from making import box_room, same_bits
 from pointsplat_ns import api, folders
+from pointsplat_ns.cli import main
 from pointsplat_ns.compression import repair, view_source
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
@@ -148,3 +149,18 @@ def test_a_folder_with_a_target_that_no_scene_meets_says_so_for_each(tmp_path, d
     ps.save(dense, tmp_path / "rooms" / "a.ply")
     [result] = ps.compact_folder(tmp_path / "rooms", by="opacity", target_db=30.0, target_mb=0.002)
     assert result.status == "failed" and "the best within the limits has" in result.error
+
+
+def test_the_command_writes_what_was_found_and_says_at_what_cost(room, dense, tmp_path, capsys):
+    main(["compact", str(room), "--target-mb", "0.002", "--by", "opacity", "-o", str(tmp_path / "small.spz")])
+    said = " ".join(capsys.readouterr().out.split())
+    assert 0.0016 < 1e-6 * (tmp_path / "small.spz").stat().st_size <= 0.002
+    assert "dB against the dense scene's renders" in said and "scenes tried; the next better, " in said
+    found = ps.compact(dense, by="opacity", target_mb=0.002, target_format=".spz")
+    assert len(ps.load(tmp_path / "small.spz")) == len(found.scene)
+
+
+def test_the_command_refuses_what_the_search_decides_before_the_scene_is_read(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["compact", str(tmp_path / "gone.ply"), "--target-db", "30", "--keep", "10%"])
+    assert capsys.readouterr().err.startswith("error: keep cannot be given with a target")
