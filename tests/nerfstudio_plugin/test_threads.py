@@ -25,7 +25,7 @@ def three_threads(monkeypatch):
 
 @pytest.mark.parametrize(("threads", "compiled", "used"), [(None, False, 1), (2, False, 2), (None, True, 3)])
 def test_steps_use_the_threads_chosen_or_set(
-    three_threads, monkeypatch, wall_scene, wall_config, run_training, tmp_path, threads, compiled, used
+    three_threads, monkeypatch, wall_scene, wall_config, tmp_path, threads, compiled, used
 ):
     seen = set()
 
@@ -34,13 +34,14 @@ def test_steps_use_the_threads_chosen_or_set(
         return torch.zeros(()), {}, {}
 
     monkeypatch.setattr("pointsplat_ns.nerfstudio_plugin.stopping.StoppableTrainer.one_step", one_step)
+    monkeypatch.setattr("nerfstudio.engine.trainer.Trainer.save_checkpoint", lambda *args: None)
     config = wall_config(wall_scene, tmp_path, 3)
     config.threads, config.early_look, config.pipeline.model.compiled = threads, False, compiled
-    config.steps_per_save = config.steps_per_eval_image = 100
-    config.pipeline.model.warmup_length = 100  # nothing is densified: no step has a gradient
-    monkeypatch.setattr("nerfstudio.engine.trainer.Trainer.save_checkpoint", lambda *args: None)
-    config.pipeline.model.refine_every = 100
-    trainer, _ = run_training(config)
+    config.steps_per_eval_image = 0
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    trainer.callbacks = []  # they need what a real step leaves
+    trainer.train()
     assert seen == {used}
     assert torch.get_num_threads() == 3
 
