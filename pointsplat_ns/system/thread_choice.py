@@ -108,10 +108,11 @@ class Stalls:
 
 @functools.cache
 def _numbers() -> torch.Tensor:
-    return torch.ones(_NUMBERS)
+    with torch.inference_mode(False):  # else they could be written to in that mode alone
+        return torch.ones(_NUMBERS, device="cpu", dtype=torch.float32)
 
 
-def _shared_operations(count: int, bound: float) -> float:
+def shared_operations(count: int, bound: float) -> float:
     """Seconds that some operations take on so many threads; once they take longer than ``bound``, those so far."""
     numbers, before = _numbers(), torch.get_num_threads()
     torch.set_num_threads(count)
@@ -129,7 +130,7 @@ def _shared_operations(count: int, bound: float) -> float:
         torch.set_num_threads(before)
 
 
-machine_stalls = Stalls(_shared_operations)
+machine_stalls = Stalls(shared_operations)
 """What is known of this machine: one for all choices of the process, so that looks are not repeated."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import random
 import threading
@@ -11,7 +12,16 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from pointsplat_ns.system.thread_choice import CLEAR, LOOK_SECONDS, SHARE, Stalls, ThreadChoice, unstalled_threads
+from pointsplat_ns.system.thread_choice import (
+    CLEAR,
+    LOOK_SECONDS,
+    SHARE,
+    Stalls,
+    ThreadChoice,
+    _numbers,
+    shared_operations,
+    unstalled_threads,
+)
 from pointsplat_ns.system.threads import fixed_threads, in_threads, most_threads, one_thread, one_thread_each
 
 CORES = 4
@@ -268,6 +278,13 @@ def test_a_real_look_changes_nothing():
     with unstalled_threads():
         assert 1 <= torch.get_num_threads() <= before
     assert torch.get_num_threads() == before
+
+
+def test_a_real_look_works_in_every_mode_of_torch():
+    _numbers.cache_clear()
+    with torch.inference_mode():
+        assert shared_operations(1, math.inf) > 0
+    assert shared_operations(1, math.inf) > 0
 
 
 def test_contexts_of_one_thread_restore_the_callers():

@@ -1,0 +1,55 @@
+"""The number of threads of trainings."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.system.thread_choice import ThreadChoice
+
+
+@pytest.fixture
+def three_threads(monkeypatch):
+    """Three threads and cores, which stall."""
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr("pointsplat_ns.system.thread_choice.cores", lambda: 3)
+    monkeypatch.setattr(
+        "pointsplat_ns.nerfstudio_plugin.stopping.ThreadChoice", lambda: ThreadChoice(lambda count: count > 1)
+    )
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(("threads", "compiled", "used"), [(None, False, 1), (2, False, 2), (None, True, 3)])
+def test_steps_use_the_threads_chosen_or_set(
+    three_threads, monkeypatch, wall_scene, wall_config, tmp_path, threads, compiled, used
+):
+    seen = set()
+
+    def one_step(trainer, step):
+        seen.add(torch.get_num_threads())
+        return torch.zeros(()), {}, {}
+
+    monkeypatch.setattr("pointsplat_ns.nerfstudio_plugin.stopping.StoppableTrainer.one_step", one_step)
+    monkeypatch.setattr("nerfstudio.engine.trainer.Trainer.save_checkpoint", lambda *args: None)
+    config = wall_config(wall_scene, tmp_path, 3)
+    config.threads, config.early_look, config.pipeline.model.compiled = threads, False, compiled
+    config.steps_per_eval_image = 0
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    trainer.callbacks = []  # they need what a real step leaves
+    trainer.train()
+    assert seen == {used}
+    assert torch.get_num_threads() == 3
+
+
+def test_less_than_one_thread_is_refused(wall_scene, wall_config, tmp_path):
+    config = wall_config(wall_scene, tmp_path, 1)
+    config.threads = 0
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    with pytest.raises(PointSplatError, match="0 threads"):
+        trainer.train()
