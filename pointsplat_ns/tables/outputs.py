@@ -25,7 +25,8 @@ FORMAT, VERSION = "pointsplat-tables", 1
 READING = (
     "Figures are means over scenes. PSNR (dB), SSIM and LPIPS (AlexNet) are against held-out photos; those of "
     '"renders" against the dense scene\'s own renders in the same poses. "Loses most" names the scene that loses most '
-    "PSNR compared to its dense scene, with its PSNR and the difference; of the dense scenes it is the one of the least PSNR. \\*: nothing is fine-tuned or refined."
+    "PSNR compared to its dense scene, with its PSNR and the difference; among dense scenes it is the one of the least "
+    "PSNR. \\*: nothing is fine-tuned or refined."
 )
 
 
@@ -88,8 +89,7 @@ def _notes(groups: Sequence[Group]) -> list[str]:
     if busy:
         notes.append(
             f"The machine was busy: while {len(busy)} of {len(cells)} cells were timed, other programs took up to "
-            f"{max(busy):.1f} cores. Table 2 has no frames a second of them; measured again with --only while nothing else "
-            "runs, they have."
+            f"{max(busy):.1f} cores. Table 2 leaves their frames a second out; --only measures them again."
         )
     if any(group.dataset for group in groups):
         notes.append(UNNAMED)
