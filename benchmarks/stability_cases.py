@@ -159,6 +159,8 @@ _TYPES = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 PRECISIONS = {torch.finfo(dtype).eps: dtype for dtype in _TYPES}
 """Types by their relative rounding."""
 
+FLOAT32 = torch.finfo(torch.float32).eps
+
 
 @dataclass(frozen=True)
 class Sweep:
@@ -191,5 +193,5 @@ SWEEPS = (
     Sweep("needles", "length / width of needles 0.3 pixels wide", _decades(0, 7), needles),
     Sweep("discs", "width / thickness of discs 20 pixels wide", _decades(0, 8), discs),
     Sweep("count", "Gaussians", _decades(1, 3, 0.5), layers, 10.0),
-    Sweep("precision", "relative rounding of the input's type", tuple(PRECISIONS), in_precision, input_precision=True),
+    Sweep("precision", "relative rounding of the type of the input", tuple(PRECISIONS), in_precision, FLOAT32, True),
 )

@@ -190,7 +190,9 @@ def _scores(given: Case, scene: Gaussians, truth: Gaussians) -> Iterator[tuple[s
 
 
 def _merge(given: Case, scene: Gaussians, truth: Gaussians) -> dict[str, float]:
-    states = [_state(part) for part in (scene, truth)]
+    centre, size = content_size(truth)  # of equal Gaussians it is a matter of ties, and only a unit
+    everyone, equal = torch.arange(len(truth)), torch.ones(len(truth))
+    states = [merge_state.start(part, everyone, equal, centre, size) for part in (scene, truth)]
     near = other_neighbours(states[1].means, NEIGHBOURS)
     costs, wanted = costs_of(states[0], near), costs_of(states[1], near, torch.float64)
     there = near != torch.arange(len(near))[:, None]
@@ -209,12 +211,6 @@ def _pairs(near: Tensor, costs: Tensor, most: int) -> set[tuple[int, int]]:
     """What one round would merge."""
     first, second = cheapest_pairs(near, costs.float(), most)
     return set(zip(first.tolist(), second.tolist(), strict=True))
-
-
-def _state(scene: Gaussians) -> merge_state.State:
-    """What merging starts from, every place being as important."""
-    centre, size = content_size(scene)
-    return merge_state.start(scene, torch.arange(len(scene)), torch.ones(len(scene)), centre, size)
 
 
 def _colours(scene: Gaussians, case: Case) -> Tensor:

@@ -30,7 +30,7 @@ MOST = 10.0
 Curve = tuple[str, str]
 """What is measured, and the quantity."""
 
-RASTERIZERS = {"eager": "ours", "compiled": "ours, compiled", "classic": "gsplat's formulas", "rounded input": "input"}
+RASTERIZERS = {"eager": "ours", "compiled": "compiled", "classic": "gsplat's formulas", "rounded input": "input"}
 OTHERS: dict[Curve, str] = {
     ("merge", "cost"): "merge: cost of a pair",
     ("merge", "pairs"): "merge: share of pairs chosen",
@@ -144,6 +144,7 @@ def plot_others(rows: Sequence[Row], path: Path) -> None:
 
 def _plot(rows: Sequence[Row], curves: dict[Curve, tuple[str, str, str]], path: Path, title: str) -> None:
     from matplotlib.figure import Figure
+    from PIL import Image
 
     sweeps = [sweep for sweep in SWEEPS if any(row.sweep == sweep.name for row in rows)]
     lines = -(-len(sweeps) // 3)
@@ -160,6 +161,9 @@ def _plot(rows: Sequence[Row], curves: dict[Curve, tuple[str, str, str]], path: 
     figure.suptitle(title, fontsize=11)
     with replacing(path) as part:
         figure.savefig(part, dpi=100, format="png")
+        with Image.open(part) as picture:  # lines need few colours
+            small = picture.convert("RGB").quantize(64)
+        small.save(part, "PNG", optimize=True)
 
 
 def _panel(axis: Axes, rows: Sequence[Row], sweep: Sweep, curves: dict[Curve, tuple[str, str, str]]) -> None:
