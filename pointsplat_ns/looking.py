@@ -108,8 +108,8 @@ def open_viewer(
     host: str = "127.0.0.1",
     port: int = 7007,
 ) -> Viewer:
-    """Show a scene, or two from the same camera, in the browser. Everything is drawn by this machine, on a CPU if it
-    has nothing else.
+    """Show a scene, or two from the same camera, in the browser. Everything is drawn by this machine's processor; no
+    GPU is needed.
 
     It opens upright: at the first of the dataset's poses if there are any, else at a sampled view.
 

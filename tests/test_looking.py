@@ -38,7 +38,7 @@ def frames_in(folder: Path) -> list[np.ndarray]:
     return [np.asarray(Image.open(path)) for path in sorted(folder.iterdir())]
 
 
-@pytest.mark.parametrize("path", ["auto", "walk", "orbit"])
+@pytest.mark.parametrize("path", ["walk", "orbit"])
 def test_film_of_a_scene_moves(path, scene, tmp_path):
     assert ps.render_path(scene, tmp_path / "frames", path=path, seconds=0.6, **SMALL) == 6
     frames = frames_in(tmp_path / "frames")

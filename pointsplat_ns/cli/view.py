@@ -16,8 +16,8 @@ def view(
     host: str = "127.0.0.1",
     port: int = 7007,
 ) -> None:
-    """Look at a scene in the browser, or at two from the same camera. It is drawn by this machine, on a CPU if it has
-    nothing else: small while the camera moves, whole once it is still. Ctrl-C ends it.
+    """Look at a scene in the browser, or at two from the same camera. It is drawn by this machine's processor, no GPU
+    is needed: small while the camera moves, whole once it is still. Ctrl-C ends it.
 
     For example: pointsplat view room.ply room_pruned.ply
 

@@ -52,13 +52,17 @@ class Exhibit:
 
 
 class Viewer:
-    """Shows one or two scenes in the browser, until it is closed.
+    """Shows one or two scenes in the browser, until it is closed; also the context of a ``with`` block.
 
-    Example:
-        >>> import pointsplat_ns as ps
-        >>> with ps.open_viewer(ps.example_room()[::10], port=0) as viewer:  # doctest: +SKIP
-        ...     print(viewer.url)
-        ...     viewer.wait()
+    Args:
+        exhibits: the scenes; the second is in the same place as the first.
+        host: the address to listen on.
+        port: the first port that is tried; 0 takes any that is free.
+        up: (3,) of length 1, which way is up; by default as the views of the first scene have it.
+
+    Raises:
+        DataError: if there is no place to look from.
+        PointSplatError: if the port cannot be listened on.
     """
 
     def __init__(self, exhibits: Sequence[Exhibit], host: str, port: int, up: Tensor | None = None):

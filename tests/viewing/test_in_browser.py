@@ -113,13 +113,15 @@ def test_picture_of_the_scene_arrives_and_becomes_whole(page):
 
 
 def test_wipe_moves_from_one_scene_to_the_other(page):
-    means = []
-    for line in (100, 0):
-        set_slider(page, "Wipe, %", line)
-        waited(lambda: not whole(page), "a picture of the moving line")
-        waited(lambda: whole(page), "the whole picture")
-        means.append(picture(page)[:, 40:].mean())
-    assert abs(means[0] - means[1]) > 40, "one is darker by far"
+    def brightness(first: int, last: int) -> float:
+        return picture(page)[:, first:last].mean()
+
+    waited(lambda: whole(page), "the whole picture, whose line is at column 600")
+    left, right = brightness(40, 560), brightness(640, 800)
+    set_slider(page, "Wipe, %", 100)
+    waited(lambda: brightness(640, 800) > 2 * right, "the first scene, which is brighter by far, on the right")
+    set_slider(page, "Wipe, %", 0)
+    waited(lambda: brightness(40, 560) < 0.5 * left, "the second scene on the left")
     set_slider(page, "Wipe, %", 50)
 
 
