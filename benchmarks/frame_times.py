@@ -20,19 +20,26 @@ from pointsplat_ns.tradeoff.judging import Judge, LookedAt
 
 
 def main(
-    scene: Path, /, keep: str = "30%", times: int = 10, views: int = 6, size: tuple[int, int] = (320, 240)
+    scene: Path,
+    /,
+    keep: str = "30%",
+    by: str = "merge",
+    times: int = 10,
+    views: int = 6,
+    size: tuple[int, int] = (320, 240),
 ) -> None:
     """Judge one smaller scene several times.
 
     Args:
         scene: what pointsplat_ns.load takes.
         keep: how much of it.
+        by: the method of pruning.
         times: how often.
         views: number of views.
         size: width and height, pixels.
     """
     dense = ps.load(scene)
-    small = ps.prune(dense, keep)
+    small = ps.prune(dense, keep, by)
     judge = Judge(dense, LookedAt(ps.sample_views(dense, views, *size), None, ""), None)
     table = Table("", "PSNR, dB", "times as fast (quartiles)", "ms a frame by the clock", "cores used by others")
     found, speeds = [], []

@@ -83,8 +83,8 @@ def _print_table(found: Tradeoff) -> None:
     print(f"{found.scene}: {len(found.points)} points, {found.width} x {found.height} pixels, {found.views_origin}")
     print(found.machine)
     caption = "*: recommended; times as fast as the dense scene: median and quartiles over views; dB of PSNR"
-    table = Table(box=SIMPLE, caption=caption)
-    table.add_column("")
+    table = Table(box=SIMPLE, caption=caption, collapse_padding=True, pad_edge=False)
+    table.add_column("", min_width=18)
     for name in [
         "Gaussians",
         "MB",
@@ -92,7 +92,6 @@ def _print_table(found: Tradeoff) -> None:
         "ms a\nframe",
         "dB,\nrenders",
         *(["dB,\nphotos"] if photos else []),
-        "made in",
     ]:
         table.add_column(name, justify="right", no_wrap=True)
     for point in found.points:
@@ -101,11 +100,10 @@ def _print_table(found: Tradeoff) -> None:
             point.label + (" *" if point.key == found.recommended else ""),
             f"{point.gaussians:,}",
             f"{point.bytes / 1e6:.2f}",
-            f"{speed.median:.2f} ({speed.low:.2f}-{speed.high:.2f})",
+            f"{speed.median:.1f} ({speed.low:.1f}-{speed.high:.1f})",
             _ms(point.frame_ms),
             f"{point.against_dense.psnr:.2f}",
             *([_psnr(point.against_photos)] if photos else []),
-            f"{point.seconds:.1f} s",
         )
     Console().print(table)
 
