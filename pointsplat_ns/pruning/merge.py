@@ -38,6 +38,7 @@ from pointsplat_ns.pruning.pair_costs import costs_of
 from pointsplat_ns.pruning.traces import how_much_seen, photo_places
 from pointsplat_ns.pruning.view_sampling import PROBED, is_room
 from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, viewpoints, weights_seen, weights_seen_from
+from pointsplat_ns.pruning.visibility import visibility
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import Views
@@ -221,6 +222,7 @@ class Merging:
         # Along a space-filling curve, neighbours are near each other in memory.
         self.members = members[curve_keys(unit_cells(scene.means[members])).argsort(stable=True)]
         self.centre, self.size = content_size(scene)
+        self.given = views
         self.views = views_in_units(views, self.centre, self.size) if views is not None else None
         self.not_shown = NOT_SHOWN if views is not None else 1.0
         self.photos: tuple[Tensor, Tensor] | None = None
@@ -277,6 +279,8 @@ class Merging:
         means = positions_in_units(self.scene.means[self.members], self.centre, self.size)
         if self.not_shown < 1:
             weights = weights_seen(means, self.views, self.not_shown)
+            if self.given is not None and len(self.members) <= MOST_SEEN:
+                weights *= visibility(self.scene, self.members, weights, self.given)
         elif self.photos is not None:
             weights = weights_seen_from(means, *self.photos)
         else:

@@ -93,8 +93,8 @@ def how_much_seen(scene: Gaussians, members: Tensor) -> Tensor:
         scene: N Gaussians.
         members: (n,) indices, n at least 1, in an order in which neighbours are near each other.
     """
-    energy = _around(_of_members(_energy, scene.features_rest, members))
-    flatness = _around(_of_members(_flatness, scene.scales, members))
+    energy = means_around(_of_members(_energy, scene.features_rest, members), NEIGHBOURHOOD)
+    flatness = means_around(_of_members(_flatness, scene.scales, members), NEIGHBOURHOOD)
     power = 1.0 if bool((energy > 0).any()) else FLATNESS_POWER
     logs = ENERGY_POWER * (energy + FAINTEST**2).log() + power * flatness
     return (logs - logs.median()).clamp(-MOST_FACTOR, MOST_FACTOR).exp().float()
@@ -116,11 +116,9 @@ def _flatness(scales: Tensor) -> Tensor:
     return (0.5 * (width + length) - thickness).nan_to_num(0.0).clamp(0.0, FLATTEST)
 
 
-def _around(values: Tensor) -> Tensor:
-    """Means over the neighbourhoods of values (n,)."""
-    means: Tensor = avg_pool1d(
-        values[None, None], NEIGHBOURHOOD, stride=1, padding=NEIGHBOURHOOD // 2, count_include_pad=False
-    )
+def means_around(values: Tensor, count: int) -> Tensor:
+    """Means (n,) of values (n,) over the ``count`` nearest in their order, an odd number; fewer at the ends."""
+    means: Tensor = avg_pool1d(values[None, None], count, stride=1, padding=count // 2, count_include_pad=False)
     return means[0, 0]
 
 
