@@ -168,7 +168,7 @@ def test_what_compact_gives_is_all_there(scene):
     fields = {field.name for field in dataclasses.fields(ps.Compacted)}
     assert fields == {
         *("scene", "pruned", "refined", "strength", "accepted", "verdict", "notes", "reference", "before", "after"),
-        *("seconds", "repaired", "after_repair"),
+        *("seconds", "repaired", "after_repair", "interrupted", "target"),
     }
     assert result.scene is (result.refined if result.accepted else result.pruned)
     assert result.psnr == (result.after if result.accepted else result.before).psnr

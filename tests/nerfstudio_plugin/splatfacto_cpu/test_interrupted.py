@@ -16,6 +16,10 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainer, splatfacto_cpu_config
 
 
+LATER = "2031-01-01_000000"
+"""When a training goes on that began a moment ago: in the same second it would have the same folder."""
+
+
 @pytest.fixture(autouse=True)
 def heeded():
     """Where the tests run in the background of a shell, SIGINT is ignored."""
@@ -32,7 +36,7 @@ def test_an_interrupted_training_ends_as_interrupted_and_not_as_finished(kind, w
 
     def main(**_):
         trainer = object.__new__(kind)
-        trainer.device, trainer.world_size = "cpu", 1
+        trainer.config, trainer.device, trainer.world_size = splatfacto_cpu_config(), "cpu", 1
         getattr(trainer, when)()
 
     monkeypatch.setattr(Trainer, when, interrupted)
@@ -74,7 +78,7 @@ def test_a_training_that_is_stopped_leaves_a_scene_and_can_be_gone_on_with(
     scene = read_scene(run.folder)
     assert len({len(value) for value in scene.tensors()}) == 1 and scene.usable().all() and len(scene) > 100
     again = wall_config(wall_scene, tmp_path, steps=3)
-    again.load_dir = config.get_checkpoint_dir()
+    again.load_dir, again.timestamp = config.get_checkpoint_dir(), LATER
     trainer, _ = run_training(again)
     assert trainer._start_step == 11 and trainer.step == 13
     state = torch.load(run.checkpoint, weights_only=True)
@@ -88,7 +92,7 @@ def test_a_training_of_a_refiner_stops_in_the_same_way(run_training, monkeypatch
     status = stopped_at(2, config, run_training, monkeypatch, signal.SIGINT, trainer_class=PointSplatTrainer)
     assert status == 130 and open_run(config.get_base_dir()).step == 2
     again = dense_config(tmp_path / "rooms", tmp_path, steps=1)
-    again.load_dir = config.get_checkpoint_dir()
+    again.load_dir, again.timestamp = config.get_checkpoint_dir(), LATER
     assert run_training(again)[0]._start_step == 3
 
 
