@@ -15,7 +15,6 @@ from pointsplat_ns.io import open_run, read_scene, write_ply
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainer, splatfacto_cpu_config
 
-
 LATER = "2031-01-01_000000"
 """When a training goes on that began a moment ago: in the same second it would have the same folder."""
 
