@@ -82,8 +82,8 @@ def compact(
         jobs: of a folder: number of processes that share its scenes and the cores; by default 1.
         shard: of a folder: only a part of its scenes; 2/5 is the second of five. Under torchrun each process takes its
             part.
-        threads: how many to use, in each process. By default the number is chosen while the work
-            goes on, and is lower while other programs keep the machine busy. It does not change the result.
+        threads: how many to use, in each process. By default the number is chosen while the work goes on, and is lower
+            while other programs keep the machine busy. It does not change the result.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.io.scene import is_folder_of_scenes

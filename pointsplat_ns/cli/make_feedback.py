@@ -29,8 +29,7 @@ def make_feedback(
         at_once: number of repairs in an update.
         seed: seed of the initial weights and of all choices.
         threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
-            programs keep the machine busy. Another number
-            sums in another order.
+            programs keep the machine busy. Another number sums in another order.
     """
     import functools
 

@@ -7,10 +7,10 @@ import functools
 from collections.abc import Sequence
 from pathlib import Path
 
-from pointsplat_ns.compression.view_source import COMPARED_VIEWS, ViewSource
+from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
-from pointsplat_ns.io.files import file_stem, logger
-from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
+from pointsplat_ns.io.files import logger
+from pointsplat_ns.io.runs import may_be_run, name_of, open_run
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
@@ -154,15 +154,8 @@ def _grouped(scenes: Sequence[TableScene], groups: Sequence[str]) -> list[TableS
 
 def _table_scene(path: Path) -> TableScene:
     """A scene, of which nothing is read but the hash of its file and, of a run, its settings."""
-    sha256, name, dataset = source_file(path).sha256, file_stem(path.stem), ""
-    if may_be_run(path):
-        try:
-            run = open_run(path, need_data=False)
-            name = scene_name(run)
-            dataset = _dataset(path)
-        except SceneError:
-            pass  # a checkpoint outside a run
-    return TableScene(name, path, sha256, dataset, None, functools.partial(_open, path))
+    dataset = _dataset(path) if may_be_run(path) else ""
+    return TableScene(name_of(path), path, source_file(path).sha256, dataset, None, functools.partial(_open, path))
 
 
 def _dataset(path: Path) -> str:
@@ -198,7 +191,7 @@ def _looked_at(path: Path, options: TableOptions) -> tuple[LookedAt, LookedAt] |
 
 
 def _sampled(source: ViewSource, options: TableOptions) -> tuple[LookedAt, LookedAt]:
-    """Views alone. Those to judge in are those that ``compact`` compares in, on which nothing is optimised."""
-    held_out = source.compared().spread(min(options.views, COMPARED_VIEWS))
+    """Views alone, to judge in and to train on."""
+    held_out = LookedAt.compared(source, options.views)
     training = source.views(max(TRAINING_PHOTOS, options.scoring_views))
-    return LookedAt(held_out, None, source.origin), LookedAt(training, None, source.origin)
+    return held_out, LookedAt(training, None, source.origin)

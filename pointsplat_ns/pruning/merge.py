@@ -224,7 +224,6 @@ class Merging:
         self.centre, self.size = content_size(scene)
         self.given = views
         self.views = views_in_units(views, self.centre, self.size) if views is not None else None
-        self.not_shown = NOT_SHOWN if views is not None else 1.0
         self.photos: tuple[Tensor, Tensor] | None = None
         if self.views is None and len(members) >= FEWEST_SEEN:
             content = in_units(scene, self.centre, self.size)
@@ -277,15 +276,15 @@ class Merging:
         if self.views is None:
             return torch.ones(len(self.members))
         means = positions_in_units(self.scene.means[self.members], self.centre, self.size)
-        if self.not_shown < 1:
-            weights = weights_seen(means, self.views, self.not_shown)
-            if self.given is not None and len(self.members) <= MOST_SEEN:
+        if self.given is not None:
+            weights = weights_seen(means, self.views, NOT_SHOWN)
+            if len(self.members) <= MOST_SEEN:
                 weights *= visibility(self.scene, self.members, weights, self.given)
         elif self.photos is not None:
             weights = weights_seen_from(means, *self.photos)
         else:
             weights = weights_seen(means, self.views)
-            if not is_room(thinned(self.scene, PROBED), None):
+            if not is_room(thinned(self.scene, PROBED)):
                 return weights
             return weights * how_much_seen(self.scene, self.members) ** UNTOLD
         return weights * how_much_seen(self.scene, self.members)

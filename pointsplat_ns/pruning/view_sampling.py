@@ -198,13 +198,13 @@ def estimated_up(scene: Gaussians) -> Tensor:
 
 
 @torch.no_grad()
-def is_room(scene: Gaussians, photos: tuple[Tensor, Tensor] | None) -> bool:
-    """Whether :func:`sample_views` looks at a scene from inside; ``photos`` as :func:`views_about` takes it.
+def is_room(scene: Gaussians) -> bool:
+    """Whether a scene that does not tell where its photos were taken is looked at from inside.
 
     Raises:
         DataError: if nothing of the scene is visible.
     """
-    return _stood_up(scene, photos)[1]
+    return _stood_up(scene, None)[1]
 
 
 def _stood_up(scene: Gaussians, photos: tuple[Tensor, Tensor] | None) -> tuple[UprightBox, bool]:

@@ -10,7 +10,7 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.traces import means_around
 from pointsplat_ns.rasterizer.pixel_walk import PixelBlock, sum_over_pixels
-from pointsplat_ns.rasterizer.projection import project
+from pointsplat_ns.rasterizer.projection import project_scene
 from pointsplat_ns.views import Views
 
 LOOKED_AT = 16
@@ -53,10 +53,7 @@ def pixels_of(scene: Gaussians, views: Views) -> Tensor:
         return torch.where(block.alpha > 0, block.alpha * block.before, 0.0).sum(-1, keepdim=True)
 
     for view in views:
-        seen = project(
-            scene.means, scene.quats, scene.stds, scene.alphas, view.viewmat, view.K, view.width, view.height,
-            near_plane=view.near_plane, far_plane=math.inf, antialiased=view.rasterize_mode == "antialiased",
-        )  # fmt: skip
+        seen = project_scene(scene, view)
         total.index_add_(0, seen.ids, sum_over_pixels(seen, view.width, view.height, 1, weights)[:, 0].double())
     return total
 

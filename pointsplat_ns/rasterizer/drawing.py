@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -11,7 +9,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.blending import Blend
 from pointsplat_ns.rasterizer.constants import QUALITIES, TILE
 from pointsplat_ns.rasterizer.frame import BlendOptions
-from pointsplat_ns.rasterizer.projection import project
+from pointsplat_ns.rasterizer.projection import project_scene
 from pointsplat_ns.rasterizer.rendering import QualityName, finite_colors
 from pointsplat_ns.rasterizer.tiles import Footprints, Region
 from pointsplat_ns.views import View
@@ -39,10 +37,7 @@ class Drawing:
 
     @torch.no_grad()
     def __init__(self, scene: Gaussians, view: View, quality: QualityName = "exact"):
-        seen = project(
-            scene.means, scene.quats, scene.stds, scene.alphas, view.viewmat, view.K, view.width, view.height,
-            view.near_plane, far_plane=math.inf, antialiased=view.rasterize_mode == "antialiased",
-        )  # fmt: skip
+        seen = project_scene(scene, view)
         seen, self._colors, _ = finite_colors(seen, scene.sh, 0, False, scene.sh_degree)
         level = QUALITIES[quality]
         self._seen, self._options = seen, BlendOptions(level)

@@ -9,7 +9,9 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.ewa import Lens, Project
+from pointsplat_ns.views import View
 
 
 @dataclass
@@ -80,6 +82,14 @@ def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: T
     for values in (means, quats, scales, opacities[:, None]):
         good &= values.isfinite().all(-1)
     return means.shape[0] - int(good.sum())
+
+
+def project_scene(scene: Gaussians, view: View) -> Projected:
+    """What a view shows of a scene, as :func:`~pointsplat_ns.render` projects it."""
+    return project(
+        scene.means, scene.quats, scene.stds, scene.alphas, view.viewmat, view.K, view.width, view.height,
+        near_plane=view.near_plane, far_plane=math.inf, antialiased=view.rasterize_mode == "antialiased",
+    )  # fmt: skip
 
 
 def project(

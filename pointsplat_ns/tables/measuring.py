@@ -27,6 +27,7 @@ from pointsplat_ns.tables.ways import SEED, Way, all_cells, cell_key
 from pointsplat_ns.tradeoff.judging import Judge, Judged
 from pointsplat_ns.tradeoff.machine import machine_text, one_at_a_time
 from pointsplat_ns.tradeoff.making import Made
+from pointsplat_ns.tradeoff.measuring import point_of
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import DENSE
 
@@ -210,24 +211,16 @@ class _SceneWork:
         command = ["pointsplat", "tables", str(self.scene.path), "-o", str(self.folder)]
         command += ["--only", self.key(way, share), *self.tools.words(way, share, self.scene.name)]
         repairs = {"fine-tuned": way.fine_tuned, "refiner": way.network is not None}
-        return Point(
+        return point_of(
+            made,
+            judged,
             key=self.key(way, share),
             label=way.label,
             command=shlex.join(command),
             by=way.by or way.name,
             share=share,
-            gaussians=len(made.scene),
-            sh_degree=made.scene.sh_degree,
             repair=next((name for name, used in repairs.items() if used), way.repair),
             bytes=ply_bytes(len(made.scene), made.scene.sh_degree),
-            against_dense=judged.against_dense,
-            against_photos=judged.against_photos,
-            frame_ms=judged.frame_ms,
-            frame_ms_low=judged.frame_ms_low,
-            frame_ms_high=judged.frame_ms_high,
-            seconds=made.seconds,
-            peak_bytes=made.peak_bytes,
-            others_cores=judged.others_cores,
         )
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pointsplat_ns.compression.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.pictures import write_picture
@@ -45,6 +46,16 @@ class LookedAt:
     origin: str
     """Text: where the views came from."""
 
+    @staticmethod
+    def compared(source: ViewSource, count: int) -> LookedAt:
+        """At most ``count`` views without photos: those that ``compact`` compares in, on which nothing is optimised.
+
+        Raises:
+            DataError: if there are none.
+        """
+        views = source.compared().spread(min(count, COMPARED_VIEWS))
+        return LookedAt(views, None, source.origin)
+
     def resized(self, side: int) -> LookedAt:
         """The same with at most ``side`` pixels on the longer side; photos are averaged over the areas of pixels."""
         views = self.views.resized(side)
@@ -60,7 +71,8 @@ class LookedAt:
 
 @dataclass(frozen=True)
 class Judged:
-    """What a scene is worth; as the fields of :class:`~pointsplat_ns.tradeoff.points.Point`."""
+    """What a scene is worth; each is a field of :class:`~pointsplat_ns.tradeoff.points.Point`, see
+    :func:`~pointsplat_ns.tradeoff.measuring.point_of`."""
 
     against_dense: Quality
     against_photos: Quality | None

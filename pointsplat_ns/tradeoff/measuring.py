@@ -8,16 +8,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
-from pointsplat_ns.compression.view_source import COMPARED_VIEWS, ViewSource
+from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import cut_sh, need_usable
 from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.tradeoff.judging import Judge, LookedAt
+from pointsplat_ns.tradeoff.judging import Judge, Judged, LookedAt
 from pointsplat_ns.tradeoff.machine import one_at_a_time
 from pointsplat_ns.tradeoff.making import Made, make, through_file
 from pointsplat_ns.tradeoff.points import Point
@@ -99,9 +100,7 @@ class Measurer:
                 return LookedAt(views, photos, "held-out photos of the dataset")
             except (SceneError, DataError) as error:
                 self.note(f"there are no held-out photos: {error}")
-        source = self.subject.new_views()
-        views = source.compared().spread(min(count, COMPARED_VIEWS))
-        return LookedAt(views, None, source.origin)
+        return LookedAt.compared(self.subject.new_views(), count)
 
     @cached_property
     def judge(self) -> Judge:
@@ -157,24 +156,27 @@ class Measurer:
     def _point(self, setting: Setting, made: Made, key: str, label: str, command: str, show: Progress) -> Point:
         size, scene = through_file(made.scene, self.subject.suffix)
         judged = self.judge.judge(scene, key, lambda share: show("", share), self.timed, setting.drawn)
-        return Point(
+        return point_of(
+            made,
+            judged,
             key=key,
             label=label,
             command=command,
             by=setting.by,
             share=setting.count / len(self.dense),
-            gaussians=len(made.scene),
-            sh_degree=made.scene.sh_degree,
             repair=setting.repair,
             bytes=size,
-            against_dense=judged.against_dense,
-            against_photos=judged.against_photos,
-            frame_ms=judged.frame_ms,
-            frame_ms_low=judged.frame_ms_low,
-            frame_ms_high=judged.frame_ms_high,
-            seconds=made.seconds,
-            peak_bytes=made.peak_bytes,
-            others_cores=judged.others_cores,
-            clock_ms=judged.clock_ms,
             drawn=setting.drawn,
         )
+
+
+def point_of(made: Made, judged: Judged, **named: Any) -> Point:
+    """The point of a scene that was made and judged; ``named`` are the other fields of :class:`Point`."""
+    return Point(
+        gaussians=len(made.scene),
+        sh_degree=made.scene.sh_degree,
+        seconds=made.seconds,
+        peak_bytes=made.peak_bytes,
+        **vars(judged),
+        **named,
+    )

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from browser import chromium, complaints
+from browser import chromium, complaints, phone_and_colours
 from flying import camera, message, picture, settle, shrink, view_on
 from making import ball, cloud
 from pointsplat_ns.gaussians import Gaussians
@@ -316,18 +316,7 @@ def test_a_damaged_scene_is_one_sentence(browser, path, tmp_path, damage):
 
 
 def test_page_fits_a_phone_follows_the_colours_of_the_reader_and_names_its_controls(opened):
-    size = {"width": 360, "height": 740, "deviceScaleFactor": 1, "mobile": True}
-    opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    try:
-        assert opened.execute_script("return document.documentElement.scrollWidth") == 360
-        colors = []
-        for scheme in ("light", "dark"):
-            feature = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
-            opened.execute_cdp_cmd("Emulation.setEmulatedMedia", feature)
-            colors.append(opened.execute_script("return getComputedStyle(document.body).backgroundColor"))
-        assert colors == ["rgb(247, 247, 245)", "rgb(18, 21, 24)"]
-    finally:
-        opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert phone_and_colours(opened) == (360, ["rgb(247, 247, 245)", "rgb(18, 21, 24)"])
     script = """return [...document.querySelectorAll("button, input, canvas, [role]:not([role='status'])")]
       .filter((e) => !(e.getAttribute("aria-label") || e.getAttribute("aria-labelledby")))
       .filter((e) => !(e.labels?.length || e.innerText)).map((e) => e.outerHTML)"""

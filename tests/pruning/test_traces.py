@@ -229,7 +229,7 @@ def test_merging_keeps_more_of_what_is_flat_in_a_room_that_tells_nothing_else():
     thinner = torch.where(left, math.log(0.005), math.log(0.05))[:, None]
     half = torch.where(flat < math.log(0.05), thinner.expand_as(flat), flat)
     even = torch.where(round_ < math.log(0.05), math.log(0.02), round_)
-    assert is_room(walls, None) and photo_places(walls.replace(scales=half)) is None
+    assert is_room(walls) and photo_places(walls.replace(scales=half)) is None
     kept = [float((merge(walls.replace(scales=s), 500).scene.means[:, 0] < 0).float().mean()) for s in (half, even)]
     assert kept[0] > kept[1] + 0.02
 

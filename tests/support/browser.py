@@ -44,3 +44,19 @@ def complaints(browser: Chrome) -> list[str]:
     graphics driver says of its speed is left out."""
     messages = (entry["message"] for entry in browser.get_log("browser"))
     return [message for message in messages if "GL Driver Message (OpenGL, Performance" not in message]
+
+
+def phone_and_colours(browser) -> tuple[int, list[str]]:
+    """How wide the open page is on a phone 360 pixels wide, and its background for readers of light and of dark."""
+    size = {"width": 360, "height": 740, "deviceScaleFactor": 1, "mobile": True}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        width = browser.execute_script("return document.documentElement.scrollWidth")
+        colors = []
+        for scheme in ("light", "dark"):
+            feature = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+            browser.execute_cdp_cmd("Emulation.setEmulatedMedia", feature)
+            colors.append(browser.execute_script("return getComputedStyle(document.body).backgroundColor"))
+        return width, colors
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from browser import chromium, complaints
+from browser import chromium, complaints, phone_and_colours
 from flying import message, picture, shrink
 from pointsplat_ns.tradeoff.front import fastest_above, fastest_within, pareto_front
 
@@ -191,18 +191,7 @@ def test_table_is_sorted_and_leads_to_the_pictures(opened, sweep):
 
 
 def test_page_fits_a_phone_and_follows_the_colours_of_the_reader(opened):
-    size = {"width": 360, "height": 740, "deviceScaleFactor": 1, "mobile": True}
-    opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    try:
-        assert opened.execute_script("return document.documentElement.scrollWidth") == 360
-        colors = []
-        for scheme in ("light", "dark"):
-            feature = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
-            opened.execute_cdp_cmd("Emulation.setEmulatedMedia", feature)
-            colors.append(opened.execute_script("return getComputedStyle(document.body).backgroundColor"))
-        assert colors == ["rgb(247, 247, 245)", "rgb(18, 21, 24)"]
-    finally:
-        opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert phone_and_colours(opened) == (360, ["rgb(247, 247, 245)", "rgb(18, 21, 24)"])
 
 
 def test_controls_have_names(opened):
