@@ -29,6 +29,7 @@ PROGRAMS = (
     "refiner",
     "repair",
     "sampled_views",
+    "soak",
     "stability",
     "threads",
 )
