@@ -17,6 +17,7 @@ from pointsplat_ns.refiner import save_refiner
 
 PROGRAMS = (
     "compaction",
+    "docs_pictures",
     "drawing",
     "example_room",
     "formats",

@@ -84,6 +84,8 @@ def test_command_is_one_that_works(command, tmp_path, monkeypatch, capsys):
     elif program == "pre-commit":
         assert words[1] in ("install", "run")
         assert (ROOT / ".pre-commit-config.yaml").is_file()
+    elif program == "docker":
+        assert words[1:2] in (("build",), ("run",)) and (ROOT / "Dockerfile").is_file()
     elif program == "npm":
         assert words == ("npm", "install", "@playcanvas/splat-transform")
     else:
