@@ -77,8 +77,7 @@ def _lines(stream: IO[str]) -> Iterator[Progress]:
 
     def show(what: str, share: float) -> None:
         taken = time.monotonic() - begun.setdefault(what, time.monotonic())
-        left = f", about {_clock(taken * (1 - share) / share)} left" if 0 < share < 1 and taken > 0 else ""
-        current[0] = f"{what}: {100 * share:.0f} %{left}"
+        current[0] = f"{what}: {100 * share:.0f} %{_left(share, taken)}"
 
     writer = threading.Thread(target=write, daemon=True)
     writer.start()
@@ -87,6 +86,16 @@ def _lines(stream: IO[str]) -> Iterator[Progress]:
     finally:
         ended.set()
         writer.join()
+
+
+def _left(share: float, taken: float) -> str:
+    """What is left of a task of which a share is done after so many seconds, in words; empty if that says nothing.
+
+    Example:
+        >>> _left(0.25, 30.0), _left(0.0, 30.0), _left(1.0, 30.0)
+        (', about 1:30 left', '', '')
+    """
+    return f", about {_clock(taken * (1 - share) / share)} left" if 0 < share < 1 and taken > 0 else ""
 
 
 def _clock(seconds: float) -> str:
