@@ -66,7 +66,7 @@ def _lines(stream: IO[str]) -> Iterator[Progress]:
     """Write what is being done to ``stream``, every :data:`LINE_SECONDS` seconds until the context is left. A thread
     writes, so that steps that report nothing for minutes are told from a program that hangs."""
     start, ended, current = time.monotonic(), threading.Event(), ["starting"]
-    begun: dict[str, float] = {}
+    begun: dict[str, tuple[float, float]] = {}  # when each task was first heard of, and what was done of it by then
 
     def write() -> None:
         while not ended.wait(LINE_SECONDS):
@@ -76,8 +76,9 @@ def _lines(stream: IO[str]) -> Iterator[Progress]:
                 return
 
     def show(what: str, share: float) -> None:
-        taken = time.monotonic() - begun.setdefault(what, time.monotonic())
-        current[0] = f"{what}: {100 * share:.0f} %{_left(share, taken)}"
+        now = time.monotonic()
+        start_of_task, before = begun.setdefault(what, (now, share))
+        current[0] = f"{what}: {100 * share:.0f} %{_left(share, share - before, now - start_of_task)}"
 
     writer = threading.Thread(target=write, daemon=True)
     writer.start()
@@ -88,14 +89,19 @@ def _lines(stream: IO[str]) -> Iterator[Progress]:
         writer.join()
 
 
-def _left(share: float, taken: float) -> str:
-    """What is left of a task of which a share is done after so many seconds, in words; empty if that says nothing.
+def _left(share: float, gained: float, taken: float) -> str:
+    """What is left of a task, in words; empty if nothing can be said.
+
+    Args:
+        share: that is done.
+        gained: the part of it that took the seconds.
+        taken: seconds.
 
     Example:
-        >>> _left(0.25, 30.0), _left(0.0, 30.0), _left(1.0, 30.0)
+        >>> _left(0.25, 0.25, 30.0), _left(0.5, 0.0, 0.0), _left(1.0, 1.0, 30.0)
         (', about 1:30 left', '', '')
     """
-    return f", about {_clock(taken * (1 - share) / share)} left" if 0 < share < 1 and taken > 0 else ""
+    return f", about {_clock(taken * (1 - share) / gained)} left" if gained > 0 and share < 1 else ""
 
 
 def _clock(seconds: float) -> str:
