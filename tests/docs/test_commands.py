@@ -33,8 +33,13 @@ def runs_quickly(words: tuple[str, ...]) -> bool:
     return ours and not takes_long and not any(word.startswith("outputs/") for word in words)
 
 
-QUICK = {command.words: command for command in COMMANDS if runs_quickly(command.words)}
-"""Commands to run, each once however many pages show it."""
+def kind(words: tuple[str, ...]) -> tuple[str, ...]:
+    """What a command does, apart from how much it keeps and how its files are called."""
+    return tuple(sorted(re.sub(r"[\d.]+|\w+(?=\.[a-z]+$)", "", word) for word in words))
+
+
+QUICK = {kind(command.words): command for command in reversed(COMMANDS) if runs_quickly(command.words)}
+"""Commands to run, each kind once however many pages show it."""
 PYTHON = sorted({block.page for block in BLOCKS if block.language == "python"})
 
 
