@@ -1,6 +1,7 @@
 # Each target sets up what it needs: an environment in $(VENV), made once and renewed when pyproject.toml changes.
 #   make test    run the test suite
 #   make lint    check style, types and the direction of imports
+#   make docs    build the documentation as a site, in site/
 #   make demo    a built-in scene made small, then the whole method: train, prune, refine, evaluate, export
 # Use an environment of your own with `make test VENV=/path/to/env`.
 
@@ -17,7 +18,7 @@ WORKERS ?= 2
 # Threads that wait for one another spin briefly and then sleep: much faster where other programs run as well.
 export GOMP_SPINCOUNT ?= 20000
 
-.PHONY: setup test lint demo clean
+.PHONY: setup test lint docs demo clean
 
 setup: $(STAMP)
 
@@ -38,8 +39,11 @@ lint: $(STAMP)
 	$(VENV)/bin/python -m mypy
 	$(VENV)/bin/lint-imports --no-cache
 
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build --strict
+
 demo: $(STAMP)
 	$(VENV)/bin/pointsplat demo
 
 clean:
-	rm -rf build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache .hypothesis
+	rm -rf build dist site *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache .hypothesis

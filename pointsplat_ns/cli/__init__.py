@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import os
+import re
 import signal
 import sys
 import threading
+import types
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-ABOUT = "Makes trained 3D Gaussian Splatting scenes smaller. `pointsplat --version` prints the version."
+ABOUT = "Makes trained 3D Gaussian Splatting scenes smaller, and looks at them. `--version` prints the version."
 
 
 class _PrintHandler(logging.Handler):
@@ -76,11 +79,38 @@ def _is_lack_of_memory(error: RuntimeError) -> bool:
     return isinstance(error, torch.cuda.OutOfMemoryError) or "can't allocate memory" in str(error)
 
 
+def _redescribed(
+    commands: dict[str, Callable[..., None]], describe: Callable[[str], str]
+) -> dict[str, Callable[..., None]]:
+    """The same commands with other docstrings."""
+
+    def with_text(command: Any) -> Callable[..., None]:
+        # A copy, as tyro looks into what a wrapper wraps.
+        same = types.FunctionType(command.__code__, command.__globals__, command.__name__, command.__defaults__)
+        same.__annotations__, same.__kwdefaults__ = command.__annotations__, command.__kwdefaults__
+        same.__doc__ = describe(inspect.getdoc(command) or "")
+        return same
+
+    return {name: with_text(command) for name, command in commands.items()}
+
+
+def _first_sentence(text: str) -> str:
+    """What the list of commands says of each."""
+    return re.split(r"(?<=\.)\s", text, maxsplit=1)[0]
+
+
+def _options_in_lines(text: str) -> str:
+    """A docstring with each option on a line of its own: the completion that tyro 1.0 writes for bash takes further
+    lines for further words."""
+    return re.sub(r"\n {8,}", " ", text)
+
+
 def main(args: list[str] | None = None) -> None:
     """Run one subcommand.
 
     Input that cannot be used, files that cannot be read or written, and a lack of memory end it with one line and exit
-    status 1; Ctrl-C ends it with 130, another signal with 128 plus its number.
+    status 1; Ctrl-C ends it with 130, another signal with 128 plus its number
+    (:data:`pointsplat_ns.cli.help.STATUSES`). With ``--json``, standard output has one JSON value and nothing else.
     """
     import tyro
 
@@ -89,10 +119,12 @@ def main(args: list[str] | None = None) -> None:
     from pointsplat_ns.cli.convert import convert
     from pointsplat_ns.cli.demo import demo
     from pointsplat_ns.cli.export import export
+    from pointsplat_ns.cli.help import after_help
     from pointsplat_ns.cli.info import info
     from pointsplat_ns.cli.lod import lod
     from pointsplat_ns.cli.make_feedback import make_feedback
     from pointsplat_ns.cli.make_refiner import make_refiner
+    from pointsplat_ns.cli.printing import only_json
     from pointsplat_ns.cli.prune import prune
     from pointsplat_ns.cli.render import render
     from pointsplat_ns.cli.report import report
@@ -121,9 +153,14 @@ def main(args: list[str] | None = None) -> None:
         "make-feedback": make_feedback,
         "demo": demo,
     }
+    args = sys.argv[1:] if args is None else args
+    if args in (["-h"], ["--help"]):
+        commands = _redescribed(commands, _first_sentence)
+    elif args and args[0].startswith("--tyro-"):
+        commands = _redescribed(commands, _options_in_lines)
     try:
-        with _log_printed(), _ended_by_signals():
-            if (sys.argv[1:] if args is None else args) == ["--version"]:
+        with _log_printed(), _ended_by_signals(), only_json(args):
+            if args == ["--version"]:
                 print(f"pointsplat-ns {__version__}")
             else:
                 tyro.extras.subcommand_cli_from_dict(commands, prog="pointsplat", description=ABOUT, args=args)
@@ -142,3 +179,7 @@ def main(args: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
+    except SystemExit as end:
+        if not end.code and (text := after_help(args)):
+            print(f"\n{text}")
+        raise

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from pointsplat_ns.cli.folders import compact_folder
+from pointsplat_ns.cli.printing import Json, print_distributions, print_json, print_result, scene_result
 from pointsplat_ns.cli.scene_options import (
     Bands,
     Output,
@@ -17,10 +18,12 @@ from pointsplat_ns.cli.scene_options import (
     file_bytes,
     in_format_of,
     output_beside,
-    print_distributions,
-    print_result,
     warn_if_larger,
 )
+
+if TYPE_CHECKING:
+    from pointsplat_ns.compression.compact import Compacted
+    from pointsplat_ns.gaussians import Gaussians
 
 
 def compact(
@@ -44,6 +47,7 @@ def compact(
     jobs: int | None = None,
     shard: str | None = None,
     threads: int | None = None,
+    json_output: Json = False,
 ) -> None:
     """Make any scene smaller and repair it, or all scenes of a folder. No photos are needed.
 
@@ -84,6 +88,7 @@ def compact(
             part.
         threads: how many to use, in each process. By default the number is chosen while the work goes on, and is lower
             while other programs keep the machine busy. It does not change the result.
+        json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.io.scene import is_folder_of_scenes
@@ -92,9 +97,9 @@ def compact(
     if is_folder_of_scenes(scene):
         with fixed_threads(threads):
             compact_folder(
-                scene, output, picture, html, dry_run, keep=keep, refiner=refiner, by=by, sh=sh, clean=clean,
-                effort=effort, seconds=seconds, target_db=target_db, target_ms=target_ms, target_mb=target_mb,
-                jobs=1 if jobs is None else jobs, shard=shard, force=force,
+                scene, output, picture, html, dry_run, json_output, keep=keep, refiner=refiner, by=by, sh=sh,
+                clean=clean, effort=effort, seconds=seconds, target_db=target_db, target_ms=target_ms,
+                target_mb=target_mb, jobs=1 if jobs is None else jobs, shard=shard, force=force,
             )  # fmt: skip
         return
     if jobs is not None or shard is not None:
@@ -103,7 +108,6 @@ def compact(
     from pointsplat_ns.compression.repair import RepairBudget
     from pointsplat_ns.io import read_scene
     from pointsplat_ns.io.formats import format_to_write
-    from pointsplat_ns.io.runs import name_of
     from pointsplat_ns.pages.scene_page import check_limit
     from pointsplat_ns.tradeoff.targets import targets_of
 
@@ -126,17 +130,38 @@ def compact(
     if not dry_run:
         ps.save(result.scene, output, progress=True)
         warn_if_larger(keep, output)
-    what = "kept" + (" and refined" if result.accepted else "") + (" and repaired" if result.repair_accepted else "")
-    print_result(what, len(dense), result.scene, result.seconds, None if dry_run else output)
-    print_distributions(dense, result.scene)
-    if picture is not None:
-        print(ps.plot_comparison(dense, result, picture))
+    shown = None if picture is None else ps.plot_comparison(dense, result, picture)
     if html is not None:
-        notes = []
-        if result.psnr is not None:
-            notes.append(f"The compact scene has {result.psnr:.2f} dB PSNR against the dense scene's renders.")
-        ps.write_page(
-            [dense, result.scene], html, ["dense", "compact"], title=name_of(scene), notes=notes, views=result.views,
-            limit_mb=html_limit, progress=True,
-        )  # fmt: skip
+        _write_page(scene, dense, result, html, html_limit)
+    written = None if dry_run else output
+    if json_output:
+        made = {
+            "refined": result.accepted,
+            "repaired": result.repair_accepted,
+            "psnr": result.psnr,
+            "picture": picture,
+            "html": html,
+        }
+        print_json({**scene_result(len(dense), result.scene, result.seconds, written), **made})
+        return
+    what = "kept" + (" and refined" if result.accepted else "") + (" and repaired" if result.repair_accepted else "")
+    print_result(what, len(dense), result.scene, result.seconds, written)
+    print_distributions(dense, result.scene)
+    if shown is not None:
+        print(shown)
+    if html is not None:
         print(f"{html}: {file_bytes(html) / 1e6:.2f} MB, to fly through in a browser")
+
+
+def _write_page(path: Path, dense: Gaussians, result: Compacted, html: Path, limit_mb: float) -> None:
+    """The page to fly through the scene before and after."""
+    import pointsplat_ns as ps
+    from pointsplat_ns.io.runs import name_of
+
+    notes = []
+    if result.psnr is not None:
+        notes.append(f"The compact scene has {result.psnr:.2f} dB PSNR against the dense scene's renders.")
+    ps.write_page(
+        [dense, result.scene], html, ["dense", "compact"], title=name_of(path), notes=notes, views=result.views,
+        limit_mb=limit_mb, progress=True,
+    )  # fmt: skip

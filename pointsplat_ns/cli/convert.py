@@ -8,6 +8,7 @@ from typing import Literal
 
 import tyro
 
+from pointsplat_ns.cli.printing import Json, print_json, scene_result
 from pointsplat_ns.cli.scene_options import Scene, check_outputs, file_bytes
 
 
@@ -21,10 +22,9 @@ def convert(
     spz_version: Literal[3, 4] = 3,
     spz_sh_bits: tuple[int, int] = (6, 5),
     force: bool = False,
+    json_output: Json = False,
 ) -> None:
     """Write a scene in another format. What each format keeps and loses stands in docs/formats.md.
-
-    For example: pointsplat convert room.ply room.spz --sh 1
 
     Args:
         scene: a file of any format (.ply, .compressed.ply, .spz, .sog or its folder, .splat, .ksplat), a Splatfacto
@@ -40,6 +40,7 @@ def convert(
         spz_sh_bits: of an .spz file: bits of SH coefficients, of degree 1 and of the others, up to 8. More bits are a
             larger file and a better picture.
         force: overwrite an existing file.
+        json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.io.formats import format_to_write
@@ -57,7 +58,11 @@ def convert(
             write_spz(after, output, report, spz_version, spz_sh_bits)
     else:
         ps.save(after, output, progress=True)
+    seconds = time.perf_counter() - start
+    if json_output:
+        print_json(scene_result(len(before), after, seconds, output))
+        return
     cut = f" cut to {after.sh_degree}" if after.sh_degree < before.sh_degree else ""
     degree = f"SH degree {before.sh_degree}{cut}"
     size = file_bytes(output) / 1e6
-    print(f"{output}: {len(after):,} Gaussians, {degree}, {size:.2f} MB, in {time.perf_counter() - start:.1f} s")
+    print(f"{output}: {len(after):,} Gaussians, {degree}, {size:.2f} MB, in {seconds:.1f} s")

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from pointsplat_ns.cli.printing import Json, print_json, scene_result
 from pointsplat_ns.cli.scene_options import check_outputs, file_bytes
 
 
@@ -16,6 +17,7 @@ def export(
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     scene: str | None = None,
     force: bool = False,
+    json_output: Json = False,
 ) -> None:
     """Write the refined scene of a pointsplat run, or the trained one of a Splatfacto run, as a file of any format.
 
@@ -24,6 +26,7 @@ def export(
         output: the file to write, of any format as for prune.
         scene: which scene of a pointsplat run; by default the first that it was not trained on, or the first.
         force: overwrite an existing file.
+        json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
 
@@ -31,5 +34,9 @@ def export(
     start = time.perf_counter()
     exported = ps.load(run, scene)
     ps.save(exported, output, progress=True)
+    seconds = time.perf_counter() - start
+    if json_output:
+        print_json(scene_result(None, exported, seconds, output))
+        return
     size = file_bytes(output) / 1e6
-    print(f"{output}: {len(exported):,} Gaussians, {size:.2f} MB, in {time.perf_counter() - start:.1f} s")
+    print(f"{output}: {len(exported):,} Gaussians, {size:.2f} MB, in {seconds:.1f} s")

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from pointsplat_ns.cli.printing import print_json
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_task import SceneResult
@@ -26,7 +29,13 @@ def need_one_scene(path: Path) -> None:
 
 
 def compact_folder(
-    folder: Path, output: Path | None, picture: Path | None, html: Path | None, dry_run: bool, **options
+    folder: Path,
+    output: Path | None,
+    picture: Path | None,
+    html: Path | None,
+    dry_run: bool,
+    json_output: bool,
+    **options,
 ) -> None:
     """Compact every scene of a folder, and print a table of them.
 
@@ -34,6 +43,7 @@ def compact_folder(
         folder: the folder.
         output: the folder for results.
         picture, html, dry_run: what is refused here.
+        json_output: print JSON in place of a table.
         options: further ones of :func:`pointsplat_ns.compact_folder`.
 
     Raises:
@@ -51,9 +61,12 @@ def compact_folder(
     results = ps.compact_folder(folder, target, progress=True, **options)
     if torchrun_rank()[0] > 0:
         return  # the first process speaks for all
-    _print_table(results)
     failed = sum(result.status == "failed" for result in results)
-    print(f"{target}: {len(results) - failed} of {len(results)} scenes, and the table {TABLE_NAME}")
+    if json_output:
+        print_json({"output": target, "scenes": [asdict(result) for result in results]})
+    else:
+        _print_table(results)
+        print(f"{target}: {len(results) - failed} of {len(results)} scenes, and the table {TABLE_NAME}")
     if failed:
         raise ps.PointSplatError(f"{failed} of {len(results)} scenes failed; the same command tries them again")
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import tyro
-
+from pointsplat_ns.cli.printing import Json, print_json
 from pointsplat_ns.cli.scene_options import Scene
 
 if TYPE_CHECKING:
@@ -16,18 +14,18 @@ WIDTH = 40
 """Characters of the longest bar."""
 
 
-def info(scene: Scene, json_output: Annotated[bool, tyro.conf.arg(name="json")] = False) -> None:
+def info(scene: Scene, json_output: Json = False) -> None:
     """Look at a scene: counts, SH, opacities, sizes, bounds, rows that look wrong, and what files of it would weigh.
 
     Args:
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
-        json_output: print JSON.
+        json_output: print JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
 
     found = ps.info(scene)
     if json_output:
-        print(json.dumps(found.as_dict(), indent=2))
+        print_json(found.as_dict())
     else:
         _print(found)
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.cli.folders import need_one_scene
+from pointsplat_ns.cli.printing import Json, print_json
 from pointsplat_ns.cli.scene_options import Bands, Output, Scene, output_beside
 
 if TYPE_CHECKING:
@@ -19,6 +21,7 @@ def lod(
     sh: Bands = "all",
     force: bool = False,
     threads: int | None = None,
+    json_output: Json = False,
 ) -> None:
     """Make levels of detail: the scene merged to fewer and fewer Gaussians in one pass, the error of each measured.
 
@@ -36,15 +39,20 @@ def lod(
         force: overwrite existing files.
         threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
             programs keep the machine busy. It does not change the result.
+        json_output: print the manifest, and nothing else on standard output.
     """
     import pointsplat_ns as ps
+    from pointsplat_ns.compression.level_folder import MANIFEST
     from pointsplat_ns.system.threads import fixed_threads
 
     need_one_scene(scene)
     folder = output or output_beside(scene, "lod").with_suffix("")
     with fixed_threads(threads):
         made = ps.lod(scene, levels, sh=sh, folder=folder, force=force, progress=True)
-    _print_table(made, folder)
+    if json_output:
+        print_json({"output": folder, **json.loads((folder / MANIFEST).read_text("utf-8"))})
+    else:
+        _print_table(made, folder)
 
 
 def _print_table(made: Levels, folder: Path) -> None:

@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 from pointsplat_ns.cli.folders import need_one_scene
+from pointsplat_ns.cli.printing import Json, print_distributions, print_json, print_result, scene_result
 from pointsplat_ns.cli.scene_options import (
     Bands,
     Output,
@@ -13,8 +14,6 @@ from pointsplat_ns.cli.scene_options import (
     check_outputs,
     in_format_of,
     output_beside,
-    print_distributions,
-    print_result,
     warn_if_larger,
 )
 
@@ -32,6 +31,7 @@ def prune(
     dry_run: bool = False,
     force: bool = False,
     threads: int | None = None,
+    json_output: Json = False,
 ) -> None:
     """Make a scene smaller: keep the Gaussians that matter, or merge them, from the scene alone.
 
@@ -57,6 +57,7 @@ def prune(
         force: overwrite existing files.
         threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
             programs keep the machine busy. It does not change the result.
+        json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.compression.prune import check_options
@@ -79,8 +80,13 @@ def prune(
     if not dry_run:
         ps.save(small, output, progress=True)
         warn_if_larger(keep, output)
-    print_result("kept", len(dense), small, seconds, None if dry_run else output)
-    print_distributions(dense, small)
     if plot is not None:
         ps.plot_distributions({"before": dense, "after": small}, plot)
+    written = None if dry_run else output
+    if json_output:
+        print_json({**scene_result(len(dense), small, seconds, written), "plot": plot})
+        return
+    print_result("kept", len(dense), small, seconds, written)
+    print_distributions(dense, small)
+    if plot is not None:
         print(f"{plot}: opacity and volume, before and after")

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from pointsplat_ns.cli.printing import Json, print_json
 from pointsplat_ns.cli.scene_options import Scene
 
 
@@ -24,10 +25,9 @@ def render(
     fps: float | None = None,
     seconds: float | None = None,
     force: bool = False,
+    json_output: Json = False,
 ) -> None:
     """Film a scene along a camera path, or two scenes from the same cameras, on any machine.
-
-    For example: pointsplat render room.ply room_pruned.ply --split wipe -o room.mp4
 
     Args:
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
@@ -46,6 +46,7 @@ def render(
         fps: frames a second; by default 24, or what the saved path says.
         seconds: how long; by default 10, or as long as it takes to show every pose of the dataset or the saved path.
         force: overwrite what is there.
+        json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
 
@@ -56,9 +57,12 @@ def render(
         fps=fps, seconds=seconds, force=force, progress=True,
     )  # fmt: skip
     files = output.iterdir() if output.is_dir() else [output]
-    size = sum(file.stat().st_size for file in files) / 1e6
+    size, seconds_taken = sum(file.stat().st_size for file in files), time.perf_counter() - start
+    if json_output:
+        print_json({"output": output, "frames": count, "bytes": size, "seconds": seconds_taken})
+        return
     frames = "1 frame" if count == 1 else f"{count} frames"
-    print(f"{output}: {frames}, {size:.2f} MB, in {time.perf_counter() - start:.1f} s")
+    print(f"{output}: {frames}, {size / 1e6:.2f} MB, in {seconds_taken:.1f} s")
 
 
 def _beside(scene: Path) -> Path:

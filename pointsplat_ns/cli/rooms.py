@@ -7,6 +7,8 @@ from typing import Annotated
 
 import tyro
 
+from pointsplat_ns.cli.printing import Json, print_json
+
 
 def rooms(
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
@@ -14,6 +16,7 @@ def rooms(
     frames: int = 80,
     width: int = 320,
     height: int = 240,
+    json_output: Json = False,
 ) -> None:
     """Generate furnished rooms with photos, depth images and poses, in the Replica layout.
 
@@ -23,10 +26,16 @@ def rooms(
         frames: photos per room.
         width: width of a photo, pixels.
         height: height of a photo, pixels.
+        json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
 
     if not seeds:
         raise ps.DataError("--seeds without a value: expected the seed of each room, such as --seeds 0 1")
+    written = []
     for seed in seeds:
-        print(ps.write_room(output / f"room{seed}", seed, frames, width, height))
+        written.append(ps.write_room(output / f"room{seed}", seed, frames, width, height))
+        if not json_output:
+            print(written[-1])
+    if json_output:
+        print_json({"output": output, "rooms": written})

@@ -1,14 +1,11 @@
-"""Arguments, output paths and printed results that several commands share."""
+"""Arguments and output paths that several commands share."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
-
-if TYPE_CHECKING:
-    from pointsplat_ns.gaussians import Gaussians
 
 Scene = tyro.conf.Positional[Path]
 Output = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
@@ -117,34 +114,3 @@ def _file_names(path: Path) -> tuple[str, ...]:
     from pointsplat_ns.io.formats import SOG_META, SOG_PARTS
 
     return (path.name, *SOG_PARTS) if path.name == SOG_META else (path.name,)
-
-
-def print_result(what: str, before: int, scene: Gaussians, seconds: float, where: Path | None) -> None:
-    """Print one line with counts, file size (that of a PLY in a dry run) and time; ``where`` is None in a dry run."""
-    from pointsplat_ns.pruning import ply_bytes
-
-    share = f" ({100 * len(scene) / before:.1f} %)" if before else ""
-    size = (ply_bytes(len(scene), scene.sh_degree) if where is None else file_bytes(where)) / 1e6
-    place = "dry run, nothing is written" if where is None else where
-    print(f"{place}: {what} {len(scene):,} of {before:,} Gaussians{share}, {size:.2f} MB, in {seconds:.1f} s")
-
-
-def print_distributions(before: Gaussians, after: Gaussians) -> None:
-    """Print a table of counts, file sizes and quantiles, before and after."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from pointsplat_ns.compression.distributions import opacity_quantiles, size_quantiles
-    from pointsplat_ns.pruning import ply_bytes
-
-    table = Table("", "before", "after", caption="quantiles are 10 / 50 / 90 %; size is the largest standard deviation")
-    rows = {
-        "Gaussians": lambda s: f"{len(s):,}",
-        "SH degree": lambda s: f"{s.sh_degree}",
-        "as .ply, MB": lambda s: f"{ply_bytes(len(s), s.sh_degree) / 1e6:.2f}",
-        "opacity": lambda s: " / ".join(f"{value:.2f}" for value in opacity_quantiles(s)),
-        "size, scene units": lambda s: " / ".join(f"{value:.2g}" for value in size_quantiles(s)),
-    }
-    for name, text in rows.items():
-        table.add_row(name, text(before), text(after))
-    Console().print(table)

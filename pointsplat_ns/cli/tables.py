@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+
+from pointsplat_ns.cli.printing import Json, print_json
 
 
 def tables(
@@ -21,6 +24,7 @@ def tables(
     fine_tune: int = 300,
     splat_transform: str | None = None,
     force: bool = False,
+    json_output: Json = False,
 ) -> None:
     """Measure the paper's Tables 1 to 4 and Figure 4 on any scenes, with our methods and splat-transform beside.
 
@@ -42,13 +46,18 @@ def tables(
         fine_tune: steps of fine-tuning, against at most 60 training photos.
         splat_transform: the program; by default the one that npx finds, if any.
         force: start over with the scenes that are named.
+        json_output: print what is in tables.json, and nothing else on standard output.
     """
     import pointsplat_ns as ps
+    from pointsplat_ns.tables.outputs import JSON
 
     found = ps.measure_tables(
         scenes, output, keeps=keeps, refiners=refiners, groups=groups, only=only, views=views, side=side,
         scoring_views=scoring_views, fine_tune=fine_tune, splat_transform=splat_transform, force=force, progress=True,
     )  # fmt: skip
+    if json_output:
+        print_json({"output": output, **json.loads((output / JSON).read_text("utf-8"))})
+        return
     for group in found:
         cells = sum(len(scene.cells) for scene in group.scenes)
         print(f"{group.name}: {cells} cells of {', '.join(scene.about.name for scene in group.scenes)}")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Literal
 
+from pointsplat_ns.cli.printing import Json, print_json
 from pointsplat_ns.cli.scene_options import Output, Scene, output_beside
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ def tradeoff(
     target_mb: float | None = None,
     force: bool = False,
     threads: int | None = None,
+    json_output: Json = False,
 ) -> None:
     """Measure how a scene trades quality for frame time, size and count, on this machine.
 
@@ -51,9 +54,11 @@ def tradeoff(
         force: start over, and overwrite results in the folder.
         threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
             programs keep the machine busy. Frames are timed on all.
+        json_output: print what is in tradeoff.json, and nothing else on standard output.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.system.threads import fixed_threads
+    from pointsplat_ns.tradeoff.outputs import JSON
 
     folder = output or output_beside(scene, "tradeoff").with_suffix("")
     with fixed_threads(threads):
@@ -61,6 +66,9 @@ def tradeoff(
             scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, side=side, drawn=drawn,
             target_db=target_db, target_ms=target_ms, target_mb=target_mb, force=force, progress=True,
         )  # fmt: skip
+    if json_output:
+        print_json({"output": folder, **json.loads((folder / JSON).read_text("utf-8"))})
+        return
     _print_table(found)
     for note in found.notes:
         print(f"note: {note}")

@@ -19,8 +19,6 @@ def view(
     """Look at a scene in the browser, or at two from the same camera. It is drawn by this machine's processor, no GPU
     is needed: small while the camera moves, whole once it is still. Ctrl-C ends it.
 
-    For example: pointsplat view room.ply room_pruned.ply
-
     Args:
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
         other: a second scene in the same place, to compare with; by default the first is compared with all of itself.

@@ -148,15 +148,27 @@ def _part_name(name: str) -> str:
     return f".{start}.{os.getpid()}.part"
 
 
+def json_text(content: Any) -> str:
+    """JSON of numbers, text, paths and collections of them, with null for numbers that JSON does not have.
+
+    Example:
+        >>> print(json_text({"psnr": float("inf"), "output": Path("room.ply")}))
+        {
+          "psnr": null,
+          "output": "room.ply"
+        }
+    """
+    return json.dumps(_without_infinities(content), indent=2, allow_nan=False, default=os.fspath)
+
+
 def write_json(content: Any, path: Path | str) -> None:
-    """Write JSON, with null for numbers that it does not have.
+    """Write JSON as :func:`json_text` has it.
 
     Raises:
         SceneError: if it cannot be written.
     """
-    text = json.dumps(_without_infinities(content), indent=2, allow_nan=False)
     with replacing(path) as part:
-        part.write_text(text + "\n", encoding="utf-8")
+        part.write_text(json_text(content) + "\n", encoding="utf-8")
 
 
 def _without_infinities(value: Any) -> Any:

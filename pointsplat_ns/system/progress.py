@@ -25,7 +25,8 @@ def silent(what: str, share: float) -> None:
 @contextmanager
 def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
     """A bar in the terminal or notebook, with an estimate of the time left; it is erased at the end. Elsewhere, as in a
-    log file, a line from time to time, such as ``[1:30] merging: 45 %`` with the minutes and seconds so far.
+    log file, a line from time to time, such as ``[1:30] merging: 45 %, about 1:50 left``: minutes and seconds since the
+    beginning, and what is left of the task at hand.
 
     Args:
         progress: True shows a bar or writes lines, on standard error; False shows nothing; a function is returned as it
@@ -65,17 +66,19 @@ def _lines(stream: IO[str]) -> Iterator[Progress]:
     """Write what is being done to ``stream``, every :data:`LINE_SECONDS` seconds until the context is left. A thread
     writes, so that steps that report nothing for minutes are told from a program that hangs."""
     start, ended, current = time.monotonic(), threading.Event(), ["starting"]
+    begun: dict[str, tuple[float, float]] = {}  # when each task was first heard of, and what was done of it by then
 
     def write() -> None:
         while not ended.wait(LINE_SECONDS):
-            minutes, seconds = divmod(round(time.monotonic() - start), 60)
             try:
-                print(f"[{minutes}:{seconds:02d}] {current[0]}", file=stream, flush=True)
+                print(f"[{_clock(time.monotonic() - start)}] {current[0]}", file=stream, flush=True)
             except (OSError, ValueError):  # nobody reads any more: the work goes on
                 return
 
     def show(what: str, share: float) -> None:
-        current[0] = f"{what}: {100 * share:.0f} %"
+        now = time.monotonic()
+        start_of_task, before = begun.setdefault(what, (now, share))
+        current[0] = f"{what}: {100 * share:.0f} %{_left(share, share - before, now - start_of_task)}"
 
     writer = threading.Thread(target=write, daemon=True)
     writer.start()
@@ -84,6 +87,27 @@ def _lines(stream: IO[str]) -> Iterator[Progress]:
     finally:
         ended.set()
         writer.join()
+
+
+def _left(share: float, gained: float, taken: float) -> str:
+    """What is left of a task, in words; empty if nothing can be said.
+
+    Args:
+        share: that is done.
+        gained: the part of it that took the seconds.
+        taken: seconds.
+
+    Example:
+        >>> _left(0.25, 0.25, 30.0), _left(0.5, 0.0, 0.0), _left(1.0, 1.0, 30.0)
+        (', about 1:30 left', '', '')
+    """
+    return f", about {_clock(taken * (1 - share) / gained)} left" if gained > 0 and share < 1 else ""
+
+
+def _clock(seconds: float) -> str:
+    """Minutes and seconds."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d}"
 
 
 def tracked(items: Iterable[T], what: str, total: int, progress: bool | Progress = True) -> Iterator[T]:

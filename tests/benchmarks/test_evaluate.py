@@ -18,6 +18,7 @@ from pointsplat_ns.refiner import save_refiner
 PROGRAMS = (
     "compaction",
     "cuda",
+    "docs_pictures",
     "drawing",
     "example_room",
     "formats",

@@ -11,6 +11,10 @@ from pathlib import Path
 
 import pytest
 
+import pointsplat_ns as ps
+from making import ball
+from pointsplat_ns.cli import main
+
 HEEDED = """
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -55,6 +59,18 @@ def noted(*arguments):
 write.render_room = noted
 main(["rooms", "-o", str(here / "rooms"), "--seeds", "0", "--frames", "500", "--width", "96", "--height", "64"])
 """
+
+
+WRITES = {
+    "room_pruned.ply": ("prune", "room.ply", "--keep", "50%", "--by", "opacity"),
+    "room.spz": ("convert", "room.ply", "room.spz"),
+    "room.compressed.ply": ("convert", "room.ply", "room.compressed.ply"),
+    "meta.json": ("convert", "room.ply", "meta.json"),
+    "small.sog": ("compact", "room.ply", "--keep", "50%", "--effort", "instant", "-o", "small.sog"),
+    "seen.png": ("prune", "room.ply", "--keep", "50%", "--by", "opacity", "--dry-run", "--plot", "seen.png"),
+    "first.png": ("render", "room.ply", "-o", "first.png", "--width", "16", "--height", "12"),
+}
+"""Commands by a file that they write."""
 
 
 @pytest.fixture()
@@ -104,6 +120,29 @@ def test_make_refiner_stops_at_once_and_takes_its_trainings_with_it(start, tmp_p
     trainings = [int(path.stem) for path in tmp_path.glob("*.pid")]
     assert len(trainings) == 2 == said.count("$ "), "a further training was started"
     assert not any(alive(pid) for pid in trainings)
+
+
+@pytest.mark.parametrize("name", WRITES)
+def test_what_is_interrupted_while_it_is_written_is_not_there_and_what_was_there_stays(
+    name, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    ps.save(ball(40, opacity=1.0, bright=1.0), "room.ply")
+    Path(name).write_text("from before")
+    replace = os.replace
+
+    def interrupted(part, target):
+        if Path(target).name == name:
+            assert Path(part).stat().st_size > 0, "nothing was written yet"
+            raise KeyboardInterrupt
+        replace(part, target)
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    with pytest.raises(SystemExit) as end:
+        main([*WRITES[name], "--force"])
+    assert end.value.code == 130 and capsys.readouterr().err.endswith("interrupted\n")
+    assert Path(name).read_text() == "from before"
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
 @pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])

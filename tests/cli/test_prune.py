@@ -47,7 +47,7 @@ def test_a_log_says_from_time_to_time_how_far_it_is(tmp_path, capsys, monkeypatc
     write_ply(box_room(1, count=1900), tmp_path / "scene.ply")
     run("prune", tmp_path / "scene.ply", "-o", tmp_path / "small.ply")
     lines = capsys.readouterr().err.splitlines()
-    assert any(re.fullmatch(r"\[\d:\d\d\] by merge: \d+ %", line) for line in lines)
+    assert any(re.fullmatch(r"\[\d:\d\d\] by merge: \d+ %(, about \d+:\d\d left)?", line) for line in lines)
     assert not any(ord(letter) < 32 for line in lines for letter in line)
 
 

@@ -134,5 +134,5 @@ def test_results_of_another_scene_are_not_overwritten_without_force(ply, tmp_pat
 
 def test_the_command_line_has_the_options_and_defaults_of_the_function():
     function, command = inspect.signature(ps.measure_tradeoff).parameters, inspect.signature(tradeoff).parameters
-    assert set(function) - {"folder", "progress"} == set(command) - {"output", "threads"}
+    assert set(function) - {"folder", "progress"} == set(command) - {"output", "threads", "json_output"}
     assert all(function[name].default == command[name].default for name in set(function) & set(command))

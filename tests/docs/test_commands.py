@@ -6,187 +6,41 @@ make the example room small are really run, on a cut of it.
 
 from __future__ import annotations
 
-import functools
-import importlib.metadata
-import inspect
 import pkgutil
 import re
-import runpy
 import shlex
 import shutil
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import tyro
 from torch.distributed.run import get_args_parser as torchrun_parser
 
 import pointsplat_ns as ps
-from pointsplat_ns.api import EXAMPLE
+from documented import BLOCKS, COMMANDS, NS_PROGRAMS, PAGES, ROOT, check_arguments, help_of, inline_code, start
+from pointsplat_ns.cli.help import EXAMPLES
 
-ROOT = Path(__file__).parents[2]
-PAGES = [
-    ROOT / "README.md",
-    ROOT / "CONTRIBUTING.md",
-    EXAMPLE.with_name("README.md"),
-    *sorted((ROOT / "docs").glob("*.md")),
-]
-BENCHMARKS = ROOT / "benchmarks"
-
-NS_PROGRAMS = ("ns-train", "ns-eval", "ns-export", "ns-viewer")
-OF_OTHERS = {"--decimate", "--no-build-isolation"}
+OF_OTHERS = {"--decimate", "--no-build-isolation", "--tyro-print-completion"}
 """Options that the documentation names and that belong to programs of others."""
 
 CUT = 1500
 """Gaussians of the scene that commands are run on: enough to draw, few enough for a second each."""
 
 
-@dataclass(frozen=True)
-class Block:
-    """A fenced block of code."""
-
-    page: Path
-    line: int
-    language: str
-    text: str
-
-    @property
-    def where(self) -> str:
-        return f"{self.page.relative_to(ROOT)}:{self.line}"
-
-
-@dataclass(frozen=True)
-class Command:
-    """One command line."""
-
-    where: str
-    words: tuple[str, ...]
-
-    def __str__(self) -> str:
-        return f"{self.where} {shlex.join(self.words)}"
-
-
-def blocks_of(page: Path) -> Iterator[Block]:
-    """The fenced blocks of a page, also those indented in a list."""
-    language, first, indent, lines = None, 0, 0, []
-    for number, line in enumerate(page.read_text("utf-8").splitlines(), 1):
-        fence = re.match(r"( *)```(\w*)\s*$", line)
-        if fence and language is None:
-            indent, language, first, lines = len(fence[1]), fence[2], number + 1, []
-        elif fence and language is not None:
-            yield Block(page, first, language, "\n".join(lines))
-            language = None
-        elif language is not None:
-            lines.append(line[indent:])
-    assert language is None, f"{page}: the block at line {first} does not end"
-
-
-def commands_of(block: Block) -> Iterator[Command]:
-    """The command lines of a block, without comments and without settings of the environment before them."""
-    joined = block.text.replace("\\\n", " ")
-    for line in joined.splitlines():
-        words = shlex.split(line, comments=True)
-        while words and re.fullmatch(r"[A-Z_]+=\S*", words[0]):
-            words.pop(0)
-        if words:
-            yield Command(block.where, tuple(words))
-
-
-def inline_code() -> Iterator[tuple[Path, str]]:
-    """The code within lines of text."""
-    for page in PAGES:
-        text = re.sub(r"^ *```.*?^ *```", "", page.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
-        for code in re.findall(r"`([^`\n]+)`", text):
-            yield page, code
-
-
 def runs_quickly(words: tuple[str, ...]) -> bool:
     """Whether a command makes the example room small with nothing else at hand and no optimisation."""
     ours = words[:1] == ("pointsplat",) and words[1] in ("prune", "compact") and words[2] == "room.ply"
-    optimises = {"--fine-tune", "--seconds"} & {*words}
-    return ours and not optimises and not any(word.startswith("outputs/") for word in words)
+    takes_long = {"--fine-tune", "--seconds", "--target-db"} & {*words}
+    return ours and not takes_long and not any(word.startswith("outputs/") for word in words)
 
 
-BLOCKS = [block for page in PAGES for block in blocks_of(page)]
-COMMANDS = [command for block in BLOCKS if block.language == "bash" for command in commands_of(block)]
-QUICK = {command.words: command for command in COMMANDS if runs_quickly(command.words)}
-"""Commands to run, each once however many pages show it."""
+def kind(words: tuple[str, ...]) -> tuple[str, ...]:
+    """What a command does, apart from how much it keeps and how its files are called."""
+    return tuple(sorted(re.sub(r"[\d.]+|\w+(?=\.[a-z]+$)", "", word) for word in words))
+
+
+QUICK = {kind(command.words): command for command in reversed(COMMANDS) if runs_quickly(command.words)}
+"""Commands to run, each kind once however many pages show it."""
 PYTHON = sorted({block.page for block in BLOCKS if block.language == "python"})
-
-
-class Parsed(BaseException):
-    """Raised in place of what a program would do with its arguments."""
-
-
-def without_body(function: Callable) -> Callable:
-    """A function of the same signature and help that does nothing."""
-
-    @functools.wraps(function)
-    def nothing(*args: object, **options: object) -> None:
-        raise Parsed
-
-    return nothing
-
-
-@contextmanager
-def parsers_only(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """While this is open, programs read their arguments and do no more."""
-    parse, parse_commands = tyro.cli, tyro.extras.subcommand_cli_from_dict
-
-    def cli(target, *args, **options):
-        parse(without_body(target) if inspect.isfunction(target) else target, *args, **options)
-        raise Parsed
-
-    def subcommand_cli_from_dict(commands, *args, **options):
-        parse_commands({name: without_body(f) for name, f in commands.items()}, *args, **options)
-        raise Parsed
-
-    with monkeypatch.context() as patch:
-        patch.setattr(tyro, "cli", cli)
-        patch.setattr(tyro.extras, "subcommand_cli_from_dict", subcommand_cli_from_dict)
-        yield
-
-
-def start(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Start a console script, or a script by ``python path``, in this process."""
-    with monkeypatch.context() as patch:
-        if words[0] == "python":
-            script = ROOT / words[1]
-            patch.setattr(sys, "argv", [str(script), *words[2:]])
-            patch.syspath_prepend(str(script.parent))
-            before = set(sys.modules)
-            try:
-                runpy.run_path(str(script), run_name="__main__")
-            finally:
-                for name in set(sys.modules) - before:  # the script's neighbours, which have names such as "report"
-                    if str(script.parent) in (getattr(sys.modules[name], "__file__", None) or ""):
-                        del sys.modules[name]
-        else:
-            [script] = importlib.metadata.entry_points(group="console_scripts", name=words[0])
-            patch.setattr(sys, "argv", list(words))
-            script.load()()
-
-
-def check_arguments(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
-    """Fail unless the program's own parser takes the arguments."""
-    with parsers_only(monkeypatch):
-        try:
-            start(words, monkeypatch)
-        except Parsed:
-            return
-        except SystemExit as end:
-            pytest.fail(f"{shlex.join(words)}: exit status {end.code}\n{''.join(capsys.readouterr())}")
-    pytest.fail(f"{shlex.join(words)}: the program read no arguments")
-
-
-def help_of(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> str:
-    """What a program says of its options."""
-    with parsers_only(monkeypatch), pytest.raises(SystemExit):
-        start((*words, "--help"), monkeypatch)
-    return capsys.readouterr().out
 
 
 @pytest.fixture(scope="module")
@@ -207,11 +61,19 @@ def test_block_says_what_it_is(block):
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=str)
-def test_command_is_one_that_works(command, monkeypatch, capsys):
+def test_command_is_one_that_works(command, tmp_path, monkeypatch, capsys):
     words = command.words
     assert not {"|", "&&", ";", ">", "<"} & set(words), "one command a line, please"
     program = words[0]
-    if program in ("pointsplat", *NS_PROGRAMS):
+    if words[1:2] == ("--tyro-write-completion",):
+        with pytest.raises(SystemExit):
+            start((*words[:-1], str(tmp_path / "script")), monkeypatch)
+        assert program in (tmp_path / "script").read_text()
+    elif program in ("pointsplat", *NS_PROGRAMS):
+        check_arguments(words, monkeypatch, capsys)
+    elif program == "ns-process-data":  # which looks for programs before it has read its arguments
+        for check in ("check_ffmpeg_installed", "check_colmap_installed"):
+            monkeypatch.setattr(f"nerfstudio.utils.install_checks.{check}", lambda *_: None)
         check_arguments(words, monkeypatch, capsys)
     elif program == "torchrun":
         started = torchrun_parser().parse_args(words[1:])
@@ -231,6 +93,11 @@ def test_command_is_one_that_works(command, monkeypatch, capsys):
     elif program == "pre-commit":
         assert words[1] in ("install", "run")
         assert (ROOT / ".pre-commit-config.yaml").is_file()
+    elif program == "docker":
+        assert (ROOT / "Dockerfile").is_file()
+        if words != ("docker", "build", "-t", "pointsplat", "."):
+            assert words[1] == "run"
+            check_arguments(words[words.index("pointsplat") :], monkeypatch, capsys)
     elif program == "npm":
         assert words == ("npm", "install", "@playcanvas/splat-transform")
     else:
@@ -278,14 +145,7 @@ def test_readme_is_short():
 
 
 def test_options_named_in_text_exist(monkeypatch, capsys):
-    programs = [
-        ("pointsplat", name)
-        for name in (
-            *("prune", "compact", "lod", "tradeoff", "tables", "convert", "info", "view", "render", "export", "report"),
-            "rooms",
-            *("make-refiner", "make-feedback", "demo"),
-        )
-    ]
+    programs = [("pointsplat", name) for name in EXAMPLES]
     programs += [
         ("ns-train", "pointsplat"),
         ("ns-train", "splatfacto-cpu"),

@@ -1,0 +1,34 @@
+# The commands of pointsplat_ns on a CPU:
+#   docker build -t pointsplat .
+#   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" pointsplat prune room.ply --keep 10%
+
+FROM python:3.11-slim AS build
+# Of nerfstudio's dependencies, fpsample and pyliblzfse have no wheels everywhere, and are compiled.
+RUN apt-get update \
+    && apt-get install --no-install-recommends -y build-essential \
+    && rm -rf /var/lib/apt/lists/*
+RUN python -m venv /opt/venv
+ENV PATH=/opt/venv/bin:$PATH
+# Builds of torch and torchvision without CUDA, both from one index, as they have to fit each other.
+ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
+RUN pip install --no-cache-dir --index-url "$TORCH_INDEX" torch torchvision
+WORKDIR /source
+COPY pyproject.toml README.md LICENSE ./
+COPY pointsplat_ns pointsplat_ns
+COPY method_configs method_configs
+RUN pip install --no-cache-dir .
+
+FROM python:3.11-slim
+# What OpenCV and open3d load of the system.
+RUN apt-get update \
+    && apt-get install --no-install-recommends -y libgl1 libglib2.0-0 libgomp1 libudev1 libx11-6 \
+    && rm -rf /var/lib/apt/lists/*
+COPY --from=build /opt/venv /opt/venv
+# Threads that wait for one another spin briefly and then sleep; caches go where any user may write.
+ENV PATH=/opt/venv/bin:$PATH \
+    GOMP_SPINCOUNT=20000 \
+    HOME=/tmp
+RUN pointsplat --version
+WORKDIR /data
+ENTRYPOINT ["pointsplat"]
+CMD ["--help"]

@@ -1,0 +1,94 @@
+"""What ``--help`` says beyond the options: examples of every command, and what exit statuses mean."""
+
+from __future__ import annotations
+
+EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
+    "prune": (
+        ("a tenth of the Gaussians, to room_pruned.ply", "pointsplat prune room.ply --keep 10%"),
+        ("a small file for the web", "pointsplat prune room.ply --keep 20% --sh auto -o small.spz"),
+        (
+            "see first what would be kept",
+            "pointsplat prune room.ply --keep 30% --by paper --dry-run --plot kept.png",
+        ),
+    ),
+    "compact": (
+        ("a tenth, repaired, and a page to compare", "pointsplat compact room.ply --keep 10% --html small.html"),
+        ("the smallest file of at least 32 dB", "pointsplat compact room.ply --target-db 32 -o small.sog"),
+        ("every scene of a folder, four at a time", "pointsplat compact rooms --keep 10% --jobs 4"),
+    ),
+    "lod": (("three levels of detail", "pointsplat lod room.ply --levels 50% 10% 2%"),),
+    "tradeoff": (
+        ("measure the trade, to room_tradeoff", "pointsplat tradeoff room.ply"),
+        ("the smallest scene of 32 dB", "pointsplat tradeoff room.ply --target-db 32 --json"),
+    ),
+    "tables": (
+        ("the paper's tables of two scenes", "pointsplat tables kitchen.ply room.ply -o tables"),
+        ("one cell again", "pointsplat tables room.ply -o tables --only room/merge/10%"),
+    ),
+    "convert": (
+        ("an SPZ of fewer SH bands", "pointsplat convert room.ply room.spz --sh 1"),
+        ("a run, in the frame of its photos' poses", "pointsplat convert outputs/room room.ply --original-frame"),
+        ("what is up, -y, turned to z", "pointsplat convert room.ply turned.glb --up=-y:z"),
+    ),
+    "info": (
+        ("what is in a scene", "pointsplat info room.ply"),
+        ("the same for a program", "pointsplat info room.spz --json"),
+    ),
+    "view": (
+        ("a scene in the browser", "pointsplat view room.ply"),
+        ("two, with a wipe", "pointsplat view room.ply room_pruned.ply --port 8000"),
+    ),
+    "render": (
+        ("a film", "pointsplat render room.ply -o room.mp4"),
+        ("two scenes with a wipe", "pointsplat render room.ply room_pruned.ply --split wipe -o both.mp4"),
+        ("one picture", "pointsplat render room.ply -o room.png --width 1280 --height 720"),
+    ),
+    "export": (
+        ("the scene of a run", "pointsplat export outputs/room/splatfacto-cpu/RUN -o room.ply"),
+        ("one scene of a trained refiner", "pointsplat export outputs/refiner --scene room2 -o room2.ply"),
+    ),
+    "report": (
+        ("the table", "pointsplat report evaluation.json"),
+        ("and a page with charts", "pointsplat report evaluation.json --html evaluation.html"),
+    ),
+    "rooms": (("two rooms of 40 photos", "pointsplat rooms -o rooms --seeds 0 1 --frames 40"),),
+    "make-refiner": (
+        ("the refiner that ships, again", "pointsplat make-refiner"),
+        ("a small one of four rooms", "pointsplat make-refiner -o outputs/mine --rooms 4 --steps 300"),
+    ),
+    "make-feedback": (
+        ("of two scenes", "pointsplat make-feedback kitchen.ply room.ply -o feedback.safetensors --updates 200"),
+    ),
+    "demo": (("in a folder of its own", "pointsplat demo --output outputs/try --keep 0.2"),),
+}
+"""Command lines of every command, with what each is for."""
+
+STATUSES = {
+    0: "done",
+    1: "an error, in one line on standard error; with a traceback, a bug of ours",
+    2: "a command line that is not understood",
+    129: "the terminal was lost (SIGHUP)",
+    130: "Ctrl-C (SIGINT)",
+    143: "asked to end (SIGTERM)",
+}
+"""What exit statuses mean."""
+
+_COMPLETION = "Completion of commands and options in your shell: docs/command_line.md."
+
+
+def after_help(args: list[str]) -> str:
+    """Text to print after the help that arguments ask for; empty if they ask for none.
+
+    Example:
+        >>> print(after_help(["rooms", "--help"]))
+        examples:
+          # two rooms of 40 photos
+          pointsplat rooms -o rooms --seeds 0 1 --frames 40
+    """
+    if not {"-h", "--help"} & {*args}:
+        return ""
+    if args[0] in EXAMPLES:
+        lines = [line for what, command in EXAMPLES[args[0]] for line in (f"  # {what}", f"  {command}")]
+        return "\n".join(["examples:", *lines])
+    table = [f"  {status:<5}{meaning}" for status, meaning in STATUSES.items()]
+    return "\n".join(["exit status:", *table, "", "`pointsplat COMMAND --help` has examples.", _COMPLETION])

@@ -1,0 +1,96 @@
+"""What ``--help`` shows beyond the options, exit statuses, and completion in shells."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pointsplat_ns.cli import main
+from pointsplat_ns.cli.compact import compact
+from pointsplat_ns.cli.help import EXAMPLES, STATUSES
+from pointsplat_ns.cli.info import info
+from pointsplat_ns.cli.make_feedback import make_feedback
+from pointsplat_ns.cli.view import view
+
+COMMANDS = {"compact": compact, "info": info, "make-feedback": make_feedback, "view": view}
+
+PAGE = Path(__file__).parents[2] / "docs" / "command_line.md"
+
+
+def shown(capsys, *words: str) -> str:
+    with pytest.raises(SystemExit) as end:
+        main([*words])
+    assert end.value.code in (None, 0)
+    return capsys.readouterr().out
+
+
+def listed(text: str) -> list[str]:
+    """The commands that the usage of the program lists."""
+    return re.search(r"usage: pointsplat \[-h\] \{([\w,-]+)\}", text)[1].split(",")
+
+
+def words_of(text: str) -> str:
+    """Text in one line, without the frames around it."""
+    return " ".join(re.sub(r"[^\w .,`-]", " ", text).split())
+
+
+def test_every_command_has_examples_of_itself(capsys):
+    assert listed(shown(capsys, "--help")) == [*EXAMPLES]
+    for name, examples in EXAMPLES.items():
+        assert examples and all(shlex.split(command)[:2] == ["pointsplat", name] for _, command in examples)
+
+
+@pytest.mark.parametrize("name", ["prune", "view"])
+def test_the_help_of_a_command_ends_with_its_examples(name, capsys):
+    _, _, after = shown(capsys, name, "--help").partition("\nexamples:\n")
+    assert [line.strip() for line in after.splitlines()] == [
+        line for what, command in EXAMPLES[name] for line in (f"# {what}", command)
+    ]
+
+
+def test_the_list_of_commands_has_one_sentence_for_each_and_the_exit_statuses(capsys):
+    text = shown(capsys, "--help")
+    plain = words_of(text)
+    for name, command in COMMANDS.items():
+        first, *rest = re.split(r"(?<=\.) ", words_of(inspect.getdoc(command).partition("\n\nArgs:")[0]))
+        assert f" {name} {first}" in plain and not any(sentence in plain for sentence in rest)
+    for status, meaning in STATUSES.items():
+        assert f"  {status:<5}{meaning}\n" in text
+
+
+def test_the_documentation_has_the_same_exit_statuses():
+    rows = re.findall(r"(?m)^\| (\d+) \| (.+?) \|$", PAGE.read_text("utf-8"))
+    assert {int(status): meaning for status, meaning in rows} == STATUSES
+
+
+def test_a_command_line_that_is_not_understood_has_status_2(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["prune", "room.ply", "--keeep", "10%"])
+    said = capsys.readouterr()
+    assert end.value.code == 2 and "--keeep" in said.err and said.out == ""
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_bash_completes_commands_and_options(tmp_path):
+    script = tmp_path / "pointsplat"
+    with script.open("w") as stream:
+        words = [sys.executable, "-c", "from pointsplat_ns.cli import main; main()", "--tyro-print-completion", "bash"]
+        subprocess.run(words, stdout=stream, check=True)
+    function = re.search(r"complete .*-F (\w+) pointsplat", script.read_text())[1]
+    for typed, expected in ((["pointsplat", "tra"], "tradeoff"), (["pointsplat", "prune", "--kee"], "--keep")):
+        given = f"COMP_WORDS=({shlex.join(typed)}); COMP_CWORD={len(typed) - 1}; {function}"
+        given += "; IFS=$'\\n'; echo \"${COMPREPLY[*]}\""
+        done = subprocess.run(["bash", "-c", f"source {shlex.quote(str(script))}; {given}"], capture_output=True)
+        assert done.stdout.decode().splitlines() == [expected], done.stderr
+
+
+def test_zsh_gets_every_command(capsys):
+    script = shown(capsys, "--tyro-print-completion", "zsh")
+    assert script.startswith("#compdef pointsplat") and all(name in script for name in EXAMPLES)

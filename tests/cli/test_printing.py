@@ -1,0 +1,137 @@
+"""``--json``: standard output has one JSON value, which says what was written; and what a pipe gets otherwise."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from making import ball, box_room
+from pointsplat_ns.cli import main
+from pointsplat_ns.compression import view_source
+from pointsplat_ns.pruning.view_sampling import sample_views
+from pointsplat_ns.tradeoff import machine, outputs
+
+COUNT = 60
+
+
+@pytest.fixture()
+def ply(tmp_path, monkeypatch) -> Path:
+    """A scene in the folder of the test, which is where commands run."""
+    ps.save(ball(COUNT, opacity=1.0, bright=1.0), tmp_path / "room.ply")
+    monkeypatch.chdir(tmp_path)
+    return Path("room.ply")
+
+
+@pytest.fixture()
+def as_json(capsys):
+    """A function that runs a command with --json and gives what it printed."""
+
+    def run(*words: object) -> dict:
+        main([*map(str, words), "--json"])
+        return json.loads(capsys.readouterr().out)
+
+    return run
+
+
+def written(result: dict) -> ps.Gaussians:
+    """The scene that a result names, after what is said of it was compared with it."""
+    scene, file = ps.load(result["output"]), Path(result["output"])
+    assert (result["gaussians"], result["sh_degree"]) == (len(scene), scene.sh_degree)
+    assert result["bytes"] == file.stat().st_size and result["seconds"] > 0
+    return scene
+
+
+def test_prune_convert_and_export_say_what_they_wrote(ply, as_json):
+    pruned = as_json("prune", ply, "--keep", "50%", "--plot", "kept.png")
+    assert len(written(pruned)) == COUNT // 2 and pruned["gaussians_before"] == COUNT
+    assert pruned["output"] == "room_pruned.ply" and pruned["plot"] == "kept.png" and Path("kept.png").is_file()
+    assert as_json("prune", ply, "--keep", "9", "--by", "opacity", "--dry-run")["output"] is None
+    assert len(written(as_json("convert", ply, "room.spz"))) == COUNT
+    parameters = {f"_model.gauss_params.{name}": value for name, value in ball(7).items()}
+    torch.save({"step": 9, "pipeline": parameters}, "step-000000009.ckpt")
+    exported = as_json("export", "step-000000009.ckpt", "-o", "seven.ply")
+    assert len(written(exported)) == 7
+    assert "gaussians_before" not in exported
+
+
+def test_compact_says_what_helped_of_one_scene_and_of_a_folder(ply, as_json):
+    made = as_json("compact", ply, "--keep", "50%", "--effort", "instant")
+    assert len(written(made)) == COUNT // 2
+    assert made["refined"] in (True, False) and made["repaired"] is False and made["psnr"] > 5
+    Path("rooms").mkdir()
+    ply.rename("rooms/a.ply")
+    many = as_json("compact", "rooms", "--keep", "50%", "--effort", "instant")
+    assert Path(many["output"]).resolve() == Path("rooms_compact").resolve()
+    assert [(scene["name"], scene["status"], scene["after"]) for scene in many["scenes"]] == [("a", "done", COUNT // 2)]
+
+
+def test_a_scene_that_fails_is_in_the_json_and_in_the_status(ply, capsys):
+    Path("rooms").mkdir()
+    Path("rooms/a.ply").write_bytes(ply.read_bytes()[:-7])
+    with pytest.raises(SystemExit) as end:
+        main(["compact", "rooms", "--keep", "50%", "--json"])
+    said = capsys.readouterr()
+    [scene] = json.loads(said.out)["scenes"]
+    assert end.value.code == 1 and scene["status"] == "failed" and "truncated" in scene["error"]
+    assert "error: 1 of 1 scenes failed" in said.err
+
+
+def test_lod_tradeoff_and_tables_print_their_files(ply, as_json, plain_page, no_lpips, tmp_path, monkeypatch):
+    assert as_json("lod", ply, "--levels", "50%") == {
+        "output": "room_lod",
+        **json.loads(Path("room_lod/lod.json").read_text("utf-8")),
+    }
+    views = sample_views(box_room(0, COUNT), 2, 24, 18)
+    monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, **options: views[:count])
+    monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
+    monkeypatch.setattr(machine, "LOCK", str(tmp_path / "lock"))
+    few = ("--views", "2", "--repairs", "none", "--drawn", "exact", "--points", "2")
+    assert as_json("tradeoff", ply, *few) == {
+        "output": "room_tradeoff",
+        **json.loads(Path("room_tradeoff/tradeoff.json").read_text("utf-8")),
+    }
+    assert as_json("tables", ply, "-o", "tables", "--only", "room/dense/*", "--views", "2") == {
+        "output": "tables",
+        **json.loads(Path("tables/tables.json").read_text("utf-8")),
+    }
+
+
+def test_render_and_rooms_say_what_they_wrote(ply, as_json, coarse_rooms):
+    film = as_json("render", ply, "-o", "frames", "--width", "16", "--height", "12", "--fps", "2", "--seconds", "1")
+    assert film["output"] == "frames" and film["frames"] == len([*Path("frames").iterdir()]) == 2
+    assert film["bytes"] == sum(path.stat().st_size for path in Path("frames").iterdir())
+    made = as_json("rooms", "-o", "rooms", "--seeds", "3", "--frames", "2", "--width", "16", "--height", "12")
+    assert made == {"output": "rooms", "rooms": ["rooms/room3"]} and Path("rooms/room3/traj.txt").is_file()
+
+
+def test_what_libraries_print_and_what_is_found_go_to_standard_error(ply, capsys, monkeypatch):
+    found = ps.info(ball(5))
+
+    def chatty(path):
+        print("a library speaks")
+        logging.getLogger("pointsplat_ns").info("a finding")
+        return found
+
+    monkeypatch.setattr("pointsplat_ns.info", chatty)
+    main(["info", str(ply), "--json"])
+    said = capsys.readouterr()
+    assert json.loads(said.out)["gaussians"] == 5
+    assert said.err.splitlines() == ["a library speaks", "a finding"]
+
+
+def test_numbers_that_json_lacks_are_null(capsys, ply):
+    torch.manual_seed(1)
+    main(["compact", str(ply), "--keep", "100%", "--by", "opacity", "--effort", "instant", "--dry-run", "--json"])
+    assert "Infinity" not in (said := capsys.readouterr().out) and json.loads(said)["gaussians"] == COUNT
+
+
+def test_a_pipe_gets_results_without_bars_and_colours(ply, capsys):
+    main(["prune", str(ply), "--keep", "50%"])
+    said = capsys.readouterr()
+    assert "room_pruned.ply: kept 30 of 60" in said.out and said.err == ""
+    assert not [letter for letter in said.out if ord(letter) < 32 and letter != "\n"]

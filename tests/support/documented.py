@@ -1,0 +1,168 @@
+"""The documentation and the examples of ``--help``: their code, and the parsers of the programs that it names."""
+
+from __future__ import annotations
+
+import functools
+import importlib.metadata
+import inspect
+import re
+import runpy
+import shlex
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import tyro
+
+from pointsplat_ns.api import EXAMPLE
+from pointsplat_ns.cli.help import EXAMPLES
+
+ROOT = Path(__file__).parents[2]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    EXAMPLE.with_name("README.md"),
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
+NS_PROGRAMS = ("ns-train", "ns-eval", "ns-export", "ns-viewer")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of code."""
+
+    page: Path
+    line: int
+    language: str
+    text: str
+
+    @property
+    def where(self) -> str:
+        return f"{self.page.relative_to(ROOT)}:{self.line}"
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command line."""
+
+    where: str
+    words: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.where} {shlex.join(self.words)}"
+
+
+def blocks_of(page: Path) -> Iterator[Block]:
+    """The fenced blocks of a page, also those indented in a list."""
+    language, first, indent, lines = None, 0, 0, []
+    for number, line in enumerate(page.read_text("utf-8").splitlines(), 1):
+        fence = re.match(r"( *)```(\w*)\s*$", line)
+        if fence and language is None:
+            indent, language, first, lines = len(fence[1]), fence[2], number + 1, []
+        elif fence and language is not None:
+            yield Block(page, first, language, "\n".join(lines))
+            language = None
+        elif language is not None:
+            lines.append(line[indent:])
+    assert language is None, f"{page}: the block at line {first} does not end"
+
+
+def commands_of(block: Block) -> Iterator[Command]:
+    """The command lines of a block, without comments and without settings of the environment before them."""
+    joined = block.text.replace("\\\n", " ")
+    for line in joined.splitlines():
+        words = shlex.split(line, comments=True)
+        while words and re.fullmatch(r"[A-Z_]+=\S*", words[0]):
+            words.pop(0)
+        if words:
+            yield Command(block.where, tuple(words))
+
+
+def inline_code() -> Iterator[tuple[Path, str]]:
+    """The code within lines of text."""
+    for page in PAGES:
+        text = re.sub(r"^ *```.*?^ *```", "", page.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+        for code in re.findall(r"`([^`\n]+)`", text):
+            yield page, code
+
+
+BLOCKS = [block for page in PAGES for block in blocks_of(page)]
+COMMANDS = [
+    *(command for block in BLOCKS if block.language == "bash" for command in commands_of(block)),
+    *(Command(f"pointsplat {name} --help", (*shlex.split(text),)) for name in EXAMPLES for _, text in EXAMPLES[name]),
+]
+
+
+class Parsed(BaseException):
+    """Raised in place of what a program would do with its arguments."""
+
+
+def without_body(function: Callable) -> Callable:
+    """A function of the same signature and help that does nothing."""
+
+    @functools.wraps(function)
+    def nothing(*args: object, **options: object) -> None:
+        raise Parsed
+
+    return nothing
+
+
+@contextmanager
+def parsers_only(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """While this is open, programs read their arguments and do no more."""
+    parse, parse_commands = tyro.cli, tyro.extras.subcommand_cli_from_dict
+
+    def cli(target, *args, **options):
+        parse(without_body(target) if inspect.isfunction(target) else target, *args, **options)
+        raise Parsed
+
+    def subcommand_cli_from_dict(commands, *args, **options):
+        parse_commands({name: without_body(f) for name, f in commands.items()}, *args, **options)
+        raise Parsed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tyro, "cli", cli)
+        patch.setattr(tyro.extras, "subcommand_cli_from_dict", subcommand_cli_from_dict)
+        yield
+
+
+def start(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Start a console script, or a script by ``python path``, in this process."""
+    with monkeypatch.context() as patch:
+        if words[0] == "python":
+            script = ROOT / words[1]
+            patch.setattr(sys, "argv", [str(script), *words[2:]])
+            patch.syspath_prepend(str(script.parent))
+            before = set(sys.modules)
+            try:
+                runpy.run_path(str(script), run_name="__main__")
+            finally:
+                for name in set(sys.modules) - before:  # the script's neighbours, which have names such as "report"
+                    if str(script.parent) in (getattr(sys.modules[name], "__file__", None) or ""):
+                        del sys.modules[name]
+        else:
+            [script] = importlib.metadata.entry_points(group="console_scripts", name=words[0])
+            patch.setattr(sys, "argv", list(words))
+            script.load()()
+
+
+def check_arguments(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """Fail unless the program's own parser takes the arguments."""
+    with parsers_only(monkeypatch):
+        try:
+            start(words, monkeypatch)
+        except Parsed:
+            return
+        except SystemExit as end:
+            pytest.fail(f"{shlex.join(words)}: exit status {end.code}\n{''.join(capsys.readouterr())}")
+    pytest.fail(f"{shlex.join(words)}: the program read no arguments")
+
+
+def help_of(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> str:
+    """What a program says of its options."""
+    with parsers_only(monkeypatch), pytest.raises(SystemExit):
+        start((*words, "--help"), monkeypatch)
+    return capsys.readouterr().out
