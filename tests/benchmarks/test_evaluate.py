@@ -33,6 +33,7 @@ PROGRAMS = (
     "soak",
     "stability",
     "threads",
+    "training",
 )
 
 
