@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.datamanagers.base_datamanager import DataManager
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -23,6 +22,7 @@ from pointsplat_ns.nerfstudio_plugin.frames import to_device
 from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache, free_memory_share
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import SampledPoses
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import find_scenes
+from pointsplat_ns.nerfstudio_plugin.spirals import SpiralSource
 
 
 @dataclass
@@ -66,7 +66,7 @@ class ScenesDataManagerConfig(FullImageDatamanagerConfig):
     images_on_gpu: Suppress[Fixed[bool]] = False
 
 
-class ScenesDataManager(DataManager):
+class ScenesDataManager(SpiralSource):
     """Hands out, at each step, one scene and some of its training photos.
 
     The scene and photos of a step depend only on the seed and the step, so that a resumed training continues as if it
