@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
@@ -28,7 +29,7 @@ class SpiralSource(_Base):
     def __init__(self) -> None:
         DataManager.__init__(self)
 
-    @property
+    @cached_property  # one that the viewer, which reads every property of a datamanager, leaves alone
     def eval_dataloader(self) -> FixedIndicesEvalDataloader:
         """Held-out cameras and photos, one at a time.
 

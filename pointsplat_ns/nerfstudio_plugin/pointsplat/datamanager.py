@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -132,7 +133,7 @@ class ScenesDataManager(SpiralSource):
         """Held-out photos of the shown scene, for the viewer."""
         return None if self.test_mode == "inference" else self.scenes[self.shown].eval_frames.dataset
 
-    @property
+    @cached_property  # one that the viewer, which reads every property of a datamanager, leaves alone
     def train_dataparser_outputs(self) -> DataparserOutputs:
         """File names of the training photos of the shown scene, or of its renders, for ``ns-render dataset``.
 

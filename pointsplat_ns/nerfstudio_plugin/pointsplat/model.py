@@ -303,8 +303,13 @@ class PointSplatModel(SplatfactoModel):
 
     @property
     def gaussians(self) -> Gaussians:
-        """The shown scene, refined."""
-        return self.refine(self.shown).detach()
+        """The shown scene, refined as in evaluation also while a training is looked at."""
+        training = self.training
+        self.eval()
+        try:
+            return self.refine(self.shown).detach()
+        finally:
+            self.train(training)
 
     @property
     def gauss_params(self) -> dict[str, Tensor]:  # type: ignore[override]

@@ -112,13 +112,6 @@ def drawn_by_ns_render(config, folder: Path, **options) -> dict[tuple[str, str],
     return {(split, name): sorted((folder / split / name).iterdir()) for split, name in outputs}
 
 
-def test_ns_render_draws_the_views_of_the_dataset(trained_walls, tmp_path):
-    written = drawn_by_ns_render(fast_config(trained_walls, tmp_path / "runs"), tmp_path / "renders")
-    for split in ("train", "test"):
-        photos, renders = ([path.name for path in written[split, name]] for name in ("gt-rgb", "rgb"))
-        assert photos == renders and len(photos) > 1, split
-
-
 @pytest.mark.parametrize("data", ["a PLY", "a run without its photos"])
 def test_ns_render_draws_the_sampled_views_of_a_scene_without_photos(data, three_rooms, trained_walls, tmp_path):
     folder = three_rooms if data == "a PLY" else without_data(trained_walls, tmp_path / "walls")
