@@ -52,7 +52,7 @@ def as_colmap(capture: Capture, folder: Path) -> Path:
 
 
 def copied(image_paths: list[Path], image_dir: Path, **options) -> list[Path]:
-    """What nerfstudio has ffmpeg do with photos that are not to be made smaller, for machines that have none."""
+    """What nerfstudio has ffmpeg do with photos that are not to be made smaller, but for compressing them again."""
     paths = [image_dir / f"frame_{number:05d}{path.suffix}" for number, path in enumerate(image_paths, 1)]
     for path, source in zip(paths, image_paths, strict=True):
         shutil.copy(source, path)

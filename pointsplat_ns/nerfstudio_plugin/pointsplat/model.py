@@ -25,7 +25,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.metrics import psnr
-from pointsplat_ns.nerfstudio_plugin.cameras import near_plane_of
+from pointsplat_ns.nerfstudio_plugin.cameras import near_plane_of, need_pinhole
 from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PhotoLoss
@@ -267,6 +267,7 @@ class PointSplatModel(SplatfactoModel):
         """The shown scene, refined, from one camera; inside the viewer's crop box if there is one."""
         if not isinstance(camera, Cameras):
             return {}
+        need_pinhole(camera)
         gaussians = self.gaussians
         if self.crop_box is not None and not self.training:
             gaussians = gaussians[self.crop_box.within(gaussians.means).reshape(-1)]

@@ -18,6 +18,7 @@ from PIL import Image
 
 from captures import Capture
 from ns_commands import METHODS, Run, started
+from pointsplat_ns.errors import DataError
 
 WIDTH, HEIGHT, FIELD_OF_VIEW = 40, 30, 60.0
 
@@ -46,12 +47,17 @@ def drawn_by_the_model(pipeline: Pipeline, camera: Cameras) -> np.ndarray:
     return pipeline.model.get_outputs_for_camera(camera)["rgb"].numpy()
 
 
+def camera_path(file: Path, pose: np.ndarray, kind: str = "perspective") -> Path:
+    """A path that stands still, as the viewer saves it."""
+    cameras = [{"camera_to_world": pose.reshape(-1).tolist(), "fov": FIELD_OF_VIEW, "aspect": WIDTH / HEIGHT}] * 2
+    size = {"render_width": WIDTH, "render_height": HEIGHT, "seconds": 1, "fps": 2, "camera_type": kind}
+    file.write_text(json.dumps({**size, "camera_path": cameras}))
+    return file
+
+
 def test_camera_path_draws_what_the_model_draws_from_there(run: Run, capture: Capture, tmp_path):
     pose = capture.poses[0]
-    cameras = [{"camera_to_world": pose.reshape(-1).tolist(), "fov": FIELD_OF_VIEW, "aspect": WIDTH / HEIGHT}] * 2
-    size = {"render_width": WIDTH, "render_height": HEIGHT, "seconds": 1, "camera_type": "perspective"}
-    path = tmp_path / "path.json"
-    path.write_text(json.dumps({**size, "fps": 2, "camera_path": cameras}))
+    path = camera_path(tmp_path / "path.json", pose)
     pictures = drawn(run, "camera-path", tmp_path, "--camera-path-filename", path)
     focal = HEIGHT / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
     camera = Cameras(torch.from_numpy(pose[None, :3]).float(), focal, focal, WIDTH / 2, HEIGHT / 2)
@@ -59,6 +65,13 @@ def test_camera_path_draws_what_the_model_draws_from_there(run: Run, capture: Ca
     assert len(pictures) == 2 and pictures[0].shape == (HEIGHT, WIDTH, 3)
     # 1/255: rounding to 8 bits, down
     assert all(np.abs(picture - expected).max() <= 1 / 255 + 1e-6 for picture in pictures)
+
+
+@pytest.mark.parametrize("kind", ["fisheye", "equirectangular"])
+def test_camera_path_of_another_lens_is_refused_and_not_drawn_as_a_pinholes(kind, run: Run, capture: Capture, tmp_path):
+    path = camera_path(tmp_path / "path.json", capture.poses[0], kind)
+    with pytest.raises(DataError, match=f"cameras of kind {kind}: expected perspective"):
+        drawn(run, "camera-path", tmp_path, "--camera-path-filename", path)
 
 
 def test_interpolate_goes_from_camera_to_camera(run: Run, tmp_path):
