@@ -38,7 +38,7 @@ def look(viewer: Viewer, pose: np.ndarray, aspect: float = 4 / 3) -> Look:
 
     Args:
         viewer: in whose process this runs.
-        pose: camera-to-world (4, 4) in OpenGL axes, in the scene's frame.
+        pose: camera-to-world (3 or 4, 4) in OpenGL axes, in the scene's frame.
         aspect: width over height of the page.
     """
     place = f"127.0.0.1:{viewer.viser_server.get_port()}"

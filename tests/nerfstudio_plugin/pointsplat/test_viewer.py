@@ -99,6 +99,23 @@ def test_the_cli_exports_any_scene_of_the_run(trained, trained_walls, tmp_path):
     assert not (tmp_path / "z.ply").exists()
 
 
+def test_ns_render_draws_paths_through_a_scene_without_photos(three_rooms, run_training, tmp_path, monkeypatch):
+    from nerfstudio.scripts.render import RenderInterpolated, SpiralRender
+    from nerfstudio.utils import install_checks
+
+    monkeypatch.setattr(install_checks, "check_ffmpeg_installed", lambda: None)  # pictures need none
+    config = fast_config(three_rooms, tmp_path, steps=1)
+    manager = config.pipeline.datamanager
+    manager.sampled_poses, manager.sampled_size = 10, (32, 24)
+    run_training(config)
+    run = config.get_base_dir() / "config.yml"
+    SpiralRender(run, tmp_path / "spiral", output_format="images", seconds=0.2, frame_rate=10).main()
+    RenderInterpolated(run, tmp_path / "between", output_format="images", interpolation_steps=2).main()
+    for name in ("spiral", "between"):
+        pictures = [matplotlib.image.imread(path) for path in sorted((tmp_path / name).iterdir())]
+        assert len(pictures) == 2 and all(picture.std() > 5 for picture in pictures), name
+
+
 def drawn_by_ns_render(config, folder: Path, **options) -> dict[tuple[str, str], list[Path]]:
     """The files that ``ns-render dataset`` writes of a run that is not trained, by split and output."""
     from nerfstudio.scripts.render import DatasetRender
