@@ -36,7 +36,7 @@ PAGES = [
 ]
 BENCHMARKS = ROOT / "benchmarks"
 
-NS_PROGRAMS = ("ns-train", "ns-eval", "ns-export", "ns-viewer")
+NS_PROGRAMS = ("ns-train", "ns-eval", "ns-render", "ns-export", "ns-viewer", "ns-process-data")
 OF_OTHERS = {"--decimate", "--no-build-isolation"}
 """Options that the documentation names and that belong to programs of others."""
 
@@ -290,6 +290,8 @@ def test_options_named_in_text_exist(monkeypatch, capsys):
         ("ns-train", "pointsplat"),
         ("ns-train", "splatfacto-cpu"),
         ("ns-train", "splatfacto-cpu", "replica-data"),
+        ("ns-train", "splatfacto-cpu", "scannetpp-seeded"),
+        ("ns-render", "interpolate"),
     ]
     programs += [("python", "benchmarks/compaction.py"), ("python", "benchmarks/rasterizer.py")]
     helps = "\n".join(help_of(words, monkeypatch, capsys) for words in programs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from pathlib import Path
@@ -47,6 +48,17 @@ def test_the_viewer_gets_what_it_reads_of_a_splatfacto_model(evaluated, trained_
     assert model.colors.shape == (model.num_points, 3)
     assert len(evaluated.datamanager.train_dataset) == 9 and len(evaluated.datamanager.eval_dataset) == 2
     assert model.get_outputs(mock.Mock(spec=[])) == {} and isinstance(camera, Cameras)
+
+
+def test_looking_at_a_training_does_not_disturb_it(trained_walls):
+    pipeline = pipeline_of(trained_walls, norm="batch")
+    expected = pipeline.model.means
+    pipeline.train()
+    before, drawn = copy.deepcopy(pipeline.model.refiner.state_dict()), torch.get_rng_state()
+    assert torch.equal(pipeline.model.means, expected), "refined as in training, where paths are dropped at random"
+    assert pipeline.model.training and pipeline.model.refiner.training
+    assert torch.equal(torch.get_rng_state(), drawn), "the training would have taken other random numbers"
+    assert all(torch.equal(before[name], value) for name, value in pipeline.model.refiner.state_dict().items())
 
 
 def test_a_crop_box_keeps_what_is_inside_and_an_empty_one_gives_background(evaluated):
