@@ -54,6 +54,7 @@ def make_dataset(
         height=HEIGHT,
         distortion_params=None if distortion is None else torch.tensor(distortion),
         camera_type=camera_type,
+        metadata={"fisheye_crop_radius": 14.0} if camera_type == CameraType.FISHEYE624 else None,
     )
     outputs = DataparserOutputs(
         image_filenames=photos,
@@ -64,16 +65,22 @@ def make_dataset(
     return UndistortedDataset(outputs, scale_factor=scale)
 
 
+ARIA = CameraType.FISHEYE624
+"""The lens of Project Aria's glasses; nerfstudio makes masks of its own for it, and takes no others."""
+
+
 @pytest.mark.parametrize(
-    ("distortion", "camera_type"),
+    ("distortion", "camera_type", "masks"),
     [
-        (None, CameraType.PERSPECTIVE),
-        ([0.1, -0.05, 0.0, 0.0, 0.01, -0.01], CameraType.PERSPECTIVE),
-        ([0.05, 0.01, 0.0, 0.0, 0.0, 0.0], CameraType.FISHEYE),
+        (None, CameraType.PERSPECTIVE, False),
+        (None, CameraType.PERSPECTIVE, True),
+        ([0.1, -0.05, 0.0, 0.0, 0.01, -0.01], CameraType.PERSPECTIVE, False),
+        ([0.1, -0.05, 0.0, 0.0, 0.01, -0.01], CameraType.PERSPECTIVE, True),
+        ([0.05, 0.01, 0.0, 0.0, 0.0, 0.0], CameraType.FISHEYE, False),
+        ([0.05, 0.01, 0.0, 0.0, 0.0, 0.0], CameraType.FISHEYE, True),
+        ([0.02, -0.01, *[0.0] * 10], ARIA, False),
     ],
-    ids=["pinhole", "opencv", "fisheye"],
 )
-@pytest.mark.parametrize("masks", [False, True])
 def test_image_mask_and_intrinsics_are_those_nerfstudio_caches(tmp_path, distortion, camera_type, masks):
     dataset = make_dataset(tmp_path, distortion=distortion, camera_type=camera_type, masks=masks)
     frames = Frames(dataset)
@@ -88,8 +95,8 @@ def test_image_mask_and_intrinsics_are_those_nerfstudio_caches(tmp_path, distort
     for i, (camera, data) in enumerate(got):
         assert torch.equal(data["image"], expected[i]["image"]) and data["image"].dtype == torch.uint8
         assert torch.equal(data["image"], got_again[i][1]["image"])
-        assert ("mask" in data) == masks and data["image_idx"] == i
-        if masks:
+        assert ("mask" in data) == (masks or camera_type == ARIA) and data["image_idx"] == i
+        if "mask" in data:
             assert torch.equal(data["mask"], expected[i]["mask"]) and data["mask"].dtype == torch.bool
         theirs = manager.train_dataset.cameras[i : i + 1]
         assert camera.shape == (1,)

@@ -116,7 +116,7 @@ def test_ns_render_draws_paths_through_a_scene_without_photos(three_rooms, run_t
     from nerfstudio.utils import install_checks
 
     monkeypatch.setattr(install_checks, "check_ffmpeg_installed", lambda: None)  # pictures need none
-    config = fast_config(three_rooms, tmp_path, steps=1)
+    config = fast_config(three_rooms / "room0.ply", tmp_path, steps=1)
     manager = config.pipeline.datamanager
     manager.sampled_poses, manager.sampled_size = 10, (32, 24)
     run_training(config)
