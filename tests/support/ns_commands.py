@@ -24,6 +24,10 @@ LOOKED_AT = 2
 """Step after which the viewer is looked at."""
 
 
+VIEWER = ("--viewer.websocket-host", "127.0.0.1", "--viewer.image-format", "png")
+"""Options of commands that open the viewer, so that its pictures are those that the model draws."""
+
+
 def started(program: ModuleType, *words: object) -> None:
     """Start one of nerfstudio's commands in this process."""
     with pytest.MonkeyPatch.context() as patch:
@@ -69,14 +73,7 @@ def with_the_viewer_open(method: str, capture: Capture, output: Path, words: lis
         viewer.viser_server.stop()
         os.kill(os.getpid(), signal.SIGINT)
 
-    options = [
-        "--vis",
-        "viewer+tensorboard",
-        "--viewer.websocket-host",
-        "127.0.0.1",
-        "--viewer.max-num-display-images",
-        "3",
-    ]
+    options = ["--vis", "viewer+tensorboard", *VIEWER, "--viewer.max-num-display-images", "3"]
     options += ["--max-num-iterations", str(STEPS[method])]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(StoppableTrainer, "_update_viewer_state", looked_at)

@@ -32,6 +32,13 @@ class Look:
     expected: np.ndarray
     """What the model draws from the same camera, as above."""
 
+    def check(self) -> None:
+        """Fail unless the page is one, and the picture what the model draws; for a viewer that sends PNG."""
+        assert b"<html" in self.page
+        assert self.picture.std() > 0.03, "a plain picture proves nothing"
+        # 1/255: rounding to 8 bits, down
+        assert np.abs(self.picture - self.expected).max() <= 1 / 255 + 1e-6
+
 
 def look(viewer: Viewer, pose: np.ndarray, aspect: float = 4 / 3) -> Look:
     """Open the viewer's page, connect as it does, and wait for the first picture.

@@ -103,6 +103,15 @@ def test_dataset_puts_beside_each_render_the_photo_as_its_camera_would_have_take
             assert np.abs(picture - shown).max() <= 1 / 255 + 1e-6
 
 
+def test_without_ffmpeg_it_says_so_even_of_pictures(trained_by_ns_train, monkeypatch, capsys, tmp_path):
+    run = trained_by_ns_train(METHODS[0])
+    monkeypatch.undo()
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(SystemExit) as end:
+        drawn(run, "spiral", tmp_path)
+    assert end.value.code == 1 and "install ffmpeg" in capsys.readouterr().out
+
+
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
 @pytest.mark.parametrize("method", METHODS[:1])
 def test_spiral_is_a_film_where_ffmpeg_is(method, trained_by_ns_train, tmp_path):
