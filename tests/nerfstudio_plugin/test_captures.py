@@ -22,6 +22,7 @@ from nerfstudio.scripts.process_data import ProcessPolycam, ProcessRecord3D
 
 from captures import BAD, FRAMES, HEIGHT, SEEDS, WIDTH, Capture, Lens, colors_at, seen_from
 from making import pipeline_of
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.nerfstudio_plugin.frames import Frame
 from pointsplat_ns.nerfstudio_plugin.scannetpp import SeededScanNetppDataParserConfig
 
@@ -181,3 +182,10 @@ def test_a_refiner_trains_on_the_same_photos(trained):
     losses["l1"].backward()
     assert losses["l1"].isfinite() and metrics["faults"] == []
     assert any(p.grad is not None and p.grad.any() for p in pipeline.model.refiner.parameters())
+
+
+def test_views_of_the_dataset_are_those_of_the_undistorted_photos(trained):
+    views = dataset_views(trained.run)
+    cameras = [camera for camera, _ in trained.trainer.pipeline.datamanager.train_frames]
+    assert torch.equal(views.Ks, torch.cat([camera.get_intrinsics_matrices() for camera in cameras]))
+    assert all((int(camera.width), int(camera.height)) == (views.width, views.height) for camera in cameras)
