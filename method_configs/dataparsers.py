@@ -22,3 +22,17 @@ def _replica() -> DataParserSpecification:
 
 
 replica = load_specification("replica-data", _replica)
+
+
+def _scannetpp() -> DataParserSpecification:
+    from pointsplat_ns.nerfstudio_plugin.scannetpp import SeededScanNetppDataParserConfig
+    from pointsplat_ns.nerfstudio_plugin.third_party_warnings import quiet_nerfstudio
+
+    quiet_nerfstudio()
+    return DataParserSpecification(
+        config=SeededScanNetppDataParserConfig(),
+        description="ScanNet++ without frames marked as bad, and with COLMAP's points to start from.",
+    )
+
+
+scannetpp = load_specification("scannetpp-seeded", _scannetpp)

@@ -147,5 +147,5 @@ def test_installed_plugin_is_found_by_nerfstudio(installed):
         "print(sorted({p.name for g in ('method_configs', 'dataparser_configs') for p in e(group='nerfstudio.' + g)}))"
     )
     assert run(installed.python, "-c", code, cwd=installed.folder).strip() == str(
-        ["pointsplat", "replica-data", "splatfacto-cpu"]
+        ["pointsplat", "replica-data", "scannetpp-seeded", "splatfacto-cpu"]
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
@@ -40,6 +42,24 @@ def near_plane_of(cameras: Cameras) -> float:
     if len(depths) != 1:
         raise DataError(f"cameras of {len(depths)} near planes; expected one for all views")
     return depths[0]
+
+
+def need_pinhole(camera: Cameras) -> None:
+    """Refuse to draw what a camera (1,) with a lens would see: a pinhole's picture is not that.
+
+    Datasets have none (:mod:`~pointsplat_ns.nerfstudio_plugin.undistorted`); camera paths of the viewer may. The viewer
+    itself draws in a thread, which an error would end: there such a camera is previewed as a pinhole, as nerfstudio's
+    Splatfacto does.
+
+    Raises:
+        DataError: if the camera is no pinhole.
+    """
+    kind = CameraType(int(camera.camera_type))
+    if kind != CameraType.PERSPECTIVE and threading.current_thread() is threading.main_thread():
+        raise DataError(
+            f"cameras of kind {kind.name.lower()}: expected perspective ones; choose Perspective in the render tab of "
+            "the viewer, or change camera_type in the camera path"
+        )
 
 
 def views_of_cameras(cameras: Cameras, background: Tensor, rasterize_mode: RasterizeMode = "classic") -> Views:

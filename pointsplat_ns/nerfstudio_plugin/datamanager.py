@@ -14,10 +14,11 @@ from typing import Literal
 
 import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
-from nerfstudio.data.datasets.base_dataset import InputDataset
 
 from pointsplat_ns.nerfstudio_plugin.frames import LOOK_AHEAD, Frame, Frames, to_device
 from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache, free_memory_share
+from pointsplat_ns.nerfstudio_plugin.spirals import SpiralSource
+from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
 
 
 @dataclass
@@ -33,8 +34,11 @@ class LazyImageDatamanagerConfig(FullImageDatamanagerConfig):
     """Memory for decoded photos; by default a quarter of the free memory. Photos that do not fit are read again."""
 
 
-class LazyImageDatamanager(FullImageDatamanager):
-    """Full images and cameras, in the order that nerfstudio's datamanager gives for the same seed, decoded lazily."""
+class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset], SpiralSource):
+    """Full images and cameras, in the order that nerfstudio's datamanager gives for the same seed, decoded lazily.
+
+    Its datasets hold undistorted photos and pinhole cameras.
+    """
 
     config: LazyImageDatamanagerConfig
 
@@ -54,7 +58,7 @@ class LazyImageDatamanager(FullImageDatamanager):
         """Held-out photos by index."""
         return self._frames_of(self.eval_dataset)
 
-    def _frames_of(self, dataset: InputDataset) -> Frames:
+    def _frames_of(self, dataset: UndistortedDataset) -> Frames:
         workers = self.config.max_thread_workers or 2
         return Frames(dataset, self.config.cache_images_type, self.frame_cache, workers)
 

@@ -1,4 +1,4 @@
-"""Posed photos, loaded lazily and undistorted as nerfstudio does it.
+"""Posed photos, loaded lazily.
 
 Threads decode photos a few steps ahead. A cache of bounded size keeps the decoded ones.
 """
@@ -11,18 +11,13 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
-from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
-from nerfstudio.data.datasets.base_dataset import InputDataset
-from PIL import Image
+from nerfstudio.cameras.cameras import Cameras
 
-from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.memory_cache import CacheKey, MemoryCache, free_memory_share
+from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
 
 LOOK_AHEAD = 4
 """Photos decoded ahead of the one in use: enough to hide decoding behind a training step, few enough to need little
@@ -46,29 +41,26 @@ class Frames:
 
     ``frames[i]`` is ``(camera, data)``: a nerfstudio camera of shape (1,) without lens distortion, and a fresh
     dictionary with ``image`` (H, W, 3 or 4; uint8 or float32 in [0, 1]), ``mask`` (H, W, 1) bool where the dataset
-    has masks, and ``image_idx``. Image, mask and intrinsics are undistorted together by nerfstudio's own function,
-    so that training and evaluation see the same pinhole camera whatever the lens. The tensors are shared with the
-    cache: do not write to them.
+    has masks, and ``image_idx``. So training and evaluation see the same pinhole camera whatever the lens. The tensors
+    are shared with the cache: do not write to them.
 
     Args:
-        dataset: a nerfstudio dataset; its cameras are read and never changed.
+        dataset: its cameras are read and never changed.
         image_type: as nerfstudio's ``cache_images_type``.
         cache: where decoded photos are kept; by default a cache of a quarter of the free memory.
         max_workers: number of threads that decode ahead.
 
     Raises:
-        DataError: if a pose or an intrinsic is NaN or infinite; when a photo or mask is missing, broken, not the size
-            that its camera says, or not of 8 bits a channel.
+        DataError: when a photo or mask cannot be used, as the dataset says.
     """
 
     def __init__(
         self,
-        dataset: InputDataset,
+        dataset: UndistortedDataset,
         image_type: Literal["uint8", "float32"] = "uint8",
         cache: MemoryCache | None = None,
         max_workers: int = 2,
     ):
-        _need_finite(dataset)
         self.dataset = dataset
         self.image_type: Literal["uint8", "float32"] = image_type
         self.cache = MemoryCache(free_memory_share()) if cache is None else cache
@@ -120,78 +112,13 @@ class Frames:
         return frame
 
     def _load(self, index: int) -> Frame:
-        path = self.dataset.image_filenames[index]
-        try:
-            _need_eight_bits(path)
-            data = self.dataset.get_data(index, image_type=self.image_type)
-        except FileNotFoundError as error:
-            raise DataError(
-                f"{error.filename or path}: no such file, but frame {index} of the dataset needs it"
-            ) from error
-        except (OSError, SyntaxError, ValueError, AssertionError) as error:
-            raise DataError(f"{path}: cannot be read as the photo of frame {index}: {error}") from error
-        camera = self.dataset.cameras[index : index + 1]
-        height, width = data["image"].shape[:2]
-        if (width, height) != (int(camera.width), int(camera.height)):
-            raise DataError(
-                f"{path}: {width} x {height} pixels, but its camera says {int(camera.width)} x {int(camera.height)}; "
-                "give the camera the size of the photos"
-            )
-        try:
-            return _undistorted(camera, data)
-        except (AssertionError, NotImplementedError, cv2.error) as error:
-            raise DataError(f"{path}: the lens distortion of its camera cannot be undone: {error}") from error
-
-
-def _need_finite(dataset: InputDataset) -> None:
-    """Refuse cameras with NaN or infinity; the error names the first photo."""
-    cameras = dataset.cameras
-    numbers = [cameras.camera_to_worlds.flatten(1), cameras.fx, cameras.fy, cameras.cx, cameras.cy]
-    bad = (~torch.cat([part.double() for part in numbers], dim=1).isfinite().all(dim=1)).nonzero()[:, 0].tolist()
-    if bad:
-        raise DataError(
-            f"{dataset.image_filenames[bad[0]]}: the pose or the intrinsics of frame {bad[0]} hold NaN or infinity, as "
-            f"do those of {len(bad) - 1} more of {len(cameras)}; expected numbers; correct them or leave the photo out"
-        )
-
-
-def _need_eight_bits(path: Path) -> None:
-    """Refuse photos that nerfstudio would misread: 16-bit greys modulo 256, the indices of a palette as greys."""
-    with Image.open(path) as photo:
-        if photo.mode not in ("L", "RGB", "RGBA"):
-            raise ValueError(f"its pixels are of mode {photo.mode}; expected 8-bit grey, RGB or RGBA; convert it")
+        data = self.dataset.get_data(index, image_type=self.image_type)
+        return self.dataset.cameras[index : index + 1], data
 
 
 def _bytes_of(data: dict[str, Any]) -> int:
     """Size of the tensors among a photo's data."""
     return sum(value.numel() * value.element_size() for value in data.values() if isinstance(value, torch.Tensor))
-
-
-def _undistorted(camera: Cameras, data: dict[str, Any]) -> Frame:
-    """The pinhole camera and the undistorted photo of a camera of shape (1,) and its photo."""
-    distortion = camera.distortion_params
-    if distortion is None or not torch.any(distortion):
-        return camera, data
-    single = camera.reshape(())
-    intrinsics, image, mask = _undistort_image(
-        single, distortion[0].numpy(), data, data["image"].numpy(), single.get_intrinsics_matrices().numpy()
-    )
-    data["image"] = torch.from_numpy(image)
-    if mask is not None:
-        data["mask"] = mask
-    pinhole = Cameras(
-        camera_to_worlds=camera.camera_to_worlds,
-        fx=float(intrinsics[0, 0]),
-        fy=float(intrinsics[1, 1]),
-        cx=float(intrinsics[0, 2]),
-        cy=float(intrinsics[1, 2]),
-        width=image.shape[1],
-        height=image.shape[0],
-        camera_type=CameraType.PERSPECTIVE,
-        times=camera.times,
-        metadata=camera.metadata,
-    )
-    return pinhole, data
 
 
 def to_device(frame: Frame, device: torch.device | str) -> Frame:

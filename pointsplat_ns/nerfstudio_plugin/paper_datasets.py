@@ -14,6 +14,9 @@ REPLICA_SCENES = ("room0", "room1", "room2", "office0", "office1", "office2", "o
 REPLICA_SIZE, REPLICA_FRAMES = (1200, 680), 2000
 """Of each of them. The rooms that this package makes may have the same names, but not this size and number."""
 
+SCANNETPP_PARSERS = ("ScanNetppDataParserConfig", "SeededScanNetppDataParserConfig")
+"""nerfstudio's and ours."""
+
 _SCANNETPP_SCENE = re.compile(r"[0-9a-f]{10}")
 
 
@@ -32,6 +35,6 @@ def paper_dataset(run: Run) -> str:
             return ""
         size = (scene.params.width, scene.params.height)
         return "Replica" if size == REPLICA_SIZE and len(scene) == REPLICA_FRAMES else ""
-    if parser == "ScanNetppDataParserConfig" and _SCANNETPP_SCENE.fullmatch(name) and (run.data / "dslr").is_dir():
+    if parser in SCANNETPP_PARSERS and _SCANNETPP_SCENE.fullmatch(name) and (run.data / "dslr").is_dir():
         return "ScanNet++"
     return ""

@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -92,6 +92,13 @@ class StoppableTrainer(Trainer):
                         f"{self.checkpoint_dir}"
                     )
                 _interrupted(self._asked or signal.SIGINT)
+
+    def _train_complete_viewer(self) -> None:
+        """Keep the viewer open after the last step until Ctrl-C or SIGTERM. The training is complete: they end it as
+        such, and need not come twice."""
+        with suppress(KeyboardInterrupt):
+            if self._asked is None:
+                super()._train_complete_viewer()
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
         """One step, with the number of threads that suits it."""

@@ -150,6 +150,8 @@ def test_options_named_in_text_exist(monkeypatch, capsys):
         ("ns-train", "pointsplat"),
         ("ns-train", "splatfacto-cpu"),
         ("ns-train", "splatfacto-cpu", "replica-data"),
+        ("ns-train", "splatfacto-cpu", "scannetpp-seeded"),
+        ("ns-render", "interpolate"),
     ]
     programs += [("python", "benchmarks/compaction.py"), ("python", "benchmarks/rasterizer.py")]
     helps = "\n".join(help_of(words, monkeypatch, capsys) for words in programs)

@@ -80,7 +80,7 @@ def test_real_photos_with_lens_distortion_are_undone_alike_in_training_and_evalu
     _, train = manager.next_train(0)
     train_camera = manager.train_frames[train["image_idx"]][0]
     eval_camera, held_out = manager.next_eval(0)
-    assert manager.train_dataset.cameras.distortion_params.any()
+    assert manager.train_dataset.lens_cameras.distortion_params.any()
     assert train_camera.distortion_params is None and eval_camera.distortion_params is None
     assert torch.equal(train_camera.get_intrinsics_matrices(), eval_camera.get_intrinsics_matrices())
     assert train["image"].shape == held_out["image"].shape != (640, 360, 3)

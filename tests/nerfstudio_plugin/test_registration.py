@@ -45,7 +45,8 @@ def case(name):
     from nerfstudio.plugins.types import MethodSpecification
     for spec, kind in ((method_configs.methods.splatfacto_cpu, MethodSpecification),
                        (method_configs.methods.pointsplat, MethodSpecification),
-                       (method_configs.dataparsers.replica, DataParserSpecification)):
+                       (method_configs.dataparsers.replica, DataParserSpecification),
+                       (method_configs.dataparsers.scannetpp, DataParserSpecification)):
         assert isinstance(spec, kind), spec
 
 for name in sys.argv[1:]:
@@ -68,7 +69,7 @@ def test_any_module_may_come_first_and_imports_no_network_no_cuda_and_little_els
     # nerfstudio imports entry points from inside its own imports, so the order decides what is half imported.
     # (That nerfstudio itself may come first is what every test that parses its command line proves.)
     modules = (
-        *("replica.dataparser", "frames", "splatfacto_cpu.model", "pointsplat.config"),
+        *("replica.dataparser", "scannetpp", "frames", "splatfacto_cpu.model", "pointsplat.config"),
         "pointsplat.scenes",  # what dataset_views imports
     )
     cases = ["method_configs.methods", *(f"pointsplat_ns.nerfstudio_plugin.{name}" for name in modules), "new modules"]
@@ -93,6 +94,7 @@ def test_entry_points_name_what_nerfstudio_expects():
     }
     assert names["method_configs"]["splatfacto-cpu"] == "method_configs.methods:splatfacto_cpu"
     assert names["dataparser_configs"]["replica-data"] == "method_configs.dataparsers:replica"
+    assert names["dataparser_configs"]["scannetpp-seeded"] == "method_configs.dataparsers:scannetpp"
 
 
 @pytest.mark.parametrize(
@@ -101,6 +103,7 @@ def test_entry_points_name_what_nerfstudio_expects():
         ([], "NerfstudioDataParserConfig"),
         (["nerfstudio-data"], "NerfstudioDataParserConfig"),
         (["scannetpp-data"], "ScanNetppDataParserConfig"),
+        (["scannetpp-seeded", "--skip-bad", "False"], "SeededScanNetppDataParserConfig"),
         (["replica-data", "--eval-every", "5"], "ReplicaDataParserConfig"),
     ],
 )

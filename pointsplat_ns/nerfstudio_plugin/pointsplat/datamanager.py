@@ -5,12 +5,12 @@ from __future__ import annotations
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.datamanagers.base_datamanager import DataManager
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -23,6 +23,7 @@ from pointsplat_ns.nerfstudio_plugin.frames import to_device
 from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache, free_memory_share
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import SampledPoses
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import find_scenes
+from pointsplat_ns.nerfstudio_plugin.spirals import SpiralSource
 
 
 @dataclass
@@ -66,7 +67,7 @@ class ScenesDataManagerConfig(FullImageDatamanagerConfig):
     images_on_gpu: Suppress[Fixed[bool]] = False
 
 
-class ScenesDataManager(DataManager):
+class ScenesDataManager(SpiralSource):
     """Hands out, at each step, one scene and some of its training photos.
 
     The scene and photos of a step depend only on the seed and the step, so that a resumed training continues as if it
@@ -132,7 +133,7 @@ class ScenesDataManager(DataManager):
         """Held-out photos of the shown scene, for the viewer."""
         return None if self.test_mode == "inference" else self.scenes[self.shown].eval_frames.dataset
 
-    @property
+    @cached_property  # one that the viewer, which reads every property of a datamanager, leaves alone
     def train_dataparser_outputs(self) -> DataparserOutputs:
         """File names of the training photos of the shown scene, or of its renders, for ``ns-render dataset``.
 

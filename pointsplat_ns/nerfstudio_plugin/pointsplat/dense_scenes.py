@@ -155,10 +155,7 @@ class DenseScene:
 
     @torch.no_grad()
     def picture(self, camera: Cameras) -> Tensor:
-        """A render of the dense scene from a camera of shape (1,): (H, W, 3) in [0, 1], at exact quality, on the CPU.
-
-        Lens distortion is ignored: the camera is taken as a pinhole with the same intrinsics.
-        """
+        """A render of the dense scene from a camera of shape (1,): (H, W, 3) in [0, 1], exact, on the CPU."""
         views = views_of_cameras(camera, self.background, self.rasterize_mode)
         return render(self.dense(keep=True).to(self._device), views[0]).cpu()
 

@@ -25,7 +25,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.metrics import psnr
-from pointsplat_ns.nerfstudio_plugin.cameras import near_plane_of
+from pointsplat_ns.nerfstudio_plugin.cameras import near_plane_of, need_pinhole
 from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PhotoLoss
@@ -267,6 +267,7 @@ class PointSplatModel(SplatfactoModel):
         """The shown scene, refined, from one camera; inside the viewer's crop box if there is one."""
         if not isinstance(camera, Cameras):
             return {}
+        need_pinhole(camera)
         gaussians = self.gaussians
         if self.crop_box is not None and not self.training:
             gaussians = gaussians[self.crop_box.within(gaussians.means).reshape(-1)]
@@ -303,8 +304,13 @@ class PointSplatModel(SplatfactoModel):
 
     @property
     def gaussians(self) -> Gaussians:
-        """The shown scene, refined."""
-        return self.refine(self.shown).detach()
+        """The shown scene, refined as in evaluation also while a training is looked at."""
+        training = self.training
+        self.eval()
+        try:
+            return self.refine(self.shown).detach()
+        finally:
+            self.train(training)
 
     @property
     def gauss_params(self) -> dict[str, Tensor]:  # type: ignore[override]

@@ -15,7 +15,6 @@ from typing import Any, Literal
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
-from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.colors import get_color
 
 from pointsplat_ns.errors import DataError, SceneError
@@ -28,6 +27,7 @@ from pointsplat_ns.nerfstudio_plugin.frames import Frames
 from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, PlyScene, SampledPoses, Split
 from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND
+from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
 from pointsplat_ns.views import RasterizeMode
 
 _NO_SEEDS = ("load_seed_points", "load_3D_points")
@@ -147,7 +147,7 @@ class TrainedScene(DenseScene):
     def _frames(self, split: str) -> Frames:
         scale = self.run.datamanager_fields.get("camera_res_scale_factor", 1.0)
         scale = float(scale) if isinstance(scale, (int, float)) else 1.0
-        return Frames(InputDataset(self._outputs(split), scale), cache=self.cache)
+        return Frames(UndistortedDataset(self._outputs(split), scale), cache=self.cache)
 
     @cached_property
     def train_frames(self) -> Any:

@@ -35,6 +35,7 @@ from pointsplat_ns.geometry.neighbours import nearest
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
+from pointsplat_ns.nerfstudio_plugin.cameras import need_pinhole
 from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND, RasterizerOptions
 from pointsplat_ns.system.threads import one_thread
 
@@ -182,9 +183,13 @@ class SplatfactoCpuModel(SplatfactoModel):
             ``rgb`` (H, W, 3) in [0, 1]; ``accumulation`` (H, W, 1); ``background``, (3,) in training and (H, W, 3) in
             evaluation; and ``depth`` (H, W, 1), in scene units along the viewing axis, or None in training unless
             ``output_depth_during_training`` is set.
+
+        Raises:
+            DataError: if the camera is no pinhole.
         """
         if not isinstance(camera, Cameras):
             return {}
+        need_pinhole(camera)
         params = self._visible_parameters()
         if params is None:
             width, height = int(camera.width.item()), int(camera.height.item())

@@ -117,3 +117,13 @@ def test_a_training_that_is_stopped_before_its_first_step_saves_nothing(
         patch.setattr(SplatfactoCpuTrainer, "_stop_if_asked", asked)
         run_training(config)
     assert end.value.code == 130 and not config.get_checkpoint_dir().exists()
+
+
+@pytest.mark.parametrize("asked, waits", [(None, True), (signal.SIGINT, False)])
+def test_a_training_that_was_asked_to_stop_in_its_last_step_does_not_keep_its_viewer_open(asked, waits, monkeypatch):
+    waited = []
+    monkeypatch.setattr(Trainer, "_train_complete_viewer", lambda trainer: waited.append(trainer))
+    trainer = object.__new__(SplatfactoCpuTrainer)
+    trainer._asked = asked
+    trainer._train_complete_viewer()
+    assert (waited == [trainer]) == waits
