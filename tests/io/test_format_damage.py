@@ -195,7 +195,8 @@ def image(width, height):
 @pytest.mark.parametrize(
     "change, fragment",
     [
-        (dict(meta=lambda meta: meta.update(count=10**8)), "pixels"),
+        (dict(meta=lambda meta: meta.update(count=10**5)), "pixels"),
+        (dict(meta=lambda meta: meta.update(count=10**8)), "compressed bytes can hold"),
         (dict(meta=lambda meta: meta.update(count=-1)), "declares -1"),
         (dict(meta=lambda meta: meta.update(count="many")), "declares 'many'"),
         (dict(meta=lambda meta: meta.update(version=9)), "version 9"),

@@ -23,8 +23,8 @@ PARTS = tuple(
 MAX_META_BYTES = 1 << 22
 """A meta.json has about 20 kB."""
 
-_SPARE = 1 << 20
-"""Pixels that an image may have beyond twice as many as are needed."""
+_SPARE = 1 << 16
+"""Pixels that an image may have beyond four times as many as are needed; some programs round sides up."""
 
 
 class Images:
@@ -56,6 +56,13 @@ class Images:
         if self._zip is not None:
             self._zip.close()
 
+    @property
+    def size(self) -> int:
+        """Bytes of the archive, or of all images in the folder."""
+        if self._zip is not None:
+            return self.path.stat().st_size
+        return sum(part.stat().st_size for part in self._folder.glob("*.webp"))
+
     def meta(self) -> dict[str, Any]:
         """The content of ``meta.json``."""
         content = json.loads(self._bytes(META, MAX_META_BYTES))
@@ -81,10 +88,15 @@ class Images:
 
         if not isinstance(name, str) or PurePosixPath(name).name != name or "\\" in name:
             raise SceneError(f"{self.path}: an image called {name!r}; expected the name of a file beside {META}")
-        data = self._bytes(name, 4 * (2 * least + _SPARE))
-        with Image.open(io.BytesIO(data), formats=("WEBP",)) as image:
+        most = 4 * least + _SPARE
+        data = self._bytes(name, 4 * most)
+        try:
+            opened = Image.open(io.BytesIO(data), formats=("WEBP",))
+        except Image.DecompressionBombError as error:
+            raise SceneError(f"{self.path}: {name} is too large ({error}); expected {least} pixels") from error
+        with opened as image:
             across, down = image.size
-            if across * down < least or across * down > 2 * least + _SPARE or width not in (None, across):
+            if across * down < least or across * down > most or width not in (None, across):
                 needed = f"{least} pixels" + (f", {width} across" if width else "")
                 raise SceneError(f"{self.path}: {name} has {across} x {down} pixels; expected {needed}")
             require_memory(self.path, 8 * across * down)
