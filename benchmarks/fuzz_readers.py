@@ -259,14 +259,13 @@ pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConf
 @reader
 def frame_of_run(folder: Path) -> Read:
     """``dataparser_transforms.json`` of a run."""
-    from pointsplat_ns.io.runs import TRANSFORMS_NAME, open_run
+    from pointsplat_ns.io.runs import TRANSFORMS_NAME, _transforms
 
-    path, _ = _run_at(folder)
-    path.write_bytes(CONFIG)
+    path = folder / TRANSFORMS_NAME
 
     def read(data: bytes) -> object:
-        (path.parent / TRANSFORMS_NAME).write_bytes(data)
-        return open_run(path.parent, need_data=False)
+        path.write_bytes(data)
+        return _transforms(path)
 
     return read
 
@@ -372,9 +371,7 @@ def evaluation(folder: Path) -> Read:
         for table in report.report_tables(results):
             Console(file=io.StringIO()).print(table)
         parts = [(report._reference(part), report._blocks(results, part)) for part in report._parts(results)]
-        return report.write_report_page(
-            "a", report._settings(results), parts, report._note(results), folder / "a.html"
-        )
+        return report.write_report_page("a", report._settings(results), parts, report._note(results), folder / "a.html")
 
     return read
 

@@ -22,7 +22,7 @@ import tyro
 
 CORPUS = Path(__file__).parents[1] / "tests" / "fuzzing" / "corpus"
 
-INSTRUMENTED = ["pointsplat_ns", "plyfile", "yaml", "fuzz_readers"]
+INSTRUMENTED = ["pointsplat_ns", "plyfile", "yaml", "nerfstudio.data.dataparsers", "fuzz_readers"]
 """Packages whose branches guide the search."""
 
 HEADROOM = 4 << 30

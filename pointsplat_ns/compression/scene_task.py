@@ -139,7 +139,7 @@ def settle(task: SceneTask, make: Callable[[Path], Made], options: Options, forc
 def remove_unfinished(task: SceneTask) -> None:
     """Remove what a process that was killed left of a result. To be called by who holds the task's lock."""
     # As :func:`~pointsplat_ns.io.files.replacing` names them; a result is written within one call by another.
-    pattern = re.compile(rf"\.{{1,2}}{re.escape(task.output.name)}(\.json)?(\.\d+\.part){{1,2}}")
+    pattern = re.compile(rf"\.{{1,2}}{re.escape(task.output.name)}(\.json)?(\.\d+(-[0-9a-f]+)?\.part){{1,2}}")
     with os.scandir(task.output.parent) as entries:
         parts = [entry.path for entry in entries if pattern.fullmatch(entry.name)]
     for part in parts:

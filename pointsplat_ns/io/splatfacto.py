@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import torch
 from torch import Tensor
@@ -111,7 +111,7 @@ def _pipeline_state(content: Any, path: Path) -> dict[str, Any]:
     return state
 
 
-def _is_dense(value: Any) -> bool:
+def _is_dense(value: Any) -> TypeGuard[Tensor]:
     """Whether a value is a tensor of plain numbers: not one that is nested, sparse, quantised or without content."""
     return (
         isinstance(value, Tensor)

@@ -98,7 +98,7 @@ def write_sog_folder(scene: Gaussians, path: Path, progress: Progress = silent) 
     with ExitStack() as stack:
         # Left in the opposite order: meta.json comes last.
         for name in [META, *(name for name in parts if name != META)]:
-            stack.enter_context(replacing(path.with_name(name))).write_bytes(parts[name])
+            stack.enter_context(replacing(path.with_name(name), len(parts[name]))).write_bytes(parts[name])
         path.with_name(META).unlink(missing_ok=True)
 
 
