@@ -14,6 +14,7 @@ import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import torch
 
@@ -251,6 +252,9 @@ pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConf
     dataparser: !!python/object:nerfstudio.data.dataparsers.nerfstudio_dataparser.NerfstudioDataParserConfig
       data: !!python/object/apply:pathlib.PosixPath [data]
       eval_mode: all
+      orientation_method: none
+      center_method: none
+      auto_scale_poses: false
   model: !!python/object:nerfstudio.models.splatfacto.SplatfactoModelConfig
     sh_degree: 1
 """
@@ -281,7 +285,6 @@ def dataset(folder: Path) -> Read:
     import_nerfstudio()
     from nerfstudio.utils.rich_utils import CONSOLE
 
-    CONSOLE.quiet = True
     path, _ = _run_at(folder)
     path.write_bytes(CONFIG)
     place = path.parent / "data"
@@ -291,7 +294,8 @@ def dataset(folder: Path) -> Read:
 
     def read(data: bytes) -> object:
         (place / "transforms.json").write_bytes(data)
-        return dataset_views(path.parent)
+        with mock.patch.object(CONSOLE, "quiet", True):
+            return dataset_views(path.parent)
 
     return read
 
@@ -415,6 +419,18 @@ def flight(folder: Path) -> Read:
         path.write_bytes(data)
         other.write_bytes(data)
         return read_flight_beside(path, other)
+
+    return read
+
+
+@reader
+def levels(folder: Path) -> Read:
+    """The manifest of levels of detail, which says whether they are complete."""
+    from pointsplat_ns.compression.level_folder import MANIFEST, check_folder
+
+    def read(data: bytes) -> object:
+        (folder / MANIFEST).write_bytes(data)
+        return check_folder(folder, 2, force=False)
 
     return read
 

@@ -2,8 +2,8 @@
 
     OMP_NUM_THREADS=1 python benchmarks/fuzzing.py --readers ply spz --seconds 1800
 
-Each reader (:mod:`fuzz_readers`) begins with the files that are kept in ``tests/fuzzing/corpus``, which the test suite
-reads as well. Whatever is neither read nor refused by one typed error in one line, takes more than 5 seconds, or more
+Each reader (:mod:`fuzz_readers`) begins with the files that are kept in ``tests/benchmarks/fuzz_corpus``, which the
+test suite reads as well. Whatever is neither read nor refused by one typed error in one line, takes more than 5 seconds, or more
 memory than it should (:mod:`fuzz_judge`), is written to the output folder, once per place in the code.
 """
 
@@ -20,7 +20,7 @@ from pathlib import Path
 
 import tyro
 
-CORPUS = Path(__file__).parents[1] / "tests" / "fuzzing" / "corpus"
+CORPUS = Path(__file__).parents[1] / "tests" / "benchmarks" / "fuzz_corpus"
 
 INSTRUMENTED = ["pointsplat_ns", "plyfile", "yaml", "nerfstudio.data.dataparsers", "fuzz_readers"]
 """Packages whose branches guide the search."""

@@ -17,6 +17,8 @@ def rooms(
 ) -> None:
     """Generate furnished rooms with photos, depth images and poses, in the Replica layout.
 
+    Rooms that are there already are left alone: after an interruption the same command goes on.
+
     Args:
         output: folder for the scenes room0, room1..., named by their seeds.
         seeds: one room for each seed; the same seed gives the same room.
@@ -25,8 +27,13 @@ def rooms(
         height: height of a photo, pixels.
     """
     import pointsplat_ns as ps
+    from pointsplat_ns.rooms.write import is_written
 
     if not seeds:
         raise ps.DataError("--seeds without a value: expected the seed of each room, such as --seeds 0 1")
     for seed in seeds:
-        print(ps.write_room(output / f"room{seed}", seed, frames, width, height))
+        room = output / f"room{seed}"
+        if is_written(room, frames, width, height):
+            print(f"{room}: there already")
+        else:
+            print(ps.write_room(room, seed, frames, width, height))

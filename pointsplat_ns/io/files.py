@@ -130,7 +130,7 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None) -> It
         os.replace(part, target)
     except OSError as error:
         why = error.strerror or one_line(error)
-        raise SceneError(f"{path}: cannot be written ({why}{_written(error, part)})") from error
+        raise SceneError(f"{path}: cannot be written ({why}{lack_of_room(error, part)})") from error
     finally:
         if part is not None:
             with suppress(OSError):  # it may never have been there; the error above says why
@@ -146,18 +146,26 @@ def _require_space(path: Path, folder: Path, size: int) -> None:
     disk = shutil.disk_usage(folder)
     if disk.total and size > disk.free:  # some network file systems tell nothing
         raise SceneError(
-            f"{path}: needs {size / 1e6:.1f} MB, {disk.free / 1e6:.1f} MB are free there; make room or name another "
-            "place; nothing was written"
+            f"{path}: needs {size / 1e6:.2g} MB, {disk.free / 1e6:.2g} MB are free there, so nothing was written; make "
+            "room or name another place"
         )
 
 
-def _written(error: OSError, part: Path | None) -> str:
-    """How far a file got for which there was no room."""
+def lack_of_room(error: OSError, part: Path | None) -> str:
+    """What to add to an error of a file, or of a folder of files, for which the disk has no room; else nothing.
+
+    Args:
+        error: of writing it.
+        part: the unfinished file or folder.
+    """
     if part is None or error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return ""
-    with suppress(OSError):
-        return f"; it needs more than the {part.stat().st_size / 1e6:.1f} MB that could be written; make room"
-    return ""
+    try:
+        written = sum(file.stat().st_size for file in (part, *part.rglob("*")) if file.is_file())
+        free = shutil.disk_usage(part.parent).free if error.errno == errno.ENOSPC else 0
+    except OSError:
+        return ""
+    return f"; it needs more than {(written + free) / 1e6:.2g} MB; make room or name another place"
 
 
 def _mode_of(path: Path) -> int | None:

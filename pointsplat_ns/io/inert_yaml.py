@@ -20,8 +20,8 @@ MAX_BYTES = 1 << 18
 """A nerfstudio configuration has about 10 kB."""
 
 MAX_VALUES = 1 << 16
-"""Values that a file may stand for, those that aliases repeat counted each time; nerfstudio's has some hundreds. As text
-or as a key, a value is as long as all that it holds."""
+"""Values that a file may stand for, those that aliases repeat counted each time; nerfstudio's has some hundreds. As
+text or as a key, a value is as long as all that it holds."""
 
 
 @dataclass(frozen=True)

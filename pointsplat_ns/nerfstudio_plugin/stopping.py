@@ -28,7 +28,6 @@ from pointsplat_ns.system.memory import keep_freed_memory
 from pointsplat_ns.system.thread_choice import ThreadChoice
 from pointsplat_ns.system.threads import fixed_threads
 
-
 STATE = "pointsplat"
 """Key in checkpoints of what a trainer needs to go on as if it had not been stopped; nerfstudio ignores it."""
 

@@ -211,7 +211,7 @@ def image(width, height):
         (dict(quats=image(4, 4)), "quats.webp has 4 x 4 pixels"),
         (dict(quats=image(5000, 5000)), "quats.webp has 5000 x 5000 pixels"),
         (dict(shN_centroids=image(64, 64)), "shN_centroids.webp has 64 x 64 pixels"),
-        (dict(quats=b"no image"), "cannot be read as SOG"),
+        (dict(quats=b"no image"), "not a WebP image"),
     ],
 )
 def test_a_sog_that_lies_is_refused_by_what_is_wrong(tmp_path, change, fragment):

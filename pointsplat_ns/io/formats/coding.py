@@ -27,7 +27,7 @@ SATURATED = 0.25
 logit that is finite. A logit of infinity would be dropped by some programs."""
 
 FREE_BYTES = 1 << 22
-"""Decompressed content up to this size is taken from a file of any size: some 200,000 Gaussians, were they all equal."""
+"""Decompressed content up to this size is taken from a file of any size: 200,000 Gaussians, were they all equal."""
 
 MAX_RATIO = 1032
 """Beyond that, the largest ratio of decompressed to compressed bytes. It is deflate's own limit."""

@@ -90,17 +90,16 @@ class Images:
             raise SceneError(f"{self.path}: an image called {name!r}; expected the name of a file beside {META}")
         most = 4 * least + _SPARE
         data = self._bytes(name, 4 * most)
+        across, down = webp_size(data)  # opening an image takes the memory of its pixels already
+        if across * down < least or across * down > most or width not in (None, across):
+            needed = f"{least} pixels" + (f", {width} across" if width else "")
+            raise SceneError(f"{self.path}: {name} has {across} x {down} pixels; expected {needed}")
+        require_memory(self.path, 8 * across * down)
         try:
-            opened = Image.open(io.BytesIO(data), formats=("WEBP",))
+            with Image.open(io.BytesIO(data), formats=("WEBP",)) as image:
+                return np.asarray(image.convert("RGBA"))
         except Image.DecompressionBombError as error:
-            raise SceneError(f"{self.path}: {name} is too large ({error}); expected {least} pixels") from error
-        with opened as image:
-            across, down = image.size
-            if across * down < least or across * down > most or width not in (None, across):
-                needed = f"{least} pixels" + (f", {width} across" if width else "")
-                raise SceneError(f"{self.path}: {name} has {across} x {down} pixels; expected {needed}")
-            require_memory(self.path, 8 * across * down)
-            return np.asarray(image.convert("RGBA"))
+            raise SceneError(f"{self.path}: {name} is too large ({error})") from error
 
     def _bytes(self, name: str, most: int) -> bytes:
         """The content of one part, which must not exceed ``most`` bytes."""
@@ -121,6 +120,24 @@ class Images:
                 return stream.read(most + 1)  # the size in the archive may be a lie
         except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
             raise SceneError(f"{self.path}: damaged; {name} cannot be read ({error})") from error
+
+
+def webp_size(data: bytes) -> tuple[int, int]:
+    """Width and height of a WebP image in pixels, as its header says (RFC 9649).
+
+    Raises:
+        ValueError: if it is none.
+    """
+    kind, head = data[12:16], data[20:30]
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(head) == 10:
+        if kind == b"VP8X":
+            return 1 + int.from_bytes(head[4:7], "little"), 1 + int.from_bytes(head[7:10], "little")
+        if kind == b"VP8L" and head[0] == 0x2F:
+            bits = int.from_bytes(head[1:5], "little")
+            return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+        if kind == b"VP8 ":
+            return int.from_bytes(head[6:8], "little") & 0x3FFF, int.from_bytes(head[8:10], "little") & 0x3FFF
+    raise ValueError("not a WebP image")
 
 
 def webp(pixels: Array, width: int, height: int) -> bytes:

@@ -39,12 +39,8 @@ def restore_training_state(pipeline: Pipeline, state: Mapping[str, Any]) -> None
     kind, keys, *rest = state["numpy"]
     np.random.set_state((kind, keys.numpy().astype(np.uint32), *rest))
     model = pipeline.model
-    model.strategy_state.update(
-        {
-            name: v.clone().to(model.device) if isinstance(v, torch.Tensor) else v
-            for name, v in state["densification"].items()
-        }
-    )
+    for name, value in state["densification"].items():
+        model.strategy_state[name] = value.clone().to(model.device) if isinstance(value, torch.Tensor) else value
     numbers = (len(manager.train_dataset), len(manager.eval_dataset))
     lists = [state[name] for name in _LISTS]
     if all(0 <= index < number for number, indices in zip(numbers, lists, strict=True) for index in indices):
