@@ -3,8 +3,8 @@
     OMP_NUM_THREADS=1 python benchmarks/fuzzing.py --readers ply spz --seconds 1800
 
 Each reader (:mod:`fuzz_readers`) begins with the files that are kept in ``tests/benchmarks/fuzz_corpus``, which the
-test suite reads as well. Whatever is neither read nor refused by one typed error in one line, takes more than 5 seconds, or more
-memory than it should (:mod:`fuzz_judge`), is written to the output folder, once per place in the code.
+test suite reads as well. Whatever is neither read nor refused by one typed error in one line, or takes more than 5
+seconds or more memory than it should (:mod:`fuzz_judge`), is written to the output folder, once per place in the code.
 """
 
 from __future__ import annotations

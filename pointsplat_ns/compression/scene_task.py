@@ -218,7 +218,7 @@ def _write_record(task: SceneTask, result: SceneResult, proofs: Mapping[str, Any
 
 
 def _is_number(value: Any, kind: type) -> bool:
-    return value is None or isinstance(value, (kind, int)) and abs(value) < 1e18
+    return value is None or (isinstance(value, (int, float)) and isinstance(value, (kind, int)) and abs(value) < 1e18)
 
 
 _FACTS = {"before": int, "after": int, "megabytes": float, "psnr": float, "seconds": float}

@@ -98,9 +98,8 @@ def write_room(
         (partial / "cam_params.json").write_text(json.dumps({"camera": camera}, indent=1) + "\n", encoding="utf-8")
         os.replace(partial, folder)
     except OSError as error:
-        raise DataError(
-            f"{folder}: cannot be written ({error.strerror or error}{lack_of_room(error, partial)})"
-        ) from error
+        why = f"{error.strerror or error}{lack_of_room(error, partial)}"
+        raise DataError(f"{folder}: cannot be written ({why})") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return folder
