@@ -174,6 +174,11 @@ def log_of_sizes(sizes: Array) -> Array:
         return np.log(sizes.astype(np.float32))
 
 
+def finite_sizes(scene: Gaussians) -> Array:
+    """Standard deviations (N, 3) as float32, the largest where that has none: infinity would be dropped by readers."""
+    return scene.stds.clamp_max(torch.finfo(torch.float32).max).numpy()
+
+
 def unit_quats(scene: Gaussians) -> Array:
     """Quaternions (N, 4) wxyz of length 1, float64; zero is the identity."""
     quats = zero_as_identity(scene.quats).double()
