@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ import pointsplat_ns as ps
 from pointsplat_ns.io.formats import format_named
 from pointsplat_ns.io.inert_yaml import read_config
 
-_TIMES = re.compile(rb"\d+(\.\d+)?(e-?\d+)?")
 _TIMED = (".json", ".csv", ".html", ".md", ".tex", ".png")
 """Kinds of files that say when something was made and how long it took, or show it."""
 
@@ -35,7 +33,13 @@ def files_of(folder: Path) -> dict[str, Path]:
 
 def without_times(path: Path) -> bytes:
     """What has to be the same in two files; of those with times in them, their suffix."""
-    return path.suffix.encode() if path.suffix in _TIMED else path.read_bytes()
+    if path.suffix in _TIMED:
+        return path.suffix.encode()
+    data = path.read_bytes()
+    if path.suffix != ".safetensors":
+        return data
+    end = 8 + int.from_bytes(data[:8], "little")
+    return json.dumps(json.loads(data[8:end]), sort_keys=True).encode() + data[end:]  # its header has no fixed order
 
 
 def not_whole(folder: Path) -> list[tuple[Path, str]]:
