@@ -47,6 +47,8 @@ def judge(read: Read, data: bytes) -> Outcome:
         if "\n" in str(error) or not str(error).strip():
             raise Wrong(f"an error that is not one line: {str(error)!r:.200}") from error
         error.__traceback__ = None
+    except Wrong:
+        raise
     except Exception as error:
         frames = traceback.extract_tb(error.__traceback__)
         ours = [f"{Path(frame.filename).name}:{frame.lineno}" for frame in frames if "pointsplat_ns" in frame.filename]

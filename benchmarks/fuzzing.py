@@ -25,6 +25,9 @@ CORPUS = Path(__file__).parents[1] / "tests" / "benchmarks" / "fuzz_corpus"
 INSTRUMENTED = ["pointsplat_ns", "plyfile", "yaml", "nerfstudio.data.dataparsers", "fuzz_readers"]
 """Packages whose branches guide the search."""
 
+MOST_CORPUS = 9000
+"""Bytes of the files that are kept of a reader, at most."""
+
 HEADROOM = 4 << 30
 """Address space beyond what is taken at the start, bytes; more than that fails as out of memory."""
 
@@ -48,6 +51,7 @@ def main(
     output: Path = Path("outputs/fuzzing"),
     most_bytes: int = 4096,
     seed: int = 1,
+    minimise: bool = False,
 ) -> None:
     """Fuzz readers one after the other, and print how many inputs each got.
 
@@ -58,11 +62,17 @@ def main(
         output: folder for the inputs that were kept, and for findings.
         most_bytes: size of an input, at most.
         seed: of the random changes.
+        minimise: instead, put what earlier fuzzing kept in the output folder into the corpus, and take out what reaches
+            nothing that smaller files do not.
     """
     known = [path.name for path in sorted(corpus.iterdir())]
     unknown = set(readers) - set(known)
     if unknown:
         raise SystemExit(f"no reader {', '.join(sorted(unknown))}; expected {', '.join(known)}")
+    if minimise:
+        for name in readers or known:
+            print(f"{name}: {minimised(name, corpus / name, output / name)} files")
+        return
     print("| Reader | Inputs | Seconds | Kept | Findings |\n|---|---|---|---|---|")
     for name in readers or known:
         found = fuzzed(name, seconds, corpus / name, output / name, most_bytes, seed)
@@ -94,6 +104,29 @@ def fuzzed(name: str, seconds: int, seeds: Path, output: Path, most_bytes: int, 
             break
     result.kept, result.findings = len(list(kept.iterdir())), len(list(found.iterdir()))
     return result
+
+
+def minimised(name: str, corpus: Path, output: Path) -> int:
+    """Choose the corpus of a reader anew, of what is in it and what fuzzing kept and found; the number of its files."""
+    import logging
+    import shutil
+
+    from fuzz_minimise import HASH, fewest
+    from fuzz_readers import READERS
+
+    logging.getLogger("pointsplat_ns").setLevel(logging.CRITICAL)
+    with tempfile.TemporaryDirectory(dir=_fast()) as folder:
+        places = (corpus, output / "kept", output / "found")
+        files = [path for place in places if place.is_dir() for path in place.iterdir()]
+        chosen = fewest(READERS[name](Path(folder)), files, INSTRUMENTED, MOST_CORPUS)
+    for path in chosen:
+        if path.parent != corpus:
+            shutil.copy(path, corpus / path.name[:HASH])
+    names = {path.name if path.parent == corpus else path.name[:HASH] for path in chosen}
+    for path in corpus.iterdir():
+        if path.name not in names:
+            path.unlink()
+    return len(chosen)
 
 
 def child(name: str, found: Path, options: list[str]) -> None:

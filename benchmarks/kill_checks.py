@@ -20,14 +20,15 @@ _TIMED = (".json", ".csv", ".html", ".md", ".tex", ".png")
 
 def files_of(folder: Path) -> dict[str, Path]:
     """The files below a folder by their relative names. What is hidden is unfinished, or a lock, and is left out; so is
-    what a training logs, which grows all the time."""
+    what a training logs line by line."""
     if not folder.is_dir():
         return {}
     files = {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*")) if path.is_file()}
     return {
         name: path
         for name, path in files.items()
-        if not any(part.startswith(".") for part in Path(name).parts) and not path.name.startswith("events.out")
+        if not any(part.startswith(".") for part in Path(name).parts)
+        and not path.name.startswith(("events.out", "losses-"))
     }
 
 

@@ -68,3 +68,13 @@ def test_the_judge_stops_what_does_not_end(judging, monkeypatch):
     monkeypatch.setattr(judging, "SECONDS", 0.1)  # of the processor
     with pytest.raises(judging.Wrong, match="more than 0.1 s"):
         judging.judge(endless, b"")
+
+
+def test_of_files_that_reach_the_same_the_smallest_is_kept_and_those_with_names(benchmark, readers, tmp_path):
+    for name, data in {"named": b"ply\nxx", "a" * 16: b"ply\nx", "b" * 16: b"ply\n", "c" * 16: b"nothing"}.items():
+        (tmp_path / name).write_bytes(data)
+    (tmp_path / "folder").mkdir()
+    read = readers["ply"](tmp_path / "folder")
+    files = [path for path in tmp_path.iterdir() if path.is_file()]
+    chosen = benchmark("fuzz_minimise").fewest(read, files, ["pointsplat_ns"], 1000)
+    assert [path.name for path in chosen] == ["named", "c" * 16]
