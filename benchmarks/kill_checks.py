@@ -14,6 +14,7 @@ import pointsplat_ns as ps
 from pointsplat_ns.io.formats import format_named
 from pointsplat_ns.io.inert_yaml import read_config
 
+_LOGS = ("events.out", "losses-")
 _TIMED = (".json", ".csv", ".html", ".md", ".tex", ".png")
 """Kinds of files that say when something was made and how long it took, or show it."""
 
