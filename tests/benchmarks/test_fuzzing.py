@@ -35,7 +35,7 @@ def quiet():
 
 def test_every_reader_has_files(readers):
     assert set(NAMES) == set(readers)
-    assert sum(path.stat().st_size for path in CORPUS.rglob("*")) < 300_000
+    assert sum(path.stat().st_size for path in CORPUS.rglob("*") if path.is_file()) < 300_000
 
 
 @pytest.mark.parametrize("name", NAMES)

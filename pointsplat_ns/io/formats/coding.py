@@ -52,7 +52,9 @@ def damage_named(path: Path, kind: str) -> Iterator[None]:
         kind: of the file, for the error, such as "SPZ".
     """
     try:
-        yield
+        # Bits that mean NaN or Inf are no reason for numpy to warn: such Gaussians are dropped, and counted.
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            yield
     except SceneError:
         raise
     except OSError as error:

@@ -98,7 +98,8 @@ def write_sog_folder(scene: Gaussians, path: Path, progress: Progress = silent) 
     with ExitStack() as stack:
         # Left in the opposite order: meta.json comes last.
         for name in [META, *(name for name in parts if name != META)]:
-            stack.enter_context(replacing(path.with_name(name), len(parts[name]))).write_bytes(parts[name])
+            size = sum(map(len, parts.values())) if name == META else 0
+            stack.enter_context(replacing(path.with_name(name), size)).write_bytes(parts[name])
         path.with_name(META).unlink(missing_ok=True)
 
 
