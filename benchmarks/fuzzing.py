@@ -20,9 +20,9 @@ from pathlib import Path
 
 import tyro
 
-CORPUS = Path(__file__).parents[1] / "tests" / "benchmarks" / "fuzz_corpus"
+CORPUS = Path(__file__).resolve().parents[1] / "tests" / "benchmarks" / "fuzz_corpus"
 
-INSTRUMENTED = ["pointsplat_ns", "plyfile", "yaml", "nerfstudio.data.dataparsers", "fuzz_readers"]
+INSTRUMENTED = ["pointsplat_ns", "plyfile", "yaml", "nerfstudio.data.dataparsers", "fuzz_readers", "fuzz_texts"]
 """Packages whose branches guide the search."""
 
 MOST_CORPUS = 9000
