@@ -19,6 +19,13 @@ class PointSplatError(Exception):
 area, random, lightgaussian, pup
     """
 
+    def __str__(self) -> str:
+        """The text in one line: what a file put into it can neither break the line nor steer a terminal."""
+        text = super().__str__()
+        if text.isprintable():
+            return text
+        return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
 
 class SceneError(PointSplatError):
     """A scene (PLY, checkpoint, run folder or tensors) that cannot be used as it is.

@@ -20,6 +20,8 @@ def rooms(
 ) -> None:
     """Generate furnished rooms with photos, depth images and poses, in the Replica layout.
 
+    Rooms that are there already are left alone: after an interruption the same command goes on.
+
     Args:
         output: folder for the scenes room0, room1..., named by their seeds.
         seeds: one room for each seed; the same seed gives the same room.
@@ -29,13 +31,16 @@ def rooms(
         json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
+    from pointsplat_ns.rooms.write import is_written
 
     if not seeds:
         raise ps.DataError("--seeds without a value: expected the seed of each room, such as --seeds 0 1")
-    written = []
+    rooms = []
     for seed in seeds:
-        written.append(ps.write_room(output / f"room{seed}", seed, frames, width, height))
+        room = output / f"room{seed}"
+        there = is_written(room, frames, width, height)
+        rooms.append(room if there else ps.write_room(room, seed, frames, width, height))
         if not json_output:
-            print(written[-1])
+            print(f"{room}: there already" if there else room)
     if json_output:
-        print_json({"output": output, "rooms": written})
+        print_json({"output": output, "rooms": rooms})

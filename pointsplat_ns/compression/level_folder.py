@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +26,9 @@ FORMAT, VERSION = "pointsplat-lod", 1
 
 MANIFEST, PICTURE = "lod.json", "lod.png"
 
+MAX_BYTES = 1 << 24
+"""A manifest has about 1 kB a level."""
+
 _COLUMNS = 3
 """Images side by side in the picture."""
 
@@ -43,15 +47,29 @@ def check_folder(folder: Path, count: int, force: bool) -> None:
         force: whether existing files may be overwritten.
 
     Raises:
-        SceneError: if it is a file or named like one, or holds a file that must not be overwritten.
+        SceneError: if it is a file or named like one, or holds a file that must not be overwritten. Levels that were
+            interrupted may be.
     """
     if folder.suffix.lower() in (".ply", ".json", ".png"):
         raise SceneError(f"{folder}: levels are several files; expected the name of a folder")
     if folder.exists() and not folder.is_dir():
         raise SceneError(f"{folder}: is a file; expected the name of a folder")
+    force = force or is_unfinished(folder)
     for name in (MANIFEST, PICTURE, *(name for index in range(count) for name in file_names(index))):
         if (folder / name).exists() and not force:
             raise SceneError(f"{folder / name}: exists already; name another folder, or overwrite it with --force")
+
+
+def is_unfinished(folder: Path) -> bool:
+    """Whether the levels in a folder are those of a command that was interrupted."""
+    path = folder / MANIFEST
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            return False
+        manifest = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(manifest, dict) and manifest.get("format") == FORMAT and manifest.get("complete") is False
 
 
 class LevelFolder:
@@ -79,8 +97,9 @@ class LevelFolder:
             SceneError: if a file cannot be written.
         """
         if not self._written:
-            for name in (MANIFEST, PICTURE):  # of older levels, which are overwritten from here on
-                (self.folder / name).unlink(missing_ok=True)
+            # Older levels are overwritten from here on.
+            write_json({"format": FORMAT, "version": VERSION, "complete": False, "levels": []}, self.folder / MANIFEST)
+            (self.folder / PICTURE).unlink(missing_ok=True)
         scene_name, parents_name = file_names(len(self._written))
         write_ply(scene, self.folder / scene_name)
         with replacing(self.folder / parents_name) as part, part.open("wb") as stream:

@@ -139,7 +139,7 @@ def settle(task: SceneTask, make: Callable[[Path], Made], options: Options, forc
 def remove_unfinished(task: SceneTask) -> None:
     """Remove what a process that was killed left of a result. To be called by who holds the task's lock."""
     # As :func:`~pointsplat_ns.io.files.replacing` names them; a result is written within one call by another.
-    pattern = re.compile(rf"\.{{1,2}}{re.escape(task.output.name)}(\.json)?(\.\d+\.part){{1,2}}")
+    pattern = re.compile(rf"\.{{1,2}}{re.escape(task.output.name)}(\.json)?(\.\d+(-[0-9a-f]+)?\.part){{1,2}}")
     with os.scandir(task.output.parent) as entries:
         parts = [entry.path for entry in entries if pattern.fullmatch(entry.name)]
     for part in parts:
@@ -159,7 +159,7 @@ def known_result(task: SceneTask) -> SceneResult:
     if record is None:
         return task.result("open")
     status: Status = "failed" if record["status"] == "failed" else "done before"
-    facts = {field.name: record[field.name] for field in dataclasses.fields(SceneResult)[4:]}
+    facts = {field.name: record.get(field.name) for field in dataclasses.fields(SceneResult)[4:]}
     return task.result(status, **facts)
 
 
@@ -217,6 +217,10 @@ def _write_record(task: SceneTask, result: SceneResult, proofs: Mapping[str, Any
         part.write_text(json.dumps({**facts, **proofs}, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
+def _is_number(value: Any, kind: type) -> bool:
+    return value is None or (isinstance(value, (int, float)) and isinstance(value, (kind, int)) and abs(value) < 1e18)
+
+
 _FACTS = {"before": int, "after": int, "megabytes": float, "psnr": float, "seconds": float}
 
 
@@ -228,5 +232,5 @@ def _read_record(task: SceneTask) -> dict[str, Any] | None:
         return None
     if not isinstance(record, dict) or record.get("status") not in ("done", "failed"):
         return None
-    numbers = all(isinstance(record.get(name), (kind, int, type(None))) for name, kind in _FACTS.items())
+    numbers = all(_is_number(record.get(name), kind) for name, kind in _FACTS.items())
     return record if numbers and isinstance(record.get("error"), str) else None

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import logging
 import math
 import os
 import re
+import secrets
+import shutil
 import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -94,12 +97,17 @@ def file_stem(text: str) -> str:
 
 
 @contextmanager
-def replacing(path: Path | str) -> Iterator[Path]:
+def replacing(path: Path | str, size: int = 0, folder: Path | None = None) -> Iterator[Path]:
     """A temporary path beside ``path`` to write to. It replaces ``path`` when the block ends without an error, else it
     is removed.
 
     Missing parent folders are created. Through a symbolic link, its target is written. A file that is replaced keeps
-    its mode.
+    its mode. Of several writers of one path, each has a temporary path of its own, and the last one's file stays.
+
+    Args:
+        path: the file.
+        size: bytes that will be written, if that is known; they must be free.
+        folder: where the temporary path is instead, on the same file system.
 
     Raises:
         SceneError: if ``path`` is a folder or a device, or cannot be written.
@@ -112,7 +120,8 @@ def replacing(path: Path | str) -> Iterator[Path]:
             raise SceneError(f"{path}: is a folder; expected the name of a file to write")
         mode = _mode_of(target)
         target.parent.mkdir(parents=True, exist_ok=True)
-        part = target.with_name(_part_name(target.name))
+        _require_space(path, target.parent, size)
+        part = (folder or target.parent) / _part_name(target.name)
         if mode is not None:
             part.touch(0o600)  # nobody else reads it before it is complete
         yield part
@@ -120,11 +129,43 @@ def replacing(path: Path | str) -> Iterator[Path]:
             part.chmod(mode)
         os.replace(part, target)
     except OSError as error:
-        raise SceneError(f"{path}: cannot be written ({error.strerror or one_line(error)})") from error
+        why = error.strerror or one_line(error)
+        raise SceneError(f"{path}: cannot be written ({why}{lack_of_room(error, part)})") from error
     finally:
         if part is not None:
             with suppress(OSError):  # it may never have been there; the error above says why
                 part.unlink()
+
+
+def _require_space(path: Path, folder: Path, size: int) -> None:
+    """Refuse to begin with what the disk has no room for. Beside it, what is replaced stays until the end.
+
+    Raises:
+        SceneError: if there is less than ``size`` bytes.
+    """
+    disk = shutil.disk_usage(folder)
+    if disk.total and size > disk.free:  # some network file systems tell nothing
+        raise SceneError(
+            f"{path}: needs {size / 1e6:.2g} MB, {disk.free / 1e6:.2g} MB are free there, so nothing was written; make "
+            "room or name another place"
+        )
+
+
+def lack_of_room(error: OSError, part: Path | None) -> str:
+    """What to add to an error of a file, or of a folder of files, for which the disk has no room; else nothing.
+
+    Args:
+        error: of writing it.
+        part: the unfinished file or folder.
+    """
+    if part is None or error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return ""
+    try:
+        written = sum(file.stat().st_size for file in (part, *part.rglob("*")) if file.is_file())
+        free = shutil.disk_usage(part.parent).free if error.errno == errno.ENOSPC else 0
+    except OSError:
+        return ""
+    return f"; it needs more than {(written + free) / 1e6:.2g} MB; make room or name another place"
 
 
 def _mode_of(path: Path) -> int | None:
@@ -143,9 +184,10 @@ def _mode_of(path: Path) -> int | None:
 
 
 def _part_name(name: str) -> str:
-    """A name for the unfinished file, no longer than file systems allow (255 bytes), however long ``name`` is."""
+    """A name for the unfinished file, no longer than file systems allow (255 bytes), however long ``name`` is. No other
+    process or thread has it, on no machine that shares the folder."""
     start = name.encode("utf-8", "surrogateescape")[:200].decode("utf-8", "ignore")
-    return f".{start}.{os.getpid()}.part"
+    return f".{start}.{os.getpid()}-{secrets.token_hex(4)}.part"
 
 
 def json_text(content: Any) -> str:

@@ -16,8 +16,12 @@ import yaml
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import one_line, require_file
 
-MAX_BYTES = 1 << 20
+MAX_BYTES = 1 << 18
 """A nerfstudio configuration has about 10 kB."""
+
+MAX_VALUES = 1 << 16
+"""Values that a file may stand for, those that aliases repeat counted each time; nerfstudio's has some hundreds. As
+text or as a key, a value is as long as all that it holds."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +64,47 @@ def read_config(path: Path | str) -> Tagged:
     if size > MAX_BYTES:
         raise SceneError(f"{path}: {size} bytes; expected a nerfstudio config.yml of at most {MAX_BYTES}")
     try:
-        root = yaml.load(path.read_text("utf-8"), Loader=_Loader)
+        loader = _Loader(path.read_text("utf-8"))
+        try:
+            node = loader.get_single_node()
+            if node is not None:
+                _count(node, {})
+            root = loader.construct_document(node) if node is not None else None
+        finally:
+            loader.dispose()
     except yaml.MarkedYAMLError as error:
         line = f" at line {error.problem_mark.line + 1}" if error.problem_mark else ""
         raise SceneError(f"{path}: not a nerfstudio config.yml ({error.problem or 'not YAML'}{line})") from error
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError, OSError) as error:
+    except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError, OSError) as error:
         raise SceneError(f"{path}: not a nerfstudio config.yml ({one_line(error, 100)})") from error
     if not isinstance(root, Tagged) or not root.fields:
         raise SceneError(f"{path}: not a nerfstudio config.yml; expected a saved trainer configuration")
     return root
+
+
+def _count(node: yaml.Node, known: dict[int, int]) -> int:
+    """The number of values that a node stands for, as often as aliases repeat them.
+
+    Args:
+        node: of the file.
+        known: numbers by the identity of nodes; 0 marks those that are being counted.
+
+    Raises:
+        ValueError: if there are too many, or a node holds itself.
+    """
+    if id(node) in known:
+        if not known[id(node)]:
+            raise ValueError("a recursive value: it holds itself")
+        return known[id(node)]
+    known[id(node)] = 0
+    parts = node.value if isinstance(node, yaml.CollectionNode) else ()
+    if isinstance(node, yaml.MappingNode):
+        parts = [part for pair in node.value for part in pair]
+    count = 1 + sum(_count(part, known) for part in parts)
+    if count > MAX_VALUES:
+        raise ValueError(f"more than {MAX_VALUES} values")
+    known[id(node)] = count
+    return count
 
 
 def _python(loader: _Loader, suffix: str, node: yaml.Node) -> Any:

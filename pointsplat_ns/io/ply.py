@@ -102,7 +102,7 @@ def write_ply(scene: Gaussians, path: Path | str) -> None:
     names = [name for group, _ in columns for name in group]
     table = torch.cat([values for _, values in columns], dim=1).numpy().astype("<f4", copy=False)
     rows = np.ascontiguousarray(table).view([(name, "<f4") for name in names]).reshape(len(scene))
-    with replacing(path) as part:
+    with replacing(path, ply_bytes(len(scene), scene.sh_degree)) as part:
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(part))
 
 

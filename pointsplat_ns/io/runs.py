@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -197,15 +198,17 @@ def _checkpoint(folder: Path, configured: Any, chosen: Path | None) -> tuple[Pat
 
 def _find_data(data: Path, folder: Path, config_path: Path) -> Path:
     """The configured data's path on this machine."""
-    data = data.expanduser()
+    with suppress(RuntimeError):  # "~nobody": a user whom this machine does not know
+        data = data.expanduser()
     if data.is_absolute():
         tried = [data]
     else:
         home = folder.resolve()
         tried = list(dict.fromkeys([Path.cwd() / data, *(above / data for above in (home, *home.parents))]))
     for candidate in tried:
-        if candidate.exists():
-            return candidate
+        with suppress(OSError):  # a name that is too long, a folder that may not be looked into
+            if candidate.exists():
+                return candidate
     places = ", ".join(map(str, tried[:3])) + (f" and {len(tried) - 3} more above" if len(tried) > 3 else "")
     raise SceneError(
         f"{config_path}: its data {data} is not there; tried {places}; "
@@ -221,7 +224,7 @@ def _transforms(path: Path) -> tuple[Tensor, float]:
         content = json.loads(path.read_text("utf-8"))
         transform = torch.tensor(content["transform"], dtype=torch.float32)
         scale = float(content["scale"])
-    except (OSError, ValueError, TypeError, KeyError, RecursionError, RuntimeError) as error:
+    except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError, RuntimeError) as error:
         why = f"lacks {error}" if isinstance(error, KeyError) else one_line(error, 80)
         raise SceneError(
             f"{path}: not a dataparser transform ({why}); expected 'transform' (3 x 4) and 'scale'"

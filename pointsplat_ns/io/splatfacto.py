@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import torch
 from torch import Tensor
@@ -18,6 +18,8 @@ from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 PREFIXES = ("_model.gauss_params.", "_model.module.gauss_params.", "_model.", "_model.module.")
 """Prefixes of the parameters' keys in ``pipeline``: current, then those before nerfstudio 1.0, each also with the
 wrapper of distributed training."""
+
+_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 
 NAMES = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
 
@@ -50,7 +52,7 @@ def read_checkpoint(path: Path | str) -> Gaussians:
         )
     limit = path.stat().st_size
     held = (state.get(prefix + name) for name in NAMES)
-    require_memory(path, min(limit, sum(4 * value.numel() for value in held if isinstance(value, Tensor))))
+    require_memory(path, min(limit, sum(4 * value.numel() for value in held if _is_dense(value))))
     tensors = {name: _parameter(state, prefix + name, path, limit) for name in NAMES}
     try:
         scene = Gaussians(**tensors)
@@ -63,7 +65,10 @@ def read_checkpoint(path: Path | str) -> Gaussians:
 
 def is_complete(path: Path) -> bool:
     """Whether a checkpoint's archive is complete, that is, has the directory at its end."""
-    return path.is_file() and zipfile.is_zipfile(path)
+    try:
+        return path.is_file() and zipfile.is_zipfile(path)
+    except (OSError, zipfile.BadZipFile):  # of an archive in several parts
+        return False
 
 
 def _load(path: Path) -> Any:
@@ -106,13 +111,22 @@ def _pipeline_state(content: Any, path: Path) -> dict[str, Any]:
     return state
 
 
+def _is_dense(value: Any) -> TypeGuard[Tensor]:
+    """Whether a value is a tensor of plain numbers: not one that is nested, sparse, quantised or without content."""
+    return (
+        isinstance(value, Tensor)
+        and not value.is_nested
+        and (value.dtype, value.layout, value.device.type) in {(dtype, torch.strided, "cpu") for dtype in _FLOATS}
+    )
+
+
 def _parameter(state: dict[str, Any], key: str, path: Path, limit: int) -> Tensor:
     """A float32 copy of one parameter, independent of the mapped file."""
     value = state.get(key)
     if value is None:
         raise SceneError(f"{path}: lacks the key {key!r}; expected a Splatfacto checkpoint")
-    if not isinstance(value, Tensor) or not value.is_floating_point() or value.layout != torch.strided:
-        kind = f"{value.dtype} {value.layout}" if isinstance(value, Tensor) else type(value).__name__
+    if not _is_dense(value):
+        kind = f"{value.dtype} {value.layout} on {value.device}" if isinstance(value, Tensor) else type(value).__name__
         raise SceneError(f"{path}: {key!r} is {kind}; expected a dense floating-point tensor")
     if value.numel() * value.element_size() > limit:
         raise SceneError(f"{path}: {key!r} has shape {tuple(value.shape)}, more than the file can hold")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,15 +14,22 @@ from types import FrameType
 from typing import Any, Literal, NoReturn
 
 import torch
+import yaml
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.io.files import one_line, replacing
+from pointsplat_ns.io.runs import step_of
 from pointsplat_ns.system.memory import keep_freed_memory
 from pointsplat_ns.system.thread_choice import ThreadChoice
 from pointsplat_ns.system.threads import fixed_threads
+
+STATE = "pointsplat"
+"""Key in checkpoints of what a trainer needs to go on as if it had not been stopped; nerfstudio ignores it."""
 
 
 @dataclass
@@ -32,12 +40,34 @@ class StoppableTrainerConfig(TrainerConfig):
     """Number of threads of a training on a CPU. By default it is chosen while the training goes on, and is lower while
     other programs keep the machine busy; the environment variable OMP_NUM_THREADS has the same effect as this."""
 
+    def save_config(self) -> None:
+        """As nerfstudio's, but whole or not at all."""
+        path = self.get_base_dir() / "config.yml"
+        CONSOLE.log(f"Saving config to: {path}")
+        with replacing(path) as part:
+            part.write_text(yaml.dump(self), "utf-8")
+
+    def first_step(self) -> int:
+        """The step that a training begins with: 0, or what the name of the checkpoint says that it goes on from."""
+        place, step = self.load_checkpoint, None
+        if self.load_dir is not None:
+            steps = [step_of(path) for path in Path(self.load_dir).glob("step-*.ckpt")]
+            step = (
+                self.load_step if self.load_step is not None else max((s for s in steps if s is not None), default=None)
+            )
+        elif place is not None:
+            step = step_of(Path(place))
+        return 0 if step is None else step + 1
+
 
 class StoppableTrainer(Trainer):
     """nerfstudio's trainer. It removes the run folder if the input cannot be used, and reuses freed memory on a CPU.
 
     Steps on a CPU use the number of threads that suits them
     (:class:`~pointsplat_ns.system.thread_choice.ThreadChoice`).
+
+    Checkpoints and the other files of a run are written beside and renamed, so that one that is there is whole,
+    however the training ended.
 
     Ctrl-C and SIGTERM end it after the step at hand, with a checkpoint of that step, and with the status of an
     interrupted program: in the middle of densification, parameters are of different numbers. A second one ends it at
@@ -66,6 +96,9 @@ class StoppableTrainer(Trainer):
             raise
         except KeyboardInterrupt:
             _interrupted(signal.SIGINT)
+        outputs = getattr(self.pipeline.datamanager, "train_dataparser_outputs", None)
+        if outputs is not None:
+            outputs.save_dataparser_transform = functools.partial(_save_whole, outputs.save_dataparser_transform)
         self._thread_choice = ThreadChoice()
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         self.callbacks.append(TrainingCallback(before, self._stop_if_asked, update_every_num_iters=1))
@@ -109,6 +142,39 @@ class StoppableTrainer(Trainer):
         """One step: the loss, its parts, and other numbers. As nerfstudio's."""
         return super().train_iteration(step)
 
+    @check_main_thread
+    def save_checkpoint(self, step: int) -> None:
+        """As nerfstudio's, but a checkpoint is whole before it is there, and holds :meth:`state_to_resume`.
+
+        Raises:
+            SceneError: if it cannot be written, as on a full disk; older ones are left alone.
+        """
+        pipeline = getattr(self.pipeline, "module", self.pipeline)
+        content: dict[str, Any] = {
+            "step": step,
+            "pipeline": pipeline.state_dict(),
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
+            "schedulers": {name: scheduler.state_dict() for name, scheduler in self.optimizers.schedulers.items()},
+            "scalers": self.grad_scaler.state_dict(),
+        }
+        if state := self.state_to_resume():
+            content[STATE] = state
+        path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
+        # Unfinished in the run's folder: nerfstudio takes every file beside checkpoints for one.
+        with replacing(path, _tensor_bytes(content), self.base_dir) as part:
+            try:
+                torch.save(content, part)
+            except RuntimeError as error:  # what torch makes of a disk that is full after all
+                raise OSError(one_line(error)) from error
+        if self.config.save_only_latest_checkpoint:
+            for other in self.checkpoint_dir.glob("*.ckpt"):
+                if other != path:
+                    other.unlink()
+
+    def state_to_resume(self) -> dict[str, Any]:
+        """What the training depends on beside weights, optimisers and schedules; nothing by default."""
+        return {}
+
     @contextmanager
     def _signals_noted(self) -> Iterator[None]:
         """While this is open, signals that would end the program end the training after its step.
@@ -150,6 +216,20 @@ class StoppableTrainer(Trainer):
             if folder == output_dir.parent or any(folder.iterdir()):
                 break
             folder.rmdir()
+
+
+def _save_whole(save: Callable[[Path], None], path: Path) -> None:
+    """Save a file by a function that writes it in place."""
+    with replacing(path) as part:
+        save(part)
+
+
+def _tensor_bytes(value: Any) -> int:
+    """Bytes of all tensors in nested dictionaries and lists."""
+    if isinstance(value, Tensor):
+        return value.numel() * value.element_size()
+    parts = value.values() if isinstance(value, Mapping) else value if isinstance(value, (list, tuple)) else ()
+    return sum(map(_tensor_bytes, parts))
 
 
 def _interrupted(number: int) -> NoReturn:

@@ -172,7 +172,7 @@ class PointTransformer(nn.Module):
 
         rates = _split(_ramp(config.drop_path, sum(config.dec_depths)), config.dec_depths)
         self.unpools = nn.ModuleList(
-            Unpool(a, skip, out, norm) for a, skip, out in zip((*dec[1:], enc[-1]), enc[:-1], dec, strict=True)
+            Unpool(a, skip, out, norm) for a, skip, out in zip((*dec, enc[-1])[1:], enc[:-1], dec, strict=True)
         )
         self.decoder = nn.ModuleList(
             Stage(c, h, config, r) for c, h, r in zip(dec, config.dec_heads, rates, strict=True)

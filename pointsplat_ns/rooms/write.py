@@ -9,12 +9,24 @@ import numpy as np
 import torch
 
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.io.files import lack_of_room
 from pointsplat_ns.rooms.camera_path import capture_path
 from pointsplat_ns.rooms.render import default_intrinsics, render_room
 from pointsplat_ns.rooms.room import make_room
 from pointsplat_ns.system.progress import Progress, tracked
 
 DEPTH_SCALE = 6553.5  # raw counts per metre, as in Replica's files: 10 m fill 16 bits
+
+
+def is_written(folder: Path, frames: int, width: int, height: int) -> bool:
+    """Whether a folder holds a room of such photos. As rooms get their names when they are complete, it then is."""
+    try:
+        camera = json.loads((folder / "cam_params.json").read_text("utf-8"))["camera"]
+        poses = (folder / "traj.txt").read_text("utf-8").splitlines()
+        photos = list((folder / "results").glob("frame*.jpg"))
+        return len(poses) == len(photos) == frames and (camera["w"], camera["h"]) == (width, height)
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        return False
 
 
 def write_room(
@@ -86,7 +98,8 @@ def write_room(
         (partial / "cam_params.json").write_text(json.dumps({"camera": camera}, indent=1) + "\n", encoding="utf-8")
         os.replace(partial, folder)
     except OSError as error:
-        raise DataError(f"{folder}: cannot be written ({error.strerror or error})") from error
+        why = f"{error.strerror or error}{lack_of_room(error, partial)}"
+        raise DataError(f"{folder}: cannot be written ({why})") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return folder

@@ -52,7 +52,14 @@ def read_flight(path: Path) -> dict[str, Any] | None:
         flight = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    return flight if isinstance(flight, dict) and flight.keys() == _KEYS and flight["scenes"] else None
+    return flight if _is_flight(flight) else None
+
+
+def _is_flight(content: Any) -> bool:
+    scenes = content["scenes"] if isinstance(content, dict) and content.keys() == _KEYS else None
+    if not isinstance(scenes, list) or not scenes:
+        return False
+    return all(isinstance(scene, dict) and isinstance(scene.get("spz"), str) for scene in scenes)
 
 
 def read_flight_beside(path: Path, dense: Path) -> dict[str, Any] | None:

@@ -70,7 +70,7 @@ class Form:
             if content["version"] != self.version:
                 raise ValueError(f"of version {content['version']!r:.20}, this program's are of {self.version}")
             return dict(content["of"]), [restored(values) for values in content[self.records]]
-        except (OSError, ValueError, TypeError, KeyError, RecursionError, PointSplatError) as error:
+        except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError, PointSplatError) as error:
             why = f"lacks {error}" if isinstance(error, KeyError) else one_line(error, 80)
             raise SceneError(
                 f"{path}: not the {self.records} of {self.of} ({why}); name another folder, or start over with --force"

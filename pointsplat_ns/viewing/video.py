@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.files import one_line, replacing
+from pointsplat_ns.io.files import lack_of_room, one_line, replacing
 
 Kind = Literal["video", "frames", "picture"]
 
@@ -120,7 +120,8 @@ def _folder_replacing(folder: Path) -> Iterator[Path]:
         for new in sorted(part.iterdir()):
             new.replace(folder / new.name)
     except OSError as error:
-        raise SceneError(f"{folder}: cannot be written ({error.strerror or one_line(error)})") from error
+        why = error.strerror or one_line(error)
+        raise SceneError(f"{folder}: cannot be written ({why}{lack_of_room(error, part)})") from error
     finally:
         if part is not None:
             shutil.rmtree(part, ignore_errors=True)

@@ -23,6 +23,8 @@ PROGRAMS = (
     "example_room",
     "formats",
     "frame_times",
+    "fuzzing",
+    "kills",
     "photo_places",
     "quality",
     "rasterizer",

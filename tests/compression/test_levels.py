@@ -230,15 +230,17 @@ def test_an_interruption_leaves_whole_files_and_a_manifest_that_is_true_of_them(
     with pytest.raises(KeyboardInterrupt):
         ps.lod(scene, ASKED, views=views, folder=tmp_path / "out")
     written = {name for index in range(after + 1) for name in file_names(index)}
-    assert set(contents(tmp_path / "out")) == written | ({"lod.json"} if after else set())
+    assert set(contents(tmp_path / "out")) == written | {"lod.json"}
     for index, count in enumerate((200, 100, 40)[: after + 1]):
         assert len(ps.load(tmp_path / "out" / f"level_{index}.ply")) == count
         assert np.load(tmp_path / "out" / f"level_{index}_parents.npy").max() == count - 1
-    if after:
-        manifest = manifest_of(tmp_path / "out")
-        assert manifest["complete"] is False
-        assert [level["count"] for level in manifest["levels"]] == [200, 100][:after]
-        assert [level["psnr"] for level in manifest["levels"]] == [near.psnr for near in measured]
+    manifest = manifest_of(tmp_path / "out")
+    assert manifest["complete"] is False
+    assert [level["count"] for level in manifest["levels"]] == [200, 100][:after]
+    assert [level.get("psnr") for level in manifest["levels"]] == [near.psnr for near in measured]
+    monkeypatch.undo()
+    ps.lod(scene, ASKED, views=views, folder=tmp_path / "out")  # the same again needs no --force
+    assert manifest_of(tmp_path / "out")["complete"] is True
 
 
 def test_an_interruption_while_overwriting_leaves_no_manifest_of_other_files(
@@ -254,7 +256,8 @@ def test_an_interruption_while_overwriting_leaves_no_manifest_of_other_files(
     monkeypatch.setattr(DenseReference, "closeness", interrupt)
     with pytest.raises(KeyboardInterrupt):
         ps.lod(scene, ["50%"], views=views, folder=out, force=True)
-    assert set(contents(out)) == set(file_names(0))
+    assert set(contents(out)) == {*file_names(0), "lod.json"}
+    assert manifest_of(out)["levels"] == [] and manifest_of(out)["complete"] is False
     assert len(ps.load(out / "level_0.ply")) == 200
 
 

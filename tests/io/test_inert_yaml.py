@@ -78,15 +78,27 @@ g: !!python/object/apply:pathlib.Path [[nested]]
 
 
 def test_nested_aliases_share_one_value(tmp_path):
-    lines = ["!!python/object:a.B", "x0: &x0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]"]
-    lines += [f"x{i}: &x{i} [{', '.join([f'*x{i - 1}'] * 9)}]" for i in range(1, 40)]
-    deepest = read(tmp_path, "\n".join(lines)).fields["x39"]
+    lines = ["!!python/object:a.B", "x0: &x0 [lol, lol, lol, lol]"]
+    lines += [f"x{i}: &x{i} [{', '.join([f'*x{i - 1}'] * 4)}]" for i in range(1, 4)]
+    deepest = read(tmp_path, "\n".join(lines)).fields["x3"]
     assert all(part is deepest[0] for part in deepest)
+
+
+@pytest.mark.parametrize("kind", ["", "!!python/tuple "])
+def test_aliases_that_stand_for_a_million_values_are_refused(tmp_path, kind):
+    lines = ["!!python/object:a.B", f"x0: &x0 {kind}[lol, lol]"]
+    lines += [f"x{i}: &x{i} {kind}[*x{i - 1}, *x{i - 1}]" for i in range(1, 20)]
+    # As a key a tuple is hashed, and a name is made to text: both would take the time and memory of all values.
+    fails(tmp_path, "\n".join([*lines, "? *x19", ": 1"]), "more than 65536 values")
+
+
+def test_a_value_that_holds_itself_is_refused(tmp_path):
+    fails(tmp_path, "!!python/object:a.B\nmethod_name: &x [*x]", "holds itself")
 
 
 def test_nested_merge_keys_are_refused(tmp_path):
     lines = ["!!python/object:a.B", "x0: &x0 {k: v}"]
-    lines += [f"x{i}: &x{i} {{<<: [{', '.join([f'*x{i - 1}'] * 9)}]}}" for i in range(1, 40)]
+    lines += [f"x{i}: &x{i} {{<<: [{', '.join([f'*x{i - 1}'] * 9)}]}}" for i in range(1, 4)]
     fails(tmp_path, "\n".join(lines), "merge keys are not supported at line 3")
 
 

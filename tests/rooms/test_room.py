@@ -295,3 +295,15 @@ def test_a_list_of_seeds_without_a_seed_is_refused(tmp_path, capsys):
     with pytest.raises(SystemExit) as end:
         main(["rooms", "-o", str(tmp_path / "rooms"), "--seeds"])
     assert end.value.code == 1 and "--seeds without a value: expected" in capsys.readouterr().err
+
+
+def test_rooms_that_are_there_are_left_alone_by_the_same_command(tmp_path, coarse_rooms, capsys):
+    words = ["rooms", "-o", str(tmp_path), "--seeds", "0", "--frames", "2", "--width", "32", "--height", "24"]
+    main(words)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    main(words)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+    assert "room0: there already" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main([*words[:-1], "16"])  # others of that name are not overwritten
+    assert "is not an empty folder" in capsys.readouterr().err

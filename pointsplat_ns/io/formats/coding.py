@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import lzma
+import struct
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,11 +26,17 @@ SATURATED = 0.25
 """Opacity bytes 0 and 255 are read as 0.25 and 254.75: in the middle of what is written as these bytes, and with a
 logit that is finite. A logit of infinity would be dropped by some programs."""
 
-FREE_BYTES = 1 << 26
-"""Decompressed content up to this size is taken from a file of any size."""
+FREE_BYTES = 1 << 22
+"""Decompressed content up to this size is taken from a file of any size: 200,000 Gaussians, were they all equal."""
 
 MAX_RATIO = 1032
 """Beyond that, the largest ratio of decompressed to compressed bytes. It is deflate's own limit."""
+
+_OF_DECODERS = (
+    ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError, SyntaxError, EOFError,
+    NotImplementedError, RuntimeError, struct.error, zlib.error, lzma.LZMAError, zipfile.BadZipFile,
+)  # fmt: skip
+"""What Python's and our decoders raise where bytes are not what they should be."""
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
@@ -42,13 +52,15 @@ def damage_named(path: Path, kind: str) -> Iterator[None]:
         kind: of the file, for the error, such as "SPZ".
     """
     try:
-        yield
+        # Bits that mean NaN or Inf are no reason for numpy to warn: such Gaussians are dropped, and counted.
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            yield
     except SceneError:
         raise
     except OSError as error:
         why = error.strerror or one_line(error)
         raise SceneError(f"{path}: cannot be read as {kind} ({why})") from error
-    except (ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError, SyntaxError) as error:
+    except _OF_DECODERS as error:
         why = f"lacks {error}" if isinstance(error, KeyError) else one_line(error)
         raise SceneError(f"{path}: damaged {kind} file ({why})") from error
 
@@ -162,6 +174,11 @@ def log_of_sizes(sizes: Array) -> Array:
     """Log-scales of standard deviations. Zero is -Inf, a flat axis; a negative size is NaN and dropped by readers."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.log(sizes.astype(np.float32))
+
+
+def finite_sizes(scene: Gaussians) -> Array:
+    """Standard deviations (N, 3) as float32, the largest where that has none: infinity would be dropped by readers."""
+    return scene.stds.clamp_max(torch.finfo(torch.float32).max).numpy()
 
 
 def unit_quats(scene: Gaussians) -> Array:

@@ -12,7 +12,7 @@ import struct
 import numpy as np
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.formats.coding import Array, bytes_of_logits, shares_of_dc, to_bytes, unit_quats
+from pointsplat_ns.io.formats.coding import Array, bytes_of_logits, finite_sizes, shares_of_dc, to_bytes, unit_quats
 from pointsplat_ns.system.progress import Progress, silent
 
 JSON_BYTES = 8192
@@ -88,7 +88,7 @@ def _attributes(scene: Gaussians) -> dict[str, Array]:
     arrays: dict[str, Array] = {"POSITION": scene.means.numpy(), "COLOR_0": rgba}
     of_splats: dict[str, Array] = {
         "ROTATION": unit_quats(scene)[:, [1, 2, 3, 0]],
-        "SCALE": scene.stds.numpy(),
+        "SCALE": finite_sizes(scene),
         "OPACITY": scene.alphas[:, None].numpy(),
     }
     coefficients = scene.sh.numpy()

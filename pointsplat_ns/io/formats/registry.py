@@ -65,7 +65,7 @@ def _writer(encode: Callable[[Gaussians, Progress], bytes]) -> Writer:
 
     def write(scene: Gaussians, path: Path, progress: Progress) -> None:
         data = encode(scene, progress)
-        with replacing(path) as part:
+        with replacing(path, len(data)) as part:
             part.write_bytes(data)
 
     return write

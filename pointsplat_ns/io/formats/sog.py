@@ -12,6 +12,7 @@ import json
 import math
 import zipfile
 from collections.abc import Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import numpy as np
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
-from pointsplat_ns.io.files import keep_usable, replacing, require_memory
+from pointsplat_ns.io.files import keep_usable, replacing
 from pointsplat_ns.io.formats.coding import (
     Array,
     bytes_of_logits,
@@ -27,6 +28,7 @@ from pointsplat_ns.io.formats.coding import (
     from_smallest_three,
     logits_of_bytes,
     morton_order,
+    require_plausible,
     scene_of,
     smallest_three,
     to_bytes,
@@ -60,12 +62,8 @@ def read_sog(path: Path | str) -> Gaussians:
         SceneError: if a part is missing or damaged, or declares more than it can hold.
     """
     path = Path(path)
-    images = Images(path)
-    try:
-        with damage_named(path, "SOG"):
-            scene = _decode(images, images.meta(), path)
-    finally:
-        images.close()
+    with damage_named(path, "SOG"), closing(Images(path)) as images:
+        scene = _decode(images, images.meta(), path)
     return keep_usable(scene, path)
 
 
@@ -88,16 +86,21 @@ def encode_sog(scene: Gaussians, progress: Progress = silent) -> bytes:
 
 
 def write_sog_folder(scene: Gaussians, path: Path, progress: Progress = silent) -> None:
-    """Write the parts of a SOG file into the folder of ``path``, which is called ``meta.json``. It is written last, so
-    that a folder with it is whole.
+    """Write the parts of a SOG file into the folder of ``path``, which is called ``meta.json``.
+
+    All parts are written beside before the first replaces an older one. Meanwhile there is no ``meta.json``, so that a
+    folder with it is whole.
 
     Raises:
         SceneError: if there are more Gaussians than the images can hold, or a part cannot be written.
     """
     parts = _parts(scene, progress)
-    for name in [*(name for name in parts if name != META), META]:
-        with replacing(path.with_name(name)) as part:
-            part.write_bytes(parts[name])
+    with ExitStack() as stack:
+        # Left in the opposite order: meta.json comes last.
+        for name in [META, *(name for name in parts if name != META)]:
+            size = sum(map(len, parts.values())) if name == META else 0
+            stack.enter_context(replacing(path.with_name(name), size)).write_bytes(parts[name])
+        path.with_name(META).unlink(missing_ok=True)
 
 
 def _decode(images: Images, meta: dict[str, Any], path: Path) -> Gaussians:
@@ -107,11 +110,11 @@ def _decode(images: Images, meta: dict[str, Any], path: Path) -> Gaussians:
     n = meta["count"] if version == 2 else meta["means"]["shape"][0]
     if not isinstance(n, int) or not 0 <= n <= MAX_SIDE**2:
         raise SceneError(f"{path}: declares {n!r} Gaussians; expected a number up to {MAX_SIDE**2}")
+    require_plausible(path, 16 * n, images.size, n, _rest_of(meta))  # four images that every scene has
     if meta.get("model", "default") == "antialiased":
         warn_antialiased(path)
     pixels = functools.partial(_pixels, images, n)
     low, high = pixels(meta["means"], 0), pixels(meta["means"], 1)
-    require_memory(path, 4 * n * (14 + 3 * _rest_of(meta)))
     mins, maxs = (_numbers(meta["means"][name], 3) for name in ("mins", "maxs"))
     logs = mins + (maxs - mins) * (low[:, :3].astype(np.float64) + 256.0 * high[:, :3]) / 65535
     quats, colors = pixels(meta["quats"]), pixels(meta["sh0"])

@@ -23,8 +23,8 @@ PARTS = tuple(
 MAX_META_BYTES = 1 << 22
 """A meta.json has about 20 kB."""
 
-_SPARE = 1 << 20
-"""Pixels that an image may have beyond twice as many as are needed."""
+_SPARE = 1 << 16
+"""Pixels that an image may have beyond four times as many as are needed; some programs round sides up."""
 
 
 class Images:
@@ -56,6 +56,13 @@ class Images:
         if self._zip is not None:
             self._zip.close()
 
+    @property
+    def size(self) -> int:
+        """Bytes of the archive, or of all images in the folder."""
+        if self._zip is not None:
+            return self.path.stat().st_size
+        return sum(part.stat().st_size for part in self._folder.glob("*.webp"))
+
     def meta(self) -> dict[str, Any]:
         """The content of ``meta.json``."""
         content = json.loads(self._bytes(META, MAX_META_BYTES))
@@ -81,14 +88,18 @@ class Images:
 
         if not isinstance(name, str) or PurePosixPath(name).name != name or "\\" in name:
             raise SceneError(f"{self.path}: an image called {name!r}; expected the name of a file beside {META}")
-        data = self._bytes(name, 4 * (2 * least + _SPARE))
-        with Image.open(io.BytesIO(data), formats=("WEBP",)) as image:
-            across, down = image.size
-            if across * down < least or across * down > 2 * least + _SPARE or width not in (None, across):
-                needed = f"{least} pixels" + (f", {width} across" if width else "")
-                raise SceneError(f"{self.path}: {name} has {across} x {down} pixels; expected {needed}")
-            require_memory(self.path, 8 * across * down)
-            return np.asarray(image.convert("RGBA"))
+        most = 4 * least + _SPARE
+        data = self._bytes(name, 4 * most)
+        across, down = webp_size(data)  # opening an image takes the memory of its pixels already
+        if across * down < least or across * down > most or width not in (None, across):
+            needed = f"{least} pixels" + (f", {width} across" if width else "")
+            raise SceneError(f"{self.path}: {name} has {across} x {down} pixels; expected {needed}")
+        require_memory(self.path, 8 * across * down)
+        try:
+            with Image.open(io.BytesIO(data), formats=("WEBP",)) as image:
+                return np.asarray(image.convert("RGBA"))
+        except Image.DecompressionBombError as error:
+            raise SceneError(f"{self.path}: {name} is too large ({error})") from error
 
     def _bytes(self, name: str, most: int) -> bytes:
         """The content of one part, which must not exceed ``most`` bytes."""
@@ -109,6 +120,24 @@ class Images:
                 return stream.read(most + 1)  # the size in the archive may be a lie
         except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
             raise SceneError(f"{self.path}: damaged; {name} cannot be read ({error})") from error
+
+
+def webp_size(data: bytes) -> tuple[int, int]:
+    """Width and height of a WebP image in pixels, as its header says (RFC 9649).
+
+    Raises:
+        ValueError: if it is none.
+    """
+    kind, head = data[12:16], data[20:30]
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(head) == 10:
+        if kind == b"VP8X":
+            return 1 + int.from_bytes(head[4:7], "little"), 1 + int.from_bytes(head[7:10], "little")
+        if kind == b"VP8L" and head[0] == 0x2F:
+            bits = int.from_bytes(head[1:5], "little")
+            return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+        if kind == b"VP8 ":
+            return int.from_bytes(head[6:8], "little") & 0x3FFF, int.from_bytes(head[8:10], "little") & 0x3FFF
+    raise ValueError("not a WebP image")
 
 
 def webp(pixels: Array, width: int, height: int) -> bytes:

@@ -18,6 +18,7 @@ from pointsplat_ns.io.formats.coding import (
     bytes_of_logits,
     damage_named,
     dc_of_shares,
+    finite_sizes,
     log_of_sizes,
     logits_of_bytes,
     scene_of,
@@ -90,7 +91,7 @@ def encode_splat(scene: Gaussians, progress: Progress = silent) -> bytes:
     scene = scene[drawing_order(scene)]
     rows = np.empty(len(scene), _ROW)
     rows["means"] = scene.means.numpy()
-    rows["stds"] = scene.stds.numpy()
+    rows["stds"] = finite_sizes(scene)
     rows["rgba"][:, :3] = to_bytes(255 * shares_of_dc(scene))
     rows["rgba"][:, 3] = bytes_of_logits(scene)
     rows["quats"] = to_bytes(128 * unit_quats(scene) + 128)

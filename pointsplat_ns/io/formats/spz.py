@@ -162,7 +162,7 @@ def write_spz(
         SceneError: if it cannot be written, or the scene is too large for the format.
     """
     data = encode_spz(keep_usable(scene.detach().to("cpu", torch.float32), path), progress, version, sh_bits)
-    with replacing(path) as part:
+    with replacing(path, len(data)) as part:
         part.write_bytes(data)
 
 

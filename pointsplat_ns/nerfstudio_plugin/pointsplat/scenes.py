@@ -17,9 +17,10 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.utils.colors import get_color
 
-from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.discovery import Supervision, find_runs_and_plys
+from pointsplat_ns.io.files import one_line
 from pointsplat_ns.io.inert_yaml import Tagged
 from pointsplat_ns.io.runs import Run, open_run
 from pointsplat_ns.io.splatfacto import read_checkpoint
@@ -132,9 +133,17 @@ class TrainedScene(DenseScene):
         """The dataparser's outputs for a split.
 
         Raises:
-            DataError: if their coordinate frame is not that of the Gaussians.
+            DataError: if the data is damaged, or its coordinate frame is not that of the Gaussians.
         """
-        outputs = self._dataparser.get_dataparser_outputs(split=split)
+        try:
+            outputs = self._dataparser.get_dataparser_outputs(split=split)
+        except PointSplatError:
+            raise
+        except Exception as error:  # nerfstudio's parsers check little: a damaged file can raise nearly anything
+            why = f"{type(error).__name__}: {one_line(error)}"
+            raise DataError(
+                f"{self.run.data}: cannot be read as the data of {self.run.folder} ({why}); put back the data as it was"
+            ) from error
         moved = (outputs.dataparser_transform[:3] - self.run.transform).abs().max()
         if moved > 1e-4 or abs(outputs.dataparser_scale / self.run.scale - 1) > 1e-4:
             raise DataError(

@@ -6,12 +6,11 @@ axes: x right, y down, z forward), ``results/frame*.jpg|png`` and, optionally,
 intrinsics are in ``cam_params.json``, in the scene folder or in the one above it. Poses belong to
 frames by order: line k is the pose of the k-th frame by number.
 
-Needs numpy and Pillow only.
+nerfstudio is not imported.
 """
 
 import json
 import logging
-import math
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from typing import Literal
 import numpy as np
 
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.io.files import one_line
 
 logger = logging.getLogger(__name__)
 
@@ -193,17 +193,17 @@ def read_cam_params(folder: Path) -> PinholeParams:
         )
     try:
         camera = json.loads(path.read_text(encoding="utf-8"))["camera"]
-    except (ValueError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not valid JSON ({error}); expected a camera's intrinsics") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: not valid JSON ({one_line(error)}); expected a camera's intrinsics") from None
     except (KeyError, TypeError):
         raise DataError(f'{path}: no "camera" entry; expected {{"camera": {{"w": ..., "h": ...}}}}') from None
     values: dict[str, float] = {}
     for key in ("w", "h", "fx", "fy", "cx", "cy", "scale"):
         value = camera.get(key) if isinstance(camera, dict) else None
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise DataError(f'{path}: camera "{key}" is {value!r}; expected a number')
-        if not math.isfinite(value) or (value <= 0 and key not in ("cx", "cy")):
-            raise DataError(f'{path}: camera "{key}" is {value}; expected a positive number')
+            raise DataError(f'{path}: camera "{key}" is {value!r:.40}; expected a number')
+        if not abs(value) < FARTHEST or (value <= 0 and key not in ("cx", "cy")):  # NaN fails too
+            raise DataError(f'{path}: camera "{key}" is {value!s:.40}; expected a positive number')
         values[key] = float(value)
     for key in ("w", "h"):
         if values[key] != int(values[key]):

@@ -18,7 +18,8 @@ from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConf
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.early_look import EarlyLook
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig, SplatfactoCpuPipelineConfig
-from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainer, StoppableTrainerConfig
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.resuming import restore_training_state, training_state
+from pointsplat_ns.nerfstudio_plugin.stopping import STATE, StoppableTrainer, StoppableTrainerConfig
 
 SPLATFACTO_STEPS = 30_000
 """Training steps that Splatfacto's schedules were chosen for."""
@@ -46,6 +47,19 @@ class SplatfactoCpuTrainer(StoppableTrainer):
             self.callbacks.append(TrainingCallback([before], look.before_step, update_every_num_iters=1))
             self.callbacks.append(TrainingCallback([after], look.after_training, update_every_num_iters=1))
 
+    def state_to_resume(self) -> dict[str, Any]:
+        """Random numbers to come, the order of the photos, and what densification has gathered."""
+        return training_state(self.pipeline)
+
+    def _load_checkpoint(self) -> None:
+        super()._load_checkpoint()
+        folder, path = self.config.load_dir, self.config.load_checkpoint
+        if folder is not None:
+            path = folder / f"step-{self._start_step - 1:09d}.ckpt"
+        state = None if path is None else torch.load(path, map_location="cpu", weights_only=True, mmap=True).get(STATE)
+        if state is not None:  # checkpoints of earlier versions have none
+            restore_training_state(self.pipeline, state)
+
 
 @dataclass
 class SplatfactoCpuTrainerConfig(StoppableTrainerConfig):
@@ -64,14 +78,16 @@ class SplatfactoCpuTrainerConfig(StoppableTrainerConfig):
         return self._target(fitted_schedules(self) if self.scale_schedules else self, **kwargs)
 
 
-def fitted_schedules(config: TrainerConfig) -> TrainerConfig:
-    """A copy of a config with Splatfacto's 30,000-step schedules shortened to its ``max_num_iterations``.
+def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainerConfig:
+    """A copy of a config with Splatfacto's 30,000-step schedules shortened to its length: ``max_num_iterations``, and
+    the steps before if it goes on from a checkpoint.
 
     Model settings are changed only if they have Splatfacto's default values, learning-rate schedules only if they end
     at 30,000. ``refine_every``, over which gradients are gathered, shrinks only below 7,000 steps and never below 25.
     The interval of the opacity reset is a multiple of it.
     """
-    share = min(1.0, config.max_num_iterations / SPLATFACTO_STEPS)
+    length = config.first_step() + config.max_num_iterations
+    share = min(1.0, length / SPLATFACTO_STEPS)
     config = copy.deepcopy(config)
     defaults = SplatfactoModelConfig()
     model = config.pipeline.model
@@ -85,7 +101,7 @@ def fitted_schedules(config: TrainerConfig) -> TrainerConfig:
             "stop_screen_size_at",
         )
     }
-    fitted["refine_every"] = min(defaults.refine_every, max(25, round(config.max_num_iterations / 70)))
+    fitted["refine_every"] = min(defaults.refine_every, max(25, round(length / 70)))
     for name, value in fitted.items():
         if getattr(model, name) == getattr(defaults, name):
             setattr(model, name, value)
