@@ -1,7 +1,9 @@
-"""What several test modules make: scenes, cameras, settings of a training, runs whose data is gone."""
+"""What several test modules make: scenes, cameras, settings of a training, runs whose data is gone; and what a file
+imports."""
 
 from __future__ import annotations
 
+import ast
 import math
 import shlex
 import shutil
@@ -19,6 +21,17 @@ BENCHMARKS = REPOSITORY / "benchmarks"
 
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 """Real captures, splats and weights that tests read in place; they skip where it is absent."""
+
+
+def imports_of(path: Path) -> set[str]:
+    """Every module or name that a file imports, wherever in it."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
 
 
 def same(a: Gaussians, b: Gaussians) -> bool:
