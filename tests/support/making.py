@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
 import torch
 
 from pointsplat_ns.gaussians import Gaussians
@@ -318,3 +319,14 @@ def parsed_by_ns_train(command: str):
     program, *words = shlex.split(command)
     assert program == "ns-train"
     return tyro.cli(AnnotatedBaseConfigUnion, args=words)
+
+
+def decoded(path: Path) -> list[np.ndarray]:
+    """The frames (H, W, 3) uint8 of a video."""
+    import av
+    from av.video.reformatter import ColorRange
+
+    ranges = {"src_color_range": ColorRange.MPEG, "dst_color_range": ColorRange.JPEG}  # PyAV 16 does not ask
+    with av.open(str(path)) as container:
+        frames = [frame.reformat(format="rgb24", **ranges) for frame in container.decode(video=0)]
+    return [frame.to_ndarray() for frame in frames]
