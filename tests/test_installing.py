@@ -72,7 +72,7 @@ RUNS = {
 """Commands that nothing is missing for, and what they print."""
 
 FAILS = {
-    "view room.ply": "the viewer in the browser needs viser, which is not installed; pip install 'viser>=0.2.7,<0.3'",
+    "view room.ply": "the viewer in the browser needs viser, which is not installed; pip install viser==0.2.7 adds it",
     "make-refiner -o made": "training needs nerfstudio, which is not installed; pip install pointsplat-ns adds it",
     "render run -o run.mp4 --path dataset": "needs nerfstudio, which is not installed; pip install pointsplat-ns",
 }

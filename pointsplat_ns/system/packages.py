@@ -10,7 +10,7 @@ from pointsplat_ns.errors import MissingPackageError
 _REMEDIES = {
     # pip adds what an installed package asks for and lacks.
     "nerfstudio": "pip install pointsplat-ns adds it",
-    "viser": "pip install 'viser>=0.2.7,<0.3' adds it",
+    "viser": "pip install viser==0.2.7 adds it",
 }
 
 

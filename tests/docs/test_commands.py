@@ -37,7 +37,7 @@ PAGES = [
 BENCHMARKS = ROOT / "benchmarks"
 
 NS_PROGRAMS = ("ns-train", "ns-eval", "ns-export", "ns-viewer")
-OF_OTHERS = {"--decimate", "--no-build-isolation"}
+OF_OTHERS = {"--decimate", "--no-build-isolation", "--only-binary"}
 """Options that the documentation names and that belong to programs of others."""
 
 CUT = 1500
@@ -101,6 +101,11 @@ def inline_code() -> Iterator[tuple[Path, str]]:
         text = re.sub(r"^ *```.*?^ *```", "", page.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
         for code in re.findall(r"`([^`\n]+)`", text):
             yield page, code
+
+
+def files_of(words: tuple[str, ...]) -> list[str]:
+    """The files of requirements that pip is given."""
+    return [words[index + 1] for index, word in enumerate(words) if word == "-r"]
 
 
 def runs_quickly(words: tuple[str, ...]) -> bool:
@@ -227,7 +232,11 @@ def test_command_is_one_that_works(command, monkeypatch, capsys):
         targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), flags=re.MULTILINE)
         assert {word for word in words[1:] if "=" not in word} <= set(targets)
     elif program == "pip":
-        assert words in (("pip", "install", "."), ("pip", "install", "-e", "."), ("pip", "install", "-e", ".[dev]"))
+        assert words[1] == "install" and set(files_of(words)) <= {"requirements/core.txt", "oldest.txt"}
+    elif program == "uv":
+        assert words[1:3] == ("pip", "compile") and {word for word in words if word.startswith("requirements/")} == {
+            str(path.relative_to(ROOT)) for path in (ROOT / "requirements").iterdir()
+        }
     elif program == "pre-commit":
         assert words[1] in ("install", "run")
         assert (ROOT / ".pre-commit-config.yaml").is_file()
