@@ -1,4 +1,4 @@
-# Each target sets up what it needs: an environment in $(VENV), made once and renewed when pyproject.toml changes.
+# Each target sets up what it needs: an environment in $(VENV), made once and renewed when what it needs changes.
 #   make test    run the test suite
 #   make lint    check style, types and the direction of imports
 #   make docs    build the documentation as a site, in site/
@@ -26,7 +26,7 @@ $(VENV)/bin/python:
 	@test -n "$(PYTHON)" || { echo "no Python 3.10, 3.11 or 3.12 found; install one or pass PYTHON=/path/to/python" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-$(STAMP): pyproject.toml | $(VENV)/bin/python
+$(STAMP): pyproject.toml $(wildcard requirements/*.txt) | $(VENV)/bin/python
 	$(VENV)/bin/python -m pip install --disable-pip-version-check -e '.[dev]'
 	@touch $@
 

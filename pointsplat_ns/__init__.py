@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_info import SceneInfo, info
     from pointsplat_ns.compression.scene_task import SceneResult
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
-    from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
+    from pointsplat_ns.errors import BudgetError, DataError, MissingPackageError, PointSplatError, SceneError
     from pointsplat_ns.folders import compact_folder
     from pointsplat_ns.gaussians import Gaussians
     from pointsplat_ns.io.scene import save
@@ -60,7 +60,7 @@ _PUBLIC = {
     "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner"),
     "pointsplat_ns.pages.scene_page": ("write_page",),
     "pointsplat_ns.pruning.view_sampling": ("sample_views",),
-    "pointsplat_ns.errors": ("BudgetError", "DataError", "PointSplatError", "SceneError"),
+    "pointsplat_ns.errors": ("BudgetError", "DataError", "MissingPackageError", "PointSplatError", "SceneError"),
     "pointsplat_ns.folders": ("compact_folder",),
     "pointsplat_ns.gaussians": ("Gaussians",),
     "pointsplat_ns.io.scene": ("save",),
@@ -86,6 +86,7 @@ __all__ = [
     "DataError",
     "Gaussians",
     "Levels",
+    "MissingPackageError",
     "PointSplatError",
     "SceneError",
     "SceneInfo",

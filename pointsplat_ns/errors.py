@@ -65,3 +65,14 @@ class BudgetError(PointSplatError, ValueError):
         ...     print(error)
         keep is 1000000000 Gaussians; expected 1 to 62845, the number in the scene
     """
+
+
+class MissingPackageError(PointSplatError):
+    """A package that not every installation has, and that what was asked for needs: nerfstudio, or viser.
+
+    Example:
+        >>> raise MissingPackageError("training needs nerfstudio, which is not installed")
+        Traceback (most recent call last):
+        ...
+        pointsplat_ns.errors.MissingPackageError: training needs nerfstudio, which is not installed
+    """

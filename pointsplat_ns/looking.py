@@ -15,6 +15,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.system.packages import need
 from pointsplat_ns.system.progress import Progress, tracked
 from pointsplat_ns.viewing.camera_path import Shot, camera_path
 from pointsplat_ns.viewing.film import Cast, Split, frames_of
@@ -126,6 +127,7 @@ def open_viewer(
     Raises:
         SceneError: if a scene is not usable.
         DataError: if there is no place to look from.
+        MissingPackageError: if viser is not installed.
         PointSplatError: if the port cannot be listened on.
 
     Example:
@@ -134,6 +136,7 @@ def open_viewer(
         ...     viewer.url.startswith("http://127.0.0.1:")
         True
     """
+    need("viser", "the viewer in the browser")
     from pointsplat_ns.viewing.viewer import Exhibit, Viewer
 
     upward, exhibits = None if up is None else axis_named(up), []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import subprocess
 import sys
@@ -11,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import pointsplat_ns as ps
-from making import REPOSITORY, ball
+from making import REPOSITORY, ball, imports_of
 
 PACKAGE = REPOSITORY / "pointsplat_ns"
 
@@ -86,17 +85,6 @@ def test_the_package_says_that_it_is_typed():
 
     settings = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))
     assert "py.typed" in settings["tool"]["setuptools"]["package-data"]["pointsplat_ns"]
-
-
-def imports_of(path: Path) -> set[str]:
-    """Every module or name that a file imports, wherever in it."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            found |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return found
 
 
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))

@@ -109,7 +109,7 @@ def main(args: list[str] | None = None) -> None:
     """Run one subcommand.
 
     Input that cannot be used, files that cannot be read or written, and a lack of memory end it with one line and exit
-    status 1; Ctrl-C ends it with 130, another signal with 128 plus its number
+    status 1, and so does a package that is missing; Ctrl-C ends it with 130, another signal with 128 plus its number
     (:data:`pointsplat_ns.cli.help.STATUSES`). With ``--json``, standard output has one JSON value and nothing else.
     """
     import tyro
@@ -167,6 +167,11 @@ def main(args: list[str] | None = None) -> None:
             sys.stdout.flush()  # so that a full disk or a closed pipe is noticed here
     except PointSplatError as error:
         print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith(__package__.partition(".")[0]):
+            raise
+        print(f"error: {error.name} is not installed; pip install pointsplat-ns adds what is missing", file=sys.stderr)
         sys.exit(1)
     except BrokenPipeError:  # of `pointsplat ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python fails again when it ends

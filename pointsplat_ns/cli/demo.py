@@ -42,9 +42,12 @@ def demo(
         height: of a photo, pixels.
         fresh: start over.
     """
+    from pointsplat_ns.system.packages import need
+
     if fresh and output.exists():
         shutil.rmtree(output)
     compact_example(output, keep)
+    need("nerfstudio", "the rest of the demo, which trains,")
     print(
         f"\nThat is a usable result. The demo now goes on to train scenes and a refiner of its own, for about "
         f"{TRAINING_MINUTES} minutes on two cores.\nIt may be stopped at any time with Ctrl-C; started again, it does "

@@ -60,7 +60,7 @@ def other_neighbours(points: Tensor, k: int) -> Tensor:
     n = len(points)
     array = points.numpy()
     tree = cKDTree(array, balanced_tree=False)
-    walk = torch.from_numpy(tree.indices)
+    walk = torch.from_numpy(tree.indices.copy())  # newer releases of scipy give what must not be written to
     near = torch.arange(n, dtype=torch.int32)[:, None].repeat(1, k)
     ranks = list(range(1, min(k + 1, n) + 1))
     crowded = []

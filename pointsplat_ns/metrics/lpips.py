@@ -15,6 +15,7 @@ import threading
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Literal
 
 import torch
@@ -42,7 +43,7 @@ _NORM_EPS = 1e-8
 
 
 class LpipsUnavailable(PointSplatError):
-    """The weights of LPIPS are not available; the message says why, in one line."""
+    """The weights of LPIPS, or torchvision, are not available; the message says why, in one line."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +75,7 @@ _BACKBONES: dict[str, _Backbone] = {
 
 def empty_features(net: Net) -> nn.Sequential:
     """torchvision's layers up to the last that LPIPS compares, without memory for their weights."""
-    from torchvision import models
-
+    models = _torchvision_models()
     with torch.device("meta"):
         network = models.alexnet(weights=None) if net == "alex" else models.vgg16(weights=None, init_weights=False)
     return network.features[: _BACKBONES[net].taps[-1] + 1]
@@ -168,13 +168,14 @@ def load_lpips(net: Net = "alex", backbone: Path | str | None = None, download: 
         download: whether the network may be used.
 
     Raises:
-        LpipsUnavailable: if the weights are not available.
+        LpipsUnavailable: if the weights are not available, or torchvision is not.
 
     Example:
         >>> load_lpips("alex", backbone="alexnet_features.pth")  # doctest: +SKIP
     """
     if net not in _BACKBONES:
         raise LpipsUnavailable(f"no LPIPS network is called {net!r}; expected one of {', '.join(_BACKBONES)}")
+    _torchvision_models()  # before anything is downloaded
     linear = _load(_linear_file(net))
     path = _local_file(net) if backbone is None else Path(backbone)
     if path is None:
@@ -245,6 +246,20 @@ class ReportedLpips:
 _loaded: LRUCache[Hashable, Lpips] = LRUCache(maxsize=4)  # 10 MB for alex, 59 MB for vgg
 _failures: TTLCache[Hashable, str] = TTLCache(maxsize=16, ttl=RETRY_AFTER_S)
 _cache_lock = threading.Lock()
+
+
+def _torchvision_models() -> ModuleType:
+    """torchvision's networks.
+
+    Raises:
+        LpipsUnavailable: if torchvision is not installed, or was built for another torch.
+    """
+    try:
+        from torchvision import models
+    except (ImportError, RuntimeError) as error:
+        why = str(error).partition("\n")[0]
+        raise LpipsUnavailable(f"LPIPS needs torchvision, which cannot be imported ({why})") from error
+    return models
 
 
 def _local_file(net: Net) -> Path | None:

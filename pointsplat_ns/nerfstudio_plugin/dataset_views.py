@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from pointsplat_ns.errors import DataError
+from pointsplat_ns.errors import DataError, MissingPackageError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.io.runs import open_run, scene_name
 from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstudio
+from pointsplat_ns.system.packages import need
 from pointsplat_ns.views import Views, spread_indices
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ def dataset_views(path: Path | str, split: Split = "train") -> Views:
 
     Raises:
         SceneError: if ``path`` is not a run, or the run's data is missing.
-        DataError: if the poses are not usable, or the split has none.
+        DataError: if the poses are not usable, the split has none, or nerfstudio is not installed.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -63,7 +64,7 @@ def dataset_photos(path: Path | str, split: Split, count: int) -> tuple[Views, l
 
     Raises:
         SceneError: if ``path`` is not a run, or the run's data is missing.
-        DataError: if the poses or a photo are not usable, or the split has none.
+        DataError: if the poses or a photo are not usable, the split has none, or nerfstudio is not installed.
     """
     scene, frames = _open(path, split)
     poses = _views_of(scene, frames, split)
@@ -86,6 +87,10 @@ def dataset_photos(path: Path | str, split: Split, count: int) -> tuple[Views, l
 def _open(path: Path | str, split: Split) -> tuple[TrainedScene, Frames]:
     """The scene of a run, and the frames of a split."""
     run = open_run(path)  # before nerfstudio is imported, which takes seconds
+    try:
+        need("nerfstudio", "reading the photos and poses of a run")
+    except MissingPackageError as error:
+        raise DataError(str(error)) from error
     import_nerfstudio()
 
     from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache

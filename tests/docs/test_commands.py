@@ -19,11 +19,16 @@ import pointsplat_ns as ps
 from documented import BLOCKS, COMMANDS, NS_PROGRAMS, PAGES, ROOT, check_arguments, help_of, inline_code, start
 from pointsplat_ns.cli.help import EXAMPLES
 
-OF_OTHERS = {"--decimate", "--no-build-isolation", "--tyro-print-completion"}
+OF_OTHERS = {"--decimate", "--no-build-isolation", "--only-binary", "--tyro-print-completion"}
 """Options that the documentation names and that belong to programs of others."""
 
 CUT = 1500
 """Gaussians of the scene that commands are run on: enough to draw, few enough for a second each."""
+
+
+def files_of(words: tuple[str, ...]) -> list[str]:
+    """The files of requirements that pip is given."""
+    return [words[index + 1] for index, word in enumerate(words) if word == "-r"]
 
 
 def runs_quickly(words: tuple[str, ...]) -> bool:
@@ -89,7 +94,11 @@ def test_command_is_one_that_works(command, tmp_path, monkeypatch, capsys):
         targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), flags=re.MULTILINE)
         assert {word for word in words[1:] if "=" not in word} <= set(targets)
     elif program == "pip":
-        assert words in (("pip", "install", "."), ("pip", "install", "-e", "."), ("pip", "install", "-e", ".[dev]"))
+        assert words[1] == "install" and set(files_of(words)) <= {"requirements/core.txt", "oldest.txt"}
+    elif program == "uv":
+        assert words[1:3] == ("pip", "compile") and {word for word in words if word.startswith("requirements/")} == {
+            str(path.relative_to(ROOT)) for path in (ROOT / "requirements").iterdir()
+        }
     elif program == "pre-commit":
         assert words[1] in ("install", "run")
         assert (ROOT / ".pre-commit-config.yaml").is_file()

@@ -13,7 +13,7 @@ import torch
 from making import normal_scene, same_bits
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import SH_C0
-from pointsplat_ns.io import allow_splatfacto_checkpoints, read_checkpoint
+from pointsplat_ns.io import read_checkpoint
 from pointsplat_ns.io.splatfacto import PREFIXES
 
 
@@ -127,11 +127,6 @@ def test_a_checkpoint_written_with_either_numpy_loads(tmp_path, checkpoint_of, c
 def zipfile_data(path):
     with zipfile.ZipFile(path) as archive:
         return [archive.read(info) for info in archive.infolist()]
-
-
-def test_registration_is_a_no_op_where_torch_has_no_register(monkeypatch):
-    monkeypatch.delattr(torch.serialization, "add_safe_globals")
-    allow_splatfacto_checkpoints()
 
 
 class Bomb:

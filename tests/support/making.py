@@ -1,7 +1,9 @@
-"""What several test modules make: scenes, cameras, settings of a training, runs whose data is gone."""
+"""What several test modules make: scenes, cameras, settings of a training, runs whose data is gone; and what a file
+imports."""
 
 from __future__ import annotations
 
+import ast
 import math
 import shlex
 import shutil
@@ -10,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
 import torch
 
 from pointsplat_ns.gaussians import Gaussians
@@ -19,6 +22,17 @@ BENCHMARKS = REPOSITORY / "benchmarks"
 
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 """Real captures, splats and weights that tests read in place; they skip where it is absent."""
+
+
+def imports_of(path: Path) -> set[str]:
+    """Every module or name that a file imports, wherever in it."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
 
 
 def same(a: Gaussians, b: Gaussians) -> bool:
@@ -305,3 +319,14 @@ def parsed_by_ns_train(command: str):
     program, *words = shlex.split(command)
     assert program == "ns-train"
     return tyro.cli(AnnotatedBaseConfigUnion, args=words)
+
+
+def decoded(path: Path) -> list[np.ndarray]:
+    """The frames (H, W, 3) uint8 of a video."""
+    import av
+    from av.video.reformatter import ColorRange
+
+    ranges = {"src_color_range": ColorRange.MPEG, "dst_color_range": ColorRange.JPEG}  # PyAV 16 does not ask
+    with av.open(str(path)) as container:
+        frames = [frame.reformat(format="rgb24", **ranges) for frame in container.decode(video=0)]
+    return [frame.to_ndarray() for frame in frames]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 import pointsplat_ns as ps
+from making import decoded
 from pointsplat_ns.viewing import video
 from pointsplat_ns.viewing.video import write_frames
 
@@ -23,13 +23,6 @@ def drawn(count: int = 6, width: int = 128, height: int = 96) -> list[np.ndarray
         .astype(np.uint8)
         for i in range(count)
     ]
-
-
-def decoded(path: Path) -> list[np.ndarray]:
-    import av
-
-    with av.open(str(path)) as container:
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:

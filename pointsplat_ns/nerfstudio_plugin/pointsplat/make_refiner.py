@@ -25,6 +25,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.results import REFINER_NAME, VAR
 from pointsplat_ns.nerfstudio_plugin.running import StoppedError, finished, run
 from pointsplat_ns.refiner import read_refiner, save_refiner
 from pointsplat_ns.rooms import write_room
+from pointsplat_ns.system.packages import need
 
 TIMESTAMP = "recipe"
 """Folder name of the runs, the same in each call, so that finished ones are found again."""
@@ -67,6 +68,7 @@ def make_refiner(
 
     Raises:
         DataError: if ``rooms`` or ``steps`` is out of range.
+        MissingPackageError: if nerfstudio is not installed.
         PointSplatError: if a command fails.
 
     Example:
@@ -81,6 +83,7 @@ def make_refiner(
         raise DataError(f"--rooms {rooms}: expected 1 to {len(TRAIN_SEEDS)}")
     if steps < 1:
         raise DataError(f"--steps {steps}: expected at least 1")
+    need("nerfstudio", "training")
     train_seeds = TRAIN_SEEDS[:rooms]
     _make_scenes(output, (*train_seeds, *UNSEEN_SEEDS), workers or os.cpu_count() or 1)
 

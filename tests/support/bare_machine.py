@@ -1,0 +1,71 @@
+"""Runs ``pointsplat`` commands one after another in this process, cut off from the network, and writes what each did.
+
+    python bare_machine.py COMMANDS.json RESULTS.json
+
+The first file is a list of command lines, each a list of words; "modules" is an attempt to import all modules. The
+second is a list of what each printed, its exit status and the hosts that it tried to reach. Views and rooms are as
+small as in the other tests.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import io
+import json
+import pkgutil
+import sys
+import traceback
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+
+import pointsplat_ns
+
+tried: list[str] = []
+
+
+def no_network(event: str, arguments: tuple) -> None:
+    """Fail whatever asks for a host's address or connects to one, as on a machine without network."""
+    if event in ("socket.connect", "socket.getaddrinfo", "socket.gethostbyname", "socket.sendto"):
+        tried.append(f"{event} {arguments}")
+        raise OSError(101, "Network is unreachable")
+
+
+def lacking() -> dict[str, str]:
+    """The package that is missing to each module that cannot be imported."""
+    found = {}
+    for module in pkgutil.walk_packages(pointsplat_ns.__path__, "pointsplat_ns."):
+        try:
+            importlib.import_module(module.name)
+        except ModuleNotFoundError as error:
+            found[module.name] = str(error.name).partition(".")[0]
+    return found
+
+
+def outcome(words: list[str]) -> dict:
+    """What a command did."""
+    from pointsplat_ns.cli import main
+
+    tried.clear()
+    out, err, status = io.StringIO(), io.StringIO(), 0
+    with redirect_stdout(out), redirect_stderr(err):
+        try:
+            print(json.dumps(lacking())) if words == ["modules"] else main(words)
+        except SystemExit as end:
+            status = end.code
+        except Exception:
+            traceback.print_exc()
+            status = -1
+    return {"status": status, "out": out.getvalue(), "err": err.getvalue(), "tried": [*tried]}
+
+
+if __name__ == "__main__":
+    sys.addaudithook(no_network)
+    from pointsplat_ns.compression import view_source
+    from pointsplat_ns.pruning.view_sampling import views_about
+    from pointsplat_ns.rooms import light
+
+    view_source.views_about = functools.partial(views_about, width=64, height=48)
+    light.TEXEL, light.LUMEL = 0.1, 0.5
+    commands, results = map(Path, sys.argv[1:])
+    results.write_text(json.dumps([outcome(words) for words in json.loads(commands.read_text("utf-8"))]))

@@ -1,0 +1,241 @@
+"""What runs where nerfstudio is missing, and so are CUDA, Node, a compiler, a network and a home to write to.
+
+The environment has nothing but what ``requirements/core.txt`` asks for and what that in turn asks for, as links to what
+is installed here.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+import torch
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+import pointsplat_ns as ps
+from evaluations import evaluation
+from making import REPOSITORY, imports_of
+from pointsplat_ns.cli import demo, main
+from pointsplat_ns.errors import MissingPackageError
+from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
+from pointsplat_ns.system.packages import need
+
+CORE, NERFSTUDIO = (REPOSITORY / "requirements" / name for name in ("core.txt", "nerfstudio.txt"))
+
+WITH_ANOTHER = {"gsplat": "nerfstudio", "websockets": "viser"}
+"""Packages that are imported where the one that brings them is."""
+
+BY_NAME = {"open3d"}
+"""Requirements that are imported nowhere: what another package needs of them is said here."""
+
+RUN_CONFIG = """\
+!!python/object:nerfstudio.engine.trainer.TrainerConfig
+data: photos
+experiment_name: kitchen
+method_name: splatfacto
+pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConfig
+  datamanager: !!python/object:nerfstudio.data.datamanagers.full_images_datamanager.FullImageDatamanagerConfig
+    dataparser: !!python/object:nerfstudio.data.dataparsers.nerfstudio_dataparser.NerfstudioDataParserConfig {}
+  model: !!python/object:nerfstudio.models.splatfacto.SplatfactoModelConfig
+    sh_degree: 3
+timestamp: run
+"""
+
+MODULES = "modules"
+"""In place of a command: import all modules, and print those that lack another package, with its name."""
+
+RUNS = {
+    "--version": "pointsplat-ns",
+    "info room.ply": "600 Gaussians",
+    "prune room.ply --keep 10%": "kept 60 of 600",
+    "compact room.ply --keep 30% --effort instant --html small.html": "small.html",
+    "lod room.ply --levels 30%": "1 levels of 600 Gaussians",
+    "tradeoff room.ply --points 2 --views 2 --side 64 --repairs none --drawn exact": "room_tradeoff",
+    "tables room.ply -o tables --only room/paper/10% --views 2 --side 64": "figure4.png",
+    "convert room.ply room.spz": "600 Gaussians",
+    "convert room.ply room.sog": "600 Gaussians",
+    "convert room.ply room.glb": "600 Gaussians",
+    "render room.ply room_pruned.ply -o film.mp4 --width 64 --height 48 --seconds 0.2": "5 frames",
+    "export run -o exported.ply": "300 Gaussians",
+    "render run -o run.png --width 64 --height 48": "reading the photos and poses of a run needs nerfstudio",
+    "report evaluation.json --html report.html": "report.html",
+    "rooms -o rooms --seeds 0 --frames 2 --width 32 --height 24": "room0",
+}
+"""Commands that nothing is missing for, and what they print."""
+
+FAILS = {
+    "view room.ply": "the viewer in the browser needs viser, which is not installed; pip install viser==0.2.7 adds it",
+    "make-refiner -o made": "training needs nerfstudio, which is not installed; pip install pointsplat-ns adds it",
+    "render run -o run.mp4 --path dataset": "needs nerfstudio, which is not installed; pip install pointsplat-ns",
+}
+"""Commands that something is missing for, and what they say."""
+
+
+def requirements_of(path: Path) -> list[Requirement]:
+    """The requirements in a file."""
+    lines = [line.strip() for line in path.read_text("utf-8").splitlines()]
+    return [Requirement(line) for line in lines if line and not line.startswith("#")]
+
+
+def installed_for(requirements: Iterable[Requirement], seen: set[str] | None = None) -> Iterator[metadata.Distribution]:
+    """The installed distributions that requirements ask for, and those that these ask for."""
+    seen = set() if seen is None else seen
+    for requirement in requirements:
+        name = canonicalize_name(requirement.name)
+        if f"{name}{sorted(requirement.extras)}" in seen:
+            continue
+        seen.add(f"{name}{sorted(requirement.extras)}")
+        found = metadata.distribution(name)
+        yield found
+        asked = [Requirement(text) for text in found.requires or ()]
+        extras = [{"extra": extra} for extra in (*requirement.extras, "")]
+        wanted = [one for one in asked if one.marker is None or any(map(one.marker.evaluate, extras))]
+        yield from installed_for(wanted, seen)
+
+
+@pytest.fixture(scope="module")
+def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
+    """What each command does on such a machine."""
+    folder = tmp_path_factory.mktemp("bare")
+    packages, nothing, work = folder / "packages", folder / "nothing", folder / "work"
+    for made in (packages, nothing, work):
+        made.mkdir()
+    for distribution in installed_for(requirements_of(CORE)):
+        tops = {file.parts[0] for file in distribution.files or () if file.parts[0] not in ("..", "__pycache__")}
+        for top in tops:
+            if not (packages / top).exists():
+                (packages / top).symlink_to(distribution.locate_file(top))
+
+    ps.save(ps.prune(ps.example_room(), 600, by="coverage"), work / "room.ply")
+    (work / "evaluation.json").write_text(json.dumps(evaluation()))
+    (work / "photos").mkdir()
+    (work / "run" / "nerfstudio_models").mkdir(parents=True)
+    (work / "run" / "config.yml").write_text(RUN_CONFIG)
+    scene = ps.load(work / "room.ply")[:300]
+    content = {"step": 9, "pipeline": {f"_model.gauss_params.{name}": value for name, value in scene.items()}}
+    torch.save(content, work / "run" / "nerfstudio_models" / "step-000000009.ckpt")
+
+    commands, results = folder / "commands.json", folder / "results.json"
+    lines = [*RUNS, *FAILS, MODULES]
+    commands.write_text(json.dumps([shlex.split(line) for line in lines]))
+    environment = {
+        "HOME": str(commands / "home"),  # below a file, nobody can make a folder
+        "PATH": str(nothing),
+        "TMPDIR": str(folder),
+        "CUDA_VISIBLE_DEVICES": "",
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": os.pathsep.join(map(str, (packages, REPOSITORY))),
+    }
+    # -S: without the site-packages of this Python.
+    done = subprocess.run(
+        [sys.executable, "-S", REPOSITORY / "tests" / "support" / "bare_machine.py", commands, results],
+        cwd=work, env=environment, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return dict(zip(lines, json.loads(results.read_text()), strict=True))
+
+
+@pytest.mark.parametrize("line", RUNS)
+def test_command_runs_on_a_bare_machine(outcomes, line):
+    done = outcomes[line]
+    assert done["status"] == 0, done["err"]
+    assert RUNS[line] in done["out"]
+
+
+@pytest.mark.parametrize("line", FAILS)
+def test_command_says_what_it_lacks_in_one_line(outcomes, line):
+    done = outcomes[line]
+    assert done["status"] == 1
+    assert done["err"].startswith("error: ") and done["err"].count("\n") == 1
+    assert FAILS[line] in done["err"]
+
+
+def test_no_command_asks_for_a_network(outcomes):
+    assert not [line for line, done in outcomes.items() if done["tried"]]
+
+
+def test_all_but_the_plugin_and_the_viewer_can_be_imported_on_a_bare_machine(outcomes):
+    lacking = json.loads(outcomes[MODULES]["out"])
+    assert lacking.pop("pointsplat_ns.viewing.server") == lacking.pop("pointsplat_ns.viewing.viewer") == "viser"
+    assert lacking and all(name.startswith("pointsplat_ns.nerfstudio_plugin.") for name in lacking)
+    assert set(lacking.values()) <= {"nerfstudio", "gsplat", "cv2"}
+
+
+def test_requirements_are_what_is_imported():
+    core, more = (_names(path) for path in (CORE, NERFSTUDIO))
+    package = REPOSITORY / "pointsplat_ns"
+    plugin, rest = set(), set()
+    for path in (*package.rglob("*.py"), *(REPOSITORY / "method_configs").glob("*.py")):
+        imported = {name.split(".")[0] for name in imports_of(path)} - {"pointsplat_ns", "method_configs", "_typeshed"}
+        inside = path.is_relative_to(package / "nerfstudio_plugin") or not path.is_relative_to(package)
+        (plugin if inside else rest).update(imported - set(sys.stdlib_module_names))
+    assert _distributions(rest - {"viser"} - WITH_ANOTHER.keys()) <= core
+    assert _distributions((plugin | rest) - WITH_ANOTHER.keys()) == (core | more) - BY_NAME
+
+
+def _names(path: Path) -> set[str]:
+    return {canonicalize_name(requirement.name) for requirement in requirements_of(path)}
+
+
+def _distributions(imported: set[str]) -> set[str]:
+    """The distributions that imported packages belong to. OpenCV's two share their package; nerfstudio takes that
+    without a window."""
+    homes = metadata.packages_distributions()
+    found = {canonicalize_name(name) for package in imported for name in homes[package]}
+    return found - {"opencv-python"}
+
+
+@pytest.fixture()
+def no_nerfstudio(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An installation without nerfstudio."""
+    monkeypatch.setitem(sys.modules, "nerfstudio", None)
+
+
+def test_the_demo_gives_its_first_result_and_then_says_what_it_lacks(no_nerfstudio, monkeypatch, tmp_path):
+    made = []
+    monkeypatch.setattr(demo, "compact_example", lambda *_: made.append("example"))
+    with pytest.raises(MissingPackageError, match="the rest of the demo, which trains, needs nerfstudio, which is not"):
+        demo.demo(tmp_path)
+    assert made == ["example"]
+
+
+def test_what_the_package_itself_lacks_is_one_line_too(monkeypatch, capsys):
+    def fail(*_):
+        raise ModuleNotFoundError("No module named 'av'", name="av")
+
+    monkeypatch.setattr("pointsplat_ns.report", fail)
+    with pytest.raises(SystemExit) as end:
+        main(["report", "evaluation.json"])
+    assert end.value.code == 1
+    assert capsys.readouterr().err == "error: av is not installed; pip install pointsplat-ns adds what is missing\n"
+
+
+def test_a_package_that_is_there_but_broken_keeps_its_error(monkeypatch, tmp_path):
+    (tmp_path / "viser").mkdir()
+    (tmp_path / "viser" / "__init__.py").write_text("import liblzfse_that_is_missing")
+    monkeypatch.delitem(sys.modules, "viser", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ModuleNotFoundError, match="liblzfse_that_is_missing"):
+        need("viser", "the viewer")
+
+
+@pytest.mark.parametrize("said", [ImportError("No module"), RuntimeError("operator torchvision::nms does not exist")])
+def test_lpips_says_that_torchvision_is_missing_or_of_another_torch(said, monkeypatch):
+    class Broken:
+        def find_spec(self, name, path=None, target=None):
+            if name == "torchvision":
+                raise said
+
+    for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(sys, "meta_path", [Broken(), *sys.meta_path])
+    with pytest.raises(LpipsUnavailable, match=f"LPIPS needs torchvision, which cannot be imported .{said}"):
+        load_lpips("alex", download=False)
