@@ -142,7 +142,7 @@ def test_scaling_measures_each_program_at_each_size(compaction, tmp_path, capsys
 def test_a_size_that_does_not_fit_is_left_out_with_the_reason(benchmark, monkeypatch):
     scaling, processes = benchmark("scaling"), benchmark("processes")
     copy = processes.Reducer("copy", lambda source, count, target: ["cp", str(source), str(target)])
-    monkeypatch.setattr(scaling.shutil, "disk_usage", lambda folder: types.SimpleNamespace(free=10**6))
+    monkeypatch.setattr(scaling.shutil, "disk_usage", lambda folder: types.SimpleNamespace(total=10**9, free=10**6))
     start, large = scaling.scaling_rows((10_000,), 3, [copy])
     assert start["failed"] == "" and start["count"] == scaling.START
     assert large["failed"] == "about 0.00273 GB of disk needed, 0.001 GB free" and large["seconds"] is None

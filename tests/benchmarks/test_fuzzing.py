@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import mmap
 from contextlib import suppress
 
 import pytest
@@ -52,7 +53,7 @@ def test_what_fuzzing_kept_is_read_or_refused(name, readers, judging, tmp_path):
     [
         (lambda _: [][1], "IndexError at "),
         (lambda _: (_ for _ in ()).throw(PointSplatError("")), "not one line"),
-        (lambda _: bytearray(b"x") * (64 << 20), "took 6. MB for 1 bytes"),
+        (lambda _: mmap.mmap(-1, 64 << 20).write(bytes(64 << 20)), r"took \d+ MB for 1 bytes"),  # of the system, always
     ],
 )
 def test_the_judge_says_what_a_reader_must_not_do(wrong, said, judging):

@@ -141,7 +141,10 @@ def test_what_is_interrupted_while_it_is_written_is_not_there_and_what_was_there
     with pytest.raises(SystemExit) as end:
         main([*WRITES[name], "--force"])
     assert end.value.code == 130 and capsys.readouterr().err.endswith("interrupted\n")
-    assert Path(name).read_text() == "from before"
+    if name == "meta.json":  # in the middle of putting several files in place: parts of two scenes are no scene
+        assert not Path(name).exists()
+    else:
+        assert Path(name).read_text() == "from before"
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
