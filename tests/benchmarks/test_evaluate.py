@@ -21,6 +21,7 @@ PROGRAMS = (
     "example_room",
     "formats",
     "frame_times",
+    "mutants",
     "photo_places",
     "quality",
     "rasterizer",
