@@ -33,7 +33,7 @@ from mutations import Mutation, mutations
 
 ROOT = Path(__file__).parents[1]
 
-LONGEST = 60
+LONGEST = 20
 """CPU seconds that a test may take, in no more than an hour: a fault that makes it longer is caught."""
 
 LOADED = (
@@ -169,7 +169,7 @@ class Limits:
 
     def pytest_runtest_setup(self) -> None:
         signal.setitimer(signal.ITIMER_PROF, LONGEST)
-        signal.setitimer(signal.ITIMER_REAL, 60 * LONGEST)
+        signal.setitimer(signal.ITIMER_REAL, 180 * LONGEST)
 
     def pytest_runtest_teardown(self) -> None:
         signal.setitimer(signal.ITIMER_PROF, 0)
