@@ -121,10 +121,11 @@ PARTS = {
     ),
     "repair": Part(
         tuple(f"pointsplat_ns/compression/{name}.py" for name in ("repair", "feedback", "optimiser")),
-        ("tests/compression/test_feedback.py", "tests/compression/test_repair.py"),
+        ("tests/compression/test_feedback.py", "tests/compression/test_optimiser.py"),
         (
-            "tests/refiner/test_feedback.py",
+            "tests/compression/test_repair.py",
             "tests/compression/test_fine_tune.py",
+            "tests/refiner/test_feedback.py",
             _SAME_RESULT,
             "tests/compression/test_compact.py",
             "tests/compression/test_feedback_training.py",

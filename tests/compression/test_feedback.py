@@ -101,7 +101,7 @@ def test_features_are_what_the_network_was_trained_on(scene, steps, shown, degre
     """Written out number by number, in the order that the weights which ship have learned."""
     scene = scene.replace(features_rest=scene.features_rest[:, : (degree + 1) ** 2 - 1]).to(torch.float64)
     # Beyond every bound, upwards and downwards.
-    scene.scales[:4] += torch.tensor([[12.0, 0, 0], [0, -12, 0], [15, 15, 15], [-15, -15, -15]])
+    scene.scales[:4] += torch.tensor([[18.0, 0, 0], [0, -18, 0], [15, 15, 15], [-15, -15, -15]])
     scene.opacities[4:6, 0] = torch.tensor([20.0, -20.0])
     scene.features_dc[6:8] = torch.tensor([[6.0], [-6.0]])
     given = [gradients(scene, 0), gradients(scene, 1, 3.0)]

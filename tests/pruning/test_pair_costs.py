@@ -108,6 +108,22 @@ def test_every_direction_has_two_sides_across():
     assert float((across - torch.eye(3, dtype=torch.float64)).abs().max()) < 0.6  # at least 53 degrees apart
 
 
+def test_sizes_are_in_units_of_the_scene_and_bounded_where_they_are_wide_beyond_any_view():
+    deviations = torch.tensor([0.5, 20.0, 500.0, 1e5])
+    scene = Gaussians(
+        means=torch.zeros(4, 3),
+        scales=deviations.log()[:, None] + torch.tensor([0.0, -20, -20]),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(4, 1),
+        opacities=torch.zeros(4, 1),
+        features_dc=torch.zeros(4, 3),
+        features_rest=torch.zeros(4, 0, 3),
+    )
+    state = start(scene, torch.arange(4), torch.ones(4), torch.zeros(3, dtype=torch.float64), 2.0)
+    _, cov = pair_costs._scaled(state)
+    expected = torch.tensor([0.25, 10.0, 250.0, pair_costs.WIDEST], dtype=torch.float64)
+    torch.testing.assert_close(cov[:, 0].sqrt(), expected, rtol=1e-6, atol=0.0)  # sizes are given in float32
+
+
 def test_costs_are_finite_and_not_negative_at_the_extremes():
     """Positions, sizes and opacities over the whole range, each Gaussian with each other."""
     g = torch.Generator().manual_seed(0)
