@@ -25,6 +25,7 @@ PROGRAMS = (
     "frame_times",
     "fuzzing",
     "kills",
+    "mutants",
     "photo_places",
     "quality",
     "rasterizer",

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
 import pointsplat_ns as ps
 from making import ball
-from pointsplat_ns.pruning.covariance import flat_area, overlap
+from pointsplat_ns.pruning.covariance import flat_area, overlap, pack, unpack
 
 
 @pytest.mark.parametrize("length", [1.0, 1e6, 1e12, 1e30])
@@ -34,6 +36,28 @@ def test_the_overlap_of_equal_round_shadows_is_the_closed_form():
     assert overlap(flat, flat, u, v).item() == pytest.approx(
         2 * torch.tensor(-10 / 16).double().exp().item(), rel=1e-12
     )
+
+
+def test_the_overlap_of_skewed_shadows_is_the_integral_of_their_product():
+    flat = torch.tensor([[3.0, 1.2, 2.0], [1.0, -0.5, 2.5]], dtype=torch.float64)
+    apart = torch.tensor([0.9, -1.4], dtype=torch.float64)
+    axis = torch.linspace(-12, 12, 481, dtype=torch.float64)
+    grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), dim=-1)
+
+    def splat(row: torch.Tensor, at: torch.Tensor | float) -> torch.Tensor:
+        inverse = torch.linalg.inv(row[[0, 1, 1, 2]].view(2, 2))
+        return torch.exp(-0.5 * ((grid - at) @ inverse * (grid - at)).sum(-1))
+
+    integral = float((splat(flat[0], 0.0) * splat(flat[1], apart)).sum()) * 0.05**2 / (2 * math.pi)
+    u, v = apart[:, None]
+    assert overlap(flat[:1], flat[1:], u, v).item() == pytest.approx(integral, rel=1e-9)
+
+
+def test_six_numbers_are_those_of_the_matrix():
+    six = torch.arange(1.0, 7.0)[None]
+    matrix = unpack(six)
+    assert matrix[0].tolist() == [[1.0, 2.0, 3.0], [2.0, 4.0, 5.0], [3.0, 5.0, 6.0]]
+    assert torch.equal(pack(matrix), six)
 
 
 def test_far_outliers_on_a_line_are_merged_to_one():

@@ -63,6 +63,26 @@ def test_the_numbers_that_undo_a_known_change_are_found(opacity, size):
     assert found.spread == pytest.approx(size, abs=0.03) or found.psnr > found.before + 3
 
 
+class Told(Reference):
+    """Knows how good each finish is."""
+
+    def __init__(self, top: float):
+        self.top = top
+
+    def psnr(self, scene: Finish) -> float:
+        return 30 - (scene.deepening - self.top) ** 2 - scene.spread**2
+
+
+@pytest.mark.parametrize(("top", "gone_on_with"), [(0.2, {0.2}), (-0.1, {-0.1, 0.0}), (0.4, {0.4, 0.3})])
+def test_spreads_are_tried_at_the_top_and_where_it_is_a_guess_at_the_nearest_tried_as_well(top, gone_on_with):
+    tried = []
+    found = Told(top).best(lambda finish: tried.append(finish) or finish)
+    with_spread = {round(finish.deepening, 9) for finish in tried if finish.spread}
+    assert with_spread == gone_on_with
+    assert (found.deepening, found.spread) == pytest.approx((top, 0.0)) and found.psnr == pytest.approx(30)
+    assert len(tried) == len(set(tried)), "rendered twice"
+
+
 def test_what_was_chosen_is_said_in_one_line():
     assert Finish(0.2, math.log(0.95), 31.0, 30.0).note == (
         "merged: optical depth x members^0.20, sizes x 0.950, chosen by small renders: 30.00 -> 31.00 dB"

@@ -269,6 +269,14 @@ def test_levels_are_nested_exact_and_the_first_is_that_of_merging_alone():
         assert torch.equal(parents[finer.assignment], coarser.assignment)
 
 
+@pytest.mark.parametrize("counts", [[60], [60, 20], [20], [20, 7]])
+def test_the_share_done_rises_and_ends_at_1_with_the_last_level(counts):
+    shares = []
+    reached = [shares[-1] for _ in merge_levels(cloud(60), counts, progress=shares.append)]
+    assert shares == sorted(shares) and all(0 <= share <= 1 for share in shares)
+    assert reached[-1] == 1 and all(share < 1 for share in reached[:-1])
+
+
 @pytest.mark.parametrize("counts", [[10, 10], [10, 20], [5, 0], [51]])
 def test_levels_that_do_not_descend_are_an_error(counts):
     with pytest.raises(BudgetError, match="expected"):
@@ -320,6 +328,23 @@ def one_view(back: float = 0.0) -> Views:
     viewmats[0, 2, 3] = back
     K = torch.tensor([[32.0, 0, 32], [0, 32.0, 32], [0, 0, 1.0]])
     return Views(viewmats, K[None], 64, 64, torch.zeros(3))
+
+
+def test_one_pair_is_enough_for_a_finish_to_be_chosen():
+    scene = cloud(60).replace(means=cloud(60).means + torch.tensor([0.0, 0.0, 4.0]))
+    assert merge(scene, 59, views=one_view()).finish.psnr is not None
+
+
+@pytest.mark.parametrize("room", [False, True])
+def test_without_photos_only_rooms_are_weighed_by_what_covers_them(monkeypatch, room):
+    monkeypatch.setattr(merging, "FEWEST_SEEN", 0)
+    monkeypatch.setattr(merging, "photo_places", lambda content: None)
+    monkeypatch.setattr(merging, "is_room", lambda scene: room)
+    monkeypatch.setattr(merging, "weights_seen", lambda means, *_: torch.full((len(means),), 3.0))
+    monkeypatch.setattr(merging, "how_much_seen", lambda scene, members: torch.full((len(members),), 16.0))
+    scene = cloud(30)
+    weights = merging.Merging(scene, torch.arange(30), None).state.weights
+    assert weights.tolist() == [6.0 if room else 3.0] * 30  # 16^(1/4)
 
 
 def test_a_scene_too_large_to_render_is_rendered_once_it_is_small_enough(monkeypatch):

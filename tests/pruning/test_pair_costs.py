@@ -10,7 +10,7 @@ import torch
 from pointsplat_ns.gaussians import SH_C0, Gaussians
 from pointsplat_ns.pruning import covariance as algebra
 from pointsplat_ns.pruning import pair_costs
-from pointsplat_ns.pruning.merge_state import OPAQUE, State, start
+from pointsplat_ns.pruning.merge_state import GROWTH, MOST_SURPLUS, OPAQUE, State, start
 
 
 def state_of(scene: Gaussians) -> State:
@@ -19,14 +19,14 @@ def state_of(scene: Gaussians) -> State:
     return start(scene, torch.arange(n), torch.ones(n), torch.zeros(3, dtype=torch.float64), 1.0)
 
 
-def disks(seed: int = 1) -> Gaussians:
-    """Two overlapping disks in the plane z = 0."""
+def disks(seed: int = 1, logits: tuple[float, float] = (0.3, -0.6)) -> Gaussians:
+    """Two overlapping disks in the plane z = 0, with opacities of these logits."""
     g = torch.Generator().manual_seed(seed)
     return Gaussians(
         means=torch.tensor([[0.0, 0, 0], [0.08, 0.03, 0]]),
         scales=torch.tensor([[-3.0, -2.6, -9.0], [-2.7, -3.2, -9.0]]),
         quats=torch.tensor([[1.0, 0, 0, 0.2], [1.0, 0, 0, -0.4]]),
-        opacities=torch.tensor([[0.3], [-0.6]]),
+        opacities=torch.tensor(logits)[:, None],
         features_dc=torch.randn(2, 3, generator=g),
         features_rest=torch.zeros(2, 0, 3),
     )
@@ -40,9 +40,10 @@ def seen_along_z(state: State) -> pair_costs.Seen:
     return pair_costs.Seen.of(centres, shadows, state.alphas.float(), state.colours)
 
 
-def test_the_cost_is_the_integral_that_it_claims_to_be():
+@pytest.mark.parametrize(("logits", "grows"), [((0.3, -0.6), False), ((6.0, 6.0), True)])
+def test_the_cost_is_the_integral_that_it_claims_to_be(logits, grows):
     """Against a sum over a fine grid in the plane, in float64."""
-    scene = disks()
+    scene = disks(logits=logits)
     state = state_of(scene)
     got = float(seen_along_z(state).costs(torch.tensor([0]), torch.tensor([[1]])))
     axis = torch.linspace(-0.6, 0.7, 1301, dtype=torch.float64)
@@ -64,7 +65,9 @@ def test_the_cost_is_the_integral_that_it_claims_to_be():
     merged_cov = (w[:, None, None] * (cov + apart[:, :, None] * apart[:, None])).sum(0)
     alpha = (alphas * areas).sum() - alphas[0] * alphas[1] * both
     alpha = alpha / torch.linalg.det(merged_cov).sqrt()
-    assert float(alpha) < OPAQUE  # no growth
+    assert (float(alpha) > OPAQUE) == grows
+    merged_cov = merged_cov * (alpha / OPAQUE).clamp(1, MOST_SURPLUS) ** GROWTH
+    alpha = alpha.clamp_max(OPAQUE)
     merged = splat(mean, merged_cov)
     on = alphas[1] * both / areas[0]
     cover = alphas[0] / 2 + on
@@ -103,6 +106,22 @@ def test_shadows_of_all_directions_are_those_of_the_covariance():
 def test_every_direction_has_two_sides_across():
     across = (pair_costs.DIRECTIONS[pair_costs.SIDES] @ pair_costs.DIRECTIONS[pair_costs.SIDES].mT).abs()
     assert float((across - torch.eye(3, dtype=torch.float64)).abs().max()) < 0.6  # at least 53 degrees apart
+
+
+def test_sizes_are_in_units_of_the_scene_and_bounded_where_they_are_wide_beyond_any_view():
+    deviations = torch.tensor([0.5, 20.0, 500.0, 1e5])
+    scene = Gaussians(
+        means=torch.zeros(4, 3),
+        scales=deviations.log()[:, None] + torch.tensor([0.0, -20, -20]),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(4, 1),
+        opacities=torch.zeros(4, 1),
+        features_dc=torch.zeros(4, 3),
+        features_rest=torch.zeros(4, 0, 3),
+    )
+    state = start(scene, torch.arange(4), torch.ones(4), torch.zeros(3, dtype=torch.float64), 2.0)
+    _, cov = pair_costs._scaled(state)
+    expected = torch.tensor([0.25, 10.0, 250.0, pair_costs.WIDEST], dtype=torch.float64)
+    torch.testing.assert_close(cov[:, 0].sqrt(), expected, rtol=1e-6, atol=0.0)  # sizes are given in float32
 
 
 def test_costs_are_finite_and_not_negative_at_the_extremes():

@@ -27,7 +27,7 @@ PAGES = [
     EXAMPLE.with_name("README.md"),
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
-NS_PROGRAMS = ("ns-train", "ns-eval", "ns-render", "ns-export", "ns-viewer", "ns-process-data")
+NS_PROGRAMS = ("ns-train", "ns-eval", "ns-render", "ns-export", "ns-viewer")
 
 
 @dataclass(frozen=True)
