@@ -347,6 +347,15 @@ def test_without_photos_only_rooms_are_weighed_by_what_covers_them(monkeypatch, 
     assert weights.tolist() == [6.0 if room else 3.0] * 30  # 16^(1/4)
 
 
+@pytest.mark.parametrize("most, expected", [(30, 3.0 * 5.0 * 4.0), (29, 3.0 * 16.0)])
+def test_given_views_are_weighed_by_what_they_show_and_less_by_what_photos_showed(monkeypatch, most, expected):
+    monkeypatch.setattr(merging, "MOST_SEEN", most)  # where more take part, what views show is not counted
+    for name, value in (("weights_seen", 3.0), ("visibility", 5.0), ("how_much_seen", 16.0)):
+        monkeypatch.setattr(merging, name, lambda *_, value=value: torch.full((30,), value))
+    weights = merging.Merging(cloud(30), torch.arange(30), one_view()).state.weights
+    assert weights.tolist() == [expected] * 30  # 16^(1/2)
+
+
 def test_a_scene_too_large_to_render_is_rendered_once_it_is_small_enough(monkeypatch):
     scene = wall()
     monkeypatch.setattr(merging, "FEWEST_SEEN", 0)
