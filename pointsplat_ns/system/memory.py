@@ -6,7 +6,10 @@ import ctypes
 import sys
 from pathlib import Path
 
-_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of mallopt(3)
+_M_TRIM_THRESHOLD, _M_MMAP_MAX, _M_ARENA_MAX = -1, -4, -8  # of mallopt(3)
+
+_ARENAS = 2
+"""Enough for a thread that draws and the others."""
 
 
 def keep_freed_memory() -> bool:
@@ -19,13 +22,30 @@ def keep_freed_memory() -> bool:
     Returns:
         Whether the setting was made.
     """
+    return _set({_M_MMAP_MAX: 0, _M_TRIM_THRESHOLD: -1})
+
+
+def share_freed_memory() -> bool:
+    """Let threads that come and go reuse the memory of one another.
+
+    By default glibc gives each new thread a place of its own to allocate from, up to eight for each core, and memory
+    that was freed there serves no other. Threads that exist keep theirs. Without Linux and glibc, nothing is changed.
+
+    Returns:
+        Whether the setting was made.
+    """
+    return _set({_M_ARENA_MAX: _ARENAS})
+
+
+def _set(values: dict[int, int]) -> bool:
+    """Set parameters of glibc's malloc; whether that was possible."""
     if not sys.platform.startswith("linux"):
         return False
     try:
         mallopt = ctypes.CDLL("libc.so.6").mallopt
     except (OSError, AttributeError):
         return False  # another C library
-    return bool(mallopt(_M_MMAP_MAX, 0)) and bool(mallopt(_M_TRIM_THRESHOLD, -1))
+    return all(bool(mallopt(name, value)) for name, value in values.items())
 
 
 class PeakMemory:

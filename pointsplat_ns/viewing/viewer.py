@@ -7,6 +7,7 @@ import math
 import shlex
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from pointsplat_ns.geometry.quaternions import rotation_matrices
 from pointsplat_ns.pruning.content import thinned
 from pointsplat_ns.pruning.view_sampling import PROBED
 from pointsplat_ns.rasterizer import render_depth
+from pointsplat_ns.system.memory import share_freed_memory
 from pointsplat_ns.viewing.camera_path import views_upright
 from pointsplat_ns.viewing.painter import Camera, Painter, Sight
 from pointsplat_ns.viewing.schedule import FULL_SIDE, Step
@@ -32,6 +34,9 @@ from pointsplat_ns.views import RasterizeMode, View, Views
 
 STARTS = 12
 """Number of views that the camera can be put at."""
+
+_GONE_SECONDS = 1.0
+"""A while after which the socket of a page that has gone is closed."""
 
 _QUALITY = {True: 75, False: 95}
 """JPEG's, of pictures while the camera moves and of others."""
@@ -66,6 +71,7 @@ class Viewer:
     """
 
     def __init__(self, exhibits: Sequence[Exhibit], host: str, port: int, up: Tensor | None = None):
+        share_freed_memory()  # each page that comes has a thread that draws
         first = exhibits[0]
         self._exhibits = exhibits
         self._starts = views_upright(first.scene, first.source, STARTS, up)
@@ -167,7 +173,9 @@ class Viewer:
             size = f"{pixels.shape[1]} x {pixels.shape[0]}"
             share = "" if step.share == 1 else f", {step.share:.0%} of the Gaussians"
             state = "moving: " if step.moving else ""
-            self._notes[client.client_id].content = f"{state}{size}, {1000 * seconds:.0f} ms a frame{share}"
+            note = self._notes.get(client.client_id)
+            if note is not None:  # the page has not gone meanwhile
+                note.content = f"{state}{size}, {1000 * seconds:.0f} ms a frame{share}"
 
         self._painters[client.client_id] = Painter(show)
         self._put(client)
@@ -179,6 +187,15 @@ class Viewer:
         self._notes.pop(client.client_id, None)
         if painter is not None:
             painter.schedule.close()  # without waiting, as the server's own thread calls this
+        later = threading.Timer(_GONE_SECONDS, self._forget_gone)
+        later.daemon = True
+        later.start()
+
+    def _forget_gone(self) -> None:
+        """Send something to all pages: viser 0.2.7 keeps one that has gone, with its socket, until that fails."""
+        with suppress(RuntimeError):  # the server may end meanwhile
+            if not self._closed:
+                self._describe()
 
     def _look(self, client: Any) -> None:
         """Draw what a client's camera sees."""

@@ -32,3 +32,32 @@ def test_large_tensors_cost_new_pages_once():
     before = run("leave")[1]
     # 128 MB are 31,250 pages of 4 kB; larger pages make fewer.
     assert after < 0.1 * before
+
+
+THREADS = """
+import ctypes, sys, threading
+from pointsplat_ns.system.memory import share_freed_memory
+shared = sys.argv[1] == "keep" and share_freed_memory()
+malloc = ctypes.CDLL("libc.so.6").malloc
+malloc.restype = ctypes.c_void_p
+places, all_there = set(), threading.Barrier(6)
+def work():
+    places.add(malloc(60_000) >> 26)  # a place begins at a multiple of 64 MB
+    all_there.wait()
+threads = [threading.Thread(target=work) for _ in range(6)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+print(shared, len(places))
+"""
+
+
+def test_threads_share_the_places_that_they_allocate_from():
+    def places(word: str) -> tuple[bool, int]:
+        done = subprocess.run([sys.executable, "-c", THREADS, word], capture_output=True, text=True, check=True)
+        shared, count = done.stdout.split()
+        return shared == "True", int(count)
+
+    shared, few = places("keep")
+    if not shared:
+        pytest.skip("not Linux with glibc, where there is nothing to do")
+    assert few <= 2 < places("leave")[1]

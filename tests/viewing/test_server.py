@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import socket
+import time
 from collections.abc import Iterator
+from types import SimpleNamespace
 
+import msgspec
+import numpy as np
 import pytest
+from viser._messages import ViewerCameraMessage
+from websockets.sync.client import connect
 
 import pointsplat_ns as ps
 from making import ball
+from pointsplat_ns.viewing.schedule import Step
 from pointsplat_ns.viewing.server import free_port, refusal
 from pointsplat_ns.viewing.viewer import Viewer
+
+SECONDS = 60
+"""How long a test waits for what shall come; it takes a fraction of one."""
 
 HOSTS = ("localhost", "127.0.0.1", "::1")
 
@@ -102,3 +113,49 @@ def test_places_that_cannot_be_listened_on_are_refused_in_one_line(host, port):
     with pytest.raises(ps.PointSplatError, match="expected") as raised:
         free_port(host, port)
     assert "\n" not in str(raised.value)
+
+
+def test_a_page_that_has_gone_is_not_kept(viewer):
+    server = viewer._server._websock_server
+    loop = server._broadcast_buffer.event_loop
+
+    async def sending() -> int:
+        return sum("_message_producer" in str(task.get_coro()) for task in asyncio.all_tasks())
+
+    def waiting() -> int:
+        return asyncio.run_coroutine_threadsafe(sending(), loop).result(SECONDS)
+
+    before = waiting()
+    for _ in range(3):
+        with connect(viewer.url.replace("http", "ws"), max_size=None) as page:
+            camera = ViewerCameraMessage((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -4.0), 1.0, 1.0, (0.0,) * 3, (0.0, 0.0, 1.0))
+            page.send(msgspec.msgpack.encode(camera.as_serializable_dict()))  # before it, viser tells of no page
+            while b"BackgroundImageMessage" not in page.recv(timeout=SECONDS):
+                pass
+            assert waiting() > before
+    end = time.monotonic() + SECONDS
+    while waiting() > before and time.monotonic() < end:
+        time.sleep(0.05)
+    assert waiting() == before
+
+
+def test_a_picture_that_is_done_when_its_page_has_gone_goes_nowhere(viewer):
+    shown = []
+
+    class Page:
+        client_id = 77
+        camera = scene = gui = SimpleNamespace(
+            add_markdown=lambda text: SimpleNamespace(), on_update=lambda look: None,
+            set_background_image=lambda *_, **__: shown.append("picture"),
+        )  # fmt: skip
+
+    page, made = Page(), {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pointsplat_ns.viewing.viewer.Painter", lambda show: made.setdefault("show", show))
+        patch.setattr(viewer, "_put", lambda client: None)
+        patch.setattr(viewer, "_look", lambda client: None)
+        viewer._connected(page)
+    viewer._painters.pop(page.client_id)
+    viewer._disconnected(page)
+    made["show"](np.zeros((2, 2, 3), np.uint8), Step(None, 1, 2, 1.0, False), 0.1)
+    assert shown == ["picture"] and page.client_id not in viewer._notes
