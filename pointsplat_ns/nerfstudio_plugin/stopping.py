@@ -49,15 +49,11 @@ class StoppableTrainerConfig(TrainerConfig):
 
     def first_step(self) -> int:
         """The step that a training begins with: 0, or what the name of the checkpoint says that it goes on from."""
-        place, step = self.load_checkpoint, None
-        if self.load_dir is not None:
-            steps = [step_of(path) for path in Path(self.load_dir).glob("step-*.ckpt")]
-            step = (
-                self.load_step if self.load_step is not None else max((s for s in steps if s is not None), default=None)
-            )
-        elif place is not None:
-            step = step_of(Path(place))
-        return 0 if step is None else step + 1
+        if self.load_dir is None:
+            return 0 if self.load_checkpoint is None else _step_after(self.load_checkpoint)
+        if self.load_step is not None:
+            return self.load_step + 1
+        return max((_step_after(path) for path in self.load_dir.glob("step-*.ckpt")), default=0)
 
 
 class StoppableTrainer(Trainer):
@@ -216,6 +212,12 @@ class StoppableTrainer(Trainer):
             if folder == output_dir.parent or any(folder.iterdir()):
                 break
             folder.rmdir()
+
+
+def _step_after(checkpoint: Path) -> int:
+    """The step that follows a checkpoint's; 0 if its name does not say which that is."""
+    step = step_of(checkpoint)
+    return 0 if step is None else step + 1
 
 
 def _save_whole(save: Callable[[Path], None], path: Path) -> None:

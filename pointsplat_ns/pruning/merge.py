@@ -56,7 +56,7 @@ FEWEST_SEEN, MOST_SEEN = 2_000, 2_000_000
 
 TOLD_TWICE = 0.5
 """Exponent of how much photos showed where views were given and what they show was counted, which tells a part of the
-same. Set on two captures (second trainings, 50 to 3 %), where it gains 0.0 to 0.4 dB over 1; on two others, -0.2 to
+same. Set on two captures (second trainings, 50 to 3 %), where it gains 0.0 to 0.6 dB over 1; on two others, -0.2 to
 0.2."""
 
 UNTOLD = 0.25

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal
 
 import torch
@@ -15,7 +14,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.io.runs import REFINER_METHOD, step_of
+from pointsplat_ns.io.runs import REFINER_METHOD
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
@@ -88,7 +87,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
         if not 0 < self.rate_factor < math.inf:  # NaN fails too
             raise PointSplatError(f"--rate-factor {self.rate_factor:g}: expected a finite number above 0")
         config = copy.deepcopy(self)
-        steps = _steps_done(config) + config.max_num_iterations
+        steps = config.first_step() + config.max_num_iterations
         rates = {"fast": RATES, "paper": PAPER_RATES, "authors": AUTHORS_RATES}[self.rates]
         for name, group in config.optimizers.items():
             if group["optimizer"].lr == RATES.get(name):
@@ -105,21 +104,6 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
                 schedule.warm_up_end = max(1, round(WARM_UP * steps))
                 schedule.max_steps = max(steps, schedule.warm_up_end + 1)  # the cosine divides by the difference
         return self._target(config, **kwargs)
-
-
-def _steps_done(config: TrainerConfig) -> int:
-    """Training steps in the checkpoint that a run resumes from, by the checkpoint's name; 0 for a new run."""
-    if config.load_dir is None:
-        return 0 if config.load_checkpoint is None else _step_after(config.load_checkpoint)
-    if config.load_step is not None:
-        return config.load_step + 1
-    return max((_step_after(path) for path in config.load_dir.glob("step-*.ckpt")), default=0)
-
-
-def _step_after(checkpoint: Path) -> int:
-    """The step that follows a checkpoint's; 0 if its name does not say which that is."""
-    step = step_of(checkpoint)
-    return 0 if step is None else step + 1
 
 
 def pointsplat_config() -> TrainerConfig:
