@@ -41,6 +41,8 @@ class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset], SpiralSourc
     """
 
     config: LazyImageDatamanagerConfig
+    latest_photo: str = ""
+    """Name of the photo of the latest training step."""
 
     @cached_property
     def frame_cache(self) -> MemoryCache:
@@ -81,6 +83,7 @@ class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset], SpiralSourc
     def next_train(self, step: int) -> Frame:
         """The next training frame; each frame is used once before any is repeated."""
         index = self.train_unseen_cameras.pop(0)
+        self.latest_photo = self.train_dataset.image_filenames[index].name
         if not self.train_unseen_cameras:
             self.train_unseen_cameras = self.sample_train_cameras()
         frame = self.train_frames[index]

@@ -1,5 +1,7 @@
 """Projection and colours against gsplat's own plain-torch formulas, in float64, with gradients."""
 
+import math
+
 import pytest
 import torch
 
@@ -166,3 +168,25 @@ def test_a_mirroring_focal_length_mirrors_the_image():
     assert torch.equal(one.ids, other.ids) and len(one.ids) > 15
     torch.testing.assert_close(one.means2d[:, 0], w - other.means2d[:, 0])
     torch.testing.assert_close(one.det, other.det)
+
+
+@pytest.mark.parametrize("opacity", [0.01, 0.3, 1.0])
+def test_what_ends_a_thousandth_beside_the_outer_pixel_centres_is_left_out_and_what_reaches_them_is_not(opacity):
+    # Points, which the low-pass of 0.3 pixels^2 makes discs; alpha is 1/255 at this distance from their centres.
+    reach = math.sqrt(2 * 0.3 * math.log(255 * opacity))
+    w, h, focal = 37, 29, 40.0
+    _, K = camera_askew(focal=focal)
+    beside = [
+        (x, y)
+        for step in (-1e-3, 1e-3)
+        for x, y in (
+            (0.5 - reach + step, 14.0), (w - 0.5 + reach - step, 14.0), (18.0, 0.5 - reach + step),
+            (18.0, h - 0.5 + reach - step),
+        )
+    ]  # fmt: skip
+    pixels = torch.tensor(beside, dtype=F64)
+    rays = (torch.cat([pixels, torch.ones(8, 1, dtype=F64)], dim=1)) @ torch.linalg.inv(K).T
+    quats, scales = torch.eye(4, dtype=F64)[[0] * 8], torch.full((8, 3), 1e-12, dtype=F64)
+    opacities = torch.full((8,), opacity, dtype=F64)
+    seen = project(3.0 * rays, quats, scales, opacities, torch.eye(4, dtype=F64), K, w, h)
+    assert seen.ids.tolist() == [4, 5, 6, 7]

@@ -45,6 +45,13 @@ def same_bits(a: Gaussians, b: Gaussians) -> bool:
     return same(*(scene.map(lambda value: value.view(torch.int32).double()) for scene in (a, b)))
 
 
+def equal(a: object, b: object) -> bool:
+    """Whether nested dictionaries of tensors and other values are equal to the bit."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(equal(a[name], b[name]) for name in a)
+    return torch.equal(a, b) if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor) else a == b
+
+
 def normal_scene(n: int = 5, degree: int = 3, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:
     """A scene whose every parameter is drawn from the standard normal distribution.
 

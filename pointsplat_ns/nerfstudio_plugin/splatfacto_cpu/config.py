@@ -4,61 +4,23 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.early_look import EarlyLook
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig, SplatfactoCpuPipelineConfig
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.resuming import restore_training_state, training_state
-from pointsplat_ns.nerfstudio_plugin.stopping import STATE, StoppableTrainer, StoppableTrainerConfig
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import SplatfactoCpuTrainer
+from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainerConfig
 
 SPLATFACTO_STEPS = 30_000
 """Training steps that Splatfacto's schedules were chosen for."""
-
-PICTURES_NAME = "pictures"
-"""Folder in a run's folder."""
-
-
-class SplatfactoCpuTrainer(StoppableTrainer):
-    """nerfstudio's trainer, which can be stopped at any time and tells early how long it takes and what comes of it."""
-
-    config: SplatfactoCpuTrainerConfig
-
-    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """As nerfstudio's.
-
-        Raises:
-            PointSplatError: if the data cannot be used.
-        """
-        super().setup(test_mode)
-        if self.config.early_look and test_mode == "val":
-            pictures = self.base_dir / PICTURES_NAME
-            look = EarlyLook(self.pipeline, pictures, self._start_step, self.config.max_num_iterations)
-            before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN
-            self.callbacks.append(TrainingCallback([before], look.before_step, update_every_num_iters=1))
-            self.callbacks.append(TrainingCallback([after], look.after_training, update_every_num_iters=1))
-
-    def state_to_resume(self) -> dict[str, Any]:
-        """Random numbers to come, the order of the photos, and what densification has gathered."""
-        return training_state(self.pipeline)
-
-    def _load_checkpoint(self) -> None:
-        super()._load_checkpoint()
-        folder, path = self.config.load_dir, self.config.load_checkpoint
-        if folder is not None:
-            path = folder / f"step-{self._start_step - 1:09d}.ckpt"
-        state = None if path is None else torch.load(path, map_location="cpu", weights_only=True, mmap=True).get(STATE)
-        if state is not None:  # checkpoints of earlier versions have none
-            restore_training_state(self.pipeline, state)
 
 
 @dataclass
@@ -72,6 +34,9 @@ class SplatfactoCpuTrainerConfig(StoppableTrainerConfig):
     early_look: bool = True
     """Say after some seconds how long the training will take, and draw a held-out photo and its render now and then, in
     the folder pictures of the run."""
+    max_skipped_in_a_row: int = 10
+    """Number of steps in a row that may be skipped because their loss or gradients are not finite, before training
+    stops and names the photos. One broken photo among sound ones stops nothing."""
 
     def setup(self, **kwargs) -> Trainer:
         """Build the trainer with a copy of this config whose schedules are fitted."""

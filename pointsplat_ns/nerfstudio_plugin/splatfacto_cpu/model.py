@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -36,6 +37,7 @@ from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.nerfstudio_plugin.cameras import need_pinhole
+from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
 from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND, RasterizerOptions
 from pointsplat_ns.system.threads import one_thread
 
@@ -172,6 +174,12 @@ class SplatfactoCpuModel(SplatfactoModel):
                 optimizer.param_groups[0]["params"] = [parameter]
                 optimizer.state[parameter] = optimizer.state.pop(held, {})
                 optimizers.parameters[name] = [parameter]
+
+    def forget_step(self) -> None:
+        """Let densification gather nothing of the latest step."""
+        centres = self.info["means2d"]
+        centres.grad = centres.absgrad = torch.zeros_like(centres)
+        self.info["radii"] = torch.zeros_like(self.info["radii"])  # nothing was seen
 
     def get_outputs(self, camera: Cameras | RayBundle) -> dict[str, Any]:
         """Render one camera.
@@ -328,6 +336,16 @@ class SplatfactoCpuPipelineConfig(VanillaPipelineConfig):
 
 class SplatfactoCpuPipeline(VanillaPipeline):
     """nerfstudio's pipeline. A metric that cannot be computed is null in its evaluation, never NaN."""
+
+    datamanager: LazyImageDatamanager
+    latest_losses: Mapping[str, Tensor] = MappingProxyType({})
+    """The parts of the loss of the latest training step."""
+
+    def get_train_loss_dict(self, step: int):
+        """As nerfstudio's, and keeps the parts of the loss."""
+        outputs, losses, metrics = super().get_train_loss_dict(step)
+        self.latest_losses = {name: value.detach() for name, value in losses.items()}
+        return outputs, losses, metrics
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False

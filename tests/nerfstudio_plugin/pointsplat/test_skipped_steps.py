@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
-from making import dense_config
+from making import dense_config, equal
 from pointsplat_ns.errors import PointSplatError, SceneError
 
 
@@ -65,13 +65,6 @@ def step_by_step(config, steps):
         optimizers = {name: o.state_dict()["state"] for name, o in trainer.optimizers.optimizers.items()}
         history.append(copy.deepcopy((trainer.pipeline.model.refiner.state_dict(), optimizers, metrics)))
     return trainer, history
-
-
-def equal(a, b) -> bool:
-    """Whether nested dicts of tensors are equal to the bit."""
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(equal(a[name], b[name]) for name in a)
-    return torch.equal(a, b)
 
 
 @pytest.mark.parametrize(
