@@ -107,10 +107,7 @@ class StoppableTrainer(Trainer):
             SystemExit: if it is interrupted.
             PointSplatError: if the number of threads is below 1.
         """
-        threads = self.config.threads
-        if threads is None and getattr(self.config.pipeline.model, "compiled", False):
-            threads = torch.get_num_threads()  # compiled kernels are made for one number, and again for each other
-        with fixed_threads(threads), self._signals_noted():
+        with fixed_threads(self.config.threads), self._signals_noted():
             try:
                 super().train()
             except KeyboardInterrupt:

@@ -5,8 +5,9 @@ A Gaussian is not drawn on a pixel where its alpha is lower than a threshold. Fr
 multiplies the transmittance by ``1 - alpha``; a pixel is finished before the Gaussian that would bring it to a second
 threshold or less. (3DGS, section 6; the thresholds stand in :mod:`~pointsplat_ns.rasterizer.constants`.)
 
-Every path follows the rule by calling what stands here, but for
-:func:`~pointsplat_ns.rasterizer.reference.rasterize_reference`, which writes it out once more to check it.
+Every path in torch follows the rule by calling what stands here, but for
+:func:`~pointsplat_ns.rasterizer.reference.rasterize_reference`, which writes it out once more to check it. The compiled
+kernels (``kernels.cpp``) write it out as well; they are compared with torch when they are loaded.
 
 Shapes: B tiles, S Gaussians of a chunk from front to back, 64 pixels of a tile.
 """
@@ -26,7 +27,7 @@ _GROUP = 16
 """Gaussians of one of these operations."""
 
 
-def alphas_(log2_alpha: Tensor, alpha_min: float | Tensor, may_clamp: bool = True) -> Tensor:
+def alphas_(log2_alpha: Tensor, alpha_min: float, may_clamp: bool = True) -> Tensor:
     """Alphas, zero where a Gaussian is not drawn, in place of their unclamped logarithms to base 2.
 
     Args:
@@ -37,8 +38,6 @@ def alphas_(log2_alpha: Tensor, alpha_min: float | Tensor, may_clamp: bool = Tru
     alpha = log2_alpha.exp2_()
     if may_clamp:
         alpha = alpha.clamp_(max=ALPHA_MAX)
-    if isinstance(alpha_min, Tensor):  # of compiled code, which would be compiled anew for every number
-        return torch.where(alpha > alpha_min, alpha, 0.0)
     return F.threshold(alpha, alpha_min, 0.0, inplace=True)
 
 
@@ -47,25 +46,10 @@ def is_clamped(alpha: Tensor) -> Tensor:
     return alpha >= ALPHA_MAX * (1 - 1e-6)  # room for the rounding of ALPHA_MAX to float32
 
 
-def is_drawn(after: Tensor, transmittance_min: float | Tensor, out: Tensor | None = None) -> Tensor:
+def is_drawn(after: Tensor, transmittance_min: float, out: Tensor | None = None) -> Tensor:
     """Where the pixel is not finished, from the transmittance that a Gaussian would leave; written to ``out`` as 0 and
     1 if that is given."""
     return torch.gt(after, transmittance_min, out=out)
-
-
-def step(alpha: Tensor, before: Tensor, transmittance_min: float | Tensor) -> tuple[Tensor, Tensor]:
-    """Pass one Gaussian.
-
-    Args:
-        alpha: (B, 64) of :func:`alphas_`.
-        before: (B, 64) transmittance in front of it; 0 where the pixel is finished.
-
-    Returns:
-        Its alpha, now 0 where the pixel is finished, and the transmittance behind it, 0 where the pixel is finished.
-    """
-    after = before * (1.0 - alpha)
-    drawn = is_drawn(after, transmittance_min)
-    return torch.where(drawn, alpha, 0.0), torch.where(drawn, after, 0.0)
 
 
 def transmittances(passing: Tensor, before: Tensor, out: Tensor) -> Tensor:

@@ -11,14 +11,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.compiled import Kernels, kernels
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, CHUNK, EXACT, TILE, Quality
 from pointsplat_ns.rasterizer.quadratics import PIXELS, basis_of, table_of
-from pointsplat_ns.rasterizer.tiles import Footprints, Region
+from pointsplat_ns.rasterizer.tiles import Footprints, TileList
 
 _BLOCK_PAIRS = 2**13  # pairs evaluated at once: 2 MB a work array in float32. Not by the number of threads: how lists
 # are cut decides how sums are rounded, and an image must not depend on how many threads are free
-_BLOCK_PAIRS_COMPILED = 2**12  # compiled kernels have no calls to save, and fit the cache better
 _BLOCK_PAIRS_GPU = 2**18
 _LONGEST_CHUNK = 1024
 
@@ -30,8 +28,8 @@ class BlendOptions(NamedTuple):
     """How to blend."""
 
     quality: Quality = EXACT
-    compiled: bool = False
-    """Use compiled kernels where the machine can make them (float32, CPU)."""
+    compiled: bool | None = None
+    """Use compiled kernels (float32, CPU): None where there are some, True with a warning where there are none."""
     memory_budget: int = MEMORY_BUDGET
 
 
@@ -61,8 +59,7 @@ class Chunk(NamedTuple):
 class Frame:
     """The tiles of one region, longest list first, and their pairs."""
 
-    def __init__(self, footprints: Footprints, region: Region, dtype: torch.dtype, compiled: bool):
-        tiles = self.list = footprints.tiles(region)
+    def __init__(self, footprints: Footprints, tiles: TileList, dtype: torch.dtype):
         lengths = tiles.offsets[1:] - tiles.offsets[:-1]
         self.width, self.height, self.tiles = footprints.width, footprints.height, lengths.numel()
         self.occupied = int((lengths > 0).sum())
@@ -71,7 +68,7 @@ class Frame:
         self.sorted = Tiles(ids, x, y, tiles.offsets[ids], tiles.offsets[ids + 1])
         self.pairs_count = tiles.gaussians.numel()
         self.gaussians = F.pad(tiles.gaussians, (0, 1), value=tiles.order.numel())  # the last pair is padding
-        pairs = _BLOCK_PAIRS_GPU if lengths.is_cuda else _BLOCK_PAIRS_COMPILED if compiled else _BLOCK_PAIRS
+        pairs = _BLOCK_PAIRS_GPU if lengths.is_cuda else _BLOCK_PAIRS
         self.block = max(1, min(pairs // CHUNK, self.occupied))  # tiles
         self.capacity = pairs
 
@@ -101,15 +98,8 @@ class Inputs(NamedTuple):
     may_clamp: bool  # some opacity exceeds ALPHA_MAX
     quality: Quality
     basis: Tensor  # [6, 64]
-    fused: Kernels | None  # the compiled chunk kernels
-    limits: tuple[Tensor, Tensor]  # the thresholds of ``quality``, as compiled kernels take them
 
     @classmethod
-    def of(cls, means2d, cov2d, det, opacities, colors, options: BlendOptions) -> Inputs:
-        channels, quality = colors.shape[1], options.quality
-        fused = None
-        if options.compiled and colors.dtype == torch.float32 and colors.device.type == "cpu":
-            fused = kernels(channels)
-        limits = (colors.new_tensor(quality.alpha_min), colors.new_tensor(quality.transmittance_min))
+    def of(cls, means2d, cov2d, det, opacities, colors, quality: Quality) -> Inputs:
         table = table_of(means2d, cov2d, det, opacities, colors)
-        return cls(table, channels, bool((opacities > ALPHA_MAX).any()), quality, basis_of(means2d), fused, limits)
+        return cls(table, colors.shape[1], bool((opacities > ALPHA_MAX).any()), quality, basis_of(means2d))

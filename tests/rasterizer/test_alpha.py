@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from pointsplat_ns.rasterizer.alpha import alphas_, is_clamped, is_drawn, last_transmittance, step, transmittances
+from pointsplat_ns.rasterizer.alpha import alphas_, is_clamped, is_drawn, last_transmittance, transmittances
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
 LENGTHS = [1, 16, 63, 64, 65, 80, 160, 200]
@@ -47,18 +47,6 @@ def test_whole_chunks_follow_the_definition(n, spread):
     # 1e-12: up to 200 factors in float64, in another order
     torch.testing.assert_close(alpha * drawn * through[:, :-1], weights, rtol=1e-12, atol=0)
     torch.testing.assert_close(last_transmittance(through, drawn), last, rtol=1e-12, atol=0)
-
-
-@pytest.mark.parametrize("spread", [1.0, 4.0])
-def test_single_steps_follow_the_definition(spread):
-    log2 = spread * random_log2(80)
-    weights, last = by_definition(log2)
-    through, seen_last = torch.ones_like(last), torch.ones_like(last)
-    for k in range(80):
-        alpha, after = step(alphas_(log2[:, k].clone(), torch.tensor(ALPHA_MIN)), through, TRANSMITTANCE_MIN)
-        torch.testing.assert_close(alpha * through, weights[:, k], rtol=1e-12, atol=0)
-        seen_last, through = torch.where(after > 0, after, seen_last), after
-    torch.testing.assert_close(seen_last, last, rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -5,15 +5,14 @@ They catch what a comparison of two paths of today cannot: that both have change
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 
 import pytest
 import torch
 
 import golden
-from pointsplat_ns.rasterizer import blending, frame, rasterization
+from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.rasterizer.tiles import Footprints
 
 F32, F64 = torch.float32, torch.float64
 
@@ -27,7 +26,14 @@ GRADIENT_32 = 1e-4
 """Of a gradient's norm, for float32: ten times what was seen; a gradient is a sum over pixels that partly cancel."""
 
 
-PATHS = {"packed": {}, "dense": {"packed": False}, "regions": {"memory_budget": 4000}}
+TORCH = {"compiled": False}
+PATHS = {
+    "packed": TORCH,
+    "dense": {"packed": False, **TORCH},
+    "regions": {"memory_budget": 4000, **TORCH},
+    "compiled": {},  # where there is a compiler, in float32, of at most four channels
+    "compiled in regions": {"memory_budget": 4000},
+}
 
 
 @pytest.fixture(scope="module")
@@ -88,22 +94,10 @@ def test_the_fast_path_draws_the_stored_images(name, dtype, options, stored):
 
 def test_a_small_budget_does_draw_in_regions(stored, monkeypatch):
     regions = []
-    made = frame.Frame.__init__
-    monkeypatch.setattr(frame.Frame, "__init__", lambda self, *args: regions.append(args[1]) or made(self, *args))
+    tiles = Footprints.tiles
+    monkeypatch.setattr(Footprints, "tiles", lambda self, region: regions.append(region) or tiles(self, region))
     draw(stored["degree 1"], golden.SCENES["degree 1"], F32, memory_budget=4000)
     assert len(set(regions)) > 1
-
-
-@pytest.mark.skipif(shutil.which(os.environ.get("CXX", "g++")) is None, reason="there is no C++ compiler")
-def test_compiled_kernels_draw_the_stored_images(kernels_of_four, monkeypatch, stored):
-    used = []
-    gather = blending.gather
-    monkeypatch.setattr(blending, "gather", lambda table, ids, x, y: used.append(len(x)) or gather(table, ids, x, y))
-    plain = {name: shape for name, shape in golden.SCENES.items() if shape.channels == 3 and shape.render_mode == "RGB"}
-    assert len(plain) >= 8  # with the same number of channels, so that they are compiled once
-    for name, shape in plain.items():
-        compare(draw(stored[name], shape, F32, compiled=True), stored[name], IMAGE_32, GRADIENT_32)
-    assert max(used) >= blending.SMALLEST, "never as many tiles as compiled kernels take"
 
 
 def test_the_comparison_fails_where_it_should(stored):

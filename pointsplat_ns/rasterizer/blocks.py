@@ -1,0 +1,153 @@
+"""Blending in plain torch: tiles of similar length together, in blocks that fit the cache.
+
+CHUNK Gaussians at a time (more where few tiles are left); tiles whose every pixel is saturated are dropped in between.
+
+Shapes: P pairs, B tiles of a block, S Gaussians of a chunk, 64 = TILE * TILE pixels, D channels.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pointsplat_ns.rasterizer import eager
+from pointsplat_ns.rasterizer.frame import Chunk, Frame, Inputs, Tiles
+from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS, gather, mean_slopes, moments
+from pointsplat_ns.rasterizer.tiles import Footprints, TileList
+
+
+class Tape(NamedTuple):
+    """What the backward pass needs of the forward pass."""
+
+    frame: Frame
+    chunks: list[list[Chunk]]  # by block
+
+
+def _blend_block(
+    frame: Frame, inputs: Inputs, work: eager.WorkArrays, image: Tensor, final: Tensor, keep_tape: bool, begin: int
+) -> list[Chunk]:
+    """Blend the tiles from ``begin`` on into their rows of ``image`` (tiles, D, 64) and ``final`` (tiles, 64)."""
+    left = Tiles(*(values[begin : begin + frame.block] for values in frame.sorted))
+    rows = None
+    longest = int(left.end[0] - left.start[0])
+    before = frame.inside(left)
+    blended = image.new_zeros(before.shape[0], inputs.channels, PIXELS)
+    last = torch.ones_like(before)
+    chunks: list[Chunk] = []
+    first = 0
+    while True:
+        b = before.shape[0]
+        s = frame.chunk_size(b, longest - first)
+        ids = frame.gaussians.index_select(0, frame.pairs(left, first, s))
+        pairs = gather(inputs.table, ids, left.x, left.y)
+        if keep_tape:
+            chunks.append(Chunk(left, rows, first, s, before))
+        before, last = eager.blend_chunk(inputs, pairs, before, last, blended, work)
+        first += s
+        if first >= longest:
+            break
+        alive = (left.end - left.start > first) & (before.amax(-1) > 0)
+        still = int(alive.sum())
+        if still == 0:
+            break
+        if still <= 0.9 * b:
+            done, alive = (~alive).nonzero()[:, 0], alive.nonzero()[:, 0]
+            finished = left.ids.index_select(0, done)
+            image.index_copy_(0, finished, blended.index_select(0, done))
+            final.index_copy_(0, finished, last.index_select(0, done))
+            left, rows = left.take(alive), alive if rows is None else rows.index_select(0, alive)
+            before, blended, last = (values.index_select(0, alive) for values in (before, blended, last))
+            longest = int((left.end - left.start).max())
+    image.index_copy_(0, left.ids, blended)
+    final.index_copy_(0, left.ids, last)
+    return chunks
+
+
+def blend_region(
+    footprints: Footprints, tiles: TileList, inputs: Inputs, image: Tensor, final: Tensor, keep_tape: bool
+) -> Tape | None:
+    """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); the tape if it is wanted."""
+    frame = Frame(footprints, tiles, image.dtype)
+    if frame.occupied < frame.tiles:
+        image.zero_()
+        final.fill_(1.0)
+    work = eager.WorkArrays(frame, image)
+    begins = range(0, frame.occupied, frame.block)
+    chunks = [_blend_block(frame, inputs, work, image, final, keep_tape, begin) for begin in begins]
+    return Tape(frame, chunks) if keep_tape else None
+
+
+def _blend_block_backward(
+    frame: Frame,
+    inputs: Inputs,
+    work: eager.WorkArrays,
+    final: Tensor,  # [tiles, 64]
+    grad_image: Tensor,  # [tiles, D, 64]
+    grad_final: Tensor,  # [tiles, 64]
+    chunks: list[Chunk],
+    place: Tensor,  # [pairs of the chunks] int64, written: places in the pair list
+    sums: Tensor,  # [pairs of the chunks, MOMENTS + D (+ 2)], written
+) -> None:
+    """The gradient sums of the pairs of one block, the last chunk first."""
+    channels = inputs.channels
+    whole = chunks[0].tiles.ids
+    block_pixels = grad_image.index_select(0, whole)  # [B, D, 64]
+    # what lies behind: sum over later Gaussians of weight * (color . grad), and the background
+    behind = grad_final.index_select(0, whole) * final.index_select(0, whole)
+    done = 0
+    for tiles, rows, first, s, before in reversed(chunks):
+        b = before.shape[0]
+        pixels = block_pixels if rows is None else block_pixels.index_select(0, rows)
+        here = slice(done, done + b * s)
+        done += b * s
+        place[here] = frame.pairs(tiles, first, s)
+        pairs = gather(inputs.table, frame.gaussians.index_select(0, place[here]), tiles.x, tiles.y)
+        behind_here = behind if rows is None else behind.index_select(0, rows)
+        grad_log, grad_colors, behind_here = eager.blend_chunk_backward(
+            inputs, pairs, before, behind_here, pixels, work
+        )
+        if rows is None:
+            behind = behind_here
+        else:
+            behind.index_copy_(0, rows, behind_here)
+
+        packed = sums[here]
+        packed[:, MOMENTS : MOMENTS + channels].view(b, s, channels).copy_(grad_colors.transpose(1, 2))
+        flat = grad_log.view(-1, PIXELS)
+        if sums.shape[1] > MOMENTS + channels:  # absolute gradients of the means
+            for column, slope in enumerate(mean_slopes(pairs.coefficients)):
+                slope = torch.mm(slope, inputs.basis[:3], out=work.array(0, b, s).view(-1, PIXELS))
+                packed[:, MOMENTS + channels + column] = slope.mul_(flat).abs_().sum(-1)
+        moments(pairs, torch.mm(inputs.basis, flat.T), packed)
+
+
+def differentiate_region(
+    footprints: Footprints,
+    tiles: TileList,
+    inputs: Inputs,
+    tape: Tape,
+    final: Tensor,  # [tiles, 64]
+    grad_image: Tensor,  # [tiles, D, 64]
+    grad_final: Tensor,  # [tiles, 64]
+    absgrad: bool,
+) -> Tensor:
+    """Moments, colour gradients and absolute gradients of the Gaussians from one region, (M, MOMENTS + D [+ 2])."""
+    frame = tape.frame
+    sizes = [sum(chunk.before.shape[0] * chunk.size for chunk in chunks) for chunks in tape.chunks]
+    total = sum(sizes)
+    sums = grad_image.new_empty(total + 1, MOMENTS + inputs.channels + (2 if absgrad else 0))  # in the tape's order
+    sums[-1] = 0.0
+    place = frame.gaussians.new_empty(total)  # in the pair list
+    work = eager.WorkArrays(frame, grad_image)
+    for block in zip(tape.chunks, place.split(sizes), sums[:-1].split(sizes), strict=True):
+        _blend_block_backward(frame, inputs, work, final, grad_image, grad_final, *block)
+
+    # group the sums of pairs by Gaussian; pairs behind a saturated tile have no sum
+    by_place = place.new_full((frame.pairs_count + 1,), total)
+    by_place.index_copy_(0, place, torch.arange(total, device=place.device))
+    by_gaussian = torch.empty_like(tiles.places).index_copy_(0, tiles.places, by_place[:-1])
+    in_depth_order = F.embedding_bag(by_gaussian, sums, torch.cumsum(tiles.counts, 0) - tiles.counts, mode="sum")
+    return torch.empty_like(in_depth_order).index_copy_(0, tiles.order, in_depth_order)

@@ -1,0 +1,302 @@
+// The two inner loops of blending for float32 on a CPU: a tile's Gaussians front to back, and their gradients.
+//
+// native.py compiles this file where there is a C++ compiler and calls it; blending.py does the same in torch. Both
+// follow the rule of alpha.py and the algebra of quadratics.py, whose names are used here. A tile has 8 x 8 pixels; a
+// row of them is one vector. Each tile is drawn by one thread from front to back, so that the number of threads changes
+// nothing.
+
+#include <cstdint>
+#include <cstring>
+
+namespace {
+
+constexpr int TILE = 8, PIXELS = TILE * TILE;
+constexpr int CHUNK = 32;    // Gaussians between two checks for saturation, and between two kept transmittances
+constexpr int GRAB = 4;      // tiles that a thread takes at once
+constexpr int MOMENTS = 6;   // w, w^2, dv, dv^2, w dv, 1
+constexpr int COLOR = 11;    // first column of the colours in the table
+constexpr float HALF = 0.5f * (TILE - 1);
+constexpr float LN2 = 0.693147180559945f;
+constexpr float SLACK = 1e-3f;  // log2 alpha: rounding never leaves out a pixel that is drawn
+
+typedef float Row __attribute__((vector_size(4 * TILE)));
+typedef int32_t Mask __attribute__((vector_size(4 * TILE)));
+
+const Row ZERO = {};
+const Row OFFSETS = {-3.5f, -2.5f, -1.5f, -0.5f, 0.5f, 1.5f, 2.5f, 3.5f};  // of pixels from the tile's centre
+
+inline Row load(const float* from) {
+    Row row;
+    std::memcpy(&row, from, sizeof(Row));
+    return row;
+}
+
+inline void store(float* to, Row row) { std::memcpy(to, &row, sizeof(Row)); }
+
+inline Row larger(Row a, Row b) { return a > b ? a : b; }
+
+inline Row smaller(Row a, Row b) { return a < b ? a : b; }
+
+inline Row magnitude(Row a) { return larger(a, -a); }
+
+inline float sum(Row row) {
+    return ((row[0] + row[4]) + (row[2] + row[6])) + ((row[1] + row[5]) + (row[3] + row[7]));
+}
+
+// 2^x to 1e-7 for x <= 0; 2^-126 below -126. A polynomial of 2^f on [-0.5, 0.5], fitted for the least relative error.
+inline Row exp2_of(Row x) {
+    x = larger(x, ZERO - 126.0f);
+    const Row shifted = x + 12582912.0f;  // 1.5 * 2^23: rounds to the nearest integer
+    const Row whole = shifted - 12582912.0f;
+    const Row f = x - whole;
+    Row p = f * 0.00015345774590969086f + 0.0013399930903688073f;
+    p = p * f + 0.009618489071726799f;
+    p = p * f + 0.05550328642129898f;
+    p = p * f + 0.24022646248340607f;
+    p = p * f + 0.6931471824645996f;
+    p = p * f + 1.0f;
+    return p * reinterpret_cast<Row>((__builtin_convertvector(whole, Mask) + 127) << 23);
+}
+
+}  // namespace
+
+extern "C" {
+
+// What is blended, and where to. Tiles are those of a region of one or several images of equal size, row by row.
+struct Task {
+    const float* table;        // [M, COLOR + channels], rows of quadratics.table_of
+    const int64_t* gaussians;  // [P] rows of the table, by tile and front to back
+    const int64_t* offsets;    // [tiles + 1] where each tile's Gaussians start
+    const int64_t* chunks;     // [tiles + 1] where each tile's chunks start
+    int64_t tiles, rows, columns, top, left, width, height, channels;
+    float log2_alpha_min, alpha_min, alpha_max, clamped_from, transmittance_min;
+    float* image;        // [tiles, channels, PIXELS]
+    float* final_;       // [tiles, PIXELS] transmittance left
+    float* before;       // [chunks, PIXELS] transmittance in front of each chunk; null where it is not wanted
+    int64_t* blended;    // [tiles] Gaussians passed before all pixels were finished
+    const float* grad_image;  // as image
+    const float* grad_final;  // as final_
+    float* sums;              // [P, MOMENTS + channels (+ 2)] gradient sums of each pair
+    int64_t absolute;         // whether sums has two columns more
+    int64_t* next;            // the first tile that no thread has taken
+};
+
+}  // extern "C"
+
+namespace {
+
+// Up to CHUNK Gaussians, as seen from a tile.
+template <int D>
+struct Chunk {
+    int size;
+    float half_a[CHUNK];          // of log2 alpha = base - half_a w^2
+    float color[CHUNK][D];
+    float r[CHUNK], a[CHUNK], d[CHUNK];
+    Row y[CHUNK], base[CHUNK], w[CHUNK], bound[CHUNK];  // by row of the tile: dv, base, w in its middle, largest log2 alpha
+
+    void read(const Task& task, int64_t begin, int64_t end, float x, float y_centre) {
+        size = static_cast<int>(end - begin);
+        for (int k = 0; k < size; ++k) {
+            const float* row = task.table + task.gaussians[begin + k] * (COLOR + D);
+            const float half_d = 0.5f * row[4];
+            half_a[k] = 0.5f * row[3];
+            r[k] = row[2], a[k] = row[3], d[k] = row[4];
+            const float dv = y_centre - row[1], s = (x - row[0]) - row[2] * dv;
+            y[k] = OFFSETS + dv;
+            base[k] = row[5] - half_d * (y[k] * y[k]);
+            w[k] = s - row[2] * OFFSETS;
+            const Row nearest = larger(magnitude(w[k]) - HALF, ZERO);
+            bound[k] = base[k] - half_a[k] * (nearest * nearest);
+            for (int c = 0; c < D; ++c) color[k][c] = row[COLOR + c];
+        }
+    }
+
+    bool reaches(int k, int row, float log2_alpha_min) const { return !(bound[k][row] < log2_alpha_min - SLACK); }
+
+    Row w_of(int k, int row) const { return OFFSETS + w[k][row]; }
+
+    // Alphas of a row of pixels, 0 where the Gaussian is not drawn for being faint.
+    Row alpha(int k, int row, Row w_row, const Task& task) const {
+        const Row value = smaller(exp2_of(base[k][row] - half_a[k] * (w_row * w_row)), ZERO + task.alpha_max);
+        return value > task.alpha_min ? value : ZERO;
+    }
+};
+
+struct Place {
+    float x, y;           // centre, pixels
+    Row inside[TILE];     // 1 for pixels of the image, by row
+};
+
+Place place_of(const Task& task, int64_t tile) {
+    const int64_t within = tile % (task.rows * task.columns);
+    const int64_t top = (task.top + within / task.columns) * TILE, left = (task.left + within % task.columns) * TILE;
+    Place place{static_cast<float>(left + TILE / 2), static_cast<float>(top + TILE / 2), {}};
+    for (int row = 0; row < TILE; ++row)
+        for (int column = 0; column < TILE; ++column)
+            place.inside[row][column] = left + column < task.width && top + row < task.height ? 1.0f : 0.0f;
+    return place;
+}
+
+template <int D>
+void blend_tile(const Task& task, int64_t tile) {
+    const Place place = place_of(task, tile);
+    Row through[TILE], last[TILE], color[TILE][D] = {};
+    for (int row = 0; row < TILE; ++row) through[row] = place.inside[row], last[row] = ZERO + 1.0f;
+    const int64_t begin = task.offsets[tile], end = task.offsets[tile + 1];
+    int64_t at = begin;
+    Chunk<D> chunk;
+    for (int64_t which = task.chunks[tile]; at < end; ++which) {
+        if (task.before)
+            for (int row = 0; row < TILE; ++row) store(task.before + which * PIXELS + row * TILE, through[row]);
+        chunk.read(task, at, at + CHUNK < end ? at + CHUNK : end, place.x, place.y);
+        at += chunk.size;
+        bool unfinished = false;
+        for (int row = 0; row < TILE; ++row) {
+            Row t = through[row], left = last[row], c[D];
+            if (!(sum(t) > 0.0f)) continue;
+            for (int i = 0; i < D; ++i) c[i] = color[row][i];
+            for (int k = 0; k < chunk.size; ++k) {
+                if (!chunk.reaches(k, row, task.log2_alpha_min)) continue;
+                const Row alpha = chunk.alpha(k, row, chunk.w_of(k, row), task);
+                const Row after = t * (1.0f - alpha);
+                const Mask drawn = after > task.transmittance_min;
+                const Row weight = drawn ? alpha * t : ZERO;
+                t = drawn ? after : ZERO;
+                left = drawn ? after : left;
+                for (int i = 0; i < D; ++i) c[i] += weight * chunk.color[k][i];
+            }
+            through[row] = t, last[row] = left;
+            for (int i = 0; i < D; ++i) color[row][i] = c[i];
+            unfinished |= sum(t) > 0.0f;
+        }
+        if (!unfinished) break;
+    }
+    task.blended[tile] = at - begin;
+    for (int row = 0; row < TILE; ++row) {
+        store(task.final_ + tile * PIXELS + row * TILE, last[row]);
+        for (int i = 0; i < D; ++i) store(task.image + (tile * D + i) * PIXELS + row * TILE, color[row][i]);
+    }
+}
+
+// The gradient sums of one Gaussian of a chunk on a tile, and what lies behind the Gaussian in front of it.
+template <int D, bool ABSOLUTE>
+void pass_back(const Task& task, const Chunk<D>& chunk, int k, const Row (&alphas)[TILE], const Row (&weights)[TILE],
+               const Row (&pixels)[TILE][D], Row (&behind)[TILE], float* out) {
+    Row g_sum = ZERO, gw = ZERO, gww = ZERO, gv = ZERO, gvv = ZERO, gwv = ZERO, g_color[D] = {}, abs_x = ZERO, abs_y = ZERO;
+    for (int row = 0; row < TILE; ++row) {
+        if (!chunk.reaches(k, row, task.log2_alpha_min)) continue;
+        const Row alpha = alphas[row], weight = weights[row];
+        Row shade = pixels[row][0] * chunk.color[k][0];
+        for (int i = 1; i < D; ++i) shade += pixels[row][i] * chunk.color[k][i];
+        for (int i = 0; i < D; ++i) g_color[i] += weight * pixels[row][i];
+        const Row term = weight * shade;
+        Row g = term - alpha / (1.0f - alpha) * behind[row];
+        g = alpha >= task.clamped_from ? ZERO : g;
+        behind[row] += term;
+        const Row w = chunk.w_of(k, row), g_w = g * w;
+        const float v = chunk.y[k][row];
+        g_sum += g, gw += g_w, gww += g_w * w;
+        gv += g * v, gvv += g * (v * v), gwv += g_w * v;
+        if (ABSOLUTE) {
+            const Row along = w * chunk.a[k];
+            abs_x += magnitude(g * along);
+            abs_y += magnitude(g * (chunk.d[k] * v - chunk.r[k] * along));
+        }
+    }
+    const Row moments[MOMENTS] = {gw, gww, gv, gvv, gwv, g_sum};
+    for (int i = 0; i < MOMENTS; ++i) out[i] = sum(moments[i]);
+    for (int i = 0; i < D; ++i) out[MOMENTS + i] = sum(g_color[i]);
+    if (ABSOLUTE) out[MOMENTS + D] = LN2 * sum(abs_x), out[MOMENTS + D + 1] = LN2 * sum(abs_y);
+}
+
+template <int D, bool ABSOLUTE>
+void differentiate_tile(const Task& task, int64_t tile) {
+    constexpr int COLUMNS = MOMENTS + D + (ABSOLUTE ? 2 : 0);
+    const Place place = place_of(task, tile);
+    const int64_t begin = task.offsets[tile], passed = begin + task.blended[tile], end = task.offsets[tile + 1];
+    std::memset(task.sums + passed * COLUMNS, 0, sizeof(float) * (end - passed) * COLUMNS);
+    Row pixels[TILE][D], behind[TILE], alphas[CHUNK][TILE], weights[CHUNK][TILE];
+    for (int row = 0; row < TILE; ++row) {
+        const int64_t at = tile * PIXELS + row * TILE;
+        behind[row] = load(task.grad_final + at) * load(task.final_ + at);
+        for (int i = 0; i < D; ++i) pixels[row][i] = load(task.grad_image + (tile * D + i) * PIXELS + row * TILE);
+    }
+    Chunk<D> chunk;
+    for (int64_t which = (passed - begin + CHUNK - 1) / CHUNK - 1; which >= 0; --which) {
+        const int64_t first = begin + which * CHUNK;
+        chunk.read(task, first, first + CHUNK < passed ? first + CHUNK : passed, place.x, place.y);
+        for (int row = 0; row < TILE; ++row) {
+            Row t = load(task.before + (task.chunks[tile] + which) * PIXELS + row * TILE);
+            for (int k = 0; k < chunk.size; ++k) {
+                if (!chunk.reaches(k, row, task.log2_alpha_min)) continue;
+                const Row alpha = chunk.alpha(k, row, chunk.w_of(k, row), task);
+                const Row after = t * (1.0f - alpha);
+                const Mask drawn = after > task.transmittance_min;
+                alphas[k][row] = drawn ? alpha : ZERO;
+                weights[k][row] = drawn ? alpha * t : ZERO;
+                t = drawn ? after : ZERO;
+            }
+        }
+        for (int k = chunk.size - 1; k >= 0; --k)
+            pass_back<D, ABSOLUTE>(task, chunk, k, alphas[k], weights[k], pixels, behind, task.sums + (first + k) * COLUMNS);
+    }
+}
+
+template <typename Work>
+void each_tile(const Task& task, Work work) {
+    for (;;) {
+        const int64_t first = __atomic_fetch_add(task.next, GRAB, __ATOMIC_RELAXED);
+        if (first >= task.tiles) return;
+        for (int64_t tile = first; tile < first + GRAB && tile < task.tiles; ++tile) work(task, tile);
+    }
+}
+
+template <int D>
+void differentiate_all(const Task& task) {
+    if (task.absolute)
+        each_tile(task, differentiate_tile<D, true>);
+    else
+        each_tile(task, differentiate_tile<D, false>);
+}
+
+}  // namespace
+
+extern "C" {
+
+int pointsplat_chunk() { return CHUNK; }
+
+void pointsplat_blend(const Task* task) {
+    switch (task->channels) {
+        case 1: return each_tile(*task, blend_tile<1>);
+        case 2: return each_tile(*task, blend_tile<2>);
+        case 3: return each_tile(*task, blend_tile<3>);
+        case 4: return each_tile(*task, blend_tile<4>);
+    }
+}
+
+void pointsplat_differentiate(const Task* task) {
+    switch (task->channels) {
+        case 1: return differentiate_all<1>(*task);
+        case 2: return differentiate_all<2>(*task);
+        case 3: return differentiate_all<3>(*task);
+        case 4: return differentiate_all<4>(*task);
+    }
+}
+
+// For each of ``count`` Gaussians the sum of its pairs: rows ``pairs[starts[i]]`` to ``pairs[starts[i + 1] - 1]``.
+void pointsplat_gather(const float* sums, const int64_t* pairs, const int64_t* starts, const int64_t* order, int64_t count,
+                       int64_t columns, float* out, int64_t* next) {
+    constexpr int64_t TAKE = 1024;
+    for (;;) {
+        const int64_t first = __atomic_fetch_add(next, TAKE, __ATOMIC_RELAXED);
+        if (first >= count) return;
+        for (int64_t i = first; i < first + TAKE && i < count; ++i) {
+            float* to = out + order[i] * columns;
+            for (int64_t c = 0; c < columns; ++c) to[c] = 0.0f;
+            for (int64_t j = starts[i]; j < starts[i + 1]; ++j)
+                for (int64_t c = 0; c < columns; ++c) to[c] += sums[pairs[j] * columns + c];
+        }
+    }
+}
+
+}  // extern "C"

@@ -1,0 +1,217 @@
+"""Blending by compiled kernels (``kernels.cpp``): what :mod:`~pointsplat_ns.rasterizer.blocks` does in torch.
+
+For float32 on a CPU, where the machine has a C++ compiler. Building takes two seconds, once. Without a compiler, or if
+what it made does not draw as torch does, blending stays with torch.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import math
+import os
+import sys
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.rasterizer import blocks
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, EXACT
+from pointsplat_ns.rasterizer.frame import Inputs
+from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
+from pointsplat_ns.rasterizer.tiles import Footprints, TileList
+from pointsplat_ns.system.native_code import NativeCodeError, load_native
+
+SOURCE = Path(__file__).with_name("kernels.cpp")
+
+MOST_CHANNELS = 4
+"""Channels that the kernels are made for: colours and depth."""
+
+_FEW_PAIRS = 2000
+"""Pairs that one thread blends sooner than several can be asked."""
+
+
+class _Task(ctypes.Structure):
+    """``struct Task`` of the kernels."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("table", "gaussians", "offsets", "chunks")),
+        *(
+            (name, ctypes.c_int64)
+            for name in ("tiles", "rows", "columns", "top", "left", "width", "height", "channels")
+        ),
+        *(
+            (name, ctypes.c_float)
+            for name in ("log2_alpha_min", "alpha_min", "alpha_max", "clamped_from", "transmittance_min")
+        ),
+        *((name, ctypes.c_void_p) for name in ("image", "final", "before", "blended")),
+        *((name, ctypes.c_void_p) for name in ("grad_image", "grad_final", "sums")),
+        ("absolute", ctypes.c_int64),
+        ("next", ctypes.c_void_p),
+    )
+
+
+class Tape(NamedTuple):
+    """What the backward pass needs of the forward pass."""
+
+    before: Tensor  # [chunks, 64] transmittance in front of each chunk of a tile's list
+    blended: Tensor  # [tiles] int64, Gaussians passed before all pixels were finished
+    chunks: Tensor  # [tiles + 1] int64, where each tile's chunks start
+
+
+def can_blend(colors: Tensor, wanted: bool | None) -> bool:
+    """Whether the kernels blend these colours (M, D).
+
+    Args:
+        colors: of the projected Gaussians.
+        wanted: None where a machine without a compiler is no reason for a warning.
+    """
+    if wanted is False or colors.dtype != torch.float32 or colors.device.type != "cpu":
+        return False
+    if not 1 <= colors.shape[1] <= MOST_CHANNELS:
+        return False
+    why = why_missing()
+    if why and wanted:
+        warnings.warn(f"the rasterizer could not be compiled and stays with torch: {why}", stacklevel=2)
+    return not why
+
+
+@functools.cache
+def why_missing() -> str:
+    """Why this machine has no kernels; empty if it has. They are built if need be, and tried."""
+    library, why = _kernels()
+    return why if library is None or _as_torch() else "what the compiler made does not draw what torch draws"
+
+
+@functools.cache
+def _kernels() -> tuple[ctypes.CDLL | None, str]:
+    """The kernels, or why there are none."""
+    try:
+        library = load_native(SOURCE)
+    except NativeCodeError as error:
+        return None, str(error)
+    for name in ("pointsplat_blend", "pointsplat_differentiate"):
+        getattr(library, name).argtypes, getattr(library, name).restype = [ctypes.c_void_p], None
+    library.pointsplat_gather.argtypes = [ctypes.c_void_p] * 4 + [ctypes.c_int64] * 2 + [ctypes.c_void_p] * 2
+    library.pointsplat_gather.restype = None
+    return library, ""
+
+
+@functools.cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Threads of a process: those of one that forked are not the other's."""
+    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="pointsplat-blend")
+
+
+def _on_threads(pairs: int, function, *arguments) -> None:
+    """Call a kernel in as many threads as torch uses. They share the work; ctypes lets go of Python meanwhile."""
+    threads = 1 if pairs < _FEW_PAIRS else torch.get_num_threads()
+    others = [_pool(os.getpid()).submit(function, *arguments) for _ in range(threads - 1)]
+    function(*arguments)
+    for other in others:
+        other.result()
+
+
+def _task(footprints: Footprints, tiles: TileList, inputs: Inputs, chunks: Tensor, next_tile: Tensor) -> _Task:
+    """A task without its outputs. It keeps none of the tensors alive."""
+    region, quality = tiles.region, inputs.quality
+    return _Task(
+        table=inputs.table.data_ptr(), gaussians=tiles.gaussians.data_ptr(), offsets=tiles.offsets.data_ptr(),
+        chunks=chunks.data_ptr(), tiles=tiles.offsets.numel() - 1, rows=region.rows, columns=region.columns,
+        top=region.top, left=region.left, width=footprints.width, height=footprints.height, channels=inputs.channels,
+        log2_alpha_min=math.log2(quality.alpha_min), alpha_min=quality.alpha_min, alpha_max=ALPHA_MAX,
+        clamped_from=ALPHA_MAX * (1 - 1e-6), transmittance_min=quality.transmittance_min, next=next_tile.data_ptr(),
+    )  # fmt: skip
+
+
+def blend_region(
+    footprints: Footprints, tiles: TileList, inputs: Inputs, image: Tensor, final: Tensor, keep_tape: bool
+) -> Tape | None:
+    """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); the tape if it is wanted."""
+    library, _ = _kernels()
+    assert library is not None
+    size = library.pointsplat_chunk()
+    chunks = torch.zeros_like(tiles.offsets)
+    torch.cumsum((tiles.offsets.diff() + (size - 1)).div_(size, rounding_mode="floor"), 0, out=chunks[1:])
+    before = image.new_empty(int(chunks[-1]) if keep_tape else 0, PIXELS)
+    blended, next_tile = torch.empty_like(tiles.offsets[1:]), torch.zeros_like(tiles.offsets[:1])
+    task = _task(footprints, tiles, inputs, chunks, next_tile)
+    task.image, task.final, task.blended = image.data_ptr(), final.data_ptr(), blended.data_ptr()
+    task.before = before.data_ptr() if keep_tape and len(before) else None
+    _on_threads(tiles.gaussians.numel(), library.pointsplat_blend, ctypes.byref(task))
+    return Tape(before, blended, chunks) if keep_tape else None
+
+
+def differentiate_region(
+    footprints: Footprints,
+    tiles: TileList,
+    inputs: Inputs,
+    tape: Tape,
+    final: Tensor,  # [tiles, 64]
+    grad_image: Tensor,  # [tiles, D, 64]
+    grad_final: Tensor,  # [tiles, 64]
+    absgrad: bool,
+) -> Tensor:
+    """Moments, colour gradients and absolute gradients of the Gaussians from one region, (M, MOMENTS + D [+ 2])."""
+    library, _ = _kernels()
+    assert library is not None
+    pairs, count = tiles.gaussians.numel(), tiles.order.numel()
+    columns = MOMENTS + inputs.channels + (2 if absgrad else 0)
+    sums, out = grad_image.new_empty(pairs, columns), grad_image.new_empty(count, columns)
+    grad_image, grad_final, next_tile = (
+        grad_image.contiguous(),
+        grad_final.contiguous(),
+        torch.zeros_like(tiles.offsets[:1]),
+    )
+    task = _task(footprints, tiles, inputs, tape.chunks, next_tile)
+    task.final, task.before, task.blended = final.data_ptr(), tape.before.data_ptr(), tape.blended.data_ptr()
+    task.grad_image, task.grad_final = grad_image.data_ptr(), grad_final.data_ptr()
+    task.sums, task.absolute = sums.data_ptr(), int(absgrad)
+    _on_threads(pairs, library.pointsplat_differentiate, ctypes.byref(task))
+
+    # sums of pairs, one after the other for each Gaussian
+    by_gaussian = torch.empty_like(tiles.places)
+    by_gaussian.index_copy_(0, tiles.places, torch.arange(pairs))
+    starts = torch.zeros(count + 1, dtype=torch.int64)
+    torch.cumsum(tiles.counts, 0, out=starts[1:])
+    next_tile.zero_()
+    _on_threads(
+        pairs, library.pointsplat_gather, sums.data_ptr(), by_gaussian.data_ptr(), starts.data_ptr(),
+        tiles.order.data_ptr(), count, columns, out.data_ptr(), next_tile.data_ptr(),
+    )  # fmt: skip
+    return out
+
+
+@torch.no_grad()
+def _as_torch() -> bool:
+    """Whether the kernels draw a small picture, and its gradients, as torch does: no miscompilation passes."""
+    generator = torch.Generator().manual_seed(0)
+    count, width, height = 90, 21, 18
+
+    def random(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    means2d = random(count, 2) * torch.tensor([width, height])
+    cov2d = torch.tensor([0.3, 0.0, 0.3]) + random(count, 1) * torch.tensor([9.0, 4.0, 5.0])
+    det, opacities, colors = cov2d[:, 0] * cov2d[:, 2] - cov2d[:, 1] ** 2, random(count), random(count, 3)
+    depths, cameras = random(count), torch.zeros(count, dtype=torch.int64)
+    footprints = Footprints(means2d, cov2d, det, opacities, depths, cameras, 1, width, height)
+    tiles = footprints.tiles(footprints.whole)
+    inputs = Inputs.of(means2d, cov2d, det, opacities, colors, EXACT)
+    number = tiles.offsets.numel() - 1
+    grads = random(number, 3, PIXELS), random(number, PIXELS)
+    drawn = []
+    for engine in (blocks, sys.modules[__name__]):
+        image, final = torch.empty(number, 3, PIXELS), torch.empty(number, PIXELS)
+        tape = engine.blend_region(footprints, tiles, inputs, image, final, True)
+        summed = engine.differentiate_region(footprints, tiles, inputs, tape, final, *grads, True)
+        drawn.append((image, final, summed))
+    # A pixel at a threshold may fall either way.
+    return all(
+        bool((ours - torchs).abs().gt(1e-3 * torchs.abs().amax()).float().mean() < 1e-2)
+        for torchs, ours in zip(*drawn, strict=True)
+    )

@@ -1,0 +1,177 @@
+"""Compiled kernels draw what torch draws, on any number of threads, and where there are none torch draws."""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from making import splats_in_view
+from pointsplat_ns.rasterizer import native, rasterization
+from pointsplat_ns.rasterizer.constants import QUALITIES
+
+WIDTH, HEIGHT = 70, 45  # neither is a multiple of the tile
+
+needs_compiler = pytest.mark.skipif(bool(native.why_missing()), reason=native.why_missing())
+
+
+def draw(channels=3, n=3000, dtype=torch.float32, absgrad=True, cameras=1, **options):
+    """Image, alphas, gradients and absolute gradients of random Gaussians of every opacity, some of them opaque."""
+    *shape, sh = splats_in_view(n, seed=2, scale=-2.5, opacity=1.3, dtype=torch.float64)
+    shape[3].clamp_(max=1.0)
+    leaves = [t.to(dtype).requires_grad_() for t in (*shape, torch.cat([sh[:, 0], sh[:, 1]], dim=1)[:, :channels])]
+    K = torch.tensor([[50.0, 0, 33], [0, 52, 21], [0, 0, 1]], dtype=dtype).repeat(cameras, 1, 1)
+    views = torch.eye(4, dtype=dtype).repeat(cameras, 1, 1)
+    views[:, 0, 3] = 0.3 * torch.arange(cameras)
+    image, alphas, meta = rasterization(*leaves, views, K, WIDTH, HEIGHT, absgrad=absgrad, **options)
+    slope = torch.linspace(0.2, 1, WIDTH, dtype=dtype)[None, None, :, None]
+    ((image * slope).sin().sum() + (alphas * slope).square().sum()).backward()
+    return [image.detach(), alphas.detach(), *(t.grad for t in leaves), meta["means2d"].absgrad]
+
+
+@pytest.fixture()
+def kernel_calls(monkeypatch):
+    """The names of the kernels called within the test."""
+    called = []
+    on_threads = native._on_threads
+    monkeypatch.setattr(
+        native,
+        "_on_threads",
+        lambda pairs, function, *rest: called.append(function) or on_threads(pairs, function, *rest),
+    )
+    return called
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "options",
+    [
+        *({"channels": channels} for channels in (1, 2, 3, 4)),
+        {"render_mode": "RGB+ED"},
+        {"cameras": 2},
+        {"quality": "fast"},
+        {"rasterize_mode": "antialiased"},
+        {"memory_budget": 100_000},
+        {"n": 3},
+    ],
+    ids=str,
+)
+def test_images_and_gradients_are_those_of_torch(options, kernel_calls):
+    got = draw(**options, compiled=True)
+    assert len(kernel_calls) >= 3
+    kernel_calls.clear()
+    wanted = draw(**options, compiled=False)
+    assert not kernel_calls
+    for ours, torchs in zip(got, wanted, strict=True):
+        # 2e-5: float32, in another order; a norm, as a pixel at a threshold may fall either way
+        assert torchs.any() and (ours - torchs).norm() <= 2e-5 * torchs.norm()
+
+
+@needs_compiler
+@pytest.mark.parametrize("quality", QUALITIES)
+def test_float64_gradients_are_met_to_the_rounding_of_float32(quality):
+    for ours, exact in zip(draw(quality=quality), draw(quality=quality, dtype=torch.float64), strict=True):
+        assert (ours - exact).norm() <= 2e-4 * exact.norm()
+
+
+@needs_compiler
+def test_any_number_of_threads_draws_the_same_bits():
+    before = torch.get_num_threads()
+    try:
+        drawn = []
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            drawn.append(draw(memory_budget=400_000))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for other in drawn[1:] for a, b in zip(drawn[0], other, strict=True))
+
+
+@pytest.mark.parametrize("options", [{"dtype": torch.float64}, {"channels": 5}, {"compiled": False}], ids=str)
+def test_what_the_kernels_are_not_made_for_is_left_to_torch(options, kernel_calls):
+    draw(n=50, **options)
+    assert not kernel_calls
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("right", "wrong"),
+    [("alpha / (1.0f - alpha)", "alpha"), ("-3.5f, -2.5f", "-2.5f, -3.5f"), ("alpha * t : ZERO;", "alpha : ZERO;")],
+    ids=["a gradient", "two pixels", "a weight"],
+)
+def test_kernels_that_do_not_draw_as_torch_does_are_not_used(right, wrong, tmp_path, monkeypatch):
+    text = native.SOURCE.read_text("utf-8")
+    assert right in text
+    changed = tmp_path / "kernels.cpp"
+    changed.write_text(text.replace(right, wrong), "utf-8")
+    monkeypatch.setenv("POINTSPLAT_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(native, "SOURCE", changed)
+    for name in ("_kernels", "why_missing"):
+        monkeypatch.setattr(native, name, functools.cache(getattr(native, name).__wrapped__))
+    with pytest.warns(UserWarning, match="stays with torch: what the compiler made does not draw what torch draws"):
+        assert not native.can_blend(torch.zeros(1, 3), True)
+    assert not native.can_blend(torch.zeros(1, 3), None)
+
+
+PROBE = """
+import torch, warnings
+from pointsplat_ns.rasterizer import rasterization
+eyes = torch.eye(4)[None], torch.eye(3)[None]
+scene = torch.tensor([[0.0, 0.0, 2.0]]), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1), torch.ones(1, 3)
+for compiled in (None, True):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        image, _, _ = rasterization(*scene, *eyes, 8, 8, compiled=compiled)
+    print(len(caught), round(float(image.max()), 3), *(w.message for w in caught), sep="|")
+"""
+
+
+@pytest.mark.parametrize("broken", ["no compiler", "a compiler that fails", "no cache"])
+def test_without_a_compiler_torch_draws_and_a_line_says_why_if_asked(broken, tmp_path):
+    failing = tmp_path / "c++"
+    failing.write_text("#!/bin/sh\necho no space left >&2\nexit 1\n")
+    failing.chmod(0o755)
+    changes = {
+        "no compiler": {"CXX": "/nonexistent/c++"},
+        "a compiler that fails": {"CXX": str(failing)},
+        "no cache": {"POINTSPLAT_CACHE": "/proc/nothing"},
+    }[broken]
+    environment = {**os.environ, "POINTSPLAT_CACHE": str(tmp_path / "cache"), **changes}
+    root = str(Path(native.__file__).parents[2])
+    ran = subprocess.run(
+        [sys.executable, "-c", PROBE],
+        env=environment,
+        cwd=root,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=True,
+    )
+    first, second = ran.stdout.strip().splitlines()[-2:]
+    assert first == "0|0.635"
+    if broken == "no cache" and not native.why_missing():  # built for this process alone
+        assert second == first
+    else:
+        count, value, message = second.split("|")
+        reason = {"no compiler": "which is not there", "a compiler that fails": "no space left"}.get(broken, "compiler")
+        assert (count, value) == ("1", "0.635") and "stays with torch" in message and reason in message
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+def test_a_process_that_was_forked_has_threads_of_its_own():
+    code = """
+import os, sys
+from pointsplat_ns.rasterizer import native
+native._pool(os.getpid()).submit(int).result()
+child = os.fork()
+if child == 0:
+    os._exit(native._pool(os.getpid()).submit(int, 7).result(10))
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 7)
+"""
+    root = Path(native.__file__).parents[2]
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], cwd=root, timeout=120, check=True)
