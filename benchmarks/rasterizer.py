@@ -47,7 +47,7 @@ def variant(**options: Any) -> Draw:
 
 
 VARIANTS: dict[str, Draw] = {
-    "eager": variant(),
+    "eager": variant(compiled=False),
     "compiled": variant(compiled=True),
     "balanced": variant(quality="balanced"),
     "fast": variant(quality="fast"),

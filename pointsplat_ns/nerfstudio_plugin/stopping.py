@@ -24,6 +24,7 @@ from torch import Tensor
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.io.files import one_line, replacing
 from pointsplat_ns.io.runs import step_of
+from pointsplat_ns.nerfstudio_plugin.rasterizer_options import RasterizerOptions
 from pointsplat_ns.system.memory import keep_freed_memory
 from pointsplat_ns.system.thread_choice import ThreadChoice
 from pointsplat_ns.system.threads import fixed_threads
@@ -86,6 +87,9 @@ class StoppableTrainer(Trainer):
         if torch.device(self.device).type == "cpu":
             keep_freed_memory()
         try:
+            model = self.config.pipeline.model
+            if self.local_rank == 0 and isinstance(model, RasterizerOptions):
+                CONSOLE.log(model.engine(torch.device(self.device)))
             super().setup(test_mode)
         except PointSplatError:
             self._withdraw()

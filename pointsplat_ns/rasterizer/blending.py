@@ -38,7 +38,7 @@ class Blend(torch.autograd.Function):
     def forward(ctx, means2d, cov2d, det, opacities, colors, footprints, region, keep_lists, options, absgrad_of):
         """The lists are kept for the backward pass only if ``keep_lists``."""
         engine = native if native.can_blend(colors, options.compiled) else blocks
-        tiles = footprints.tiles(region)
+        tiles = engine.tiles_of(footprints, region)
         image = colors.new_empty(tiles.offsets.numel() - 1, colors.shape[1], PIXELS)
         final = colors.new_empty(tiles.offsets.numel() - 1, PIXELS)
         inputs = Inputs.of(means2d, cov2d, det, opacities, colors, options.quality)
@@ -59,7 +59,7 @@ class Blend(torch.autograd.Function):
         if ctx.kept:
             tiles, tape = ctx.kept
         else:
-            tiles = footprints.tiles(region)
+            tiles = engine.tiles_of(footprints, region)
             again = torch.empty_like(grad_image), torch.empty_like(final)
             tape = engine.blend_region(footprints, tiles, inputs, *again, True)
         summed = engine.differentiate_region(

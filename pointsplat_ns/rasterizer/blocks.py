@@ -16,7 +16,12 @@ from torch import Tensor
 from pointsplat_ns.rasterizer import eager
 from pointsplat_ns.rasterizer.frame import Chunk, Frame, Inputs, Tiles
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS, gather, mean_slopes, moments
-from pointsplat_ns.rasterizer.tiles import Footprints, TileList
+from pointsplat_ns.rasterizer.tiles import Footprints, Region, TileList
+
+
+def tiles_of(footprints: Footprints, region: Region) -> TileList:
+    """The pairs of Gaussian and tile."""
+    return footprints.tiles(region)
 
 
 class Tape(NamedTuple):

@@ -23,7 +23,7 @@ from pointsplat_ns.rasterizer import blocks
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, EXACT
 from pointsplat_ns.rasterizer.frame import Inputs
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
-from pointsplat_ns.rasterizer.tiles import Footprints, TileList
+from pointsplat_ns.rasterizer.tiles import SLACK, Footprints, Region, TileList
 from pointsplat_ns.system.native_code import NativeCodeError, load_native
 
 SOURCE = Path(__file__).with_name("kernels.cpp")
@@ -52,6 +52,17 @@ class _Task(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("grad_image", "grad_final", "sums")),
         ("absolute", ctypes.c_int64),
         ("next", ctypes.c_void_p),
+    )
+
+
+class _Listing(ctypes.Structure):
+    """``struct Listing`` of the kernels."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("shapes", "first_row", "last_row", "cameras", "order")),
+        *((name, ctypes.c_int64) for name in ("count", "tiles", "rows", "columns", "top", "left", "height")),
+        ("slack", ctypes.c_float),
+        *((name, ctypes.c_void_p) for name in ("counts", "offsets", "gaussians", "places")),
     )
 
 
@@ -94,7 +105,7 @@ def _kernels() -> tuple[ctypes.CDLL | None, str]:
         library = load_native(SOURCE)
     except NativeCodeError as error:
         return None, str(error)
-    for name in ("pointsplat_blend", "pointsplat_differentiate"):
+    for name in ("pointsplat_list", "pointsplat_blend", "pointsplat_differentiate"):
         getattr(library, name).argtypes, getattr(library, name).restype = [ctypes.c_void_p], None
     library.pointsplat_gather.argtypes = [ctypes.c_void_p] * 4 + [ctypes.c_int64] * 2 + [ctypes.c_void_p] * 2
     library.pointsplat_gather.restype = None
@@ -114,6 +125,29 @@ def _on_threads(pairs: int, function, *arguments) -> None:
     function(*arguments)
     for other in others:
         other.result()
+
+
+def tiles_of(footprints: Footprints, region: Region) -> TileList:
+    """As :meth:`~pointsplat_ns.rasterizer.tiles.Footprints.tiles`."""
+    library, _ = _kernels()
+    assert library is not None
+    f, rows, columns = footprints, region.rows, region.columns
+    count, tiles = f.order.numel(), f.cameras * rows * columns
+    counts, offsets = torch.empty_like(f.order), torch.zeros(tiles + 1, dtype=torch.int64)
+    shapes = f.shapes.contiguous()
+    listing = _Listing(
+        shapes=shapes.data_ptr(), first_row=f.row0.data_ptr(), last_row=f.row1.data_ptr(),
+        cameras=f.camera_ids.data_ptr(), order=f.order.data_ptr(), count=count, tiles=tiles, rows=rows, columns=columns,
+        top=region.top, left=region.left, height=f.height, slack=SLACK, counts=counts.data_ptr(),
+        offsets=offsets.data_ptr(),
+    )  # fmt: skip
+    library.pointsplat_list(ctypes.byref(listing))
+    offsets = torch.cumsum(offsets, 0)
+    gaussians, places = offsets.new_empty(int(offsets[-1])), offsets.new_empty(int(offsets[-1]))
+    listing.offsets, listing.gaussians, listing.places = offsets.data_ptr(), gaussians.data_ptr(), places.data_ptr()
+    if len(gaussians):
+        library.pointsplat_list(ctypes.byref(listing))
+    return TileList(gaussians, offsets, places, counts, f.order, region)
 
 
 def _task(footprints: Footprints, tiles: TileList, inputs: Inputs, chunks: Tensor, next_tile: Tensor) -> _Task:
@@ -200,13 +234,13 @@ def _as_torch() -> bool:
     det, opacities, colors = cov2d[:, 0] * cov2d[:, 2] - cov2d[:, 1] ** 2, random(count), random(count, 3)
     depths, cameras = random(count), torch.zeros(count, dtype=torch.int64)
     footprints = Footprints(means2d, cov2d, det, opacities, depths, cameras, 1, width, height)
-    tiles = footprints.tiles(footprints.whole)
     inputs = Inputs.of(means2d, cov2d, det, opacities, colors, EXACT)
-    number = tiles.offsets.numel() - 1
+    number = footprints.rows * footprints.columns
     grads = random(number, 3, PIXELS), random(number, PIXELS)
     drawn = []
     for engine in (blocks, sys.modules[__name__]):
         image, final = torch.empty(number, 3, PIXELS), torch.empty(number, PIXELS)
+        tiles = engine.tiles_of(footprints, footprints.whole)
         tape = engine.blend_region(footprints, tiles, inputs, image, final, True)
         summed = engine.differentiate_region(footprints, tiles, inputs, tape, final, *grads, True)
         drawn.append((image, final, summed))

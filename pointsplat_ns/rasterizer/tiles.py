@@ -18,7 +18,8 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, TILE
 
-_SLACK = 1e-3  # pixels added around each ellipse, so that rounding never drops a pixel that is drawn
+SLACK = 1e-3
+"""Pixels added around each ellipse, so that rounding never drops a pixel that is drawn."""
 
 
 class Region(NamedTuple):
@@ -103,7 +104,7 @@ class Footprints:
         self.shapes = shapes.index_select(0, self.order)  # [M, 7]
         self.camera_ids = camera_ids.index_select(0, self.order)
         mx, my = self.shapes[:, 0], self.shapes[:, 1]
-        half_x, half_y = ((level * v).sqrt_().index_select(0, self.order).add_(_SLACK) for v in (xx, yy))
+        half_x, half_y = ((level * v).sqrt_().index_select(0, self.order).add_(SLACK) for v in (xx, yy))
         # the box around the ellipse, in tiles
         self.row0 = _tile_of(my - half_y, up=True, tiles=self.rows)
         self.row1 = _tile_of(my + half_y, up=False, tiles=self.rows)
@@ -143,12 +144,12 @@ class Footprints:
         owner, row = _expand((row1 - row0 + 1).clamp_min_(0))
         row += row0.index_select(0, owner)
         mx, my, level, inverse_yy, peak, slope, variance = self.shapes.index_select(0, owner).unbind(-1)
-        top = row * TILE + (0.5 - _SLACK) - my
-        bottom = (row * TILE + (TILE - 0.5)).clamp_(max=self.height - 0.5) + _SLACK - my
+        top = row * TILE + (0.5 - SLACK) - my
+        bottom = (row * TILE + (TILE - 0.5)).clamp_(max=self.height - 0.5) + SLACK - my
 
         def edge(dy: Tensor, sign: float) -> Tensor:
             dy = torch.minimum(torch.maximum(dy, top), bottom)
-            reach = (level - dy * dy * inverse_yy).clamp_min_(0).mul_(variance).sqrt_().add_(_SLACK)
+            reach = (level - dy * dy * inverse_yy).clamp_min_(0).mul_(variance).sqrt_().add_(SLACK)
             return (mx + slope * dy).add_(reach, alpha=sign)
 
         column0 = _tile_of(edge(-peak, -1.0), up=True, tiles=self.columns).clamp_(min=region.left)

@@ -23,9 +23,9 @@ def three_threads(monkeypatch):
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize(("threads", "compiled", "used"), [(None, False, 1), (2, False, 2), (None, True, 3)])
+@pytest.mark.parametrize(("threads", "used"), [(None, 1), (2, 2)])
 def test_steps_use_the_threads_chosen_or_set(
-    three_threads, monkeypatch, wall_scene, wall_config, tmp_path, threads, compiled, used
+    three_threads, monkeypatch, wall_scene, wall_config, tmp_path, threads, used
 ):
     seen = set()
 
@@ -36,7 +36,7 @@ def test_steps_use_the_threads_chosen_or_set(
     monkeypatch.setattr("pointsplat_ns.nerfstudio_plugin.stopping.StoppableTrainer.one_step", one_step)
     monkeypatch.setattr("nerfstudio.engine.trainer.Trainer.save_checkpoint", lambda *args: None)
     config = wall_config(wall_scene, tmp_path, 3)
-    config.threads, config.early_look, config.pipeline.model.compiled = threads, False, compiled
+    config.threads, config.early_look = threads, False
     config.steps_per_eval_image = 0
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()

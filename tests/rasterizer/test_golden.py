@@ -96,7 +96,7 @@ def test_a_small_budget_does_draw_in_regions(stored, monkeypatch):
     regions = []
     tiles = Footprints.tiles
     monkeypatch.setattr(Footprints, "tiles", lambda self, region: regions.append(region) or tiles(self, region))
-    draw(stored["degree 1"], golden.SCENES["degree 1"], F32, memory_budget=4000)
+    draw(stored["degree 1"], golden.SCENES["degree 1"], F32, memory_budget=4000, **TORCH)
     assert len(set(regions)) > 1
 
 
