@@ -87,10 +87,10 @@ class StoppableTrainer(Trainer):
         if torch.device(self.device).type == "cpu":
             keep_freed_memory()
         try:
+            super().setup(test_mode)
             model = self.config.pipeline.model
             if self.local_rank == 0 and isinstance(model, RasterizerOptions):
                 CONSOLE.log(model.engine(torch.device(self.device)))
-            super().setup(test_mode)
         except PointSplatError:
             self._withdraw()
             raise
