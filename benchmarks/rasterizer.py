@@ -24,7 +24,7 @@ from options import Options, write_json
 from report import Result, console, plot, print_tables, summary
 from scenes import Scene, room_scene, trained_scenes
 from torch import Tensor
-from yardstick import EXACT_EXTENT, Yardstick, load_yardstick
+from yardstick import CLASSIC_EXTENT, EXACT_EXTENT, TIGHT_EXTENT, Yardstick, load_yardstick
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.rasterizer import rasterization, rasterize_reference
@@ -54,8 +54,9 @@ VARIANTS: dict[str, Draw] = {
 }
 """What is timed, by name; the first is the one that the others' errors and all ratios refer to."""
 
-PEERS = {"C++": False, "C++ boxes": True}
-"""The C++ peer per pixel, which is the classic design, and turned inside out, which is faster (see yardstick.cpp)."""
+PEERS = {"C++": (CLASSIC_EXTENT, False), "C++ boxes": (CLASSIC_EXTENT, True), "C++ tight": (TIGHT_EXTENT, True)}
+"""The C++ peer per pixel, which is the classic design; turned inside out, which is faster; and that with tight boxes
+(see yardstick.cpp): extent and whether by boxes."""
 SIZES = ((160, 120), (640, 480), (1200, 680))
 COUNTS = (10_000, 60_000, 200_000, 300_000, 1_000_000)
 MAIN_SIZE, MAIN_COUNT, REFERENCE_COUNT = (640, 480), 200_000, 10_000
@@ -250,8 +251,8 @@ def run_case(case: Case, args: Args, floor: dict[str, float], module: Any, with_
     functions["stages"] = case.time_stages
     with_peer = module is not None and pairs["needed"] <= KEPT_HITS_MAX
     if with_peer:
-        for name, boxes in PEERS.items():
-            peer = Yardstick(module, boxes=boxes)
+        for name, (extent, boxes) in PEERS.items():
+            peer = Yardstick(module, extent, boxes)
             functions[name] = lambda name=name, peer=peer: case.time_yardstick(name, peer)
     if with_gsplat:
         functions["gsplat"] = case.time_gsplat

@@ -43,7 +43,7 @@ class Result:
 def summary(result: Result, base: str) -> str:
     """One case in one line."""
     parts = [f"{result.scene} at {result.width}x{result.height}"]
-    for name in (base, "C++", "C++ boxes", "gsplat"):
+    for name in (base, "C++", "C++ boxes", "C++ tight", "gsplat"):
         if result.both(name) is not None:
             ahead, back = result.seconds[f"{name} forward"], result.seconds[f"{name} backward"]
             parts.append(f"{name} {ahead:.3f} + {back:.3f} s")
@@ -84,6 +84,7 @@ def print_tables(
             (f"C++ / {variant}, backward", _speedup("C++ backward", f"{variant} backward")),
             (f"C++ / {variant}, both", lambda r, v=variant: _times(r.both("C++"), r.both(v))),
             (f"C++ boxes / {variant}, both", lambda r, v=variant: _times(r.both("C++ boxes"), r.both(v))),
+            (f"C++ tight / {variant}, both", lambda r, v=variant: _times(r.both("C++ tight"), r.both(v))),
         ]
     peers += [
         (f"{base} / floor, forward", _speedup(f"{base} inference", "floor forward")),
@@ -95,7 +96,7 @@ def print_tables(
 
     shared = ("projection", "binning", "projection backward")
     peer = [(f"C++ {name}", _milliseconds(f"C++ stage {name}")) for name in shared]
-    for name in ("C++", "C++ boxes"):
+    for name in ("C++", "C++ boxes", "C++ tight"):
         peer += [(f"{name} {stage}", _milliseconds(f"{name} stage {stage}")) for stage in STAGES[3:5]]
         peer.append((f"{name} both", lambda r, n=name: "-" if r.both(n) is None else f"{1e3 * r.both(n):.1f}"))
     peer += [
@@ -169,6 +170,7 @@ def plot(results: Sequence[Result], base: str, path: Path) -> None:
         base: ("o", True),
         "C++": ("x", True),
         "C++ boxes": ("+", True),
+        "C++ tight": ("*", True),
         "gsplat": ("^", True),
         "floor": ("_", False),
     }

@@ -1,13 +1,14 @@
 // A plain single-threaded rasterizer of 3D Gaussians in the classic design, forward and backward: what
 // benchmarks/rasterizer.py compares with. Scalar code on one core, nothing of it is used by the package.
 //
-//   projection: EWA splatting, SH colours of degree 3, a square of `extent` standard deviations around each mean
+//   projection: EWA splatting, SH colours of degree 3, a square of `extent` standard deviations around each mean, or,
+//               if that is 0, the tight box around the ellipse on which alpha falls to its threshold
 //   binning:    16 x 16 tiles; one depth sort of the Gaussians, then a stable counting sort by tile
 //   forward:    per pixel front to back, scalar exp, stopped when saturated; what was drawn is kept
 //   backward:   per pixel back to front over what was drawn; sums per tile, then per Gaussian
 //
 // `boxes` turns the loops of blending inside out, which suits a CPU better: within a tile Gaussian by Gaussian, and
-// for each only the pixels of its square.
+// for each only the pixels of its square or box.
 //
 // Formulas: Zwicker et al., "EWA Splatting" (2002); Kerbl et al., "3D Gaussian Splatting" (2023).
 
@@ -49,7 +50,7 @@ struct Camera {
 };
 
 struct Splat {  // what blending reads of a projected Gaussian
-  float x, y, a, b, c, opacity, limit, r, g, bl, radius;  // limit: the sigma at which alpha falls to alpha_min
+  float x, y, a, b, c, opacity, limit, r, g, bl, rx, ry;  // limit: the sigma at which alpha falls to alpha_min
 };
 
 struct SplatGrad {
@@ -231,10 +232,12 @@ class Yardstick {
       const float x = cam_.fx * g.p[0] * g.rz + cam_.cx, y = cam_.fy * g.p[1] * g.rz + cam_.cy;
       const float mid = 0.5f * (g.xx + g.yy), half = 0.5f * (g.xx - g.yy);
       const float radius = std::ceil(s_.extent * std::sqrt(mid + std::sqrt(half * half + g.xy * g.xy)));
+      const float level = 2 * std::log(opacities[i] / s_.alpha_min);
+      const float rx = s_.extent > 0 ? radius : std::sqrt(level * g.xx), ry = s_.extent > 0 ? radius : std::sqrt(level * g.yy);
       auto tile = [](float at, int end) { return (int)std::floor(std::min((float)end, std::max(0.0f, at / TILE))); };
-      const Box box{tile(x - radius, columns_), std::min(columns_, tile(x + radius, columns_) + 1),
-                    tile(y - radius, rows_), std::min(rows_, tile(y + radius, rows_) + 1)};
-      if (x + radius < 0 || y + radius < 0 || box.x0 >= box.x1 || box.y0 >= box.y1) continue;
+      const Box box{tile(x - rx, columns_), std::min(columns_, tile(x + rx, columns_) + 1),
+                    tile(y - ry, rows_), std::min(rows_, tile(y + ry, rows_) + 1)};
+      if (x + rx < 0 || y + ry < 0 || box.x0 >= box.x1 || box.y0 >= box.y1) continue;
       float d[3], basis[16], color[3];
       for (int k = 0; k < 3; ++k) d[k] = means[3 * i + k] - cam_.centre[k];
       const float length = std::sqrt(dot3(d, d));
@@ -249,7 +252,7 @@ class Yardstick {
       }
       const float o = opacities[i], r = 1 / g.det;
       splats_.push_back({x, y, g.yy * r, -g.xy * r, g.xx * r, o, std::log(o / s_.alpha_min) + 1e-4f, color[0],
-                         color[1], color[2], radius});
+                         color[1], color[2], rx, ry});
       ids_.push_back(i), boxes_.push_back(box), depths_.push_back(g.p[2]), clipped_.push_back(clipped);
     }
   }
@@ -381,10 +384,10 @@ class Yardstick {
       for (int64_t k = offsets_[tile]; k < offsets_[tile + 1] && open > 0; ++k) {
         const Splat& s = splats_[list_[k]];
         auto from = [](float at, int low, int high) { return (int)std::min((float)high, std::max((float)low, at)); };
-        const int px0 = from(std::ceil(s.x - s.radius - 0.5f), x0, x1);
-        const int px1 = from(std::floor(s.x + s.radius + 0.5f), x0, x1);
-        const int py0 = from(std::ceil(s.y - s.radius - 0.5f), y0, y1);
-        const int py1 = from(std::floor(s.y + s.radius + 0.5f), y0, y1);
+        const int px0 = from(std::ceil(s.x - s.rx - 0.5f), x0, x1);
+        const int px1 = from(std::floor(s.x + s.rx + 0.5f), x0, x1);
+        const int py0 = from(std::ceil(s.y - s.ry - 0.5f), y0, y1);
+        const int py1 = from(std::floor(s.y + s.ry + 0.5f), y0, y1);
         for (int py = py0; py < py1; ++py) {
           const float dy = py + 0.5f - s.y, half_c = 0.5f * s.c * dy * dy;
           looked_at_ += px1 - px0;

@@ -13,6 +13,8 @@ from pointsplat_ns.rasterizer import constants
 STAGES = ("projection", "binning", "blending", "blending backward", "projection backward")
 CLASSIC_EXTENT = 3.0
 """Standard deviations around a mean that the classic design looks at."""
+TIGHT_EXTENT = 0.0
+"""Stands for the box around each ellipse on which alpha falls to its threshold."""
 EXACT_EXTENT = 3.4
 """Standard deviations beyond which no opacity reaches 1/255: nothing is cut off, for comparing images."""
 
@@ -37,7 +39,7 @@ class Yardstick:
     module: object
     extent: float = CLASSIC_EXTENT
     boxes: bool = False
-    """Blend Gaussian by Gaussian over the pixels of its square, in place of pixel by pixel over its tile's list."""
+    """Blend Gaussian by Gaussian over the pixels of its square or box, not pixel by pixel over its tile's list."""
     seconds: dict[str, float] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
 
