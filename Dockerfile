@@ -19,9 +19,10 @@ COPY method_configs method_configs
 RUN pip install --no-cache-dir .
 
 FROM python:3.11-slim
-# What OpenCV and open3d load of the system.
+# What OpenCV and open3d load of the system, and the compiler of the rasterizer's kernels: they are made for the processor
+# that they run on.
 RUN apt-get update \
-    && apt-get install --no-install-recommends -y libgl1 libglib2.0-0 libgomp1 libudev1 libx11-6 \
+    && apt-get install --no-install-recommends -y g++ libgl1 libglib2.0-0 libgomp1 libudev1 libx11-6 \
     && rm -rf /var/lib/apt/lists/*
 COPY --from=build /opt/venv /opt/venv
 # Threads that wait for one another spin briefly and then sleep; caches go where any user may write.
