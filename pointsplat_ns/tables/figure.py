@@ -65,8 +65,9 @@ def plot_figure(groups: Sequence[Group], path: Path) -> None:
         right.set_xlabel("log10 of the volume, scene units cubed")
         left.set_ylabel("% of the Gaussians in a bin")
         left.set_title(f"{group.name}, {100 * FIGURE_SHARE:g} % kept", fontsize=10)
-        if left.has_data():
-            right.legend(fontsize=8)
+    drawn = [axis for axis in figure.axes if axis.has_data()]
+    if drawn:
+        figure.legend(*drawn[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, fontsize=8)
     with replacing(path) as part:
         figure.savefig(part, dpi=110, format="png")
 
