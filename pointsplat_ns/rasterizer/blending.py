@@ -11,6 +11,7 @@ Shapes: M Gaussians, 64 = TILE * TILE pixels, D channels.
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import ModuleType
 
 import torch
 from torch import Tensor
@@ -31,13 +32,18 @@ def bytes_per_pair(colors: Tensor) -> int:
     return _BYTES_PER_PAIR * size // 4 + (colors.shape[1] - 3) * size
 
 
+def engine_of(colors: Tensor, compiled: bool | None) -> ModuleType:
+    """What blends colours (M, D): the module with ``tiles_of``, ``blend_region`` and ``differentiate_region``."""
+    return native if native.can_blend(colors, compiled) else blocks
+
+
 class Blend(torch.autograd.Function):
     """Blend projected Gaussians into the tiles of one region; see :func:`blend`."""
 
     @staticmethod
     def forward(ctx, means2d, cov2d, det, opacities, colors, footprints, region, keep_lists, options, absgrad_of):
         """The lists are kept for the backward pass only if ``keep_lists``."""
-        engine = native if native.can_blend(colors, options.compiled) else blocks
+        engine = engine_of(colors, options.compiled)
         tiles = engine.tiles_of(footprints, region)
         image = colors.new_empty(tiles.offsets.numel() - 1, colors.shape[1], PIXELS)
         final = colors.new_empty(tiles.offsets.numel() - 1, PIXELS)
