@@ -16,14 +16,16 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.rasterizer import blocks
-from pointsplat_ns.rasterizer.constants import ALPHA_MAX, EXACT
-from pointsplat_ns.rasterizer.frame import Inputs
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, EXACT, Quality
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
 from pointsplat_ns.rasterizer.tiles import SLACK, Footprints, Region, TileList
 from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
 
 MOST_CHANNELS = 4
 """Channels that the kernels are made for: colours and depth."""
+
+_GEOMETRY = 6
+"""Columns of the table in front of the colours."""
 
 _FEW_PAIRS = 2000
 """Pairs that one thread blends sooner than several can be asked."""
@@ -60,6 +62,14 @@ class _Listing(ctypes.Structure):
     )
 
 
+class Inputs(NamedTuple):
+    """What is blended."""
+
+    table: Tensor  # [M, 6 + D]
+    channels: int
+    quality: Quality
+
+
 class Tape(NamedTuple):
     """What the backward pass needs of the forward pass."""
 
@@ -77,6 +87,32 @@ def can_blend(colors: Tensor, wanted: bool | None) -> bool:
     """
     suited = colors.dtype == torch.float32 and colors.device.type == "cpu" and 1 <= colors.shape[1] <= MOST_CHANNELS
     return suited and KERNELS.usable(wanted)
+
+
+def inputs_of(
+    means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor, quality: Quality
+) -> Inputs:
+    """As :meth:`~pointsplat_ns.rasterizer.frame.Inputs.of`, without what only torch needs."""
+    count, channels = colors.shape
+    tensors = [tensor.contiguous() for tensor in (means2d, cov2d, det, opacities, colors)]
+    table, next_row = colors.new_empty(count, _GEOMETRY + channels), torch.zeros(1, dtype=torch.int64)
+    on_threads(
+        count >= _FEW_PAIRS, KERNELS.library.pointsplat_tabulate, *(tensor.data_ptr() for tensor in tensors), count,
+        channels, table.data_ptr(), next_row.data_ptr(),
+    )  # fmt: skip
+    return Inputs(table, channels, quality)
+
+
+def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list[Tensor]:
+    """As :func:`~pointsplat_ns.rasterizer.quadratics.chain`."""
+    count, next_row = len(summed), torch.zeros(1, dtype=torch.int64)
+    cov2d, det, opacities = cov2d.contiguous(), det.contiguous(), opacities.contiguous()
+    grads = [det.new_empty(count, 2), torch.empty_like(cov2d), torch.empty_like(det), torch.empty_like(opacities)]
+    on_threads(
+        count >= _FEW_PAIRS, KERNELS.library.pointsplat_chain, summed.data_ptr(), summed.stride(0), cov2d.data_ptr(),
+        det.data_ptr(), opacities.data_ptr(), count, *(grad.data_ptr() for grad in grads), next_row.data_ptr(),
+    )  # fmt: skip
+    return grads
 
 
 def tiles_of(footprints: Footprints, region: Region) -> TileList:
@@ -182,16 +218,16 @@ def _as_torch() -> bool:
     det, opacities, colors = cov2d[:, 0] * cov2d[:, 2] - cov2d[:, 1] ** 2, random(count), random(count, 3)
     depths, cameras = random(count), torch.zeros(count, dtype=torch.int64)
     footprints = Footprints(means2d, cov2d, det, opacities, depths, cameras, 1, width, height)
-    inputs = Inputs.of(means2d, cov2d, det, opacities, colors, EXACT)
     number = footprints.rows * footprints.columns
     grads = random(number, 3, PIXELS), random(number, PIXELS)
     drawn = []
     for engine in (blocks, sys.modules[__name__]):
         image, final = torch.empty(number, 3, PIXELS), torch.empty(number, PIXELS)
         tiles = engine.tiles_of(footprints, footprints.whole)
+        inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, EXACT)
         tape = engine.blend_region(footprints, tiles, inputs, image, final, True)
         summed = engine.differentiate_region(footprints, tiles, inputs, tape, final, *grads, True)
-        drawn.append((image, final, summed))
+        drawn.append((image, final, summed, *engine.chain(summed[:, :MOMENTS], cov2d, det, opacities)))
     torchs, ours = drawn
     return agreement(ours, torchs, off=1e-3, share=1e-2)  # a pixel at a threshold may fall either way
 
@@ -202,6 +238,14 @@ KERNELS = Kernels(
     {
         **dict.fromkeys(("pointsplat_list", "pointsplat_blend", "pointsplat_differentiate"), [ctypes.c_void_p]),
         "pointsplat_gather": [ctypes.c_void_p] * 4 + [ctypes.c_int64] * 2 + [ctypes.c_void_p] * 2,
+        "pointsplat_tabulate": [ctypes.c_void_p] * 5 + [ctypes.c_int64] * 2 + [ctypes.c_void_p] * 2,
+        "pointsplat_chain": [
+            ctypes.c_void_p,
+            ctypes.c_int64,
+            *[ctypes.c_void_p] * 3,
+            ctypes.c_int64,
+            *[ctypes.c_void_p] * 5,
+        ],
     },
     _as_torch,
 )

@@ -248,6 +248,12 @@ def test_any_number_of_threads_projects_the_same_bits():
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
 
 
+ALL_KERNELS = {
+    *("project", "unpack", "color", "tabulate", "blend"),
+    *("differentiate", "gather", "chain", "color", "clear", "project_backward"),
+}
+
+
 @pytest.fixture()
 def kernel_calls(monkeypatch):
     """The kernels called within the test."""
@@ -266,7 +272,7 @@ def kernel_calls(monkeypatch):
 @pytest.mark.parametrize(
     ("dtype", "compiled", "names"),
     [
-        (F32, None, {"project", "unpack", "color", "blend", "differentiate", "gather", "project_backward", "clear"}),
+        (F32, None, ALL_KERNELS),
         (F32, False, set()),
         (F64, None, set()),
         (F64, True, set()),
