@@ -6,6 +6,7 @@ For float32 on a CPU, where the machine has a C++ compiler.
 from __future__ import annotations
 
 import ctypes
+import math
 from pathlib import Path
 
 import torch
@@ -107,6 +108,19 @@ def can_project(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor,
     return suited and KERNELS.usable(wanted)
 
 
+def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> int:
+    """As :func:`~pointsplat_ns.rasterizer.projection.count_meaningless`."""
+    library = KERNELS.library
+    tensors = [tensor.contiguous() for tensor in (means, quats, scales, opacities)]
+    ranges = -(-len(means) // library.pointsplat_range())
+    counts, next_range = torch.empty(ranges, dtype=torch.int64), torch.zeros(1, dtype=torch.int64)
+    on_threads(
+        ranges >= _SEVERAL, library.pointsplat_count_meaningless, ctypes.byref(_Scene.of(*tensors)), counts.data_ptr(),
+        next_range.data_ptr(),
+    )  # fmt: skip
+    return int(counts.sum())
+
+
 class CompiledProject(torch.autograd.Function):
     """As :class:`~pointsplat_ns.rasterizer.ewa.Project`."""
 
@@ -196,12 +210,19 @@ def _as_torch() -> bool:
         grads = torch.autograd.grad(total, leaves)
         projected.append((ids, [*(value.detach() for value in values), radii.float(), beyond, *grads]))
     (torchs_ids, torchs), (our_ids, ours) = projected
-    return torch.equal(our_ids, torchs_ids) and agreement(ours, torchs, off=1e-4, share=1e-2)
+    spoilt = [value.clone() for value in scene]
+    for row, (value, wrong) in enumerate(zip(spoilt, (math.nan, math.inf, -1.0, -1.0), strict=True)):
+        value[row] = wrong
+    counted = count_meaningless(*scene) == 0 and count_meaningless(*spoilt) == len(spoilt)
+    return counted and torch.equal(our_ids, torchs_ids) and agreement(ours, torchs, off=1e-4, share=1e-2)
 
 
 KERNELS = Kernels(
     "the rasterizer",
     Path(__file__).with_name("projection.cpp"),
-    dict.fromkeys(("pointsplat_project", "pointsplat_unpack", "pointsplat_project_backward"), [ctypes.c_void_p]),
+    {
+        **dict.fromkeys(("pointsplat_project", "pointsplat_unpack", "pointsplat_project_backward"), [ctypes.c_void_p]),
+        "pointsplat_count_meaningless": [ctypes.c_void_p] * 3,
+    },
     _as_torch,
 )

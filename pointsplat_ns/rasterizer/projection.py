@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.rasterizer import native_projection
 from pointsplat_ns.rasterizer.ewa import Lens, Project
-from pointsplat_ns.rasterizer.native_projection import CompiledProject, can_project
 from pointsplat_ns.views import View
 
 
@@ -66,7 +66,9 @@ def _close(values: Sequence[float], wanted: Sequence[float]) -> bool:
 
 
 @torch.no_grad()
-def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> int:
+def count_meaningless(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, compiled: bool | None = None
+) -> int:
     """Number of Gaussians that no camera can draw: a NaN or infinite parameter, a negative scale or opacity.
 
     Args:
@@ -74,7 +76,10 @@ def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: T
         quats: (N, 4)
         scales: (N, 3)
         opacities: (N,)
+        compiled: as for :func:`~pointsplat_ns.rasterization`.
     """
+    if native_projection.can_project(means, quats, scales, opacities, compiled):
+        return native_projection.count_meaningless(means, quats, scales, opacities)
     # one NaN or infinity spoils a sum, so a clean scene costs four sums and one answer
     total = means.sum() + quats.sum() + scales.sum() + opacities.sum()
     if bool(total.isfinite() & ~(scales < 0).any() & ~(opacities < 0).any()):
@@ -134,5 +139,6 @@ def project(
     if not _close((skew, below, *last), (0.0, 0.0, 0.0, 0.0, 1.0)):
         raise ValueError(f"K is {K.tolist()}; expected no skew: zeros but for fx, fy, cx, cy and the 1 of the last row")
     lens = Lens(fx, fy, cx, cy, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased)
-    function = CompiledProject if can_project(means, quats, scales, opacities, compiled) else Project
+    suited = native_projection.can_project(means, quats, scales, opacities, compiled)
+    function = native_projection.CompiledProject if suited else Project
     return Projected(*function.apply(means, quats, scales, opacities, viewmat[:3, :3].double(), centre, lens))

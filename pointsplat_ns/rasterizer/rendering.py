@@ -21,8 +21,8 @@ RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 QualityName = Literal["exact", "balanced", "fast"]
 
 
-def _cat(tensors: list[Tensor]) -> Tensor:
-    return tensors[0] if len(tensors) == 1 else torch.cat(tensors)
+def _cat(tensors: list[Tensor], dim: int = 0) -> Tensor:
+    return tensors[0] if len(tensors) == 1 else torch.cat(tensors, dim)
 
 
 def finite_colors(seen: Projected, *rest) -> tuple[Projected, Tensor, Tensor]:
@@ -170,14 +170,14 @@ def rasterization(
         )
         for c in range(cameras)
     ]  # fmt: skip
-    skipped = count_meaningless(means, quats, scales, opacities)
+    skipped = count_meaningless(means, quats, scales, opacities, compiled)
     channels = []
     if render_mode.startswith("RGB"):
         colored = [finite_colors(s, colors, c, per_camera, sh_degree, compiled) for c, s in enumerate(seen)]
         seen = [projected for projected, _, _ in colored]
         channels.append(_cat([values for _, values, _ in colored]))
         skipped += torch.cat([bad for _, _, bad in colored]).unique().numel()
-    camera_ids = torch.cat([torch.full_like(s.ids, c) for c, s in enumerate(seen)])
+    camera_ids = _cat([torch.full_like(s.ids, c) for c, s in enumerate(seen)])
     gaussian_ids = torch.cat([s.ids for s in seen])
     dense_ids = camera_ids * n + gaussian_ids
 
@@ -211,7 +211,7 @@ def rasterization(
         setattr(meta_means2d, "absgrad", values)  # noqa: B010 - where gsplat puts it, on the tensor itself
 
     image, through = blend(
-        means2d, cov2d, det, alphas, torch.cat(channels, dim=-1), footprints,
+        means2d, cov2d, det, alphas, _cat(channels, dim=-1), footprints,
         BlendOptions(level, compiled, memory_budget), keep_absgrad if absgrad else None,
     )  # fmt: skip
     accumulated = 1.0 - through
@@ -224,12 +224,11 @@ def rasterization(
         expected = image[..., -1:] / accumulated.clamp_min(1e-10)
         image = torch.cat([image[..., :-1], expected], dim=-1)
 
-    conics = torch.cat([s.conics for s in seen]).detach()
     with torch.no_grad():
         arrays = {
             "radii": packed_of("radii"),
             "depths": depths.detach(),
-            "conics": conics,
+            "conics": _cat([s.conics for s in seen]),
             "opacities": alphas.detach(),
         }
         if not packed:

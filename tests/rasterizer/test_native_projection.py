@@ -10,7 +10,7 @@ import torch
 
 from making import camera_askew, splats_in_view
 from pointsplat_ns.rasterizer import native, native_colors, native_projection, rasterization
-from pointsplat_ns.rasterizer.projection import project
+from pointsplat_ns.rasterizer.projection import count_meaningless, project
 from pointsplat_ns.system.kernels import Kernels, on_threads
 
 WIDTH, HEIGHT = 37, 29
@@ -204,6 +204,15 @@ def test_what_is_seen_and_its_gradients_are_those_of_torch_and_as_near_to_float6
 
 
 @needs_compiler
+@pytest.mark.parametrize("name", CASES)
+def test_as_many_gaussians_are_without_meaning_as_torch_counts(name):
+    scene = [t.float().repeat(3 if t.dim() == 1 else (3, 1)) for t in made(name)[0][:4]]
+    counts = [count_meaningless(*scene, compiled) for compiled in (True, False)]
+    assert counts[0] == counts[1] and (counts[0] > 0) == (name == "without meaning")
+    assert count_meaningless(*(t[:0] for t in scene), True) == 0
+
+
+@needs_compiler
 @pytest.mark.parametrize("count", [0, 1, 9, 60])
 def test_where_no_gaussian_is_seen_gradients_are_zero(count):
     scene = scene_of(60)
@@ -249,7 +258,7 @@ def test_any_number_of_threads_projects_the_same_bits():
 
 
 ALL_KERNELS = {
-    *("project", "unpack", "color", "tabulate", "blend"),
+    *("project", "count_meaningless", "unpack", "color", "tabulate", "blend"),
     *("differentiate", "gather", "chain", "color", "clear", "project_backward"),
 }
 
