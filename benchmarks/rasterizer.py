@@ -28,9 +28,9 @@ from yardstick import CLASSIC_EXTENT, EXACT_EXTENT, TIGHT_EXTENT, Yardstick, loa
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.rasterizer import rasterization, rasterize_reference
-from pointsplat_ns.rasterizer.blending import blend
+from pointsplat_ns.rasterizer.blending import blend, engine_of
+from pointsplat_ns.rasterizer.colors import sh_to_color
 from pointsplat_ns.rasterizer.projection import Projected, project
-from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.rasterizer.tiles import Footprints
 
 Draw = Callable[[list[Tensor], Tensor, Tensor, int, int], tuple[Tensor, Tensor]]
@@ -130,14 +130,15 @@ class Case:
         return Footprints(*geometry, torch.zeros_like(seen.ids), 1, self.width, self.height)
 
     def time_stages(self) -> dict[str, float]:
-        """Stage by stage, forward as in training and backward: what `rasterization` does for one camera.
+        """Stage by stage, forward as in training and backward: what `rasterization` does for one camera, compiled
+        where it is so by default.
 
         Blending makes the lists of tiles itself; that part is timed once more on its own, and counted as binning.
         """
         marks = [now()]
         seen = project(*self.tensors[:4], self.viewmat, self.K, self.width, self.height)
         marks.append(now())
-        colors = sh_to_color(seen.directions, self.tensors[4].index_select(0, seen.ids), 3)
+        colors = sh_to_color(seen.directions, self.tensors[4], 3, seen.ids)
         marks.append(now())
         inputs = [seen.means2d, seen.cov2d, seen.det, seen.opacities, colors]
         leaves = [t.detach().requires_grad_() for t in inputs]
@@ -150,7 +151,7 @@ class Case:
         marks.append(now())
         torch.autograd.grad(inputs, self.tensors, grads)
         marks.append(now())
-        footprints.tiles(footprints.whole)
+        engine_of(colors, None).tiles_of(footprints, footprints.whole)
         marks.append(now())
         names = (
             "projection",

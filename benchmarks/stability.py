@@ -25,7 +25,7 @@ from stability_measures import Row, measured
 from stability_report import TRUSTED, plot_others, plot_rasterizers, tables
 
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.rasterizer.native import why_missing
+from pointsplat_ns.rasterizer.native import KERNELS
 from pointsplat_ns.system.progress import progress_bar
 
 
@@ -46,7 +46,7 @@ def main(
         raise SystemExit(f"no sweep {', '.join(sorted(unknown))}; expected {', '.join(s.name for s in SWEEPS)}")
     output.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
-    compiled = compiled and not why_missing()
+    compiled = compiled and not KERNELS.why_missing
     cases = [(sweep, value) for sweep in SWEEPS if sweep.name in sweeps for value in sweep.values]
     rows: list[Row] = []
     with progress_bar() as show:

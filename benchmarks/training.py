@@ -30,16 +30,16 @@ from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import splatfacto_cpu
 PARTS = {
     "blending": ("Blend",),
     "blending, backward": ("BlendBackward",),
-    "projection": ("Project",),
-    "projection, backward": ("ProjectBackward",),
-    "colours by SH, both ways": ("_Color", "_ColorBackward"),
+    "projection": ("CompiledProject", "Project"),
+    "projection, backward": ("CompiledProjectBackward", "ProjectBackward"),
+    "colours by SH, both ways": ("CompiledColor", "CompiledColorBackward", "Color", "ColorBackward"),
     "Adam": ("Optimizer.step#Adam.step",),
 }
 """Events of torch's profiler that are a part of a step."""
 
 KINDS = {
     "ours": "ours",
-    "torch": "blended by torch, without a compiler",
+    "torch": "drawn by torch, without a compiler",
     "theirs": "with nerfstudio's Adam and SSIM as well",
 }
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.backends import use_gsplat
-from pointsplat_ns.rasterizer.native import why_missing
+from pointsplat_ns.rasterizer.native import KERNELS
 
 VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """Evaluation background of scenes trained with random backgrounds: the viewer's colour, as in Splatfacto."""
@@ -34,7 +34,7 @@ class RasterizerOptions:
             return "rasterizer: gsplat"
         if device.type != "cpu":
             return "rasterizer: torch"
-        why = "as --pipeline.model.compiled is False" if self.compiled is False else why_missing()
+        why = "as --pipeline.model.compiled is False" if self.compiled is False else KERNELS.why_missing
         return (
             f"rasterizer: torch, several times slower than compiled kernels: {why}" if why else "rasterizer: compiled"
         )

@@ -11,15 +11,16 @@ Shapes: M Gaussians, 64 = TILE * TILE pixels, D channels.
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import ModuleType
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.rasterizer import blocks, native
 from pointsplat_ns.rasterizer.constants import TILE
-from pointsplat_ns.rasterizer.frame import BlendOptions, Inputs
+from pointsplat_ns.rasterizer.frame import BlendOptions
 from pointsplat_ns.rasterizer.precision import full_precision
-from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS, chain
+from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
 from pointsplat_ns.rasterizer.tiles import Footprints, Region
 
 _BYTES_PER_PAIR = 192  # of RGB in float32: lists, tape, gradient sums; 75 MB for 0.30 M pairs, less what images take
@@ -31,17 +32,23 @@ def bytes_per_pair(colors: Tensor) -> int:
     return _BYTES_PER_PAIR * size // 4 + (colors.shape[1] - 3) * size
 
 
+def engine_of(colors: Tensor, compiled: bool | None) -> ModuleType:
+    """What blends colours (M, D): the module with ``inputs_of``, ``tiles_of``, ``blend_region``,
+    ``differentiate_region`` and ``chain``."""
+    return native if native.can_blend(colors, compiled) else blocks
+
+
 class Blend(torch.autograd.Function):
     """Blend projected Gaussians into the tiles of one region; see :func:`blend`."""
 
     @staticmethod
     def forward(ctx, means2d, cov2d, det, opacities, colors, footprints, region, keep_lists, options, absgrad_of):
         """The lists are kept for the backward pass only if ``keep_lists``."""
-        engine = native if native.can_blend(colors, options.compiled) else blocks
+        engine = engine_of(colors, options.compiled)
         tiles = engine.tiles_of(footprints, region)
         image = colors.new_empty(tiles.offsets.numel() - 1, colors.shape[1], PIXELS)
         final = colors.new_empty(tiles.offsets.numel() - 1, PIXELS)
-        inputs = Inputs.of(means2d, cov2d, det, opacities, colors, options.quality)
+        inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, options.quality)
         needs_grad = any(ctx.needs_input_grad)
         tape = engine.blend_region(footprints, tiles, inputs, image, final, needs_grad and keep_lists)
         if needs_grad:
@@ -55,7 +62,7 @@ class Blend(torch.autograd.Function):
     def backward(ctx, grad_image, grad_final):
         means2d, cov2d, det, opacities, colors, final = ctx.saved_tensors
         footprints, region, options, absgrad_of, engine = ctx.arguments
-        inputs = Inputs.of(means2d, cov2d, det, opacities, colors, options.quality)
+        inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, options.quality)
         if ctx.kept:
             tiles, tape = ctx.kept
         else:
@@ -68,7 +75,7 @@ class Blend(torch.autograd.Function):
         first, last = MOMENTS, MOMENTS + inputs.channels
         if absgrad_of is not None:
             absgrad_of(summed[:, last:])
-        grads = chain(summed[:, :first], cov2d, det, opacities)
+        grads = engine.chain(summed[:, :first], cov2d, det, opacities)
         return *grads, summed[:, first:last], None, None, None, None, None
 
 

@@ -1,4 +1,4 @@
-"""The arithmetic of EWA splatting with its hand-derived gradient: what :func:`projection.project` runs.
+"""The arithmetic of EWA splatting with its hand-derived gradient: what :func:`projection.project` runs in torch.
 
 Everything is held component by component, (components, M), so that each operation runs over contiguous
 memory; no matrices are built per Gaussian. With ``W`` the camera's rotation, ``R`` that of the Gaussian,
@@ -55,6 +55,12 @@ class Lens(NamedTuple):
         """Bound of ``|J| z``, pixels: of the focal length times the length of (1, 1, clamp)."""
         bounds = [abs(bound) for bound in (*self.clamp_x(), *self.clamp_y())]
         return max(abs(self.fx), abs(self.fy)) * (1.0 + sum(bounds))
+
+
+def longest_axis(dtype: torch.dtype) -> float:
+    """Bound of standard deviations in the image, pixels, 1e9 in float32: of longer ones the determinant would overflow,
+    and over any image they are as flat."""
+    return torch.finfo(dtype).max ** 0.25 / 4
 
 
 def _ordered(low: float, high: float) -> tuple[float, float]:
@@ -150,9 +156,7 @@ class Project(torch.autograd.Function):
         unit, inverse_length = unit_rows(quats.index_select(0, ids).T.contiguous())
         std = scales.index_select(0, ids).T.contiguous()
         meaningful = (std >= 0).all(0)
-        # An axis of more than 1e9 pixels would overflow the determinant; over any image it is as flat as one of 1e9.
-        longest = torch.finfo(std.dtype).max ** 0.25 / 4
-        std = torch.minimum(std, points[2] * (longest / lens.steepness()))
+        std = torch.minimum(std, points[2] * (longest_axis(std.dtype) / lens.steepness()))
         shape = _shape(slopes, rz, unit, std, view, lens)
 
         p1, p2 = shape.p1, shape.p2

@@ -18,9 +18,10 @@ constexpr int TILE = 8, PIXELS = TILE * TILE;
 constexpr int CHUNK = 32;    // Gaussians between two checks for saturation, and between two kept transmittances
 constexpr int GRAB = 4;      // tiles that a thread takes at once
 constexpr int MOMENTS = 6;   // w, w^2, dv, dv^2, w dv, 1
-constexpr int COLOR = 11;    // first column of the colours in the table
+constexpr int COLOR = 6;     // first column of the colours in the table
+constexpr int TAKE = 1024;   // Gaussians that a thread takes at once
 constexpr float HALF = 0.5f * (TILE - 1);
-constexpr float LN2 = 0.693147180559945f;
+constexpr float LN2 = 0.693147180559945f, LOG2E = 1.44269504088896f;
 constexpr float SLACK = 1e-3f;  // log2 alpha: rounding never leaves out a pixel that is drawn
 
 typedef float Row __attribute__((vector_size(4 * TILE)));
@@ -68,7 +69,7 @@ extern "C" {
 
 // What is blended, and where to. Tiles are those of a region of one or several images of equal size, row by row.
 struct Task {
-    const float* table;        // [M, COLOR + channels], rows of quadratics.table_of
+    const float* table;        // [M, COLOR + channels], of pointsplat_tabulate
     const int64_t* gaussians;  // [P] rows of the table, by tile and front to back
     const int64_t* offsets;    // [tiles + 1] where each tile's Gaussians start
     const int64_t* chunks;     // [tiles + 1] where each tile's chunks start
@@ -218,7 +219,7 @@ void differentiate_tile(const Task& task, int64_t tile) {
     constexpr int COLUMNS = MOMENTS + D + (ABSOLUTE ? 2 : 0);
     const Place place = place_of(task, tile);
     const int64_t begin = task.offsets[tile], passed = begin + task.blended[tile], end = task.offsets[tile + 1];
-    std::memset(task.sums + passed * COLUMNS, 0, sizeof(float) * (end - passed) * COLUMNS);
+    std::fill(task.sums + passed * COLUMNS, task.sums + end * COLUMNS, 0.0f);
     Row pixels[TILE][D], behind[TILE], alphas[CHUNK][TILE], weights[CHUNK][TILE];
     for (int row = 0; row < TILE; ++row) {
         const int64_t at = tile * PIXELS + row * TILE;
@@ -252,6 +253,15 @@ void each_tile(const Task& task, Work work) {
         const int64_t first = __atomic_fetch_add(task.next, GRAB, __ATOMIC_RELAXED);
         if (first >= task.tiles) return;
         for (int64_t tile = first; tile < first + GRAB && tile < task.tiles; ++tile) work(task, tile);
+    }
+}
+
+template <typename Work>
+void each_gaussian(int64_t* next, int64_t count, Work work) {
+    for (;;) {
+        const int64_t first = __atomic_fetch_add(next, TAKE, __ATOMIC_RELAXED);
+        if (first >= count) return;
+        for (int64_t i = first; i < first + TAKE && i < count; ++i) work(i);
     }
 }
 
@@ -340,17 +350,42 @@ void pointsplat_list(const Listing* listing) {
 // For each of ``count`` Gaussians the sum of its pairs: rows ``pairs[starts[i]]`` to ``pairs[starts[i + 1] - 1]``.
 void pointsplat_gather(const float* sums, const int64_t* pairs, const int64_t* starts, const int64_t* order, int64_t count,
                        int64_t columns, float* out, int64_t* next) {
-    constexpr int64_t TAKE = 1024;
-    for (;;) {
-        const int64_t first = __atomic_fetch_add(next, TAKE, __ATOMIC_RELAXED);
-        if (first >= count) return;
-        for (int64_t i = first; i < first + TAKE && i < count; ++i) {
-            float* to = out + order[i] * columns;
-            for (int64_t c = 0; c < columns; ++c) to[c] = 0.0f;
-            for (int64_t j = starts[i]; j < starts[i + 1]; ++j)
-                for (int64_t c = 0; c < columns; ++c) to[c] += sums[pairs[j] * columns + c];
-        }
-    }
+    each_gaussian(next, count, [&](int64_t i) {
+        float* to = out + order[i] * columns;
+        for (int64_t c = 0; c < columns; ++c) to[c] = 0.0f;
+        for (int64_t j = starts[i]; j < starts[i + 1]; ++j)
+            for (int64_t c = 0; c < columns; ++c) to[c] += sums[pairs[j] * columns + c];
+    });
+}
+
+// What a tile reads of a Gaussian: x, y (pixels), r, a, d (log2 per pixels^2), log2 opacity, the colour; as
+// quadratics.table_of.
+void pointsplat_tabulate(const float* means2d, const float* cov2d, const float* det, const float* opacities,
+                         const float* colors, int64_t count, int64_t channels, float* table, int64_t* next) {
+    each_gaussian(next, count, [&](int64_t i) {
+        const float xy = cov2d[3 * i + 1], yy = cov2d[3 * i + 2];
+        float* row = table + i * (COLOR + channels);
+        row[0] = means2d[2 * i], row[1] = means2d[2 * i + 1];
+        row[2] = xy / yy, row[3] = LOG2E * yy / det[i], row[4] = LOG2E / yy, row[5] = std::log2(opacities[i]);
+        std::copy_n(colors + i * channels, channels, row + COLOR);
+    });
+}
+
+// From the moments of Gaussians, the first columns of ``sums``, to their gradients; as quadratics.chain.
+void pointsplat_chain(const float* sums, int64_t columns, const float* cov2d, const float* det, const float* opacities,
+                      int64_t count, float* grad_means2d, float* grad_cov2d, float* grad_det, float* grad_opacities,
+                      int64_t* next) {
+    each_gaussian(next, count, [&](int64_t i) {
+        const float* sum = sums + i * columns;
+        const float w = sum[0], ww = sum[1], v = sum[2], vv = sum[3], wv = sum[4], one = sum[5];
+        const float xy = cov2d[3 * i + 1], yy = cov2d[3 * i + 2], a = yy / det[i], r = xy / yy, d = 1.0f / yy;
+        const float grad_x = a * w, grad_a = -0.5f * ww, grad_r = a * wv, grad_d = -0.5f * vv;
+        grad_means2d[2 * i] = grad_x, grad_means2d[2 * i + 1] = d * v - r * grad_x;
+        grad_cov2d[3 * i] = 0.0f, grad_cov2d[3 * i + 1] = grad_r * d;
+        grad_cov2d[3 * i + 2] = grad_a / det[i] - (grad_r * r + grad_d * d) * d;
+        grad_det[i] = -grad_a * a / det[i];
+        grad_opacities[i] = one / opacities[i];
+    });
 }
 
 }  // extern "C"

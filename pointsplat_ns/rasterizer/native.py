@@ -7,12 +7,8 @@ what it made does not draw as torch does, blending stays with torch.
 from __future__ import annotations
 
 import ctypes
-import functools
 import math
-import os
 import sys
-import warnings
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,16 +16,16 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.rasterizer import blocks
-from pointsplat_ns.rasterizer.constants import ALPHA_MAX, EXACT
-from pointsplat_ns.rasterizer.frame import Inputs
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, EXACT, Quality
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
 from pointsplat_ns.rasterizer.tiles import SLACK, Footprints, Region, TileList
-from pointsplat_ns.system.native_code import NativeCodeError, load_native
-
-SOURCE = Path(__file__).with_name("kernels.cpp")
+from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
 
 MOST_CHANNELS = 4
 """Channels that the kernels are made for: colours and depth."""
+
+_GEOMETRY = 6
+"""Columns of the table in front of the colours."""
 
 _FEW_PAIRS = 2000
 """Pairs that one thread blends sooner than several can be asked."""
@@ -66,6 +62,14 @@ class _Listing(ctypes.Structure):
     )
 
 
+class Inputs(NamedTuple):
+    """What is blended."""
+
+    table: Tensor  # [M, 6 + D]
+    channels: int
+    quality: Quality
+
+
 class Tape(NamedTuple):
     """What the backward pass needs of the forward pass."""
 
@@ -81,56 +85,38 @@ def can_blend(colors: Tensor, wanted: bool | None) -> bool:
         colors: of the projected Gaussians.
         wanted: None where a machine without a compiler is no reason for a warning.
     """
-    if wanted is False or colors.dtype != torch.float32 or colors.device.type != "cpu":
-        return False
-    if not 1 <= colors.shape[1] <= MOST_CHANNELS:
-        return False
-    why = why_missing()
-    if why and wanted:
-        warnings.warn(f"the rasterizer could not be compiled and stays with torch: {why}", stacklevel=2)
-    return not why
+    suited = colors.dtype == torch.float32 and colors.device.type == "cpu" and 1 <= colors.shape[1] <= MOST_CHANNELS
+    return suited and KERNELS.usable(wanted)
 
 
-@functools.cache
-def why_missing() -> str:
-    """Why this machine has no kernels; empty if it has. They are built if need be, and tried."""
-    library, why = _kernels()
-    return why if library is None or _as_torch() else "what the compiler made does not draw what torch draws"
+def inputs_of(
+    means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor, quality: Quality
+) -> Inputs:
+    """As :meth:`~pointsplat_ns.rasterizer.frame.Inputs.of`, without what only torch needs."""
+    count, channels = colors.shape
+    tensors = [tensor.contiguous() for tensor in (means2d, cov2d, det, opacities, colors)]
+    table, next_row = colors.new_empty(count, _GEOMETRY + channels), torch.zeros(1, dtype=torch.int64)
+    on_threads(
+        count >= _FEW_PAIRS, KERNELS.library.pointsplat_tabulate, *(tensor.data_ptr() for tensor in tensors), count,
+        channels, table.data_ptr(), next_row.data_ptr(),
+    )  # fmt: skip
+    return Inputs(table, channels, quality)
 
 
-@functools.cache
-def _kernels() -> tuple[ctypes.CDLL | None, str]:
-    """The kernels, or why there are none."""
-    try:
-        library = load_native(SOURCE)
-    except NativeCodeError as error:
-        return None, str(error)
-    for name in ("pointsplat_list", "pointsplat_blend", "pointsplat_differentiate"):
-        getattr(library, name).argtypes, getattr(library, name).restype = [ctypes.c_void_p], None
-    library.pointsplat_gather.argtypes = [ctypes.c_void_p] * 4 + [ctypes.c_int64] * 2 + [ctypes.c_void_p] * 2
-    library.pointsplat_gather.restype = None
-    return library, ""
-
-
-@functools.cache
-def _pool(process: int) -> ThreadPoolExecutor:
-    """Threads of a process: those of one that forked are not the other's."""
-    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="pointsplat-blend")
-
-
-def _on_threads(pairs: int, function, *arguments) -> None:
-    """Call a kernel in as many threads as torch uses. They share the work; ctypes lets go of Python meanwhile."""
-    threads = 1 if pairs < _FEW_PAIRS else torch.get_num_threads()
-    others = [_pool(os.getpid()).submit(function, *arguments) for _ in range(threads - 1)]
-    function(*arguments)
-    for other in others:
-        other.result()
+def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list[Tensor]:
+    """As :func:`~pointsplat_ns.rasterizer.quadratics.chain`."""
+    count, next_row = len(summed), torch.zeros(1, dtype=torch.int64)
+    cov2d, det, opacities = cov2d.contiguous(), det.contiguous(), opacities.contiguous()
+    grads = [det.new_empty(count, 2), torch.empty_like(cov2d), torch.empty_like(det), torch.empty_like(opacities)]
+    on_threads(
+        count >= _FEW_PAIRS, KERNELS.library.pointsplat_chain, summed.data_ptr(), summed.stride(0), cov2d.data_ptr(),
+        det.data_ptr(), opacities.data_ptr(), count, *(grad.data_ptr() for grad in grads), next_row.data_ptr(),
+    )  # fmt: skip
+    return grads
 
 
 def tiles_of(footprints: Footprints, region: Region) -> TileList:
     """As :meth:`~pointsplat_ns.rasterizer.tiles.Footprints.tiles`."""
-    library, _ = _kernels()
-    assert library is not None
     f, rows, columns = footprints, region.rows, region.columns
     count, tiles = f.order.numel(), f.cameras * rows * columns
     counts, offsets = torch.empty_like(f.order), torch.zeros(tiles + 1, dtype=torch.int64)
@@ -141,12 +127,12 @@ def tiles_of(footprints: Footprints, region: Region) -> TileList:
         top=region.top, left=region.left, height=f.height, slack=SLACK, counts=counts.data_ptr(),
         offsets=offsets.data_ptr(),
     )  # fmt: skip
-    library.pointsplat_list(ctypes.byref(listing))
+    KERNELS.library.pointsplat_list(ctypes.byref(listing))
     offsets = torch.cumsum(offsets, 0)
     gaussians, places = offsets.new_empty(int(offsets[-1])), offsets.new_empty(int(offsets[-1]))
     listing.offsets, listing.gaussians, listing.places = offsets.data_ptr(), gaussians.data_ptr(), places.data_ptr()
     if len(gaussians):
-        library.pointsplat_list(ctypes.byref(listing))
+        KERNELS.library.pointsplat_list(ctypes.byref(listing))
     return TileList(gaussians, offsets, places, counts, f.order, region)
 
 
@@ -166,8 +152,7 @@ def blend_region(
     footprints: Footprints, tiles: TileList, inputs: Inputs, image: Tensor, final: Tensor, keep_tape: bool
 ) -> Tape | None:
     """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); the tape if it is wanted."""
-    library, _ = _kernels()
-    assert library is not None
+    library = KERNELS.library
     size = library.pointsplat_chunk()
     chunks = torch.zeros_like(tiles.offsets)
     torch.cumsum((tiles.offsets.diff() + (size - 1)).div_(size, rounding_mode="floor"), 0, out=chunks[1:])
@@ -176,7 +161,7 @@ def blend_region(
     task = _task(footprints, tiles, inputs, chunks, next_tile)
     task.image, task.final, task.blended = image.data_ptr(), final.data_ptr(), blended.data_ptr()
     task.before = before.data_ptr() if keep_tape and len(before) else None
-    _on_threads(tiles.gaussians.numel(), library.pointsplat_blend, ctypes.byref(task))
+    on_threads(tiles.gaussians.numel() >= _FEW_PAIRS, library.pointsplat_blend, ctypes.byref(task))
     return Tape(before, blended, chunks) if keep_tape else None
 
 
@@ -191,8 +176,7 @@ def differentiate_region(
     absgrad: bool,
 ) -> Tensor:
     """Moments, colour gradients and absolute gradients of the Gaussians from one region, (M, MOMENTS + D [+ 2])."""
-    library, _ = _kernels()
-    assert library is not None
+    library = KERNELS.library
     pairs, count = tiles.gaussians.numel(), tiles.order.numel()
     columns = MOMENTS + inputs.channels + (2 if absgrad else 0)
     sums, out = grad_image.new_empty(pairs, columns), grad_image.new_empty(count, columns)
@@ -205,7 +189,7 @@ def differentiate_region(
     task.final, task.before, task.blended = final.data_ptr(), tape.before.data_ptr(), tape.blended.data_ptr()
     task.grad_image, task.grad_final = grad_image.data_ptr(), grad_final.data_ptr()
     task.sums, task.absolute = sums.data_ptr(), int(absgrad)
-    _on_threads(pairs, library.pointsplat_differentiate, ctypes.byref(task))
+    on_threads(pairs >= _FEW_PAIRS, library.pointsplat_differentiate, ctypes.byref(task))
 
     # sums of pairs, one after the other for each Gaussian
     by_gaussian = torch.empty_like(tiles.places)
@@ -213,8 +197,8 @@ def differentiate_region(
     starts = torch.zeros(count + 1, dtype=torch.int64)
     torch.cumsum(tiles.counts, 0, out=starts[1:])
     next_tile.zero_()
-    _on_threads(
-        pairs, library.pointsplat_gather, sums.data_ptr(), by_gaussian.data_ptr(), starts.data_ptr(),
+    on_threads(
+        pairs >= _FEW_PAIRS, library.pointsplat_gather, sums.data_ptr(), by_gaussian.data_ptr(), starts.data_ptr(),
         tiles.order.data_ptr(), count, columns, out.data_ptr(), next_tile.data_ptr(),
     )  # fmt: skip
     return out
@@ -222,7 +206,7 @@ def differentiate_region(
 
 @torch.no_grad()
 def _as_torch() -> bool:
-    """Whether the kernels draw a small picture, and its gradients, as torch does: no miscompilation passes."""
+    """Whether the kernels draw a small picture, and its gradients, as torch does."""
     generator = torch.Generator().manual_seed(0)
     count, width, height = 90, 21, 18
 
@@ -234,18 +218,34 @@ def _as_torch() -> bool:
     det, opacities, colors = cov2d[:, 0] * cov2d[:, 2] - cov2d[:, 1] ** 2, random(count), random(count, 3)
     depths, cameras = random(count), torch.zeros(count, dtype=torch.int64)
     footprints = Footprints(means2d, cov2d, det, opacities, depths, cameras, 1, width, height)
-    inputs = Inputs.of(means2d, cov2d, det, opacities, colors, EXACT)
     number = footprints.rows * footprints.columns
     grads = random(number, 3, PIXELS), random(number, PIXELS)
     drawn = []
     for engine in (blocks, sys.modules[__name__]):
         image, final = torch.empty(number, 3, PIXELS), torch.empty(number, PIXELS)
         tiles = engine.tiles_of(footprints, footprints.whole)
+        inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, EXACT)
         tape = engine.blend_region(footprints, tiles, inputs, image, final, True)
         summed = engine.differentiate_region(footprints, tiles, inputs, tape, final, *grads, True)
-        drawn.append((image, final, summed))
-    # A pixel at a threshold may fall either way.
-    return all(
-        bool((ours - torchs).abs().gt(1e-3 * torchs.abs().amax()).float().mean() < 1e-2)
-        for torchs, ours in zip(*drawn, strict=True)
-    )
+        drawn.append((image, final, summed, *engine.chain(summed[:, :MOMENTS], cov2d, det, opacities)))
+    torchs, ours = drawn
+    return agreement(ours, torchs, off=1e-3, share=1e-2)  # a pixel at a threshold may fall either way
+
+
+KERNELS = Kernels(
+    "the rasterizer",
+    Path(__file__).with_name("kernels.cpp"),
+    {
+        **dict.fromkeys(("pointsplat_list", "pointsplat_blend", "pointsplat_differentiate"), [ctypes.c_void_p]),
+        "pointsplat_gather": [ctypes.c_void_p] * 4 + [ctypes.c_int64] * 2 + [ctypes.c_void_p] * 2,
+        "pointsplat_tabulate": [ctypes.c_void_p] * 5 + [ctypes.c_int64] * 2 + [ctypes.c_void_p] * 2,
+        "pointsplat_chain": [
+            ctypes.c_void_p,
+            ctypes.c_int64,
+            *[ctypes.c_void_p] * 3,
+            ctypes.c_int64,
+            *[ctypes.c_void_p] * 5,
+        ],
+    },
+    _as_torch,
+)

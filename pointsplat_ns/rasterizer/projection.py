@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.rasterizer import native_projection
 from pointsplat_ns.rasterizer.ewa import Lens, Project
 from pointsplat_ns.views import View
 
@@ -65,7 +66,9 @@ def _close(values: Sequence[float], wanted: Sequence[float]) -> bool:
 
 
 @torch.no_grad()
-def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> int:
+def count_meaningless(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, compiled: bool | None = None
+) -> int:
     """Number of Gaussians that no camera can draw: a NaN or infinite parameter, a negative scale or opacity.
 
     Args:
@@ -73,7 +76,10 @@ def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: T
         quats: (N, 4)
         scales: (N, 3)
         opacities: (N,)
+        compiled: as for :func:`~pointsplat_ns.rasterization`.
     """
+    if native_projection.can_project(means, quats, scales, opacities, compiled):
+        return native_projection.count_meaningless(means, quats, scales, opacities)
     # one NaN or infinity spoils a sum, so a clean scene costs four sums and one answer
     total = means.sum() + quats.sum() + scales.sum() + opacities.sum()
     if bool(total.isfinite() & ~(scales < 0).any() & ~(opacities < 0).any()):
@@ -106,6 +112,7 @@ def project(
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
     antialiased: bool = False,
+    compiled: bool | None = None,
 ) -> Projected:
     """Project the Gaussians that one camera sees; the others are left out.
 
@@ -118,6 +125,9 @@ def project(
     - The compensation is not below 0.005 (Mip-Splatting); gsplat lets it reach 0, where its gradient is unbounded.
     - No axis is drawn longer than 1e9 pixels (float32), so that no determinant overflows.
 
+    Done in torch (:mod:`~pointsplat_ns.rasterizer.ewa`), or by compiled kernels where there is a compiler
+    (:mod:`~pointsplat_ns.rasterizer.native_projection`); ``compiled`` is that of :func:`~pointsplat_ns.rasterization`.
+
     Raises:
         ValueError: if a focal length is zero, or the camera is not finite, has skew or is no motion.
     """
@@ -129,4 +139,6 @@ def project(
     if not _close((skew, below, *last), (0.0, 0.0, 0.0, 0.0, 1.0)):
         raise ValueError(f"K is {K.tolist()}; expected no skew: zeros but for fx, fy, cx, cy and the 1 of the last row")
     lens = Lens(fx, fy, cx, cy, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased)
-    return Projected(*Project.apply(means, quats, scales, opacities, viewmat[:3, :3].double(), centre, lens))
+    suited = native_projection.can_project(means, quats, scales, opacities, compiled)
+    function = native_projection.CompiledProject if suited else Project
+    return Projected(*function.apply(means, quats, scales, opacities, viewmat[:3, :3].double(), centre, lens))

@@ -10,19 +10,19 @@ from torch import Tensor
 from pointsplat_ns.rasterizer.arguments import check_options, check_tensors
 from pointsplat_ns.rasterizer.backends import use_gsplat
 from pointsplat_ns.rasterizer.blending import blend
+from pointsplat_ns.rasterizer.colors import sh_to_color
 from pointsplat_ns.rasterizer.constants import EPS2D, LARGEST_COLOR, QUALITIES, TILE, Quality
 from pointsplat_ns.rasterizer.frame import MEMORY_BUDGET, BlendOptions
 from pointsplat_ns.rasterizer.precision import full_precision
 from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, project
-from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.rasterizer.tiles import Footprints
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 QualityName = Literal["exact", "balanced", "fast"]
 
 
-def _cat(tensors: list[Tensor]) -> Tensor:
-    return tensors[0] if len(tensors) == 1 else torch.cat(tensors)
+def _cat(tensors: list[Tensor], dim: int = 0) -> Tensor:
+    return tensors[0] if len(tensors) == 1 else torch.cat(tensors, dim)
 
 
 def finite_colors(seen: Projected, *rest) -> tuple[Projected, Tensor, Tensor]:
@@ -39,11 +39,13 @@ def finite_colors(seen: Projected, *rest) -> tuple[Projected, Tensor, Tensor]:
     return seen, colors, dropped
 
 
-def _colors_of(seen: Projected, colors: Tensor, camera: int, per_camera: bool, sh_degree: int | None) -> Tensor:
+def _colors_of(
+    seen: Projected, colors: Tensor, camera: int, per_camera: bool, sh_degree: int | None, compiled: bool | None = None
+) -> Tensor:
     colors = colors[camera] if per_camera else colors
     if sh_degree is None:
         return colors.index_select(0, seen.ids)
-    return sh_to_color(seen.directions, colors, sh_degree, seen.ids)
+    return sh_to_color(seen.directions, colors, sh_degree, seen.ids, compiled)
 
 
 @full_precision
@@ -114,9 +116,9 @@ def rasterization(
         backend: what draws. "gsplat" hands everything to gsplat itself, which needs CUDA; "auto" does so
             where it can. What follows has no effect on gsplat.
         quality: what to give up for speed, by name or as thresholds; see ``QUALITIES``.
-        compiled: blend with compiled kernels, three to five times as fast as torch (CPU, float32, at most four
-            channels): None where the machine has a C++ compiler, which takes two seconds once; True warns where it
-            has none; False never.
+        compiled: project and blend with compiled kernels, several times as fast as torch (CPU, float32; blending at
+            most four channels): None where the machine has a C++ compiler, which takes four seconds once; True warns
+            where it has none; False never.
         memory_budget: bytes that lists of pairs may take before the image is drawn in several
             regions, one after the other; the image is the same to rounding.
         tile_size, sparse_grad, channel_chunk: accepted for gsplat's sake, without effect.
@@ -164,18 +166,18 @@ def rasterization(
     seen = [
         project(
             means, quats, scales, opacities, viewmats[c], Ks[c], width, height,
-            near_plane, far_plane, radius_clip, eps2d, rasterize_mode == "antialiased",
+            near_plane, far_plane, radius_clip, eps2d, rasterize_mode == "antialiased", compiled,
         )
         for c in range(cameras)
     ]  # fmt: skip
-    skipped = count_meaningless(means, quats, scales, opacities)
+    skipped = count_meaningless(means, quats, scales, opacities, compiled)
     channels = []
     if render_mode.startswith("RGB"):
-        colored = [finite_colors(s, colors, c, per_camera, sh_degree) for c, s in enumerate(seen)]
+        colored = [finite_colors(s, colors, c, per_camera, sh_degree, compiled) for c, s in enumerate(seen)]
         seen = [projected for projected, _, _ in colored]
         channels.append(_cat([values for _, values, _ in colored]))
         skipped += torch.cat([bad for _, _, bad in colored]).unique().numel()
-    camera_ids = torch.cat([torch.full_like(s.ids, c) for c, s in enumerate(seen)])
+    camera_ids = _cat([torch.full_like(s.ids, c) for c, s in enumerate(seen)])
     gaussian_ids = torch.cat([s.ids for s in seen])
     dense_ids = camera_ids * n + gaussian_ids
 
@@ -209,7 +211,7 @@ def rasterization(
         setattr(meta_means2d, "absgrad", values)  # noqa: B010 - where gsplat puts it, on the tensor itself
 
     image, through = blend(
-        means2d, cov2d, det, alphas, torch.cat(channels, dim=-1), footprints,
+        means2d, cov2d, det, alphas, _cat(channels, dim=-1), footprints,
         BlendOptions(level, compiled, memory_budget), keep_absgrad if absgrad else None,
     )  # fmt: skip
     accumulated = 1.0 - through
@@ -222,12 +224,11 @@ def rasterization(
         expected = image[..., -1:] / accumulated.clamp_min(1e-10)
         image = torch.cat([image[..., :-1], expected], dim=-1)
 
-    conics = torch.cat([s.conics for s in seen]).detach()
     with torch.no_grad():
         arrays = {
             "radii": packed_of("radii"),
             "depths": depths.detach(),
-            "conics": conics,
+            "conics": _cat([s.conics for s in seen]),
             "opacities": alphas.detach(),
         }
         if not packed:

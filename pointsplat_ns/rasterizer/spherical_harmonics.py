@@ -1,4 +1,4 @@
-"""Real spherical harmonics up to degree 3, and colours from them."""
+"""Real spherical harmonics up to degree 3, and colours from them in torch."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901
 _BLOCK = 4096  # Gaussians whose coefficients are read at once on a CPU: 0.8 MB at degree 3
 
 
-def _check_degree(degree: int) -> None:
+def check_degree(degree: int) -> None:
+    """Raise a ValueError unless the degree is 0 to 3."""
     if not 0 <= degree <= 3:
         raise ValueError(f"SH degree is {degree}; expected 0 to 3")
 
@@ -94,13 +95,13 @@ def _blocks(count: int, on_cpu: bool) -> list[slice]:
     return [slice(start, min(start + step, count)) for start in range(0, count, step)]
 
 
-def _offset(color: Tensor) -> Tensor:
+def offset(color: Tensor) -> Tensor:
     """Add the 1/2 of 3DGS, and turn infinities to NaN: a lower bound of 0 would hide that one has no meaning."""
     return (color - color) + (color + 0.5)
 
 
-class _Color(torch.autograd.Function):
-    """Colours of some rows of SH coefficients; see :func:`sh_to_color`."""
+class Color(torch.autograd.Function):
+    """Colours of some rows of SH coefficients; see :func:`~pointsplat_ns.rasterizer.colors.sh_to_color`."""
 
     @staticmethod
     def forward(ctx, directions, coefficients, ids, degree):
@@ -111,7 +112,7 @@ class _Color(torch.autograd.Function):
         for part in _blocks(color.shape[0], color.device.type == "cpu"):
             chosen = coefficients.index_select(0, ids[part])[:, :used]
             torch.bmm(basis[part].unsqueeze(1), chosen, out=color[part].unsqueeze(1))
-        color = _offset(color)
+        color = offset(color)
         ctx.degree = degree
         ctx.save_for_backward(coefficients, unit, inverse_length, basis, color > 0, ids)
         return color.clamp_min_(0.0)
@@ -140,34 +141,6 @@ class _Color(torch.autograd.Function):
         return grad_directions, grad_coefficients, None, None
 
 
-def sh_to_color(directions: Tensor, coefficients: Tensor, degree: int, ids: Tensor | None = None) -> Tensor:
-    """Colours seen along directions, as 3DGS defines them: ``max(SH + 1/2, 0)``.
-
-    Args:
-        directions: (M, 3) from the camera centre to the Gaussian, world space, any length; a zero direction sees
-            the basis at zero.
-        coefficients: (M, K, 3), or (N, K, 3) with ``ids``; K >= (degree + 1)^2, the rest is ignored.
-        degree: 0 to 3.
-        ids: (M,) int64, each at most once: the row of ``coefficients`` that each direction belongs to.
-
-    Returns:
-        (M, 3), not below 0; NaN where a coefficient is not finite.
-
-    Raises:
-        ValueError: if the degree is not 0 to 3, or there are too few coefficients.
-    """
-    _check_degree(degree)
-    used = (degree + 1) ** 2
-    if coefficients.shape[-2] < used:
-        raise ValueError(f"{coefficients.shape[-2]} SH coefficients given; degree {degree} needs {used}")
-    if degree == 0:
-        constant = coefficients[..., 0, :]
-        return _offset(C0 * (constant if ids is None else constant.index_select(0, ids))).clamp_min(0.0)
-    if ids is None:
-        ids = torch.arange(coefficients.shape[0], device=coefficients.device)
-    return _Color.apply(directions, coefficients, ids, degree)
-
-
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """Basis values for unit directions.
 
@@ -181,5 +154,5 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     Raises:
         ValueError: if the degree is not 0 to 3.
     """
-    _check_degree(degree)
+    check_degree(degree)
     return torch.stack(_basis_rows(directions.movedim(-1, 0), degree), dim=-1)

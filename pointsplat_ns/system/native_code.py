@@ -37,14 +37,15 @@ def load_native(source: Path) -> ctypes.CDLL:
     compiler and the processor. Where no such folder can be had it is built anew for each process.
 
     Args:
-        source: the file.
+        source: the file. It may include headers (``.h``) that lie beside it.
 
     Raises:
         NativeCodeError: if there is no compiler, or it fails.
     """
     compiler = _compiler()
     machine, macros = _target(compiler)
-    key = hashlib.sha256(b"\0".join([source.read_bytes(), macros, " ".join((compiler, machine, *_FLAGS)).encode()]))
+    texts = [file.read_bytes() for file in (source, *sorted(source.parent.glob("*.h")))]
+    key = hashlib.sha256(b"\0".join([*texts, macros, " ".join((compiler, machine, *_FLAGS)).encode()]))
     name = f"{source.stem}-{key.hexdigest()[:20]}.so"
     folder = _cache_folder()
     with contextlib.ExitStack() as stack:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import subprocess
 import sys
@@ -14,10 +13,11 @@ import torch
 from making import splats_in_view
 from pointsplat_ns.rasterizer import native, rasterization
 from pointsplat_ns.rasterizer.constants import QUALITIES
+from pointsplat_ns.system.kernels import Kernels, on_threads
 
 WIDTH, HEIGHT = 70, 45  # neither is a multiple of the tile
 
-needs_compiler = pytest.mark.skipif(bool(native.why_missing()), reason=native.why_missing())
+needs_compiler = pytest.mark.skipif(bool(native.KERNELS.why_missing), reason=native.KERNELS.why_missing)
 
 
 def draw(channels=3, n=3000, dtype=torch.float32, absgrad=True, cameras=1, **options):
@@ -36,14 +36,14 @@ def draw(channels=3, n=3000, dtype=torch.float32, absgrad=True, cameras=1, **opt
 
 @pytest.fixture()
 def kernel_calls(monkeypatch):
-    """The names of the kernels called within the test."""
+    """The kernels called within the test."""
     called = []
-    on_threads = native._on_threads
-    monkeypatch.setattr(
-        native,
-        "_on_threads",
-        lambda pairs, function, *rest: called.append(function) or on_threads(pairs, function, *rest),
-    )
+
+    def recorded(worth_it, function, *arguments):
+        called.append(function)
+        on_threads(worth_it, function, *arguments)
+
+    monkeypatch.setattr(native, "on_threads", recorded)
     return called
 
 
@@ -105,15 +105,16 @@ def test_what_the_kernels_are_not_made_for_is_left_to_torch(options, kernel_call
     ids=["a gradient", "two pixels", "a weight"],
 )
 def test_kernels_that_do_not_draw_as_torch_does_are_not_used(right, wrong, tmp_path, monkeypatch):
-    text = native.SOURCE.read_text("utf-8")
+    kernels = native.KERNELS
+    text = kernels.source.read_text("utf-8")
     assert right in text
     changed = tmp_path / "kernels.cpp"
     changed.write_text(text.replace(right, wrong), "utf-8")
     monkeypatch.setenv("POINTSPLAT_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(native, "SOURCE", changed)
-    for name in ("_kernels", "why_missing"):
-        monkeypatch.setattr(native, name, functools.cache(getattr(native, name).__wrapped__))
-    with pytest.warns(UserWarning, match="stays with torch: what the compiler made does not draw what torch draws"):
+    monkeypatch.setattr(native, "KERNELS", Kernels(kernels.what, changed, kernels.functions, kernels.agree))
+    with pytest.warns(
+        UserWarning, match="stays with torch: what the compiler made of kernels.cpp does not do what torch"
+    ):
         assert not native.can_blend(torch.zeros(1, 3), True)
     assert not native.can_blend(torch.zeros(1, 3), None)
 
@@ -127,7 +128,8 @@ for compiled in (None, True):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         image, _, _ = rasterization(*scene, *eyes, 8, 8, compiled=compiled)
-    print(len(caught), round(float(image.max()), 3), *(w.message for w in caught), sep="|")
+    texts = {str(w.message) for w in caught}
+    print(len(texts), round(float(image.max()), 3), *texts, sep="|")
 """
 
 
@@ -154,24 +156,9 @@ def test_without_a_compiler_torch_draws_and_a_line_says_why_if_asked(broken, tmp
     )
     first, second = ran.stdout.strip().splitlines()[-2:]
     assert first == "0|0.635"
-    if broken == "no cache" and not native.why_missing():  # built for this process alone
+    if broken == "no cache" and not native.KERNELS.why_missing:  # built for this process alone
         assert second == first
     else:
         count, value, message = second.split("|")
         reason = {"no compiler": "which is not there", "a compiler that fails": "no space left"}.get(broken, "compiler")
         assert (count, value) == ("1", "0.635") and "stays with torch" in message and reason in message
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
-def test_a_process_that_was_forked_has_threads_of_its_own():
-    code = """
-import os, sys
-from pointsplat_ns.rasterizer import native
-native._pool(os.getpid()).submit(int).result()
-child = os.fork()
-if child == 0:
-    os._exit(native._pool(os.getpid()).submit(int, 7).result(10))
-sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 7)
-"""
-    root = Path(native.__file__).parents[2]
-    subprocess.run([sys.executable, "-W", "ignore", "-c", code], cwd=root, timeout=120, check=True)

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from making import camera_askew
+from pointsplat_ns.rasterizer.colors import sh_to_color
 from pointsplat_ns.rasterizer.projection import project
-from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color, unit_rows
+from pointsplat_ns.rasterizer.spherical_harmonics import unit_rows
 
 F64 = torch.float64
 

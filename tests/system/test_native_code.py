@@ -45,6 +45,13 @@ def test_what_was_built_is_loaded_and_a_changed_source_is_built_anew(build, monk
     assert build(TWO.replace("2", "3")).answer() == 3 and len(list(build.cache.iterdir())) == 2
 
 
+def test_a_changed_header_beside_the_source_is_built_anew(build, tmp_path):
+    header = tmp_path / "some.h"
+    for number in (2, 3):
+        header.write_text(f"constexpr int NUMBER = {number};\n")
+        assert build('#include "some.h"\nextern "C" int answer() { return NUMBER; }\n').answer() == number
+
+
 def test_a_folder_that_others_can_write_to_is_not_loaded_from(build, tmp_path):
     build.cache.mkdir()
     build.cache.chmod(0o777)

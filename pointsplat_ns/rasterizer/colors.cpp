@@ -1,0 +1,170 @@
+// Colours of Gaussians by spherical harmonics, for float32 on a CPU, and their gradients.
+//
+// native_colors.py compiles this file where there is a C++ compiler and calls it; spherical_harmonics.py does the same in
+// torch, says where the formulas are from, and has the names that are used here. Threads take ranges of Gaussians, and
+// nothing is summed across Gaussians, so that the number of threads changes nothing.
+
+#include "lanes.h"
+
+extern "C" {
+
+// Colours of ``count`` Gaussians, or their gradients.
+struct Colors {
+    const float *directions, *coefficients;  // [M, 3], [N, K, 3]
+    const int64_t* ids;                      // [M] rows of the coefficients
+    int64_t count, stored, degree;           // M, K, degree of the basis
+    float* colors;                           // [M, 3]
+    const float* grad_colors;                // as colors; null forward
+    float *grad_directions, *grad_coefficients;  // as directions and coefficients; null where not wanted
+    int64_t* next;
+};
+
+}  // extern "C"
+
+namespace {
+
+constexpr float C0 = 0.28209479177387814f, C1 = 0.4886025119029199f;
+constexpr float C2[3] = {1.0925484305920792f, 0.31539156525252005f, 0.5462742152960396f};
+constexpr float C3[5] = {0.5900435899266435f, 2.890611442640554f, 0.4570457994644658f, 0.3731763325901154f,
+                         1.445305721320277f};
+
+template <int DEGREE>
+void basis_of(const Lane (&unit)[3], Lane* out) {
+    const Lane x = unit[0], y = unit[1], z = unit[2], xx = x * x, yy = y * y, zz = z * z, xy = x * y;
+    out[0] = ZERO + C0;
+    if (DEGREE >= 1) out[1] = -C1 * y, out[2] = C1 * z, out[3] = -C1 * x;
+    if (DEGREE >= 2) {
+        out[4] = C2[0] * xy, out[5] = -C2[0] * (y * z), out[6] = C2[1] * (2.0f * zz - xx - yy);
+        out[7] = -C2[0] * (x * z), out[8] = C2[2] * (xx - yy);
+    }
+    if (DEGREE >= 3) {
+        const Lane around = 4.0f * zz - xx - yy;
+        out[9] = -C3[0] * y * (3.0f * xx - yy), out[10] = C3[1] * xy * z, out[11] = -C3[2] * y * around;
+        out[12] = C3[3] * z * (2.0f * zz - 3.0f * xx - 3.0f * yy), out[13] = -C3[2] * x * around;
+        out[14] = C3[4] * z * (xx - yy), out[15] = -C3[0] * x * (xx - 3.0f * yy);
+    }
+}
+
+// Gradient by the unit direction, from the gradients of the basis.
+template <int DEGREE>
+void basis_backward(const Lane (&unit)[3], const Lane* grad, Lane (&out)[3]) {
+    const Lane x = unit[0], y = unit[1], z = unit[2];
+    Lane gx = -C1 * grad[3], gy = -C1 * grad[1], gz = C1 * grad[2];
+    if (DEGREE >= 2) {
+        const Lane a = C2[0] * grad[4], b = C2[0] * grad[5], c = 2.0f * C2[1] * grad[6], d = C2[0] * grad[7];
+        const Lane e = 2.0f * C2[2] * grad[8];
+        gx += a * y - c * x - d * z + e * x;
+        gy += a * x - b * z - c * y - e * y;
+        gz += 2.0f * c * z - b * y - d * x;
+    }
+    if (DEGREE >= 3) {
+        const Lane xx = x * x, yy = y * y, zz = z * z, xy = x * y, xz = x * z, yz = y * z;
+        const Lane h0 = C3[0] * grad[9], h1 = C3[1] * grad[10], h2 = C3[2] * grad[11], h3 = C3[3] * grad[12];
+        const Lane h4 = C3[2] * grad[13], h5 = C3[4] * grad[14], h6 = C3[0] * grad[15];
+        const Lane around = 4.0f * zz - xx - yy, across = 3.0f * (xx - yy), six = 6.0f * xy;
+        gx += h1 * yz - h0 * six + 2.0f * (h2 * xy) - 6.0f * (h3 * xz) - h4 * (around - 2.0f * xx) + 2.0f * (h5 * xz) -
+              h6 * across;
+        gy += h1 * xz - h0 * across - h2 * (around - 2.0f * yy) - 6.0f * (h3 * yz) + 2.0f * (h4 * xy) -
+              2.0f * (h5 * yz) + h6 * six;
+        gz += h1 * xy - 8.0f * (h2 * yz) + h3 * (6.0f * zz - 3.0f * xx - 3.0f * yy) - 8.0f * (h4 * xz) + h5 * (xx - yy);
+    }
+    out[0] = gx, out[1] = gy, out[2] = gz;
+}
+
+// Has the coefficients of some Gaussians brought to the cache: they lie apart, so that nothing else foresees it.
+template <int USED>
+void fetch(const Colors& task, const Lanes& rows) {
+    for (int64_t row : rows.rows) {
+        const float* sh = task.coefficients + task.ids[row] * task.stored * 3;
+        for (int at = 0; at < 3 * USED; at += 16) __builtin_prefetch(sh + at);
+    }
+}
+
+template <int DEGREE>
+void color_lanes(const Colors& task, const Lanes& rows) {
+    constexpr int USED = (DEGREE + 1) * (DEGREE + 1);
+    fetch<USED>(task, rows);
+    Lane unit[3], lanes[USED];
+    rows.load(task.directions, unit);
+    normalise(unit);
+    basis_of<DEGREE>(unit, lanes);
+    float basis[USED][LANES];
+    std::memcpy(basis, lanes, sizeof(lanes));
+    for (int lane = 0; lane < rows.count; ++lane) {
+        const float* sh = task.coefficients + task.ids[rows.rows[lane]] * task.stored * 3;
+        float sum[3] = {};
+        for (int k = 0; k < USED; ++k)
+            for (int c = 0; c < 3; ++c) sum[c] += basis[k][lane] * sh[3 * k + c];
+        for (int c = 0; c < 3; ++c) {
+            const float color = (sum[c] - sum[c]) + (sum[c] + 0.5f);  // NaN where it is infinite
+            task.colors[3 * rows.rows[lane] + c] = color < 0.0f ? 0.0f : color;
+        }
+    }
+}
+
+template <int DEGREE>
+void color_backward_lanes(const Colors& task, const Lanes& rows) {
+    constexpr int USED = (DEGREE + 1) * (DEGREE + 1);
+    if (task.grad_directions) fetch<USED>(task, rows);
+    Lane unit[3], lanes[USED];
+    rows.load(task.directions, unit);
+    const Lane inverse_length = normalise(unit);
+    basis_of<DEGREE>(unit, lanes);
+    float basis[USED][LANES], grad_basis[USED][LANES] = {};
+    std::memcpy(basis, lanes, sizeof(lanes));
+    for (int lane = 0; lane < rows.count; ++lane) {
+        const int64_t row = rows.rows[lane], place = task.ids[row] * task.stored * 3;
+        float grad[3];
+        for (int c = 0; c < 3; ++c) grad[c] = task.colors[3 * row + c] > 0.0f ? task.grad_colors[3 * row + c] : 0.0f;
+        if (task.grad_directions) {
+            const float* sh = task.coefficients + place;
+            for (int k = 0; k < USED; ++k)
+                grad_basis[k][lane] = sh[3 * k] * grad[0] + sh[3 * k + 1] * grad[1] + sh[3 * k + 2] * grad[2];
+        }
+        if (task.grad_coefficients) {
+            float* out = task.grad_coefficients + place;
+            for (int k = 0; k < USED; ++k)
+                for (int c = 0; c < 3; ++c) out[3 * k + c] = basis[k][lane] * grad[c];
+            std::fill(out + 3 * USED, out + 3 * task.stored, 0.0f);
+        }
+    }
+    if (DEGREE == 0 || !task.grad_directions) return;
+    std::memcpy(lanes, grad_basis, sizeof(lanes));
+    Lane grad_unit[3];
+    basis_backward<DEGREE>(unit, lanes, grad_unit);
+    const Lane along_itself = dot(unit, grad_unit);
+    for (int i = 0; i < 3; ++i) grad_unit[i] = (grad_unit[i] - unit[i] * along_itself) * inverse_length;
+    rows.store(task.grad_directions, grad_unit);
+}
+
+template <int DEGREE>
+void color_all(const Colors& task) {
+    const auto work = task.grad_colors ? color_backward_lanes<DEGREE> : color_lanes<DEGREE>;
+    each_range(task.next, task.count, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t at = first; at < last; at += LANES) work(task, Lanes(at, last - at));
+    });
+}
+
+}  // namespace
+
+extern "C" {
+
+// Colours, or their gradients if ``grad_colors`` is there.
+void pointsplat_color(const Colors* task) {
+    switch (task->degree) {
+        case 0: return color_all<0>(*task);
+        case 1: return color_all<1>(*task);
+        case 2: return color_all<2>(*task);
+        case 3: return color_all<3>(*task);
+    }
+}
+
+// Zeros in the rows of an array that are not marked.
+void pointsplat_clear(float* array, const uint8_t* marked, int64_t rows, int64_t columns, int64_t* next) {
+    each_range(next, rows, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t row = first; row < last; ++row)
+            if (!marked[row]) std::fill_n(array + row * columns, columns, 0.0f);
+    });
+}
+
+}  // extern "C"

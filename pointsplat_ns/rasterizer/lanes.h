@@ -1,0 +1,133 @@
+// What projection.cpp and colors.cpp share: numbers of eight Gaussians at once, one in each lane of a vector, and ranges of
+// Gaussians for threads.
+
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+
+namespace {
+
+constexpr int LANES = 8;
+constexpr int64_t RANGE = 1024;  // Gaussians that a thread takes at once
+constexpr float SHORTEST = std::numeric_limits<float>::min();  // vectors of no larger component are zero
+
+typedef float Lane __attribute__((vector_size(4 * LANES)));
+typedef double Wide __attribute__((vector_size(8 * LANES)));
+typedef int32_t Mask __attribute__((vector_size(4 * LANES)));
+
+const Lane ZERO = {};
+
+inline Lane larger(Lane a, Lane b) { return a > b ? a : b; }
+
+inline Lane smaller(Lane a, Lane b) { return a < b ? a : b; }
+
+inline Lane clamp(Lane x, float low, float high) { return smaller(larger(x, ZERO + low), ZERO + high); }
+
+inline Lane magnitude(Lane x) { return larger(x, -x); }
+
+inline Mask is_finite(Lane x) { return x - x == ZERO; }
+
+inline Lane narrow(Wide x) { return __builtin_convertvector(x, Lane); }
+
+template <typename Function>
+inline Lane each(Lane x, Function function) {
+    float values[LANES];
+    std::memcpy(values, &x, sizeof(Lane));
+    for (float& value : values) value = function(value);
+    std::memcpy(&x, values, sizeof(Lane));
+    return x;
+}
+
+inline Lane root(Lane x) {
+    return each(x, [](float value) { return std::sqrt(value); });
+}
+
+template <int D>
+inline Lane dot(const Lane (&a)[D], const Lane (&b)[D]) {
+    Lane sum = a[0] * b[0];
+    for (int d = 1; d < D; ++d) sum += a[d] * b[d];
+    return sum;
+}
+
+// Each component is of two columns, so that of a needle's is exact.
+inline void cross(const Lane (&p)[3], const Lane (&q)[3], Lane (&out)[3]) {
+    out[0] = p[1] * q[2] - p[2] * q[1];
+    out[1] = p[2] * q[0] - p[0] * q[2];
+    out[2] = p[0] * q[1] - p[1] * q[0];
+}
+
+// Unit vectors in place, and the inverse of their lengths; both zero for zero. Squares neither under- nor overflow.
+template <int D>
+inline Lane normalise(Lane (&vector)[D]) {
+    Lane largest = magnitude(vector[0]);
+    for (int d = 1; d < D; ++d) largest = larger(largest, magnitude(vector[d]));
+    const Mask zero = largest < SHORTEST;
+    const Lane inverse = zero ? ZERO : 1.0f / largest;
+    for (Lane& value : vector) value *= inverse;
+    const Lane square = dot(vector, vector), shrink = 1.0f / root(zero ? ZERO + 1.0f : square);
+    for (Lane& value : vector) value *= shrink;
+    return inverse * shrink;
+}
+
+// Rows of up to eight Gaussians. What stands in the lanes behind the last is computed as well, and not written.
+struct Lanes {
+    int64_t rows[LANES];
+    int count;
+
+    Lanes(const int64_t* from, int64_t left) : count(static_cast<int>(std::min<int64_t>(left, LANES))) {
+        for (int lane = 0; lane < LANES; ++lane) rows[lane] = from[std::min(lane, count - 1)];
+    }
+
+    Lanes(int64_t first, int64_t left) : count(static_cast<int>(std::min<int64_t>(left, LANES))) {
+        for (int lane = 0; lane < LANES; ++lane) rows[lane] = first + std::min(lane, count - 1);
+    }
+
+    // Zeros where there is no array.
+    template <int D>
+    void load(const float* array, Lane (&out)[D]) const {
+        if (!array) {
+            for (Lane& value : out) value = ZERO;
+            return;
+        }
+        float values[D][LANES];
+        for (int lane = 0; lane < LANES; ++lane)
+            for (int d = 0; d < D; ++d) values[d][lane] = array[rows[lane] * D + d];
+        std::memcpy(out, values, sizeof(out));
+    }
+
+    Lane load(const float* array) const {
+        Lane out[1];
+        load(array, out);
+        return out[0];
+    }
+
+    // Nothing where there is no array.
+    template <int D>
+    void store(float* array, const Lane (&in)[D]) const {
+        if (!array) return;
+        float values[D][LANES];
+        std::memcpy(values, in, sizeof(in));
+        for (int lane = 0; lane < count; ++lane)
+            for (int d = 0; d < D; ++d) array[rows[lane] * D + d] = values[d][lane];
+    }
+
+    void store(float* array, Lane in) const {
+        const Lane one[1] = {in};
+        store(array, one);
+    }
+};
+
+template <typename Work>
+void each_range(int64_t* next, int64_t count, Work work) {
+    for (;;) {
+        const int64_t range = __atomic_fetch_add(next, 1, __ATOMIC_RELAXED), first = range * RANGE;
+        if (first >= count) return;
+        work(range, first, std::min(first + RANGE, count));
+    }
+}
+
+}  // namespace

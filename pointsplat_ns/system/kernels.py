@@ -1,0 +1,93 @@
+"""Functions of a C++ file of this package: built and tried when first asked for, and called on several threads."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pointsplat_ns.system.native_code import NativeCodeError, load_native
+
+
+class Kernels:
+    """What a C++ file does faster than torch.
+
+    Args:
+        what: a name of it, for warnings.
+        source: the file.
+        functions: types of the arguments by name of the function, for those that return nothing.
+        agree: whether the functions do what torch does, on a small input, so that no miscompilation passes; it may call
+            them.
+    """
+
+    def __init__(self, what: str, source: Path, functions: Mapping[str, Sequence[Any]], agree: Callable[[], bool]):
+        self.what, self.source, self.functions, self.agree = what, source, functions, agree
+
+    @functools.cached_property
+    def library(self) -> ctypes.CDLL:
+        """The functions, built if need be.
+
+        Raises:
+            NativeCodeError: if this machine cannot build them.
+        """
+        library = load_native(self.source)
+        for name, types in self.functions.items():
+            function = getattr(library, name)
+            function.argtypes, function.restype = list(types), None
+        return library
+
+    @functools.cached_property
+    def why_missing(self) -> str:
+        """Why this machine has none that can be used; empty if it has. They are built if need be, and tried."""
+        try:
+            _ = self.library
+        except NativeCodeError as error:
+            return str(error)
+        with torch.inference_mode(False):
+            agree = self.agree()
+        return "" if agree else f"what the compiler made of {self.source.name} does not do what torch does"
+
+    def usable(self, wanted: bool | None) -> bool:
+        """Whether to use them.
+
+        Args:
+            wanted: False where they are not wanted; None where a machine without a compiler is no reason for a warning.
+        """
+        if wanted is False:
+            return False
+        if self.why_missing and wanted:
+            # from here, so that a text that several have in common is shown once
+            text = f"{self.what} could not be compiled and stays with torch: {self.why_missing}"
+            warnings.warn(text, stacklevel=1)
+        return not self.why_missing
+
+
+@functools.cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Threads of a process: those of one that forked are not the other's."""
+    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="pointsplat-kernel")
+
+
+def on_threads(worth_it: bool, function: Callable[..., object], *arguments: object) -> None:
+    """Call a function of a C++ file in as many threads as torch uses, or in one if more are not worth it.
+
+    They share the work by what the arguments point to; ctypes lets go of Python meanwhile.
+    """
+    threads = torch.get_num_threads() if worth_it else 1
+    others = [_pool(os.getpid()).submit(function, *arguments) for _ in range(threads - 1)]
+    function(*arguments)
+    for other in others:
+        other.result()
+
+
+def agreement(ours: Sequence[torch.Tensor], torchs: Sequence[torch.Tensor], off: float, share: float) -> bool:
+    """Whether tensors agree: in each, less than a share of the numbers is further off than so much of the largest."""
+    within = [(a - b).abs() <= off * b.abs().amax() for a, b in zip(ours, torchs, strict=True)]  # NaN is not
+    return all(bool((~near).float().mean() < share) for near in within)

@@ -1,0 +1,319 @@
+"""Compiled kernels project what torch projects, with the same gradients, from ordinary scenes to degenerate ones."""
+
+from __future__ import annotations
+
+import math
+import shutil
+
+import pytest
+import torch
+
+from making import camera_askew, splats_in_view
+from pointsplat_ns.rasterizer import native, native_colors, native_projection, rasterization
+from pointsplat_ns.rasterizer.projection import count_meaningless, project
+from pointsplat_ns.system.kernels import Kernels, on_threads
+
+WIDTH, HEIGHT = 37, 29
+F32, F64 = torch.float32, torch.float64
+NAMES = ("means", "quats", "scales", "opacities", "viewmat")
+OUTPUTS = ("means2d", "depths", "cov2d", "det", "opacities", "directions")
+
+missing = native_projection.KERNELS.why_missing
+needs_compiler = pytest.mark.skipif(bool(missing), reason=missing)
+
+
+def scene_of(n=400, scale=-2.0, **options):
+    """Means, quaternions, scales, opacities, view and intrinsics, float64 numbers that float32 holds; but for some of
+    the view, which stays in float64."""
+    *scene, _ = splats_in_view(n, seed=7, scale=scale, **options)
+    return [t.float().double() for t in (*scene, *camera_askew())]
+
+
+def _far_from_the_origin(means, quats, scales, opacities, view, K):
+    shift = torch.tensor([1e6, -7e5, 4e5], dtype=F64)
+    means.mul_(64).add_(shift).copy_(means.float())
+    scales.mul_(64)
+    view[:3, 3] = view[:3, 3] * 64 - view[:3, :3] @ shift
+
+
+def _in_units_of(size):
+    def change(means, quats, scales, opacities, view, K):
+        means.mul_(size).copy_(means.float())
+        scales.mul_(size).copy_(scales.float())
+        view[:3, 3] *= size
+
+    return change
+
+
+def _needles(aspect):
+    def change(means, quats, scales, *_):
+        scales[:, 0], scales[:, 1:] = 2.0, 2.0 / aspect
+        scales.copy_(scales.float())
+
+    return change
+
+
+def _meaningless(means, quats, scales, opacities, *_):
+    for i, wrong in enumerate((math.nan, math.inf, -math.inf)):
+        for j, tensor in enumerate((means, quats, scales, opacities)):
+            tensor[20 * i + 4 * j : 20 * i + 4 * j + 4].view(4, -1)[:, 0] = wrong
+    scales[60:70, 1] = -1e-3
+    opacities[70:80] = -0.5
+
+
+def _at_the_near_plane(means, quats, scales, opacities, view, K):
+    view.copy_(torch.eye(4, dtype=F64))
+    near = torch.tensor(0.25)
+    means[:200, 2] = near.double()
+    means[:50, 2] = torch.nextafter(near, torch.tensor(1.0)).double()
+    means[50:100, 2] = torch.nextafter(near, torch.tensor(0.0)).double()
+    means[:200, :2] *= 0.03
+    means.copy_(means.float())
+
+
+def _behind_and_inside(means, quats, scales, opacities, view, K):
+    means[::2, 2] *= -1
+    means[1::4] = means[1::4] * 1e-3
+    scales[::3] *= 1e3
+
+
+def _longer_than_any_image(means, quats, scales, *_):
+    scales[::2, 0] = 1e12
+    scales[::5] = 1e20
+    scales.copy_(scales.float())
+
+
+def _opacities(means, quats, scales, opacities, *_):
+    opacities[:50], opacities[50:100], opacities[100:150] = 0, 1, 3
+    opacities[150:200] = torch.tensor(1 / 255).double()
+
+
+def _any_length(means, quats, *_):
+    quats.mul_(10.0 ** torch.linspace(-44, 37, len(quats), dtype=F64)[:, None]).copy_(quats.float())
+
+
+def _nothing(*_):
+    pass
+
+
+# what changes a scene, in place, and options of the projection
+CASES = {
+    "ordinary": (_nothing, {}),
+    "antialiased": (_nothing, {"antialiased": True}),
+    "points, antialiased": (lambda m, q, s, o, *_: (s.mul_(1e-3), o.mul_(300)), {"antialiased": True}),
+    "large, antialiased": (lambda m, q, s, *_: s.mul_(300), {"antialiased": True}),
+    "far from the origin": (_far_from_the_origin, {}),
+    "units of 1e-9": (_in_units_of(1e-9), {"near_plane": 1e-11}),
+    "units of 1e12": (_in_units_of(1e12), {"far_plane": math.inf}),
+    "needles of 1e4": (_needles(1e4), {}),
+    "needles of 1e6": (_needles(1e6), {}),
+    "flat": (lambda m, q, s, *_: s[:, 2].zero_(), {}),
+    "lines": (lambda m, q, s, *_: s[:, 1:].zero_(), {}),
+    "points": (lambda m, q, s, *_: s.zero_(), {}),
+    "zero quaternions": (lambda m, q, *_: q[::2].zero_(), {}),
+    "quaternions of any length": (_any_length, {}),
+    "without meaning": (_meaningless, {}),
+    "behind, and around the camera": (_behind_and_inside, {}),
+    "at the near plane": (_at_the_near_plane, {"near_plane": 0.25}),
+    "longer than any image": (_longer_than_any_image, {}),
+    "opacities": (_opacities, {}),
+    "principal point outside": (lambda m, q, s, o, view, K: K[0, 2].fill_(-30.0), {}),
+    "a mirror": (lambda m, q, s, o, view, K: K[0, 0].neg_(), {}),
+    "small ones left out": (_nothing, {"radius_clip": 6.0}),
+    "far ones left out": (_nothing, {"far_plane": 3.0}),
+    "no low-pass": (_nothing, {"eps2d": 0.0}),
+}
+
+
+def made(name):
+    scene = scene_of()
+    change, options = CASES[name]
+    change(*scene)
+    return scene, options
+
+
+def projected(scene, options, dtype, compiled):
+    """Leaves (N, ...) and what is seen; the view stays in float64."""
+    leaves = [*(t.to(dtype, copy=True).requires_grad_() for t in scene[:4]), scene[4].clone().requires_grad_()]
+    return leaves, project(*leaves, scene[5], WIDTH, HEIGHT, compiled=compiled, **options)
+
+
+def values_and_gradients(leaves, seen, common, exact=None):
+    """Of the Gaussians ``common``: outputs, and gradients of a sum in which each output weighs the same, in float64."""
+    rows = torch.searchsorted(seen.ids, common)
+    values = [getattr(seen, name)[rows] for name in OUTPUTS]
+    generator = torch.Generator().manual_seed(0)
+    total = torch.zeros(())
+    for value, size in zip(values, exact or values, strict=True):
+        weights = torch.randn(size.shape, generator=generator, dtype=F64) / (1e-30 + size.detach().double().abs())
+        total = total + (value * weights.to(value.dtype)).sum()
+    grads = torch.autograd.grad(total, leaves)
+    return [value.detach().double() for value in values], [grad.double() for grad in grads]
+
+
+def off(ours, right):
+    """How far rows are off: the norm of all, and the median of each one's."""
+    one = ours.shape[0]
+    difference, size = ((t.reshape(one, -1)) for t in (ours - right, right))
+    rows = difference.norm(dim=1) / size.norm(dim=1)
+    rows = rows[size.norm(dim=1) > 0]
+    return float(difference.norm() / size.norm().clamp_min(1e-300)), float(rows.median()) if len(rows) else 0.0
+
+
+def at_a_bound(scene, options):
+    """Gaussians that some bound, moved by a thousandth of a pixel or the rounding of float32, keeps or drops."""
+    seen = []
+    for step in (-1, 1):
+        for axis in (0, 1):
+            moved = scene[5].clone()
+            moved[axis, 2] += step * 1e-3
+            seen.append(projected([*scene[:5], moved], options, F64, False)[1].ids)
+        nudge = 1 + step * 1e-6
+        bounds = {name: options[name] * nudge for name in ("near_plane", "far_plane", "radius_clip") if name in options}
+        seen.append(projected([*scene[:3], scene[3] * nudge, *scene[4:]], {**options, **bounds}, F64, False)[1].ids)
+    every = torch.cat(seen).bincount(minlength=len(scene[0]))
+    return ((every > 0) & (every < len(seen))).nonzero()[:, 0]
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_seen_and_its_gradients_are_those_of_torch_and_as_near_to_float64(name):
+    scene, options = made(name)
+    ours, torchs, exact = (projected(scene, options, *how) for how in ((F32, True), (F32, False), (F64, False)))
+    ids, torchs_ids = (set(seen.ids.tolist()) for _, seen in (ours, torchs))
+    assert len(ids) >= 50 and ours[1].ids.tolist() == sorted(ids)
+    if ids != torchs_ids:
+        assert ids ^ torchs_ids <= set(at_a_bound(scene, options).tolist())
+    common = torch.tensor(sorted(ids & torchs_ids & set(exact[1].ids.tolist())))
+    sizes = [getattr(exact[1], output)[torch.searchsorted(exact[1].ids, common)] for output in OUTPUTS]
+    results = [values_and_gradients(leaves, seen, common, sizes) for leaves, seen in (ours, torchs, exact)]
+
+    names = [*OUTPUTS, *(f"gradient of {part}" for part in NAMES)]
+    bounded_otherwise = name == "longer than any image"  # float64 draws longer axes
+    for what, mine, theirs, right in zip(names, *([*values, *grads] for values, grads in results), strict=True):
+        assert mine.isfinite().all(), what
+        # ten times what was seen: float32 in another order
+        assert off(mine, theirs)[0] <= 5e-6 and off(mine, theirs)[1] <= 5e-6, (what, off(mine, theirs))
+        for error, torchs_error in zip(off(mine, right), off(theirs, right), strict=True):
+            assert bounded_otherwise or error <= 2 * torchs_error + 1e-6, (what, error, torchs_error)
+    one, other = (seen.select(torch.searchsorted(seen.ids, common)) for _, seen in (ours, torchs))
+    assert ((one.radii - other.radii).abs() <= 1 + 1e-6 * other.radii).all()  # rounded up
+    assert off(one.beyond, other.beyond)[0] <= 1e-6
+    dropped = torch.ones(len(scene[0]), dtype=torch.bool).index_fill_(0, common, False)
+    assert not any(grad[dropped].any() for grad in results[0][1][:4])
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", CASES)
+def test_as_many_gaussians_are_without_meaning_as_torch_counts(name):
+    scene = [t.float().repeat(3 if t.dim() == 1 else (3, 1)) for t in made(name)[0][:4]]
+    counts = [count_meaningless(*scene, compiled) for compiled in (True, False)]
+    assert counts[0] == counts[1] and (counts[0] > 0) == (name == "without meaning")
+    assert count_meaningless(*(t[:0] for t in scene), True) == 0
+
+
+@needs_compiler
+@pytest.mark.parametrize("count", [0, 1, 9, 60])
+def test_where_no_gaussian_is_seen_gradients_are_zero(count):
+    scene = scene_of(60)
+    scene[0][:, 2] = -scene[0][:, 2].abs() - 1
+    scene[:4] = [t[:count] for t in scene[:4]]
+    leaves, seen = projected(scene, {}, F32, True)
+    assert [tuple(t.shape) for t in vars(seen).values()] == [
+        (0,), (0, 2), (0,), (0, 3), (0,), (0,), (0, 3), (0,), (0,)
+    ]  # fmt: skip
+    assert (seen.ids.dtype, seen.radii.dtype, seen.beyond.dtype) == (torch.int64, torch.int32, F32)
+    grads = torch.autograd.grad(seen.means2d.sum() + seen.det.sum(), leaves)
+    assert [g.shape for g in grads] == [leaf.shape for leaf in leaves] and not any(g.any() for g in grads)
+
+
+@needs_compiler
+@pytest.mark.parametrize("wanted", range(5))
+def test_one_gradient_alone_from_some_outputs_and_inputs_in_any_layout(wanted):
+    scene = scene_of(60)
+    grads = []
+    for compiled in (True, False):
+        leaves = [t.float() if i < 4 else t for i, t in enumerate(scene[:5])]
+        leaf = leaves[wanted].requires_grad_()
+        leaves[:4] = [t.repeat_interleave(2, 0)[::2] for t in leaves[:4]]  # not contiguous
+        seen = project(*leaves, scene[5], WIDTH, HEIGHT, compiled=compiled, antialiased=True)
+        total = seen.opacities.sum() + seen.means2d.sum() + seen.depths.sum()
+        grads.append(torch.autograd.grad(total, leaf)[0])
+    assert grads[1].any() and off(*grads)[0] <= 2e-6
+
+
+@needs_compiler
+def test_any_number_of_threads_projects_the_same_bits():
+    *scene, view, K = scene_of(9000)
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            leaves, seen = projected([*scene, view, K], {"antialiased": True}, F32, True)
+            values, grads = values_and_gradients(leaves, seen, seen.ids)
+            results.append([seen.ids, seen.beyond, seen.radii, *values, *grads])
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+
+
+ALL_KERNELS = {
+    *("project", "count_meaningless", "unpack", "color", "tabulate", "blend"),
+    *("differentiate", "gather", "chain", "color", "clear", "project_backward"),
+}
+
+
+@pytest.fixture()
+def kernel_calls(monkeypatch):
+    """The kernels called within the test."""
+    called = []
+
+    def recorded(worth_it, function, *arguments):
+        called.append(function)
+        on_threads(worth_it, function, *arguments)
+
+    for module in (native, native_colors, native_projection):
+        monkeypatch.setattr(module, "on_threads", recorded)
+    return called
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("dtype", "compiled", "names"),
+    [
+        (F32, None, ALL_KERNELS),
+        (F32, False, set()),
+        (F64, None, set()),
+        (F64, True, set()),
+    ],
+)
+def test_kernels_are_called_for_float32_unless_they_are_not_wanted(dtype, compiled, names, kernel_calls):
+    *scene, view, K = (t.to(dtype) for t in (*splats_in_view(60, seed=7, scale=-2.0), *camera_askew()))
+    leaves = [t.requires_grad_() for t in scene]
+    image, _, _ = rasterization(*leaves, view[None], K[None], WIDTH, HEIGHT, sh_degree=2, compiled=compiled)
+    image.sum().backward()
+    assert {function.__name__ for function in kernel_calls} == {f"pointsplat_{name}" for name in names}
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("module", "right", "wrong"),
+    [
+        (native_projection, "grad_det0 += grad_ratio / s.det * (s.blur / s.det)", "grad_det0 += grad_ratio / s.det"),
+        (native_projection, "(x - half_x <= camera.width - 0.5f)", "(x <= camera.width - 0.5f)"),
+        (native_colors, "+ 2.0f * (h5 * xz) -", "- 2.0f * (h5 * xz) -"),
+    ],
+    ids=["a gradient", "who is seen", "a colour's gradient"],
+)
+def test_kernels_that_do_not_do_as_torch_does_are_not_used(module, right, wrong, tmp_path, monkeypatch):
+    kernels = module.KERNELS
+    text = kernels.source.read_text("utf-8")
+    assert text.count(right) == 1
+    (tmp_path / kernels.source.name).write_text(text.replace(right, wrong), "utf-8")
+    shutil.copy(kernels.source.with_name("lanes.h"), tmp_path)
+    monkeypatch.setenv("POINTSPLAT_CACHE", str(tmp_path / "cache"))
+    changed = Kernels(kernels.what, tmp_path / kernels.source.name, kernels.functions, kernels.agree)
+    monkeypatch.setattr(module, "KERNELS", changed)
+    with pytest.warns(UserWarning, match=f"stays with torch: what the compiler made of {kernels.source.name} does not"):
+        assert not changed.usable(True)
+    assert not changed.usable(None)
