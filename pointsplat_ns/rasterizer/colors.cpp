@@ -15,7 +15,7 @@ struct Colors {
     int64_t count, stored, degree;           // M, K, degree of the basis
     float* colors;                           // [M, 3]
     const float* grad_colors;                // as colors; null forward
-    float *grad_directions, *grad_coefficients;  // as directions and coefficients; null where not wanted
+    float *grad_directions, *grad_coefficients;  // as directions, and coefficients, zeros before; or null
     int64_t* next;
 };
 
@@ -125,7 +125,6 @@ void color_backward_lanes(const Colors& task, const Lanes& rows) {
             float* out = task.grad_coefficients + place;
             for (int k = 0; k < USED; ++k)
                 for (int c = 0; c < 3; ++c) out[3 * k + c] = basis[k][lane] * grad[c];
-            std::fill(out + 3 * USED, out + 3 * task.stored, 0.0f);
         }
     }
     if (DEGREE == 0 || !task.grad_directions) return;
@@ -157,14 +156,6 @@ void pointsplat_color(const Colors* task) {
         case 2: return color_all<2>(*task);
         case 3: return color_all<3>(*task);
     }
-}
-
-// Zeros in the rows of an array that are not marked.
-void pointsplat_clear(float* array, const uint8_t* marked, int64_t rows, int64_t columns, int64_t* next) {
-    each_range(next, rows, [&](int64_t, int64_t first, int64_t last) {
-        for (int64_t row = first; row < last; ++row)
-            if (!marked[row]) std::fill_n(array + row * columns, columns, 0.0f);
-    });
 }
 
 }  // extern "C"

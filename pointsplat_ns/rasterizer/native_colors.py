@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -70,7 +71,8 @@ class CompiledColor(torch.autograd.Function):
             grad_directions = torch.empty_like(directions)
             task.grad_directions = grad_directions.data_ptr()
         if ctx.needs_input_grad[1]:
-            grad_coefficients = _zeros_but(ids, coefficients)
+            # NumPy takes memory that the system has zeroed: rows that are not seen are not written, nor paid for
+            grad_coefficients = torch.from_numpy(np.zeros(coefficients.shape, np.float32))
             task.grad_coefficients = grad_coefficients.data_ptr()
         _call(task)
         return grad_directions, grad_coefficients, None, None
@@ -88,18 +90,6 @@ def _call(task: _Colors) -> None:
     next_range = torch.zeros(1, dtype=torch.int64)
     task.next = next_range.data_ptr()
     on_threads(task.count >= _SEVERAL, KERNELS.library.pointsplat_color, ctypes.byref(task))
-
-
-def _zeros_but(ids: Tensor, like: Tensor) -> Tensor:
-    """Zeros in the shape of (N, K, 3), but for the rows ``ids``, which are left open."""
-    out, rows = torch.empty_like(like), like.shape[0]
-    marked, next_range = torch.zeros(rows, dtype=torch.uint8), torch.zeros(1, dtype=torch.int64)
-    marked.index_fill_(0, ids, 1)
-    on_threads(
-        rows >= _SEVERAL, KERNELS.library.pointsplat_clear, out.data_ptr(), marked.data_ptr(), rows,
-        out[:1].numel(), next_range.data_ptr(),
-    )  # fmt: skip
-    return out
 
 
 def _as_torch() -> bool:
@@ -123,9 +113,6 @@ def _as_torch() -> bool:
 KERNELS = Kernels(
     "the rasterizer",
     Path(__file__).with_name("colors.cpp"),
-    {
-        "pointsplat_color": [ctypes.c_void_p],
-        "pointsplat_clear": [ctypes.c_void_p] * 2 + [ctypes.c_int64] * 2 + [ctypes.c_void_p],
-    },
+    {"pointsplat_color": [ctypes.c_void_p]},
     _as_torch,
 )

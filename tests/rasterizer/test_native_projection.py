@@ -259,7 +259,7 @@ def test_any_number_of_threads_projects_the_same_bits():
 
 ALL_KERNELS = {
     *("project", "count_meaningless", "unpack", "color", "tabulate", "blend"),
-    *("differentiate", "gather", "chain", "color", "clear", "project_backward"),
+    *("differentiate", "gather", "chain", "project_backward"),
 }
 
 
