@@ -25,7 +25,7 @@ from stability_measures import Row, measured
 from stability_report import TRUSTED, plot_others, plot_rasterizers, tables
 
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.rasterizer.native import KERNELS
+from pointsplat_ns.rasterizer.compiled.blending import KERNELS
 from pointsplat_ns.system.progress import progress_bar
 
 

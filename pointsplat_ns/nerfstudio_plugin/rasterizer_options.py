@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.backends import use_gsplat
-from pointsplat_ns.rasterizer.native import KERNELS
+from pointsplat_ns.rasterizer.compiled.blending import KERNELS
 
 VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """Evaluation background of scenes trained with random backgrounds: the viewer's colour, as in Splatfacto."""

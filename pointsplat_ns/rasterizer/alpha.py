@@ -7,7 +7,7 @@ threshold or less. (3DGS, section 6; the thresholds stand in :mod:`~pointsplat_n
 
 Every path in torch follows the rule by calling what stands here, but for
 :func:`~pointsplat_ns.rasterizer.reference.rasterize_reference`, which writes it out once more to check it. The compiled
-kernels (``kernels.cpp``) write it out as well; they are compared with torch when they are loaded.
+kernels (``blending.cpp``) write it out as well; they are compared with torch when they are loaded.
 
 Shapes: B tiles, S Gaussians of a chunk from front to back, 64 pixels of a tile.
 """

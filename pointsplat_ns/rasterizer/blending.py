@@ -1,8 +1,8 @@
 """Front-to-back alpha blending over tiles, with its own backward pass.
 
 Done in torch (:mod:`~pointsplat_ns.rasterizer.blocks`), or by compiled kernels where there is a compiler
-(:mod:`~pointsplat_ns.rasterizer.native`). What is evaluated per pixel, and how gradients are summed, stands in
-:mod:`~pointsplat_ns.rasterizer.quadratics`; which Gaussian is drawn on which pixel in
+(:mod:`~pointsplat_ns.rasterizer.compiled.blending`). What is evaluated per pixel, and how gradients are summed, stands
+in :mod:`~pointsplat_ns.rasterizer.quadratics`; which Gaussian is drawn on which pixel in
 :mod:`~pointsplat_ns.rasterizer.alpha`.
 
 Shapes: M Gaussians, 64 = TILE * TILE pixels, D channels.
@@ -16,7 +16,8 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rasterizer import blocks, native
+from pointsplat_ns.rasterizer import blocks
+from pointsplat_ns.rasterizer.compiled import blending as compiled_blending
 from pointsplat_ns.rasterizer.constants import TILE
 from pointsplat_ns.rasterizer.frame import BlendOptions
 from pointsplat_ns.rasterizer.precision import full_precision
@@ -35,7 +36,7 @@ def bytes_per_pair(colors: Tensor) -> int:
 def engine_of(colors: Tensor, compiled: bool | None) -> ModuleType:
     """What blends colours (M, D): the module with ``inputs_of``, ``tiles_of``, ``blend_region``,
     ``differentiate_region`` and ``chain``."""
-    return native if native.can_blend(colors, compiled) else blocks
+    return compiled_blending if compiled_blending.can_blend(colors, compiled) else blocks
 
 
 class Blend(torch.autograd.Function):

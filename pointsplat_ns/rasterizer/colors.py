@@ -1,12 +1,12 @@
 """Colours of Gaussians from spherical harmonics: in torch (:mod:`~pointsplat_ns.rasterizer.spherical_harmonics`), or by
-compiled kernels where there is a compiler (:mod:`~pointsplat_ns.rasterizer.native_colors`)."""
+compiled kernels where there is a compiler (:mod:`~pointsplat_ns.rasterizer.compiled.colors`)."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.native_colors import CompiledColor, can_color
+from pointsplat_ns.rasterizer.compiled.colors import CompiledColor, can_color
 from pointsplat_ns.rasterizer.spherical_harmonics import C0, Color, check_degree, offset
 
 

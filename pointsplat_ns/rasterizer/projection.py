@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.rasterizer import native_projection
+from pointsplat_ns.rasterizer.compiled import projection as compiled_projection
 from pointsplat_ns.rasterizer.ewa import Lens, Project
 from pointsplat_ns.views import View
 
@@ -78,8 +78,8 @@ def count_meaningless(
         opacities: (N,)
         compiled: as for :func:`~pointsplat_ns.rasterization`.
     """
-    if native_projection.can_project(means, quats, scales, opacities, compiled):
-        return native_projection.count_meaningless(means, quats, scales, opacities)
+    if compiled_projection.can_project(means, quats, scales, opacities, compiled):
+        return compiled_projection.count_meaningless(means, quats, scales, opacities)
     # one NaN or infinity spoils a sum, so a clean scene costs four sums and one answer
     total = means.sum() + quats.sum() + scales.sum() + opacities.sum()
     if bool(total.isfinite() & ~(scales < 0).any() & ~(opacities < 0).any()):
@@ -126,7 +126,8 @@ def project(
     - No axis is drawn longer than 1e9 pixels (float32), so that no determinant overflows.
 
     Done in torch (:mod:`~pointsplat_ns.rasterizer.ewa`), or by compiled kernels where there is a compiler
-    (:mod:`~pointsplat_ns.rasterizer.native_projection`); ``compiled`` is that of :func:`~pointsplat_ns.rasterization`.
+    (:mod:`~pointsplat_ns.rasterizer.compiled.projection`); ``compiled`` is that of
+    :func:`~pointsplat_ns.rasterization`.
 
     Raises:
         ValueError: if a focal length is zero, or the camera is not finite, has skew or is no motion.
@@ -139,6 +140,6 @@ def project(
     if not _close((skew, below, *last), (0.0, 0.0, 0.0, 0.0, 1.0)):
         raise ValueError(f"K is {K.tolist()}; expected no skew: zeros but for fx, fy, cx, cy and the 1 of the last row")
     lens = Lens(fx, fy, cx, cy, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased)
-    suited = native_projection.can_project(means, quats, scales, opacities, compiled)
-    function = native_projection.CompiledProject if suited else Project
+    suited = compiled_projection.can_project(means, quats, scales, opacities, compiled)
+    function = compiled_projection.CompiledProject if suited else Project
     return Projected(*function.apply(means, quats, scales, opacities, viewmat[:3, :3].double(), centre, lens))

@@ -1,4 +1,4 @@
-"""Blending by compiled kernels (``kernels.cpp``): what :mod:`~pointsplat_ns.rasterizer.blocks` does in torch.
+"""Blending by compiled kernels (``blending.cpp``): what :mod:`~pointsplat_ns.rasterizer.blocks` does in torch.
 
 For float32 on a CPU, where the machine has a C++ compiler. Building takes two seconds, once. Without a compiler, or if
 what it made does not draw as torch does, blending stays with torch.
@@ -234,7 +234,7 @@ def _as_torch() -> bool:
 
 KERNELS = Kernels(
     "the rasterizer",
-    Path(__file__).with_name("kernels.cpp"),
+    Path(__file__).with_name("blending.cpp"),
     {
         **dict.fromkeys(("pointsplat_list", "pointsplat_blend", "pointsplat_differentiate"), [ctypes.c_void_p]),
         "pointsplat_gather": [ctypes.c_void_p] * 4 + [ctypes.c_int64] * 2 + [ctypes.c_void_p] * 2,

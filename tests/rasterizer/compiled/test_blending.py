@@ -11,13 +11,14 @@ import pytest
 import torch
 
 from making import splats_in_view
-from pointsplat_ns.rasterizer import native, rasterization
+from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.rasterizer.compiled import blending
 from pointsplat_ns.rasterizer.constants import QUALITIES
 from pointsplat_ns.system.kernels import Kernels, on_threads
 
 WIDTH, HEIGHT = 70, 45  # neither is a multiple of the tile
 
-needs_compiler = pytest.mark.skipif(bool(native.KERNELS.why_missing), reason=native.KERNELS.why_missing)
+needs_compiler = pytest.mark.skipif(bool(blending.KERNELS.why_missing), reason=blending.KERNELS.why_missing)
 
 
 def draw(channels=3, n=3000, dtype=torch.float32, absgrad=True, cameras=1, **options):
@@ -43,7 +44,7 @@ def kernel_calls(monkeypatch):
         called.append(function)
         on_threads(worth_it, function, *arguments)
 
-    monkeypatch.setattr(native, "on_threads", recorded)
+    monkeypatch.setattr(blending, "on_threads", recorded)
     return called
 
 
@@ -105,18 +106,18 @@ def test_what_the_kernels_are_not_made_for_is_left_to_torch(options, kernel_call
     ids=["a gradient", "two pixels", "a weight"],
 )
 def test_kernels_that_do_not_draw_as_torch_does_are_not_used(right, wrong, tmp_path, monkeypatch):
-    kernels = native.KERNELS
+    kernels = blending.KERNELS
     text = kernels.source.read_text("utf-8")
     assert right in text
     changed = tmp_path / "kernels.cpp"
     changed.write_text(text.replace(right, wrong), "utf-8")
     monkeypatch.setenv("POINTSPLAT_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(native, "KERNELS", Kernels(kernels.what, changed, kernels.functions, kernels.agree))
+    monkeypatch.setattr(blending, "KERNELS", Kernels(kernels.what, changed, kernels.functions, kernels.agree))
     with pytest.warns(
         UserWarning, match="stays with torch: what the compiler made of kernels.cpp does not do what torch"
     ):
-        assert not native.can_blend(torch.zeros(1, 3), True)
-    assert not native.can_blend(torch.zeros(1, 3), None)
+        assert not blending.can_blend(torch.zeros(1, 3), True)
+    assert not blending.can_blend(torch.zeros(1, 3), None)
 
 
 PROBE = """
@@ -144,7 +145,7 @@ def test_without_a_compiler_torch_draws_and_a_line_says_why_if_asked(broken, tmp
         "no cache": {"POINTSPLAT_CACHE": "/proc/nothing"},
     }[broken]
     environment = {**os.environ, "POINTSPLAT_CACHE": str(tmp_path / "cache"), **changes}
-    root = str(Path(native.__file__).parents[2])
+    root = str(Path(blending.__file__).parents[3])
     ran = subprocess.run(
         [sys.executable, "-c", PROBE],
         env=environment,
@@ -156,7 +157,7 @@ def test_without_a_compiler_torch_draws_and_a_line_says_why_if_asked(broken, tmp
     )
     first, second = ran.stdout.strip().splitlines()[-2:]
     assert first == "0|0.635"
-    if broken == "no cache" and not native.KERNELS.why_missing:  # built for this process alone
+    if broken == "no cache" and not blending.KERNELS.why_missing:  # built for this process alone
         assert second == first
     else:
         count, value, message = second.split("|")

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from making import camera_askew, splats_in_view
-from pointsplat_ns.rasterizer import native, native_colors, native_projection, rasterization
+from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.rasterizer.compiled import blending, colors, projection
 from pointsplat_ns.rasterizer.projection import count_meaningless, project
 from pointsplat_ns.system.kernels import Kernels, on_threads
 
@@ -18,7 +19,7 @@ F32, F64 = torch.float32, torch.float64
 NAMES = ("means", "quats", "scales", "opacities", "viewmat")
 OUTPUTS = ("means2d", "depths", "cov2d", "det", "opacities", "directions")
 
-missing = native_projection.KERNELS.why_missing
+missing = projection.KERNELS.why_missing
 needs_compiler = pytest.mark.skipif(bool(missing), reason=missing)
 
 
@@ -272,7 +273,7 @@ def kernel_calls(monkeypatch):
         called.append(function)
         on_threads(worth_it, function, *arguments)
 
-    for module in (native, native_colors, native_projection):
+    for module in (blending, colors, projection):
         monkeypatch.setattr(module, "on_threads", recorded)
     return called
 
@@ -299,9 +300,9 @@ def test_kernels_are_called_for_float32_unless_they_are_not_wanted(dtype, compil
 @pytest.mark.parametrize(
     ("module", "right", "wrong"),
     [
-        (native_projection, "grad_det0 += grad_ratio / s.det * (s.blur / s.det)", "grad_det0 += grad_ratio / s.det"),
-        (native_projection, "(x - half_x <= camera.width - 0.5f)", "(x <= camera.width - 0.5f)"),
-        (native_colors, "+ 2.0f * (h5 * xz) -", "- 2.0f * (h5 * xz) -"),
+        (projection, "grad_det0 += grad_ratio / s.det * (s.blur / s.det)", "grad_det0 += grad_ratio / s.det"),
+        (projection, "(x - half_x <= camera.width - 0.5f)", "(x <= camera.width - 0.5f)"),
+        (colors, "+ 2.0f * (h5 * xz) -", "- 2.0f * (h5 * xz) -"),
     ],
     ids=["a gradient", "who is seen", "a colour's gradient"],
 )

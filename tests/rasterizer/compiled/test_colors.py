@@ -7,12 +7,12 @@ import math
 import pytest
 import torch
 
-from pointsplat_ns.rasterizer import native_colors
 from pointsplat_ns.rasterizer.colors import sh_to_color
+from pointsplat_ns.rasterizer.compiled import colors as compiled_colors
 
 F32, F64 = torch.float32, torch.float64
 
-missing = native_colors.KERNELS.why_missing
+missing = compiled_colors.KERNELS.why_missing
 needs_compiler = pytest.mark.skipif(bool(missing), reason=missing)
 
 

@@ -1,7 +1,7 @@
 // The inner loops of blending for float32 on a CPU: which Gaussian touches which tile, a tile's Gaussians front to back,
 // and their gradients.
 //
-// native.py compiles this file where there is a C++ compiler and calls it; tiles.py and blocks.py do the same in torch.
+// blending.py compiles this file where there is a C++ compiler and calls it; tiles.py and blocks.py do the same in torch.
 // Both follow the rule of alpha.py and the algebra of quadratics.py, whose names are used here. A tile has 8 x 8 pixels; a
 // row of them is one vector. Each tile is drawn by one thread from front to back, so that the number of threads changes
 // nothing.
