@@ -49,8 +49,10 @@ class Step(Generic[R]):
     share: float
     """Share of the Gaussians to draw, in (0, 1]."""
     moving: bool
-    """Whether it stands in for the whole picture as long as the camera moves. It is then drawn to its end even if a
-    newer request comes, as nothing would ever be seen otherwise."""
+    """Whether it is quick enough for a camera that moves. It is then drawn to its end even if a newer request comes, as
+    nothing would ever be seen otherwise."""
+    whole: bool
+    """Whether it is the whole picture, with all Gaussians. One that is quick enough for a moving camera may be."""
 
 
 class Schedule(Generic[R]):
@@ -125,7 +127,7 @@ class Schedule(Generic[R]):
                 self._effort = min(max(self._effort * min(max(change, low), high), self._least()), 1.0)
             if step.number == self._number:
                 self._drawn = step.side
-                self._complete = step.side >= self._full_side and step.share == 1.0
+                self._complete = step.whole
             self._changed.notify_all()
 
     def _moving_side(self) -> int:
@@ -140,7 +142,7 @@ class Schedule(Generic[R]):
         full, smallest = self._full_side, self._moving_side()
         if self._drawn == 0:
             side = min(max(round(full * math.sqrt(self._effort)), smallest), full)
-            share = min(self._effort / (smallest / full) ** 2, 1.0)
-            return Step(self._request, self._number, side, max(share, LEAST_SHARE), True)
+            share = max(min(self._effort / (smallest / full) ** 2, 1.0), LEAST_SHARE)
+            return Step(self._request, self._number, side, share, moving=True, whole=side == full and share == 1.0)
         side = full if full <= _BETWEEN * self._drawn or self._drawn > smallest else round(math.sqrt(full * smallest))
-        return Step(self._request, self._number, side, 1.0, False)
+        return Step(self._request, self._number, side, 1.0, moving=False, whole=side == full)

@@ -169,10 +169,11 @@ class Viewer:
         self._notes[client.client_id] = client.gui.add_markdown("drawing")
 
         def show(pixels: np.ndarray, step: Step[Sight], seconds: float) -> None:
-            client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=_QUALITY[step.moving])
+            stands_in = step.moving and not step.whole
+            client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=_QUALITY[stands_in])
             size = f"{pixels.shape[1]} x {pixels.shape[0]}"
             share = "" if step.share == 1 else f", {step.share:.0%} of the Gaussians"
-            state = "moving: " if step.moving else ""
+            state = "moving: " if stands_in else ""
             note = self._notes.get(client.client_id)
             if note is not None:  # the page has not gone meanwhile
                 note.content = f"{state}{size}, {1000 * seconds:.0f} ms a frame{share}"

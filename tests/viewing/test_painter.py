@@ -37,7 +37,7 @@ def sight(camera: Camera, scene: ps.Gaussians, second: ps.Gaussians | None = Non
 
 
 def step(of: Sight, side: int = 400, moving: bool = False) -> Step[Sight]:
-    return Step(of, 1, side, 1.0, moving)
+    return Step(of, 1, side, 1.0, moving, whole=not moving)
 
 
 def test_picture_is_the_render_of_its_view(scene, camera):

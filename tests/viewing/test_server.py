@@ -139,23 +139,41 @@ def test_a_page_that_has_gone_is_not_kept(viewer):
     assert waiting() == before
 
 
-def test_a_picture_that_is_done_when_its_page_has_gone_goes_nowhere(viewer):
-    shown = []
+@pytest.fixture()
+def painted(viewer):
+    """A page that is looked at, and what paints on it: gives the function that shows a picture, and what was shown."""
+    shown, made = [], {}
 
     class Page:
         client_id = 77
         camera = scene = gui = SimpleNamespace(
-            add_markdown=lambda text: SimpleNamespace(), on_update=lambda look: None,
-            set_background_image=lambda *_, **__: shown.append("picture"),
+            add_markdown=lambda text: SimpleNamespace(content=text), on_update=lambda look: None,
+            set_background_image=lambda *_, jpeg_quality, **__: shown.append(jpeg_quality),
         )  # fmt: skip
 
-    page, made = Page(), {}
+    page = Page()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pointsplat_ns.viewing.viewer.Painter", lambda show: made.setdefault("show", show))
         patch.setattr(viewer, "_put", lambda client: None)
         patch.setattr(viewer, "_look", lambda client: None)
         viewer._connected(page)
     viewer._painters.pop(page.client_id)
+    yield page, made["show"], shown
+    viewer._notes.pop(page.client_id, None)
+
+
+def test_a_picture_that_is_done_when_its_page_has_gone_goes_nowhere(viewer, painted):
+    page, show, shown = painted
     viewer._disconnected(page)
-    made["show"](np.zeros((2, 2, 3), np.uint8), Step(None, 1, 2, 1.0, False), 0.1)
-    assert shown == ["picture"] and page.client_id not in viewer._notes
+    show(np.zeros((2, 2, 3), np.uint8), Step(None, 1, 2, 1.0, False, True), 0.1)
+    assert len(shown) == 1 and page.client_id not in viewer._notes
+
+
+def test_a_whole_picture_of_a_moving_camera_is_sent_and_named_as_a_whole_one(viewer, painted):
+    page, show, shown = painted
+    said = []
+    for moving, whole in ((True, False), (True, True), (False, True)):
+        show(np.zeros((2, 2, 3), np.uint8), Step(None, 1, 2, 1.0, moving, whole), 0.1)
+        said.append(viewer._notes[page.client_id].content)
+    assert said == ["moving: 2 x 2, 100 ms a frame", *["2 x 2, 100 ms a frame"] * 2]
+    assert shown[0] < shown[1] == shown[2]
