@@ -129,7 +129,8 @@ def plot(rows: list[Row], path: Path) -> None:
             if points:
                 axis.plot(*zip(*points, strict=True), marker="o", label=kind)
         axis.axhline(0, color="grey", linewidth=0.8)
-        axis.set(title=f"{key[0]}, {key[1]}", xlabel="CPU seconds after merging", ylabel="gain, dB")
+        against = "renders" if start.photo_psnr is None else "held-out photos"
+        axis.set(title=f"{key[0]}, {key[1]}", xlabel="CPU seconds after merging", ylabel=f"gain against {against}, dB")
     for axis in axes[len(scenes) :]:
         axis.set_axis_off()
     axes[0].legend()
@@ -137,7 +138,9 @@ def plot(rows: list[Row], path: Path) -> None:
 
 
 def gain(row: Row, start: Row) -> float:
-    """Mean gain in both sets of sampled views, dB."""
+    """Gain against held-out photos, dB, or where there are none the mean gain in both sets of sampled views."""
+    if row.photo_psnr is not None and start.photo_psnr is not None:
+        return row.photo_psnr - start.photo_psnr
     return 0.5 * (row.psnr_a + row.psnr_b - start.psnr_a - start.psnr_b)
 
 
