@@ -20,6 +20,9 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX
 
+CLAMPED = ALPHA_MAX * (1 - 1e-6)
+"""From here on alpha is held at ALPHA_MAX: room for the rounding of that to float32."""
+
 STEP_BY_STEP = 64
 """Longer chunks are scanned in fewer, larger operations."""
 
@@ -43,7 +46,7 @@ def alphas_(log2_alpha: Tensor, alpha_min: float, may_clamp: bool = True) -> Ten
 
 def is_clamped(alpha: Tensor) -> Tensor:
     """Where alpha is held at ALPHA_MAX: it has no gradient there."""
-    return alpha >= ALPHA_MAX * (1 - 1e-6)  # room for the rounding of ALPHA_MAX to float32
+    return alpha >= CLAMPED
 
 
 def is_drawn(after: Tensor, transmittance_min: float, out: Tensor | None = None) -> Tensor:

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.system.kernels import on_threads
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 BENCHMARKS = REPOSITORY / "benchmarks"
@@ -50,6 +51,19 @@ def equal(a: object, b: object) -> bool:
     if isinstance(a, dict) and isinstance(b, dict):
         return a.keys() == b.keys() and all(equal(a[name], b[name]) for name in a)
     return torch.equal(a, b) if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor) else a == b
+
+
+def record_kernels(monkeypatch, *modules) -> list:
+    """The kernels that modules of ``pointsplat_ns.rasterizer.compiled`` call from now on, as a list that grows."""
+    called: list = []
+
+    def recorded(worth_it, function, *arguments):
+        called.append(function)
+        on_threads(worth_it, function, *arguments)
+
+    for module in modules:
+        monkeypatch.setattr(module, "on_threads", recorded)
+    return called
 
 
 def normal_scene(n: int = 5, degree: int = 3, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:

@@ -13,6 +13,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.nerfstudio_plugin.optimizers import all_finite
 from pointsplat_ns.nerfstudio_plugin.pointsplat import distributed
 from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import average_gradients
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
@@ -121,8 +122,7 @@ class PointSplatTrainer(StoppableTrainer):
         """One text for each part of the network with a gradient that is not finite."""
         faults = []
         for name, parameters in self.optimizers.parameters.items():
-            largest = [p.grad.abs().amax() for p in parameters if p.grad is not None]
-            if largest and not torch.stack(largest).isfinite().all():
+            if not all_finite(p.grad for p in parameters if p.grad is not None):
                 faults.append(f"the gradient of the {name} is not finite")
         return faults
 

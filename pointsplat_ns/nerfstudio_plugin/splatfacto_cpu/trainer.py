@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from pointsplat_ns.errors import DataError, PointSplatError
+from pointsplat_ns.nerfstudio_plugin.optimizers import all_finite
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.early_look import EarlyLook
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuPipeline
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.resuming import restore_training_state, training_state
@@ -54,14 +55,6 @@ class CheckingOptimizers(Optimizers):
         """Whether all gradients of a group are finite. Its optimiser has its parameters, which densification renews."""
         groups = self.optimizers[name].param_groups
         return all_finite(p.grad for group in groups for p in group["params"] if p.grad is not None)
-
-
-def all_finite(tensors: Iterable[Tensor]) -> bool:
-    """Whether all numbers are finite.
-
-    A sum is not finite if a number is not, and is a fifth of the work; where it overflows, numbers are looked at.
-    """
-    return all(bool(tensor.sum().isfinite()) or bool(tensor.isfinite().all()) for tensor in tensors)
 
 
 class SplatfactoCpuTrainer(StoppableTrainer):

@@ -6,11 +6,9 @@
 // row of them is one vector. Each tile is drawn by one thread from front to back, so that the number of threads changes
 // nothing.
 
-#include <algorithm>
-#include <cmath>
-#include <cstdint>
-#include <cstring>
 #include <vector>
+
+#include "lanes.h"
 
 namespace {
 
@@ -19,15 +17,13 @@ constexpr int CHUNK = 32;    // Gaussians between two checks for saturation, and
 constexpr int GRAB = 4;      // tiles that a thread takes at once
 constexpr int MOMENTS = 6;   // w, w^2, dv, dv^2, w dv, 1
 constexpr int COLOR = 6;     // first column of the colours in the table
-constexpr int TAKE = 1024;   // Gaussians that a thread takes at once
 constexpr float HALF = 0.5f * (TILE - 1);
 constexpr float LN2 = 0.693147180559945f, LOG2E = 1.44269504088896f;
 constexpr float SLACK = 1e-3f;  // log2 alpha: rounding never leaves out a pixel that is drawn
 
-typedef float Row __attribute__((vector_size(4 * TILE)));
-typedef int32_t Mask __attribute__((vector_size(4 * TILE)));
+typedef Lane Row;  // of pixels
+static_assert(LANES == TILE, "a row of a tile is one vector");
 
-const Row ZERO = {};
 const Row OFFSETS = {-3.5f, -2.5f, -1.5f, -0.5f, 0.5f, 1.5f, 2.5f, 3.5f};  // of pixels from the tile's centre
 
 inline Row load(const float* from) {
@@ -37,12 +33,6 @@ inline Row load(const float* from) {
 }
 
 inline void store(float* to, Row row) { std::memcpy(to, &row, sizeof(Row)); }
-
-inline Row larger(Row a, Row b) { return a > b ? a : b; }
-
-inline Row smaller(Row a, Row b) { return a < b ? a : b; }
-
-inline Row magnitude(Row a) { return larger(a, -a); }
 
 inline float sum(Row row) {
     return ((row[0] + row[4]) + (row[2] + row[6])) + ((row[1] + row[5]) + (row[3] + row[7]));
@@ -258,11 +248,9 @@ void each_tile(const Task& task, Work work) {
 
 template <typename Work>
 void each_gaussian(int64_t* next, int64_t count, Work work) {
-    for (;;) {
-        const int64_t first = __atomic_fetch_add(next, TAKE, __ATOMIC_RELAXED);
-        if (first >= count) return;
-        for (int64_t i = first; i < first + TAKE && i < count; ++i) work(i);
-    }
+    each_range(next, count, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t i = first; i < last; ++i) work(i);
+    });
 }
 
 template <int D>

@@ -1,7 +1,7 @@
 """Blending by compiled kernels (``blending.cpp``): what :mod:`~pointsplat_ns.rasterizer.blocks` does in torch.
 
-For float32 on a CPU, where the machine has a C++ compiler. Building takes two seconds, once. Without a compiler, or if
-what it made does not draw as torch does, blending stays with torch.
+For float32 on a CPU, where the machine has a C++ compiler. Without a compiler, or if what it made does not draw as
+torch does, blending stays with torch.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.rasterizer import blocks
+from pointsplat_ns.rasterizer.alpha import CLAMPED
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, EXACT, Quality
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
 from pointsplat_ns.rasterizer.tiles import SLACK, Footprints, Region, TileList
@@ -144,7 +145,7 @@ def _task(footprints: Footprints, tiles: TileList, inputs: Inputs, chunks: Tenso
         chunks=chunks.data_ptr(), tiles=tiles.offsets.numel() - 1, rows=region.rows, columns=region.columns,
         top=region.top, left=region.left, width=footprints.width, height=footprints.height, channels=inputs.channels,
         log2_alpha_min=math.log2(quality.alpha_min), alpha_min=quality.alpha_min, alpha_max=ALPHA_MAX,
-        clamped_from=ALPHA_MAX * (1 - 1e-6), transmittance_min=quality.transmittance_min, next=next_tile.data_ptr(),
+        clamped_from=CLAMPED, transmittance_min=quality.transmittance_min, next=next_tile.data_ptr(),
     )  # fmt: skip
 
 
@@ -180,11 +181,8 @@ def differentiate_region(
     pairs, count = tiles.gaussians.numel(), tiles.order.numel()
     columns = MOMENTS + inputs.channels + (2 if absgrad else 0)
     sums, out = grad_image.new_empty(pairs, columns), grad_image.new_empty(count, columns)
-    grad_image, grad_final, next_tile = (
-        grad_image.contiguous(),
-        grad_final.contiguous(),
-        torch.zeros_like(tiles.offsets[:1]),
-    )
+    grad_image, grad_final = grad_image.contiguous(), grad_final.contiguous()
+    next_tile = torch.zeros_like(tiles.offsets[:1])
     task = _task(footprints, tiles, inputs, tape.chunks, next_tile)
     task.final, task.before, task.blended = final.data_ptr(), tape.before.data_ptr(), tape.blended.data_ptr()
     task.grad_image, task.grad_final = grad_image.data_ptr(), grad_final.data_ptr()

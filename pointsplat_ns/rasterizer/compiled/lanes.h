@@ -1,5 +1,5 @@
-// What projection.cpp and colors.cpp share: numbers of eight Gaussians at once, one in each lane of a vector, and ranges of
-// Gaussians for threads.
+// What the kernels share: eight numbers at once, of as many Gaussians or of a tile's row of pixels, one in each lane of a
+// vector, and ranges of Gaussians for threads.
 
 #pragma once
 

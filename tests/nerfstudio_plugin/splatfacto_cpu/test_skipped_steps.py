@@ -15,8 +15,8 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from making import equal
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
+from pointsplat_ns.nerfstudio_plugin.optimizers import all_finite
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModel
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import all_finite
 
 LOG = "pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer.CONSOLE.log"
 

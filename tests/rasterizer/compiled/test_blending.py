@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,11 +11,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from making import splats_in_view
+from making import record_kernels, splats_in_view
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.compiled import blending
 from pointsplat_ns.rasterizer.constants import QUALITIES
-from pointsplat_ns.system.kernels import Kernels, on_threads
+from pointsplat_ns.system.kernels import Kernels
 
 WIDTH, HEIGHT = 70, 45  # neither is a multiple of the tile
 
@@ -38,14 +39,7 @@ def draw(channels=3, n=3000, dtype=torch.float32, absgrad=True, cameras=1, **opt
 @pytest.fixture()
 def kernel_calls(monkeypatch):
     """The kernels called within the test."""
-    called = []
-
-    def recorded(worth_it, function, *arguments):
-        called.append(function)
-        on_threads(worth_it, function, *arguments)
-
-    monkeypatch.setattr(blending, "on_threads", recorded)
-    return called
+    return record_kernels(monkeypatch, blending)
 
 
 @needs_compiler
@@ -109,6 +103,7 @@ def test_kernels_that_do_not_draw_as_torch_does_are_not_used(right, wrong, tmp_p
     kernels = blending.KERNELS
     text = kernels.source.read_text("utf-8")
     assert right in text
+    shutil.copy(blending.KERNELS.source.with_name("lanes.h"), tmp_path)
     changed = tmp_path / "kernels.cpp"
     changed.write_text(text.replace(right, wrong), "utf-8")
     monkeypatch.setenv("POINTSPLAT_CACHE", str(tmp_path / "cache"))

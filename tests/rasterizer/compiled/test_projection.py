@@ -8,11 +8,11 @@ import shutil
 import pytest
 import torch
 
-from making import camera_askew, splats_in_view
+from making import camera_askew, record_kernels, splats_in_view
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.compiled import blending, colors, projection
 from pointsplat_ns.rasterizer.projection import count_meaningless, project
-from pointsplat_ns.system.kernels import Kernels, on_threads
+from pointsplat_ns.system.kernels import Kernels
 
 WIDTH, HEIGHT = 37, 29
 F32, F64 = torch.float32, torch.float64
@@ -267,15 +267,7 @@ ALL_KERNELS = {
 @pytest.fixture()
 def kernel_calls(monkeypatch):
     """The kernels called within the test."""
-    called = []
-
-    def recorded(worth_it, function, *arguments):
-        called.append(function)
-        on_threads(worth_it, function, *arguments)
-
-    for module in (blending, colors, projection):
-        monkeypatch.setattr(module, "on_threads", recorded)
-    return called
+    return record_kernels(monkeypatch, blending, colors, projection)
 
 
 @needs_compiler
