@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import datetime
 import functools
-import os
 from pathlib import Path
-
-import torch
-import torch.distributed as dist
 
 from pointsplat_ns.compression.compact import compact_scene, resolve_options
 from pointsplat_ns.compression.repair import Effort, RepairBudget
@@ -20,15 +15,12 @@ from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
-from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import gathered
 from pointsplat_ns.pruning import Keep
+from pointsplat_ns.system.processes import connect_torchrun, gathered, torchrun_device, torchrun_rank
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 from pointsplat_ns.tradeoff.finding import find_scene
 from pointsplat_ns.tradeoff.settings import Repair, repairs_of
 from pointsplat_ns.tradeoff.targets import Targets, targets_of
-
-FOREVER = datetime.timedelta(days=1000)
-"""How long processes of ``torchrun`` wait for one another; the last scene of one may take long."""
 
 
 def compact_folder(
@@ -100,9 +92,8 @@ def compact_folder(
     target = output_folder(folder, "compact") if output is None else Path(output)
     part = WHOLE if shard is None else Shard.of(shard)
     rank, world_size = torchrun_rank()
-    if world_size > 1 and not dist.is_initialized():
-        dist.init_process_group("gloo", timeout=FOREVER)
-    device = f"cuda:{os.environ.get('LOCAL_RANK', 0)}" if torch.cuda.is_available() else "cpu"
+    connect_torchrun()
+    device = str(torchrun_device())
     trained = _refiner_on(refiner, device)
     repair = RepairBudget(effort, seconds)
     budget, method = resolve_options(trained, keep, by, sh)
@@ -160,10 +151,3 @@ def _found(
     if result.interrupted:
         raise KeyboardInterrupt  # which is meant for all scenes, not for the search of this one
     return Made(result.scene, len(dense), result.psnr)
-
-
-def torchrun_rank() -> tuple[int, int]:
-    """Rank of this process and number of processes that ``torchrun`` started together; 0 and 1 without it."""
-    if "TORCHELASTIC_RUN_ID" not in os.environ:
-        return 0, 1
-    return int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])

@@ -52,7 +52,7 @@ def compact_folder(
     """
     import pointsplat_ns as ps
     from pointsplat_ns.compression.scene_folder import TABLE_NAME, output_folder
-    from pointsplat_ns.folders import torchrun_rank
+    from pointsplat_ns.system.processes import torchrun_rank
 
     for name, given in (("--picture", picture is not None), ("--html", html is not None), ("--dry-run", dry_run)):
         if given:

@@ -13,6 +13,7 @@ def make_feedback(
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("outputs/feedback.safetensors"),
     keep: tuple[str, ...] = ("3%", "10%", "30%", "50%"),
     updates: int = 1000,
+    seconds: float | None = None,
     at_once: int = 4,
     seed: int = 0,
     threads: int | None = None,
@@ -20,32 +21,42 @@ def make_feedback(
     """Train the network that sets the steps of `compact`'s repairs, on scenes and what is merged of them; no photos.
 
     It is saved every minute and at the end. With a GPU, 1,000 updates take some minutes to an hour; without one, days.
+    Under `torchrun --nproc-per-node 4 --no-python pointsplat make-feedback ...` four processes share the work; on one
+    GPU that pays too.
 
     Args:
         scenes: 3DGS .ply files, Splatfacto checkpoints or runs.
         output: file for the network.
         keep: budgets that the scenes are merged to: ratios (0.3), percentages (30%) or counts (50000).
-        updates: number of updates of the network.
+        updates: number of updates of the network, at most.
+        seconds: end after this time, with fewer updates; the learning rate falls with the time then.
         at_once: number of repairs in an update.
         seed: seed of the initial weights and of all choices.
         threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
             programs keep the machine busy. Another number sums in another order.
     """
-    import functools
-
-    import torch
+    import math
 
     import pointsplat_ns as ps
     from pointsplat_ns.compression.feedback_training import TrainingScene, train_feedback
+    from pointsplat_ns.system.processes import connect_torchrun, torchrun_device, torchrun_rank
     from pointsplat_ns.system.progress import progress_bar, tracked
     from pointsplat_ns.system.threads import fixed_threads
 
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    ready = []
+    if seconds is not None and not seconds > 0:
+        raise ps.DataError(f"--seconds {seconds:g}: expected a number above 0")
+    if updates < 1:
+        raise ps.DataError(f"--updates {updates}: expected at least 1")
+    connect_torchrun()
+    device, first, ready = torchrun_device(), torchrun_rank()[0] == 0, []
     with fixed_threads(threads):
-        for path in tracked(scenes, "merging scenes", len(scenes)):
+        for path in tracked(scenes, "merging scenes", len(scenes)) if first else scenes:
             ready.append(TrainingScene.of(path.stem, ps.load(path).to(device), keep))
-            print(f"{path}: {len(ready[-1].dense):,} Gaussians, {len(ready[-1].views)} views")
-        with progress_bar() as show:
-            train_feedback(ready, updates, at_once, seed, output, functools.partial(show, "training"))
-    print(f"{output}: the network")
+            if first:
+                print(f"{path}: {len(ready[-1].dense):,} Gaussians, {len(ready[-1].views)} views")
+        with progress_bar(first) as show:
+            train_feedback(
+                ready, updates, at_once, seed, output, lambda share: show("training", share), seconds or math.inf
+            )
+    if first:
+        print(f"{output}: the network")

@@ -7,11 +7,13 @@ as constant, as usual for learned optimisers (Andrychowicz et al., arXiv 1606.04
 
 from __future__ import annotations
 
+import math
 import random
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -25,6 +27,7 @@ from pointsplat_ns.pruning import prune
 from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, save_feedback_refiner
+from pointsplat_ns.system import processes
 from pointsplat_ns.system.thread_choice import ThreadChoice
 from pointsplat_ns.views import Views
 
@@ -42,6 +45,9 @@ FLOOR = 1e-5
 
 RATE, WARM_UP = 3e-3, 20
 """Learning rate of Adam, and updates until it is reached; then it falls as those of repairs do."""
+
+BACKEND: Literal["auto"] = "auto"
+"""What draws: gsplat where there are its CUDA kernels, which are several times as fast there."""
 
 SAVED_EVERY = 60.0
 """Seconds between intermediate saves."""
@@ -78,11 +84,12 @@ def roll_out(
     reached: list[Tensor] = []
     for step in range(steps):
         view = scene.views[chosen[step]]
-        feedback.observe(gradients_of(now.detach(), view, _target(scene, chosen[step])))
+        feedback.observe(gradients_of(now.detach(), view, _target(scene, chosen[step]), BACKEND))
         learned = network(feedback.features(now.detach(), step / steps, steps))
         now = feedback.moved(now, share_of_rates(step / steps), *learned)
         seen = [
-            _decibels(render(now, scene.views[index]), _target(scene, index)) for index in looked_at.get(step + 1, [])
+            _decibels(render(now, scene.views[index], backend=BACKEND), _target(scene, index))
+            for index in looked_at.get(step + 1, [])
         ]
         if seen:
             reached.append(torch.stack(seen).mean())
@@ -96,22 +103,34 @@ def train_feedback(
     seed: int = 0,
     output: Path | None = None,
     progress: Callable[[float], None] | None = None,
+    seconds: float = math.inf,
 ) -> FeedbackRefiner:
     """Train a network.
 
+    Processes that are connected (:mod:`pointsplat_ns.system.processes`) share the repairs of each update among them.
+    What is learned is the same, to rounding. Updates whose gradients are not finite are left out.
+
     Args:
-        scenes: on one device, where all is computed.
+        scenes: on one device, where all is computed; the same in every process.
         updates: number of steps of the network's optimiser.
         at_once: repairs whose gradients are averaged in an update.
         seed: of the network's initial weights and of all choices.
-        output: file that the network is saved to now and then, and at the end.
+        output: file that the network is saved to now and then, and at the end, by the first process.
         progress: called with the share done, in [0, 1].
+        seconds: after which training ends with fewer updates; the rates fall with the time then.
+
+    Returns:
+        The network, in evaluation mode.
 
     Raises:
-        DataError: if there is no scene, or one has too few views for a repair.
+        DataError: if there is no scene, one has too few views for a repair, or there are fewer repairs in an update
+            than processes.
     """
+    size, rank = processes.world_size(), processes.rank()
     if not scenes:
         raise DataError("no scene to train on; expected at least one")
+    if at_once < size:
+        raise DataError(f"{at_once} repairs in an update; expected at least as many as processes, {size}")
     for scene in scenes:
         if len(scene.views) < max(STEPS) + 3:
             raise DataError(f"{scene.name}: {len(scene.views)} views; expected at least {max(STEPS) + 3}")
@@ -121,29 +140,40 @@ def train_feedback(
         network = FeedbackRefiner().to(scenes[0].dense.device)
     adam = torch.optim.Adam(network.parameters(), lr=RATE, betas=(0.9, 0.99))
     metadata = {"scenes": [scene.name for scene in scenes], "keep": [*scenes[0].pruned], "repairs_per_update": at_once}
-    saved, threads = time.monotonic(), ThreadChoice()
-    for update in range(updates):
-        adam.param_groups[0]["lr"] = RATE * min(1, (update + 1) / WARM_UP) * share_of_rates(update / updates)
+    began, threads = time.monotonic(), ThreadChoice()
+    saved, update, done = began, 0, 0.0
+    while done < 1:
+        adam.param_groups[0]["lr"] = RATE * min(1, (update + 1) / WARM_UP) * share_of_rates(done)
         adam.zero_grad()
-        for _ in range(at_once):
+        for number in range(at_once):
             scene = generator.choice(scenes)
             pruned = generator.choice(list(scene.pruned.values()))
             steps = generator.choice(STEPS)
-            with threads.step(steps, pruned.device):
-                (-roll_out(network, scene, pruned, steps, generator) / at_once).backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0, error_if_nonfinite=True)
-        adam.step()
-        if output is not None and (time.monotonic() - saved > SAVED_EVERY or update == updates - 1):
-            save_feedback_refiner(network, output, {**metadata, "updates": update + 1})
-            saved = time.monotonic()
+            its_own = random.Random(generator.getrandbits(64))
+            if number % size == rank:
+                with threads.step(steps, pruned.device):
+                    (-roll_out(network, scene, pruned, steps, its_own) * (size / at_once)).backward()
+        processes.average_gradients(network.parameters())
+        if torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0).isfinite():
+            adam.step()
+        update += 1
+        elapsed = time.monotonic() - began
+        done = processes.gathered([max(update / updates, elapsed / seconds)])[0]  # the first process's clock counts
+        if output is not None and rank == 0 and (began + elapsed - saved > SAVED_EVERY or done >= 1):
+            save_feedback_refiner(network, output, {**metadata, "updates": update})
+            saved = began + elapsed
         if progress is not None:
-            progress((update + 1) / updates)
+            progress(min(done, 1.0))
     return network.eval()
+
+
+def _drawn(gaussians: Gaussians, scene: TrainingScene, index: int) -> Tensor:
+    return render(gaussians, scene.views[index], backend=BACKEND)
 
 
 @torch.no_grad()
 def _target(scene: TrainingScene, index: int) -> Tensor:
-    return render(scene.dense, scene.views[index])
+    return _drawn(scene.dense, scene, index)
 
 
 def _decibels(image: Tensor, target: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from torch import Tensor
 
@@ -73,7 +75,9 @@ def extent(scene: Gaussians) -> float:
         return float(centred.norm(dim=1).quantile(0.9)) or 1.0
 
 
-def gradients_of(scene: Gaussians, view: View, target: Tensor) -> dict[str, Tensor]:
+def gradients_of(
+    scene: Gaussians, view: View, target: Tensor, backend: Literal["torch", "auto"] = "torch"
+) -> dict[str, Tensor]:
     """Gradients of the loss of one view by parameter. What is not finite is 0, and so are the gradients of values that
     are not finite themselves.
 
@@ -81,10 +85,11 @@ def gradients_of(scene: Gaussians, view: View, target: Tensor) -> dict[str, Tens
         scene: K Gaussians.
         view: what is rendered.
         target: (H, W, 3) image that it should look like, in [0, 1].
+        backend: what draws, as for :func:`pointsplat_ns.rasterizer.render`.
     """
     leaves = scene.map(lambda value: value.detach().requires_grad_())
     with torch.enable_grad():
-        _loss(render(leaves, view), target).backward()
+        _loss(render(leaves, view, backend=backend), target).backward()
     return {name: _finite_gradient(value) for name, value in leaves.items()}
 
 

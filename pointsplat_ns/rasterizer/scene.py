@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -18,7 +19,13 @@ from pointsplat_ns.views import View, Views
 _RENDERS = ThreadChoice()
 
 
-def render(scene: Gaussians, views: View | Views, quality: QualityName = "exact", reduced: int = 1) -> Tensor:
+def render(
+    scene: Gaussians,
+    views: View | Views,
+    quality: QualityName = "exact",
+    reduced: int = 1,
+    backend: Literal["torch", "gsplat", "auto"] = "torch",
+) -> Tensor:
     """What a scene looks like from one view or several, over the views' background. Differentiable in the scene.
 
     Args:
@@ -27,6 +34,8 @@ def render(scene: Gaussians, views: View | Views, quality: QualityName = "exact"
             the other.
         quality: what to give up for speed: "exact", "balanced" or "fast", as for :func:`pointsplat_ns.rasterization`.
         reduced: draw this factor fewer pixels a side, and enlarge the picture (bicubic): faster, and blurred.
+        backend: "torch", or gsplat where it can be used ("auto"), as for :func:`pointsplat_ns.rasterization`. gsplat
+            leaves out tests of what it is given.
 
     Returns:
         Colours in [0, 1]: (H, W, 3) for a view, (C, H, W, 3) for C views.
@@ -45,11 +54,11 @@ def render(scene: Gaussians, views: View | Views, quality: QualityName = "exact"
     if isinstance(views, Views):
         if len(views) == 0:
             return scene.means.new_zeros(0, views.height, views.width, 3)
-        return torch.stack([render(scene, view, quality, reduced) for view in views])
+        return torch.stack([render(scene, view, quality, reduced, backend) for view in views])
     if reduced < 1:
         raise ValueError(f"reduced is {reduced}; expected 1 or more")
     if reduced > 1:
-        return _enlarged(render(scene, _smaller(views, reduced), quality), views)
+        return _enlarged(render(scene, _smaller(views, reduced), quality, backend=backend), views)
     with _RENDERS.step(_work(scene, views), scene.device):
         image, alpha, _ = rasterization(
             means=scene.means,
@@ -66,6 +75,7 @@ def render(scene: Gaussians, views: View | Views, quality: QualityName = "exact"
             far_plane=math.inf,  # the unit of length may be small
             rasterize_mode=views.rasterize_mode,
             quality=quality,
+            backend=backend,
         )
         return (image[0] + (1 - alpha[0]) * views.background.to(image)).clamp(0, 1)
 

@@ -14,8 +14,8 @@ import pytest
 import pointsplat_ns as ps
 from making import ball, same
 from pointsplat_ns.cli import main
-from pointsplat_ns.folders import torchrun_rank
 from pointsplat_ns.system.claims import claim
+from pointsplat_ns.system.processes import torchrun_rank
 
 
 def run(*args) -> None:

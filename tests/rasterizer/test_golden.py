@@ -34,6 +34,8 @@ PATHS = {
     "compiled": {},  # where there is a compiler, in float32, of at most four channels
     "compiled in regions": {"memory_budget": 4000},
 }
+if torch.cuda.is_available():
+    PATHS["CUDA"] = {"device": "cuda"}
 
 
 @pytest.fixture(scope="module")
@@ -54,19 +56,20 @@ def test_the_file_holds_the_scenes_and_they_show_something(stored):
         assert scene["alphas"].max() > 0.2 and all(scene[f"grad of {part}"].any() for part in golden.NAMES), name
 
 
-def draw(scene, shape, dtype, **options):
+def draw(scene, shape, dtype, device="cpu", **options):
     """What the fast path makes of a stored scene: image, alphas, gradients, in float64."""
-    leaves = {name: scene[name].to(dtype, copy=True).requires_grad_() for name in golden.NAMES}
-    background = torch.tensor([shape.background], dtype=dtype) if shape.background is not None else None
+    leaves = {name: scene[name].to(device, dtype, copy=True).requires_grad_() for name in golden.NAMES}
+    background = torch.tensor([shape.background], device=device, dtype=dtype) if shape.background is not None else None
     renders, alphas, _ = rasterization(
-        *leaves.values(), scene["viewmat"][None].to(dtype), scene["K"][None].to(dtype), golden.WIDTH, golden.HEIGHT,
-        sh_degree=shape.sh_degree, backgrounds=background, render_mode=shape.render_mode, rasterize_mode=shape.mode,
-        **options,
+        *leaves.values(), scene["viewmat"][None].to(leaves["means"]), scene["K"][None].to(leaves["means"]),
+        golden.WIDTH, golden.HEIGHT, sh_degree=shape.sh_degree, backgrounds=background, render_mode=shape.render_mode,
+        rasterize_mode=shape.mode, **options,
     )  # fmt: skip
     grads = torch.autograd.grad(golden.total(renders[0], alphas[0]), list(leaves.values()), materialize_grads=True)
     of_names = {f"grad of {name}": grad for name, grad in zip(golden.NAMES, grads, strict=True)}
     return {
-        name: value.detach().to(F64) for name, value in {"image": renders[0], "alphas": alphas[0], **of_names}.items()
+        name: value.detach().to("cpu", F64)
+        for name, value in {"image": renders[0], "alphas": alphas[0], **of_names}.items()
     }
 
 

@@ -1,29 +1,15 @@
-"""Training one network in several processes: losses, gradients, batch norm and reports over all of them.
-
-In a single process every function here changes nothing. The processes are those of ``torch.distributed``, with the
-backend nccl on GPUs and gloo on CPUs.
-"""
+"""Training one network in several processes: losses and batch norm over all of them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
 from pointsplat_ns.refiner.encoder import BatchNorm
-
-
-def world_size() -> int:
-    """Number of processes that train together."""
-    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
-
-
-def rank() -> int:
-    """Index of this process among all machines' processes."""
-    return dist.get_rank() if world_size() > 1 else 0
+from pointsplat_ns.system.processes import world_size
 
 
 def means_over_ranks(values: dict[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
@@ -50,56 +36,9 @@ def means_over_ranks(values: dict[str, Tensor], names: Sequence[str]) -> dict[st
     }
 
 
-def any_rank(flag: bool, device: torch.device | str) -> bool:
-    """Whether ``flag`` is set in any process. All processes must call this, each with its own device."""
-    if world_size() == 1:
-        return flag
-    count = torch.tensor([float(flag)], device=device)
-    dist.all_reduce(count)
-    return bool(count > 0)
-
-
 def with_value(local: Tensor, value: Tensor) -> Tensor:
     """A scalar with the value of ``value`` and the gradient of ``local``."""
     return local + (value - local).detach()
-
-
-def gathered(items: list[Any]) -> list[Any]:
-    """The items of all processes, in the order of their ranks; the same list in every process."""
-    if world_size() == 1:
-        return items
-    parts: list[Any] = [None] * world_size()
-    dist.all_gather_object(parts, items)
-    return [item for part in parts for item in part]
-
-
-@torch.no_grad()
-def share_state(module: nn.Module) -> None:
-    """Copy the parameters and buffers of the first process to all others."""
-    if world_size() > 1:
-        for value in (*module.parameters(), *module.buffers()):
-            dist.broadcast(value, 0)
-
-
-@torch.no_grad()
-def average_gradients(parameters: Iterable[nn.Parameter], steps: int = 1) -> None:
-    """Divide gradients that were summed over ``steps`` by that number, and average them over processes.
-
-    With several processes, a parameter without a gradient in any of them gets a gradient of zeros.
-    """
-    parameters = list(parameters)
-    share = 1.0 / (steps * world_size())
-    if share == 1.0 or not parameters:
-        return
-    if world_size() > 1:
-        grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
-        flat = torch.cat([grad.reshape(-1) for grad in grads])
-        dist.all_reduce(flat)
-        for p, grad, mean in zip(parameters, grads, flat.split([g.numel() for g in grads]), strict=True):
-            p.grad = grad.copy_(mean.view_as(grad))
-    for p in parameters:
-        if p.grad is not None:
-            p.grad.mul_(share)
 
 
 class SyncedBatchNorm(BatchNorm):

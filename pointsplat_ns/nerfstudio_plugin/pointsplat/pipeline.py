@@ -29,6 +29,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, Po
 from pointsplat_ns.nerfstudio_plugin.pointsplat.results import REFINER_NAME
 from pointsplat_ns.nerfstudio_plugin.pointsplat.training_state import TrainingState
 from pointsplat_ns.refiner import save_refiner
+from pointsplat_ns.system import processes
 
 
 @dataclass
@@ -60,22 +61,22 @@ class PointSplatPipeline(VanillaPipeline):
         grad_scaler: GradScaler | None = None,
     ):
         super(VanillaPipeline, self).__init__()
-        if world_size != distributed.world_size():
+        if world_size != processes.world_size():
             raise SceneError(
-                f"{world_size} processes are asked for and {distributed.world_size()} are connected; start them with "
+                f"{world_size} processes are asked for and {processes.world_size()} are connected; start them with "
                 "ns-train --machine.num-devices, on GPUs, or join them with torch.distributed"
             )
         if world_size > 1 and torch.device(device).type == "cuda":
             torch.cuda.set_device(local_rank)  # nccl gathers objects through the current device
         self.config, self.test_mode, self.world_size = config, test_mode, world_size
         self.datamanager = config.datamanager.setup(
-            device=device, test_mode=test_mode, world_size=world_size, local_rank=distributed.rank()
+            device=device, test_mode=test_mode, world_size=world_size, local_rank=processes.rank()
         )
         torch.manual_seed(config.datamanager.seed)
         self._model = config.model.setup(scene_box=None, num_train_data=0, device=device, grad_scaler=grad_scaler)
         self.model.to(device)
         self.model.attach(self.datamanager.scenes, self.datamanager.shown, self.datamanager.cache)
-        distributed.share_state(self.model.refiner)
+        processes.share_state(self.model.refiner)
         if world_size > 1:
             distributed.synchronise_batch_norm(self.model.refiner)
         scenes, indices = self.datamanager.scenes, self.datamanager.train_indices
@@ -172,7 +173,7 @@ class PointSplatPipeline(VanillaPipeline):
         self.eval()
         manager, model, lpips = self.datamanager, self.model, ReportedLpips()
         reports: list[SceneReport] = []
-        for index in range(distributed.rank(), len(manager.scenes), self.world_size):
+        for index in range(processes.rank(), len(manager.scenes), self.world_size):
             scene = manager.scenes[index]
             dense = scene.dense(keep=False)
             smaller = model.pruned_scene(index, dense)
@@ -186,7 +187,7 @@ class PointSplatPipeline(VanillaPipeline):
             reports.append(report)
         self.train(training)
         order = {scene.name: index for index, scene in enumerate(manager.scenes)}
-        reports = sorted(distributed.gathered(reports), key=lambda report: order[report.name])
+        reports = sorted(processes.gathered(reports), key=lambda report: order[report.name])
         summary = summarize_by_reference(reports, [scene.has_photos for scene in manager.scenes], get_std)
         config = self.config.model
         summary["settings"] = {
@@ -204,7 +205,7 @@ class PointSplatPipeline(VanillaPipeline):
 
         def save(step: int) -> None:
             trainer = attributes.trainer
-            if trainer is not None and distributed.rank() == 0:
+            if trainer is not None and processes.rank() == 0:
                 names = [self.datamanager.scenes[i].name for i in self.datamanager.train_indices]
                 save_refiner(
                     self.model.refiner,

@@ -14,10 +14,9 @@ from torch import Tensor, nn
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.nerfstudio_plugin.optimizers import all_finite
-from pointsplat_ns.nerfstudio_plugin.pointsplat import distributed
-from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import average_gradients
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
 from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainer
+from pointsplat_ns.system import processes
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.config import PointSplatTrainerConfig
@@ -43,7 +42,7 @@ class AveragingOptimizers(Optimizers):
     def optimizer_scaler_step_some(self, grad_scaler, param_groups: list[str]) -> None:
         """As nerfstudio's, with averaged gradients."""
         for group in param_groups:
-            average_gradients(self.parameters[group], self._counted[group])
+            processes.average_gradients(self.parameters[group], self._counted[group])
         super().optimizer_scaler_step_some(grad_scaler, param_groups)
 
 
@@ -100,11 +99,11 @@ class PointSplatTrainer(StoppableTrainer):
             _, losses, metrics = pipeline.get_train_loss_dict(step=step)
             loss = functools.reduce(torch.add, losses.values())
         faults = metrics.pop("faults")
-        skip = distributed.any_rank(bool(faults), self.device)
+        skip = processes.any_rank(bool(faults), self.device)
         if not skip:
             self.grad_scaler.scale(loss).backward()
             faults = [] if self.grad_scaler.is_enabled() else self._faults_of_gradients()
-            skip = distributed.any_rank(bool(faults), self.device)
+            skip = processes.any_rank(bool(faults), self.device)
         if skip:
             self._forget(statistics)
             self._count(step, pipeline.datamanager.scenes[metrics["scene"]].name, faults)
@@ -135,11 +134,11 @@ class PointSplatTrainer(StoppableTrainer):
 
     def _count(self, step: int, scene: str, faults: list[str]) -> None:
         """Count and log the scenes, of all processes, that made a step be skipped."""
-        faulty = distributed.gathered([(scene, "; ".join(faults))] if faults else [])
+        faulty = processes.gathered([(scene, "; ".join(faults))] if faults else [])
         skipped = self.pipeline.training_state.skipped
         for name, text in faulty:
             skipped[name] += 1
-            if distributed.rank() == 0:
+            if processes.rank() == 0:
                 total, most = skipped.total(), self.config.max_skipped_steps
                 CONSOLE.log(f"step {step} is skipped: {name}: {text} ({total} skipped so far; more than {most} stop)")
 
@@ -167,5 +166,5 @@ class PointSplatTrainer(StoppableTrainer):
     def save_checkpoint(self, step: int) -> None:
         """As nerfstudio's; all processes call it, the first one writes."""
         for name in self.pipeline.training_state.waiting:
-            average_gradients(self.optimizers.parameters[name])  # over processes, so that all hold the same
+            processes.average_gradients(self.optimizers.parameters[name])  # over processes, so that all hold the same
         super().save_checkpoint(step)

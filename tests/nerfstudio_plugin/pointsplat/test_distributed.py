@@ -163,13 +163,9 @@ def work(rank: int, folder: Path) -> None:
     """What each of the two processes does."""
     import torch.distributed as dist
 
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import (
-        average_gradients,
-        gathered,
-        means_over_ranks,
-        synchronise_batch_norm,
-    )
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks, synchronise_batch_norm
     from pointsplat_ns.refiner.encoder import BatchNorm
+    from pointsplat_ns.system.processes import average_gradients, gathered
 
     dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=2)
     found = train(config_of(folder / "rooms", folder / f"out{rank}", UPDATES), world_size=2)
@@ -309,13 +305,8 @@ def test_numbers_of_several_processes_become_one(together):
 
 
 def test_a_process_alone_is_left_as_it_is():
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import (
-        average_gradients,
-        gathered,
-        means_over_ranks,
-        rank,
-        world_size,
-    )
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks
+    from pointsplat_ns.system.processes import average_gradients, gathered, rank, world_size
 
     assert (rank(), world_size(), gathered([1])) == (0, 1, [1])
     assert means_over_ranks({"psnr": torch.tensor(3.0)}, ("l1", "psnr")) == {"psnr": torch.tensor(3.0)}

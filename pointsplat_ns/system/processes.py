@@ -1,0 +1,95 @@
+"""Several processes that work as one: who there is, and what they tell one another.
+
+In a single process every function here changes nothing. The processes are those of ``torch.distributed``, started by
+``torchrun`` or by nerfstudio, with the backend nccl on GPUs and gloo on CPUs.
+"""
+
+from __future__ import annotations
+
+import datetime
+import os
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import nn
+
+FOREVER = datetime.timedelta(days=1000)
+"""How long processes of ``torchrun`` wait for one another; the last scene of one may take long."""
+
+
+def torchrun_rank() -> tuple[int, int]:
+    """Rank of this process and number of processes that ``torchrun`` started together; 0 and 1 without it."""
+    if "TORCHELASTIC_RUN_ID" not in os.environ:
+        return 0, 1
+    return int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
+
+
+def torchrun_device() -> torch.device:
+    """The device of this process: of the GPUs the one that is its turn, if there are any."""
+    count = torch.cuda.device_count()
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)) % count) if count else torch.device("cpu")
+
+
+def connect_torchrun() -> None:
+    """Connect the processes that ``torchrun`` started together; does nothing in one alone, or a second time."""
+    if torchrun_rank()[1] > 1 and not dist.is_initialized():
+        dist.init_process_group("gloo", timeout=FOREVER)
+
+
+def world_size() -> int:
+    """Number of processes that train together."""
+    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
+
+
+def rank() -> int:
+    """Index of this process among all machines' processes."""
+    return dist.get_rank() if world_size() > 1 else 0
+
+
+def any_rank(flag: bool, device: torch.device | str) -> bool:
+    """Whether ``flag`` is set in any process. All processes must call this, each with its own device."""
+    if world_size() == 1:
+        return flag
+    count = torch.tensor([float(flag)], device=device)
+    dist.all_reduce(count)
+    return bool(count > 0)
+
+
+def gathered(items: list[Any]) -> list[Any]:
+    """The items of all processes, in the order of their ranks; the same list in every process."""
+    if world_size() == 1:
+        return items
+    parts: list[Any] = [None] * world_size()
+    dist.all_gather_object(parts, items)
+    return [item for part in parts for item in part]
+
+
+@torch.no_grad()
+def share_state(module: nn.Module) -> None:
+    """Copy the parameters and buffers of the first process to all others."""
+    if world_size() > 1:
+        for value in (*module.parameters(), *module.buffers()):
+            dist.broadcast(value, 0)
+
+
+@torch.no_grad()
+def average_gradients(parameters: Iterable[nn.Parameter], steps: int = 1) -> None:
+    """Divide gradients that were summed over ``steps`` by that number, and average them over processes.
+
+    With several processes, a parameter without a gradient in any of them gets a gradient of zeros.
+    """
+    parameters = list(parameters)
+    share = 1.0 / (steps * world_size())
+    if share == 1.0 or not parameters:
+        return
+    if world_size() > 1:
+        grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
+        flat = torch.cat([grad.reshape(-1) for grad in grads])
+        dist.all_reduce(flat)
+        for p, grad, mean in zip(parameters, grads, flat.split([g.numel() for g in grads]), strict=True):
+            p.grad = grad.copy_(mean.view_as(grad))
+    for p in parameters:
+        if p.grad is not None:
+            p.grad.mul_(share)
