@@ -152,6 +152,17 @@ def normalise(norm: nn.Module, x: torch.Tensor, weights: torch.Tensor) -> dict[s
     return found | {name: value.clone() for name, value in norm.named_buffers()}
 
 
+def feedback(file: Path) -> list[torch.Tensor]:
+    """What the network that sets the steps of repairs learns in two updates of two repairs."""
+    from making import ball
+    from pointsplat_ns.compression import feedback_training
+
+    with mock.patch.multiple(feedback_training, STEPS=(6,), SIDE=32):
+        scene = feedback_training.TrainingScene.of("ball", ball(800), ["30%"], times=1)
+        network = feedback_training.train_feedback([scene], 2, at_once=2, output=file)
+    return [value.detach() for value in network.parameters()]
+
+
 def rows() -> tuple[torch.Tensor, torch.Tensor]:
     """Points of two scenes of different sizes, far from zero, and weights for the loss."""
     generator = torch.Generator().manual_seed(7)
@@ -187,6 +198,7 @@ def work(rank: int, folder: Path) -> None:
     one.grad = torch.full((2,), 1.0 + rank) if rank else None
     average_gradients([one, none], steps=4)
     found["averaged"] = (one.grad, none.grad)
+    found["feedback"] = feedback(folder / f"feedback{rank}.safetensors")
     torch.save(found, folder / f"found{rank}.pt")
     dist.destroy_process_group()
 
@@ -204,11 +216,15 @@ def together(tmp_path_factory):
         alone = train(alone)
         with broken(BROKEN[0] | {2}, BROKEN[1] | {7}):  # what either of two processes cannot use, both leave out
             alone["skipping"] = train(gathering(folder / "rooms", folder / "skipping", 8, 4))
+        alone["feedback"] = feedback(folder / "feedback.safetensors")
         text = pair.communicate(timeout=600)[0].decode()
     finally:
         pair.kill()
     assert pair.returncode == 0, text
-    return [torch.load(folder / f"found{rank}.pt") for rank in (0, 1)], alone
+    found = [torch.load(folder / f"found{rank}.pt") for rank in (0, 1)]
+    for rank in (0, 1):
+        found[rank]["feedback written"] = (folder / f"feedback{rank}.safetensors").is_file()
+    return found, alone
 
 
 def test_losses_and_metrics_are_those_of_one_process_with_twice_the_batch(together):
@@ -240,6 +256,14 @@ def test_the_first_process_alone_writes(together):
     found, alone = together
     assert {"refiner.safetensors", f"step-{UPDATES - 1:09d}.ckpt"} <= set(found[0]["files"])
     assert not {"refiner.safetensors"} & set(found[1]["files"]) and not [f for f in found[1]["files"] if "ckpt" in f]
+
+
+def test_processes_share_the_repairs_that_a_feedback_refiner_learns_from(together):
+    found, alone = together
+    for a, b, wanted in zip(found[0]["feedback"], found[1]["feedback"], alone["feedback"], strict=True):
+        assert torch.equal(a, b)
+        assert wanted.any() and (a - wanted).abs().max() < 1e-3 * wanted.abs().max()
+    assert [part["feedback written"] for part in found] == [True, False]
 
 
 @pytest.mark.parametrize("name", ["resumed", "skipping", "batch norm"])
