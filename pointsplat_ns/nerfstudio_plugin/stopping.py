@@ -17,6 +17,7 @@ import torch
 import yaml
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
@@ -96,6 +97,9 @@ class StoppableTrainer(Trainer):
             raise
         except KeyboardInterrupt:
             _interrupted(signal.SIGINT)
+        if self.local_rank == 0:
+            # nerfstudio takes the steps of this call for the last step, also where a training goes on from a later one.
+            writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
         outputs = getattr(self.pipeline.datamanager, "train_dataparser_outputs", None)
         if outputs is not None:
             outputs.save_dataparser_transform = functools.partial(_save_whole, outputs.save_dataparser_transform)
@@ -118,7 +122,7 @@ class StoppableTrainer(Trainer):
                 if self._between_steps and self.step > self._start_step:
                     self.save_checkpoint(self.step - 1)
                     CONSOLE.log(
-                        f"Saved after step {self.step - 1}. The scene is usable as it is; to go on: --load-dir "
+                        f"Saved after step {self.step - 1}. The run is usable as it is; to go on: --load-dir "
                         f"{self.checkpoint_dir}"
                     )
                 _interrupted(self._asked or signal.SIGINT)

@@ -6,10 +6,11 @@ In a single process every function here changes nothing. The processes are those
 
 from __future__ import annotations
 
+import atexit
 import datetime
 import os
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import torch.distributed as dist
@@ -26,16 +27,29 @@ def torchrun_rank() -> tuple[int, int]:
     return int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
 
 
+def local_rank() -> int:
+    """Rank of this process among those that ``torchrun`` started on this machine; 0 without it."""
+    return int(os.environ["LOCAL_RANK"]) if torchrun_rank()[1] > 1 else 0
+
+
 def torchrun_device() -> torch.device:
     """The device of this process: of the GPUs the one that is its turn, if there are any."""
     count = torch.cuda.device_count()
-    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)) % count) if count else torch.device("cpu")
+    return torch.device("cuda", local_rank() % count) if count else torch.device("cpu")
 
 
-def connect_torchrun() -> None:
-    """Connect the processes that ``torchrun`` started together; does nothing in one alone, or a second time."""
-    if torchrun_rank()[1] > 1 and not dist.is_initialized():
-        dist.init_process_group("gloo", timeout=FOREVER)
+def connect_torchrun(backend: Literal["gloo", "nccl"] = "gloo") -> None:
+    """Connect the processes that ``torchrun`` started together; does nothing in one alone, or a second time.
+
+    Args:
+        backend: nccl where each process has a GPU of its own.
+    """
+    if torchrun_rank()[1] == 1 or dist.is_initialized():
+        return
+    if backend == "nccl":
+        torch.cuda.set_device(local_rank())  # nccl gathers objects through the current device
+    dist.init_process_group(backend, timeout=FOREVER)
+    atexit.register(dist.destroy_process_group)
 
 
 def world_size() -> int:

@@ -82,7 +82,7 @@ def test_command_is_one_that_works(command, tmp_path, monkeypatch, capsys):
         check_arguments(words, monkeypatch, capsys)
     elif program == "torchrun":
         started = torchrun_parser().parse_args(words[1:])
-        assert started.no_python and started.training_script == "pointsplat", "no rule for this program"
+        assert started.no_python and started.training_script in ("pointsplat", "ns-train"), "no rule for this program"
         check_arguments((started.training_script, *started.training_script_args), monkeypatch, capsys)
     elif program == "python" and words[1:2] == ("-m",):
         assert words[2] == "pytest", "no rule for this module"

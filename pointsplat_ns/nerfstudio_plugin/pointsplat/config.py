@@ -19,6 +19,7 @@ from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainerConfig
+from pointsplat_ns.system.processes import connect_torchrun, gathered, local_rank, rank, torchrun_rank
 
 RATES = {
     "encoder": 1e-4,
@@ -75,6 +76,32 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     # A setting of nerfstudio's text-to-NeRF methods: hidden on the command line.
     prompt: Suppress[Fixed[str | None]] = None
 
+    def set_timestamp(self) -> None:
+        """As nerfstudio's; of processes that ``torchrun`` started, which are connected here, all take the first one's.
+
+        Raises:
+            PointSplatError: if nerfstudio is to start several processes on a CPU, which it cannot.
+        """
+        kind, number = self.machine.device_type, self.machine.num_devices
+        if kind != "cuda" and number > 1:
+            raise PointSplatError(
+                f"--machine.num-devices {number} is for GPUs; expected 1, or processes on a CPU that are started by "
+                f"torchrun --nproc-per-node {number} --no-python ns-train {self.method_name}"
+            )
+        super().set_timestamp()
+        connect_torchrun("nccl" if kind == "cuda" else "gloo")
+        self.timestamp = gathered([self.timestamp])[0]
+
+    def print_to_terminal(self) -> None:
+        """As nerfstudio's, by the first process."""
+        if rank() == 0:
+            super().print_to_terminal()
+
+    def save_config(self) -> None:
+        """As nerfstudio's, but whole or not at all, and by the first process."""
+        if rank() == 0:
+            super().save_config()
+
     def setup(self, **kwargs) -> Trainer:
         """Build the trainer with a copy of this config whose rates are set and whose schedules end with the run.
 
@@ -103,6 +130,9 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
                     continue
                 schedule.warm_up_end = max(1, round(WARM_UP * steps))
                 schedule.max_steps = max(steps, schedule.warm_up_end + 1)  # the cosine divides by the difference
+        _, together = torchrun_rank()
+        if together > 1:  # nerfstudio, which did not start them, takes each for one alone
+            kwargs |= {"local_rank": local_rank(), "world_size": together}
         return self._target(config, **kwargs)
 
 

@@ -64,7 +64,7 @@ class PointSplatPipeline(VanillaPipeline):
         if world_size != processes.world_size():
             raise SceneError(
                 f"{world_size} processes are asked for and {processes.world_size()} are connected; start them with "
-                "ns-train --machine.num-devices, on GPUs, or join them with torch.distributed"
+                "torchrun, or, on GPUs, by ns-train --machine.num-devices"
             )
         if world_size > 1 and torch.device(device).type == "cuda":
             torch.cuda.set_device(local_rank)  # nccl gathers objects through the current device

@@ -328,6 +328,34 @@ def test_numbers_of_several_processes_become_one(together):
         assert part["averaged"][1].tolist() == [0.0] * 3
 
 
+def test_ns_train_under_torchrun_is_one_training(tmp_path):
+    write_rooms(tmp_path / "rooms")
+    asked = [
+        *("--data", tmp_path / "rooms", "--output-dir", tmp_path / "out", "--experiment-name", "pair"),
+        *("--max-num-iterations", 2, "--steps-per-eval-image", 0, "--vis", "tensorboard"),
+        *("--pipeline.datamanager.sampled-poses", 5, "--pipeline.datamanager.sampled-size", 32, 24),
+        *("--pipeline.model.size", "tiny", "--pipeline.model.by", "paper", "--pipeline.model.lpips-weight", 0),
+    ]
+    run = ("-m", "torch.distributed.run", "--nproc-per-node", "2", "-m", "nerfstudio.scripts.train", "pointsplat")
+    done = subprocess.run(
+        [sys.executable, *run, *map(str, asked)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=600
+    )
+    assert done.returncode == 0, done.stdout.decode()
+    (folder,) = (tmp_path / "out" / "pair" / "pointsplat").iterdir()
+    found = {path.name for path in folder.rglob("*") if "events" not in path.name}
+    assert found == {"config.yml", "refiner.safetensors", "nerfstudio_models", f"step-{1:09d}.ckpt"}
+    assert done.stdout.decode().count("rasterizer: ") == 1
+
+
+def test_several_processes_on_a_cpu_are_started_by_torchrun(tmp_path):
+    from pointsplat_ns.errors import PointSplatError
+
+    config = config_of(tmp_path, tmp_path, 1)
+    config.machine.num_devices = 2
+    with pytest.raises(PointSplatError, match="torchrun --nproc-per-node 2 --no-python ns-train pointsplat"):
+        config.set_timestamp()
+
+
 def test_a_process_alone_is_left_as_it_is():
     from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks
     from pointsplat_ns.system.processes import average_gradients, gathered, rank, world_size

@@ -15,6 +15,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.scene_box import OrientedBox, SceneBox
 from nerfstudio.models import splatfacto as stock
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
+from nerfstudio.utils import writer
 from PIL import Image
 
 from making import SHARED_DATA
@@ -295,6 +296,7 @@ def test_resuming_goes_on_from_the_checkpoint_and_still_learns(
     trainer, losses = run_training(again)
     model = trainer.pipeline.model
     assert trainer._start_step == 50 and trainer.step == 59
+    assert writer.GLOBAL_BUFFER["max_iter"] == 60, "what shares done and times left are told by"
     assert np.mean(losses) < 0.7 * np.mean(before[:10]), "resumed from scratch"
     assert model.means.shape != saved.shape or not torch.equal(model.means, saved), "resumed but no longer learning"
     for name, parameter in model.gauss_params.items():
