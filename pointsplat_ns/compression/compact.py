@@ -112,10 +112,9 @@ def compact_scene(
     error over all pixels of all views. On scenes unlike its training scenes, a refiner's residuals tend to have the
     right direction but to be too large. So half of the residuals are tried as well, and the share at the minimum of the
     parabola through the errors at 0, 1/2 and 1, where the error is least if renders change linearly with the residuals.
-    The best is kept if it gains at least :data:`MIN_GAIN`. A requested PSNR (``auto``) is reached before refinement, so
-    that it holds in any case. Then the scene is repaired (:func:`~pointsplat_ns.compression.repair.repair`), from views
-    other than those compared; that, too, is kept if it gains as much, and is closer in at least half of
-    the views.
+    The best is kept if it :func:`helps`. A requested PSNR (``auto``) is reached before refinement, so that it holds in
+    any case. Then the scene is repaired (:func:`~pointsplat_ns.compression.repair.repair`), from views other than those
+    compared; that, too, is kept if it helps.
 
     Args:
         dense: N Gaussians.
@@ -168,7 +167,7 @@ def compact_scene(
         repaired = repair(scene.to(device), dense.to(device), views, budget, functools.partial(progress, "repairing"))
         after_repair = reference.closeness(repaired.scene)
         verdict += "\n" + _repair_verdict(close, after_repair, repaired)
-        if _repair_helps(close, after_repair):
+        if helps(close, after_repair):
             scene = repaired.scene
     seconds = time.perf_counter() - start
     return Compacted(
@@ -281,8 +280,10 @@ def bottom_of_parabola(at_zero: float, at_half: float, at_one: float) -> float:
 
 
 def helps(before: Closeness, after: Closeness) -> bool:
-    """Whether refinement is worth keeping, see :data:`MIN_GAIN`."""
-    return after.psnr >= before.psnr + MIN_GAIN and math.isfinite(before.psnr)
+    """Whether a refinement or repair is worth keeping: it gains :data:`MIN_GAIN`, and is closer in at least half of the
+    views, as a gain over all pixels may be that of a few views, paid for by the others."""
+    gains = after.psnr >= before.psnr + MIN_GAIN and math.isfinite(before.psnr)
+    return gains and 2 * _closer_in(before, after) >= len(before.errors)
 
 
 def _figures(before: Closeness, after: Closeness) -> str:
@@ -299,15 +300,9 @@ def _closer_in(before: Closeness, after: Closeness) -> int:
     return sum(new < old for new, old in zip(after.errors, before.errors, strict=True))
 
 
-def _repair_helps(before: Closeness, after: Closeness) -> bool:
-    """Whether a repair is worth keeping: also closer in at least half of the views, as a gain over all pixels may be
-    that of a few views, paid for by the others."""
-    return helps(before, after) and 2 * _closer_in(before, after) >= len(before.errors)
-
-
 def _left_out(before: Closeness, after: Closeness) -> str:
     """Why what brought these errors was left out."""
-    if helps(before, after):
+    if after.psnr >= before.psnr + MIN_GAIN:
         return "it is farther in most views"
     return "it does not help" if after.psnr <= before.psnr else f"it brings less than {MIN_GAIN:g} dB"
 
@@ -326,6 +321,6 @@ def _verdict(before: Closeness, after: Closeness, strength: float) -> str:
 def _repair_verdict(before: Closeness, after: Closeness, repaired: Repaired) -> str:
     """One line of text: what the repair gained and cost, or why it was left out."""
     cost = f"{repaired.steps} steps in {repaired.seconds:.1f} s" + (", interrupted" if repaired.interrupted else "")
-    if _repair_helps(before, after):
+    if helps(before, after):
         return f"repair, {cost}: {_figures(before, after)}"
     return f"repair left out, {_left_out(before, after)} ({cost}): {_figures(before, after)}"
