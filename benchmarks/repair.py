@@ -96,7 +96,7 @@ def rows_of(path: Path, keep: str, seconds: list[float], fine_tune_steps: list[i
     reference = DenseReference(dense, views)
     before = reference.closeness(merged)
     refined, _, after = as_far_as_it_helps(reference, before, merged, ps.load_refiner()(merged))
-    refined = refined if helps(before, after) else merged
+    refined, close = (refined, after) if helps(before, after) else (merged, before)
     yield row("refiner", refined, 0, started)
     for steps in fine_tune_steps:
         started = now()
@@ -105,7 +105,7 @@ def rows_of(path: Path, keep: str, seconds: list[float], fine_tune_steps: list[i
     for budget in (RepairBudget("quick"), *(RepairBudget(seconds=limit) for limit in seconds)):
         for kind, network in (("Adam", None), ("repair", shipped_feedback_refiner(dense.device))):
             started = now()
-            repaired = repair(refined, dense, source, budget, network=network)
+            repaired = repair(refined, dense, source, budget, network=network, psnr=close.psnr)
             yield row(kind, repaired.scene, repaired.steps, started)
 
 

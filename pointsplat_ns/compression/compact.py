@@ -164,7 +164,8 @@ def compact_scene(
     if reference is not None and close is not None and not budget.empty and close.psnr < math.inf:
         progress("repairing", 0.0)
         device = reference.renders[0].device
-        repaired = repair(scene.to(device), dense.to(device), views, budget, functools.partial(progress, "repairing"))
+        shown = functools.partial(progress, "repairing")
+        repaired = repair(scene.to(device), dense.to(device), views, budget, shown, psnr=close.psnr)
         after_repair = reference.closeness(repaired.scene)
         verdict += "\n" + _repair_verdict(close, after_repair, repaired)
         if helps(close, after_repair):

@@ -291,7 +291,9 @@ def test_a_repair_that_helps_is_kept_and_one_that_harms_is_left_out(scene, views
     spoiled = pruned.replace(features_dc=pruned.features_dc * math.nan)
     far = pruned.replace(features_dc=pruned.features_dc + 2.0)
     for made, kept in ((larger, True), (far, False), (spoiled, False)):
-        monkeypatch.setattr(compact_module, "repair", lambda *_, made=made, kept=kept: Repaired(made, 5, 0.5, not kept))
+        monkeypatch.setattr(
+            compact_module, "repair", lambda *_, made=made, kept=kept, **others: Repaired(made, 5, 0.5, not kept)
+        )
         result = compacted(scene, refiner, views, budget=budget)
         assert (result.scene is made) == kept and result.repaired.scene is made
         assert same(result.scene, made if kept else pruned)
@@ -318,7 +320,7 @@ def test_what_most_views_pay_for_is_left_out(scene, views, monkeypatch):
         return Closeness((0.9, 0.2, 0.2) if same(scene, pruned) else (0.1, 0.21, 0.21), None)
 
     monkeypatch.setattr(DenseReference, "closeness", closeness)
-    monkeypatch.setattr(compact_module, "repair", lambda *_: Repaired(made, 5, 0.5, False))
+    monkeypatch.setattr(compact_module, "repair", lambda *_, **others: Repaired(made, 5, 0.5, False))
     result = compacted(scene, trained(tiny_refiner("scales", 0.1)), views, budget=RepairBudget("quick", 1.0))
     assert same(result.scene, pruned) and result.after_repair.psnr > result.before.psnr + 3
     assert result.verdict.startswith("refinement left out, it is farther in most views: ")
