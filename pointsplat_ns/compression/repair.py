@@ -32,9 +32,9 @@ above Adam's after 8 and 32 steps, and 0.1 to 0.2 below after 128 and 200."""
 
 NEARLY_RIGHT = 35.0
 """PSNR, in dB, above which the learning rates fall with the root mean square error that is left, see
-:func:`share_of_start`. Steps of a size that repairs a tenth of a scene disturb the half of it, which is nearly right: from
-41 dB, half of a cake gains 1.9 dB at half the rates and 1.0 at all of them; from 40 dB, half of a room gains 1.2 dB and
-nothing. At 36 dB and below all of the rates gain most. (Tuned on a bouquet, a cake and two rooms.)"""
+:func:`share_of_start`. Steps of a size that repairs a tenth of a scene disturb the half of it, which is nearly right:
+from 41 dB, half of a cake gains 1.9 dB at half the rates and 1.0 at all of them; from 40 dB, half of a room gains 1.2
+dB and nothing. At 36 dB and below all of the rates gain most. (Tuned on a bouquet, a cake and two rooms.)"""
 
 LAST_SHARE = 0.02
 """Share of the learning rates at the last step, see :func:`share_of_rates`."""

@@ -113,6 +113,16 @@ def test_learning_rates_fall_to_nearly_nothing(hollow_ball, pruned, monkeypatch)
     assert shares[0] == 1 and shares == sorted(shares, reverse=True) and 0.02 <= shares[-1] < 0.03
 
 
+def test_what_is_nearly_right_takes_steps_in_proportion_to_its_error(hollow_ball, pruned, monkeypatch):
+    monkeypatch.setitem(STEPS, "quick", 1)
+    shifts = []
+    for psnr in (0.0, 35.0, 55.0, math.inf):
+        after = repair(pruned, hollow_ball, Few(hollow_ball), RepairBudget("quick"), psnr=psnr).scene
+        shifts.append(float((after.features_dc - pruned.features_dc).abs().max()))
+    assert shifts[0] == shifts[1] > 0 == shifts[3]
+    assert shifts[2] == pytest.approx(0.1 * shifts[0], rel=1e-3)
+
+
 def test_an_interruption_loses_nothing(hollow_ball, pruned):
     def stop(share: float) -> None:
         if share > 0.2:
@@ -162,7 +172,7 @@ def test_gradients_that_are_not_finite_and_values_that_are_not_stay_out(pruned, 
     scene.opacities[0], scene.scales[1, 2] = math.inf, -math.inf
     optimiser = Optimiser(scene, RATES)
 
-    def spoiled(scene, view):
+    def spoiled(scene, view, **options):
         weight = torch.ones_like(scene.means)
         weight[2] = math.nan
         return render(scene, view) + 0.0 * (weight * scene.means).sum().nan_to_num()
