@@ -114,7 +114,7 @@ def test_an_interruption_leaves_what_was_measured_and_the_next_call_goes_on(new_
 def test_ctrl_c_during_a_repair_is_no_shorter_repair(new_sweep, tmp_path, monkeypatch):
     from pointsplat_ns.compression import compact
 
-    monkeypatch.setattr(compact, "repair", lambda scene, *args: Repaired(scene, 1, 0.1, interrupted=True))
+    monkeypatch.setattr(compact, "repair", lambda scene, *_, **others: Repaired(scene, 1, 0.1, interrupted=True))
     running = new_sweep(tmp_path)
     running.measure_dense()
     with pytest.raises(KeyboardInterrupt):
