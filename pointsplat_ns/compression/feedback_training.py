@@ -18,9 +18,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.feedback import FEWEST_STEPS, MOST_STEPS, Feedback
 from pointsplat_ns.compression.optimiser import gradients_of
-from pointsplat_ns.compression.repair import share_of_rates
+from pointsplat_ns.compression.repair import share_of_rates, share_of_start
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import prune
@@ -39,6 +40,9 @@ AT_ONCE, TIMES = 32, 6
 
 SIDE = 400
 """Their longer side, pixels, as in repairs."""
+
+JUDGED_IN = 12
+"""Views that tell how close a scene is before its repair."""
 
 FLOOR = 1e-5
 """Added to mean squared errors, so that scenes that are nearly right do not rule: 50 dB."""
@@ -61,6 +65,8 @@ class TrainingScene:
     dense: Gaussians
     pruned: dict[str, Gaussians]
     """By budget."""
+    psnr: dict[str, float]
+    """Of what was made of it, by budget, against the dense scene's renders, dB."""
     views: Views
 
     @classmethod
@@ -70,28 +76,30 @@ class TrainingScene:
         viewmats, Ks = (torch.cat([getattr(v, field) for v in sampled]) for field in ("viewmats", "Ks"))
         first = sampled[0]
         views = Views(viewmats, Ks, first.width, first.height, first.background, near_plane=first.near_plane)
-        return cls(name, dense, {budget: prune(dense, budget, "merge") for budget in keep}, views.resized(SIDE))
+        views = views.resized(SIDE)
+        pruned = {budget: prune(dense, budget, "merge") for budget in keep}
+        reference = DenseReference(dense, views.spread(JUDGED_IN))
+        psnr = {budget: reference.psnr(scene)[0] for budget, scene in pruned.items()}
+        return cls(name, dense, pruned, psnr, views)
 
 
 def roll_out(
-    network: FeedbackRefiner, scene: TrainingScene, pruned: Gaussians, steps: int, generator: random.Random
+    network: FeedbackRefiner, scene: TrainingScene, budget: str, steps: int, generator: random.Random
 ) -> Tensor:
     """How close a repair comes in views that it has not seen: the PSNR half-way or so and the mean of two views at the
     end, each with half the weight, dB. Differentiable in the network."""
     chosen = generator.sample(range(len(scene.views)), steps + 3)
     looked_at = {generator.randrange(max(1, steps // 4), steps): chosen[steps : steps + 1], steps: chosen[steps + 1 :]}
-    feedback, now = Feedback(pruned, len(scene.dense)), pruned
+    now, share = scene.pruned[budget], share_of_start(scene.psnr[budget])
+    feedback = Feedback(now, len(scene.dense))
     reached: list[Tensor] = []
     for step in range(steps):
         view = scene.views[chosen[step]]
         feedback.observe(gradients_of(now.detach(), view, _target(scene, chosen[step]), BACKEND))
         learned = network(feedback.features(now.detach(), step / steps, steps))
-        now = feedback.moved(now, share_of_rates(step / steps), *learned)
-        seen = [
-            _decibels(render(now, scene.views[index], backend=BACKEND), _target(scene, index))
-            for index in looked_at.get(step + 1, [])
-        ]
-        if seen:
+        now = feedback.moved(now, share * share_of_rates(step / steps), *learned)
+        if step + 1 in looked_at:
+            seen = [_decibels(_drawn(now, scene, index), _target(scene, index)) for index in looked_at[step + 1]]
             reached.append(torch.stack(seen).mean())
     return 0.5 * torch.stack(reached).sum()
 
@@ -147,12 +155,12 @@ def train_feedback(
         adam.zero_grad()
         for number in range(at_once):
             scene = generator.choice(scenes)
-            pruned = generator.choice(list(scene.pruned.values()))
+            budget = generator.choice(list(scene.pruned))
             steps = generator.choice(STEPS)
             its_own = random.Random(generator.getrandbits(64))
             if number % size == rank:
-                with threads.step(steps, pruned.device):
-                    (-roll_out(network, scene, pruned, steps, its_own) * (size / at_once)).backward()
+                with threads.step(steps, scene.dense.device):
+                    (-roll_out(network, scene, budget, steps, its_own) * (size / at_once)).backward()
         processes.average_gradients(network.parameters())
         if torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0).isfinite():
             adam.step()

@@ -25,6 +25,7 @@ def test_a_scene_is_merged_to_each_budget_and_has_views(small, hollow_ball):
     assert {budget: len(scene) for budget, scene in small.pruned.items()} == {"10%": 150, "20%": 300}
     assert len(small.views) == 32 and max(small.views.width, small.views.height) == 48
     assert small.dense is hollow_ball
+    assert 5 < small.psnr["10%"] < small.psnr["20%"] < 50
 
 
 def test_training_brings_repairs_closer(small, tmp_path):
@@ -32,7 +33,7 @@ def test_training_brings_repairs_closer(small, tmp_path):
 
     def reached(network: FeedbackRefiner) -> float:
         with torch.no_grad():
-            repairs = [roll_out(network, small, small.pruned["20%"], 6, random.Random(seed)) for seed in range(4)]
+            repairs = [roll_out(network, small, "20%", 6, random.Random(seed)) for seed in range(4)]
         return float(torch.stack(repairs).mean())
 
     shares: list[float] = []
