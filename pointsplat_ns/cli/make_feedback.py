@@ -50,7 +50,7 @@ def make_feedback(
     connect_torchrun()
     device, first, ready = torchrun_device(), torchrun_rank()[0] == 0, []
     with fixed_threads(threads):
-        for path in tracked(scenes, "merging scenes", len(scenes)) if first else scenes:
+        for path in tracked(scenes, "merging scenes", len(scenes), first):
             ready.append(TrainingScene.of(path.stem, ps.load(path).to(device), keep))
             if first:
                 print(f"{path}: {len(ready[-1].dense):,} Gaussians, {len(ready[-1].views)} views")

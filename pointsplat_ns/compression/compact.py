@@ -283,8 +283,11 @@ def bottom_of_parabola(at_zero: float, at_half: float, at_one: float) -> float:
 def helps(before: Closeness, after: Closeness) -> bool:
     """Whether a refinement or repair is worth keeping: it gains :data:`MIN_GAIN`, and is closer in at least half of the
     views, as a gain over all pixels may be that of a few views, paid for by the others."""
-    gains = after.psnr >= before.psnr + MIN_GAIN and math.isfinite(before.psnr)
-    return gains and 2 * _closer_in(before, after) >= len(before.errors)
+    return _gains(before, after) and 2 * _closer_in(before, after) >= len(before.errors)
+
+
+def _gains(before: Closeness, after: Closeness) -> bool:
+    return after.psnr >= before.psnr + MIN_GAIN and math.isfinite(before.psnr)
 
 
 def _figures(before: Closeness, after: Closeness) -> str:
@@ -303,7 +306,7 @@ def _closer_in(before: Closeness, after: Closeness) -> int:
 
 def _left_out(before: Closeness, after: Closeness) -> str:
     """Why what brought these errors was left out."""
-    if after.psnr >= before.psnr + MIN_GAIN:
+    if _gains(before, after):
         return "it is farther in most views"
     return "it does not help" if after.psnr <= before.psnr else f"it brings less than {MIN_GAIN:g} dB"
 

@@ -22,6 +22,7 @@ from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.feedback import FEWEST_STEPS, MOST_STEPS, Feedback
 from pointsplat_ns.compression.optimiser import gradients_of
 from pointsplat_ns.compression.repair import share_of_rates, share_of_start
+from pointsplat_ns.compression.view_source import COMPARED_VIEWS
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import prune
@@ -40,9 +41,6 @@ AT_ONCE, TIMES = 32, 6
 
 SIDE = 400
 """Their longer side, pixels, as in repairs."""
-
-JUDGED_IN = 12
-"""Views that tell how close a scene is before its repair."""
 
 FLOOR = 1e-5
 """Added to mean squared errors, so that scenes that are nearly right do not rule: 50 dB."""
@@ -78,7 +76,7 @@ class TrainingScene:
         views = Views(viewmats, Ks, first.width, first.height, first.background, near_plane=first.near_plane)
         views = views.resized(SIDE)
         pruned = {budget: prune(dense, budget, "merge") for budget in keep}
-        reference = DenseReference(dense, views.spread(JUDGED_IN))
+        reference = DenseReference(dense, views.spread(COMPARED_VIEWS))
         psnr = {budget: reference.psnr(scene)[0] for budget, scene in pruned.items()}
         return cls(name, dense, pruned, psnr, views)
 
@@ -165,11 +163,11 @@ def train_feedback(
         if torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0).isfinite():
             adam.step()
         update += 1
-        elapsed = time.monotonic() - began
-        done = processes.gathered([max(update / updates, elapsed / seconds)])[0]  # the first process's clock counts
-        if output is not None and rank == 0 and (began + elapsed - saved > SAVED_EVERY or done >= 1):
+        now = time.monotonic()
+        done = processes.gathered([max(update / updates, (now - began) / seconds)])[0]  # by the first one's clock
+        if output is not None and rank == 0 and (now - saved > SAVED_EVERY or done >= 1):
             save_feedback_refiner(network, output, {**metadata, "updates": update})
-            saved = began + elapsed
+            saved = now
         if progress is not None:
             progress(min(done, 1.0))
     return network.eval()
