@@ -24,10 +24,10 @@ from typing import Annotated, Any
 
 import torch
 import tyro
-from compaction_tables import PAIRS, Row, averages, lead_table, leads, table
+from compaction_tables import MERGE, PAIRS, Row, averages, lead_table, leads, table
 from held_out import Scene, compare, load, lpips_or_none, name_of
 from options import write_whole
-from processes import pointsplat_prune
+from processes import COMPACT, pointsplat_compact, pointsplat_prune
 from rich.console import Console
 from scaling import print_score_times, scaling_rows, scaling_table, slope_table, slopes
 from splat_transform import peers_of
@@ -152,6 +152,7 @@ def main(
     keep: tuple[float, ...] = (0.5, 0.3, 0.1, 0.03),
     methods: tuple[str, ...] = NEED_NO_VIEWS,
     views: int = 8,
+    compact: bool = False,
     splat_transform: tuple[str, ...] = (),
     in_process: bool = False,
     lpips: bool = True,
@@ -171,6 +172,7 @@ def main(
         keep: shares of the Gaussians to keep.
         methods: rows; "merge" alone gives the table that compares it with splat-transform.
         views: at most so many views of each scene.
+        compact: ``pointsplat compact`` with its defaults, which repairs what it merged, is a row too.
         splat_transform: programs, of any versions, each of whose modes is a row; by default the one that
             ``npx --no-install splat-transform`` finds.
         in_process: call our methods within this process: faster, but the seconds leave out starting, reading and
@@ -199,7 +201,7 @@ def main(
         raise SystemExit(f"two scenes have one name: {', '.join(names)}; expected different ones")
     network = lpips_or_none(lpips)
     inside = methods if in_process else ()
-    programs = [*([] if in_process else map(pointsplat_prune, methods)), *peers]
+    programs = [*([] if in_process else map(pointsplat_prune, methods)), *([pointsplat_compact()] if compact else []), *peers]
     ways = ["sweep"] if sweep else [*inside, *(program.label for program in programs)]
     settings = {"keep": keep, "methods": ways, "views": views, "in_process": in_process, "lpips": network is not None}
     settings |= {"sh": sh} if sh < MAX_SH_DEGREE else {}
@@ -223,9 +225,10 @@ def main(
         shown += rows
     if len(scenes) > 1:
         console().print(table(averages(shown)))
-    for column in PAIRS:
-        if (compared := lead_table(leads(shown), column)) is not None:
-            console().print(compared)
+    for method in (MERGE, COMPACT):
+        for column in PAIRS:
+            if (compared := lead_table(leads(shown, method), column, method)) is not None:
+                console().print(compared)
     if missing:
         print(f"{NAME}: - ({missing})")
 

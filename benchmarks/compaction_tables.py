@@ -60,12 +60,12 @@ def averages(rows: list[Row]) -> list[Row]:
     return result
 
 
-def leads(rows: list[Row]) -> list[Row]:
-    """How far ``merge`` is ahead, in dB, of the best mode of splat-transform at each scene and budget; the best is
+def leads(rows: list[Row], method: str = MERGE) -> list[Row]:
+    """How far a method is ahead, in dB, of the best mode of splat-transform at each scene and budget; the best is
     chosen anew for each reference. Scenes and budgets without both have no row."""
     result = []
     for (scene, keep), same in grouped(rows, lambda row: (row["scene"], row["keep"])).items():
-        ours = [row for row in same if row["method"] == MERGE]
+        ours = [row for row in same if row["method"] == method]
         peers = [row for row in same if row["method"].startswith(NAME)]
         lead: Row = {"scene": scene, "keep": keep}
         for column in PAIRS:
@@ -97,13 +97,13 @@ def summary(found: list[Row], column: str) -> Iterator[tuple[str, dict[float, fl
             yield f"{group} worst".strip(), least, {keep: lead["scene"] for keep, lead in worst.items()}
 
 
-def lead_table(found: list[Row], column: str) -> Table | None:
-    """The leads as a table, None if there are none."""
+def lead_table(found: list[Row], column: str, method: str = MERGE) -> Table | None:
+    """The leads of a method as a table, None if there are none."""
     lines = list(summary(found, column))
     if not lines:
         return None
     against = {"dense_psnr": "the dense scene's renders", "photo_psnr": "held-out photos"}[column]
-    shown = Table(title=f"{MERGE} minus the best mode of {NAME}, PSNR in dB against {against}")
+    shown = Table(title=f"{method} minus the best mode of {NAME}, PSNR in dB against {against}")
     keeps = sorted({keep for _, values, _ in lines for keep in values}, reverse=True)
     shown.add_column("scene")
     for keep in keeps:

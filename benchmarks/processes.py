@@ -7,12 +7,25 @@ from pathlib import Path
 
 from pointsplat_ns.tables.splat_transform import Reducer
 
+COMPACT = "compact"
+"""Label of ``pointsplat compact`` with its defaults."""
+
+_PROGRAM = [sys.executable, "-c", "from pointsplat_ns.cli import main; main()"]
+
 
 def pointsplat_prune(method: str) -> Reducer:
     """``pointsplat prune --by METHOD``, by the interpreter in use."""
-    program = [sys.executable, "-c", "from pointsplat_ns.cli import main; main()"]
 
     def command(source: Path, count: int, target: Path) -> list[str]:
-        return [*program, "prune", str(source), "--keep", str(count), "--by", method, "-o", str(target)]
+        return [*_PROGRAM, "prune", str(source), "--keep", str(count), "--by", method, "-o", str(target)]
 
     return Reducer(method, command)
+
+
+def pointsplat_compact() -> Reducer:
+    """``pointsplat compact`` with its defaults, by the interpreter in use."""
+
+    def command(source: Path, count: int, target: Path) -> list[str]:
+        return [*_PROGRAM, "compact", str(source), "--keep", str(count), "-o", str(target)]
+
+    return Reducer(COMPACT, command)

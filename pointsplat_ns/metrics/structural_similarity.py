@@ -1,15 +1,23 @@
 """A fast SSIM for training losses.
 
 It is defined as in pytorch-msssim, which Splatfacto uses, and in :func:`pointsplat_ns.ssim`, which uses kornia. Both
-blur the five maps one after the other; blurring them together takes about half the time on a CPU. Tests check that all
-three agree.
+blur five maps one after the other. Here a compiled kernel (``structural_similarity.cpp``) does all at once, for float32
+on a CPU with a C++ compiler; elsewhere torch blurs them together, which takes about half the time of one by one. Tests
+check that all agree.
 """
 
 from __future__ import annotations
 
+import ctypes
+import math
+from pathlib import Path
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
 
 SSIM_WINDOW = 11
 """Side of SSIM's Gaussian window in pixels."""
@@ -20,8 +28,14 @@ SIGMA = 1.5
 C1, C2 = 0.01**2, 0.03**2
 """The two constants of Wang et al. 2004 for a data range of 1."""
 
+_BAND = 48
+"""Number of rows that a thread takes at once, about: ten more are blurred for each."""
 
-def mean_ssim(image: Tensor, other: Tensor) -> Tensor:
+_INTERLEAVED = 4
+"""Largest number of channels that may lie together, ``MOST_STEP`` of the kernel."""
+
+
+def mean_ssim(image: Tensor, other: Tensor, compiled: bool | None = None) -> Tensor:
     """Mean structural similarity (Wang et al. 2004, eq. 13) of two images.
 
     An 11 x 11 Gaussian window of sigma 1.5, population moments, and only pixels whose window lies inside the image. A
@@ -30,10 +44,15 @@ def mean_ssim(image: Tensor, other: Tensor) -> Tensor:
     Args:
         image: (B, C, H, W), in [0, 1].
         other: the same shape.
+        compiled: False leaves it to torch; True warns if it could not be compiled.
 
     Returns:
         A scalar in [-1, 1]; 1 for identical images. Differentiable.
     """
+    if _suited(image, other) and KERNELS.usable(compiled):
+        if other.requires_grad and torch.is_grad_enabled():  # it is symmetric, and the kernel's gradient by the first
+            image, other = other, image
+        return CompiledSimilarity.apply(image, other)
     maps = torch.cat([image, other, image * image, other * other, image * other], dim=1)
     mean, other_mean, square, other_square, product = _blur(maps).chunk(5, dim=1)
     mean_product, mean_square, other_mean_square = mean * other_mean, mean * mean, other_mean * other_mean
@@ -45,11 +64,105 @@ def mean_ssim(image: Tensor, other: Tensor) -> Tensor:
 def _blur(maps: Tensor) -> Tensor:
     """Gaussian blur of (B, K, H, W) where the whole window fits: (B, K, H - 10, W - 10)."""
     channels = maps.shape[1]
-    offset = torch.arange(SSIM_WINDOW, dtype=maps.dtype, device=maps.device) - SSIM_WINDOW // 2
-    weight = torch.exp(-offset.square() / (2 * SIGMA**2))
-    weight = (weight / weight.sum()).repeat(channels, 1, 1, 1)  # (K, 1, 1, 11)
+    weight = _window(maps).repeat(channels, 1, 1, 1)  # (K, 1, 1, 11)
     if maps.shape[3] >= SSIM_WINDOW:
         maps = F.conv2d(maps, weight, groups=channels)
     if maps.shape[2] >= SSIM_WINDOW:
         maps = F.conv2d(maps, weight.transpose(2, 3), groups=channels)
     return maps
+
+
+def _window(like: Tensor) -> Tensor:
+    """Weights (11,) along one side."""
+    offset = torch.arange(SSIM_WINDOW, dtype=like.dtype, device=like.device) - SSIM_WINDOW // 2
+    weight = torch.exp(-offset.square() / (2 * SIGMA**2))
+    return weight / weight.sum()
+
+
+class _Similarity(ctypes.Structure):
+    """``struct Similarity`` of the kernel."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("image", "other", "window")),
+        *((name, ctypes.c_int64) for name in ("planes", "height", "row", "step", "bands")),
+        *((name, ctypes.c_void_p) for name in ("partials", "sums", "grad", "next")),
+    )
+
+
+def _suited(image: Tensor, other: Tensor) -> bool:
+    """Whether the kernel can take these images, and a gradient by one of them at most is asked for."""
+    both = (image, other)
+    return (
+        all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in both)
+        and image.dim() == 4
+        and image.shape == other.shape
+        and min(image.shape[2:]) >= SSIM_WINDOW
+        and image.numel() > 0
+        and not (torch.is_grad_enabled() and image.requires_grad and other.requires_grad)
+    )
+
+
+class CompiledSimilarity(torch.autograd.Function):
+    """:func:`mean_ssim` by the kernel, with the gradient by the first image."""
+
+    @staticmethod
+    def forward(ctx, image, other):
+        # Where the channels of pixels lie together, as in a render, they are taken so.
+        interleaved = image.shape[1] <= _INTERLEAVED and image.permute(0, 2, 3, 1).is_contiguous()
+        order = (0, 2, 3, 1) if interleaved else (0, 1, 2, 3)
+        image, other = (tensor.detach().permute(order).contiguous() for tensor in (image, other))
+        batch, *_, side = image.shape
+        planes, height = (batch, image.shape[1]) if interleaved else (batch * image.shape[1], image.shape[2])
+        step, row = (side, image.shape[2] * side) if interleaved else (1, side)
+        rows, windows = height - SSIM_WINDOW + 1, row - (SSIM_WINDOW - 1) * step
+        ctx.shape, ctx.interleaved = (planes, height, row, step, math.ceil(rows / _BAND)), interleaved
+        ctx.count = planes * rows * windows
+        partials = image.new_empty(3, planes, rows, windows) if ctx.needs_input_grad[0] else None
+        sums = torch.empty(planes * ctx.shape[-1], dtype=torch.float64)
+        _call(image, other, ctx.shape, partials, sums=sums)
+        ctx.save_for_backward(image, other, partials)
+        return (sums.sum() / ctx.count).float()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):
+        image, other, partials = ctx.saved_tensors
+        by_image = torch.empty_like(image)
+        _call(image, other, ctx.shape, partials, grad=by_image)
+        by_image *= grad / ctx.count
+        return by_image.permute(0, 3, 1, 2) if ctx.interleaved else by_image, None
+
+
+def _call(
+    image: Tensor,
+    other: Tensor,
+    shape: tuple[int, int, int, int, int],
+    partials: Tensor | None,
+    sums: Tensor | None = None,
+    grad: Tensor | None = None,
+) -> None:
+    window, next_band = _window(image), torch.zeros(1, dtype=torch.int64)
+    optional = (None if tensor is None else tensor.data_ptr() for tensor in (partials, sums, grad))
+    task = _Similarity(image.data_ptr(), other.data_ptr(), window.data_ptr(), *shape, *optional, next_band.data_ptr())
+    on_threads(shape[0] * shape[-1] > 1, KERNELS.library.pointsplat_similarity, ctypes.byref(task))
+
+
+def _as_torch() -> bool:
+    """Whether the kernel gives the similarity of some images and its gradient as torch does."""
+    generator = torch.Generator().manual_seed(0)
+    image, noise = (torch.rand(1, 70, 59, 3, generator=generator) for _ in range(2))
+    found = []
+    for function in (CompiledSimilarity.apply, lambda *images: mean_ssim(*images, compiled=False)):
+        with torch.enable_grad():
+            leaf = image.clone().requires_grad_()
+            value = function(leaf.permute(0, 3, 1, 2), (0.6 * image + 0.4 * noise).permute(0, 3, 1, 2))
+        found.append((value.detach(), *torch.autograd.grad(value, leaf)))
+    return agreement(found[0], found[1], off=1e-4, share=1e-2)
+
+
+KERNELS = Kernels(
+    "SSIM",
+    Path(__file__).with_name("structural_similarity.cpp"),
+    {"pointsplat_similarity": [ctypes.c_void_p]},
+    _as_torch,
+)

@@ -1,0 +1,276 @@
+"""Trains the same photos with ``splatfacto-cpu`` and with OpenSplat's CPU backend: held-out PSNR over time.
+
+    python benchmarks/opensplat.py replica/kitchen replica/office0 --opensplat opensplat --downscale 2 --plot curves.png
+
+OpenSplat (https://github.com/pierotofy/OpenSplat, AGPL) is a program of its own, built by whoever runs this. Both get the
+same folder in nerfstudio's layout: photos already made smaller, poses, and the seed points that ``replica-data`` fuses
+from depth images; OpenSplat gets the frames that are not held out. It trains twice, with its schedules as they are and
+in proportion to the length of the run, as ours are. The Gaussians of each are drawn by our rasterizer.
+
+Time is that of all threads together, in minutes of the processor: with one thread, what a clock shows on an idle core.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import psutil
+import torch
+import tyro
+from held_out import mean_psnr
+from options import write_whole
+from PIL import Image
+from rich.console import Console
+from rich.table import Table
+
+import pointsplat_ns as ps
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
+from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
+from pointsplat_ns.views import Views
+
+OURS, DEFAULTS, SCALED = "splatfacto-cpu", "OpenSplat, its own schedules", "OpenSplat, schedules in proportion"
+FULL_LENGTH = 30_000
+"""Steps that the schedules of both programs were chosen for."""
+
+
+@dataclass
+class Look:
+    """What a training had come to at one moment."""
+
+    scene: str
+    method: str
+    step: int
+    minutes: float
+    """Of the processor, since the program was started."""
+    clock: float
+    """Minutes by the clock."""
+    gaussians: int
+    psnr: float
+    """Mean over all held-out photos, dB."""
+
+
+def main(
+    scenes: tuple[Path, ...],
+    /,
+    opensplat: Path,
+    steps: int = 2000,
+    ours: int | None = None,
+    downscale: int = 2,
+    looks: int = 8,
+    threads: int = 1,
+    output: Path = Path("outputs/opensplat"),
+    plot: Path | None = None,
+    json_file: Path | None = None,
+) -> None:
+    """Train each scene three times, and print what the held-out photos say of it.
+
+    Args:
+        scenes: folders in the Replica layout, with depth images.
+        opensplat: the program.
+        steps: that OpenSplat trains.
+        ours: steps that ``splatfacto-cpu`` trains; as many by default.
+        downscale: photos are made so many times smaller a side.
+        looks: how often each training is looked at; the last is its end.
+        threads: of each training.
+        output: folder for the photos and all trainings. A finished training there is not repeated.
+        plot: draw PSNR over time here, as a PNG.
+        json_file: write all figures here.
+    """
+    found: list[Look] = []
+    environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
+    for path in scenes:
+        folder = output / path.name
+        exported(path, folder / "data", downscale)
+        lengths = {OURS: ours or steps, SCALED: steps, DEFAULTS: steps}
+        for method, length in lengths.items():
+            words = _command(method, opensplat.resolve(), folder / "data", folder / _slug(method), length, looks)
+            train(words, folder / _slug(method), environment)
+        views, photos = dataset_photos(_run(folder / _slug(OURS)), "test", sys.maxsize)
+        for method in lengths:
+            found += looked_at(path.name, method, folder / _slug(method), views, photos)
+            write_whole(json_file, {"threads": threads, "downscale": downscale, "looks": [asdict(look) for look in found]})
+    print_table(found)
+    if plot is not None:
+        draw(found, plot)
+
+
+def exported(scene: Path, folder: Path, downscale: int) -> None:
+    """Write a scene in nerfstudio's layout, smaller: ``transforms.json`` of all frames, another of those that train, the
+    photos and the seed points. Nothing is done if it is there."""
+    if (folder / "transforms.json").is_file():
+        return
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    (folder / "train").mkdir(exist_ok=True)
+    parser = ReplicaDataParserConfig(data=scene).setup()
+    splits = {split: parser.get_dataparser_outputs(split) for split in ("train", "test")}
+    frames: dict[str, list[dict]] = {}
+    for split, outputs in splits.items():
+        for index, source in enumerate(outputs.image_filenames):
+            name = f"images/{source.stem}.png"
+            with Image.open(source) as photo:
+                photo.reduce(downscale).save(folder / name)
+            pose = torch.cat([outputs.cameras.camera_to_worlds[index], torch.tensor([[0.0, 0.0, 0.0, 1.0]])])
+            frames.setdefault(split, []).append({"file_path": name, "transform_matrix": pose.tolist()})
+    camera = splits["train"].cameras[0]
+    intrinsics = {name: float(getattr(camera, a)) / downscale for name, a in _INTRINSICS.items()}
+    common = {"camera_model": "OPENCV", **intrinsics, "w": photo.width // downscale, "h": photo.height // downscale}
+    points, colors = (splits["train"].metadata[name] for name in ("points3D_xyz", "points3D_rgb"))
+    _write_points(folder / "points.ply", points.tolist(), colors.tolist())
+    theirs = [{**frame, "file_path": f"../{frame['file_path']}"} for frame in frames["train"]]
+    (folder / "train" / "transforms.json").write_text(
+        json.dumps({**common, "ply_file_path": "../points.ply", "frames": theirs}), "utf-8"
+    )
+    names = {split: [frame["file_path"] for frame in frames[split]] for split in frames}
+    lists = {"train_filenames": names["train"], "val_filenames": names["test"], "test_filenames": names["test"]}
+    whole = {**common, "ply_file_path": "points.ply", "frames": frames["train"] + frames["test"], **lists}
+    (folder / "transforms.json").write_text(json.dumps(whole), "utf-8")
+
+
+_INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
+
+
+def _write_points(path: Path, points: list[list[float]], colors: list[list[int]]) -> None:
+    """As text, in the order of properties that OpenSplat wants."""
+    names = [f"property float {axis}" for axis in "xyz"] + [f"property uchar {color}" for color in ("red", "green", "blue")]
+    head = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *names, "end_header"]
+    rows = [" ".join(map(str, (*place, *color))) for place, color in zip(points, colors, strict=True)]
+    path.write_text("\n".join([*head, *rows]) + "\n", "utf-8")
+
+
+def _slug(method: str) -> str:
+    return method.lower().replace(",", "").replace(" ", "-")
+
+
+def _command(method: str, opensplat: Path, data: Path, folder: Path, steps: int, looks: int) -> list[str]:
+    """The words that train."""
+    every = str(max(1, steps // looks))
+    if method == OURS:
+        program = [sys.executable, "-c", "from nerfstudio.scripts.train import entrypoint; entrypoint()", "splatfacto-cpu"]
+        program += ["--max-num-iterations", str(steps), "--steps-per-save", every, "--save-only-latest-checkpoint", "False"]
+        program += ["--output-dir", str(folder), "--data", str(data), "nerfstudio-data", "--auto-scale-poses", "False"]
+        return [*program, "--orientation-method", "none", "--center-method", "none"]
+    program = [str(opensplat), str(data / "train"), "--cpu", "--keep-crs", "--num-iters", str(steps)]
+    program += ["--save-every", every, "--output", str(folder / "splat.ply")]
+    if method == SCALED:
+        share = min(1.0, steps / FULL_LENGTH)
+        fitted = {"resolution-schedule": 3000, "sh-degree-interval": 1000, "warmup-length": 500, "stop-screen-size-at": 4000}
+        for name, value in fitted.items():
+            program += [f"--{name}", str(max(1, round(share * value)))]
+        program += ["--refine-every", str(min(100, max(25, round(steps / 70))))]
+    return program
+
+
+def train(words: list[str], folder: Path, environment: dict[str, str]) -> None:
+    """Run a training, and note when each of its files was there: ``times.json``. A training that was finished is not
+    repeated.
+
+    Raises:
+        PointSplatError: if it fails.
+    """
+    record = folder / "times.json"
+    if record.is_file():
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    times: dict[str, tuple[float, float]] = {}
+    start = time.monotonic()
+    with (folder / "log.txt").open("w") as log:
+        process = subprocess.Popen(words, stdout=log, stderr=subprocess.STDOUT, env=environment)
+        seen = psutil.Process(process.pid)
+        while process.poll() is None:
+            time.sleep(0.1)
+            spent, clock = _cpu_seconds(seen), time.monotonic() - start
+            for file in _saved(folder):
+                times.setdefault(str(file.relative_to(folder)), (spent, clock))
+    if process.returncode:
+        raise PointSplatError(f"{words[0]}: it ended with status {process.returncode}; see {folder / 'log.txt'}")
+    record.write_text(json.dumps(times), "utf-8")
+
+
+def _cpu_seconds(process: psutil.Process) -> float:
+    """Of a process and those that it started, as far as they are still there."""
+    try:
+        each = [process, *process.children(recursive=True)]
+        return sum(sum(one.cpu_times()[:4]) for one in each if one.is_running())
+    except psutil.NoSuchProcess:
+        return 0.0
+
+
+def _saved(folder: Path) -> Iterator[Path]:
+    """What a training has saved so far."""
+    yield from folder.glob("*.ply")
+    yield from folder.rglob("step-*.ckpt")
+
+
+def _run(folder: Path) -> Path:
+    """The run's folder of a training of ours."""
+    return next(folder.rglob("config.yml")).parent
+
+
+def _step(file: str) -> int:
+    digits = "".join(filter(str.isdigit, Path(file).stem))
+    return int(digits) + (file.endswith(".ckpt")) if digits else sys.maxsize
+
+
+def looked_at(scene: str, method: str, folder: Path, views: Views, photos: list[torch.Tensor]) -> list[Look]:
+    """Judge all that a training saved, in the order of time."""
+    looks = []
+    times: dict[str, tuple[float, float]] = json.loads((folder / "times.json").read_text("utf-8"))
+    for file, (spent, clock) in sorted(times.items(), key=lambda item: _step(item[0])):
+        if spent:
+            gaussians: Gaussians = ps.load(folder / file)
+            psnr = mean_psnr(gaussians, views, photos)
+            looks.append(Look(scene, method, _step(file), spent / 60, clock / 60, len(gaussians), psnr))
+    return looks
+
+
+def print_table(found: list[Look]) -> None:
+    """A row a training: its end, and when it was as good as OpenSplat's better end."""
+    table = Table("scene", "trained by", "steps", "Gaussians", "PSNR, dB", "minutes", "as good as OpenSplat after", "share")
+    for scene in dict.fromkeys(look.scene for look in found):
+        trainings = {method: [look for look in found if (look.scene, look.method) == (scene, method)] for method in METHODS}
+        best = max((trainings[method][-1] for method in (DEFAULTS, SCALED)), key=lambda look: look.psnr)
+        for method, looks in trainings.items():
+            end = looks[-1]
+            steps = max(look.step for look in looks if look.step < sys.maxsize)
+            reached = next((look.minutes for look in looks if look.psnr >= best.psnr), None)
+            row = [scene, method, f"{steps:,}", f"{end.gaussians:,}", f"{end.psnr:.2f}", f"{end.minutes:.1f}"]
+            row += ["never", ""] if reached is None else [f"{reached:.1f}", f"{reached / best.minutes:.2f}"]
+            table.add_row(*row)
+    Console(width=140).print(table)
+
+
+METHODS = (OURS, SCALED, DEFAULTS)
+
+
+def draw(found: list[Look], path: Path) -> None:
+    """Draw PSNR over the minutes, a panel a scene."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    scenes = list(dict.fromkeys(look.scene for look in found))
+    figure, panels = plt.subplots(1, len(scenes), figsize=(4.2 * len(scenes), 3.6), squeeze=False, layout="constrained")
+    for panel, scene in zip(panels[0], scenes, strict=True):
+        for method in METHODS:
+            looks = [look for look in found if (look.scene, look.method) == (scene, method)]
+            panel.plot([look.minutes for look in looks], [look.psnr for look in looks], marker=".", label=method)
+        panel.set(title=scene, xlabel="minutes of one core", xscale="log")
+        panel.grid(alpha=0.3)
+    panels[0][0].set_ylabel("PSNR of held-out photos, dB")
+    panels[0][0].legend(fontsize="small")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
