@@ -201,7 +201,11 @@ def main(
         raise SystemExit(f"two scenes have one name: {', '.join(names)}; expected different ones")
     network = lpips_or_none(lpips)
     inside = methods if in_process else ()
-    programs = [*([] if in_process else map(pointsplat_prune, methods)), *([pointsplat_compact()] if compact else []), *peers]
+    programs = [
+        *([] if in_process else map(pointsplat_prune, methods)),
+        *([pointsplat_compact()] if compact else []),
+        *peers,
+    ]
     ways = ["sweep"] if sweep else [*inside, *(program.label for program in programs)]
     settings = {"keep": keep, "methods": ways, "views": views, "in_process": in_process, "lpips": network is not None}
     settings |= {"sh": sh} if sh < MAX_SH_DEGREE else {}

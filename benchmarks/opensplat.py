@@ -2,10 +2,10 @@
 
     python benchmarks/opensplat.py replica/kitchen replica/office0 --opensplat opensplat --downscale 2 --plot curves.png
 
-OpenSplat (https://github.com/pierotofy/OpenSplat, AGPL) is a program of its own, built by whoever runs this. Both get the
-same folder in nerfstudio's layout: photos already made smaller, poses, and the seed points that ``replica-data`` fuses
-from depth images; OpenSplat gets the frames that are not held out. It trains twice, with its schedules as they are and
-in proportion to the length of the run, as ours are. The Gaussians of each are drawn by our rasterizer.
+OpenSplat (https://github.com/pierotofy/OpenSplat, AGPL) is a program of its own, built by whoever runs this. Both get
+the same folder in nerfstudio's layout: photos already made smaller, poses, and the seed points that ``replica-data``
+fuses from depth images; OpenSplat gets the frames that are not held out. It trains twice, with its schedules as they
+are and in proportion to the length of the run, as ours are. The Gaussians of each are drawn by our rasterizer.
 
 Time is that of all threads together, in minutes of the processor: with one thread, what a clock shows on an idle core.
 """
@@ -97,15 +97,17 @@ def main(
         views, photos = dataset_photos(_run(folder / _slug(OURS)), "test", sys.maxsize)
         for method in lengths:
             found += looked_at(path.name, method, folder / _slug(method), views, photos)
-            write_whole(json_file, {"threads": threads, "downscale": downscale, "looks": [asdict(look) for look in found]})
+            write_whole(
+                json_file, {"threads": threads, "downscale": downscale, "looks": [asdict(look) for look in found]}
+            )
     print_table(found)
     if plot is not None:
         draw(found, plot)
 
 
 def exported(scene: Path, folder: Path, downscale: int) -> None:
-    """Write a scene in nerfstudio's layout, smaller: ``transforms.json`` of all frames, another of those that train, the
-    photos and the seed points. Nothing is done if it is there."""
+    """Write a scene in nerfstudio's layout, smaller: ``transforms.json`` of all frames, another of those that train,
+    the photos and the seed points. Nothing is done if it is there."""
     if (folder / "transforms.json").is_file():
         return
     (folder / "images").mkdir(parents=True, exist_ok=True)
@@ -140,7 +142,9 @@ _INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
 
 def _write_points(path: Path, points: list[list[float]], colors: list[list[int]]) -> None:
     """As text, in the order of properties that OpenSplat wants."""
-    names = [f"property float {axis}" for axis in "xyz"] + [f"property uchar {color}" for color in ("red", "green", "blue")]
+    names = [f"property float {axis}" for axis in "xyz"] + [
+        f"property uchar {color}" for color in ("red", "green", "blue")
+    ]
     head = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *names, "end_header"]
     rows = [" ".join(map(str, (*place, *color))) for place, color in zip(points, colors, strict=True)]
     path.write_text("\n".join([*head, *rows]) + "\n", "utf-8")
@@ -154,15 +158,32 @@ def _command(method: str, opensplat: Path, data: Path, folder: Path, steps: int,
     """The words that train."""
     every = str(max(1, steps // looks))
     if method == OURS:
-        program = [sys.executable, "-c", "from nerfstudio.scripts.train import entrypoint; entrypoint()", "splatfacto-cpu"]
-        program += ["--max-num-iterations", str(steps), "--steps-per-save", every, "--save-only-latest-checkpoint", "False"]
+        program = [
+            sys.executable,
+            "-c",
+            "from nerfstudio.scripts.train import entrypoint; entrypoint()",
+            "splatfacto-cpu",
+        ]
+        program += [
+            "--max-num-iterations",
+            str(steps),
+            "--steps-per-save",
+            every,
+            "--save-only-latest-checkpoint",
+            "False",
+        ]
         program += ["--output-dir", str(folder), "--data", str(data), "nerfstudio-data", "--auto-scale-poses", "False"]
         return [*program, "--orientation-method", "none", "--center-method", "none"]
     program = [str(opensplat), str(data / "train"), "--cpu", "--keep-crs", "--num-iters", str(steps)]
     program += ["--save-every", every, "--output", str(folder / "splat.ply")]
     if method == SCALED:
         share = min(1.0, steps / FULL_LENGTH)
-        fitted = {"resolution-schedule": 3000, "sh-degree-interval": 1000, "warmup-length": 500, "stop-screen-size-at": 4000}
+        fitted = {
+            "resolution-schedule": 3000,
+            "sh-degree-interval": 1000,
+            "warmup-length": 500,
+            "stop-screen-size-at": 4000,
+        }
         for name, value in fitted.items():
             program += [f"--{name}", str(max(1, round(share * value)))]
         program += ["--refine-every", str(min(100, max(25, round(steps / 70))))]
@@ -234,9 +255,13 @@ def looked_at(scene: str, method: str, folder: Path, views: Views, photos: list[
 
 def print_table(found: list[Look]) -> None:
     """A row a training: its end, and when it was as good as OpenSplat's better end."""
-    table = Table("scene", "trained by", "steps", "Gaussians", "PSNR, dB", "minutes", "as good as OpenSplat after", "share")
+    table = Table(
+        "scene", "trained by", "steps", "Gaussians", "PSNR, dB", "minutes", "as good as OpenSplat after", "share"
+    )
     for scene in dict.fromkeys(look.scene for look in found):
-        trainings = {method: [look for look in found if (look.scene, look.method) == (scene, method)] for method in METHODS}
+        trainings = {
+            method: [look for look in found if (look.scene, look.method) == (scene, method)] for method in METHODS
+        }
         best = max((trainings[method][-1] for method in (DEFAULTS, SCALED)), key=lambda look: look.psnr)
         for method, looks in trainings.items():
             end = looks[-1]

@@ -27,6 +27,7 @@ SHIPPED = (
     "pointsplat_ns/examples/room.ply",
     "pointsplat_ns/refiner/pretrained/refiner.safetensors",
     "pointsplat_ns/refiner/pretrained/CARD.md",
+    "pointsplat_ns/metrics/structural_similarity.cpp",
     "pointsplat_ns/rasterizer/compiled/blending.cpp",
     "pointsplat_ns/rasterizer/compiled/colors.cpp",
     "pointsplat_ns/rasterizer/compiled/lanes.h",

@@ -26,6 +26,7 @@ PROGRAMS = (
     "fuzzing",
     "kills",
     "mutants",
+    "opensplat",
     "photo_places",
     "quality",
     "rasterizer",

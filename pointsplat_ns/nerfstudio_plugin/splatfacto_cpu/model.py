@@ -98,7 +98,6 @@ class SplatfactoCpuModel(SplatfactoModel):
             x, y, w = config.grid_shape
             self.bil_grids = BilateralGrid(num=self.num_train_data, grid_X=x, grid_Y=y, grid_W=w)
         self.psnr = PeakSignalNoiseRatio(data_range=1.0)
-        self.ssim = mean_ssim
         self.lpips = LpipsMetric()  # type: ignore[assignment]  # Splatfacto's is torchmetrics' module
         self.step = 0
         self.crop_box: OrientedBox | None = None
@@ -125,6 +124,10 @@ class SplatfactoCpuModel(SplatfactoModel):
             verbose=True,
         )
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
+
+    def ssim(self, image: Tensor, other: Tensor) -> Tensor:
+        """Mean SSIM of two (1, 3, H, W) images in [0, 1], as Splatfacto's."""
+        return mean_ssim(image, other, False if self.config.compiled is False else None)
 
     def _seed_parameters(self, points: Tensor, colors: Tensor) -> torch.nn.ParameterDict:
         """Splatfacto's parameters for N points (N, 3) and their colours (N, 3) from 0 to 255, or (0, 3) if unknown."""

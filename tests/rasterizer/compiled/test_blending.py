@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +14,6 @@ from making import record_kernels, splats_in_view
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.compiled import blending
 from pointsplat_ns.rasterizer.constants import QUALITIES
-from pointsplat_ns.system.kernels import Kernels
 
 WIDTH, HEIGHT = 70, 45  # neither is a multiple of the tile
 
@@ -91,28 +89,6 @@ def test_any_number_of_threads_draws_the_same_bits():
 def test_what_the_kernels_are_not_made_for_is_left_to_torch(options, kernel_calls):
     draw(n=50, **options)
     assert not kernel_calls
-
-
-@needs_compiler
-@pytest.mark.parametrize(
-    ("right", "wrong"),
-    [("alpha / (1.0f - alpha)", "alpha"), ("-3.5f, -2.5f", "-2.5f, -3.5f"), ("alpha * t : ZERO;", "alpha : ZERO;")],
-    ids=["a gradient", "two pixels", "a weight"],
-)
-def test_kernels_that_do_not_draw_as_torch_does_are_not_used(right, wrong, tmp_path, monkeypatch):
-    kernels = blending.KERNELS
-    text = kernels.source.read_text("utf-8")
-    assert right in text
-    shutil.copy(blending.KERNELS.source.with_name("lanes.h"), tmp_path)
-    changed = tmp_path / "kernels.cpp"
-    changed.write_text(text.replace(right, wrong), "utf-8")
-    monkeypatch.setenv("POINTSPLAT_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(blending, "KERNELS", Kernels(kernels.what, changed, kernels.functions, kernels.agree))
-    with pytest.warns(
-        UserWarning, match="stays with torch: what the compiler made of kernels.cpp does not do what torch"
-    ):
-        assert not blending.can_blend(torch.zeros(1, 3), True)
-    assert not blending.can_blend(torch.zeros(1, 3), None)
 
 
 PROBE = """

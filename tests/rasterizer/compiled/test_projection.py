@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 
 import pytest
 import torch
@@ -12,7 +11,6 @@ from making import camera_askew, record_kernels, splats_in_view
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.compiled import blending, colors, projection
 from pointsplat_ns.rasterizer.projection import count_meaningless, project
-from pointsplat_ns.system.kernels import Kernels
 
 WIDTH, HEIGHT = 37, 29
 F32, F64 = torch.float32, torch.float64
@@ -286,27 +284,3 @@ def test_kernels_are_called_for_float32_unless_they_are_not_wanted(dtype, compil
     image, _, _ = rasterization(*leaves, view[None], K[None], WIDTH, HEIGHT, sh_degree=2, compiled=compiled)
     image.sum().backward()
     assert {function.__name__ for function in kernel_calls} == {f"pointsplat_{name}" for name in names}
-
-
-@needs_compiler
-@pytest.mark.parametrize(
-    ("module", "right", "wrong"),
-    [
-        (projection, "grad_det0 += grad_ratio / s.det * (s.blur / s.det)", "grad_det0 += grad_ratio / s.det"),
-        (projection, "(x - half_x <= camera.width - 0.5f)", "(x <= camera.width - 0.5f)"),
-        (colors, "+ 2.0f * (h5 * xz) -", "- 2.0f * (h5 * xz) -"),
-    ],
-    ids=["a gradient", "who is seen", "a colour's gradient"],
-)
-def test_kernels_that_do_not_do_as_torch_does_are_not_used(module, right, wrong, tmp_path, monkeypatch):
-    kernels = module.KERNELS
-    text = kernels.source.read_text("utf-8")
-    assert text.count(right) == 1
-    (tmp_path / kernels.source.name).write_text(text.replace(right, wrong), "utf-8")
-    shutil.copy(kernels.source.with_name("lanes.h"), tmp_path)
-    monkeypatch.setenv("POINTSPLAT_CACHE", str(tmp_path / "cache"))
-    changed = Kernels(kernels.what, tmp_path / kernels.source.name, kernels.functions, kernels.agree)
-    monkeypatch.setattr(module, "KERNELS", changed)
-    with pytest.warns(UserWarning, match=f"stays with torch: what the compiler made of {kernels.source.name} does not"):
-        assert not changed.usable(True)
-    assert not changed.usable(None)
