@@ -16,6 +16,7 @@ def make_feedback(
     seconds: float | None = None,
     at_once: int = 4,
     seed: int = 0,
+    start: Path | None = None,
     threads: int | None = None,
 ) -> None:
     """Train the network that sets the steps of `compact`'s repairs, on scenes and what is merged of them; no photos.
@@ -32,13 +33,16 @@ def make_feedback(
         seconds: end after this time, with fewer updates; the learning rate falls with the time then.
         at_once: number of repairs in an update.
         seed: seed of the initial weights and of all choices.
+        start: go on from this network, with a third of the learning rate, instead of from one that does nothing yet.
         threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
             programs keep the machine busy. Another number sums in another order.
     """
+    import functools
     import math
 
     import pointsplat_ns as ps
     from pointsplat_ns.compression.feedback_training import TrainingScene, train_feedback
+    from pointsplat_ns.refiner.feedback import read_feedback_refiner
     from pointsplat_ns.system.processes import connect_torchrun, torchrun_device, torchrun_rank
     from pointsplat_ns.system.progress import progress_bar, tracked
     from pointsplat_ns.system.threads import fixed_threads
@@ -47,6 +51,7 @@ def make_feedback(
         raise ps.DataError(f"--seconds {seconds:g}: expected a number above 0")
     if updates < 1:
         raise ps.DataError(f"--updates {updates}: expected at least 1")
+    known = None if start is None else read_feedback_refiner(start)
     connect_torchrun()
     device, first, ready = torchrun_device(), torchrun_rank()[0] == 0, []
     with fixed_threads(threads):
@@ -55,8 +60,7 @@ def make_feedback(
             if first:
                 print(f"{path}: {len(ready[-1].dense):,} Gaussians, {len(ready[-1].views)} views")
         with progress_bar(first) as show:
-            train_feedback(
-                ready, updates, at_once, seed, output, lambda share: show("training", share), seconds or math.inf
-            )
+            told = functools.partial(show, "training")
+            train_feedback(ready, updates, at_once, seed, output, told, seconds or math.inf, known)
     if first:
         print(f"{output}: the network")

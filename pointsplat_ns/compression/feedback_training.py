@@ -48,6 +48,9 @@ FLOOR = 1e-5
 RATE, WARM_UP = 3e-3, 20
 """Learning rate of Adam, and updates until it is reached; then it falls as those of repairs do."""
 
+RATE_GOING_ON = 1e-3
+"""The same where training goes on from a trained network."""
+
 BACKEND: Literal["auto"] = "auto"
 """What draws: gsplat where there are its CUDA kernels, which are several times as fast there."""
 
@@ -110,6 +113,7 @@ def train_feedback(
     output: Path | None = None,
     progress: Callable[[float], None] | None = None,
     seconds: float = math.inf,
+    start: FeedbackRefiner | None = None,
 ) -> FeedbackRefiner:
     """Train a network.
 
@@ -124,6 +128,7 @@ def train_feedback(
         output: file that the network is saved to now and then, and at the end, by the first process.
         progress: called with the share done, in [0, 1].
         seconds: after which training ends with fewer updates; the rates fall with the time then.
+        start: a trained network to go on from, which is not changed; by default one that changes nothing yet.
 
     Returns:
         The network, in evaluation mode.
@@ -144,12 +149,15 @@ def train_feedback(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = FeedbackRefiner().to(scenes[0].dense.device)
-    adam = torch.optim.Adam(network.parameters(), lr=RATE, betas=(0.9, 0.99))
+    if start is not None:
+        network.load_state_dict(start.state_dict())
+    rate = RATE if start is None else RATE_GOING_ON
+    adam = torch.optim.Adam(network.parameters(), lr=rate, betas=(0.9, 0.99))
     metadata = {"scenes": [scene.name for scene in scenes], "keep": [*scenes[0].pruned], "repairs_per_update": at_once}
     began, threads = time.monotonic(), ThreadChoice()
     saved, update, done = began, 0, 0.0
     while done < 1:
-        adam.param_groups[0]["lr"] = RATE * min(1, (update + 1) / WARM_UP) * share_of_rates(done)
+        adam.param_groups[0]["lr"] = rate * min(1, (update + 1) / WARM_UP) * share_of_rates(done)
         adam.zero_grad()
         for number in range(at_once):
             scene = generator.choice(scenes)

@@ -19,6 +19,7 @@ from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.early_look import EarlyLook
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuPipeline
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.resuming import restore_training_state, training_state
 from pointsplat_ns.nerfstudio_plugin.stopping import STATE, StoppableTrainer
+from pointsplat_ns.system.small_numbers import tiny_as_zero
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainerConfig
@@ -88,6 +89,11 @@ class SplatfactoCpuTrainer(StoppableTrainer):
             before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN
             self.callbacks.append(TrainingCallback([before], look.before_step, update_every_num_iters=1))
             self.callbacks.append(TrainingCallback([after], look.after_training, update_every_num_iters=1))
+
+    def train(self) -> None:
+        """As nerfstudio's."""
+        with tiny_as_zero():
+            super().train()
 
     def setup_optimizers(self) -> CheckingOptimizers:
         """The optimisers."""
