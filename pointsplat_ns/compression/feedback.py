@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pointsplat_ns.compression.optimiser import RATES, extent, seen_rms
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.refiner.feedback import OFFSETS, PARAMETERS
+from pointsplat_ns.refiner.feedback import PARAMETERS
 
 FASTER = 8.0
 """Factor on the learning rates of 3DGS, which suit 30,000 steps."""
@@ -21,6 +21,9 @@ DAMPING = 0.5
 """Adam's epsilon, as a share of the root mean square of a parameter's gradient over what is seen in the first step that
 sees any. Adam moves all Gaussians equally far, also those that are right already and have next to no gradients; what is
 damped moves less. Half the rates without it gain as much where a scene is wrong, but disturb what was right."""
+
+_SHOWN = ("scales", "opacities", "features_dc")
+"""Kinds of parameters whose steps a network sees."""
 
 FEWEST_STEPS, MOST_STEPS = 6, 32
 """Numbers of steps that the network was trained for; others are shown to it as the nearest of these."""
@@ -96,7 +99,7 @@ class Feedback:
                 mean / (size + _SMALL * unit),
                 torch.log10(last / (size + _SMALL * unit) + 1e-2) / 2,
             ]
-        columns += [self._directions[name].clamp(-3, 3) for name in OFFSETS]
+        columns += [self._directions[name].clamp(-3, 3) for name in _SHOWN]
         scales = _bounded(scene.scales)
         mean = scales.mean(1, keepdim=True)
         columns += [
@@ -112,30 +115,24 @@ class Feedback:
         same = scene.means.new_tensor([done, known, self._log_keep]).expand(len(scene), 3)
         return torch.cat([*columns, same], dim=1).float().clamp_(-8, 8).nan_to_num_(0.0)
 
-    def moves(self, share: float, factors: Tensor | None = None, offsets: Tensor | None = None) -> dict[str, Tensor]:
-        """What to add to each parameter: Adam's steps, multiplied by factors, and offsets.
+    def moves(self, share: float, factors: Tensor | None = None) -> dict[str, Tensor]:
+        """What to add to each parameter: Adam's steps, multiplied by factors.
 
         Args:
             share: of the learning rates.
             factors: (K, 6), one a kind of parameter; None is 1.
-            offsets: (K, 7), see :data:`~pointsplat_ns.refiner.feedback.OFFSETS`; None is 0.
         """
-        moves, at = {}, 0
+        moves = {}
         for kind, name in enumerate(PARAMETERS):
             step = self._directions[name]
             if factors is not None:
                 step = step * factors[:, kind].to(step).view(-1, *[1] * (step.dim() - 1))
-            if offsets is not None and name in OFFSETS:
-                step = step - offsets[:, at : at + OFFSETS[name]].to(step)
-                at += OFFSETS[name]
             moves[name] = step * (-share * self.rates[name])
         return moves
 
-    def moved(
-        self, scene: Gaussians, share: float, factors: Tensor | None = None, offsets: Tensor | None = None
-    ) -> Gaussians:
+    def moved(self, scene: Gaussians, share: float, factors: Tensor | None = None) -> Gaussians:
         """A scene after a step; arguments as for :meth:`moves`."""
-        moves = self.moves(share, factors, offsets)
+        moves = self.moves(share, factors)
         return Gaussians(**{name: value + moves[name] for name, value in scene.items()})
 
     def _whole(self, which: int) -> float:

@@ -97,8 +97,8 @@ def roll_out(
     for step in range(steps):
         view = scene.views[chosen[step]]
         feedback.observe(gradients_of(now.detach(), view, _target(scene, chosen[step]), BACKEND))
-        learned = network(feedback.features(now.detach(), step / steps, steps))
-        now = feedback.moved(now, share * share_of_rates(step / steps), *learned)
+        factors = network(feedback.features(now.detach(), step / steps, steps))
+        now = feedback.moved(now, share * share_of_rates(step / steps), factors)
         if step + 1 in looked_at:
             seen = [_decibels(_drawn(now, scene, index), _target(scene, index)) for index in looked_at[step + 1]]
             reached.append(torch.stack(seen).mean())

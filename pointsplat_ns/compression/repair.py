@@ -129,8 +129,8 @@ def repair(
                 with torch.no_grad():
                     target = render(dense, view)
                 feedback.observe(gradients_of(scene, view, target))
-                learned = _learned(network, feedback, scene, done, budget.steps_in_all(steps, done))
-                scene = feedback.moved(scene, share * share_of_rates(done), *learned)
+                factors = _factors(network, feedback, scene, done, budget.steps_in_all(steps, done))
+                scene = feedback.moved(scene, share * share_of_rates(done), factors)
             steps += 1
             done = budget.share_done(steps, time.perf_counter() - start)
             if progress is not None:
@@ -156,11 +156,11 @@ def share_of_start(psnr: float) -> float:
     return min(1.0, 10 ** ((NEARLY_RIGHT - psnr) / 20))
 
 
-def _learned(
+def _factors(
     network: FeedbackRefiner | None, feedback: Feedback, scene: Gaussians, done: float, steps: int
-) -> tuple[Tensor, Tensor] | tuple[None, None]:
-    """Factors and offsets of the next step; None without a network, or if there are more steps than it is good for."""
+) -> Tensor | None:
+    """Factors of the next step; None without a network, or if there are more steps than it is good for."""
     if network is None or steps > LONGEST:
-        return None, None
+        return None
     with torch.no_grad(), one_thread():  # a small network: shared, its sums would be rounded by the number of threads
         return network(feedback.features(scene, done, steps))

@@ -2,9 +2,9 @@
 
 The refiner of the paper sees a scene and not its error. This one sees the error: after each render it is given, for
 every Gaussian by itself, what the gradients of the rendering loss have been so far. It multiplies the steps of Adam, by
-kind of parameter, and adds steps of its own. Untrained it changes nothing, so that what remains is Adam. Such learned
-optimisers are due to Andrychowicz et al. (arXiv 1606.04474); G3R (arXiv 2409.19405) and QuickSplat (ICCV 2025) use
-gradients as the input of networks that reconstruct scenes.
+kind of parameter, so that nothing moves where no gradient says so. Untrained it changes nothing, and what remains is
+Adam. Such learned optimisers are due to Andrychowicz et al. (arXiv 1606.04474); G3R (arXiv 2409.19405) and QuickSplat
+(ICCV 2025) use gradients as the input of networks that reconstruct scenes.
 """
 
 from __future__ import annotations
@@ -23,9 +23,6 @@ from pointsplat_ns.refiner.weights import checked_tensors, opened_weights
 PARAMETERS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
 """Kinds of parameters, each of which has a factor."""
 
-OFFSETS = {"scales": 3, "opacities": 1, "features_dc": 3}
-"""Kinds of parameters that the network may also move where their gradients do not say so, and their numbers."""
-
 FEATURES = 39
 """Numbers that the network sees of a Gaussian, see :mod:`pointsplat_ns.compression.feedback`."""
 
@@ -35,7 +32,7 @@ WIDTH, DEPTH = 64, 2
 REACH = 2.0
 """Bound of the logarithms of the factors: from 1/7 to 7."""
 
-FORMAT = "pointsplat-feedback/1"
+FORMAT = "pointsplat-feedback/2"
 
 PRETRAINED = Path(__file__).parent / "pretrained" / "feedback.safetensors"
 """The network that ships; ``CARD.md`` beside it describes its training and results."""
@@ -45,9 +42,8 @@ class FeedbackRefiner(nn.Module):
     """An MLP that every Gaussian goes through by itself.
 
     Example:
-        >>> factors, offsets = FeedbackRefiner()(torch.zeros(5, FEATURES))
-        >>> factors.unique().tolist(), offsets.unique().tolist()
-        ([1.0], [0.0])
+        >>> FeedbackRefiner()(torch.zeros(5, FEATURES)).unique().tolist()
+        [1.0]
     """
 
     def __init__(self) -> None:
@@ -57,24 +53,18 @@ class FeedbackRefiner(nn.Module):
         for _ in range(DEPTH):
             layers += [nn.Linear(width, WIDTH), nn.SiLU()]
             width = WIDTH
-        last = nn.Linear(width, len(PARAMETERS) + sum(OFFSETS.values()))
+        last = nn.Linear(width, len(PARAMETERS))
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
         self.mlp = nn.Sequential(*layers, last)
 
-    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Factors and offsets of the steps.
+    def forward(self, features: Tensor) -> Tensor:
+        """Factors of the steps, (N, 6) above 0, one a kind of :data:`PARAMETERS`.
 
         Args:
             features: (N, :data:`FEATURES`).
-
-        Returns:
-            Factors (N, 6) above 0, one a kind of :data:`PARAMETERS`; offsets (N, 7) in (-1, 1), what is
-            added to the kinds of :data:`OFFSETS` in their order, in units of the learning rates.
         """
-        out = self.mlp(features)
-        kinds = len(PARAMETERS)
-        return (REACH * torch.tanh(out[:, :kinds] / REACH)).exp(), torch.tanh(out[:, kinds:])
+        return (REACH * torch.tanh(self.mlp(features) / REACH)).exp()
 
 
 def save_feedback_refiner(network: FeedbackRefiner, path: Path | str, metadata: dict[str, Any] | None = None) -> None:
