@@ -26,10 +26,6 @@ Effort = Literal["instant", "quick", "thorough"]
 STEPS: dict[Effort, int] = {"instant": 0, "quick": 32, "thorough": 400}
 """Steps of each effort. Those of "quick" take about as long as merging 100,000 to a million Gaussians."""
 
-LONGEST = 2 * MOST_STEPS
-"""Largest number of steps that the network sets; longer repairs are left to Adam. On a bouquet learned steps end 0.3 dB
-above Adam's after 8 and 32 steps, and 0.1 to 0.2 below after 128 and 200."""
-
 NEARLY_RIGHT = 35.0
 """PSNR, in dB, above which the learning rates fall with the root mean square error that is left, see
 :func:`share_of_start`. Steps of a size that repairs a tenth of a scene disturb the half of it, which is nearly right:
@@ -100,7 +96,7 @@ def repair(
     """Optimise a smaller scene against renders of the dense one; its number of Gaussians does not change.
 
     Each step renders both from a view. A network sees what the gradients of the loss have said of each Gaussian, and
-    sets how far it moves (:mod:`~pointsplat_ns.refiner.feedback`); in long repairs Adam does. The views are none of
+    sets how far it moves (:mod:`~pointsplat_ns.refiner.feedback`). The views are none of
     those that results are compared in, and come from :meth:`ViewSource.others`: no sampled view comes twice, so that
     there is none to overfit. Ctrl-C ends the repair; what has been reached is returned.
 
@@ -159,8 +155,8 @@ def share_of_start(psnr: float) -> float:
 def _factors(
     network: FeedbackRefiner | None, feedback: Feedback, scene: Gaussians, done: float, steps: int
 ) -> Tensor | None:
-    """Factors of the next step; None without a network, or if there are more steps than it is good for."""
-    if network is None or steps > LONGEST:
+    """Factors of the next step; None without a network."""
+    if network is None:
         return None
     with torch.no_grad(), one_thread():  # a small network: shared, its sums would be rounded by the number of threads
         return network(feedback.features(scene, done, steps))

@@ -68,17 +68,6 @@ def test_learned_steps_come_closer_than_those_of_adam(monkeypatch):
     assert reference.psnr(learned)[0] > reference.psnr(plain)[0] + 0.05 > reference.psnr(pruned)[0] + 0.1
 
 
-@pytest.mark.parametrize(("steps", "learned"), [(4, True), (5, False)])
-def test_repairs_longer_than_the_network_is_good_for_are_left_to_adam(hollow_ball, pruned, monkeypatch, steps, learned):
-    monkeypatch.setattr(repair_module, "LONGEST", 4)
-    monkeypatch.setitem(STEPS, "quick", steps)
-    first, second = (
-        repair(pruned, hollow_ball, Few(hollow_ball), RepairBudget("quick"), network=network).scene
-        for network in ("shipped", None)
-    )
-    assert same(first, second) != learned
-
-
 def test_how_many_steps_there_will_be_is_known_or_estimated():
     assert RepairBudget("quick").steps_in_all(0, 0.0) == STEPS["quick"]
     timed = RepairBudget(seconds=10.0)
