@@ -4,7 +4,8 @@ Over a few rounds, pairs of neighbours are replaced by one Gaussian with their c
 the projection), centre, covariance and colour. The cost of a pair is the expected change of rendered images, see
 :mod:`~pointsplat_ns.pruning.pair_costs`, as large as it appears from where the scene is looked at, see
 :mod:`~pointsplat_ns.pruning.viewpoints` and :mod:`~pointsplat_ns.pruning.traces`. Two numbers of the result are chosen
-by small renders, see :mod:`~pointsplat_ns.pruning.finishing`.
+by small renders, see :mod:`~pointsplat_ns.pruning.finishing`. Before that, members go to the group that they fit best,
+see :mod:`~pointsplat_ns.pruning.regrouping`.
 
 Everything is computed on one thread each, in pieces that several threads take: so the result is the same bits on any
 number of threads, and no thread waits for another within an operation.
@@ -28,13 +29,14 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.geometry.quaternions import quaternions_of
 from pointsplat_ns.pruning.content import content_size, in_units, positions_in_units, thinned, views_in_units
-from pointsplat_ns.pruning.covariance import TINY, unpack
+from pointsplat_ns.pruning.covariance import TINY, shadow, unpack
 from pointsplat_ns.pruning.coverage import curve_keys, unit_cells
 from pointsplat_ns.pruning.duplicates import Copies, Reduced
 from pointsplat_ns.pruning.finishing import SIDE, Finish, Reference
 from pointsplat_ns.pruning.matching import cheapest_pairs
-from pointsplat_ns.pruning.merge_state import CHUNK, OPAQUE, start
+from pointsplat_ns.pruning.merge_state import CHUNK, OPAQUE, grown, start
 from pointsplat_ns.pruning.pair_costs import costs_of
+from pointsplat_ns.pruning.regrouping import ROUNDS, moments, regrouped
 from pointsplat_ns.pruning.traces import how_much_seen, photo_places
 from pointsplat_ns.pruning.view_sampling import PROBED, is_room
 from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, viewpoints, weights_seen, weights_seen_from
@@ -110,7 +112,8 @@ def merge_levels(
 ) -> Iterator[Merged]:
     """Replace a scene by fewer and fewer Gaussians in one pass.
 
-    Each level is merged from the one before: Gaussians that are one in a level are one in all that follow.
+    Each level is merged from the one before: Gaussians that are one in a level are one in all that follow. So several
+    levels are not regrouped, and each is a little worse than what :func:`merge` makes.
 
     Args:
         scene: N Gaussians, see :func:`merge`.
@@ -160,7 +163,7 @@ def _levels(
                 merging.round(k)
             report(0.95 * (first - len(merging)) / max(first - last, 1))
         with one_thread_each():
-            merged = merging.level()
+            merged = merging.level(regroups=len(counts) == 1)
         if k == last:
             report(1.0)
         assignment = merged.assignment[reduced.index]
@@ -213,6 +216,27 @@ class Tree:
         return shares
 
 
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """Members that are one Gaussian each."""
+
+    place: Tensor  # [n] int64, the group of each member
+    shares: Tensor  # [n] float32, of each member in the mass of its group
+    first: Tensor  # [K] int64, index in the scene of the first member
+    means: Tensor  # [K, 3] float64
+    cov: Tensor  # [K, 6] float64
+    alphas: Tensor  # [K] float64
+    sizes: Tensor  # [K] int32, number of members
+
+    def in_order(self) -> Groups:
+        """The groups in the order of their first members."""
+        order = self.first.argsort()
+        rank = torch.empty_like(order)
+        rank[order] = torch.arange(len(order))
+        ordered = (values[order] for values in (self.first, self.means, self.cov, self.alphas, self.sizes))
+        return Groups(rank[self.place], self.shares, *ordered)
+
+
 class Merging:
     """A scene while it is merged.
 
@@ -256,26 +280,50 @@ class Merging:
         self.state.keep(left)
         self._see()
 
-    def level(self) -> Merged:
-        """The Gaussians that remain, as a scene."""
-        order = self._in_order()
-        place = self._place(order)
+    def level(self, regroups: bool = False) -> Merged:
+        """The Gaussians that remain, as a scene; with members that changed groups, if that is asked for."""
+        groups = self._groups()
+        if regroups and bool((groups.sizes > 1).any()):
+            groups = self._regrouped(groups)
+        groups = groups.in_order()
         assignment = torch.full((len(self.scene),), -1)
-        assignment[self.members] = place
-        scene, finish = self._finished(self._made(order, place))
+        assignment[self.members] = groups.place
+        scene, finish = self._finished(groups)
         return Merged(scene, assignment, finish)
 
-    def _in_order(self) -> Tensor:
-        """Indices (n left,) of the Gaussians that remain in the order of their first members in the scene."""
-        first = torch.full((len(self.members),), len(self.scene))
-        first.scatter_reduce_(0, self.tree.roots().long(), self.members, "amin")
-        return first[self.alive].argsort()
-
-    def _place(self, order: Tensor) -> Tensor:
-        """Where in ``order`` (n left,) the remaining Gaussian is that each member is part of, (n,)."""
+    def _groups(self) -> Groups:
+        """What was merged."""
         place = torch.empty(len(self.members), dtype=torch.int64)
-        place[self.alive[order]] = torch.arange(len(order))
-        return place[self.tree.roots().long()]
+        place[self.alive] = torch.arange(len(self.alive))
+        place = place[self.tree.roots().long()]
+        state = self.state
+        return Groups(
+            place, self.tree.shares(), self._first(place), state.means, state.cov, state.alphas, state.members
+        )
+
+    def _first(self, place: Tensor) -> Tensor:
+        """Index in the scene of the first member of each group."""
+        first = torch.full((len(self),), len(self.scene))
+        return first.scatter_reduce_(0, place, self.members, "amin")
+
+    def _regrouped(self, groups: Groups) -> Groups:
+        """Groups whose members fit them better. Of their mass, as much is seen as before."""
+        scene, members, place, count = self.scene, self.members, groups.place, len(self)
+        common = moments(scene, members, place, count)
+        seen = groups.alphas * shadow(groups.cov) / common.mass.clamp_min(TINY)
+        for _ in range(ROUNDS):
+            place = regrouped(scene, members, place, common)
+            common = moments(scene, members, place, count)
+        alphas = torch.where(common.mass > TINY, seen * common.mass / shadow(common.cov).clamp_min(TINY), groups.alphas)
+        return Groups(
+            place,
+            common.shares.float(),
+            self._first(place),
+            common.means,
+            grown(common.cov, alphas),
+            alphas.clamp_max(OPAQUE),
+            torch.bincount(place, minlength=count).to(torch.int32),
+        )
 
     def _weights(self) -> Tensor:
         if self.views is None:
@@ -299,52 +347,48 @@ class Merging:
         """Render what remains, once it is few enough."""
         if self.reference is None and self.views is not None and len(self) <= MOST_SEEN:
             if self.tree.rounds:
-                order = torch.arange(len(self))
-                now = self._made(order, self._place(order))(Finish())
+                now = self._made(self._groups())(Finish())
             else:
                 now = self.scene[self.members] if len(self.members) < len(self.scene) else self.scene
             self.reference = Reference(in_units(now, self.centre, self.size), self.views)
 
-    def _finished(self, make: Callable[[Finish], Gaussians]) -> tuple[Gaussians, Finish]:
-        """The scene with the finish that suits it, and that."""
-        if self.reference is None or not bool((self.state.members > 1).any()):
+    def _finished(self, groups: Groups) -> tuple[Gaussians, Finish]:
+        """The scene of groups with the finish that suits it, and that."""
+        make = self._made(groups)
+        if self.reference is None or not bool((groups.sizes > 1).any()):
             return make(Finish()), Finish()
         finish = self.reference.best(lambda tried: in_units(make(tried), self.centre, self.size))
         return make(finish), finish
 
-    def _sh(self, place: Tensor, alone: Tensor) -> tuple[Tensor, Tensor]:
-        """SH coefficients (K, 3) and (K, (d+1)^2 - 1, 3): means by mass over the members, of which ``place`` (n,) says
-        where they belong; those of a Gaussian ``alone`` (K,), without other members, are its own, to the bit."""
-        scene, shares = self.scene, self.tree.shares()
+    def _sh(self, groups: Groups, alone: Tensor) -> tuple[Tensor, Tensor]:
+        """SH coefficients (K, 3) and (K, (d+1)^2 - 1, 3): means by mass over the members; those of a group of one,
+        ``alone`` (K,), are its own, to the bit."""
+        scene, place = self.scene, groups.place
         wide = torch.promote_types(scene.dtype, torch.float32)
         means = []
         for values in (scene.features_dc, scene.features_rest):
             mean = torch.zeros(len(alone), *values.shape[1:], dtype=wide)
             for these in torch.arange(len(place)).split(CHUNK):
                 own = values[self.members[these]].to(wide)
-                mean.index_add_(0, place[these], own * shares[these].to(wide).view(-1, *[1] * (own.dim() - 1)))
+                mean.index_add_(0, place[these], own * groups.shares[these].to(wide).view(-1, *[1] * (own.dim() - 1)))
                 single = alone[place[these]]
                 mean[place[these][single]] = own[single]
             means.append(mean.to(scene.dtype))
         return means[0], means[1]
 
-    def _made(self, order: Tensor, place: Tensor) -> Callable[[Finish], Gaussians]:
-        """A function from a finish to the scene of the remaining Gaussians ``order`` (K,); ``place`` (n,) as
-        :meth:`_place` gives it."""
-        state, like = self.state, self.scene
-        sizes = state.members[order].double()
-        sh = self._sh(place, sizes == 1)
+    def _made(self, groups: Groups) -> Callable[[Finish], Gaussians]:
+        """A function from a finish to the scene of groups (K)."""
+        like, sizes = self.scene, groups.sizes.double()
+        sh = self._sh(groups, sizes == 1)
         alone = (sizes == 1)[:, None]
-        kept = self.members[self.alive[order]]
-        scales, quats = _axes(state.cov[order])
-        alphas = state.alphas[order]
-        means = torch.where(alone, like.means[kept], state.means[order].to(like.dtype))
-        quats = torch.where(alone, like.quats[kept], quats.to(like.dtype))
+        scales, quats = _axes(groups.cov)
+        means = torch.where(alone, like.means[groups.first], groups.means.to(like.dtype))
+        quats = torch.where(alone, like.quats[groups.first], quats.to(like.dtype))
 
         def make(finish: Finish) -> Gaussians:
-            logits = torch.logit(deepened(alphas, sizes, finish.deepening), 1e-7)[:, None].to(like.dtype)
-            spread = torch.where(alone, like.scales[kept], (scales + finish.spread).to(like.dtype))
-            return Gaussians(means, spread, quats, torch.where(alone, like.opacities[kept], logits), *sh)
+            logits = torch.logit(deepened(groups.alphas, sizes, finish.deepening), 1e-7)[:, None].to(like.dtype)
+            spread = torch.where(alone, like.scales[groups.first], (scales + finish.spread).to(like.dtype))
+            return Gaussians(means, spread, quats, torch.where(alone, like.opacities[groups.first], logits), *sh)
 
         return make
 

@@ -95,9 +95,14 @@ class State:
         mass = ai * flat_area(si) + aj * flat_area(sj) - ai * aj * overlap(si, sj, u, v)
         alphas = mass.clamp_min(0) / flat_area(sk).clamp_min(TINY)
         self.means[i] = wi[:, None] * self.means[i] + wj[:, None] * self.means[j]
-        self.cov[i] = cov * ((alphas / OPAQUE).clamp(1, MOST_SURPLUS) ** GROWTH)[:, None]
+        self.cov[i] = grown(cov, alphas)
         self.alphas[i] = alphas.clamp_max(OPAQUE)
         return wi
+
+
+def grown(cov: Tensor, alphas: Tensor) -> Tensor:
+    """Covariances (n, 6) with the area that opacities (n,) above :data:`OPAQUE` need."""
+    return cov * ((alphas / OPAQUE).clamp(1, MOST_SURPLUS) ** GROWTH)[:, None]
 
 
 def start(scene: Gaussians, members: Tensor, weights: Tensor, centre: Tensor, size: float) -> State:

@@ -79,9 +79,10 @@ def test_a_level_by_size_fits_into_its_file(scene, views, tmp_path):
         assert size <= limit < size + row + 1  # one more, and perhaps another digit of the count, would not fit
 
 
-def test_the_first_level_is_what_prune_gives(scene, levels, views):
-    assert same(levels[0].scene, ps.prune(scene, "50%", views=views))
-    assert not same(levels[0].scene, ps.prune(scene, "50%")), "merging looks from the views"
+def test_a_level_alone_is_what_prune_gives(scene, views):
+    alone = ps.lod(scene, ["50%"], views=views)[0].scene
+    assert same(alone, ps.prune(scene, "50%", views=views))
+    assert not same(alone, ps.prune(scene, "50%")), "merging looks from the views"
 
 
 def test_composing_parents_gives_where_merging_put_each_gaussian(scene, levels, views):

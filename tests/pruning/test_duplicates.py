@@ -110,7 +110,7 @@ def test_levels_with_copies_are_nested_and_exact():
         parents = torch.full((len(finer.scene),), -1)
         parents[finer.assignment] = coarser.assignment
         assert torch.equal(parents[finer.assignment], coarser.assignment)
-    assert same(levels[3].scene, merge(scene, 300).scene)
+    assert same(levels[3].scene, next(merge_levels(scene, counts[3:])).scene)
 
 
 def test_renders_without_the_copies_are_those_with_them():
