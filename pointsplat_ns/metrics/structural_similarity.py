@@ -9,6 +9,7 @@ check that all agree.
 from __future__ import annotations
 
 import ctypes
+import functools
 import math
 from pathlib import Path
 
@@ -152,7 +153,7 @@ def _as_torch() -> bool:
     generator = torch.Generator().manual_seed(0)
     image, noise = (torch.rand(1, 70, 59, 3, generator=generator) for _ in range(2))
     found = []
-    for function in (CompiledSimilarity.apply, lambda *images: mean_ssim(*images, compiled=False)):
+    for function in (CompiledSimilarity.apply, functools.partial(mean_ssim, compiled=False)):
         with torch.enable_grad():
             leaf = image.clone().requires_grad_()
             value = function(leaf.permute(0, 3, 1, 2), (0.6 * image + 0.4 * noise).permute(0, 3, 1, 2))

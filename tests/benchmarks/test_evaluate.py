@@ -34,6 +34,7 @@ PROGRAMS = (
     "refiner",
     "repair",
     "sampled_views",
+    "small_numbers",
     "soak",
     "stability",
     "threads",
