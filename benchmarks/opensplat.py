@@ -6,6 +6,11 @@ OpenSplat (https://github.com/pierotofy/OpenSplat, AGPL) is a program of its own
 the same folder in nerfstudio's layout: photos already made smaller, poses, and the seed points that ``replica-data``
 fuses from depth images; OpenSplat gets the frames that are not held out. It trains twice, with its schedules as they
 are and in proportion to the length of the run, as ours are. The Gaussians of each are drawn by our rasterizer.
+OpenSplat takes the middle of a photo to be its principal point: photos are cut so that it is.
+
+Its CPU backend at commit 15b7e80 sorts Gaussians by memory that is not their depth (``camDepths`` in ``gsplat_cpu.cpp``
+is a strided view that is read as if it were whole), so that its scenes look right in nothing but itself. Build it with
+``.contiguous()`` there.
 
 Time is that of all threads together, in minutes of the processor: with one thread, what a clock shows on an idle core.
 """
@@ -114,17 +119,21 @@ def exported(scene: Path, folder: Path, downscale: int) -> None:
     (folder / "train").mkdir(exist_ok=True)
     parser = ReplicaDataParserConfig(data=scene).setup()
     splits = {split: parser.get_dataparser_outputs(split) for split in ("train", "test")}
+    camera = splits["train"].cameras[0]
+    intrinsics = {name: float(getattr(camera, a)) / downscale for name, a in _INTRINSICS.items()}
+    whole_size = torch.tensor([int(camera.width), int(camera.height)]) // downscale
+    corner, size = centred(torch.tensor([intrinsics["cx"], intrinsics["cy"]]), whole_size)
+    intrinsics["cx"], intrinsics["cy"] = intrinsics["cx"] - int(corner[0]), intrinsics["cy"] - int(corner[1])
     frames: dict[str, list[dict]] = {}
     for split, outputs in splits.items():
         for index, source in enumerate(outputs.image_filenames):
             name = f"images/{source.stem}.png"
             with Image.open(source) as photo:
-                photo.reduce(downscale).save(folder / name)
+                smaller = photo.reduce(downscale).crop((*corner.tolist(), *(corner + size).tolist()))
+            smaller.save(folder / name)
             pose = torch.cat([outputs.cameras.camera_to_worlds[index], torch.tensor([[0.0, 0.0, 0.0, 1.0]])])
             frames.setdefault(split, []).append({"file_path": name, "transform_matrix": pose.tolist()})
-    camera = splits["train"].cameras[0]
-    intrinsics = {name: float(getattr(camera, a)) / downscale for name, a in _INTRINSICS.items()}
-    common = {"camera_model": "OPENCV", **intrinsics, "w": photo.width // downscale, "h": photo.height // downscale}
+    common = {"camera_model": "OPENCV", **intrinsics, "w": int(size[0]), "h": int(size[1])}
     points, colors = (splits["train"].metadata[name] for name in ("points3D_xyz", "points3D_rgb"))
     _write_points(folder / "points.ply", points.tolist(), colors.tolist())
     theirs = [{**frame, "file_path": f"../{frame['file_path']}"} for frame in frames["train"]]
@@ -135,6 +144,13 @@ def exported(scene: Path, folder: Path, downscale: int) -> None:
     lists = {"train_filenames": names["train"], "val_filenames": names["test"], "test_filenames": names["test"]}
     whole = {**common, "ply_file_path": "points.ply", "frames": frames["train"] + frames["test"], **lists}
     (folder / "transforms.json").write_text(json.dumps(whole), "utf-8")
+
+
+def centred(principal: torch.Tensor, size: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Corner (2,) and size (2,), in whole pixels, of the largest part of a photo whose middle is the principal point
+    (2,), to half a pixel."""
+    half = torch.minimum(principal, size - principal)
+    return (principal - half).round().long(), (2 * half).round().long()
 
 
 _INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
