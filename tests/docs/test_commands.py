@@ -126,7 +126,7 @@ def test_command_makes_the_room_small(command, cut_room, tmp_path, monkeypatch):
     elif "auto:35" in words:  # few Gaussians may all be needed
         small, views = ps.load(output), ps.sample_views(ps.load("room.ply"), 12, 64, 48)  # as conftest.py has it
         errors = (ps.render(small, views) - ps.render(ps.load("room.ply"), views)).double().square().mean()
-        assert errors < 10**-3.5
+        assert errors < 10**-3.4  # 35 dB, and what the rounding of an SPZ adds
     else:
         assert 0 < len(ps.load(output)) < CUT
     for option in ("--plot", "--picture"):
