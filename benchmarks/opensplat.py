@@ -290,6 +290,7 @@ def print_table(found: list[Look]) -> None:
 
 
 METHODS = (OURS, SCALED, DEFAULTS)
+TICKS = (0.3, 1, 3, 10, 30, 100)
 
 
 def draw(found: list[Look], path: Path) -> None:
@@ -298,6 +299,7 @@ def draw(found: list[Look], path: Path) -> None:
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
+    from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 
     scenes = list(dict.fromkeys(look.scene for look in found))
     figure, panels = plt.subplots(1, len(scenes), figsize=(4.2 * len(scenes), 3.6), squeeze=False, layout="constrained")
@@ -305,7 +307,10 @@ def draw(found: list[Look], path: Path) -> None:
         for method in METHODS:
             looks = [look for look in found if (look.scene, look.method) == (scene, method)]
             panel.plot([look.minutes for look in looks], [look.psnr for look in looks], marker=".", label=method)
-        panel.set(title=scene, xlabel="minutes of one core", xscale="log")
+        panel.set(title=scene, xlabel="minutes of the processor", xscale="log")
+        panel.xaxis.set(
+            major_locator=FixedLocator(TICKS), major_formatter=ScalarFormatter(), minor_locator=NullLocator()
+        )
         panel.grid(alpha=0.3)
     panels[0][0].set_ylabel("PSNR of held-out photos, dB")
     panels[0][0].legend(fontsize="small")
