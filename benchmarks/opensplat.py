@@ -26,12 +26,14 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
 import psutil
 import torch
 import tyro
 from held_out import mean_psnr
 from options import write_whole
 from PIL import Image
+from plyfile import PlyData, PlyElement
 from rich.console import Console
 from rich.table import Table
 
@@ -40,11 +42,12 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import fitted_schedules, splatfacto_cpu_config
 from pointsplat_ns.views import Views
 
 OURS, DEFAULTS, SCALED = "splatfacto-cpu", "OpenSplat, its own schedules", "OpenSplat, schedules in proportion"
-FULL_LENGTH = 30_000
-"""Steps that the schedules of both programs were chosen for."""
+SCHEDULES = ("resolution_schedule", "sh_degree_interval", "warmup_length", "stop_screen_size_at", "refine_every")
+"""Options of both programs, of the same defaults, that depend on the length of a training."""
 
 
 @dataclass
@@ -135,7 +138,7 @@ def exported(scene: Path, folder: Path, downscale: int) -> None:
             frames.setdefault(split, []).append({"file_path": name, "transform_matrix": pose.tolist()})
     common = {"camera_model": "OPENCV", **intrinsics, "w": int(size[0]), "h": int(size[1])}
     points, colors = (splits["train"].metadata[name] for name in ("points3D_xyz", "points3D_rgb"))
-    _write_points(folder / "points.ply", points.tolist(), colors.tolist())
+    _write_points(folder / "points.ply", points, colors)
     theirs = [{**frame, "file_path": f"../{frame['file_path']}"} for frame in frames["train"]]
     (folder / "train" / "transforms.json").write_text(
         json.dumps({**common, "ply_file_path": "../points.ply", "frames": theirs}), "utf-8"
@@ -156,14 +159,13 @@ def centred(principal: torch.Tensor, size: torch.Tensor) -> tuple[torch.Tensor, 
 _INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
 
 
-def _write_points(path: Path, points: list[list[float]], colors: list[list[int]]) -> None:
+def _write_points(path: Path, points: torch.Tensor, colors: torch.Tensor) -> None:
     """As text, in the order of properties that OpenSplat wants."""
-    names = [f"property float {axis}" for axis in "xyz"] + [
-        f"property uchar {color}" for color in ("red", "green", "blue")
-    ]
-    head = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *names, "end_header"]
-    rows = [" ".join(map(str, (*place, *color))) for place, color in zip(points, colors, strict=True)]
-    path.write_text("\n".join([*head, *rows]) + "\n", "utf-8")
+    rows = np.empty(len(points), [(axis, "f4") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")])
+    for columns, values in (("xyz", points), (("red", "green", "blue"), colors)):
+        for column, of_column in zip(columns, values.T.numpy(), strict=True):
+            rows[column] = of_column
+    PlyData([PlyElement.describe(rows, "vertex")], text=True).write(path)
 
 
 def _slug(method: str) -> str:
@@ -174,35 +176,19 @@ def _command(method: str, opensplat: Path, data: Path, folder: Path, steps: int,
     """The words that train."""
     every = str(max(1, steps // looks))
     if method == OURS:
-        program = [
-            sys.executable,
-            "-c",
-            "from nerfstudio.scripts.train import entrypoint; entrypoint()",
-            "splatfacto-cpu",
-        ]
-        program += [
-            "--max-num-iterations",
-            str(steps),
-            "--steps-per-save",
-            every,
-            "--save-only-latest-checkpoint",
-            "False",
-        ]
+        program = [sys.executable, "-c", "from nerfstudio.scripts.train import entrypoint; entrypoint()"]
+        program += ["splatfacto-cpu", "--max-num-iterations", str(steps), "--steps-per-save", every]
+        program += ["--save-only-latest-checkpoint", "False"]
         program += ["--output-dir", str(folder), "--data", str(data), "nerfstudio-data", "--auto-scale-poses", "False"]
         return [*program, "--orientation-method", "none", "--center-method", "none"]
     program = [str(opensplat), str(data / "train"), "--cpu", "--keep-crs", "--num-iters", str(steps)]
     program += ["--save-every", every, "--output", str(folder / "splat.ply")]
     if method == SCALED:
-        share = min(1.0, steps / FULL_LENGTH)
-        fitted = {
-            "resolution-schedule": 3000,
-            "sh-degree-interval": 1000,
-            "warmup-length": 500,
-            "stop-screen-size-at": 4000,
-        }
-        for name, value in fitted.items():
-            program += [f"--{name}", str(max(1, round(share * value)))]
-        program += ["--refine-every", str(min(100, max(25, round(steps / 70))))]
+        config = splatfacto_cpu_config()
+        config.max_num_iterations = steps
+        model = fitted_schedules(config).pipeline.model
+        for name in SCHEDULES:
+            program += [f"--{name.replace('_', '-')}", str(getattr(model, name))]
     return program
 
 

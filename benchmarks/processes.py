@@ -15,17 +15,16 @@ _PROGRAM = [sys.executable, "-c", "from pointsplat_ns.cli import main; main()"]
 
 def pointsplat_prune(method: str) -> Reducer:
     """``pointsplat prune --by METHOD``, by the interpreter in use."""
-
-    def command(source: Path, count: int, target: Path) -> list[str]:
-        return [*_PROGRAM, "prune", str(source), "--keep", str(count), "--by", method, "-o", str(target)]
-
-    return Reducer(method, command)
+    return _pointsplat(method, "prune", "--by", method)
 
 
 def pointsplat_compact() -> Reducer:
     """``pointsplat compact`` with its defaults, by the interpreter in use."""
+    return _pointsplat(COMPACT, "compact")
 
+
+def _pointsplat(label: str, name: str, *options: str) -> Reducer:
     def command(source: Path, count: int, target: Path) -> list[str]:
-        return [*_PROGRAM, "compact", str(source), "--keep", str(count), "-o", str(target)]
+        return [*_PROGRAM, name, str(source), "--keep", str(count), *options, "-o", str(target)]
 
-    return Reducer(COMPACT, command)
+    return Reducer(label, command)

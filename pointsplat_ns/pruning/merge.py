@@ -36,7 +36,7 @@ from pointsplat_ns.pruning.finishing import SIDE, Finish, Reference
 from pointsplat_ns.pruning.matching import cheapest_pairs
 from pointsplat_ns.pruning.merge_state import CHUNK, OPAQUE, grown, start
 from pointsplat_ns.pruning.pair_costs import costs_of
-from pointsplat_ns.pruning.regrouping import ROUNDS, moments, regrouped
+from pointsplat_ns.pruning.regrouping import ROUNDS, masses_of, moments, regrouped
 from pointsplat_ns.pruning.traces import how_much_seen, photo_places
 from pointsplat_ns.pruning.view_sampling import PROBED, is_room
 from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, viewpoints, weights_seen, weights_seen_from
@@ -309,11 +309,12 @@ class Merging:
     def _regrouped(self, groups: Groups) -> Groups:
         """Groups whose members fit them better. Of their mass, as much is seen as before."""
         scene, members, place, count = self.scene, self.members, groups.place, len(self)
-        common = moments(scene, members, place, count)
+        masses = masses_of(scene, members)
+        common = moments(scene, members, masses, place, count)
         seen = groups.alphas * shadow(groups.cov) / common.mass.clamp_min(TINY)
         for _ in range(ROUNDS):
-            place = regrouped(scene, members, place, common)
-            common = moments(scene, members, place, count)
+            place = regrouped(scene, members, masses, place, common)
+            common = moments(scene, members, masses, place, count)
         alphas = torch.where(common.mass > TINY, seen * common.mass / shadow(common.cov).clamp_min(TINY), groups.alphas)
         return Groups(
             place,

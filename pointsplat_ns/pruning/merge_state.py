@@ -100,6 +100,11 @@ class State:
         return wi
 
 
+def covariances_of(scene: Gaussians, rows: Tensor) -> Tensor:
+    """Covariances (m, 6) of some Gaussians, float64."""
+    return covariances(scene.scales[rows].double(), scene.quats[rows].double())
+
+
 def grown(cov: Tensor, alphas: Tensor) -> Tensor:
     """Covariances (n, 6) with the area that opacities (n,) above :data:`OPAQUE` need."""
     return cov * ((alphas / OPAQUE).clamp(1, MOST_SURPLUS) ** GROWTH)[:, None]
@@ -117,8 +122,7 @@ def start(scene: Gaussians, members: Tensor, weights: Tensor, centre: Tensor, si
     """
     cov = torch.empty(len(members), 6, dtype=torch.float64)
     for these in torch.arange(len(members)).split(CHUNK):
-        own = members[these]
-        cov[these] = covariances(scene.scales[own].double(), scene.quats[own].double())
+        cov[these] = covariances_of(scene, members[these])
     return State(
         means=scene.means[members].double(),
         cov=cov,

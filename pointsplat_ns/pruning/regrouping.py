@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import SH_C0, Gaussians
-from pointsplat_ns.pruning.covariance import TINY, covariances, outer, shadow, unpack
-from pointsplat_ns.pruning.merge_state import CHUNK
+from pointsplat_ns.pruning.covariance import TINY, outer, shadow, unpack
+from pointsplat_ns.pruning.merge_state import CHUNK, MOST_CONTRAST, covariances_of
 from pointsplat_ns.system.threads import in_threads
 
 ROUNDS = 2
@@ -41,21 +41,28 @@ class Moments:
     means: Tensor  # [K, 3] float64
     cov: Tensor  # [K, 6] float64, of the members and between them
     colours: Tensor  # [K, 3] float64, constant part
-    masses: Tensor  # [n] float64, of the members
     shares: Tensor  # [n] float64, of the members in their groups
 
 
-def moments(scene: Gaussians, members: Tensor, place: Tensor, count: int) -> Moments:
+def masses_of(scene: Gaussians, members: Tensor) -> Tensor:
+    """Masses of some Gaussians (n,), float64."""
+    parts = []
+    for rows in members.split(CHUNK):
+        parts.append(torch.sigmoid(scene.opacities[rows, 0].double()) * shadow(covariances_of(scene, rows)))
+    return torch.cat(parts)
+
+
+def moments(scene: Gaussians, members: Tensor, masses: Tensor, place: Tensor, count: int) -> Moments:
     """Moments of groups.
 
     Args:
         scene: N Gaussians on the CPU.
         members: (n,) indices of those that belong to groups.
+        masses: (n,) of them, see :func:`masses_of`.
         place: (n,) the group of each.
         count: number of groups, K; each has a member.
     """
     everywhere = torch.arange(len(members)).split(CHUNK)
-    masses = torch.cat([_mass(scene, members[these]) for these in everywhere])
 
     def summed(*shape: int) -> Tensor:
         return torch.zeros(count, *shape, dtype=torch.float64)
@@ -70,16 +77,16 @@ def moments(scene: Gaussians, members: Tensor, place: Tensor, count: int) -> Mom
         colours.index_add_(0, group, share * _colours(scene, members[these]))
     for these in everywhere:
         apart = scene.means[members[these]].double() - means[place[these]]
-        cov.index_add_(0, place[these], shares[these, None] * (_cov(scene, members[these]) + outer(apart)))
-    return Moments(mass, means, cov, colours, masses, shares)
+        cov.index_add_(0, place[these], shares[these, None] * (covariances_of(scene, members[these]) + outer(apart)))
+    return Moments(mass, means, cov, colours, shares)
 
 
-def regrouped(scene: Gaussians, members: Tensor, place: Tensor, groups: Moments) -> Tensor:
+def regrouped(scene: Gaussians, members: Tensor, masses: Tensor, place: Tensor, groups: Moments) -> Tensor:
     """The group (n,) that each member fits best: of least expected -log of the group's density over the member, and
     least difference of colour. The heaviest member of each group stays, so that no group is empty.
 
     Args:
-        scene, members, place: as for :func:`moments`.
+        scene, members, masses, place: as for :func:`moments`.
         groups: their moments.
     """
     from scipy.spatial import cKDTree
@@ -100,7 +107,7 @@ def regrouped(scene: Gaussians, members: Tensor, place: Tensor, groups: Moments)
         _, near = tree.query(means.numpy(), k=ranks)
         groups_near = torch.cat([place[these, None], torch.from_numpy(near).long()], dim=1)
         apart = means[:, None] - groups.means[groups_near]
-        both = _cov(scene, own)[:, None] + outer(apart.view(-1, 3)).view(*groups_near.shape, 6)
+        both = covariances_of(scene, own)[:, None] + outer(apart.view(-1, 3)).view(*groups_near.shape, 6)
         fit = 0.5 * ((both * inverse[groups_near]).sum(2) + log_volumes[groups_near])
         contrast = _colours(scene, own)[:, None] - groups.colours[groups_near]
         fit += contrast.square().sum(2) / (2 * CONTRAST**2)
@@ -108,17 +115,9 @@ def regrouped(scene: Gaussians, members: Tensor, place: Tensor, groups: Moments)
         result[these] = groups_near.gather(1, best)[:, 0]
 
     in_threads(choose, torch.arange(len(members)).split(CHUNK // 4))
-    heaviest = torch.zeros(count, dtype=torch.float64).scatter_reduce_(0, place, groups.masses, "amax")
-    return torch.where(groups.masses >= heaviest[place], place, result)
-
-
-def _cov(scene: Gaussians, rows: Tensor) -> Tensor:
-    return covariances(scene.scales[rows].double(), scene.quats[rows].double())
-
-
-def _mass(scene: Gaussians, rows: Tensor) -> Tensor:
-    return torch.sigmoid(scene.opacities[rows, 0].double()) * shadow(_cov(scene, rows))
+    heaviest = torch.zeros(count, dtype=torch.float64).scatter_reduce_(0, place, masses, "amax")
+    return torch.where(masses >= heaviest[place], place, result)
 
 
 def _colours(scene: Gaussians, rows: Tensor) -> Tensor:
-    return (scene.features_dc[rows].double() * SH_C0).clamp_(-10, 10)
+    return (scene.features_dc[rows].double() * SH_C0).clamp_(-MOST_CONTRAST, MOST_CONTRAST)

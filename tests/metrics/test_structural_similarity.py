@@ -10,6 +10,7 @@ from pytorch_msssim import SSIM
 
 from pointsplat_ns.metrics import ssim
 from pointsplat_ns.metrics.structural_similarity import KERNELS, mean_ssim
+from pointsplat_ns.system.threads import fixed_threads
 
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 
@@ -91,13 +92,10 @@ def test_compiled_it_is_torchs_and_as_near_to_float64(shape, together, first):
 @needs_compiler
 def test_any_number_of_threads_gives_the_same_bits():
     image, other = images(1, 3, 200, 40)
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 5):
-            torch.set_num_threads(threads)
+    results = []
+    for threads in (1, 2, 5):
+        with fixed_threads(threads):
             results.append(found(image, other, torch.float32, True))
-    finally:
-        torch.set_num_threads(before)
     assert all(torch.equal(a, b) for result in results for a, b in zip(result, results[0], strict=True))
 
 
