@@ -10,18 +10,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import fmean
-from typing import TypeVar
-
-import torch
-from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.metrics import finite_psnr
+from pointsplat_ns.pruning.small_renders import each_view
 from pointsplat_ns.rasterizer import render
-from pointsplat_ns.system.threads import in_threads
 from pointsplat_ns.views import Views
-
-Result = TypeVar("Result")
 
 LOOKED_AT = 6
 """Number of views that renders are compared in."""
@@ -29,9 +23,6 @@ LOOKED_AT = 6
 SIDE = 320
 """Their longer side, pixels. In smaller images the rasterizer's low-pass filter enlarges small Gaussians, which asks
 for larger merged ones: at 160 pixels, what was chosen on real scenes lost up to 0.5 dB at 320."""
-
-AT_ONCE = 2_000_000
-"""Largest number of Gaussians in all that are rendered at once, as each render takes memory; but always two scenes."""
 
 DEEPENINGS = (0.0, 0.15, 0.3)
 SPREADS = (-0.1, 0.0, 0.05)
@@ -71,24 +62,12 @@ class Reference:
 
     def __init__(self, dense: Gaussians, views: Views):
         self.views = views.spread(LOOKED_AT).resized(SIDE)
-        self.renders = self._each(dense, lambda index, image: image)
+        self.renders = list(each_view(self.views, len(dense), lambda view: render(dense, view)))
 
     def psnr(self, scene: Gaussians) -> float:
         """Mean PSNR of a scene's renders, dB."""
-        return fmean(self._each(scene, lambda index, image: finite_psnr(image, self.renders[index])))
-
-    def _each(self, scene: Gaussians, function: Callable[[int, Tensor], Result]) -> list[Result]:
-        """A function of every view's number and render, several at once."""
-        results: dict[int, Result] = {}
-
-        @torch.no_grad()
-        def work(index: int) -> None:
-            results[index] = function(index, render(scene, self.views[index]))
-
-        at_once = max(2, AT_ONCE // max(1, len(scene)))
-        for first in range(0, len(self.views), at_once):
-            in_threads(work, range(first, min(first + at_once, len(self.views))))
-        return [results[index] for index in range(len(self.views))]
+        renders = each_view(self.views, len(scene), lambda view: render(scene, view))
+        return fmean(finite_psnr(now, before) for now, before in zip(renders, self.renders, strict=True))
 
     def best(self, make: Callable[[Finish], Gaussians]) -> Finish:
         """The best finish of those tried: first the deepening, then the spread, each at the top of the parabola through

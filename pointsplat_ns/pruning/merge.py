@@ -3,9 +3,10 @@
 Over a few rounds, pairs of neighbours are replaced by one Gaussian with their common mass (opacity times the area of
 the projection), centre, covariance and colour. The cost of a pair is the expected change of rendered images, see
 :mod:`~pointsplat_ns.pruning.pair_costs`, as large as it appears from where the scene is looked at, see
-:mod:`~pointsplat_ns.pruning.viewpoints` and :mod:`~pointsplat_ns.pruning.traces`. Two numbers of the result are chosen
-by small renders, see :mod:`~pointsplat_ns.pruning.finishing`. Before that, members go to the group that they fit best,
-see :mod:`~pointsplat_ns.pruning.regrouping`.
+:mod:`~pointsplat_ns.pruning.viewpoints` and :mod:`~pointsplat_ns.pruning.traces`, and less where others stand in front,
+see :mod:`~pointsplat_ns.pruning.visibility`. Then members go to the group that they fit best, see
+:mod:`~pointsplat_ns.pruning.regrouping`. Small renders choose two numbers of the result, see
+:mod:`~pointsplat_ns.pruning.finishing`, and whether members do change groups.
 
 Everything is computed on one thread each, in pieces that several threads take: so the result is the same bits on any
 number of threads, and no thread waits for another within an operation.
@@ -40,7 +41,7 @@ from pointsplat_ns.pruning.regrouping import ROUNDS, masses_of, moments, regroup
 from pointsplat_ns.pruning.traces import how_much_seen, photo_places
 from pointsplat_ns.pruning.view_sampling import PROBED, is_room
 from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, viewpoints, weights_seen, weights_seen_from
-from pointsplat_ns.pruning.visibility import visibility
+from pointsplat_ns.pruning.visibility import Shown
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import Views
@@ -281,14 +282,17 @@ class Merging:
         self._see()
 
     def level(self, regroups: bool = False) -> Merged:
-        """The Gaussians that remain, as a scene; with members that changed groups, if that is asked for."""
-        groups = self._groups()
+        """The Gaussians that remain, as a scene; if that is asked for, with members that changed groups, where small
+        renders do not gain by leaving them."""
+        groups = self._groups().in_order()
+        scene, finish = self._finished(groups)
         if regroups and bool((groups.sizes > 1).any()):
-            groups = self._regrouped(groups)
-        groups = groups.in_order()
+            other = self._regrouped(groups).in_order()
+            made, chosen = self._finished(other)
+            if chosen.psnr is None or finish.psnr is None or chosen.psnr >= finish.psnr:
+                groups, scene, finish = other, made, chosen
         assignment = torch.full((len(self.scene),), -1)
         assignment[self.members] = groups.place
-        scene, finish = self._finished(groups)
         return Merged(scene, assignment, finish)
 
     def _groups(self) -> Groups:
@@ -307,9 +311,9 @@ class Merging:
         return first.scatter_reduce_(0, place, self.members, "amin")
 
     def _regrouped(self, groups: Groups) -> Groups:
-        """Groups whose members fit them better. Of their mass, as much is seen as before."""
+        """Groups whose members fit them better, as far as they are seen. Of their mass, as much is seen as before."""
         scene, members, place, count = self.scene, self.members, groups.place, len(self)
-        masses = masses_of(scene, members)
+        masses = masses_of(scene, members) * self.seen
         common = moments(scene, members, masses, place, count)
         seen = groups.alphas * shadow(groups.cov) / common.mass.clamp_min(TINY)
         for _ in range(ROUNDS):
@@ -327,22 +331,25 @@ class Merging:
         )
 
     def _weights(self) -> Tensor:
+        """How large a unit of area at each member is to those who look, (n,); and by the way, how much is seen of
+        each."""
+        self.seen = torch.ones(len(self.members))
         if self.views is None:
             return torch.ones(len(self.members))
         means = positions_in_units(self.scene.means[self.members], self.centre, self.size)
         if self.given is not None:
-            weights = weights_seen(means, self.views, NOT_SHOWN)
-            if len(self.members) <= MOST_SEEN:
-                weights *= visibility(self.scene, self.members, weights, self.given)
-                return weights * how_much_seen(self.scene, self.members) ** TOLD_TWICE
+            weights, told = weights_seen(means, self.views, NOT_SHOWN), TOLD_TWICE
         elif self.photos is not None:
-            weights = weights_seen_from(means, *self.photos)
+            weights, told = weights_seen_from(means, *self.photos), 1.0
         else:
             weights = weights_seen(means, self.views)
-            if not is_room(thinned(self.scene, PROBED)):
-                return weights
-            return weights * how_much_seen(self.scene, self.members) ** UNTOLD
-        return weights * how_much_seen(self.scene, self.members)
+            told = UNTOLD if is_room(thinned(self.scene, PROBED)) else 0.0
+        if len(self.members) <= MOST_SEEN:
+            shown = Shown.of(in_units(self.scene, self.centre, self.size), self.members, weights, self.views)
+            self.seen, weights = shown.each(), weights * shown.around()
+        elif self.given is not None:
+            told = 1.0
+        return weights * how_much_seen(self.scene, self.members) ** told if told else weights
 
     def _see(self) -> None:
         """Render what remains, once it is few enough."""

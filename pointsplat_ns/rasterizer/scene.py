@@ -60,24 +60,29 @@ def render(
     if reduced > 1:
         return _enlarged(render(scene, _smaller(views, reduced), quality, backend=backend), views)
     with _RENDERS.step(_work(scene, views), scene.device):
-        image, alpha, _ = rasterization(
-            means=scene.means,
-            quats=scene.quats,
-            scales=scene.stds,
-            opacities=_alphas(scene),
-            colors=scene.sh,
-            viewmats=views.viewmat[None].to(scene.device),  # float32 would move a camera that is far from the origin
-            Ks=views.K[None].to(scene.means),
-            width=views.width,
-            height=views.height,
-            sh_degree=scene.sh_degree,
-            near_plane=views.near_plane,
-            far_plane=math.inf,  # the unit of length may be small
-            rasterize_mode=views.rasterize_mode,
-            quality=quality,
-            backend=backend,
-        )
-        return (image[0] + (1 - alpha[0]) * views.background.to(image)).clamp(0, 1)
+        image, alpha = _rasterized(scene, views, scene.sh, sh_degree=scene.sh_degree, quality=quality, backend=backend)
+        return (image + (1 - alpha) * views.background.to(image)).clamp(0, 1)
+
+
+def _rasterized(scene: Gaussians, view: View, colors: Tensor, **options) -> tuple[Tensor, Tensor]:
+    """Image (H, W, channels) and alphas (H, W, 1) of a scene with these colours, and more of what
+    :func:`~pointsplat_ns.rasterization` takes."""
+    image, alpha, _ = rasterization(
+        means=scene.means,
+        quats=scene.quats,
+        scales=scene.stds,
+        opacities=_alphas(scene),
+        colors=colors,
+        viewmats=view.viewmat[None].to(scene.device),  # float32 would move a camera that is far from the origin
+        Ks=view.K[None].to(scene.means),
+        width=view.width,
+        height=view.height,
+        near_plane=view.near_plane,
+        far_plane=math.inf,  # the unit of length may be small
+        rasterize_mode=view.rasterize_mode,
+        **options,
+    )
+    return image[0], alpha[0]
 
 
 def _smaller(view: View, factor: int) -> View:
@@ -104,22 +109,28 @@ def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
         Expected depth (H, W) along the camera's z axis, scene units, and alpha (H, W) in [0, 1].
     """
     with _RENDERS.step(_work(scene, view), scene.device):
-        depth, alpha, _ = rasterization(
-            means=scene.means,
-            quats=scene.quats,
-            scales=scene.stds,
-            opacities=_alphas(scene),
-            colors=scene.means,  # any colours: only depths are rendered
-            viewmats=view.viewmat[None].to(scene.device),
-            Ks=view.K[None].to(scene.means),
-            width=view.width,
-            height=view.height,
-            render_mode="ED",
-            near_plane=view.near_plane,
-            far_plane=math.inf,
-            rasterize_mode=view.rasterize_mode,
-        )
-    return depth[0, ..., 0], alpha[0, ..., 0]
+        colors = scene.means  # any: only depths are rendered
+        depth, alpha = _rasterized(scene, view, colors, render_mode="ED")
+    return depth[..., 0], alpha[..., 0]
+
+
+def pixels_of(scene: Gaussians, view: View) -> Tensor:
+    """Pixels that each Gaussian has in a picture: the sum over all of them of its alpha times the transmittance in
+    front of it, by which its colour is weighted there. It is the gradient of the sum of the picture by colours.
+
+    Args:
+        scene: N Gaussians, on any device.
+        view: the camera.
+
+    Returns:
+        (N,), at least float32; 0 where the view does not show it.
+    """
+    scene = scene.detach().to(torch.promote_types(scene.dtype, torch.float32))
+    colors = torch.zeros_like(scene.means[:, :1]).requires_grad_()
+    with _RENDERS.step(_work(scene, view), scene.device), torch.enable_grad():
+        image, _ = _rasterized(scene, view, colors)
+        (pixels,) = torch.autograd.grad(image.sum(), colors)
+    return pixels[:, 0]
 
 
 def _work(scene: Gaussians, view: View) -> int:

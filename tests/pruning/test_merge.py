@@ -340,25 +340,57 @@ def test_one_pair_is_enough_for_a_finish_to_be_chosen():
     assert merge(scene, 59, views=one_view()).finish.psnr is not None
 
 
-@pytest.mark.parametrize("room", [False, True])
-def test_without_photos_only_rooms_are_weighed_by_what_covers_them(monkeypatch, room):
+class Half:
+    """Shown are a fifth of all neighbourhoods, and half of each."""
+
+    @classmethod
+    def of(cls, scene, members, weights, views):
+        """Whatever the views show."""
+        return cls()
+
+    def around(self):
+        """For 30 members."""
+        return torch.full((30,), 0.2)
+
+    def each(self):
+        """For 30 members."""
+        return torch.full((30,), 0.5)
+
+
+@pytest.mark.parametrize("most", [30, 29])  # where more take part, it is not counted what views show
+@pytest.mark.parametrize(
+    "where, told", [("given", 4.0), ("photos", 16.0), ("room", 2.0), ("outside", 1.0)]  # 16^(1/2), 16, 16^(1/4)
+)  # fmt: skip
+def test_members_are_weighed_by_what_is_seen_of_them(monkeypatch, where, told, most):
     monkeypatch.setattr(merging, "FEWEST_SEEN", 0)
-    monkeypatch.setattr(merging, "photo_places", lambda content: None)
-    monkeypatch.setattr(merging, "is_room", lambda scene: room)
-    monkeypatch.setattr(merging, "weights_seen", lambda means, *_: torch.full((len(means),), 3.0))
-    monkeypatch.setattr(merging, "how_much_seen", lambda scene, members: torch.full((len(members),), 16.0))
-    scene = cloud(30)
-    weights = merging.Merging(scene, torch.arange(30), None).state.weights
-    assert weights.tolist() == [6.0 if room else 3.0] * 30  # 16^(1/4)
-
-
-@pytest.mark.parametrize("most, expected", [(30, 3.0 * 5.0 * 4.0), (29, 3.0 * 16.0)])
-def test_given_views_are_weighed_by_what_they_show_and_less_by_what_photos_showed(monkeypatch, most, expected):
-    monkeypatch.setattr(merging, "MOST_SEEN", most)  # where more take part, what views show is not counted
-    for name, value in (("weights_seen", 3.0), ("visibility", 5.0), ("how_much_seen", 16.0)):
+    monkeypatch.setattr(merging, "MOST_SEEN", most)
+    monkeypatch.setattr(merging, "photo_places", lambda content: ("places", "shares") if where == "photos" else None)
+    monkeypatch.setattr(merging, "viewpoints", lambda *_: one_view())
+    monkeypatch.setattr(merging, "is_room", lambda scene: where == "room")
+    monkeypatch.setattr(merging, "Shown", Half)
+    for name, value in (("weights_seen", 3.0), ("weights_seen_from", 3.0), ("how_much_seen", 16.0)):
         monkeypatch.setattr(merging, name, lambda *_, value=value: torch.full((30,), value))
-    weights = merging.Merging(cloud(30), torch.arange(30), one_view()).state.weights
-    assert weights.tolist() == [expected] * 30  # 16^(1/2)
+    merge_of = merging.Merging(cloud(30), torch.arange(30), one_view() if where == "given" else None)
+    if most == 30:
+        assert merge_of.seen.tolist() == [0.5] * 30
+        assert merge_of.state.weights.tolist() == pytest.approx([3.0 * 0.2 * told] * 30)
+    else:
+        assert merge_of.seen.tolist() == [1.0] * 30
+        assert merge_of.state.weights.tolist() == [3.0 * (16.0 if where == "given" else told)] * 30
+
+
+@pytest.mark.parametrize("worth", [-1.0, 0.0, 1.0])
+def test_members_change_groups_unless_small_renders_lose_by_it(monkeypatch, worth):
+    scene = cloud(60).replace(means=cloud(60).means + torch.tensor([0.0, 0.0, 4.0]))
+    monkeypatch.setattr(merging, "regrouped", lambda scene, members, masses, place, groups: place.roll(1))
+    psnrs = iter((30.0, 30.0 + worth))
+    monkeypatch.setattr(merging.Reference, "best", lambda self, make: (make(Finish()), Finish(psnr=next(psnrs)))[1])
+    merged = merge(scene, 20, views=one_view())
+    monkeypatch.setattr(merging, "ROUNDS", 0)
+    monkeypatch.setattr(merging.Reference, "best", lambda self, make: Finish(psnr=0.0))
+    as_merged = merge(scene, 20, views=one_view())
+    assert merged.finish.psnr == max(30.0, 30.0 + worth)
+    assert torch.equal(merged.assignment, as_merged.assignment) == (worth < 0)
 
 
 def test_a_scene_too_large_to_render_is_rendered_once_it_is_small_enough(monkeypatch):

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from making import ball, normal_scene
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.gaussians import SH_C0, Gaussians
 from pointsplat_ns.pruning.merge import merge
+from pointsplat_ns.pruning.regrouping import masses_of, moments
 from pointsplat_ns.pruning.view_sampling import look_at
-from pointsplat_ns.pruning.visibility import LEAST, POWER, pixels_of, visibility
-from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.pruning.visibility import LEAST, LEAST_EACH, POWER, Shown
 from pointsplat_ns.views import Views
 
 
@@ -34,26 +34,13 @@ def two_walls(rows: int = 32) -> Gaussians:
     return scene.replace(means=means, scales=scales, quats=quats, opacities=torch.full((len(means), 1), 4.0))
 
 
-def test_pixels_are_the_gradient_of_the_sum_of_the_picture_by_the_colours():
-    scene = normal_scene(200, degree=0, dtype=torch.float64)
-    views = views_from((0, -6, 1), (5, 3, 0))
-    colors = torch.zeros(len(scene), 1, dtype=torch.float64, requires_grad=True)
-    for view in views:
-        picture, _, _ = rasterization(
-            scene.means, scene.quats, scene.stds, scene.alphas, colors, view.viewmat[None], view.K[None],
-            view.width, view.height,
-        )  # fmt: skip
-        picture.sum().backward()
-    assert float(colors.grad.sum()) > 100
-    assert torch.allclose(pixels_of(scene, views), colors.grad[:, 0], rtol=1e-9, atol=1e-9)
-
-
 def test_what_is_hidden_has_a_small_share():
     scene = two_walls()
-    shares = visibility(scene, torch.arange(len(scene)), torch.ones(len(scene)), views_from((0, 0, -4)))
-    front, back = shares.chunk(2)
-    assert shares.dtype == torch.float32
-    assert float(front.median()) > 0.9 and float(back.median()) < 0.15
+    shown = Shown.of(scene, torch.arange(len(scene)), torch.ones(len(scene)), views_from((0, 0, -4)))
+    for shares, least in ((shown.around(), LEAST), (shown.each(), LEAST_EACH)):
+        front, back = shares.chunk(2)
+        assert shares.dtype == torch.float32
+        assert float(front.median()) > 0.9 and float(back.median()) < max(0.15, least**POWER * 1.001)
 
 
 def test_merging_keeps_what_views_show_rather_than_what_is_hidden():
@@ -61,6 +48,18 @@ def test_merging_keeps_what_views_show_rather_than_what_is_hidden():
     kept = merge(scene, 600, views=views_from((0, 0, -4), (1, 0, -4), (0, 1, -4))).scene
     front = int((kept.means[:, 2] < 0).sum())
     assert len(kept) == 600 and front > 1.5 * (600 - front)
+
+
+def test_a_group_looks_like_those_of_its_members_that_are_seen():
+    scene = two_walls()
+    front, back = scene.features_dc.chunk(2)
+    scene = scene.replace(features_dc=torch.cat([torch.ones_like(front), -torch.ones_like(back)]))
+    members, place = torch.arange(len(scene)), torch.arange(len(scene)) % len(front)  # each with the one behind it
+    masses = masses_of(scene, members)
+    shown = Shown.of(scene, members, torch.ones(len(scene)), views_from((0, 0, -4)))
+    for weights, redness in ((torch.ones(len(scene)), 0.0), (shown.each(), (1 - 0.4) / (1 + 0.4))):
+        colours = moments(scene, members, masses * weights, place, len(front)).colours
+        assert float(colours.median()) / SH_C0 == pytest.approx(redness, abs=0.06)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
@@ -75,11 +74,13 @@ def test_shares_are_bounded_whatever_the_scene(dtype):
         (scene, views_from((0, -6, 1))[[]]),
     ):
         for weights in (torch.ones(400), torch.zeros(400), torch.full((400,), 3e38)):
-            shares = visibility(some, torch.arange(400), weights, views)
-            assert shares.shape == (400,)
-            assert bool(((shares >= LEAST**POWER * 0.999) & (shares <= 1)).all())
+            shown = Shown.of(some, torch.arange(400), weights, views)
+            for shares, least in ((shown.around(), LEAST), (shown.each(), LEAST_EACH)):
+                assert shares.shape == (400,)
+                assert bool(((shares >= least**POWER * 0.999) & (shares <= 1)).all())
 
 
 def test_what_no_view_shows_is_told_by_nothing():
     scene = normal_scene(50, degree=0)
-    assert visibility(scene, torch.arange(50), torch.ones(50), views_from((0, -6, 1))[[]]).tolist() == [1.0] * 50
+    shown = Shown.of(scene, torch.arange(50), torch.ones(50), views_from((0, -6, 1))[[]])
+    assert shown.around().tolist() == shown.each().tolist() == [1.0] * 50

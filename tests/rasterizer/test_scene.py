@@ -8,6 +8,9 @@ import torch.nn.functional as F
 
 import pointsplat_ns as ps
 from making import box_room
+from pointsplat_ns.rasterizer import pixels_of
+from pointsplat_ns.rasterizer.pixel_walk import sum_over_pixels
+from pointsplat_ns.rasterizer.projection import project_scene
 
 
 @pytest.fixture(scope="module")
@@ -43,3 +46,20 @@ def test_quality_is_handed_on(room, views):
 def test_options_that_mean_nothing_are_refused(room, views, options, said):
     with pytest.raises(ValueError, match=said):
         ps.render(room, views, **options)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
+def test_pixels_of_gaussians_are_sums_of_their_weights(room, views, dtype):
+    scene = room.to(dtype)
+    counted = scene.to(torch.promote_types(dtype, torch.float32))
+    for view in views:
+        seen = project_scene(counted, view)
+        weights = sum_over_pixels(
+            seen, view.width, view.height, 1,
+            lambda block: torch.where(block.alpha > 0, block.alpha * block.before, 0.0).sum(-1, keepdim=True),
+        )  # fmt: skip
+        wanted = torch.zeros(len(scene), dtype=counted.dtype).index_add_(0, seen.ids, weights[:, 0])
+        with torch.no_grad():  # as it is where scenes are merged
+            pixels = pixels_of(scene, view)
+        assert pixels.dtype == counted.dtype and float(pixels.sum()) > 0.5 * view.width * view.height
+        torch.testing.assert_close(pixels, wanted, rtol=1e-4, atol=1e-4)
