@@ -287,10 +287,13 @@ class Merging:
         groups = self._groups().in_order()
         scene, finish = self._finished(groups)
         if regroups and bool((groups.sizes > 1).any()):
+            del scene
             other = self._regrouped(groups).in_order()
-            made, chosen = self._finished(other)
+            scene, chosen = self._finished(other)
             if chosen.psnr is None or finish.psnr is None or chosen.psnr >= finish.psnr:
-                groups, scene, finish = other, made, chosen
+                groups, finish = other, chosen
+            else:
+                scene = self._made(groups)(finish)
         assignment = torch.full((len(self.scene),), -1)
         assignment[self.members] = groups.place
         return Merged(scene, assignment, finish)
@@ -313,7 +316,7 @@ class Merging:
     def _regrouped(self, groups: Groups) -> Groups:
         """Groups whose members fit them better, as far as they are seen. Of their mass, as much is seen as before."""
         scene, members, place, count = self.scene, self.members, groups.place, len(self)
-        masses = masses_of(scene, members) * self.seen
+        masses = masses_of(scene, members).mul_(self.seen)
         common = moments(scene, members, masses, place, count)
         seen = groups.alphas * shadow(groups.cov) / common.mass.clamp_min(TINY)
         for _ in range(ROUNDS):
@@ -333,7 +336,7 @@ class Merging:
     def _weights(self) -> Tensor:
         """How large a unit of area at each member is to those who look, (n,); and by the way, how much is seen of
         each."""
-        self.seen = torch.ones(len(self.members))
+        self.seen = torch.ones(()).expand(len(self.members))
         if self.views is None:
             return torch.ones(len(self.members))
         means = positions_in_units(self.scene.means[self.members], self.centre, self.size)

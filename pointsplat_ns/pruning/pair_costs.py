@@ -93,41 +93,54 @@ def costs_of(state: State, near: Tensor, dtype: torch.dtype = torch.float32) -> 
         (n, k): squared colour units times solid angle, with the surroundings of the first of each pair.
     """
     n = len(state)
-    means, cov = _scaled(state)
     ways = torch.empty(n, 3, dtype=torch.uint8)
     everywhere = torch.arange(n).split(CHUNK)
 
     def choose(these: Tensor) -> None:
-        shadows = (cov[these] @ TO_SHADOW.permute(1, 0, 2).reshape(6, -1)).view(-1, len(DIRECTIONS), 3)
+        _, cov = _scaled(state, these)
+        shadows = (cov @ TO_SHADOW.permute(1, 0, 2).reshape(6, -1)).view(-1, len(DIRECTIONS), 3)
         areas = shadows[..., 0] * shadows[..., 2] - shadows[..., 1] ** 2
         ways[these] = SIDES[areas.argmax(1)].to(torch.uint8)
 
     in_threads(choose, everywhere)
-    alphas, colours, costs = state.alphas.to(dtype), state.colours.to(dtype), torch.zeros(near.shape, dtype=dtype)
+    seen = Seen(torch.empty(n, 8, dtype=dtype), state.colours.to(dtype))
+    costs = torch.zeros(near.shape, dtype=dtype)
     for way in range(len(DIRECTIONS)):
         here = (ways == way).any(1).nonzero()[:, 0]
         if len(here) == 0:
             continue
-        centres, shadows = (means @ AXES[way]).to(dtype), (cov @ TO_SHADOW[way]).to(dtype)
-        spread = THINNEST * (shadows[:, 0] + shadows[:, 2]) + NARROWEST**2
-        shadows[:, 0] += spread
-        shadows[:, 2] += spread
-        seen = Seen.of(centres, shadows, alphas, colours)
 
-        def add(these: Tensor, seen: Seen = seen) -> None:
+        def look(these: Tensor, way: int = way) -> None:
+            seen.plane[these] = projected(state, these, way, dtype)
+
+        def add(these: Tensor) -> None:
             costs[these] += seen.costs(these, near[these])
 
+        in_threads(look, everywhere)
         in_threads(add, here.split(CHUNK))
     return costs.mul_(state.weights[:, None])
 
 
-def _scaled(state: State) -> tuple[Tensor, Tensor]:
-    """Means (n, 3) and covariances (n, 6) in units of the scene's size, around its centre, within the bounds."""
-    means = ((state.means - state.centre) / state.size).clamp_(-FARTHEST, FARTHEST)
-    cov = state.cov / state.size**2
+def _scaled(state: State, these: Tensor) -> tuple[Tensor, Tensor]:
+    """Means (m, 3) and covariances (m, 6) of some Gaussians in units of the scene's size, around its centre, within the
+    bounds."""
+    means = ((state.means[these] - state.centre) / state.size).clamp_(-FARTHEST, FARTHEST)
+    cov = state.cov[these] / state.size**2
     total = cov[:, 0] + cov[:, 3] + cov[:, 5]
     cov *= (WIDEST**2 / total.clamp_min(WIDEST**2))[:, None]
     return means, cov
+
+
+def projected(state: State, these: Tensor, way: int, dtype: torch.dtype) -> Tensor:
+    """Rows of :attr:`Seen.plane` of some Gaussians, seen from a direction."""
+    means, cov = _scaled(state, these)
+    centres, shadows = (means @ AXES[way]).to(dtype), (cov @ TO_SHADOW[way]).to(dtype)
+    spread = THINNEST * (shadows[:, 0] + shadows[:, 2]) + NARROWEST**2
+    shadows[:, 0] += spread
+    shadows[:, 2] += spread
+    lengths = state.colours[these].to(dtype).square().sum(1)
+    columns = torch.stack([area_of(*shadows.unbind(1)), state.alphas[these].to(dtype), lengths], dim=1)
+    return torch.cat([centres, shadows, columns], dim=1)
 
 
 def area_of(uu: Tensor, uv: Tensor, vv: Tensor) -> Tensor:
@@ -158,12 +171,6 @@ class Seen:
 
     plane: Tensor  # [n, 8] centre u, v; variances uu, uv, vv; area; opacity; squared length of the colour
     colours: Tensor  # [n, C]
-
-    @classmethod
-    def of(cls, centres: Tensor, shadows: Tensor, alphas: Tensor, colours: Tensor) -> Seen:
-        """From centres (n, 2), shadows (n, 3), opacities (n,) and colours (n, C)."""
-        columns = area_of(*shadows.unbind(1)), alphas, colours.square().sum(1)
-        return cls(torch.cat([centres, shadows, torch.stack(columns, dim=1)], dim=1), colours)
 
     def costs(self, i: Tensor, j: Tensor) -> Tensor:
         """Change of the image by each merge of Gaussians ``i`` (m,) with their neighbours ``j`` (m, k), (m, k)."""

@@ -46,10 +46,11 @@ class Moments:
 
 def masses_of(scene: Gaussians, members: Tensor) -> Tensor:
     """Masses of some Gaussians (n,), float64."""
-    parts = []
-    for rows in members.split(CHUNK):
-        parts.append(torch.sigmoid(scene.opacities[rows, 0].double()) * shadow(covariances_of(scene, rows)))
-    return torch.cat(parts)
+    masses = torch.empty(len(members), dtype=torch.float64)
+    for these in torch.arange(len(members)).split(CHUNK):
+        rows = members[these]
+        masses[these] = torch.sigmoid(scene.opacities[rows, 0].double()) * shadow(covariances_of(scene, rows))
+    return masses
 
 
 def moments(scene: Gaussians, members: Tensor, masses: Tensor, place: Tensor, count: int) -> Moments:
@@ -68,11 +69,13 @@ def moments(scene: Gaussians, members: Tensor, masses: Tensor, place: Tensor, co
         return torch.zeros(count, *shape, dtype=torch.float64)
 
     mass, sizes = summed().index_add_(0, place, masses), torch.bincount(place, minlength=count)
-    whole = mass[place]
-    shares = torch.where(whole > TINY, masses / whole.clamp_min(TINY), 1 / sizes[place])
+    shares = torch.empty_like(masses)
     means, colours, cov = summed(3), summed(3), summed(6)
     for these in everywhere:
-        share, group = shares[these, None], place[these]
+        group = place[these]
+        whole = mass[group]
+        shares[these] = torch.where(whole > TINY, masses[these] / whole.clamp_min(TINY), 1 / sizes[group])
+        share = shares[these, None]
         means.index_add_(0, group, share * scene.means[members[these]].double())
         colours.index_add_(0, group, share * _colours(scene, members[these]))
     for these in everywhere:
@@ -114,9 +117,13 @@ def regrouped(scene: Gaussians, members: Tensor, masses: Tensor, place: Tensor, 
         best = fit.nan_to_num_(nan=torch.inf).argmin(1, keepdim=True)
         result[these] = groups_near.gather(1, best)[:, 0]
 
-    in_threads(choose, torch.arange(len(members)).split(CHUNK // 4))
+    pieces = torch.arange(len(members)).split(CHUNK // 4)
+    in_threads(choose, pieces)
     heaviest = torch.zeros(count, dtype=torch.float64).scatter_reduce_(0, place, masses, "amax")
-    return torch.where(masses >= heaviest[place], place, result)
+    for these in pieces:
+        stays = masses[these] >= heaviest[place[these]]
+        result[these] = torch.where(stays, place[these], result[these])
+    return result
 
 
 def _colours(scene: Gaussians, rows: Tensor) -> Tensor:

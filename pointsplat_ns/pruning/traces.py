@@ -101,8 +101,12 @@ def how_much_seen(scene: Gaussians, members: Tensor) -> Tensor:
 
 
 def _of_members(function: Callable[[Tensor], Tensor], values: Tensor, members: Tensor) -> Tensor:
-    """A function of rows of values (N, ...) for the members (n,), float64; in pieces, as values may be on disk."""
-    return torch.cat([function(values[these].double()) for these in members.split(CHUNK)])
+    """A function of rows of values (N, ...) for the members (n,), float64; in pieces, as values may be on disk. Small
+    results that are kept between large pieces would hold on to the memory of these."""
+    result = torch.empty(len(members), dtype=torch.float64)
+    for these in torch.arange(len(members)).split(CHUNK):
+        result[these] = function(values[members[these]].double())
+    return result
 
 
 def _energy(rest: Tensor) -> Tensor:

@@ -35,9 +35,8 @@ def disks(seed: int = 1, logits: tuple[float, float] = (0.3, -0.6)) -> Gaussians
 def seen_along_z(state: State) -> pair_costs.Seen:
     way = int(pair_costs.DIRECTIONS[:, 2].abs().argmax())
     assert float(pair_costs.DIRECTIONS[way, 2].abs()) == 1.0
-    centres = (state.means @ pair_costs.AXES[way]).float()
-    shadows = (state.cov @ pair_costs.TO_SHADOW[way]).float()
-    return pair_costs.Seen.of(centres, shadows, state.alphas.float(), state.colours)
+    rows = pair_costs.projected(state, torch.arange(len(state)), way, torch.float32)
+    return pair_costs.Seen(rows, state.colours)
 
 
 @pytest.mark.parametrize(("logits", "grows"), [((0.3, -0.6), False), ((6.0, 6.0), True)])
@@ -119,7 +118,7 @@ def test_sizes_are_in_units_of_the_scene_and_bounded_where_they_are_wide_beyond_
         features_rest=torch.zeros(4, 0, 3),
     )
     state = start(scene, torch.arange(4), torch.ones(4), torch.zeros(3, dtype=torch.float64), 2.0)
-    _, cov = pair_costs._scaled(state)
+    _, cov = pair_costs._scaled(state, torch.arange(len(state)))
     expected = torch.tensor([0.25, 10.0, 250.0, pair_costs.WIDEST], dtype=torch.float64)
     torch.testing.assert_close(cov[:, 0].sqrt(), expected, rtol=1e-6, atol=0.0)  # sizes are given in float32
 
@@ -157,13 +156,8 @@ def test_float32_costs_rank_pairs_as_float64_does():
     i, j = torch.arange(n), torch.randint(0, n, (n, 8), generator=g)
     single = pair_costs.costs_of(state, j.to(torch.int32)).double()
     for way in range(len(pair_costs.DIRECTIONS)):
-        shadows = state.cov @ pair_costs.TO_SHADOW[way]
-        floor = pair_costs.THINNEST * (shadows[:, 0] + shadows[:, 2]) + pair_costs.NARROWEST**2
-        shadows[:, 0] += floor
-        shadows[:, 2] += floor
-        exact = (state.means @ pair_costs.AXES[way], shadows, state.alphas, state.colours.double())
         a, b = (
-            pair_costs.Seen.of(*(value.to(dtype) for value in exact)).costs(i, j).double()
+            pair_costs.Seen(pair_costs.projected(state, i, way, dtype), state.colours.to(dtype)).costs(i, j).double()
             for dtype in (torch.float64, torch.float32)
         )
         assert float((a - b).abs().max()) < 1e-3 * float(a.max())
