@@ -214,7 +214,7 @@ def compact(
         by: the method, as for :func:`prune`; by default the one that the refiner was trained with.
         sh: SH bands to keep, as for :func:`prune`.
         clean: as for :func:`prune`.
-        effort: "instant" is only the refiner; "quick" and "thorough" take 32 and 400 steps.
+        effort: "instant" is only the refiner; "quick" and "thorough" take 48 and 400 steps.
         seconds: repair for so long, instead; Ctrl-C ends it earlier, and what has been reached is kept.
         target_db: least PSNR against the given scene's renders, dB, mean over views; those of held-out photos where the
             run's are found.

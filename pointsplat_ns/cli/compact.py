@@ -71,7 +71,7 @@ def compact(
         by: the method of prune; by default the one that the refiner was trained with.
         sh: SH bands to keep, as for prune: all, up to a degree, or auto.
         clean: as for prune: first remove what cannot be drawn and what is seen from nowhere.
-        effort: how long to repair then: not at all (instant), 32 steps (quick, about as long as merging takes), or 400.
+        effort: how long to repair then: not at all (instant), 48 steps (quick, about as long as merging takes), or 400.
         seconds: repair for so many seconds, instead of a fixed effort. Ctrl-C ends it earlier and loses nothing.
         target_db: find the smallest file of at least this PSNR against the dense scene's renders, in place of --keep
             and --sh: count, SH degree and whether to repair are decided by what the scene needs.

@@ -23,7 +23,7 @@ from pointsplat_ns.system.threads import one_thread
 
 Effort = Literal["instant", "quick", "thorough"]
 
-STEPS: dict[Effort, int] = {"instant": 0, "quick": 32, "thorough": 400}
+STEPS: dict[Effort, int] = {"instant": 0, "quick": 48, "thorough": 400}
 """Steps of each effort. Those of "quick" take about as long as merging 100,000 to a million Gaussians."""
 
 NEARLY_RIGHT = 35.0

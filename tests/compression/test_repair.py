@@ -32,8 +32,8 @@ class Few(ViewSource):
 
 
 @pytest.fixture(autouse=True)
-def quick_as_it_ships(monkeypatch):
-    """Other tests go without."""
+def quick_takes_steps(monkeypatch):
+    """Other tests go without; fewer than ship, as these are many."""
     monkeypatch.setitem(STEPS, "quick", 32)
 
 
