@@ -259,7 +259,8 @@ class Merging:
             content = in_units(scene, self.centre, self.size)
             self.photos = photo_places(content)
             self.views = viewpoints(content, self.photos, SIDE, 3 * SIDE // 4)
-        self.state = start(scene, self.members, self._weights(), self.centre, self.size)
+        weights, self.seen = self._weights()
+        self.state = start(scene, self.members, weights, self.centre, self.size)
         self.tree = Tree(torch.arange(len(self.members), dtype=torch.int32))
         self.alive = torch.arange(len(self.members))  # [n left] index in members
         self.reference: Reference | None = None
@@ -287,13 +288,10 @@ class Merging:
         groups = self._groups().in_order()
         scene, finish = self._finished(groups)
         if regroups and bool((groups.sizes > 1).any()):
-            del scene
             other = self._regrouped(groups).in_order()
-            scene, chosen = self._finished(other)
+            made, chosen = self._finished(other)
             if chosen.psnr is None or finish.psnr is None or chosen.psnr >= finish.psnr:
-                groups, finish = other, chosen
-            else:
-                scene = self._made(groups)(finish)
+                groups, scene, finish = other, made, chosen
         assignment = torch.full((len(self.scene),), -1)
         assignment[self.members] = groups.place
         return Merged(scene, assignment, finish)
@@ -333,26 +331,24 @@ class Merging:
             torch.bincount(place, minlength=count).to(torch.int32),
         )
 
-    def _weights(self) -> Tensor:
-        """How large a unit of area at each member is to those who look, (n,); and by the way, how much is seen of
-        each."""
-        self.seen = torch.ones(()).expand(len(self.members))
+    def _weights(self) -> tuple[Tensor, Tensor]:
+        """How large a unit of area at each member is to those who look, (n,), and how much is seen of each, (n,)."""
+        seen = torch.ones(()).expand(len(self.members))
         if self.views is None:
-            return torch.ones(len(self.members))
+            return torch.ones(len(self.members)), seen
+        counted = len(self.members) <= MOST_SEEN
         means = positions_in_units(self.scene.means[self.members], self.centre, self.size)
         if self.given is not None:
-            weights, told = weights_seen(means, self.views, NOT_SHOWN), TOLD_TWICE
+            weights, told = weights_seen(means, self.views, NOT_SHOWN), TOLD_TWICE if counted else 1.0
         elif self.photos is not None:
             weights, told = weights_seen_from(means, *self.photos), 1.0
         else:
             weights = weights_seen(means, self.views)
             told = UNTOLD if is_room(thinned(self.scene, PROBED)) else 0.0
-        if len(self.members) <= MOST_SEEN:
+        if counted:
             shown = Shown.of(in_units(self.scene, self.centre, self.size), self.members, weights, self.views)
-            self.seen, weights = shown.each(), weights * shown.around()
-        elif self.given is not None:
-            told = 1.0
-        return weights * how_much_seen(self.scene, self.members) ** told if told else weights
+            seen, weights = shown.each(), weights * shown.around()
+        return weights * how_much_seen(self.scene, self.members) ** told if told else weights, seen
 
     def _see(self) -> None:
         """Render what remains, once it is few enough."""

@@ -103,7 +103,7 @@ def costs_of(state: State, near: Tensor, dtype: torch.dtype = torch.float32) -> 
         ways[these] = SIDES[areas.argmax(1)].to(torch.uint8)
 
     in_threads(choose, everywhere)
-    seen = Seen(torch.empty(n, 8, dtype=dtype), state.colours.to(dtype))
+    seen = Seen.of(state, dtype)
     costs = torch.zeros(near.shape, dtype=dtype)
     for way in range(len(DIRECTIONS)):
         here = (ways == way).any(1).nonzero()[:, 0]
@@ -111,7 +111,7 @@ def costs_of(state: State, near: Tensor, dtype: torch.dtype = torch.float32) -> 
             continue
 
         def look(these: Tensor, way: int = way) -> None:
-            seen.plane[these] = projected(state, these, way, dtype)
+            seen.look(state, these, way)
 
         def add(these: Tensor) -> None:
             costs[these] += seen.costs(these, near[these])
@@ -129,18 +129,6 @@ def _scaled(state: State, these: Tensor) -> tuple[Tensor, Tensor]:
     total = cov[:, 0] + cov[:, 3] + cov[:, 5]
     cov *= (WIDEST**2 / total.clamp_min(WIDEST**2))[:, None]
     return means, cov
-
-
-def projected(state: State, these: Tensor, way: int, dtype: torch.dtype) -> Tensor:
-    """Rows of :attr:`Seen.plane` of some Gaussians, seen from a direction."""
-    means, cov = _scaled(state, these)
-    centres, shadows = (means @ AXES[way]).to(dtype), (cov @ TO_SHADOW[way]).to(dtype)
-    spread = THINNEST * (shadows[:, 0] + shadows[:, 2]) + NARROWEST**2
-    shadows[:, 0] += spread
-    shadows[:, 2] += spread
-    lengths = state.colours[these].to(dtype).square().sum(1)
-    columns = torch.stack([area_of(*shadows.unbind(1)), state.alphas[these].to(dtype), lengths], dim=1)
-    return torch.cat([centres, shadows, columns], dim=1)
 
 
 def area_of(uu: Tensor, uv: Tensor, vv: Tensor) -> Tensor:
@@ -171,6 +159,22 @@ class Seen:
 
     plane: Tensor  # [n, 8] centre u, v; variances uu, uv, vv; area; opacity; squared length of the colour
     colours: Tensor  # [n, C]
+
+    @classmethod
+    def of(cls, state: State, dtype: torch.dtype) -> Seen:
+        """What all directions have in common; :meth:`look` adds the rest."""
+        plane, colours = torch.empty(len(state), 8, dtype=dtype), state.colours.to(dtype)
+        plane[:, 6], plane[:, 7] = state.alphas, colours.square().sum(1)
+        return cls(plane, colours)
+
+    def look(self, state: State, these: Tensor, way: int) -> None:
+        """Project some Gaussians."""
+        means, cov = _scaled(state, these)
+        centres, shadows = ((values @ to).to(self.plane) for values, to in ((means, AXES[way]), (cov, TO_SHADOW[way])))
+        spread = THINNEST * (shadows[:, 0] + shadows[:, 2]) + NARROWEST**2
+        shadows[:, 0] += spread
+        shadows[:, 2] += spread
+        self.plane[these, :6] = torch.cat([centres, shadows, area_of(*shadows.unbind(1))[:, None]], dim=1)
 
     def costs(self, i: Tensor, j: Tensor) -> Tensor:
         """Change of the image by each merge of Gaussians ``i`` (m,) with their neighbours ``j`` (m, k), (m, k)."""

@@ -32,11 +32,16 @@ def disks(seed: int = 1, logits: tuple[float, float] = (0.3, -0.6)) -> Gaussians
     )
 
 
+def seen_from(state: State, way: int, dtype: torch.dtype) -> pair_costs.Seen:
+    seen = pair_costs.Seen.of(state, dtype)
+    seen.look(state, torch.arange(len(state)), way)
+    return seen
+
+
 def seen_along_z(state: State) -> pair_costs.Seen:
     way = int(pair_costs.DIRECTIONS[:, 2].abs().argmax())
     assert float(pair_costs.DIRECTIONS[way, 2].abs()) == 1.0
-    rows = pair_costs.projected(state, torch.arange(len(state)), way, torch.float32)
-    return pair_costs.Seen(rows, state.colours)
+    return seen_from(state, way, torch.float32)
 
 
 @pytest.mark.parametrize(("logits", "grows"), [((0.3, -0.6), False), ((6.0, 6.0), True)])
@@ -156,9 +161,6 @@ def test_float32_costs_rank_pairs_as_float64_does():
     i, j = torch.arange(n), torch.randint(0, n, (n, 8), generator=g)
     single = pair_costs.costs_of(state, j.to(torch.int32)).double()
     for way in range(len(pair_costs.DIRECTIONS)):
-        a, b = (
-            pair_costs.Seen(pair_costs.projected(state, i, way, dtype), state.colours.to(dtype)).costs(i, j).double()
-            for dtype in (torch.float64, torch.float32)
-        )
+        a, b = (seen_from(state, way, dtype).costs(i, j).double() for dtype in (torch.float64, torch.float32))
         assert float((a - b).abs().max()) < 1e-3 * float(a.max())
     assert bool(single.isfinite().all())
