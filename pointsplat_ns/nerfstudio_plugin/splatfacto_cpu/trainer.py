@@ -86,9 +86,14 @@ class SplatfactoCpuTrainer(StoppableTrainer):
         if self.config.early_look and test_mode == "val":
             pictures = self.base_dir / PICTURES_NAME
             look = EarlyLook(self.pipeline, pictures, self._start_step, self.config.max_num_iterations)
+
+            def after_training(step: int) -> None:
+                with self.train_lock:  # as nerfstudio holds it in a step: the viewer's threads draw with the same model
+                    look.after_training(step)
+
             before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN
             self.callbacks.append(TrainingCallback([before], look.before_step, update_every_num_iters=1))
-            self.callbacks.append(TrainingCallback([after], look.after_training, update_every_num_iters=1))
+            self.callbacks.append(TrainingCallback([after], after_training, update_every_num_iters=1))
 
     def train(self) -> None:
         """As nerfstudio's."""

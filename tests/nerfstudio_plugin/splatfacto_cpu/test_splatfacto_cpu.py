@@ -22,7 +22,12 @@ from making import SHARED_DATA
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import fitted_schedules, splatfacto_cpu_config
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import LONE_POINT_SCALE, SplatfactoCpuModelConfig
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import (
+    LONE_POINT_SCALE,
+    SplatfactoCpuModel,
+    SplatfactoCpuModelConfig,
+)
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import SplatfactoCpuTrainer
 from pointsplat_ns.nerfstudio_plugin.stopping import STATE
 from pointsplat_ns.rasterizer import rasterization
 
@@ -273,6 +278,31 @@ def test_a_held_out_photo_and_its_render_lie_in_the_run(trained):
     assert (picture[:, :64] - data["image"] / 255).abs().mean() < 0.02
     assert (picture[:, 64:] - render).abs().mean() < 0.02
     assert picture[:, 64:].std() > 0.05, "a plain picture proves nothing"
+
+
+def test_the_last_picture_and_a_viewer_that_is_still_open_do_not_draw_at_the_same_time(
+    wall_scene, wall_config, run_training, monkeypatch, tmp_path
+):
+    trainers, drawn = [], []
+    setup, draw = SplatfactoCpuTrainer.setup, SplatfactoCpuModel.get_outputs
+
+    def noted(trainer):
+        trainers.append(trainer)
+        setup(trainer)
+
+    def beside_a_viewer(model, camera):
+        if not model.training:
+            lock = trainers[0].train_lock
+            drawn.append(lock.locked())
+            if lock.acquire(blocking=False):  # the viewer's thread is done with a picture that it began in a step
+                model.train()
+                lock.release()
+        return draw(model, camera)
+
+    monkeypatch.setattr(SplatfactoCpuTrainer, "setup", noted)
+    monkeypatch.setattr(SplatfactoCpuModel, "get_outputs", beside_a_viewer)
+    run_training(wall_config(wall_scene, tmp_path, steps=1))
+    assert drawn == [True]
 
 
 def test_checkpoint_has_splatfactos_layout_and_loads_weights_only(trained):
