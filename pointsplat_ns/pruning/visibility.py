@@ -14,10 +14,11 @@ from pointsplat_ns.pruning.traces import means_around
 from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.views import Views
 
-LOOKED_AT = 16
-"""Number of views, at most, that are looked at."""
+LOOKED_AT = 48
+"""Number of views, at most, that are looked at. Over 16, 48 gain 0.2 to 0.7 dB in a lounge, with its poses and without,
+and -0.2 to 0.4 in eight other scenes, for a second or two."""
 
-SIDE = 160
+SIDE = 112
 """Their longer side, pixels: it is counted who hides whom, which small pictures tell as well."""
 
 NEIGHBOURHOOD = 17
