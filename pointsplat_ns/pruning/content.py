@@ -82,5 +82,14 @@ def views_in_units(views: Views, centre: Tensor, size: float) -> Views:
 def thinned(scene: Gaussians, most: int) -> Gaussians:
     """At most about ``most`` Gaussians, evenly taken, grown so that they cover as much as all."""
     step = max(1, len(scene) // most)
-    some = Gaussians(*(value[::step] for value in scene.tensors()))
-    return some.replace(scales=some.scales + 0.5 * math.log(step))
+    return _grown(Gaussians(*(value[::step] for value in scene.tensors())), step)
+
+
+def some_of(scene: Gaussians, members: Tensor, step: int) -> Gaussians:
+    """Every so many-th of the members (n,), without SH, grown so that they cover as much as all."""
+    return _grown(scene.replace(features_rest=scene.features_rest[:, :0])[members[::step]], step)
+
+
+def _grown(scene: Gaussians, step: int) -> Gaussians:
+    """Gaussians that stand for so many each."""
+    return scene.replace(scales=scene.scales + 0.5 * math.log(step))

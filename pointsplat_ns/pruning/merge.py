@@ -29,7 +29,7 @@ from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.geometry.quaternions import quaternions_of
-from pointsplat_ns.pruning.content import content_size, in_units, positions_in_units, thinned, views_in_units
+from pointsplat_ns.pruning.content import content_size, in_units, positions_in_units, some_of, thinned, views_in_units
 from pointsplat_ns.pruning.covariance import TINY, shadow, unpack
 from pointsplat_ns.pruning.coverage import curve_keys, unit_cells
 from pointsplat_ns.pruning.duplicates import Copies, Reduced
@@ -54,8 +54,9 @@ SHARE_PER_ROUND = 0.4
 worse: the cost of a pair does not include earlier losses of its members, and even thinning keeps losses small."""
 
 FEWEST_SEEN, MOST_SEEN = 2_000, 2_000_000
-"""Smallest and largest number of Gaussians of a scene that is looked at and rendered to choose the numbers of
-:class:`Finish`. Smaller ones are merged in less time than that takes."""
+"""Smallest and largest number of Gaussians that are rendered, to tell what stands in front and to choose the numbers of
+:class:`Finish`. Smaller scenes are merged in less time than that takes. Of larger ones, some tell what stands in front:
+one of four loses 0.1 to 0.7 dB of the 1 to 2 that are gained on a bouquet."""
 
 TOLD_TWICE = 0.5
 """Exponent of how much photos showed where views were given and what they show was counted, which tells a part of the
@@ -333,22 +334,30 @@ class Merging:
 
     def _weights(self) -> tuple[Tensor, Tensor]:
         """How large a unit of area at each member is to those who look, (n,), and how much is seen of each, (n,)."""
-        seen = torch.ones(()).expand(len(self.members))
         if self.views is None:
-            return torch.ones(len(self.members)), seen
-        counted = len(self.members) <= MOST_SEEN
+            return torch.ones(len(self.members)), torch.ones(()).expand(len(self.members))
         means = positions_in_units(self.scene.means[self.members], self.centre, self.size)
         if self.given is not None:
-            weights, told = weights_seen(means, self.views, NOT_SHOWN), TOLD_TWICE if counted else 1.0
+            weights, told = weights_seen(means, self.views, NOT_SHOWN), TOLD_TWICE
         elif self.photos is not None:
             weights, told = weights_seen_from(means, *self.photos), 1.0
         else:
             weights = weights_seen(means, self.views)
             told = UNTOLD if is_room(thinned(self.scene, PROBED)) else 0.0
-        if counted:
-            shown = Shown.of(in_units(self.scene, self.centre, self.size), self.members, weights, self.views)
-            seen, weights = shown.each(), weights * shown.around()
+        around, seen = self._shown(weights, self.views)
+        weights = weights * around
         return weights * how_much_seen(self.scene, self.members) ** told if told else weights, seen
+
+    def _shown(self, weights: Tensor, views: Views) -> tuple[Tensor, Tensor]:
+        """Root of the share of the neighbourhood of each member that views really show, (n,), and of each by itself; of
+        a scene too large to render, that of one of several members along the curve."""
+        scene, members, step = self.scene, self.members, -(-len(self.members) // MOST_SEEN)
+        if step > 1:
+            scene = some_of(scene, members, step)
+            members, weights = torch.arange(len(scene)), weights[::step]
+        shown = Shown.of(in_units(scene, self.centre, self.size), members, weights, views)
+        around, each = (share.repeat_interleave(step)[: len(self.members)] for share in (shown.around(), shown.each()))
+        return around, each
 
     def _see(self) -> None:
         """Render what remains, once it is few enough."""

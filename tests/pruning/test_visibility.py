@@ -9,6 +9,7 @@ import torch
 
 from making import ball, normal_scene
 from pointsplat_ns.gaussians import SH_C0, Gaussians
+from pointsplat_ns.pruning import merge as merging
 from pointsplat_ns.pruning.merge import merge
 from pointsplat_ns.pruning.regrouping import masses_of, moments
 from pointsplat_ns.pruning.view_sampling import look_at
@@ -48,6 +49,16 @@ def test_merging_keeps_what_views_show_rather_than_what_is_hidden():
     kept = merge(scene, 600, views=views_from((0, 0, -4), (1, 0, -4), (0, 1, -4))).scene
     front = int((kept.means[:, 2] < 0).sum())
     assert len(kept) == 600 and front > 1.5 * (600 - front)
+
+
+def test_of_a_scene_too_large_to_render_some_tell_what_is_hidden(monkeypatch):
+    monkeypatch.setattr(merging, "MOST_SEEN", 700)
+    scene = two_walls()
+    members = torch.arange(len(scene))
+    seen = merging.Merging(scene, members, views_from((0, 0, -4))).seen
+    of_all = merging.Merging(scene, members, views_from((0, 0, -4)))
+    front = scene.means[of_all.members, 2] < 0
+    assert seen.shape == (2048,) and float(seen[front].mean()) > 1.5 * float(seen[~front].mean())
 
 
 def test_a_group_looks_like_those_of_its_members_that_are_seen():
