@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -114,7 +114,7 @@ def compact_scene(
     parabola through the errors at 0, 1/2 and 1, where the error is least if renders change linearly with the residuals.
     The best is kept if it :func:`helps`. A requested PSNR (``auto``) is reached before refinement, so that it holds in
     any case. Then the scene is repaired (:func:`~pointsplat_ns.compression.repair.repair`), from views other than those
-    compared; that, too, is kept if it helps.
+    compared; that, too, is kept as far as it helps.
 
     Args:
         dense: N Gaussians.
@@ -165,9 +165,13 @@ def compact_scene(
         progress("repairing", 0.0)
         device = reference.renders[0].device
         shown = functools.partial(progress, "repairing")
-        repaired = repair(scene.to(device), dense.to(device), views, budget, shown, psnr=close.psnr)
-        after_repair = reference.closeness(repaired.scene)
-        verdict += "\n" + _repair_verdict(close, after_repair, repaired)
+        unrepaired = scene.to(device)
+        repaired = repair(unrepaired, dense.to(device), views, budget, shown, psnr=close.psnr)
+        after_repair, share = reference.closeness(repaired.scene), 1.0
+        if not helps(close, after_repair):
+            stepped_back, share, after_repair = as_far_as_it_helps(reference, close, unrepaired, repaired.scene)
+            repaired = replace(repaired, scene=stepped_back)
+        verdict += "\n" + _repair_verdict(close, after_repair, repaired, share)
         if helps(close, after_repair):
             scene = repaired.scene
     seconds = time.perf_counter() - start
@@ -231,18 +235,19 @@ def as_far_as_it_helps(
     refined: Gaussians,
     progress: Progress = silent,
 ) -> tuple[Gaussians, float, Closeness]:
-    """The scene at the best share of a refiner's residuals, that share, and its errors; at full strength if none helps.
+    """The scene at the best share of a refinement or repair that helps, that share, and its errors; at full strength if
+    none helps.
 
     Args:
         reference: the dense scene's renders.
         before: errors of ``pruned`` against them.
-        pruned, refined: the scenes before and after refinement.
+        pruned, refined: the scenes before and after.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
     """
     device = reference.renders[0].device
     tried = _try_strengths(reference, before, pruned.to(device), refined.to(device), progress)
-    best = min(tried, key=lambda share: tried[share].error)
-    strength = best if helps(before, tried[best]) else 1.0
+    helping = [share for share in tried if helps(before, tried[share])]
+    strength = min(helping, key=lambda share: tried[share].error, default=1.0)
     return at_strength(pruned, refined, strength), strength, tried[strength]
 
 
@@ -315,16 +320,20 @@ def _verdict(before: Closeness, after: Closeness, strength: float) -> str:
     """One line of text: what refinement gained, or why it was left out."""
     figures = _figures(before, after)
     if helps(before, after):
-        share = "" if strength == 1 else f" at {strength:.0%} of its strength"
-        return f"refinement{share}: {figures}"
+        return f"refinement{_at(strength)}: {figures}"
     if after.errors == before.errors:
         return f"refinement left out: it changes nothing, {before.psnr:.2f} dB in {views_text(len(before.errors))}"
     return f"refinement left out, {_left_out(before, after)}: {figures}"
 
 
-def _repair_verdict(before: Closeness, after: Closeness, repaired: Repaired) -> str:
+def _repair_verdict(before: Closeness, after: Closeness, repaired: Repaired, strength: float) -> str:
     """One line of text: what the repair gained and cost, or why it was left out."""
     cost = f"{repaired.steps} steps in {repaired.seconds:.1f} s" + (", interrupted" if repaired.interrupted else "")
     if helps(before, after):
-        return f"repair, {cost}: {_figures(before, after)}"
+        return f"repair{_at(strength)}, {cost}: {_figures(before, after)}"
     return f"repair left out, {_left_out(before, after)} ({cost}): {_figures(before, after)}"
+
+
+def _at(strength: float) -> str:
+    """A strength in words, if it is not the whole."""
+    return "" if strength == 1 else f" at {strength:.0%} of its strength"

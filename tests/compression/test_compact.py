@@ -11,7 +11,7 @@ import torch
 import pointsplat_ns.compression.compact as compact_module
 from making import ball, same
 from pointsplat_ns.compression.closeness import Closeness, DenseReference
-from pointsplat_ns.compression.compact import MIN_GAIN, Compacted, at_strength, bottom_of_parabola, compact_scene
+from pointsplat_ns.compression.compact import MIN_GAIN, Compacted, at_strength, bottom_of_parabola, compact_scene, helps
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import RepairBudget, Repaired
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
@@ -289,7 +289,7 @@ def test_a_repair_that_helps_is_kept_and_one_that_harms_is_left_out(scene, views
     pruned, reference = prune(scene, 0.5, "opacity"), DenseReference(scene, views)
     larger = pruned.replace(scales=pruned.scales + 0.1)
     spoiled = pruned.replace(features_dc=pruned.features_dc * math.nan)
-    far = pruned.replace(features_dc=pruned.features_dc + 2.0)
+    far = pruned.replace(features_dc=pruned.features_dc - 2.0)
     for made, kept in ((larger, True), (far, False), (spoiled, False)):
         monkeypatch.setattr(
             compact_module, "repair", lambda *_, made=made, kept=kept, **others: Repaired(made, 5, 0.5, not kept)
@@ -301,6 +301,19 @@ def test_a_repair_that_helps_is_kept_and_one_that_harms_is_left_out(scene, views
         line = result.verdict.splitlines()[1]
         assert line.startswith("repair, 5 steps in 0.5 s: " if kept else "repair left out, ")
         assert ("interrupted" in line) == (not kept)
+
+
+def test_a_repair_that_goes_too_far_is_kept_in_part(scene, views, monkeypatch):
+    refiner, reference = trained(tiny_refiner()), DenseReference(scene, views)
+    pruned = prune(scene, 0.5, "opacity")
+    made = pruned.replace(scales=pruned.scales + 0.6)
+    monkeypatch.setattr(compact_module, "repair", lambda *_, **others: Repaired(made, 5, 0.5, False))
+    result = compacted(scene, refiner, views, budget=RepairBudget("quick", 1.0))
+    assert not helps(result.before, reference.closeness(made))
+    assert result.repair_accepted and result.psnr == reference.psnr(result.scene)[0] > result.before.psnr + MIN_GAIN
+    share = (result.scene.scales - pruned.scales).mean() / 0.6
+    assert 0 < share < 1 and torch.equal(result.scene.means, pruned.means)
+    assert f"repair at {share:.0%} of its strength, 5 steps in 0.5 s: " in result.verdict
 
 
 def test_what_cannot_be_compared_or_is_as_good_as_can_be_is_not_repaired(scene, views, monkeypatch):
