@@ -41,7 +41,7 @@ from pointsplat_ns.pruning.regrouping import ROUNDS, masses_of, moments, regroup
 from pointsplat_ns.pruning.traces import how_much_seen, photo_places
 from pointsplat_ns.pruning.view_sampling import PROBED, is_room
 from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, viewpoints, weights_seen, weights_seen_from
-from pointsplat_ns.pruning.visibility import Shown
+from pointsplat_ns.pruning.visibility import MOST_DRAWN, Shown
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import Views
@@ -54,9 +54,8 @@ SHARE_PER_ROUND = 0.4
 worse: the cost of a pair does not include earlier losses of its members, and even thinning keeps losses small."""
 
 FEWEST_SEEN, MOST_SEEN = 2_000, 2_000_000
-"""Smallest and largest number of Gaussians that are rendered, to tell what stands in front and to choose the numbers of
-:class:`Finish`. Smaller scenes are merged in less time than that takes. Of larger ones, some tell what stands in front:
-one of four loses 0.1 to 0.7 dB of the 1 to 2 that are gained on a bouquet."""
+"""Smallest and largest number of Gaussians of a scene that is looked at and rendered to choose the numbers of
+:class:`Finish`. Smaller ones are merged in less time than that takes."""
 
 TOLD_TWICE = 0.5
 """Exponent of how much photos showed where views were given and what they show was counted, which tells a part of the
@@ -349,9 +348,9 @@ class Merging:
         return weights * how_much_seen(self.scene, self.members) ** told if told else weights, seen
 
     def _shown(self, weights: Tensor, views: Views) -> tuple[Tensor, Tensor]:
-        """Root of the share of the neighbourhood of each member that views really show, (n,), and of each by itself; of
-        a scene too large to render, that of one of several members along the curve."""
-        scene, members, step = self.scene, self.members, -(-len(self.members) // MOST_SEEN)
+        """Root of the share of the neighbourhood of each member that views really show, (n,), and of each by itself; in a
+        large scene, that of one of several members along the curve."""
+        scene, members, step = self.scene, self.members, -(-len(self.members) // MOST_DRAWN)
         if step > 1:
             scene = some_of(scene, members, step)
             members, weights = torch.arange(len(scene)), weights[::step]

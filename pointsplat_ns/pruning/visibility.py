@@ -21,6 +21,11 @@ and -0.2 to 0.4 in eight other scenes, for a second or two."""
 SIDE = 112
 """Their longer side, pixels: it is counted who hides whom, which small pictures tell as well."""
 
+MOST_DRAWN = 500_000
+"""Number of Gaussians, at most, that are drawn: of more, evenly chosen ones stand for all. One of two or four tells a
+lounge of 445,000 as much as all do (0.0 dB); one of four takes 0.4 of the 1.4 dB away that a bouquet of 117,000 gains at
+10 %."""
+
 NEIGHBOURHOOD = 17
 """Number of Gaussians along the curve that are counted together: of two in the same place, the one in front hides the
 other, and either may be."""

@@ -362,13 +362,13 @@ class Half:
         return torch.full((self.count,), 0.5)
 
 
-@pytest.mark.parametrize("most", [30, 29, 7, 1])  # of more members, some are looked at
+@pytest.mark.parametrize("most", [30, 29, 7, 1])  # of more members, some are drawn
 @pytest.mark.parametrize(
     "where, told", [("given", 4.0), ("photos", 16.0), ("room", 2.0), ("outside", 1.0)]  # 16^(1/2), 16, 16^(1/4)
 )  # fmt: skip
 def test_members_are_weighed_by_what_is_seen_of_them(monkeypatch, where, told, most):
     monkeypatch.setattr(merging, "FEWEST_SEEN", 0)
-    monkeypatch.setattr(merging, "MOST_SEEN", most)
+    monkeypatch.setattr(merging, "MOST_DRAWN", most)
     monkeypatch.setattr(merging, "photo_places", lambda content: ("places", "shares") if where == "photos" else None)
     monkeypatch.setattr(merging, "viewpoints", lambda *_: one_view())
     monkeypatch.setattr(merging, "is_room", lambda scene: where == "room")
