@@ -348,8 +348,8 @@ class Merging:
         return weights * how_much_seen(self.scene, self.members) ** told if told else weights, seen
 
     def _shown(self, weights: Tensor, views: Views) -> tuple[Tensor, Tensor]:
-        """Root of the share of the neighbourhood of each member that views really show, (n,), and of each by itself; in a
-        large scene, that of one of several members along the curve."""
+        """Root of the share of the neighbourhood of each member that views really show, (n,), and of each by itself; in
+        a large scene, that of one of several members along the curve."""
         scene, members, step = self.scene, self.members, -(-len(self.members) // MOST_DRAWN)
         if step > 1:
             scene = some_of(scene, members, step)
