@@ -22,9 +22,9 @@ SIDE = 112
 """Their longer side, pixels: it is counted who hides whom, which small pictures tell as well."""
 
 MOST_DRAWN = 500_000
-"""Number of Gaussians, at most, that are drawn: of more, evenly chosen ones stand for all. In a lounge of 445,000 one of
-two or four tells as much as all do (0.0 dB); in a bouquet of 117,000 one of four takes away 0.4 of the 1.4 dB that are
-gained at 10 %."""
+"""Number of Gaussians, at most, that are drawn: of more, evenly chosen ones stand for all. In a lounge of 445,000 one
+of two or four tells as much as all do (0.0 dB); in a bouquet of 117,000 one of four takes away 0.4 of the 1.4 dB that
+are gained at 10 %."""
 
 NEIGHBOURHOOD = 17
 """Number of Gaussians along the curve that are counted together: of two in the same place, the one in front hides the
