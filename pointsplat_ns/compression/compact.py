@@ -169,7 +169,9 @@ def compact_scene(
         repaired = repair(unrepaired, dense.to(device), views, budget, shown, psnr=close.psnr)
         after_repair, share = reference.closeness(repaired.scene), 1.0
         if not helps(close, after_repair):
-            stepped_back, share, after_repair = as_far_as_it_helps(reference, close, unrepaired, repaired.scene)
+            stepped_back, share, after_repair = as_far_as_it_helps(
+                reference, close, unrepaired, repaired.scene, after=after_repair
+            )
             repaired = replace(repaired, scene=stepped_back)
         verdict += "\n" + _repair_verdict(close, after_repair, repaired, share)
         if helps(close, after_repair):
@@ -234,6 +236,7 @@ def as_far_as_it_helps(
     pruned: Gaussians,
     refined: Gaussians,
     progress: Progress = silent,
+    after: Closeness | None = None,
 ) -> tuple[Gaussians, float, Closeness]:
     """The scene at the best share of a refinement or repair that helps, that share, and its errors; at full strength if
     none helps.
@@ -243,19 +246,25 @@ def as_far_as_it_helps(
         before: errors of ``pruned`` against them.
         pruned, refined: the scenes before and after.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
+        after: errors of ``refined``, if they are known.
     """
     device = reference.renders[0].device
-    tried = _try_strengths(reference, before, pruned.to(device), refined.to(device), progress)
+    tried = {} if after is None else {1.0: after}
+    _try_strengths(tried, reference, before, pruned.to(device), refined.to(device), progress)
     helping = [share for share in tried if helps(before, tried[share])]
     strength = min(helping, key=lambda share: tried[share].error, default=1.0)
     return at_strength(pruned, refined, strength), strength, tried[strength]
 
 
 def _try_strengths(
-    reference: DenseReference, before: Closeness, pruned: Gaussians, refined: Gaussians, progress: Progress
-) -> dict[float, Closeness]:
-    """Errors by the strength tried; 1 is always among them."""
-    tried: dict[float, Closeness] = {}
+    tried: dict[float, Closeness],
+    reference: DenseReference,
+    before: Closeness,
+    pruned: Gaussians,
+    refined: Gaussians,
+    progress: Progress,
+) -> None:
+    """Add errors by the strength tried to those that are known; 1 is then always among them."""
 
     def attempt(strength: float) -> None:
         done = len(tried)
@@ -263,14 +272,14 @@ def _try_strengths(
             at_strength(pruned, refined, strength), lambda share: progress("comparing renders", (done + share) / 3)
         )
 
-    attempt(1.0)
+    if 1.0 not in tried:
+        attempt(1.0)
     if tried[1.0].errors != before.errors:
         attempt(0.5)
         bottom = bottom_of_parabola(before.error, tried[0.5].error, tried[1.0].error)
         if 0.05 < bottom < 0.95 and abs(bottom - 0.5) > 0.05:  # closer ones hardly differ from those tried
             attempt(bottom)
     progress("comparing renders", 1.0)
-    return tried
 
 
 def bottom_of_parabola(at_zero: float, at_half: float, at_one: float) -> float:

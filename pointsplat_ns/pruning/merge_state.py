@@ -5,6 +5,7 @@ The replacement has the common mass (opacity times the area of the projection), 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -100,6 +101,17 @@ class State:
         return wi
 
 
+def in_pieces(
+    function: Callable[[Tensor], Tensor], members: Tensor, *shape: int, dtype: torch.dtype = torch.float64
+) -> Tensor:
+    """What a function makes of members (n,): of some at once (m,), in (m, *shape), and so of all, (n, *shape). Small
+    results that are kept between large pieces would hold on to the memory of these."""
+    result = torch.empty(len(members), *shape, dtype=dtype)
+    for these in torch.arange(len(members)).split(CHUNK):
+        result[these] = function(members[these]).to(dtype)
+    return result
+
+
 def covariances_of(scene: Gaussians, rows: Tensor) -> Tensor:
     """Covariances (m, 6) of some Gaussians, float64."""
     return covariances(scene.scales[rows].double(), scene.quats[rows].double())
@@ -120,12 +132,9 @@ def start(scene: Gaussians, members: Tensor, weights: Tensor, centre: Tensor, si
         centre: (3,) of the scene's content.
         size: diagonal of the scene's content, scene units.
     """
-    cov = torch.empty(len(members), 6, dtype=torch.float64)
-    for these in torch.arange(len(members)).split(CHUNK):
-        cov[these] = covariances_of(scene, members[these])
     return State(
         means=scene.means[members].double(),
-        cov=cov,
+        cov=in_pieces(lambda rows: covariances_of(scene, rows), members, 6),
         alphas=torch.sigmoid(scene.opacities[members, 0]).double(),
         colours=_colours(scene, members),
         weights=weights.float(),
@@ -151,7 +160,4 @@ def _colours(scene: Gaussians, members: Tensor) -> Tensor:
         products += values.T @ values
     mean = total / len(members)
     axes = torch.linalg.eigh(products - len(members) * mean[:, None] * mean).eigenvectors[:, -COLOUR_AXES:]
-    colours = torch.empty(len(members), axes.shape[1])
-    for these in torch.arange(len(members)).split(CHUNK):
-        colours[these] = ((coefficients(members[these]) - mean) @ axes).float()
-    return colours
+    return in_pieces(lambda rows: (coefficients(rows) - mean) @ axes, members, axes.shape[1], dtype=torch.float32)

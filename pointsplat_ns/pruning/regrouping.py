@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import SH_C0, Gaussians
 from pointsplat_ns.pruning.covariance import TINY, outer, shadow, unpack
-from pointsplat_ns.pruning.merge_state import CHUNK, MOST_CONTRAST, covariances_of
+from pointsplat_ns.pruning.merge_state import CHUNK, MOST_CONTRAST, covariances_of, in_pieces
 from pointsplat_ns.system.threads import in_threads
 
 ROUNDS = 2
@@ -46,11 +46,9 @@ class Moments:
 
 def masses_of(scene: Gaussians, members: Tensor) -> Tensor:
     """Masses of some Gaussians (n,), float64."""
-    masses = torch.empty(len(members), dtype=torch.float64)
-    for these in torch.arange(len(members)).split(CHUNK):
-        rows = members[these]
-        masses[these] = torch.sigmoid(scene.opacities[rows, 0].double()) * shadow(covariances_of(scene, rows))
-    return masses
+    return in_pieces(
+        lambda rows: torch.sigmoid(scene.opacities[rows, 0].double()) * shadow(covariances_of(scene, rows)), members
+    )
 
 
 def moments(scene: Gaussians, members: Tensor, masses: Tensor, place: Tensor, count: int) -> Moments:

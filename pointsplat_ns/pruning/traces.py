@@ -16,7 +16,6 @@ None of this is in the literature that we know of; it was found on trained scene
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -24,7 +23,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.merge_state import CHUNK
+from pointsplat_ns.pruning.merge_state import in_pieces
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
 NEIGHBOURHOOD = 129
@@ -93,20 +92,11 @@ def how_much_seen(scene: Gaussians, members: Tensor) -> Tensor:
         scene: N Gaussians.
         members: (n,) indices, n at least 1, in an order in which neighbours are near each other.
     """
-    energy = means_around(_of_members(_energy, scene.features_rest, members), NEIGHBOURHOOD)
-    flatness = means_around(_of_members(_flatness, scene.scales, members), NEIGHBOURHOOD)
+    energy = means_around(in_pieces(lambda rows: _energy(scene.features_rest[rows].double()), members), NEIGHBOURHOOD)
+    flatness = means_around(in_pieces(lambda rows: _flatness(scene.scales[rows].double()), members), NEIGHBOURHOOD)
     power = 1.0 if bool((energy > 0).any()) else FLATNESS_POWER
     logs = ENERGY_POWER * (energy + FAINTEST**2).log() + power * flatness
     return (logs - logs.median()).clamp(-MOST_FACTOR, MOST_FACTOR).exp().float()
-
-
-def _of_members(function: Callable[[Tensor], Tensor], values: Tensor, members: Tensor) -> Tensor:
-    """A function of rows of values (N, ...) for the members (n,), float64; in pieces, as values may be on disk. Small
-    results that are kept between large pieces would hold on to the memory of these."""
-    result = torch.empty(len(members), dtype=torch.float64)
-    for these in torch.arange(len(members)).split(CHUNK):
-        result[these] = function(values[members[these]].double())
-    return result
 
 
 def _energy(rest: Tensor) -> Tensor:
