@@ -146,7 +146,7 @@ def _require_space(path: Path, folder: Path, size: int) -> None:
     disk = shutil.disk_usage(folder)
     if disk.total and size > disk.free:  # some network file systems tell nothing
         raise SceneError(
-            f"{path}: needs {size / 1e6:.2g} MB, {disk.free / 1e6:.2g} MB are free there, so nothing was written; make "
+            f"{path}: needs {_megabytes(size)}, {_megabytes(disk.free)} are free there, so nothing was written; make "
             "room or name another place"
         )
 
@@ -165,7 +165,17 @@ def lack_of_room(error: OSError, part: Path | None) -> str:
         free = shutil.disk_usage(part.parent).free if error.errno == errno.ENOSPC else 0
     except OSError:
         return ""
-    return f"; it needs more than {(written + free) / 1e6:.2g} MB; make room or name another place"
+    return f"; it needs more than {_megabytes(written + free)}; make room or name another place"
+
+
+def _megabytes(size: int) -> str:
+    """A number of bytes in MB, to two digits.
+
+    Example:
+        >>> _megabytes(3_847), _megabytes(113_000_000)
+        ('0.0038 MB', '110 MB')
+    """
+    return f"{float(f'{size / 1e6:.2g}'):,g} MB"
 
 
 def _mode_of(path: Path) -> int | None:
