@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,13 +15,20 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
-from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
+from pointsplat_ns.nerfstudio_plugin.optimizers import FallingRateConfig, FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig, SplatfactoCpuPipelineConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import SplatfactoCpuTrainer
 from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainerConfig
 
 SPLATFACTO_STEPS = 30_000
 """Training steps that Splatfacto's schedules were chosen for."""
+
+MOST_HASTE = 8.0
+"""Maximum factor on the first learning rates, and on the threshold of densification: that of a run of 470 steps."""
+
+
+OF_GAUSSIANS = ("means", "features_dc", "features_rest", "opacities", "scales", "quats")
+"""Groups of parameters whose learning rates begin higher in short runs."""
 
 
 @dataclass
@@ -29,8 +37,9 @@ class SplatfactoCpuTrainerConfig(StoppableTrainerConfig):
 
     _target: type = field(default_factory=lambda: SplatfactoCpuTrainer)
     scale_schedules: bool = True
-    """Shorten Splatfacto's schedules (resolution, SH degree, densification, learning rates) in proportion if the run is
-    shorter than 30,000 steps. Options set by hand are not changed."""
+    """If the run is shorter than 30,000 steps, shorten Splatfacto's schedules (resolution, SH degree, densification,
+    learning rates) in proportion, let learning rates begin higher, and the scene grow to fewer Gaussians. Options set
+    by hand are not changed."""
     early_look: bool = True
     """Say after some seconds how long the training will take, and draw a held-out photo and its render now and then, in
     the folder pictures of the run."""
@@ -50,13 +59,17 @@ def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainer
     Model settings are changed only if they have Splatfacto's default values, learning-rate schedules only if they end
     at 30,000. ``refine_every``, over which gradients are gathered, shrinks only below 7,000 steps and never below 25.
     The interval of the opacity reset is a multiple of it.
+
+    Few steps can train only few Gaussians, and have to take them far. So the gradient above which a Gaussian is split
+    or duplicated grows with the root of how many times shorter the run is, but at most by :data:`MOST_HASTE`. The
+    learning rates of Gaussians begin as many times higher, and end as Splatfacto's.
     """
     length = config.first_step() + config.max_num_iterations
     share = min(1.0, length / SPLATFACTO_STEPS)
     config = copy.deepcopy(config)
     defaults = SplatfactoModelConfig()
     model = config.pipeline.model
-    fitted = {
+    fitted: dict[str, float] = {
         name: max(1, round(share * getattr(defaults, name)))
         for name in (
             "warmup_length",
@@ -67,12 +80,18 @@ def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainer
         )
     }
     fitted["refine_every"] = min(defaults.refine_every, max(25, round(length / 70)))
+    haste = min(MOST_HASTE, 1 / math.sqrt(share))
+    fitted["densify_grad_thresh"] = haste * defaults.densify_grad_thresh
     for name, value in fitted.items():
         if getattr(model, name) == getattr(defaults, name):
             setattr(model, name, value)
-    for group in config.optimizers.values():
+    own = _optimizers()
+    for name, group in config.optimizers.items():
         schedule = group["scheduler"]
-        if isinstance(schedule, ExponentialDecaySchedulerConfig) and schedule.max_steps == SPLATFACTO_STEPS:
+        if haste > 1 and name in OF_GAUSSIANS and group == own[name]:
+            last = 1.0 if schedule is None else schedule.lr_final / group["optimizer"].lr
+            group["scheduler"] = FallingRateConfig(first=haste, last=last, max_steps=length)
+        elif isinstance(schedule, ExponentialDecaySchedulerConfig) and schedule.max_steps == SPLATFACTO_STEPS:
             schedule.max_steps = max(1, round(share * SPLATFACTO_STEPS))
             schedule.warmup_steps = round(share * schedule.warmup_steps)
     return config

@@ -21,7 +21,7 @@ from PIL import Image
 from making import SHARED_DATA
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import fitted_schedules, splatfacto_cpu_config
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import MOST_HASTE, fitted_schedules, splatfacto_cpu_config
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import (
     LONE_POINT_SCALE,
     SplatfactoCpuModel,
@@ -224,16 +224,41 @@ def test_schedules_follow_the_length_of_the_run_and_spare_what_was_set_by_hand()
     config = splatfacto_cpu_config()
     config.max_num_iterations = 3000
     config.pipeline.model.warmup_length = 77
+    config.optimizers["scales"]["optimizer"].lr = 0.01
     fitted = fitted_schedules(config)
     model = fitted.pipeline.model
     assert (model.resolution_schedule, model.sh_degree_interval, model.stop_split_at) == (300, 100, 1500)
     assert model.warmup_length == 77 and model.refine_every == 43
+    assert model.densify_grad_thresh == pytest.approx(8e-4 * 10**0.5), "fewer steps, fewer Gaussians"
     assert fitted.optimizers["means"]["scheduler"].max_steps == 3000
     assert fitted.optimizers["camera_opt"]["scheduler"].warmup_steps == 100
+    assert fitted.optimizers["scales"]["scheduler"] is None, "its rate was set by hand"
     assert config.pipeline.model.resolution_schedule == 3000, "the config itself, which is saved, is left alone"
     config.max_num_iterations = 50_000
     assert fitted_schedules(config).pipeline.model.resolution_schedule == 3000
+    assert fitted_schedules(config).pipeline.model.densify_grad_thresh == 8e-4
     assert fitted_schedules(config).optimizers["means"]["scheduler"].max_steps == 30_000
+
+
+@pytest.mark.parametrize(("name", "rate", "last"), [("opacities", 0.05, 0.05), ("means", 1.6e-4, 1.6e-6)])
+def test_rates_of_a_short_run_begin_higher_and_end_as_splatfactos(name, rate, last):
+    config = splatfacto_cpu_config()
+    config.max_num_iterations = 3000
+    group = fitted_schedules(config).optimizers[name]
+    adam = torch.optim.Adam([torch.zeros(1)], lr=group["optimizer"].lr)
+    scheduler = group["scheduler"].setup().get_scheduler(adam, group["optimizer"].lr)
+    rates = []
+    for _ in range(3002):
+        rates += scheduler.get_last_lr()
+        adam.step()
+        scheduler.step()
+    assert rates[0] == pytest.approx(rate * 10**0.5) and rates[3000] == rates[3001] == pytest.approx(last)
+    assert rates == sorted(rates, reverse=True)
+    assert scheduler.state_dict()["base_lrs"] == [rate], "what a checkpoint holds does not depend on the length"
+    config.max_num_iterations = 30_000
+    assert fitted_schedules(config).optimizers == config.optimizers
+    config.max_num_iterations = 10
+    assert fitted_schedules(config).optimizers[name]["scheduler"].first == MOST_HASTE
 
 
 def test_a_run_that_cannot_start_leaves_no_folder(tmp_path, wall_config, run_training):
