@@ -28,7 +28,7 @@ def test_training_lowers_the_loss_on_all_views(trained, trained_walls):
     _, trainer, _ = trained
     untrained = pipeline_of(trained_walls)
     model = trainer.pipeline.eval().model
-    assert view_loss(model, trainer.pipeline.datamanager, 0) < 0.9 * view_loss(
+    assert view_loss(model, trainer.pipeline.datamanager, 0) < 0.95 * view_loss(
         untrained.model, untrained.datamanager, 0
     )
 
