@@ -26,7 +26,6 @@ SPLATFACTO_STEPS = 30_000
 MOST_HASTE = 8.0
 """Maximum factor on the first learning rates, and on the threshold of densification: that of a run of 470 steps."""
 
-
 OF_GAUSSIANS = ("means", "features_dc", "features_rest", "opacities", "scales", "quats")
 """Groups of parameters whose learning rates begin higher in short runs."""
 
@@ -64,7 +63,7 @@ def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainer
     or duplicated grows with the root of how many times shorter the run is, but at most by :data:`MOST_HASTE`. The
     learning rates of Gaussians begin as many times higher, and end as Splatfacto's.
     """
-    length = config.first_step() + config.max_num_iterations
+    length = max(1, config.first_step() + config.max_num_iterations)
     share = min(1.0, length / SPLATFACTO_STEPS)
     config = copy.deepcopy(config)
     defaults = SplatfactoModelConfig()
