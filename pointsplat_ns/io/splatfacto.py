@@ -22,6 +22,7 @@ wrapper of distributed training."""
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 
 NAMES = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
+"""Names of the parameters of Gaussians, in checkpoints and in Splatfacto's optimisers."""
 
 
 def read_checkpoint(path: Path | str) -> Gaussians:

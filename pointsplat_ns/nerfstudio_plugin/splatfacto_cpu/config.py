@@ -14,6 +14,7 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
+from pointsplat_ns.io.splatfacto import NAMES
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
 from pointsplat_ns.nerfstudio_plugin.optimizers import FallingRateConfig, FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig, SplatfactoCpuPipelineConfig
@@ -25,9 +26,6 @@ SPLATFACTO_STEPS = 30_000
 
 MOST_HASTE = 8.0
 """Maximum factor on the first learning rates, and on the threshold of densification: that of a run of 470 steps."""
-
-OF_GAUSSIANS = ("means", "features_dc", "features_rest", "opacities", "scales", "quats")
-"""Groups of parameters whose learning rates begin higher in short runs."""
 
 
 @dataclass
@@ -87,7 +85,7 @@ def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainer
     own = _optimizers()
     for name, group in config.optimizers.items():
         schedule = group["scheduler"]
-        if haste > 1 and name in OF_GAUSSIANS and group == own[name]:
+        if haste > 1 and name in NAMES and group == own[name]:
             last = 1.0 if schedule is None else schedule.lr_final / group["optimizer"].lr
             group["scheduler"] = FallingRateConfig(first=haste, last=last, max_steps=length)
         elif isinstance(schedule, ExponentialDecaySchedulerConfig) and schedule.max_steps == SPLATFACTO_STEPS:
