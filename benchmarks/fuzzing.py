@@ -40,6 +40,8 @@ class Result:
     runs: int = 0
     seconds: float = 0.0
     """Of fuzzing, without the start."""
+    cpu_seconds: float = 0.0
+    """Of the processor, with the start: less than ``seconds`` where other programs run."""
     kept: int = 0
     """Inputs that reach something of their own."""
     findings: int = 0
@@ -74,10 +76,11 @@ def main(
         for name in readers or known:
             print(f"{name}: {minimised(name, corpus / name, output / name)} files")
         return
-    print("| Reader | Inputs | Seconds | Kept | Findings |\n|---|---|---|---|---|")
+    print("| Reader | Inputs | Seconds | CPU seconds | Kept | Findings |\n|---|---|---|---|---|---|")
     for name in readers or known:
         found = fuzzed(name, seconds, corpus / name, output / name, most_bytes, seed)
-        row = (f"{found.runs:,}", f"{found.seconds:.0f}", f"{found.kept:,}", str(found.findings))
+        times = (f"{found.seconds:.0f}", f"{found.cpu_seconds:.0f}")
+        row = (f"{found.runs:,}", *times, f"{found.kept:,}", str(found.findings))
         print(f"| {name} | {' | '.join(row)} |", flush=True)
 
 
@@ -91,7 +94,7 @@ def fuzzed(name: str, seconds: int, seeds: Path, output: Path, most_bytes: int, 
         command = [sys.executable, __file__, "--child", name, str(found)]
         command += [f"-max_total_time={left}", f"-max_len={most_bytes}", "-timeout=20", "-rss_limit_mb=0"]
         command += ["-print_final_stats=1", f"-seed={seed}", f"-artifact_prefix={found}/", str(kept), str(seeds)]
-        start = time.monotonic()
+        start, cpu = time.monotonic(), _cpu_of_children()
         with (output / "log.txt").open("w") as log:
             status = subprocess.run(command, stderr=log, stdout=log).returncode
         said = (output / "log.txt").read_text("utf-8", "replace")
@@ -99,6 +102,7 @@ def fuzzed(name: str, seconds: int, seeds: Path, output: Path, most_bytes: int, 
         if not runs:
             raise SystemExit(f"{name} did not start; see {output / 'log.txt'}")
         result.runs += int(runs[-1])
+        result.cpu_seconds += _cpu_of_children() - cpu
         took = re.findall(r"^Done \d+ runs in (\d+) second", said, re.M)  # without the start, which imports torch
         result.seconds += float(took[-1]) if took else time.monotonic() - start
         seed += 1
@@ -164,6 +168,12 @@ def child(name: str, found: Path, options: list[str]) -> None:
 
         atheris.Setup([sys.argv[0], *options], one_input)
         atheris.Fuzz()
+
+
+def _cpu_of_children() -> float:
+    """CPU seconds of the processes that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _fast() -> str | None:

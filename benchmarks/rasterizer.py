@@ -27,8 +27,8 @@ from torch import Tensor
 from yardstick import CLASSIC_EXTENT, EXACT_EXTENT, TIGHT_EXTENT, Yardstick, load_yardstick
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.rasterizer import rasterization, rasterize_reference
-from pointsplat_ns.rasterizer.blending import blend, engine_of
+from pointsplat_ns.rasterizer import binning, rasterization, rasterize_reference
+from pointsplat_ns.rasterizer.blending import blend
 from pointsplat_ns.rasterizer.colors import sh_to_color
 from pointsplat_ns.rasterizer.projection import Projected, project
 from pointsplat_ns.rasterizer.tiles import Footprints
@@ -126,8 +126,9 @@ class Case:
         return count_pairs(seen, footprints.tiles(footprints.whole), self.width, self.height)
 
     def footprints_of(self, seen: Projected) -> Footprints:
-        geometry = (t.detach() for t in (seen.means2d, seen.cov2d, seen.det, seen.opacities, seen.beyond))
-        return Footprints(*geometry, torch.zeros_like(seen.ids), 1, self.width, self.height)
+        geometry = [t.detach() for t in (seen.means2d, seen.cov2d, seen.det, seen.opacities)]
+        camera, engine = torch.zeros_like(seen.ids), binning.engine_of(None, *geometry)
+        return Footprints(*geometry, seen.beyond, camera, 1, self.width, self.height, engine=engine)
 
     def time_stages(self) -> dict[str, float]:
         """Stage by stage, forward as in training and backward: what `rasterization` does for one camera, compiled
@@ -151,7 +152,7 @@ class Case:
         marks.append(now())
         torch.autograd.grad(inputs, self.tensors, grads)
         marks.append(now())
-        engine_of(colors, None).tiles_of(footprints, footprints.whole)
+        footprints.tiles(footprints.whole)
         marks.append(now())
         names = (
             "projection",

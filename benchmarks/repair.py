@@ -97,6 +97,7 @@ def rows_of(path: Path, keep: str, seconds: list[float], fine_tune_steps: list[i
     before = reference.closeness(merged)
     refined, _, after = as_far_as_it_helps(reference, before, merged, ps.load_refiner()(merged))
     refined, close = (refined, after) if helps(before, after) else (merged, before)
+    psnr = reference.psnr_of_covered(close.psnr)
     yield row("refiner", refined, 0, started)
     for steps in fine_tune_steps:
         started = now()
@@ -105,7 +106,7 @@ def rows_of(path: Path, keep: str, seconds: list[float], fine_tune_steps: list[i
     for budget in (RepairBudget("quick"), *(RepairBudget(seconds=limit) for limit in seconds)):
         for kind, network in (("Adam", None), ("repair", shipped_feedback_refiner(dense.device))):
             started = now()
-            repaired = repair(refined, dense, source, budget, network=network, psnr=close.psnr)
+            repaired = repair(refined, dense, source, budget, network=network, psnr=psnr)
             yield row(kind, repaired.scene, repaired.steps, started)
 
 

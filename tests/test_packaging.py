@@ -32,6 +32,7 @@ SHIPPED = (
     "pointsplat_ns/rasterizer/compiled/colors.cpp",
     "pointsplat_ns/rasterizer/compiled/lanes.h",
     "pointsplat_ns/rasterizer/compiled/projection.cpp",
+    "pointsplat_ns/rasterizer/compiled/tiles.cpp",
     "pointsplat_ns/pages/templates/base.html",
     "pointsplat_ns/pages/templates/style.css",
     "pointsplat_ns/pages/templates/tradeoff.js",

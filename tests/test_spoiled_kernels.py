@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pointsplat_ns.metrics import structural_similarity
-from pointsplat_ns.rasterizer.compiled import blending, colors, projection
+from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
 from pointsplat_ns.system.kernels import Kernels
 
 
@@ -21,7 +21,8 @@ NUMBERS = torch.zeros(1, 3)
 ASKED = {
     blending: lambda: blending.can_blend(NUMBERS, None),
     projection: lambda: projection.can_project(NUMBERS, NUMBERS, NUMBERS, NUMBERS, None),
-    colors: lambda: colors.can_color(NUMBERS, NUMBERS, None),
+    colors: lambda: colors.can_color(None, NUMBERS, NUMBERS),
+    tiles: lambda: tiles.can_list(None, NUMBERS),
     structural_similarity: can_compare,
 }
 """Whether each module would use its kernels."""
@@ -45,6 +46,9 @@ missing = next((module.KERNELS.why_missing for module in ASKED if module.KERNELS
             projection, "(x - half_x <= camera.width - 0.5f)", "(x <= camera.width - 0.5f)", 1, id="who is seen"
         ),
         pytest.param(colors, "+ 2.0f * (h5 * xz) -", "- 2.0f * (h5 * xz) -", 1, id="a colour's gradient"),
+        pytest.param(colors, "grad_rest + task.ids[row] * task.rest_row", "grad_rest", 1, id="a part's gradient"),
+        pytest.param(tiles, "level - dy * dy * inverse_yy", "level - dy * inverse_yy", 1, id="which tiles"),
+        pytest.param(tiles, "tile_to(y + half_y,", "tile_to(y - half_y,", 1, id="a box"),
         pytest.param(structural_similarity, "- square + C2;", "+ C2;", 1, id="a variance"),
         pytest.param(structural_similarity, "column - REACH * task.step,", "column,", 1, id="a border's gradient"),
         pytest.param(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.metrics import SSIM_WINDOW, ssim
-from pointsplat_ns.rasterizer import render
+from pointsplat_ns.rasterizer import render, render_with_alpha
 from pointsplat_ns.views import Views
 
 
@@ -51,7 +51,10 @@ class DenseReference:
     @torch.no_grad()
     def __init__(self, dense: Gaussians, views: Views):
         self.views = views
-        self.renders: list[Tensor] = [render(dense, view) for view in views]
+        drawn = [render_with_alpha(dense, view) for view in views]
+        self.renders: list[Tensor] = [image for image, _ in drawn]
+        self.covered = sum(float(alpha.double().mean()) for _, alpha in drawn) / len(drawn)
+        """Share of all pixels that the dense scene covers, in [0, 1]."""
 
     @torch.no_grad()
     def errors(self, scene: Gaussians) -> list[float]:
@@ -71,6 +74,11 @@ class DenseReference:
             if progress is not None:
                 progress((index + 1) / len(self.renders))
         return Closeness(tuple(errors), sum(similarities) / len(similarities) if similarities else None)
+
+    def psnr_of_covered(self, psnr: float) -> float:
+        """A PSNR over all pixels of all views, dB, if all that is wrong lies in the pixels that the dense scene covers:
+        of these alone. A small thing in a large empty picture is not closer to the dense one for being small."""
+        return psnr + 10 * math.log10(self.covered) if self.covered > 0 else psnr
 
     def psnr(self, scene: Gaussians) -> tuple[float, float]:
         """PSNR over all pixels of all views, and of the worst view, dB."""

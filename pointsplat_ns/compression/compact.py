@@ -166,7 +166,8 @@ def compact_scene(
         device = reference.renders[0].device
         shown = functools.partial(progress, "repairing")
         unrepaired = scene.to(device)
-        repaired = repair(unrepaired, dense.to(device), views, budget, shown, psnr=close.psnr)
+        psnr = reference.psnr_of_covered(close.psnr)
+        repaired = repair(unrepaired, dense.to(device), views, budget, shown, psnr=psnr)
         after_repair, share = reference.closeness(repaired.scene), 1.0
         if not helps(close, after_repair):
             stepped_back, share, after_repair = as_far_as_it_helps(

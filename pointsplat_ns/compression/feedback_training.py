@@ -67,7 +67,7 @@ class TrainingScene:
     pruned: dict[str, Gaussians]
     """By budget."""
     psnr: dict[str, float]
-    """Of what was made of it, by budget, against the dense scene's renders, dB."""
+    """Of what was made of it, by budget, against the dense scene's renders, over what that covers, dB."""
     views: Views
 
     @classmethod
@@ -80,7 +80,7 @@ class TrainingScene:
         views = views.resized(SIDE)
         pruned = {budget: prune(dense, budget, "merge") for budget in keep}
         reference = DenseReference(dense, views.spread(COMPARED_VIEWS))
-        psnr = {budget: reference.psnr(scene)[0] for budget, scene in pruned.items()}
+        psnr = {budget: reference.psnr_of_covered(reference.psnr(scene)[0]) for budget, scene in pruned.items()}
         return cls(name, dense, pruned, psnr, views)
 
 

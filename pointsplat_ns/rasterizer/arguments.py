@@ -17,7 +17,7 @@ def check_tensors(
     quats: Tensor,
     scales: Tensor,
     opacities: Tensor,
-    colors: Tensor,
+    colors: Tensor | tuple[Tensor, Tensor],
     viewmats: Tensor,
     Ks: Tensor,
     sh_degree: int | None,
@@ -42,28 +42,37 @@ def check_tensors(
             raise ValueError(f"{name} has shape {tuple(tensor.shape)}; expected {shape}")
     if c == 0:
         raise ValueError("viewmats holds no camera; expected at least one")
-    if sh_degree is None:
-        channels = _check_channels(colors, n, c)
-    else:
-        channels = _check_harmonics(colors, n, c, sh_degree)
+    shape = tuple(colors.shape) if isinstance(colors, Tensor) else _shape_together(colors, n, sh_degree)
+    channels = _check_channels(shape, n, c) if sh_degree is None else _check_harmonics(shape, n, c, sh_degree)
     if backgrounds is not None and tuple(backgrounds.shape) != (c, channels):
         raise ValueError(f"backgrounds has shape {tuple(backgrounds.shape)}; expected {(c, channels)}")
 
 
-def _check_channels(colors: Tensor, n: int, c: int) -> int:
+def _shape_together(colors: tuple[Tensor, Tensor], n: int, sh_degree: int | None) -> tuple[int, ...]:
+    """The shape that the first SH coefficients and the others would have in one tensor."""
+    shapes = [tuple(tensor.shape) for tensor in colors]
+    if sh_degree is None:
+        raise ValueError(f"colors are {len(shapes)} tensors, which are SH coefficients; they need sh_degree")
+    if len(shapes) != 2 or shapes[0] != (n, 3) or len(shapes[1]) != 3 or shapes[1][::2] != (n, 3):
+        raise ValueError(
+            f"colors have shapes {', '.join(map(str, shapes))}; expected SH coefficients ({n}, 3) and ({n}, K - 1, 3)"
+        )
+    return (n, 1 + shapes[1][1], 3)
+
+
+def _check_channels(shape: tuple[int, ...], n: int, c: int) -> int:
     """The number of channels of colours that are no SH coefficients."""
-    shape = tuple(colors.shape)
     if shape[:-1] not in ((n,), (c, n)) or shape[-1] < 1:
         hint = "; SH coefficients need sh_degree" if shape in ((n, *shape[1:2], 3), (c, n, *shape[2:3], 3)) else ""
         raise ValueError(f"colors has shape {shape}; expected ({n}, channels) or ({c}, {n}, channels){hint}")
     return shape[-1]
 
 
-def _check_harmonics(colors: Tensor, n: int, c: int, sh_degree: int) -> int:
+def _check_harmonics(shape: tuple[int, ...], n: int, c: int, sh_degree: int) -> int:
     """The number of channels of SH coefficients: three."""
     if not isinstance(sh_degree, int) or not 0 <= sh_degree <= 3:
         raise ValueError(f"sh_degree is {sh_degree!r}; expected 0 to 3, or None")
-    shape, needed = tuple(colors.shape), (sh_degree + 1) ** 2
+    needed = (sh_degree + 1) ** 2
     if len(shape) < 3 or shape[:-2] not in ((n,), (c, n)) or shape[-1] != 3:
         raise ValueError(f"colors has shape {shape}; expected SH coefficients ({n}, K, 3) or ({c}, {n}, K, 3)")
     if shape[-2] < needed:

@@ -34,8 +34,8 @@ def bytes_per_pair(colors: Tensor) -> int:
 
 
 def engine_of(colors: Tensor, compiled: bool | None) -> ModuleType:
-    """What blends colours (M, D): the module with ``inputs_of``, ``tiles_of``, ``blend_region``,
-    ``differentiate_region`` and ``chain``."""
+    """What blends colours (M, D): the module with ``inputs_of``, ``blend_region``, ``differentiate_region`` and
+    ``chain``."""
     return compiled_blending if compiled_blending.can_blend(colors, compiled) else blocks
 
 
@@ -46,7 +46,7 @@ class Blend(torch.autograd.Function):
     def forward(ctx, means2d, cov2d, det, opacities, colors, footprints, region, keep_lists, options, absgrad_of):
         """The lists are kept for the backward pass only if ``keep_lists``."""
         engine = engine_of(colors, options.compiled)
-        tiles = engine.tiles_of(footprints, region)
+        tiles = footprints.tiles(region)
         image = colors.new_empty(tiles.offsets.numel() - 1, colors.shape[1], PIXELS)
         final = colors.new_empty(tiles.offsets.numel() - 1, PIXELS)
         inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, options.quality)
@@ -67,7 +67,7 @@ class Blend(torch.autograd.Function):
         if ctx.kept:
             tiles, tape = ctx.kept
         else:
-            tiles = engine.tiles_of(footprints, region)
+            tiles = footprints.tiles(region)
             again = torch.empty_like(grad_image), torch.empty_like(final)
             tape = engine.blend_region(footprints, tiles, inputs, *again, True)
         summed = engine.differentiate_region(

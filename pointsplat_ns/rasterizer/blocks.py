@@ -17,14 +17,9 @@ from pointsplat_ns.rasterizer import eager
 from pointsplat_ns.rasterizer.frame import Chunk, Frame, Inputs, Tiles
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS, gather, mean_slopes, moments
 from pointsplat_ns.rasterizer.quadratics import chain as chain  # what an engine of blending offers
-from pointsplat_ns.rasterizer.tiles import Footprints, Region, TileList
+from pointsplat_ns.rasterizer.tiles import Footprints, TileList
 
 inputs_of = Inputs.of
-
-
-def tiles_of(footprints: Footprints, region: Region) -> TileList:
-    """The pairs of Gaussian and tile."""
-    return footprints.tiles(region)
 
 
 class Tape(NamedTuple):

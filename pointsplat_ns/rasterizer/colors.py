@@ -11,14 +11,19 @@ from pointsplat_ns.rasterizer.spherical_harmonics import C0, Color, check_degree
 
 
 def sh_to_color(
-    directions: Tensor, coefficients: Tensor, degree: int, ids: Tensor | None = None, compiled: bool | None = None
+    directions: Tensor,
+    coefficients: Tensor | tuple[Tensor, Tensor],
+    degree: int,
+    ids: Tensor | None = None,
+    compiled: bool | None = None,
 ) -> Tensor:
     """Colours seen along directions, as 3DGS defines them: ``max(SH + 1/2, 0)``.
 
     Args:
         directions: (M, 3) from the camera centre to the Gaussian, world space, any length; a zero direction sees
             the basis at zero.
-        coefficients: (M, K, 3), or (N, K, 3) with ``ids``; K >= (degree + 1)^2, the rest is ignored.
+        coefficients: (M, K, 3), or (N, K, 3) with ``ids``; K >= (degree + 1)^2, the rest is ignored. Or the first of
+            each and the others, (N, 3) and (N, K - 1, 3): the kernels then bring nothing together.
         degree: 0 to 3.
         ids: (M,) int64, each at most once: the row of ``coefficients`` that each direction belongs to.
         compiled: as for :func:`~pointsplat_ns.rasterization`.
@@ -30,14 +35,15 @@ def sh_to_color(
         ValueError: if the degree is not 0 to 3, or there are too few coefficients.
     """
     check_degree(degree)
-    used = (degree + 1) ** 2
-    if coefficients.shape[-2] < used:
-        raise ValueError(f"{coefficients.shape[-2]} SH coefficients given; degree {degree} needs {used}")
+    first, rest = coefficients if isinstance(coefficients, tuple) else (coefficients, None)
+    used, stored = (degree + 1) ** 2, first.shape[-2] if rest is None else 1 + rest.shape[-2]
+    if stored < used:
+        raise ValueError(f"{stored} SH coefficients given; degree {degree} needs {used}")
     if ids is None:
-        ids = torch.arange(coefficients.shape[0], device=coefficients.device)
-    if can_color(directions, coefficients, compiled):
+        ids = torch.arange(first.shape[0], device=first.device)
+    if can_color(compiled, directions, first, *([] if rest is None else [rest])):
         # a constant has no direction
-        return CompiledColor.apply(directions if degree else directions.detach(), coefficients, ids, degree)
+        return CompiledColor.apply(directions if degree else directions.detach(), first, rest, ids, degree)
     if degree == 0:
-        return offset(C0 * coefficients[..., 0, :].index_select(0, ids)).clamp_min(0.0)
-    return Color.apply(directions, coefficients, ids, degree)
+        return offset(C0 * (first[..., 0, :] if rest is None else first).index_select(0, ids)).clamp_min(0.0)
+    return Color.apply(directions, first if rest is None else torch.cat([first[:, None], rest], 1), ids, degree)

@@ -28,6 +28,9 @@ sums over pixels of colours times slopes, then stay finite."""
 TILE = 8
 """Tile edge in pixels. 8 was measured faster than 16: fewer pixels evaluated for nothing."""
 
+SLACK = 1e-3
+"""Pixels added around each ellipse, so that rounding never drops a pixel that is drawn."""
+
 CHUNK = 16
 """Gaussians blended at once for each tile, before the saturated tiles are dropped."""
 

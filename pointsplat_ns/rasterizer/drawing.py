@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.rasterizer import binning
 from pointsplat_ns.rasterizer.blending import Blend
 from pointsplat_ns.rasterizer.constants import QUALITIES, TILE
 from pointsplat_ns.rasterizer.frame import BlendOptions
@@ -38,12 +39,13 @@ class Drawing:
     @torch.no_grad()
     def __init__(self, scene: Gaussians, view: View, quality: QualityName = "exact"):
         seen = project_scene(scene, view)
-        seen, self._colors, _ = finite_colors(seen, scene.sh, 0, False, scene.sh_degree)
+        seen, self._colors, _ = finite_colors(seen, (scene.features_dc, scene.features_rest), 0, False, scene.sh_degree)
         level = QUALITIES[quality]
         self._seen, self._options = seen, BlendOptions(level)
         self._footprints = Footprints(
             seen.means2d, seen.cov2d, seen.det, seen.opacities, seen.beyond, torch.zeros_like(seen.ids), 1,
             view.width, view.height, level.alpha_min,
+            binning.engine_of(None, seen.means2d, seen.cov2d, seen.det, seen.opacities),
         )  # fmt: skip
         self._width, self._height = view.width, view.height
         self._background = view.background.to(self._colors)

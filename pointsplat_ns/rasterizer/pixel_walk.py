@@ -16,6 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from pointsplat_ns.rasterizer import binning
 from pointsplat_ns.rasterizer.alpha import alphas_, is_clamped, is_drawn, last_transmittance, transmittances
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, TILE, TRANSMITTANCE_MIN
 from pointsplat_ns.rasterizer.projection import Projected
@@ -56,7 +57,8 @@ def sum_over_pixels(
     means2d, cov2d, det = seen.means2d.detach(), seen.cov2d.detach(), seen.det.detach()
     total = means2d.new_zeros(len(seen.ids), columns)
     camera = torch.zeros_like(seen.ids)
-    footprints = Footprints(means2d, cov2d, det, seen.opacities, seen.beyond, camera, 1, width, height)
+    engine = binning.engine_of(None, means2d, cov2d, det, seen.opacities)
+    footprints = Footprints(means2d, cov2d, det, seen.opacities, seen.beyond, camera, 1, width, height, engine=engine)
     lists = footprints.tiles(footprints.whole)
     gaussians, starts, across = lists.gaussians, lists.offsets, footprints.columns
     xx, xy, yy = cov2d.unbind(-1)

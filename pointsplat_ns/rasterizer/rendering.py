@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from torch import Tensor
 
+from pointsplat_ns.rasterizer import binning
 from pointsplat_ns.rasterizer.arguments import check_options, check_tensors
 from pointsplat_ns.rasterizer.backends import use_gsplat
 from pointsplat_ns.rasterizer.blending import blend
@@ -19,6 +20,8 @@ from pointsplat_ns.rasterizer.tiles import Footprints
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 QualityName = Literal["exact", "balanced", "fast"]
+Colors = Tensor | tuple[Tensor, Tensor]
+"""Channels or SH coefficients; or the first SH coefficient of each Gaussian, (N, 3), and the others, (N, K - 1, 3)."""
 
 
 def _cat(tensors: list[Tensor], dim: int = 0) -> Tensor:
@@ -40,12 +43,13 @@ def finite_colors(seen: Projected, *rest) -> tuple[Projected, Tensor, Tensor]:
 
 
 def _colors_of(
-    seen: Projected, colors: Tensor, camera: int, per_camera: bool, sh_degree: int | None, compiled: bool | None = None
+    seen: Projected, colors: Colors, camera: int, per_camera: bool, sh_degree: int | None, compiled: bool | None = None
 ) -> Tensor:
-    colors = colors[camera] if per_camera else colors
-    if sh_degree is None:
-        return colors.index_select(0, seen.ids)
-    return sh_to_color(seen.directions, colors, sh_degree, seen.ids, compiled)
+    if isinstance(colors, Tensor):
+        colors = colors[camera] if per_camera else colors
+        if sh_degree is None:
+            return colors.index_select(0, seen.ids)
+    return sh_to_color(seen.directions, colors, cast(int, sh_degree), seen.ids, compiled)
 
 
 @full_precision
@@ -54,7 +58,7 @@ def rasterization(
     quats: Tensor,  # [N, 4]
     scales: Tensor,  # [N, 3]
     opacities: Tensor,  # [N] or [N, 1]
-    colors: Tensor,  # [(C,) N, D] or [(C,) N, K, 3]
+    colors: Colors,  # [(C,) N, D] or [(C,) N, K, 3], or [N, 3] and [N, K - 1, 3]
     viewmats: Tensor,  # [C, 4, 4]
     Ks: Tensor,  # [C, 3, 3]
     width: int,
@@ -98,7 +102,9 @@ def rasterization(
         quats: wxyz, any length; the zero quaternion is the identity, and so is one of less than 1e-38.
         scales: standard deviations (not logarithms), scene units.
         opacities: in [0, 1].
-        colors: D channels, or SH coefficients if ``sh_degree`` is given; for all cameras or each.
+        colors: D channels, or SH coefficients if ``sh_degree`` is given; for all cameras or each. Or, for all cameras,
+            the first SH coefficient and the others as two tensors, as :class:`~pointsplat_ns.Gaussians` holds them:
+            bringing them together costs up to as much as drawing them.
         viewmats: world to camera, OpenCV axes (x right, y down, z forward), rigid.
         Ks: intrinsics in pixels; the centre of the first pixel is at (0.5, 0.5).
         near_plane, far_plane: depths drawn, scene units.
@@ -148,6 +154,8 @@ def rasterization(
     if backend != "torch" and use_gsplat(backend, means.device):
         from gsplat.rendering import rasterization as gsplat_rasterization
 
+        if isinstance(colors, tuple):
+            colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
         return gsplat_rasterization(
             means, quats, scales, opacities, colors, viewmats.to(means), Ks.to(means), width, height, near_plane,
             far_plane, radius_clip, eps2d, sh_degree, packed, 16, backgrounds, render_mode, sparse_grad, absgrad,
@@ -159,9 +167,10 @@ def rasterization(
         width, height, near_plane, far_plane, radius_clip, eps2d, render_mode, rasterize_mode, quality, memory_budget
     )
     dtype = means.dtype if means.dtype in (torch.float32, torch.float64) else torch.float32
-    means, quats, scales, opacities, colors = (tensor.to(dtype) for tensor in (means, quats, scales, opacities, colors))
+    means, quats, scales, opacities = (tensor.to(dtype) for tensor in (means, quats, scales, opacities))
+    colors = colors.to(dtype) if isinstance(colors, Tensor) else (colors[0].to(dtype), colors[1].to(dtype))
     n, cameras = means.shape[0], viewmats.shape[0]
-    per_camera = colors.dim() == (4 if sh_degree is not None else 3)
+    per_camera = isinstance(colors, Tensor) and colors.dim() == (4 if sh_degree is not None else 3)
 
     seen = [
         project(
@@ -202,8 +211,9 @@ def rasterization(
 
     level = quality if isinstance(quality, Quality) else QUALITIES[quality]
     footprints = Footprints(
-        means2d, cov2d, det, alphas, packed_of("beyond"), camera_ids, cameras, width, height, level.alpha_min
-    )
+        means2d, cov2d, det, alphas, packed_of("beyond"), camera_ids, cameras, width, height, level.alpha_min,
+        binning.engine_of(compiled, means2d, cov2d, det, alphas),
+    )  # fmt: skip
 
     def keep_absgrad(values: Tensor) -> None:
         if not packed:

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.rasterizer.rendering import QualityName, rasterization
+from pointsplat_ns.rasterizer.rendering import Colors, QualityName, rasterization
 from pointsplat_ns.system.thread_choice import ThreadChoice
 from pointsplat_ns.system.threads import one_thread
 from pointsplat_ns.views import View, Views
@@ -59,12 +59,24 @@ def render(
         raise ValueError(f"reduced is {reduced}; expected 1 or more")
     if reduced > 1:
         return _enlarged(render(scene, _smaller(views, reduced), quality, backend=backend), views)
-    with _RENDERS.step(_work(scene, views), scene.device):
-        image, alpha = _rasterized(scene, views, scene.sh, sh_degree=scene.sh_degree, quality=quality, backend=backend)
-        return (image + (1 - alpha) * views.background.to(image)).clamp(0, 1)
+    return render_with_alpha(scene, views, quality, backend)[0]
 
 
-def _rasterized(scene: Gaussians, view: View, colors: Tensor, **options) -> tuple[Tensor, Tensor]:
+def render_with_alpha(
+    scene: Gaussians,
+    view: View,
+    quality: QualityName = "exact",
+    backend: Literal["torch", "gsplat", "auto"] = "torch",
+) -> tuple[Tensor, Tensor]:
+    """What :func:`render` gives of one view, and what share of each pixel the scene covers: (H, W, 3) and (H, W, 1),
+    both in [0, 1]. Arguments and errors as there."""
+    with _RENDERS.step(_work(scene, view), scene.device):
+        colors = scene.features_dc, scene.features_rest
+        image, alpha = _rasterized(scene, view, colors, sh_degree=scene.sh_degree, quality=quality, backend=backend)
+        return (image + (1 - alpha) * view.background.to(image)).clamp(0, 1), alpha
+
+
+def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tuple[Tensor, Tensor]:
     """Image (H, W, channels) and alphas (H, W, 1) of a scene with these colours, and more of what
     :func:`~pointsplat_ns.rasterization` takes."""
     image, alpha, _ = rasterization(

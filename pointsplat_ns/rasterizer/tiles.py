@@ -11,32 +11,15 @@ list does not depend on the region that it is part of.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from types import ModuleType
 
 import torch
 from torch import Tensor
 
+from pointsplat_ns.rasterizer import ellipses as in_torch
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, TILE
-
-SLACK = 1e-3
-"""Pixels added around each ellipse, so that rounding never drops a pixel that is drawn."""
-
-
-class Region(NamedTuple):
-    """A rectangle of tiles: rows ``top`` to ``bottom`` - 1, columns ``left`` to ``right`` - 1."""
-
-    top: int
-    bottom: int
-    left: int
-    right: int
-
-    @property
-    def rows(self) -> int:
-        return self.bottom - self.top
-
-    @property
-    def columns(self) -> int:
-        return self.right - self.left
+from pointsplat_ns.rasterizer.ellipses import Frame
+from pointsplat_ns.rasterizer.ellipses import Region as Region  # what users of tiles name a part of an image by
 
 
 @dataclass
@@ -67,14 +50,6 @@ def _by_depth(depths: Tensor) -> Tensor:
     return torch.sort(bits, stable=True).indices
 
 
-def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """For ``counts`` (M,): the owner of each of ``sum(counts)`` items and its place with that owner."""
-    owner = torch.repeat_interleave(counts)
-    starts = torch.cumsum(counts, 0) - counts
-    place = torch.arange(owner.numel(), device=counts.device)
-    return owner, place.sub_(starts.index_select(0, owner))
-
-
 class Footprints:
     """The 1/255 ellipses of projected Gaussians, in depth order."""
 
@@ -91,25 +66,29 @@ class Footprints:
         width: int,
         height: int,
         alpha_min: float = ALPHA_MIN,
+        engine: ModuleType = in_torch,  # what finds ellipses and pairs, see binning.engine_of
     ):
-        self.cameras, self.width, self.height = cameras, width, height
-        self.columns, self.rows = -(-width // TILE), -(-height // TILE)
-        self.order = _by_depth(depths.contiguous())
-        xx, xy, yy = cov2d.unbind(-1)
-        level = 2.0 * (opacities / alpha_min).log().clamp_min_(0.0)
-        # Over a strip of y, the right edge mx + r dy + sqrt(v (level - dy^2 / yy)) is concave in dy, with
-        # its maximum at dy = xy sqrt(level / xx); the left edge mirrors it.
-        peak, slope, variance = xy * (level / xx).sqrt(), xy / yy, det / yy
-        shapes = torch.stack([*means2d.unbind(-1), level, 1.0 / yy, peak, slope, variance], dim=-1)
-        self.shapes = shapes.index_select(0, self.order)  # [M, 7]
-        self.camera_ids = camera_ids.index_select(0, self.order)
-        mx, my = self.shapes[:, 0], self.shapes[:, 1]
-        half_x, half_y = ((level * v).sqrt_().index_select(0, self.order).add_(SLACK) for v in (xx, yy))
-        # the box around the ellipse, in tiles
-        self.row0 = _tile_of(my - half_y, up=True, tiles=self.rows)
-        self.row1 = _tile_of(my + half_y, up=False, tiles=self.rows)
-        self.column0 = _tile_of(mx - half_x, up=True, tiles=self.columns)
-        self.widths = (_tile_of(mx + half_x, up=False, tiles=self.columns) - self.column0 + 1).clamp_min_(0)
+        self.width, self.height = width, height
+        self._frame = Frame(cameras, height, rows=-(-height // TILE), columns=-(-width // TILE))
+        self._engine = engine
+        self._ellipses = engine.ellipses_of(
+            means2d, cov2d, det, opacities, _by_depth(depths.contiguous()), camera_ids, self._frame, alpha_min
+        )
+
+    @property
+    def cameras(self) -> int:
+        """Number of images."""
+        return self._frame.cameras
+
+    @property
+    def rows(self) -> int:
+        """Rows of tiles of an image."""
+        return self._frame.rows
+
+    @property
+    def columns(self) -> int:
+        """Columns of tiles of an image."""
+        return self._frame.columns
 
     @property
     def whole(self) -> Region:
@@ -121,60 +100,28 @@ class Footprints:
 
         A tile is not divided: one that all M Gaussians touch makes M pairs.
         """
-        if self.order.numel() * self.rows * self.columns <= most_pairs:
+        row0, column0, widths = self._ellipses.row0, self._ellipses.column0, self._ellipses.widths
+        if row0.numel() * self.rows * self.columns <= most_pairs:
             return [self.whole]
-        heights = (self.row1 - self.row0 + 1).clamp_min_(0)
-        if int((heights * self.widths).sum()) <= most_pairs:  # boxes around the ellipses
+        heights = (self._ellipses.row1 - row0 + 1).clamp_min_(0)
+        if int((heights * widths).sum()) <= most_pairs:  # boxes around the ellipses
             return [self.whole]
-        widths = torch.where(heights > 0, self.widths, 0)
+        widths = torch.where(heights > 0, widths, 0)
         regions = []
-        for top, bottom, pairs in _intervals(_spread(self.row0, heights, widths, self.rows), most_pairs):
+        for top, bottom, pairs in _intervals(_spread(row0, heights, widths, self.rows), most_pairs):
             if pairs <= most_pairs:
                 regions.append(Region(top, bottom, 0, self.columns))
                 continue
-            reaching = (self.row0 <= top) & (self.row1 >= top)  # one row of tiles is too many
-            columns = _spread(self.column0[reaching], self.widths[reaching], 1, self.columns)
+            reaching = (row0 <= top) & (self._ellipses.row1 >= top)  # one row of tiles is too many
+            columns = _spread(column0[reaching], widths[reaching], 1, self.columns)
             regions += [Region(top, bottom, left, right) for left, right, _ in _intervals(columns, most_pairs)]
         return regions
-
-    def _strips(self, region: Region) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Each row of tiles that each Gaussian reaches: the Gaussian (depth order), the row, first and last column."""
-        row0 = self.row0.clamp_min(region.top)
-        row1 = self.row1.clamp_max(region.bottom - 1)
-        owner, row = _expand((row1 - row0 + 1).clamp_min_(0))
-        row += row0.index_select(0, owner)
-        mx, my, level, inverse_yy, peak, slope, variance = self.shapes.index_select(0, owner).unbind(-1)
-        top = row * TILE + (0.5 - SLACK) - my
-        bottom = (row * TILE + (TILE - 0.5)).clamp_(max=self.height - 0.5) + SLACK - my
-
-        def edge(dy: Tensor, sign: float) -> Tensor:
-            dy = torch.minimum(torch.maximum(dy, top), bottom)
-            reach = (level - dy * dy * inverse_yy).clamp_min_(0).mul_(variance).sqrt_().add_(SLACK)
-            return (mx + slope * dy).add_(reach, alpha=sign)
-
-        column0 = _tile_of(edge(-peak, -1.0), up=True, tiles=self.columns).clamp_(min=region.left)
-        column1 = _tile_of(edge(peak, 1.0), up=False, tiles=self.columns).clamp_(max=region.right - 1)
-        return owner, row, column0, column1
 
     @torch.no_grad()
     def tiles(self, region: Region) -> TileList:
         """Pair Gaussians with tiles and sort the pairs by tile, then depth, then row of the input."""
-        rows, columns = region.rows, region.columns
-        owner, row, column0, column1 = self._strips(region)
-        widths = (column1 - column0 + 1).clamp_min_(0)
-        counts = torch.zeros_like(self.order).index_add_(0, owner, widths)
-        first = (self.camera_ids.index_select(0, owner) * rows + row - region.top) * columns + column0 - region.left
-        strip, tile = _expand(widths)
-        tile += first.index_select(0, strip)
-        gaussian = self.order.index_select(0, owner).index_select(0, strip)
-
-        tiles = self.cameras * rows * columns
-        if tiles < 2**31:  # the fewer the bits, the fewer the passes of a radix sort
-            tile = tile.to(torch.int16 if tiles < 2**15 else torch.int32)
-        tile, places = torch.sort(tile, stable=True)
-        edges = torch.arange(tiles + 1, device=tile.device, dtype=tile.dtype if tiles < 2**15 - 1 else torch.int64)
-        offsets = torch.searchsorted(tile.to(edges.dtype), edges)
-        return TileList(gaussian.index_select(0, places), offsets, places, counts, self.order, region)
+        pairs = self._engine.pairs_of(self._ellipses, self._frame, region)
+        return TileList(**pairs._asdict(), order=self._ellipses.order, region=region)
 
 
 def _spread(first: Tensor, lengths: Tensor, amounts: Tensor | int, bins: int) -> list[int]:
@@ -195,12 +142,3 @@ def _intervals(amounts: list[int], most: int) -> list[tuple[int, int, int]]:
             first, total = i, 0
         total += amount
     return [*intervals, (first, len(amounts), total)]
-
-
-def _tile_of(position: Tensor, up: bool, tiles: int) -> Tensor:
-    """First tile with a pixel centre at or after ``position`` (up), or last with one at or before."""
-    if up:
-        tile = torch.ceil((position - (TILE - 0.5)) / TILE)
-        return tile.clamp_(0, tiles).long()
-    tile = torch.floor((position - 0.5) / TILE)
-    return tile.clamp_(-1, tiles - 1).long()

@@ -303,6 +303,19 @@ def test_a_repair_that_helps_is_kept_and_one_that_harms_is_left_out(scene, views
         assert ("interrupted" in line) == (not kept)
 
 
+def test_a_repair_knows_how_close_the_scene_is_where_there_is_anything(scene, views, monkeypatch):
+    told = []
+
+    def repair(scene, *_, psnr, **others):
+        told.append(psnr)
+        return Repaired(scene, 5, 0.5, False)
+
+    monkeypatch.setattr(compact_module, "repair", repair)
+    result = compacted(scene, trained(tiny_refiner()), views, budget=RepairBudget("quick", 1.0))
+    assert result.reference.covered < 0.95
+    assert told == [pytest.approx(result.before.psnr + 10 * math.log10(result.reference.covered))]
+
+
 def test_a_repair_that_goes_too_far_is_kept_in_part(scene, views, monkeypatch):
     refiner, reference = trained(tiny_refiner()), DenseReference(scene, views)
     pruned = prune(scene, 0.5, "opacity")

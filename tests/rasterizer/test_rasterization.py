@@ -174,6 +174,16 @@ def test_nothing_to_draw_gives_black_and_zero_gradients(case):
         assert all(g is None or (g == 0).all() for g in grads)
 
 
+def test_coefficients_in_two_tensors_draw_the_same_picture():
+    means, quats, scales, opacities, sh = leaves(splats_in_view(40))
+    view, K, w, h = *camera_askew(), 37, 29
+    drawn = []
+    for colors in (sh, (sh[:, 0], sh[:, 1:])):
+        image, _, _ = rasterization(means, quats, scales, opacities, colors, view[None], K[None], w, h, sh_degree=3)
+        drawn.append((image, *torch.autograd.grad(image.square().sum(), (sh, means))))
+    assert all(torch.equal(a, b) for a, b in zip(*drawn, strict=True)) and drawn[0][1].any()
+
+
 def test_tiles_hold_every_pair_that_draws_and_few_others():
     scene = splats_in_view(200, seed=9, scale=-2.5, spread=1.5)
     view, K, w, h = *camera_askew(cx=30.0, cy=20.0), 61, 43
@@ -240,6 +250,14 @@ def test_tiles_hold_every_pair_that_draws_and_few_others():
         (dict(viewmats=torch.diag(torch.tensor([1.0, 1, 1, 2]))[None]), "viewmat has the last row .*2.0"),
         (dict(viewmats=(torch.eye(4) + torch.eye(4).roll(1, 1))[None].mT), "viewmat has the last row"),
         (dict(colors=torch.zeros(3, 4, 3), sh_degree=3), "4 SH coefficients given; degree 3 needs 16"),
+        (dict(colors=(torch.zeros(3, 3), torch.zeros(3, 3, 3))), "colors are 2 tensors.*need sh_degree"),
+        (dict(colors=(torch.zeros(3, 3), torch.zeros(3, 3, 3)), sh_degree=3), "4 SH coefficients given"),
+        (
+            dict(colors=(torch.zeros(3, 3), torch.zeros(2, 3, 3)), sh_degree=1),
+            r"shapes \(3, 3\), \(2, 3, 3\); expected",
+        ),
+        (dict(colors=(torch.zeros(3, 1), torch.zeros(3, 3, 3)), sh_degree=1), r"expected SH coefficients \(3, 3\) and"),
+        (dict(colors=(torch.zeros(3, 3),), sh_degree=0), "colors have shapes"),
     ],
 )
 def test_wrong_arguments_say_what_was_got_and_wanted(change, message):

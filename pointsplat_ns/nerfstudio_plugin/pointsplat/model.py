@@ -242,7 +242,7 @@ class PointSplatModel(SplatfactoModel):
             quats=gaussians.quats,
             scales=gaussians.stds,
             opacities=gaussians.alphas,
-            colors=gaussians.sh,
+            colors=(gaussians.features_dc, gaussians.features_rest),
             viewmats=viewmats_from_opengl(camera.camera_to_worlds),
             Ks=camera.get_intrinsics_matrices().to(self.device),
             width=width,

@@ -6,8 +6,6 @@
 // row of them is one vector. Each tile is drawn by one thread from front to back, so that the number of threads changes
 // nothing.
 
-#include <vector>
-
 #include "lanes.h"
 
 namespace {
@@ -282,56 +280,6 @@ void pointsplat_differentiate(const Task* task) {
         case 2: return differentiate_all<2>(*task);
         case 3: return differentiate_all<3>(*task);
         case 4: return differentiate_all<4>(*task);
-    }
-}
-
-// The tiles of a region that ellipses touch, as tiles.Footprints finds them. Counts pairs if ``gaussians`` is null, else
-// lists them.
-struct Listing {
-    const float* shapes;          // [count, 7] in depth order: x, y, level, 1 / yy, peak, slope, variance
-    const int64_t *first_row, *last_row, *cameras, *order;  // [count] in depth order; order is the row of the input
-    int64_t count, tiles, rows, columns, top, left, height;
-    float slack;
-    int64_t* counts;     // [count] pairs of each Gaussian
-    int64_t* offsets;    // [tiles + 1]
-    int64_t *gaussians, *places;  // [P] by tile, front to back; and where each pair stands by Gaussian
-};
-
-void pointsplat_list(const Listing* listing) {
-    const Listing& l = *listing;
-    std::vector<int64_t> next;
-    if (l.gaussians) next.assign(l.offsets, l.offsets + l.tiles);
-    int64_t pair = 0;
-    for (int64_t i = 0; i < l.count; ++i) {
-        const float *s = l.shapes + 7 * i, x = s[0], y = s[1], level = s[2], inverse_yy = s[3], peak = s[4];
-        const int64_t last = std::min(l.last_row[i], l.top + l.rows - 1);
-        const int64_t before = pair;
-        for (int64_t row = std::max(l.first_row[i], l.top); row <= last; ++row) {
-            const float top = row * TILE + (0.5f - l.slack) - y;
-            const float bottom = std::min(row * TILE + (TILE - 0.5f), l.height - 0.5f) + l.slack - y;
-            const auto edge = [&](float dy, float sign) {
-                dy = std::min(std::max(dy, top), bottom);
-                const float within = std::max(level - dy * dy * inverse_yy, 0.0f);
-                return x + s[5] * dy + sign * (std::sqrt(within * s[6]) + l.slack);
-            };
-            const float right_tile = std::floor((edge(peak, 1.0f) - 0.5f) / TILE);
-            const float left_tile = std::ceil((edge(-peak, -1.0f) - (TILE - 0.5f)) / TILE);
-            const float left = std::max(left_tile, static_cast<float>(l.left));
-            const float right = std::min(right_tile, static_cast<float>(l.left + l.columns - 1));
-            if (!(left <= right)) continue;
-            const int64_t from = static_cast<int64_t>(left) - l.left, to = static_cast<int64_t>(right) - l.left;
-            const int64_t base = (l.cameras[i] * l.rows + row - l.top) * l.columns;
-            for (int64_t tile = base + from; tile <= base + to; ++tile, ++pair) {
-                if (!l.gaussians) {
-                    ++l.offsets[tile + 1];
-                    continue;
-                }
-                const int64_t place = next[tile]++;
-                l.gaussians[place] = l.order[i];
-                l.places[place] = pair;
-            }
-        }
-        l.counts[i] = pair - before;
     }
 }
 

@@ -19,7 +19,7 @@ from pointsplat_ns.rasterizer import blocks
 from pointsplat_ns.rasterizer.alpha import CLAMPED
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, EXACT, Quality
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
-from pointsplat_ns.rasterizer.tiles import SLACK, Footprints, Region, TileList
+from pointsplat_ns.rasterizer.tiles import Footprints, TileList
 from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
 
 MOST_CHANNELS = 4
@@ -49,17 +49,6 @@ class _Task(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("grad_image", "grad_final", "sums")),
         ("absolute", ctypes.c_int64),
         ("next", ctypes.c_void_p),
-    )
-
-
-class _Listing(ctypes.Structure):
-    """``struct Listing`` of the kernels."""
-
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("shapes", "first_row", "last_row", "cameras", "order")),
-        *((name, ctypes.c_int64) for name in ("count", "tiles", "rows", "columns", "top", "left", "height")),
-        ("slack", ctypes.c_float),
-        *((name, ctypes.c_void_p) for name in ("counts", "offsets", "gaussians", "places")),
     )
 
 
@@ -114,27 +103,6 @@ def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list
         det.data_ptr(), opacities.data_ptr(), count, *(grad.data_ptr() for grad in grads), next_row.data_ptr(),
     )  # fmt: skip
     return grads
-
-
-def tiles_of(footprints: Footprints, region: Region) -> TileList:
-    """As :meth:`~pointsplat_ns.rasterizer.tiles.Footprints.tiles`."""
-    f, rows, columns = footprints, region.rows, region.columns
-    count, tiles = f.order.numel(), f.cameras * rows * columns
-    counts, offsets = torch.empty_like(f.order), torch.zeros(tiles + 1, dtype=torch.int64)
-    shapes = f.shapes.contiguous()
-    listing = _Listing(
-        shapes=shapes.data_ptr(), first_row=f.row0.data_ptr(), last_row=f.row1.data_ptr(),
-        cameras=f.camera_ids.data_ptr(), order=f.order.data_ptr(), count=count, tiles=tiles, rows=rows, columns=columns,
-        top=region.top, left=region.left, height=f.height, slack=SLACK, counts=counts.data_ptr(),
-        offsets=offsets.data_ptr(),
-    )  # fmt: skip
-    KERNELS.library.pointsplat_list(ctypes.byref(listing))
-    offsets = torch.cumsum(offsets, 0)
-    gaussians, places = offsets.new_empty(int(offsets[-1])), offsets.new_empty(int(offsets[-1]))
-    listing.offsets, listing.gaussians, listing.places = offsets.data_ptr(), gaussians.data_ptr(), places.data_ptr()
-    if len(gaussians):
-        KERNELS.library.pointsplat_list(ctypes.byref(listing))
-    return TileList(gaussians, offsets, places, counts, f.order, region)
 
 
 def _task(footprints: Footprints, tiles: TileList, inputs: Inputs, chunks: Tensor, next_tile: Tensor) -> _Task:
@@ -219,9 +187,9 @@ def _as_torch() -> bool:
     number = footprints.rows * footprints.columns
     grads = random(number, 3, PIXELS), random(number, PIXELS)
     drawn = []
+    tiles = footprints.tiles(footprints.whole)
     for engine in (blocks, sys.modules[__name__]):
         image, final = torch.empty(number, 3, PIXELS), torch.empty(number, PIXELS)
-        tiles = engine.tiles_of(footprints, footprints.whole)
         inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, EXACT)
         tape = engine.blend_region(footprints, tiles, inputs, image, final, True)
         summed = engine.differentiate_region(footprints, tiles, inputs, tape, final, *grads, True)
@@ -234,7 +202,7 @@ KERNELS = Kernels(
     "the rasterizer",
     Path(__file__).with_name("blending.cpp"),
     {
-        **dict.fromkeys(("pointsplat_list", "pointsplat_blend", "pointsplat_differentiate"), [ctypes.c_void_p]),
+        **dict.fromkeys(("pointsplat_blend", "pointsplat_differentiate"), [ctypes.c_void_p]),
         "pointsplat_gather": [ctypes.c_void_p] * 4 + [ctypes.c_int64] * 2 + [ctypes.c_void_p] * 2,
         "pointsplat_tabulate": [ctypes.c_void_p] * 5 + [ctypes.c_int64] * 2 + [ctypes.c_void_p] * 2,
         "pointsplat_chain": [

@@ -10,13 +10,20 @@ extern "C" {
 
 // Colours of ``count`` Gaussians, or their gradients.
 struct Colors {
-    const float *directions, *coefficients;  // [M, 3], [N, K, 3]
+    const float* directions;                 // [M, 3]
+    const float *first, *rest;               // the coefficients of a Gaussian: its first, [3], and the others, [K - 1, 3]
+    int64_t first_row, rest_row;             // numbers from those of a Gaussian to those of the next
     const int64_t* ids;                      // [M] rows of the coefficients
-    int64_t count, stored, degree;           // M, K, degree of the basis
+    int64_t count, degree;                   // M, degree of the basis
     float* colors;                           // [M, 3]
     const float* grad_colors;                // as colors; null forward
-    float *grad_directions, *grad_coefficients;  // as directions, and coefficients, zeros before; or null
+    float* grad_directions;                  // as directions; or null
+    float *grad_first, *grad_rest;           // as the coefficients, zeros before; or null
     int64_t* next;
+
+    const float* coefficient(int64_t row, int k) const {
+        return k ? rest + ids[row] * rest_row + 3 * (k - 1) : first + ids[row] * first_row;
+    }
 };
 
 }  // extern "C"
@@ -75,8 +82,10 @@ void basis_backward(const Lane (&unit)[3], const Lane* grad, Lane (&out)[3]) {
 template <int USED>
 void fetch(const Colors& task, const Lanes& rows) {
     for (int64_t row : rows.rows) {
-        const float* sh = task.coefficients + task.ids[row] * task.stored * 3;
-        for (int at = 0; at < 3 * USED; at += 16) __builtin_prefetch(sh + at);
+        __builtin_prefetch(task.coefficient(row, 0));
+        if (USED == 1) continue;
+        const float* rest = task.coefficient(row, 1);
+        for (int at = 0; at < 3 * (USED - 1); at += 16) __builtin_prefetch(rest + at);
     }
 }
 
@@ -91,10 +100,11 @@ void color_lanes(const Colors& task, const Lanes& rows) {
     float basis[USED][LANES];
     std::memcpy(basis, lanes, sizeof(lanes));
     for (int lane = 0; lane < rows.count; ++lane) {
-        const float* sh = task.coefficients + task.ids[rows.rows[lane]] * task.stored * 3;
-        float sum[3] = {};
-        for (int k = 0; k < USED; ++k)
-            for (int c = 0; c < 3; ++c) sum[c] += basis[k][lane] * sh[3 * k + c];
+        const float *first = task.coefficient(rows.rows[lane], 0), *rest = task.coefficient(rows.rows[lane], 1);
+        float sum[3];
+        for (int c = 0; c < 3; ++c) sum[c] = basis[0][lane] * first[c];
+        for (int k = 1; k < USED; ++k)
+            for (int c = 0; c < 3; ++c) sum[c] += basis[k][lane] * rest[3 * (k - 1) + c];
         for (int c = 0; c < 3; ++c) {
             const float color = (sum[c] - sum[c]) + (sum[c] + 0.5f);  // NaN where it is infinite
             task.colors[3 * rows.rows[lane] + c] = color < 0.0f ? 0.0f : color;
@@ -113,18 +123,23 @@ void color_backward_lanes(const Colors& task, const Lanes& rows) {
     float basis[USED][LANES], grad_basis[USED][LANES] = {};
     std::memcpy(basis, lanes, sizeof(lanes));
     for (int lane = 0; lane < rows.count; ++lane) {
-        const int64_t row = rows.rows[lane], place = task.ids[row] * task.stored * 3;
+        const int64_t row = rows.rows[lane];
         float grad[3];
         for (int c = 0; c < 3; ++c) grad[c] = task.colors[3 * row + c] > 0.0f ? task.grad_colors[3 * row + c] : 0.0f;
         if (task.grad_directions) {
-            const float* sh = task.coefficients + place;
-            for (int k = 0; k < USED; ++k)
-                grad_basis[k][lane] = sh[3 * k] * grad[0] + sh[3 * k + 1] * grad[1] + sh[3 * k + 2] * grad[2];
+            for (int k = 0; k < USED; ++k) {
+                const float* sh = task.coefficient(row, k);
+                grad_basis[k][lane] = sh[0] * grad[0] + sh[1] * grad[1] + sh[2] * grad[2];
+            }
         }
-        if (task.grad_coefficients) {
-            float* out = task.grad_coefficients + place;
-            for (int k = 0; k < USED; ++k)
-                for (int c = 0; c < 3; ++c) out[3 * k + c] = basis[k][lane] * grad[c];
+        if (task.grad_first) {
+            float* out = task.grad_first + task.ids[row] * task.first_row;
+            for (int c = 0; c < 3; ++c) out[c] = basis[0][lane] * grad[c];
+        }
+        if (task.grad_rest) {
+            float* out = task.grad_rest + task.ids[row] * task.rest_row;
+            for (int k = 1; k < USED; ++k)
+                for (int c = 0; c < 3; ++c) out[3 * (k - 1) + c] = basis[k][lane] * grad[c];
         }
     }
     if (DEGREE == 0 || !task.grad_directions) return;

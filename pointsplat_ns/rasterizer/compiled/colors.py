@@ -24,65 +24,86 @@ class _Colors(ctypes.Structure):
     """``struct Colors`` of the kernels."""
 
     _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("directions", "coefficients", "ids")),
-        *((name, ctypes.c_int64) for name in ("count", "stored", "degree")),
-        *((name, ctypes.c_void_p) for name in ("colors", "grad_colors", "grad_directions", "grad_coefficients")),
+        *((name, ctypes.c_void_p) for name in ("directions", "first", "rest")),
+        *((name, ctypes.c_int64) for name in ("first_row", "rest_row")),
+        ("ids", ctypes.c_void_p),
+        *((name, ctypes.c_int64) for name in ("count", "degree")),
+        *((name, ctypes.c_void_p) for name in ("colors", "grad_colors", "grad_directions", "grad_first", "grad_rest")),
         ("next", ctypes.c_void_p),
     )
 
 
-def can_color(directions: Tensor, coefficients: Tensor, wanted: bool | None) -> bool:
-    """Whether the kernels compute the colours of these coefficients along these directions.
+def can_color(wanted: bool | None, *tensors: Tensor) -> bool:
+    """Whether the kernels compute colours from these directions and coefficients.
 
     Args:
-        directions: (M, 3)
-        coefficients: (N, K, 3)
         wanted: None where a machine without a compiler is no reason for a warning.
+        tensors: directions and coefficients.
     """
-    suited = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in (directions, coefficients))
+    suited = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
     return suited and KERNELS.usable(wanted)
 
 
 class CompiledColor(torch.autograd.Function):
-    """As :class:`~pointsplat_ns.rasterizer.spherical_harmonics.Color`."""
+    """As :class:`~pointsplat_ns.rasterizer.spherical_harmonics.Color`, of coefficients (N, K, 3) or, where ``rest`` is
+    given, of the first (N, 3) and the others (N, K - 1, 3), which then need not be brought together."""
 
     @staticmethod
-    def forward(ctx, directions, coefficients, ids, degree):
+    def forward(ctx, directions, coefficients, rest, ids, degree):
         directions, coefficients, ids = (t.contiguous() for t in (directions, coefficients, ids))
+        rest = None if rest is None else rest.contiguous()
         if len(ids):
             first, last = ids.aminmax()
             if first < 0 or last >= len(coefficients):
                 raise IndexError(f"ids are from {first} to {last}; expected rows of {len(coefficients)} Gaussians")
         colors = torch.empty_like(directions)
-        _call(_task(directions, coefficients, ids, degree, colors))
+        _call(_task(directions, coefficients, rest, ids, degree, colors))
         ctx.degree = degree
-        ctx.save_for_backward(directions, coefficients, ids, colors)
+        ctx.save_for_backward(directions, coefficients, rest, ids, colors)
         return colors
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad):
-        directions, coefficients, ids, colors = ctx.saved_tensors
+        directions, coefficients, rest, ids, colors = ctx.saved_tensors
         grad = grad.contiguous()
-        task = _task(directions, coefficients, ids, ctx.degree, colors)
+        task = _task(directions, coefficients, rest, ids, ctx.degree, colors)
         task.grad_colors = grad.data_ptr()
-        grad_directions = grad_coefficients = None
+        grad_directions = grad_coefficients = grad_rest = None
         if ctx.needs_input_grad[0] and ctx.degree:  # a constant has no direction
             grad_directions = torch.empty_like(directions)
             task.grad_directions = grad_directions.data_ptr()
         if ctx.needs_input_grad[1]:
-            # NumPy takes memory that the system has zeroed: rows that are not seen are not written, nor paid for
-            grad_coefficients = torch.from_numpy(np.zeros(coefficients.shape, np.float32))
-            task.grad_coefficients = grad_coefficients.data_ptr()
+            grad_coefficients = _zeros_like(coefficients)
+            task.grad_first, after = _pointers(grad_coefficients, None)
+            task.grad_rest = after if rest is None else None
+        if ctx.needs_input_grad[2]:
+            grad_rest = _zeros_like(rest)
+            task.grad_rest = grad_rest.data_ptr()
         _call(task)
-        return grad_directions, grad_coefficients, None, None
+        return grad_directions, grad_coefficients, grad_rest, None, None
 
 
-def _task(directions: Tensor, coefficients: Tensor, ids: Tensor, degree: int, colors: Tensor) -> _Colors:
+def _zeros_like(coefficients: Tensor) -> Tensor:
+    """By NumPy, which takes memory that the system has zeroed: rows that are not seen are not written, nor paid for."""
+    return torch.from_numpy(np.zeros(coefficients.shape, np.float32))
+
+
+def _pointers(coefficients: Tensor, rest: Tensor | None) -> tuple[int, int]:
+    """Where the first coefficients and the others begin."""
+    first = coefficients.data_ptr()
+    return first, first + 3 * coefficients.element_size() if rest is None else rest.data_ptr()
+
+
+def _task(
+    directions: Tensor, coefficients: Tensor, rest: Tensor | None, ids: Tensor, degree: int, colors: Tensor
+) -> _Colors:
     """A task without its gradients. It keeps none of the tensors alive."""
+    first, others = _pointers(coefficients, rest)
     return _Colors(
-        directions=directions.data_ptr(), coefficients=coefficients.data_ptr(), ids=ids.data_ptr(), count=len(ids),
-        stored=coefficients.shape[1], degree=degree, colors=colors.data_ptr(),
+        directions=directions.data_ptr(), first=first, rest=others, first_row=coefficients[:1].numel(),
+        rest_row=(coefficients if rest is None else rest)[:1].numel(), ids=ids.data_ptr(), count=len(ids),
+        degree=degree, colors=colors.data_ptr(),
     )  # fmt: skip
 
 
@@ -93,19 +114,26 @@ def _call(task: _Colors) -> None:
 
 
 def _as_torch() -> bool:
-    """Whether the kernels give the colours of some coefficients, with gradients, as torch does."""
+    """Whether the kernels give the colours of some coefficients, together and apart, with gradients, as torch does."""
     generator = torch.Generator().manual_seed(0)
     coefficients, ids = torch.randn(60, 17, 3, generator=generator), torch.arange(0, 60, 2)
     directions, weights = (torch.randn(30, 3, generator=generator) for _ in range(2))
+
+    def together(along: Tensor, coefficients: Tensor, ids: Tensor, degree: int) -> Tensor:
+        return CompiledColor.apply(along, coefficients, None, ids, degree)
+
+    def apart(along: Tensor, coefficients: Tensor, ids: Tensor, degree: int) -> Tensor:
+        return CompiledColor.apply(along, coefficients[:, 0], coefficients[:, 1:], ids, degree)
+
     for degree in range(4):
         colored = []
-        for function in (Color, CompiledColor):
+        for function in (Color.apply, together, apart):
+            leaves = [directions.clone().requires_grad_(degree > 0), coefficients.clone().requires_grad_()]
             with torch.enable_grad():
-                leaves = [directions.clone().requires_grad_(degree > 0), coefficients.clone().requires_grad_()]
-                colors = function.apply(*leaves, ids, degree)
+                colors = function(leaves[0], leaves[1], ids, degree)
             grads = torch.autograd.grad((colors * weights).sum(), leaves[degree == 0 :])
             colored.append((colors.detach(), *grads))
-        if not agreement(colored[1], colored[0], off=1e-5, share=1e-2):
+        if not all(agreement(ours, colored[0], off=1e-5, share=1e-2) for ours in colored[1:]):
             return False
     return True
 

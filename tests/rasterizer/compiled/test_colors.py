@@ -53,6 +53,25 @@ def test_colours_and_gradients_are_those_of_torch_and_as_near_to_float64(degree,
     assert not ours[2][rest].any() and not ours[2][:, (degree + 1) ** 2 :].any()
 
 
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+@pytest.mark.parametrize("degree", range(4))
+def test_coefficients_apart_give_the_bits_of_those_together(degree, compiled):
+    directions, coefficients, ids = inputs(stored=(degree + 1) ** 2 + 1)
+    weights, results = torch.randn(len(ids), 3), []
+    for apart in (False, True):
+        leaves = [tensor.float().requires_grad_() for tensor in (directions, coefficients)]
+        first, rest = leaves[1][:, 0], leaves[1][:, 1:]
+        colors = sh_to_color(leaves[0], (first, rest) if apart else leaves[1], degree, ids, compiled)
+        grads = torch.autograd.grad((colors * weights).sum(), leaves, allow_unused=True, materialize_grads=True)
+        results.append((colors, *grads))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True)) and results[0][2].any()
+
+
+def test_too_few_coefficients_are_refused_apart_as_well():
+    with pytest.raises(ValueError, match="4 SH coefficients given; degree 2 needs 9"):
+        sh_to_color(torch.zeros(2, 3), (torch.zeros(2, 3), torch.zeros(2, 3, 3)), 2)
+
+
 @needs_compiler
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
 def test_what_is_not_finite_makes_nan_of_its_own_colour_and_of_no_other(wrong):

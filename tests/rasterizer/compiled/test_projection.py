@@ -9,7 +9,7 @@ import torch
 
 from making import camera_askew, record_kernels, splats_in_view
 from pointsplat_ns.rasterizer import rasterization
-from pointsplat_ns.rasterizer.compiled import blending, colors, projection
+from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
 from pointsplat_ns.rasterizer.projection import count_meaningless, project
 
 WIDTH, HEIGHT = 37, 29
@@ -257,7 +257,7 @@ def test_any_number_of_threads_projects_the_same_bits():
 
 
 ALL_KERNELS = {
-    *("project", "count_meaningless", "unpack", "color", "tabulate", "blend"),
+    *("project", "count_meaningless", "unpack", "color", "ellipses", "strips", "tabulate", "blend"),
     *("differentiate", "gather", "chain", "project_backward"),
 }
 
@@ -265,7 +265,7 @@ ALL_KERNELS = {
 @pytest.fixture()
 def kernel_calls(monkeypatch):
     """The kernels called within the test."""
-    return record_kernels(monkeypatch, blending, colors, projection)
+    return record_kernels(monkeypatch, blending, colors, projection, tiles)
 
 
 @needs_compiler

@@ -1,0 +1,17 @@
+"""What finds the tiles that Gaussians touch: torch (:mod:`~pointsplat_ns.rasterizer.ellipses`), or compiled kernels
+where there is a compiler (:mod:`~pointsplat_ns.rasterizer.compiled.tiles`)."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+from torch import Tensor
+
+from pointsplat_ns.rasterizer import ellipses
+from pointsplat_ns.rasterizer.compiled import tiles as compiled_tiles
+
+
+def engine_of(compiled: bool | None, *tensors: Tensor) -> ModuleType:
+    """The module with ``ellipses_of`` and ``pairs_of`` for Gaussians of which these are means, covariances and so on;
+    ``compiled`` as for :func:`~pointsplat_ns.rasterization`."""
+    return compiled_tiles if compiled_tiles.can_list(compiled, *tensors) else ellipses

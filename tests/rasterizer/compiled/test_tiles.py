@@ -1,0 +1,88 @@
+"""Compiled kernels find the tiles that torch finds."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pointsplat_ns.rasterizer import binning
+from pointsplat_ns.rasterizer import ellipses as in_torch
+from pointsplat_ns.rasterizer.compiled import tiles as compiled_tiles
+from pointsplat_ns.rasterizer.constants import ALPHA_MIN
+from pointsplat_ns.rasterizer.ellipses import Ellipses, Frame, Region
+from pointsplat_ns.rasterizer.tiles import Footprints
+from pointsplat_ns.system.threads import fixed_threads
+
+missing = compiled_tiles.KERNELS.why_missing
+needs_compiler = pytest.mark.skipif(bool(missing), reason=missing)
+
+WIDTH, HEIGHT = 203, 149
+
+
+def given(count=6000, cameras=2, seed=1):
+    """Gaussians in and around images, from points to needles and some larger than an image, some too faint to draw."""
+    g = torch.Generator().manual_seed(seed)
+    means2d = torch.rand(count, 2, generator=g) * 400 - 100
+    spread = 10.0 ** (4 * torch.rand(count, 2, generator=g) - 1)
+    share = (2 * torch.rand(count, generator=g) - 1) * 0.999
+    xx, yy = spread.unbind(-1)
+    cov2d = torch.stack([xx, share * (xx * yy).sqrt(), yy], -1)
+    det = xx * yy * (1 - share * share)
+    opacities = torch.rand(count, generator=g) ** 4
+    depths, camera_ids = torch.randn(count, generator=g).abs(), torch.randint(cameras, (count,), generator=g)
+    return means2d, cov2d, det, opacities, depths, camera_ids, cameras, WIDTH, HEIGHT
+
+
+REGIONS = (Region(0, 19, 0, 26), Region(3, 4, 0, 26), Region(5, 6, 7, 8), Region(18, 19, 25, 26))
+
+
+@needs_compiler
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_pairs_are_those_of_torch(cameras):
+    ours, torchs = (Footprints(*given(cameras=cameras), engine=engine) for engine in (compiled_tiles, in_torch))
+    assert ours.whole == torchs.whole == REGIONS[0]
+    assert ours.regions(5000) == torchs.regions(5000) and len(ours.regions(5000)) > 3
+    for region in REGIONS:
+        mine, theirs = ours.tiles(region), torchs.tiles(region)
+        assert len(theirs.gaussians) > 0
+        for name in ("gaussians", "offsets", "places", "counts", "order"):
+            assert torch.equal(getattr(mine, name), getattr(theirs, name)), (region, name)
+
+
+@needs_compiler
+def test_ellipses_are_those_of_torch_to_rounding():
+    means2d, cov2d, det, opacities, depths, camera_ids, cameras, *_ = given()
+    frame, order = Frame(cameras, HEIGHT, 19, 26), depths.argsort()
+    arguments = means2d, cov2d, det, opacities, order, camera_ids, frame
+    ours, torchs = (module.ellipses_of(*arguments, ALPHA_MIN) for module in (compiled_tiles, in_torch))
+    assert torch.allclose(ours.shapes, torchs.shapes, rtol=1e-5, atol=1e-6) and ours.shapes.isfinite().all()
+    for name in set(Ellipses._fields) - {"shapes"}:
+        assert torch.equal(getattr(ours, name), getattr(torchs, name)), name
+    assert (torchs.shapes[:, 2] == 0).any(), "some are too faint"
+
+
+@needs_compiler
+def test_nothing_gives_no_pair_and_any_number_of_threads_the_same_bits():
+    empty = Footprints(*(v[:0] if isinstance(v, torch.Tensor) else v for v in given()), engine=compiled_tiles)
+    tiles = empty.tiles(empty.whole)
+    assert len(tiles.gaussians) == len(tiles.counts) == 0 and not tiles.offsets.any()
+    found = []
+    for threads in (1, 2, 5):
+        with fixed_threads(threads):
+            footprints = Footprints(*given(20_000), engine=compiled_tiles)
+            found.append((footprints._ellipses.shapes, footprints.tiles(footprints.whole).gaussians))
+    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("dtype", "compiled", "module"),
+    [
+        (torch.float32, None, compiled_tiles),
+        (torch.float32, True, compiled_tiles),
+        (torch.float32, False, in_torch),
+        (torch.float64, True, in_torch),
+    ],
+)
+def test_kernels_are_for_float32_unless_they_are_not_wanted(dtype, compiled, module):
+    assert binning.engine_of(compiled, torch.zeros(1, 2), torch.zeros(1, dtype=dtype)) is module
