@@ -34,6 +34,7 @@ PROGRAMS = (
     "refiner",
     "repair",
     "sampled_views",
+    "second_order",
     "small_numbers",
     "soak",
     "stability",
