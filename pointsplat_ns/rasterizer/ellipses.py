@@ -30,8 +30,8 @@ class Region(NamedTuple):
         return self.right - self.left
 
 
-class Frame(NamedTuple):
-    """The images that the ellipses are in."""
+class Grid(NamedTuple):
+    """The tiles of the images that the ellipses are in."""
 
     cameras: int
     height: int  # pixels
@@ -67,7 +67,7 @@ def ellipses_of(
     opacities: Tensor,  # [M]
     order: Tensor,  # [M] int64, rows in depth order
     cameras: Tensor,  # [M] int64
-    frame: Frame,
+    grid: Grid,
     alpha_min: float,
 ) -> Ellipses:
     """The ellipses within which Gaussians have an alpha of at least ``alpha_min``."""
@@ -81,16 +81,16 @@ def ellipses_of(
     mx, my = shapes[:, 0], shapes[:, 1]
     half_x, half_y = ((level * v).sqrt_().index_select(0, order).add_(SLACK) for v in (xx, yy))
     # the box around the ellipse, in tiles
-    row0, row1 = _tile_of(my - half_y, up=True, tiles=frame.rows), _tile_of(my + half_y, up=False, tiles=frame.rows)
-    column0 = _tile_of(mx - half_x, up=True, tiles=frame.columns)
-    widths = (_tile_of(mx + half_x, up=False, tiles=frame.columns) - column0 + 1).clamp_min_(0)
+    row0, row1 = _tile_of(my - half_y, up=True, tiles=grid.rows), _tile_of(my + half_y, up=False, tiles=grid.rows)
+    column0 = _tile_of(mx - half_x, up=True, tiles=grid.columns)
+    widths = (_tile_of(mx + half_x, up=False, tiles=grid.columns) - column0 + 1).clamp_min_(0)
     return Ellipses(order, cameras.index_select(0, order), shapes, row0, row1, column0, widths)
 
 
-def pairs_of(ellipses: Ellipses, frame: Frame, region: Region) -> Pairs:
+def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> Pairs:
     """Pair Gaussians with the tiles of a region, and sort the pairs by tile, then depth, then row of the input."""
     rows, columns = region.rows, region.columns
-    owner, row, column0, column1 = _strips(ellipses, frame, region)
+    owner, row, column0, column1 = _strips(ellipses, grid, region)
     widths = (column1 - column0 + 1).clamp_min_(0)
     counts = torch.zeros_like(ellipses.order).index_add_(0, owner, widths)
     first = (ellipses.cameras.index_select(0, owner) * rows + row - region.top) * columns + column0 - region.left
@@ -98,7 +98,7 @@ def pairs_of(ellipses: Ellipses, frame: Frame, region: Region) -> Pairs:
     tile += first.index_select(0, strip)
     gaussian = ellipses.order.index_select(0, owner).index_select(0, strip)
 
-    tiles = frame.cameras * rows * columns
+    tiles = grid.cameras * rows * columns
     if tiles < 2**31:  # the fewer the bits, the fewer the passes of a radix sort
         tile = tile.to(torch.int16 if tiles < 2**15 else torch.int32)
     tile, places = torch.sort(tile, stable=True)
@@ -107,7 +107,7 @@ def pairs_of(ellipses: Ellipses, frame: Frame, region: Region) -> Pairs:
     return Pairs(gaussian.index_select(0, places), offsets, places, counts)
 
 
-def _strips(ellipses: Ellipses, frame: Frame, region: Region) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _strips(ellipses: Ellipses, grid: Grid, region: Region) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Each row of tiles that each Gaussian reaches: the Gaussian (depth order), the row, first and last column."""
     row0 = ellipses.row0.clamp_min(region.top)
     row1 = ellipses.row1.clamp_max(region.bottom - 1)
@@ -115,15 +115,15 @@ def _strips(ellipses: Ellipses, frame: Frame, region: Region) -> tuple[Tensor, T
     row += row0.index_select(0, owner)
     mx, my, level, inverse_yy, peak, slope, variance = ellipses.shapes.index_select(0, owner).unbind(-1)
     top = row * TILE + (0.5 - SLACK) - my
-    bottom = (row * TILE + (TILE - 0.5)).clamp_(max=frame.height - 0.5) + SLACK - my
+    bottom = (row * TILE + (TILE - 0.5)).clamp_(max=grid.height - 0.5) + SLACK - my
 
     def edge(dy: Tensor, sign: float) -> Tensor:
         dy = torch.minimum(torch.maximum(dy, top), bottom)
         reach = (level - dy * dy * inverse_yy).clamp_min_(0).mul_(variance).sqrt_().add_(SLACK)
         return (mx + slope * dy).add_(reach, alpha=sign)
 
-    column0 = _tile_of(edge(-peak, -1.0), up=True, tiles=frame.columns).clamp_(min=region.left)
-    column1 = _tile_of(edge(peak, 1.0), up=False, tiles=frame.columns).clamp_(max=region.right - 1)
+    column0 = _tile_of(edge(-peak, -1.0), up=True, tiles=grid.columns).clamp_(min=region.left)
+    column1 = _tile_of(edge(peak, 1.0), up=False, tiles=grid.columns).clamp_(max=region.right - 1)
     return owner, row, column0, column1
 
 

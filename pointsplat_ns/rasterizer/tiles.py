@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer import ellipses as in_torch
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, TILE
-from pointsplat_ns.rasterizer.ellipses import Frame
+from pointsplat_ns.rasterizer.ellipses import Grid
 from pointsplat_ns.rasterizer.ellipses import Region as Region  # what users of tiles name a part of an image by
 
 
@@ -69,26 +69,26 @@ class Footprints:
         engine: ModuleType = in_torch,  # what finds ellipses and pairs, see binning.engine_of
     ):
         self.width, self.height = width, height
-        self._frame = Frame(cameras, height, rows=-(-height // TILE), columns=-(-width // TILE))
+        self._grid = Grid(cameras, height, rows=-(-height // TILE), columns=-(-width // TILE))
         self._engine = engine
         self._ellipses = engine.ellipses_of(
-            means2d, cov2d, det, opacities, _by_depth(depths.contiguous()), camera_ids, self._frame, alpha_min
+            means2d, cov2d, det, opacities, _by_depth(depths.contiguous()), camera_ids, self._grid, alpha_min
         )
 
     @property
     def cameras(self) -> int:
         """Number of images."""
-        return self._frame.cameras
+        return self._grid.cameras
 
     @property
     def rows(self) -> int:
         """Rows of tiles of an image."""
-        return self._frame.rows
+        return self._grid.rows
 
     @property
     def columns(self) -> int:
         """Columns of tiles of an image."""
-        return self._frame.columns
+        return self._grid.columns
 
     @property
     def whole(self) -> Region:
@@ -120,7 +120,7 @@ class Footprints:
     @torch.no_grad()
     def tiles(self, region: Region) -> TileList:
         """Pair Gaussians with tiles and sort the pairs by tile, then depth, then row of the input."""
-        pairs = self._engine.pairs_of(self._ellipses, self._frame, region)
+        pairs = self._engine.pairs_of(self._ellipses, self._grid, region)
         return TileList(**pairs._asdict(), order=self._ellipses.order, region=region)
 
 

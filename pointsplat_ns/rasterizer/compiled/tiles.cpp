@@ -28,7 +28,7 @@ inline int64_t tile_to(float position, int64_t tiles) {
 
 extern "C" {
 
-struct Frame {
+struct Grid {
     int64_t height, rows, columns;  // pixels, tiles
     float slack;
 };
@@ -42,7 +42,7 @@ struct Ellipses {
 };
 
 struct Footprints {
-    Frame frame;
+    Grid grid;
     Ellipses ellipses;
     const float *means2d, *cov2d, *det, *opacities;  // of the projected Gaussians, in their own order
     const int64_t* cameras;
@@ -53,7 +53,7 @@ struct Footprints {
 void pointsplat_ellipses(const Footprints* task) {
     const Footprints& f = *task;
     const Ellipses& e = f.ellipses;
-    const float slack = f.frame.slack;
+    const float slack = f.grid.slack;
     each_range(f.next, e.count, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t at = first; at < last; ++at) {
             const int64_t ahead = e.order[std::min(at + AHEAD, e.count - 1)], i = e.order[at];
@@ -67,9 +67,9 @@ void pointsplat_ellipses(const Footprints* task) {
             shape[0] = x, shape[1] = y, shape[2] = level, shape[3] = 1.0f / yy;
             shape[4] = xy * std::sqrt(level / xx), shape[5] = xy / yy, shape[6] = f.det[i] / yy;
             const float half_x = std::sqrt(level * xx) + slack, half_y = std::sqrt(level * yy) + slack;
-            e.row0[at] = tile_from(y - half_y, f.frame.rows), e.row1[at] = tile_to(y + half_y, f.frame.rows);
-            e.column0[at] = tile_from(x - half_x, f.frame.columns);
-            const int64_t width = tile_to(x + half_x, f.frame.columns) - e.column0[at] + 1;
+            e.row0[at] = tile_from(y - half_y, f.grid.rows), e.row1[at] = tile_to(y + half_y, f.grid.rows);
+            e.column0[at] = tile_from(x - half_x, f.grid.columns);
+            const int64_t width = tile_to(x + half_x, f.grid.columns) - e.column0[at] + 1;
             e.widths[at] = std::max<int64_t>(width, 0);
             e.cameras[at] = f.cameras[i];
         }
@@ -83,7 +83,7 @@ struct Strip {
 
 // The pairs of a region, in three calls: strips, by threads; how many there are; and the pairs.
 struct Listing {
-    Frame frame;
+    Grid grid;
     Ellipses ellipses;
     int64_t top, bottom, left, right, tiles;  // the region, and its tiles in all images
     const int64_t* starts;                    // [M + 1] where each Gaussian's strips start
@@ -117,21 +117,21 @@ extern "C" {
 
 void pointsplat_strips(const Listing* listing) {
     const Listing& l = *listing;
-    const float slack = l.frame.slack;
+    const float slack = l.grid.slack;
     each_range(l.next, l.ellipses.count, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i) {
             const float *s = l.ellipses.shapes + 7 * i, x = s[0], y = s[1], level = s[2], inverse_yy = s[3], peak = s[4];
             int64_t row = l.first_row(i);
             for (int64_t at = l.starts[i]; at < l.starts[i + 1]; ++at, ++row) {
                 const float top = row * TILE + (0.5f - slack) - y;
-                const float bottom = std::min(row * TILE + (TILE - 0.5f), l.frame.height - 0.5f) + slack - y;
+                const float bottom = std::min(row * TILE + (TILE - 0.5f), l.grid.height - 0.5f) + slack - y;
                 const auto edge = [&](float dy, float sign) {
                     dy = std::min(std::max(dy, top), bottom);
                     const float within = std::max(level - dy * dy * inverse_yy, 0.0f);
                     return x + s[5] * dy + sign * (std::sqrt(within * s[6]) + slack);
                 };
-                const int64_t from = std::max(tile_from(edge(-peak, -1.0f), l.frame.columns), l.left);
-                const int64_t to = std::min(tile_to(edge(peak, 1.0f), l.frame.columns), l.right - 1);
+                const int64_t from = std::max(tile_from(edge(-peak, -1.0f), l.grid.columns), l.left);
+                const int64_t to = std::min(tile_to(edge(peak, 1.0f), l.grid.columns), l.right - 1);
                 l.strips[at] = {static_cast<int32_t>(from - l.left), static_cast<int32_t>(to - l.left)};
             }
         }

@@ -14,21 +14,21 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer import ellipses as in_torch
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, SLACK
-from pointsplat_ns.rasterizer.ellipses import Ellipses, Frame, Pairs, Region
+from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, Pairs, Region
 from pointsplat_ns.system.kernels import Kernels, on_threads
 
 _SEVERAL = 4000
 """Gaussians from which on more than one thread is asked."""
 
 
-class _Frame(ctypes.Structure):
-    """``struct Frame`` of the kernels."""
+class _Grid(ctypes.Structure):
+    """``struct Grid`` of the kernels."""
 
     _fields_ = (*((name, ctypes.c_int64) for name in ("height", "rows", "columns")), ("slack", ctypes.c_float))
 
     @classmethod
-    def of(cls, frame: Frame) -> _Frame:
-        return cls(frame.height, frame.rows, frame.columns, SLACK)
+    def of(cls, grid: Grid) -> _Grid:
+        return cls(grid.height, grid.rows, grid.columns, SLACK)
 
 
 class _Ellipses(ctypes.Structure):
@@ -48,7 +48,7 @@ class _Footprints(ctypes.Structure):
     """``struct Footprints`` of the kernels."""
 
     _fields_ = (
-        ("frame", _Frame),
+        ("grid", _Grid),
         ("ellipses", _Ellipses),
         *((name, ctypes.c_void_p) for name in ("means2d", "cov2d", "det", "opacities", "cameras")),
         ("alpha_min", ctypes.c_float),
@@ -60,7 +60,7 @@ class _Listing(ctypes.Structure):
     """``struct Listing`` of the kernels."""
 
     _fields_ = (
-        ("frame", _Frame),
+        ("grid", _Grid),
         ("ellipses", _Ellipses),
         *((name, ctypes.c_int64) for name in ("top", "bottom", "left", "right", "tiles")),
         *((name, ctypes.c_void_p) for name in ("starts", "strips", "counts", "offsets", "gaussians", "places", "next")),
@@ -85,7 +85,7 @@ def ellipses_of(
     opacities: Tensor,
     order: Tensor,
     cameras: Tensor,
-    frame: Frame,
+    grid: Grid,
     alpha_min: float,
 ) -> Ellipses:
     """As :func:`pointsplat_ns.rasterizer.ellipses.ellipses_of`."""
@@ -94,24 +94,24 @@ def ellipses_of(
     found = Ellipses(order, numbers[0], means2d.new_empty(len(order), 7), *numbers[1:])
     next_range = torch.zeros(1, dtype=torch.int64)
     task = _Footprints(
-        _Frame.of(frame), _Ellipses.of(found), *(tensor.data_ptr() for tensor in given), alpha_min,
+        _Grid.of(grid), _Ellipses.of(found), *(tensor.data_ptr() for tensor in given), alpha_min,
         next_range.data_ptr(),
     )  # fmt: skip
     on_threads(len(order) >= _SEVERAL, KERNELS.library.pointsplat_ellipses, ctypes.byref(task))
     return found
 
 
-def pairs_of(ellipses: Ellipses, frame: Frame, region: Region) -> Pairs:
+def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> Pairs:
     """As :func:`pointsplat_ns.rasterizer.ellipses.pairs_of`."""
     library, count = KERNELS.library, len(ellipses.order)
     heights = ellipses.row1.clamp_max(region.bottom - 1).sub_(ellipses.row0.clamp_min(region.top)).add_(1).clamp_min_(0)
     starts = torch.zeros(count + 1, dtype=torch.int64)
     torch.cumsum(heights, 0, out=starts[1:])
     strips, counts = torch.empty(int(starts[-1]), 2, dtype=torch.int32), torch.zeros_like(ellipses.order)
-    tiles = frame.cameras * region.rows * region.columns
+    tiles = grid.cameras * region.rows * region.columns
     offsets, next_range = torch.zeros(tiles + 1, dtype=torch.int64), torch.zeros(1, dtype=torch.int64)
     task = _Listing(
-        _Frame.of(frame), _Ellipses.of(ellipses), *region, tiles, starts.data_ptr(), strips.data_ptr(),
+        _Grid.of(grid), _Ellipses.of(ellipses), *region, tiles, starts.data_ptr(), strips.data_ptr(),
         counts.data_ptr(), offsets.data_ptr(), next=next_range.data_ptr(),
     )  # fmt: skip
     on_threads(count >= _SEVERAL, library.pointsplat_strips, ctypes.byref(task))
@@ -126,7 +126,7 @@ def pairs_of(ellipses: Ellipses, frame: Frame, region: Region) -> Pairs:
 def _as_torch() -> bool:
     """Whether the kernels find the pairs of some Gaussians in two images as torch does."""
     generator = torch.Generator().manual_seed(0)
-    count, frame = 90, Frame(2, 43, 6, 8)
+    count, grid = 90, Grid(2, 43, 6, 8)
 
     def random(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator)
@@ -137,8 +137,8 @@ def _as_torch() -> bool:
     order, cameras = torch.randperm(count, generator=generator), torch.arange(count) % 2
     found = []
     for functions in (in_torch.ellipses_of, in_torch.pairs_of), (ellipses_of, pairs_of):
-        ellipses = functions[0](means2d, cov2d, det, opacities, order, cameras, frame, ALPHA_MIN)
-        regions = [functions[1](ellipses, frame, region) for region in (Region(0, 6, 0, 8), Region(1, 4, 2, 7))]
+        ellipses = functions[0](means2d, cov2d, det, opacities, order, cameras, grid, ALPHA_MIN)
+        regions = [functions[1](ellipses, grid, region) for region in (Region(0, 6, 0, 8), Region(1, 4, 2, 7))]
         boxes = ellipses._replace(shapes=ellipses.shapes.round(decimals=2))  # the logarithm may round otherwise
         found.append([*boxes, *(tensor for pairs in regions for tensor in pairs)])
     return all(torch.equal(a, b) for a, b in zip(*found, strict=True))

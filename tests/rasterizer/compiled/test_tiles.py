@@ -9,7 +9,7 @@ from pointsplat_ns.rasterizer import binning
 from pointsplat_ns.rasterizer import ellipses as in_torch
 from pointsplat_ns.rasterizer.compiled import tiles as compiled_tiles
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
-from pointsplat_ns.rasterizer.ellipses import Ellipses, Frame, Region
+from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, Region
 from pointsplat_ns.rasterizer.tiles import Footprints
 from pointsplat_ns.system.threads import fixed_threads
 
@@ -52,8 +52,8 @@ def test_pairs_are_those_of_torch(cameras):
 @needs_compiler
 def test_ellipses_are_those_of_torch_to_rounding():
     means2d, cov2d, det, opacities, depths, camera_ids, cameras, *_ = given()
-    frame, order = Frame(cameras, HEIGHT, 19, 26), depths.argsort()
-    arguments = means2d, cov2d, det, opacities, order, camera_ids, frame
+    grid, order = Grid(cameras, HEIGHT, 19, 26), depths.argsort()
+    arguments = means2d, cov2d, det, opacities, order, camera_ids, grid
     ours, torchs = (module.ellipses_of(*arguments, ALPHA_MIN) for module in (compiled_tiles, in_torch))
     assert torch.allclose(ours.shapes, torchs.shapes, rtol=1e-5, atol=1e-6) and ours.shapes.isfinite().all()
     for name in set(Ellipses._fields) - {"shapes"}:
