@@ -39,6 +39,7 @@ from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.nerfstudio_plugin.cameras import need_pinhole
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
 from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND, RasterizerOptions
+from pointsplat_ns.rasterizer.rendering import Colors
 from pointsplat_ns.system.threads import one_thread
 
 LONE_POINT_SCALE = 0.01
@@ -257,7 +258,7 @@ class SplatfactoCpuModel(SplatfactoModel):
     ) -> tuple[Tensor, Tensor, dict]:
         """Image (1, H, W, 3 or 4), alpha (1, H, W, 1), and the info dictionary that densification needs."""
         if self.config.sh_degree > 0:
-            colors = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
+            colors: Colors = params["features_dc"], params["features_rest"]
             degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
         else:
             colors, degree = _sigmoid(params["features_dc"]), None
