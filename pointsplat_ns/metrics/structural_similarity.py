@@ -50,7 +50,7 @@ def mean_ssim(image: Tensor, other: Tensor, compiled: bool | None = None) -> Ten
     Returns:
         A scalar in [-1, 1]; 1 for identical images. Differentiable.
     """
-    if _suited(image, other) and KERNELS.usable(compiled):
+    if _suited(image, other) and KERNELS.usable_for(compiled, image, other):
         if other.requires_grad and torch.is_grad_enabled():  # it is symmetric, and the kernel's gradient by the first
             image, other = other, image
         return CompiledSimilarity.apply(image, other)
@@ -91,11 +91,9 @@ class _Similarity(ctypes.Structure):
 
 
 def _suited(image: Tensor, other: Tensor) -> bool:
-    """Whether the kernel can take these images, and a gradient by one of them at most is asked for."""
-    both = (image, other)
+    """Whether the kernel can take images of these sizes, and a gradient by one of them at most is asked for."""
     return (
-        all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in both)
-        and image.dim() == 4
+        image.dim() == 4
         and image.shape == other.shape
         and min(image.shape[2:]) >= SSIM_WINDOW
         and image.numel() > 0

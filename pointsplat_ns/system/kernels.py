@@ -68,6 +68,11 @@ class Kernels:
             warnings.warn(text, stacklevel=1)
         return not self.why_missing
 
+    def usable_for(self, wanted: bool | None, *tensors: torch.Tensor) -> bool:
+        """Whether to use them for these tensors: float32, on a CPU; ``wanted`` as for :meth:`usable`."""
+        suited = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
+        return suited and self.usable(wanted)
+
 
 @functools.cache
 def _pool(process: int) -> ThreadPoolExecutor:

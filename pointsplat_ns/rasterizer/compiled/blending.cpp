@@ -10,7 +10,7 @@
 
 namespace {
 
-constexpr int TILE = 8, PIXELS = TILE * TILE;
+constexpr int PIXELS = TILE * TILE;
 constexpr int CHUNK = 32;    // Gaussians between two checks for saturation, and between two kept transmittances
 constexpr int GRAB = 4;      // tiles that a thread takes at once
 constexpr int MOMENTS = 6;   // w, w^2, dv, dv^2, w dv, 1

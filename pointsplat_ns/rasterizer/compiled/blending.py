@@ -75,8 +75,7 @@ def can_blend(colors: Tensor, wanted: bool | None) -> bool:
         colors: of the projected Gaussians.
         wanted: None where a machine without a compiler is no reason for a warning.
     """
-    suited = colors.dtype == torch.float32 and colors.device.type == "cpu" and 1 <= colors.shape[1] <= MOST_CHANNELS
-    return suited and KERNELS.usable(wanted)
+    return 1 <= colors.shape[1] <= MOST_CHANNELS and KERNELS.usable_for(wanted, colors)
 
 
 def inputs_of(

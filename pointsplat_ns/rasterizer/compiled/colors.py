@@ -40,8 +40,7 @@ def can_color(wanted: bool | None, *tensors: Tensor) -> bool:
         wanted: None where a machine without a compiler is no reason for a warning.
         tensors: directions and coefficients.
     """
-    suited = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
-    return suited and KERNELS.usable(wanted)
+    return KERNELS.usable_for(wanted, *tensors)
 
 
 class CompiledColor(torch.autograd.Function):

@@ -12,6 +12,7 @@
 namespace {
 
 constexpr int LANES = 8;
+constexpr int TILE = 8;          // edge of a tile, pixels
 constexpr int64_t RANGE = 1024;  // Gaussians that a thread takes at once
 constexpr float SHORTEST = std::numeric_limits<float>::min();  // vectors of no larger component are zero
 

@@ -103,9 +103,7 @@ def can_project(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor,
         means, quats, scales, opacities: of N Gaussians.
         wanted: None where a machine without a compiler is no reason for a warning.
     """
-    tensors = (means, quats, scales, opacities)
-    suited = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
-    return suited and KERNELS.usable(wanted)
+    return KERNELS.usable_for(wanted, means, quats, scales, opacities)
 
 
 def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> int:

@@ -9,7 +9,6 @@
 
 namespace {
 
-constexpr int TILE = 8;
 constexpr int64_t AHEAD = 24;  // Gaussians that are brought to the cache before they are read: they lie apart
 
 // First tile with a pixel centre at or after a position.

@@ -74,8 +74,7 @@ def can_list(wanted: bool | None, *tensors: Tensor) -> bool:
         wanted: None where a machine without a compiler is no reason for a warning.
         tensors: floating point.
     """
-    suited = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
-    return suited and KERNELS.usable(wanted)
+    return KERNELS.usable_for(wanted, *tensors)
 
 
 def ellipses_of(
