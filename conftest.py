@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from pointsplat_ns.compression import repair, view_source
-from pointsplat_ns.pruning.view_sampling import views_about
+from pointsplat_ns.looking.sampling import views_about
 from pointsplat_ns.rooms import light
 
 

@@ -23,7 +23,7 @@ from torch import Tensor
 import pointsplat_ns as ps
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.pruning.view_sampling import estimated_up
+from pointsplat_ns.looking.sampling import estimated_up
 
 SHOWN = 0
 """Index of the sampled view that most pictures show."""

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
 from pointsplat_ns.io import open_run, read_scene
+from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.metrics import finite_psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
 from pointsplat_ns.pruning import cut_sh
-from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.rasterizer import render, render_depth
 from pointsplat_ns.views import View, Views
 

@@ -183,7 +183,7 @@ def prepare(place: Path, training: bool) -> None:
     import json
 
     from pointsplat_ns.compression import repair, view_source
-    from pointsplat_ns.pruning.view_sampling import views_about
+    from pointsplat_ns.looking.sampling import views_about
     from pointsplat_ns.rooms import light
 
     os.chdir(place)

@@ -24,15 +24,15 @@ from held_out import name_of
 from torch import Tensor
 
 import pointsplat_ns as ps
-from pointsplat_ns.compression.view_source import MERGED_FROM
 from pointsplat_ns.gaussians import MAX_SH_DEGREE
 from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.looking.content import content_size, positions_in_units, views_in_units
+from pointsplat_ns.looking.sampling import estimated_up
+from pointsplat_ns.looking.traces import Witnesses, photo_places
+from pointsplat_ns.looking.view_source import MERGED_FROM
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning import cut_sh
-from pointsplat_ns.pruning.content import content_size, positions_in_units, views_in_units
 from pointsplat_ns.pruning.merge import Merging
-from pointsplat_ns.pruning.traces import Witnesses, photo_places
-from pointsplat_ns.pruning.view_sampling import estimated_up
 from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, weights_seen
 
 ANY = 500

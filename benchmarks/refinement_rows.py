@@ -20,17 +20,17 @@ from pointsplat_ns.compression.closeness import Closeness, DenseReference
 from pointsplat_ns.compression.compact import as_far_as_it_helps, helps
 from pointsplat_ns.compression.fine_tune import fine_tune
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, open_refiner_run
-from pointsplat_ns.compression.view_source import COMPARED_SIDE, COMPARED_VIEWS
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import open_run
 from pointsplat_ns.io.files import replacing
+from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.view_source import COMPARED_SIDE, COMPARED_VIEWS
 from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning import PruneSettings
 from pointsplat_ns.pruning.scores import DEFAULT_OPACITY_WEIGHT
-from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner import read_metadata
 

@@ -25,8 +25,8 @@ from pointsplat_ns.compression.compact import as_far_as_it_helps, helps
 from pointsplat_ns.compression.fine_tune import fine_tune
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.refiner.feedback import shipped_feedback_refiner
 from pointsplat_ns.views import Views

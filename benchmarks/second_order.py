@@ -31,8 +31,8 @@ import pointsplat_ns as ps
 from pointsplat_ns.compression.optimiser import extent
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import RepairBudget, repair, share_of_rates
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.refiner.feedback import shipped_feedback_refiner
 from pointsplat_ns.views import View

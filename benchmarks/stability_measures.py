@@ -16,8 +16,8 @@ from torch import Tensor
 import pointsplat_ns as ps
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
+from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.pruning import merge_state
-from pointsplat_ns.pruning.content import content_size
 from pointsplat_ns.pruning.matching import cheapest_pairs
 from pointsplat_ns.pruning.merge import NEIGHBOURS, merge
 from pointsplat_ns.pruning.pair_costs import costs_of

@@ -67,7 +67,7 @@ def merging(options: Options) -> float:
 def repairing(options: Options) -> float:
     """Seconds of a step of a repair."""
     from pointsplat_ns.compression.repair import RepairBudget, repair
-    from pointsplat_ns.compression.view_source import ViewSource
+    from pointsplat_ns.looking.view_source import ViewSource
     from pointsplat_ns.pruning import prune
 
     scene = ps.example_room() if options.scene is None else ps.load(options.scene)

@@ -31,10 +31,11 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_task import SceneResult
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
     from pointsplat_ns.errors import BudgetError, DataError, MissingPackageError, PointSplatError, SceneError
+    from pointsplat_ns.filming import open_viewer, render_path
     from pointsplat_ns.folders import compact_folder
     from pointsplat_ns.gaussians import Gaussians
     from pointsplat_ns.io.scene import save
-    from pointsplat_ns.looking import open_viewer, render_path
+    from pointsplat_ns.looking.sampling import sample_views
     from pointsplat_ns.metrics import psnr, ssim
     from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
     from pointsplat_ns.nerfstudio_plugin.measure_tables import measure_tables
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner import make_refiner
     from pointsplat_ns.nerfstudio_plugin.pointsplat.report import report
     from pointsplat_ns.pages.scene_page import write_page
-    from pointsplat_ns.pruning.view_sampling import sample_views
     from pointsplat_ns.rasterizer import rasterization, render
     from pointsplat_ns.rooms import write_room
     from pointsplat_ns.tradeoff.points import Tradeoff
@@ -59,12 +59,12 @@ _PUBLIC = {
     "pointsplat_ns.compression.scene_task": ("SceneResult",),
     "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner"),
     "pointsplat_ns.pages.scene_page": ("write_page",),
-    "pointsplat_ns.pruning.view_sampling": ("sample_views",),
+    "pointsplat_ns.looking.sampling": ("sample_views",),
     "pointsplat_ns.errors": ("BudgetError", "DataError", "MissingPackageError", "PointSplatError", "SceneError"),
     "pointsplat_ns.folders": ("compact_folder",),
     "pointsplat_ns.gaussians": ("Gaussians",),
     "pointsplat_ns.io.scene": ("save",),
-    "pointsplat_ns.looking": ("open_viewer", "render_path"),
+    "pointsplat_ns.filming": ("open_viewer", "render_path"),
     "pointsplat_ns.metrics": ("psnr", "ssim"),
     "pointsplat_ns.nerfstudio_plugin.dataset_views": ("dataset_views",),
     "pointsplat_ns.nerfstudio_plugin.measure_tables": ("measure_tables",),

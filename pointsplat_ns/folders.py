@@ -10,9 +10,9 @@ from pointsplat_ns.compression.repair import Effort, RepairBudget
 from pointsplat_ns.compression.scene_folder import WHOLE, Command, Shard, output_folder, settle_folder
 from pointsplat_ns.compression.scene_task import Made, Options, SceneResult
 from pointsplat_ns.compression.trained_refiner import load_refiner
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
 from pointsplat_ns.pruning import Keep

@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.compression.closeness import DenseReference, views_text
-from pointsplat_ns.compression.view_source import COMPARED_SIDE, ViewSource
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
-from pointsplat_ns.pruning.content import content_box, content_diagonal, in_units
-from pointsplat_ns.pruning.view_sampling import sample_views
+from pointsplat_ns.looking.content import content_box, content_diagonal, in_units
+from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.view_source import COMPARED_SIDE, ViewSource
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.progress import Progress, silent

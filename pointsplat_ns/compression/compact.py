@@ -13,9 +13,9 @@ from pointsplat_ns.compression.closeness import Closeness, DenseReference, views
 from pointsplat_ns.compression.prune import check_options, prune_scene
 from pointsplat_ns.compression.repair import RepairBudget, Repaired, repair
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import Keep, method_named, need_usable
 from pointsplat_ns.pruning.finishing import top_of_parabola
 from pointsplat_ns.system.progress import Progress, silent

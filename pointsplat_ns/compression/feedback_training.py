@@ -22,11 +22,11 @@ from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.feedback import FEWEST_STEPS, MOST_STEPS, Feedback
 from pointsplat_ns.compression.optimiser import gradients_of
 from pointsplat_ns.compression.repair import share_of_rates, share_of_start
-from pointsplat_ns.compression.view_source import COMPARED_VIEWS
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.view_source import COMPARED_VIEWS
 from pointsplat_ns.pruning import prune
-from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, save_feedback_refiner
 from pointsplat_ns.system import processes

@@ -15,7 +15,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import content_hash, write_ply
 from pointsplat_ns.io.files import replacing, write_json
-from pointsplat_ns.pruning.content import content_box
+from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.rasterizer import render
 
 if TYPE_CHECKING:

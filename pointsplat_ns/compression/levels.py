@@ -27,11 +27,11 @@ from pointsplat_ns.compression.level_errors import (
 )
 from pointsplat_ns.compression.level_folder import LevelFolder
 from pointsplat_ns.compression.prune import prune_scene
-from pointsplat_ns.compression.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable
 from pointsplat_ns.io.source import SourceFile
+from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, found_by_trying, need_usable, parse_keep, resolve_keep
 from pointsplat_ns.pruning.merge import merge_levels
 from pointsplat_ns.system.progress import Progress, silent

@@ -14,7 +14,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.quaternions import quaternions_of
 from pointsplat_ns.io.runs import Run, may_be_run, open_run
-from pointsplat_ns.pruning.view_sampling import estimated_up
+from pointsplat_ns.looking.sampling import estimated_up
 from pointsplat_ns.refiner.augmentation import Transform
 
 _AXES = {"x": 0, "y": 1, "z": 2}

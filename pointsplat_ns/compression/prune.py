@@ -15,10 +15,10 @@ from pointsplat_ns.compression.budget_search import SH_PSNR, needed_sh_degree, s
 from pointsplat_ns.compression.cleaning import Cleaning, clean_scene
 from pointsplat_ns.compression.fine_tune import fine_tune
 from pointsplat_ns.compression.size_search import largest_within
-from pointsplat_ns.compression.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.errors import BudgetError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
+from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.pruning import (
     Keep,
     Megabytes,

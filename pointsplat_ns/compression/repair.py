@@ -13,9 +13,9 @@ from torch import Tensor
 
 from pointsplat_ns.compression.feedback import MOST_STEPS, Feedback
 from pointsplat_ns.compression.optimiser import gradients_of
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, shipped_feedback_refiner
 from pointsplat_ns.system.thread_choice import ThreadChoice

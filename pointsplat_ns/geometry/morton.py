@@ -1,8 +1,15 @@
-"""Bits of grid coordinates, as space-filling curves arrange them."""
+"""Space-filling curves: Morton codes of positions."""
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
+
+_BITS = 20
+"""Bits of the grid per axis: 60 of the 63 in a key."""
+
+_SAMPLE = 2**14
+"""Number of positions that the scene's extent is estimated from, evenly spread over the order of the scene."""
 
 
 def spread_bits(x: Tensor) -> Tensor:
@@ -27,3 +34,21 @@ def spread_bits(x: Tensor) -> Tensor:
 def interleave(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     """The Morton code of three coordinates whose bits are spread; x has the highest bit."""
     return (x << 2).bitwise_or_(y << 1).bitwise_or_(z)
+
+
+def unit_cells(means: Tensor) -> Tensor:
+    """Positions (N, 3), float32, scaled so that most lie in a cube of side 1/2 around 1/2; those far outside are
+    clamped to [0, 1]. So the few distant Gaussians of most scenes do not coarsen the grid of the others."""
+    some = means[:: max(1, len(means) // _SAMPLE)].double()
+    n = len(some)
+    ranked = some.sort(dim=0).values
+    low, high = ranked[(n - 1) // 100], ranked[n - 1 - (n - 1) // 100]
+    side = 2 * (high - low).amax()
+    cells = (means.double() - 0.5 * (low + high)).div_(side.clamp_min(torch.finfo(torch.float64).tiny))
+    return cells.float().clamp_(-0.5, 0.5).add_(0.5)
+
+
+def curve_keys(cells: Tensor, offset: float = 0.0) -> Tensor:
+    """Morton codes (N,) int64 of points (N, 3) in the unit cube, shifted by ``offset`` along each axis."""
+    grid = (cells.T + offset).clamp_(0, 1).mul_(2**_BITS - 1).long()
+    return interleave(*(spread_bits(axis) for axis in grid))

@@ -7,12 +7,12 @@ import functools
 from collections.abc import Sequence
 from pathlib import Path
 
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.io.runs import may_be_run, name_of, open_run
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
 from pointsplat_ns.nerfstudio_plugin.paper_datasets import paper_dataset
 from pointsplat_ns.system.progress import Progress, progress_bar

@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, name_of
 from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.io.source import source_file
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.tradeoff.measuring import Subject

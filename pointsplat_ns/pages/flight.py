@@ -19,16 +19,16 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import encode_spz
-from pointsplat_ns.pruning import need_usable, ply_bytes
-from pointsplat_ns.pruning.content import (
+from pointsplat_ns.looking.content import (
     content_box,
     content_diagonal,
     in_units,
     positions_in_units,
     views_in_units,
 )
-from pointsplat_ns.pruning.upright import level_directions
-from pointsplat_ns.pruning.view_sampling import NEAR_PLANE, estimated_up, look_at, sample_views
+from pointsplat_ns.looking.sampling import NEAR_PLANE, estimated_up, look_at, sample_views
+from pointsplat_ns.looking.upright import level_directions
+from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.views import Views
 

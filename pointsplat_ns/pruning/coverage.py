@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.morton import interleave, spread_bits
+from pointsplat_ns.geometry.morton import curve_keys, unit_cells
 from pointsplat_ns.pruning.scores import log_area
 
 RUN = 12
@@ -31,14 +31,8 @@ AREA_EXPONENT = 0.5
 """Mass is alpha times area to this power: the geometric mean of the two largest axes. Area itself (1) keeps blobs and
 loses detail; 0.25 to 0.65 differ little."""
 
-_BITS = 20
-"""Bits of the grid per axis: 60 of the 63 in a key."""
-
 _RUNS_AT_ONCE = 2**12
 """Number of runs processed together, small enough for the processor's cache."""
-
-_SAMPLE = 2**14
-"""Number of positions that the scene's extent is estimated from, evenly spread over the order of the scene."""
 
 
 def coverage_score(scene: Gaussians) -> Tensor:
@@ -69,24 +63,6 @@ def coverage_score(scene: Gaussians) -> Tensor:
         scores.index_add_(0, order, mass_shares(mass[order], RUN, first))
     scores = scores.double() / len(OFFSETS)
     return scores if whole else torch.full_like(usable, math.nan, dtype=torch.float64).masked_scatter_(usable, scores)
-
-
-def unit_cells(means: Tensor) -> Tensor:
-    """Positions (N, 3), float32, scaled so that most lie in a cube of side 1/2 around 1/2; those far outside are
-    clamped to [0, 1]. So the few distant Gaussians of most scenes do not coarsen the grid of the others."""
-    some = means[:: max(1, len(means) // _SAMPLE)].double()
-    n = len(some)
-    ranked = some.sort(dim=0).values
-    low, high = ranked[(n - 1) // 100], ranked[n - 1 - (n - 1) // 100]
-    side = 2 * (high - low).amax()
-    cells = (means.double() - 0.5 * (low + high)).div_(side.clamp_min(torch.finfo(torch.float64).tiny))
-    return cells.float().clamp_(-0.5, 0.5).add_(0.5)
-
-
-def curve_keys(cells: Tensor, offset: float = 0.0) -> Tensor:
-    """Morton codes (N,) int64 of points (N, 3) in the unit cube, shifted by ``offset`` along each axis."""
-    grid = (cells.T + offset).clamp_(0, 1).mul_(2**_BITS - 1).long()
-    return interleave(*(spread_bits(axis) for axis in grid))
 
 
 def mass_shares(log_mass: Tensor, run: int, first: int = 0) -> Tensor:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from statistics import fmean
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.metrics import finite_psnr
-from pointsplat_ns.pruning.small_renders import each_view
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views
 

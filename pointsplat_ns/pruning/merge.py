@@ -3,7 +3,7 @@
 Over a few rounds, pairs of neighbours are replaced by one Gaussian with their common mass (opacity times the area of
 the projection), centre, covariance and colour. The cost of a pair is the expected change of rendered images, see
 :mod:`~pointsplat_ns.pruning.pair_costs`, as large as it appears from where the scene is looked at, see
-:mod:`~pointsplat_ns.pruning.viewpoints` and :mod:`~pointsplat_ns.pruning.traces`, and less where others stand in front,
+:mod:`~pointsplat_ns.pruning.viewpoints` and :mod:`~pointsplat_ns.looking.traces`, and less where others stand in front,
 see :mod:`~pointsplat_ns.pruning.visibility`. Then members go to the group that they fit best, see
 :mod:`~pointsplat_ns.pruning.regrouping`. Small renders choose two numbers of the result, see
 :mod:`~pointsplat_ns.pruning.finishing`, and whether members do change groups.
@@ -27,22 +27,23 @@ from torch import Tensor
 
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.morton import curve_keys, unit_cells
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.geometry.quaternions import quaternions_of
-from pointsplat_ns.pruning.content import content_size, in_units, positions_in_units, some_of, thinned, views_in_units
+from pointsplat_ns.looking.content import content_size, in_units, positions_in_units, some_of, thinned, views_in_units
+from pointsplat_ns.looking.sampling import PROBED, is_room
+from pointsplat_ns.looking.traces import how_much_seen, photo_places
 from pointsplat_ns.pruning.covariance import TINY, shadow, unpack
-from pointsplat_ns.pruning.coverage import curve_keys, unit_cells
 from pointsplat_ns.pruning.duplicates import Copies, Reduced
 from pointsplat_ns.pruning.finishing import SIDE, Finish, Reference
 from pointsplat_ns.pruning.matching import cheapest_pairs
-from pointsplat_ns.pruning.merge_state import CHUNK, OPAQUE, grown, start
+from pointsplat_ns.pruning.merge_state import OPAQUE, grown, start
 from pointsplat_ns.pruning.pair_costs import costs_of
 from pointsplat_ns.pruning.regrouping import ROUNDS, masses_of, moments, regrouped
-from pointsplat_ns.pruning.traces import how_much_seen, photo_places
-from pointsplat_ns.pruning.view_sampling import PROBED, is_room
 from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, viewpoints, weights_seen, weights_seen_from
 from pointsplat_ns.pruning.visibility import MOST_DRAWN, Shown
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
+from pointsplat_ns.system.pieces import CHUNK
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import Views
 
@@ -94,7 +95,7 @@ def merge(
         progress: called with the share done, in [0, 1].
         views: where the scene is looked at from, such as the poses of its photos; what they do not show is merged
             first. By default from about where photos were taken, if the scene tells
-            (:mod:`~pointsplat_ns.pruning.traces`), else from free places in it, in all directions.
+            (:mod:`~pointsplat_ns.looking.traces`), else from free places in it, in all directions.
 
     Returns:
         Exactly ``k`` Gaussians. Deterministic.

@@ -5,7 +5,6 @@ The replacement has the common mass (opacity times the area of the projection), 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -23,6 +22,7 @@ from pointsplat_ns.pruning.covariance import (
     plane,
     shadow,
 )
+from pointsplat_ns.system.pieces import CHUNK, in_pieces
 
 OPAQUE = 0.99
 """Largest opacity of a replacement. If the mass needs more, the area grows."""
@@ -38,9 +38,6 @@ COLOUR_AXES = 8
 
 MOST_CONTRAST = 10.0
 """Bound of a colour's coefficients in costs, in colour units: a few broken colours must not hide all others."""
-
-CHUNK = 1 << 16
-"""Number of Gaussians processed at once where many numbers of each are needed."""
 
 
 @dataclass
@@ -99,17 +96,6 @@ class State:
         self.cov[i] = grown(cov, alphas)
         self.alphas[i] = alphas.clamp_max(OPAQUE)
         return wi
-
-
-def in_pieces(
-    function: Callable[[Tensor], Tensor], members: Tensor, *shape: int, dtype: torch.dtype = torch.float64
-) -> Tensor:
-    """What a function makes of members (n,): of some at once (m,), in (m, *shape), and so of all, (n, *shape). Small
-    results that are kept between large pieces would hold on to the memory of these."""
-    result = torch.empty(len(members), *shape, dtype=dtype)
-    for these in torch.arange(len(members)).split(CHUNK):
-        result[these] = function(members[these]).to(dtype)
-    return result
 
 
 def covariances_of(scene: Gaussians, rows: Tensor) -> Tensor:

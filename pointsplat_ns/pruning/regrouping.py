@@ -14,7 +14,8 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import SH_C0, Gaussians
 from pointsplat_ns.pruning.covariance import TINY, outer, shadow, unpack
-from pointsplat_ns.pruning.merge_state import CHUNK, MOST_CONTRAST, covariances_of, in_pieces
+from pointsplat_ns.pruning.merge_state import MOST_CONTRAST, covariances_of
+from pointsplat_ns.system.pieces import CHUNK, in_pieces
 from pointsplat_ns.system.threads import in_threads
 
 ROUNDS = 2

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.small_renders import each_view
-from pointsplat_ns.pruning.traces import means_around
+from pointsplat_ns.looking.each_view import each_view
+from pointsplat_ns.looking.traces import means_around
 from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.views import Views
 

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.tradeoff.judging import LookedAt
 
 

@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.pictures import write_picture
+from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.metrics import SSIM_WINDOW, ImageError, finite_psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.rasterizer import render

@@ -12,10 +12,10 @@ from pointsplat_ns.compression.compact import Compacted, compact_scene
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import RepairBudget
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.scene import read_scene, save
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.system.memory import PeakMemory
 from pointsplat_ns.system.progress import Progress

@@ -13,9 +13,9 @@ from typing import Any
 from torch import Tensor
 
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import cut_sh, need_usable
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.tradeoff.judging import Judge, Judged, LookedAt

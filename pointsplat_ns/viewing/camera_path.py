@@ -8,11 +8,11 @@ from pathlib import Path
 
 from torch import Tensor
 
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.content import content_box
-from pointsplat_ns.pruning.view_sampling import sample_views
+from pointsplat_ns.looking.content import content_box
+from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.viewing.saved_path import MOST_FRAMES, MOST_PIXELS, read_path
 from pointsplat_ns.viewing.trajectories import STOPS, along, fitted, orbit, walk
 from pointsplat_ns.views import Views

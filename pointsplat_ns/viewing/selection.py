@@ -9,12 +9,12 @@ from functools import cached_property
 
 from torch import Tensor
 
-from pointsplat_ns.compression.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable
+from pointsplat_ns.looking.content import thinned
+from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.pruning import resolve_keep, select
-from pointsplat_ns.pruning.content import thinned
 from pointsplat_ns.pruning.coverage import coverage_score
 from pointsplat_ns.pruning.methods import prune
 

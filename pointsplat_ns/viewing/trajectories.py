@@ -11,8 +11,8 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.cameras import invert_rigid
-from pointsplat_ns.pruning.upright import level_directions
-from pointsplat_ns.pruning.view_sampling import look_at
+from pointsplat_ns.looking.sampling import look_at
+from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.views import Views
 
 STOPS = 12

@@ -16,12 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.geometry.quaternions import rotation_matrices
-from pointsplat_ns.pruning.content import thinned
-from pointsplat_ns.pruning.view_sampling import PROBED
+from pointsplat_ns.looking.content import thinned
+from pointsplat_ns.looking.sampling import PROBED
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.rasterizer import render_depth
 from pointsplat_ns.system.memory import share_freed_memory
 from pointsplat_ns.viewing.camera_path import views_upright

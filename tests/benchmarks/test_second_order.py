@@ -10,9 +10,9 @@ import torch
 import pointsplat_ns as ps
 from making import cloud
 from pointsplat_ns.compression.closeness import DenseReference
-from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import prune
-from pointsplat_ns.pruning.view_sampling import sample_views
 
 UNITS = {"means": 4e-3, "scales": 0.1, "quats": 0.05, "opacities": 0.3, "features_dc": 0.1, "features_rest": 0.03}
 

@@ -12,8 +12,8 @@ import torch
 import pointsplat_ns as ps
 from making import ball, box_room
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression import view_source
-from pointsplat_ns.pruning.view_sampling import sample_views
+from pointsplat_ns.looking import view_source
+from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.tradeoff import machine, outputs
 
 COUNT = 60

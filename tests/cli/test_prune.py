@@ -16,8 +16,8 @@ from making import box_room, normal_scene, same
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.trained_refiner import open_refiner_run, scenes_of_run
-from pointsplat_ns.compression.view_source import COMPARED_VIEWS
 from pointsplat_ns.io import read_ply, read_scene, write_ply
+from pointsplat_ns.looking.view_source import COMPARED_VIEWS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning import METHODS, prune, select
 from pointsplat_ns.system import progress

@@ -15,8 +15,8 @@ import pytest
 import pointsplat_ns as ps
 from making import box_room
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression import view_source
-from pointsplat_ns.pruning.view_sampling import sample_views
+from pointsplat_ns.looking import view_source
+from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.tables.cells import CELLS
 from pointsplat_ns.tradeoff import machine
 

@@ -15,7 +15,7 @@ from making import box_room, same_bits
 from pointsplat_ns.cli import main
 from pointsplat_ns.cli.tradeoff import tradeoff
 from pointsplat_ns.compression import repair, view_source
-from pointsplat_ns.pruning.view_sampling import sample_views
+from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.tradeoff import judging, machine, outputs
 from pointsplat_ns.tradeoff.journal import POINTS
 

@@ -3,8 +3,8 @@
 import pytest
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning import view_sampling
-from pointsplat_ns.pruning.view_sampling import sample_views
+from pointsplat_ns.looking import sampling
+from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.views import Views
 
 
@@ -17,4 +17,4 @@ def ball_views(hollow_ball: Gaussians) -> Views:
 @pytest.fixture()
 def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """The search for views ends at the first places that show nothing, not at the fourth: each time takes seconds."""
-    monkeypatch.setattr(view_sampling, "_FRUITLESS", 1)
+    monkeypatch.setattr(sampling, "_FRUITLESS", 1)

@@ -16,12 +16,12 @@ from pointsplat_ns.compression import cleaning
 from pointsplat_ns.compression.cleaning import Cleaning, blend_weights, clean_scene, find_junk
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.prune import prune_scene
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, write_ply
+from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import WithinPsnr, resolve_keep
-from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.views import Views
 
 ROOM, PLANTED = 2500, 12
@@ -250,7 +250,7 @@ def test_without_a_free_place_or_views_only_the_undrawable_go(monkeypatch):
 
     monkeypatch.setattr("pointsplat_ns.pruning.viewpoints.views_about", nowhere)
     monkeypatch.setattr("pointsplat_ns.compression.cleaning.sample_views", nowhere)
-    monkeypatch.setattr("pointsplat_ns.compression.view_source.views_about", nowhere)
+    monkeypatch.setattr("pointsplat_ns.looking.view_source.views_about", nowhere)
     scene = with_junk(box_room(0, 40, size=0.05))
     junk = find_junk(scene)
     assert junk.places == 0 and len(junk.unseen) == 0

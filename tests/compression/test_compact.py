@@ -15,11 +15,11 @@ from pointsplat_ns.compression.compact import MIN_GAIN, Compacted, at_strength, 
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import RepairBudget, Repaired
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import PruneSettings, WithinPsnr, prune
-from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.refiner import Refiner, RefinerConfig
 from pointsplat_ns.views import Views
 

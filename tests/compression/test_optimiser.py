@@ -7,9 +7,9 @@ import torch
 
 from making import ball
 from pointsplat_ns.compression.optimiser import extent, gradients_of
+from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.metrics import SSIM_WINDOW
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
-from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.rasterizer import render
 
 

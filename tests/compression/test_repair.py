@@ -16,10 +16,10 @@ from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.feedback import MOST_STEPS, Feedback
 from pointsplat_ns.compression.optimiser import RATES, Optimiser, gradients_of, seen_rms
 from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
-from pointsplat_ns.compression.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.pruning import prune
-from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.rasterizer import render
 
 

@@ -19,7 +19,7 @@ import torch
 import pointsplat_ns as ps
 from pointsplat_ns.compression.optimiser import gradients_of
 from pointsplat_ns.compression.repair import RepairBudget, repair
-from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import finishing
 from pointsplat_ns.system.threads import fixed_threads
 

@@ -22,9 +22,9 @@ from flying import camera, message, picture, settle, shrink, view_on
 from making import ball, cloud
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import read_spz
+from pointsplat_ns.looking.content import in_units
+from pointsplat_ns.looking.sampling import look_at
 from pointsplat_ns.pages.flight import Stage
-from pointsplat_ns.pruning.content import in_units
-from pointsplat_ns.pruning.view_sampling import look_at
 from sweeps import room_views
 
 pytest.importorskip("selenium", reason="selenium is not installed")

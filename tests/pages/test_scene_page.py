@@ -15,9 +15,9 @@ from html_parts import hashed, names_nothing_outside, parts_of, policy_of
 from making import ball, box_room
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import read_spz
+from pointsplat_ns.looking.content import in_units
+from pointsplat_ns.looking.sampling import look_at
 from pointsplat_ns.pages.flight import REACH, VIEWS, Stage
-from pointsplat_ns.pruning.content import in_units
-from pointsplat_ns.pruning.view_sampling import look_at
 from sweeps import room_views
 
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(1)>\"'&</title>"

@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.morton import curve_keys, unit_cells
 from pointsplat_ns.pruning import METHODS, score_of, select
-from pointsplat_ns.pruning.coverage import coverage_score, curve_keys, mass_shares, unit_cells
+from pointsplat_ns.pruning.coverage import coverage_score, mass_shares
 
 
 def scene_at(means, log_scales=-3.0, logits=1.0):

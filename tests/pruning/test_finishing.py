@@ -9,8 +9,8 @@ import torch
 
 from making import ball
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.pruning.finishing import Finish, Reference, top_of_parabola
-from pointsplat_ns.pruning.view_sampling import sample_views
 
 
 def test_the_top_of_a_parabola():

@@ -9,7 +9,7 @@ import torch
 
 from making import ball, box_room
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.content import UNITS, content_size, in_units, thinned
+from pointsplat_ns.looking.content import UNITS, content_size, in_units, thinned
 from pointsplat_ns.pruning.viewpoints import EDGE, NOT_SHOWN, in_picture, viewpoints, weights_seen
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views

@@ -61,8 +61,8 @@ def outcome(words: list[str]) -> dict:
 
 if __name__ == "__main__":
     sys.addaudithook(no_network)
-    from pointsplat_ns.compression import view_source
-    from pointsplat_ns.pruning.view_sampling import views_about
+    from pointsplat_ns.looking import view_source
+    from pointsplat_ns.looking.sampling import views_about
     from pointsplat_ns.rooms import light
 
     view_source.views_about = functools.partial(views_about, width=64, height=48)

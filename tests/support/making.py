@@ -292,8 +292,8 @@ def dense_config(data: Path, output_dir: Path, steps: int):
 @contextmanager
 def views_sampled_once() -> Iterator[None]:
     """Within, trainings do not sample a scene's poses again that they sampled before. That takes most of their time."""
+    from pointsplat_ns.looking.sampling import sample_views
     from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
-    from pointsplat_ns.pruning.view_sampling import sample_views
 
     known = {}
 

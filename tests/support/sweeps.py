@@ -12,8 +12,8 @@ from PIL import Image
 from torch import Tensor
 
 import pointsplat_ns as ps
+from pointsplat_ns.looking.sampling import look_at
 from pointsplat_ns.pruning import ply_bytes
-from pointsplat_ns.pruning.view_sampling import look_at
 from pointsplat_ns.tradeoff.points import Point, Quality, Tradeoff, picture_path
 
 BUDGETS = (("coverage", 0.9), ("coverage", 0.5), ("opacity", 0.6), ("coverage", 0.1))

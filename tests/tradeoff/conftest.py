@@ -10,8 +10,8 @@ import pytest
 import pointsplat_ns as ps
 from making import box_room
 from pointsplat_ns.compression import repair
-from pointsplat_ns.compression.view_source import ViewSource
-from pointsplat_ns.pruning.view_sampling import sample_views
+from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.tradeoff import machine, outputs
 from pointsplat_ns.tradeoff.measuring import Subject
 from pointsplat_ns.tradeoff.sweep import Options, Sweep

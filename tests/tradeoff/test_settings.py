@@ -11,8 +11,8 @@ import pointsplat_ns as ps
 from making import same_bits
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression import repair, view_source
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.tradeoff.making import make
 from pointsplat_ns.tradeoff.settings import REPAIRS, Naming, Setting, check_repairs, setting_of
 from trades import point

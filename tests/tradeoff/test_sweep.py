@@ -12,8 +12,8 @@ import torch
 import pointsplat_ns as ps
 from making import same_bits
 from pointsplat_ns.compression.repair import Repaired
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.tradeoff import judging, making, measuring, sweep
 from pointsplat_ns.tradeoff.journal import POINTS
 from pointsplat_ns.tradeoff.outputs import OUTPUTS, PAGE, PLOTS, TABLE

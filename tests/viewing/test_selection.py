@@ -10,7 +10,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, same
-from pointsplat_ns.compression.view_source import ViewSource
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.viewing import selection as module
 from pointsplat_ns.viewing.selection import Selection
 

@@ -16,12 +16,12 @@ from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.io.discovery import find_plys
+from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views
 from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import PlyScene, SampledPoses
-from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.rasterizer import render
 
 POSES = SampledPoses(train=6, test=3, width=32, height=24, seed=1)

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 from pointsplat_ns.api import Source, load
 from pointsplat_ns.compression.placing import axis_named
-from pointsplat_ns.compression.view_source import ViewSource
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.system.packages import need
 from pointsplat_ns.system.progress import Progress, tracked

@@ -23,8 +23,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.merge_state import in_pieces
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
+from pointsplat_ns.system.pieces import in_pieces
 
 NEIGHBOURHOOD = 129
 """Number of Gaussians along the curve whose mean says how much a place was seen; one alone says little."""

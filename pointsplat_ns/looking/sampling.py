@@ -13,10 +13,10 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.content import UNITS, content_box, content_diagonal, in_units, positions_in_units, thinned
-from pointsplat_ns.pruning.surface import Surface
-from pointsplat_ns.pruning.traces import TELLING, explained, photo_places
-from pointsplat_ns.pruning.upright import UprightBox, level_directions, pointing_up, upright_axis
+from pointsplat_ns.looking.content import UNITS, content_box, content_diagonal, in_units, positions_in_units, thinned
+from pointsplat_ns.looking.surface import Surface
+from pointsplat_ns.looking.traces import TELLING, explained, photo_places
+from pointsplat_ns.looking.upright import UprightBox, level_directions, pointing_up, upright_axis
 from pointsplat_ns.rasterizer import render_depth
 from pointsplat_ns.views import Views
 
@@ -114,7 +114,7 @@ def sample_views(
     what the views before them have not shown, in the middle of the picture rather than at its edge; a small depth image
     tests that nothing is in the way. Ask for all the views at once that are wanted, as they then complete each other.
 
-    Where the SH of a scene tell from where its photos were taken (:mod:`pointsplat_ns.pruning.traces`), cameras stand
+    Where the SH of a scene tell from where its photos were taken (:mod:`pointsplat_ns.looking.traces`), cameras stand
     about there and look at what photos showed.
 
     Args:
@@ -124,7 +124,7 @@ def sample_views(
         height: of the images, pixels. The field of view is 70 degrees across the longer side.
         seed: the same scene and seed give the same views, another seed gives others.
         up: (3,) which way is up in the world, of any length; by default it is estimated from the scene
-            (:mod:`pointsplat_ns.pruning.upright`).
+            (:mod:`pointsplat_ns.looking.upright`).
 
     Returns:
         ``count`` views, on the CPU, over black: ``viewmats`` (count, 4, 4) from world to camera in OpenCV axes and
@@ -155,7 +155,7 @@ def views_about(
     seed: int = 0,
     up: Tensor | None = None,
 ) -> Views:
-    """As :func:`sample_views`, with what :func:`~pointsplat_ns.pruning.traces.photo_places` says of the scene."""
+    """As :func:`sample_views`, with what :func:`~pointsplat_ns.looking.traces.photo_places` says of the scene."""
     if count < 1:
         raise DataError(f"{count} views asked for; expected at least 1")
     if min(width, height) < 1:

@@ -14,8 +14,8 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run
-from pointsplat_ns.pruning.traces import photo_places
-from pointsplat_ns.pruning.view_sampling import views_about
+from pointsplat_ns.looking.sampling import views_about
+from pointsplat_ns.looking.traces import photo_places
 from pointsplat_ns.views import RasterizeMode, View, Views, spread_indices
 
 MERGED_FROM = 48

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from upright_scenes import TURNS, plates, room, tower, turned
 
 from making import ball, box_room
-from pointsplat_ns.pruning.content import content_size
-from pointsplat_ns.pruning.surface import Surface
-from pointsplat_ns.pruning.upright import UprightBox, level_directions, levelness, pointing_up, upright_axis
+from pointsplat_ns.looking.content import content_size
+from pointsplat_ns.looking.surface import Surface
+from pointsplat_ns.looking.upright import UprightBox, level_directions, levelness, pointing_up, upright_axis
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 PLACES = torch.linspace(0, 2 * math.pi, 61)[:60]

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pointsplat_ns.pruning.content import UNITS
-from pointsplat_ns.pruning.surface import Surface
+from pointsplat_ns.looking.content import UNITS
+from pointsplat_ns.looking.surface import Surface
 
 USED = 4096
 """Number of points, at most, that are looked at."""

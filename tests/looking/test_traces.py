@@ -11,9 +11,9 @@ from upright_scenes import room
 from making import EYES, ball, normal_scene, photographed
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.looking.sampling import is_room, look_at, sample_views, views_about
+from pointsplat_ns.looking.traces import MOST_FACTOR, correlation, how_much_seen, log_norms, photo_places
 from pointsplat_ns.pruning.merge import merge
-from pointsplat_ns.pruning.traces import MOST_FACTOR, correlation, how_much_seen, log_norms, photo_places
-from pointsplat_ns.pruning.view_sampling import is_room, look_at, sample_views, views_about
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.views import Views

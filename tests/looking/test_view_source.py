@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from making import ball, box_room
-from pointsplat_ns.compression.view_source import COMPARED_SIDE, COMPARED_VIEWS, ViewSource
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.view_source import COMPARED_SIDE, COMPARED_VIEWS, ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.pruning.view_sampling import sample_views
 from pointsplat_ns.views import Views
 
 
@@ -100,7 +100,7 @@ def test_views_are_spread_resized_and_checked(ball_views):
 def test_sampled_poses_of_a_scene_whose_sh_tell_of_its_photos_say_so(monkeypatch):
     asked = []
     told = torch.tensor([[0.5, 0.0, 0.0]], dtype=torch.float64), torch.ones(1)
-    monkeypatch.setattr("pointsplat_ns.compression.view_source.photo_places", lambda scene: asked.append(scene) or told)
+    monkeypatch.setattr("pointsplat_ns.looking.view_source.photo_places", lambda scene: asked.append(scene) or told)
     source = ViewSource(box_room(0))
     assert len(source.views(3)) and len(source.compared())
     assert source.origin == "poses sampled about where photos were taken, as the Gaussians tell"

@@ -8,8 +8,8 @@ import torch
 from upright_scenes import TURNS, room, tower, turned
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.pruning.content import content_box
-from pointsplat_ns.pruning.view_sampling import look_at, sample_views
+from pointsplat_ns.looking.content import content_box
+from pointsplat_ns.looking.sampling import look_at, sample_views
 from pointsplat_ns.rasterizer import render, render_depth
 
 

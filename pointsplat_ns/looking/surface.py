@@ -10,14 +10,14 @@ import math
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.morton import curve_keys, unit_cells
 from pointsplat_ns.geometry.quaternions import rotation_matrices
-from pointsplat_ns.pruning.content import UNITS, positions_in_units
-from pointsplat_ns.pruning.coverage import curve_keys, unit_cells
-from pointsplat_ns.pruning.scores import area_score
-from pointsplat_ns.pruning.traces import how_much_seen, unit_sh
+from pointsplat_ns.looking.content import UNITS, positions_in_units
+from pointsplat_ns.looking.traces import how_much_seen, unit_sh
 
 POINTS = 12288
 """Number of points that stand for a scene."""
@@ -46,7 +46,7 @@ class Surface:
     points: Tensor  # [M, 3] float64
     normals: Tensor  # [M, 3] float64 along the shortest axis of the Gaussian, of either sign
     flatness: Tensor  # [M] float64 in [0, 1]: 1 less the ratio of the shortest axis to the next
-    shown: Tensor  # [M] float32, how much photos showed of it, see :func:`~pointsplat_ns.pruning.traces.how_much_seen`
+    shown: Tensor  # [M] float32, how much photos showed of it, see :func:`~pointsplat_ns.looking.traces.how_much_seen`
     sh: Tensor  # [M, K, 3] float32, SH coefficients of its Gaussian, without the constant, at a length of 1
 
     @staticmethod
@@ -60,7 +60,8 @@ class Surface:
         """
         generator = torch.Generator().manual_seed(0)
         alphas = scene.alphas.detach().double()
-        weights = 0.5 * area_score(scene).nan_to_num(nan=-math.inf)
+        log_areas = F.logsigmoid(scene.opacities[:, 0].double()) + scene.scales.double().topk(2).values.sum(1)
+        weights = 0.5 * torch.where(scene.usable(), log_areas, -math.inf).nan_to_num(nan=-math.inf, posinf=math.inf)
         clear = alphas >= min(_CLEAR, float(alphas[weights > -math.inf].max()) if len(weights) else 0.0)
         weights = torch.where(clear, weights, -math.inf) if bool((weights[clear] > -math.inf).any()) else weights
         ranked = weights[weights > -math.inf].sort().values

@@ -1,0 +1,22 @@
+"""Computes many rows in pieces, so that intermediate results stay small."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+CHUNK = 1 << 16
+"""Number of rows of a piece."""
+
+
+def in_pieces(
+    function: Callable[[Tensor], Tensor], members: Tensor, *shape: int, dtype: torch.dtype = torch.float64
+) -> Tensor:
+    """What a function makes of members (n,): of some at once (m,), in (m, *shape), and so of all, (n, *shape). Small
+    results that are kept between large pieces would hold on to the memory of these."""
+    result = torch.empty(len(members), *shape, dtype=dtype)
+    for these in torch.arange(len(members)).split(CHUNK):
+        result[these] = function(members[these]).to(dtype)
+    return result
