@@ -7,7 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from pointsplat_ns.compression import repair, view_source
+from pointsplat_ns.compression import repair
+from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import views_about
 from pointsplat_ns.rooms import light
 

@@ -182,7 +182,8 @@ def prepare(place: Path, training: bool) -> None:
     """Lay out the inputs in a folder, and make it the current one."""
     import json
 
-    from pointsplat_ns.compression import repair, view_source
+    from pointsplat_ns.compression import repair
+    from pointsplat_ns.looking import view_source
     from pointsplat_ns.looking.sampling import views_about
     from pointsplat_ns.rooms import light
 

@@ -14,7 +14,8 @@ import pointsplat_ns as ps
 from making import box_room, same_bits
 from pointsplat_ns.cli import main
 from pointsplat_ns.cli.tradeoff import tradeoff
-from pointsplat_ns.compression import repair, view_source
+from pointsplat_ns.compression import repair
+from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.tradeoff import judging, machine, outputs
 from pointsplat_ns.tradeoff.journal import POINTS

@@ -11,7 +11,8 @@ import torch
 
 import pointsplat_ns as ps
 from making import box_room
-from pointsplat_ns.compression import repair, view_source
+from pointsplat_ns.compression import repair
+from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.refiner import Refiner, preset
 from pointsplat_ns.refiner.weights import save_refiner

@@ -12,8 +12,9 @@ import pointsplat_ns as ps
 from making import box_room, same_bits
 from pointsplat_ns import api, folders
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression import repair, view_source
+from pointsplat_ns.compression import repair
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.looking import view_source
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
 from pointsplat_ns.tradeoff import finding, judging
 from pointsplat_ns.tradeoff.finding import find_scene
