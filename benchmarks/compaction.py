@@ -13,22 +13,21 @@ runs as a process of its own that reads the same PLY and writes one; its time an
 
 from __future__ import annotations
 
-import json
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 import tyro
 from compaction_tables import MERGE, PAIRS, Row, averages, lead_table, leads, table
 from held_out import Scene, compare, load, lpips_or_none, name_of
 from options import write_whole
-from processes import COMPACT, pointsplat_compact, pointsplat_prune
-from rich.console import Console
+from printing import console
+from processes import COMPACT, count_of, pointsplat_compact, pointsplat_prune
+from results import Results
 from scaling import print_score_times, scaling_rows, scaling_table, slope_table, slopes
 from splat_transform import peers_of
 
@@ -74,11 +73,6 @@ def sweep_rows(scene: Scene, keeps: tuple[float, ...], lpips: Lpips | None) -> I
                 yield _row(scene, keep, f"{method} {weight}", small, usage, lpips)
 
 
-def count_of(keep: float, gaussians: int) -> int:
-    """The number that a share means; every program is given the number."""
-    return max(1, round(keep * gaussians))
-
-
 def _pruned(dense: Gaussians, count: int, method: str, weight: float | None = None) -> tuple[Gaussians, Usage]:
     start, cpu_start = time.perf_counter(), time.process_time()
     small = prune(dense, count, method, opacity_weight=weight)
@@ -90,44 +84,15 @@ def _row(scene: Scene, keep: float, method: str, small: Gaussians, usage: Usage,
     return about | vars(usage) | compare(scene, small, lpips)
 
 
-class Results:
-    """The rows of all scenes, in a file that is written anew after each.
+def rows_that_stand(results: Results, name: str, path: Path) -> list[Row]:
+    """The rows of a scene that are there, if it still has as many Gaussians."""
+    rows = results.of(name)
+    return rows if rows and len(read_scene(path)) == rows[0]["gaussians"] else []
 
-    Args:
-        path: the JSON file; None for none.
-        settings: what rows depend on beside the scene.
-        resume: take up the rows that the file has.
 
-    Raises:
-        SystemExit: if the file to take up cannot be read or was written with other settings.
-    """
-
-    def __init__(self, path: Path | None, settings: dict[str, Any], resume: bool):
-        self.path, self.settings = path, json.loads(json.dumps(settings))
-        self.rows: list[Row] = []
-        if resume and path is None:
-            raise SystemExit("--resume without --json; expected the file to take up")
-        if resume and path is not None and path.exists():
-            try:
-                content = json.loads(path.read_text("utf-8"))
-                self.rows, known = content["rows"], content["settings"]
-            except (OSError, ValueError, KeyError, TypeError) as error:
-                raise SystemExit(f"{path}: cannot be taken up ({error!r}); give another --json") from error
-            other = [name for name in self.settings if self.settings[name] != known.get(name)]
-            if other:
-                found = ", ".join(f"{name} {known.get(name)}, now {self.settings[name]}" for name in other)
-                raise SystemExit(f"{path}: was written with {found}; expected the same, or another --json")
-
-    def of(self, name: str, path: Path) -> list[Row]:
-        """The rows of a scene that are there, if it still has as many Gaussians."""
-        rows = [row for row in self.rows if row["scene"] == name]
-        return rows if rows and len(read_scene(path)) == rows[0]["gaussians"] else []
-
-    def add(self, name: str, rows: list[Row]) -> None:
-        """Put the rows of a scene in the place of those there are, and write."""
-        self.rows = [row for row in self.rows if row["scene"] != name] + rows
-        content = {"rows": self.rows, "averages": averages(self.rows), "leads": leads(self.rows)}
-        write_whole(self.path, {"settings": self.settings} | content)
+def summaries(rows: list[Row]) -> dict[str, list[Row]]:
+    """What the file tells beside the rows."""
+    return {"averages": averages(rows), "leads": leads(rows)}
 
 
 def measure_scaling(counts: tuple[int, ...], sh_degree: int, programs: list[Reducer], path: Path | None) -> None:
@@ -139,11 +104,6 @@ def measure_scaling(counts: tuple[int, ...], sh_degree: int, programs: list[Redu
         print(f"{row['gaussians']:,} {row['method']}: {took}", flush=True)
         write_whole(path, {"rows": rows, "slopes": slopes(rows)})
     console().print(scaling_table(rows), slope_table(slopes(rows)))
-
-
-def console() -> Console:
-    """Wide enough for the tables where standard output is a file."""
-    return Console(width=None if sys.stdout.isatty() else 240)
 
 
 @torch.no_grad()
@@ -209,10 +169,10 @@ def main(
     ways = ["sweep"] if sweep else [*inside, *(program.label for program in programs)]
     settings = {"keep": keep, "methods": ways, "views": views, "in_process": in_process, "lpips": network is not None}
     settings |= {"sh": sh} if sh < MAX_SH_DEGREE else {}
-    results = Results(json_path, settings, resume)
+    results = Results(json_path, settings, resume, summaries)
     shown: list[Row] = []
     for name, path in zip(names, scenes, strict=True):
-        rows = results.of(name, path)
+        rows = rows_that_stand(results, name, path)
         if rows:
             print(f"{name}: as {json_path} has it")
         else:
@@ -224,7 +184,7 @@ def main(
             else:
                 found, total = rows_of(scene, keep, inside, programs, network), len(ways)
             rows = list(tracked(found, name, len(keep) * total))
-            results.add(name, rows)
+            results.put(name, rows)
         console().print(table(rows))
         shown += rows
     if len(scenes) > 1:

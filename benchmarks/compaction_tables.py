@@ -60,15 +60,26 @@ def averages(rows: list[Row]) -> list[Row]:
     return result
 
 
-def leads(rows: list[Row], method: str = MERGE) -> list[Row]:
-    """How far a method is ahead, in dB, of the best mode of splat-transform at each scene and budget; the best is
-    chosen anew for each reference. Scenes and budgets without both have no row."""
+def leads(
+    rows: list[Row], method: str = MERGE, columns: tuple[str, ...] = PAIRS, rivals: tuple[str, ...] | None = None
+) -> list[Row]:
+    """How far a method is ahead, in dB, of the best of others at each scene and budget.
+
+    Args:
+        rows: one for each scene, budget and method.
+        method: whose lead it is.
+        columns: what they are compared by; the best of the others is chosen anew for each.
+        rivals: the others; by default all modes of splat-transform.
+
+    Returns:
+        A row for each scene and budget that has both.
+    """
     result = []
     for (scene, keep), same in grouped(rows, lambda row: (row["scene"], row["keep"])).items():
         ours = [row for row in same if row["method"] == method]
-        peers = [row for row in same if row["method"].startswith(NAME)]
+        peers = [row for row in same if (row["method"].startswith(NAME) if rivals is None else row["method"] in rivals)]
         lead: Row = {"scene": scene, "keep": keep}
-        for column in PAIRS:
+        for column in columns:
             known = [row for row in peers if row[column] is not None]
             if ours and ours[0][column] is not None and known:
                 best = max(known, key=lambda row: row[column])
@@ -78,32 +89,52 @@ def leads(rows: list[Row], method: str = MERGE) -> list[Row]:
     return result
 
 
-def summary(found: list[Row], column: str) -> Iterator[tuple[str, dict[float, float], dict[float, str]]]:
+def summary(
+    found: list[Row], column: str, together: bool = False
+) -> Iterator[tuple[str, dict[float, float], dict[float, str]]]:
     """Lines of the table of leads: name, dB by budget, and what stands beside them.
 
-    Each group of scenes is followed by its mean and by its least lead, with the scene that has it.
+    Each group of scenes is followed by its mean and by its least lead, with the scene that has it; if ``together``, the
+    last lines tell these of all scenes of several groups.
     """
-    for group, members in grouped(found, lambda lead: group_of(lead["scene"])).items():
+    groups = grouped(found, lambda lead: group_of(lead["scene"]))
+    for group, members in groups.items():
         known = [lead for lead in members if column in lead]
         for scene, same in grouped(known, lambda lead: lead["scene"]).items():
             beside = {lead["keep"]: lead[f"{column}_peer"].removeprefix(NAME).strip() for lead in same}
             yield scene, {lead["keep"]: lead[column] for lead in same}, beside
-        budgets = grouped(known, lambda lead: lead["keep"])
-        mean = {keep: fmean(lead[column] for lead in same) for keep, same in budgets.items()}
-        worst = {keep: min(same, key=lambda lead: lead[column]) for keep, same in budgets.items()}
-        if known:
-            yield f"{group} mean".strip(), mean, {}
-            least = {keep: lead[column] for keep, lead in worst.items()}
-            yield f"{group} worst".strip(), least, {keep: lead["scene"] for keep, lead in worst.items()}
+        yield from _mean_and_worst(known, column, group)
+    if together and len(groups) > 1:
+        yield from _mean_and_worst([lead for lead in found if column in lead], column, "all")
+
+
+def _mean_and_worst(
+    known: list[Row], column: str, name: str
+) -> Iterator[tuple[str, dict[float, float], dict[float, str]]]:
+    """The last two lines of a group of scenes, in :func:`summary`; none if there is no lead."""
+    budgets = grouped(known, lambda lead: lead["keep"])
+    worst = {keep: min(same, key=lambda lead: lead[column]) for keep, same in budgets.items()}
+    if known:
+        yield f"{name} mean".strip(), {k: fmean(lead[column] for lead in same) for k, same in budgets.items()}, {}
+        least = {keep: lead[column] for keep, lead in worst.items()}
+        yield f"{name} worst".strip(), least, {keep: lead["scene"] for keep, lead in worst.items()}
+
+
+AGAINST = {"dense_psnr": "the dense scene's renders", "photo_psnr": "held-out photos"}
+"""What the PSNR of a column is against."""
 
 
 def lead_table(found: list[Row], column: str, method: str = MERGE) -> Table | None:
-    """The leads of a method as a table, None if there are none."""
-    lines = list(summary(found, column))
+    """The leads of a method over splat-transform as a table, None if there are none."""
+    title = f"{method} minus the best mode of {NAME}, PSNR in dB against {AGAINST[column]}"
+    return table_of_leads(list(summary(found, column)), title)
+
+
+def table_of_leads(lines: list[tuple[str, dict[float, float], dict[float, str]]], title: str) -> Table | None:
+    """Lines of :func:`summary` as a table, None if there are none."""
     if not lines:
         return None
-    against = {"dense_psnr": "the dense scene's renders", "photo_psnr": "held-out photos"}[column]
-    shown = Table(title=f"{method} minus the best mode of {NAME}, PSNR in dB against {against}")
+    shown = Table(title=title)
     keeps = sorted({keep for _, values, _ in lines for keep in values}, reverse=True)
     shown.add_column("scene")
     for keep in keeps:
@@ -114,20 +145,21 @@ def lead_table(found: list[Row], column: str, method: str = MERGE) -> Table | No
     return shown
 
 
-def _number(digits: int, scale: float = 1.0, sign: str = "") -> Callable[[float], str]:
+def number(digits: int, scale: float = 1.0, sign: str = "") -> Callable[[float], str]:
+    """How a column writes its numbers: digits after the point, a factor first, and "+" for a sign always."""
     return lambda value: f"{scale * value:{sign},.{digits}f}"
 
 
 SHOWN: dict[str, tuple[str, Callable[[Any], str]]] = {
-    "count": ("splats", _number(0)),
-    "seconds": ("s", _number(1)),
-    "cpu_seconds": ("CPU s", _number(1)),
-    "peak_bytes": ("MB", _number(0, 1e-6)),
-    **{f"dense_{name}": (name.upper(), _number(2 if name == "psnr" else 3)) for name in COLUMNS},
-    **{name: (name.split("_")[1], _number(2)) for name in HALVES},
-    BRIGHTNESS: ("light", _number(1, sign="+")),
-    **{f"photo_{name}": (f"photo {name.upper()}", _number(2 if name == "psnr" else 3)) for name in COLUMNS},
-    "worst": ("worst", _number(2)),
+    "count": ("splats", number(0)),
+    "seconds": ("s", number(1)),
+    "cpu_seconds": ("CPU s", number(1)),
+    "peak_bytes": ("MB", number(0, 1e-6)),
+    **{f"dense_{name}": (name.upper(), number(2 if name == "psnr" else 3)) for name in COLUMNS},
+    **{name: (name.split("_")[1], number(2)) for name in HALVES},
+    BRIGHTNESS: ("light", number(1, sign="+")),
+    **{f"photo_{name}": (f"photo {name.upper()}", number(2 if name == "psnr" else 3)) for name in COLUMNS},
+    "worst": ("worst", number(2)),
     "worst_scene": ("of", str),
 }
 """Columns by what a row calls them: their heads, and how a value is written."""

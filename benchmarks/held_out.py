@@ -96,12 +96,18 @@ def compare(scene: Scene, small: Gaussians, lpips: Lpips | None) -> dict[str, fl
         values.setdefault(BRIGHTNESS, []).append(255 * float((image.double() - dense_render.double()).mean()))
         targets = {"dense": dense_render} | ({"photo": scene.photos[i]} if scene.photos else {})
         for against, target in targets.items():
-            values.setdefault(f"{against}_psnr", []).append(finite_psnr(image, target))
-            values.setdefault(f"{against}_ssim", []).append(float(ssim(image, target)))
-            if lpips is not None:
-                values.setdefault(f"{against}_lpips", []).append(float(lpips(image, target)))
+            for name, value in metrics_of(image, target, lpips).items():
+                values.setdefault(f"{against}_{name}", []).append(value)
     names = [f"{against}_{column}" for against in REFERENCES for column in COLUMNS]
     return {name: fmean(values[name]) if name in values else None for name in (*names, *HALVES, BRIGHTNESS)}
+
+
+@torch.no_grad()
+def metrics_of(image: Tensor, target: Tensor, lpips: Lpips | None) -> dict[str, float]:
+    """The metrics of one picture (H, W, 3) against another, by the names of :data:`COLUMNS`; without LPIPS where there
+    is no network."""
+    found = {"psnr": finite_psnr(image, target), "ssim": float(ssim(image, target))}
+    return found if lpips is None else found | {"lpips": float(lpips(image, target))}
 
 
 @torch.no_grad()

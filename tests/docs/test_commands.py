@@ -162,7 +162,7 @@ def test_options_named_in_text_exist(monkeypatch, capsys):
         ("ns-train", "splatfacto-cpu", "scannetpp-seeded"),
         ("ns-render", "interpolate"),
     ]
-    programs += [("python", "benchmarks/compaction.py"), ("python", "benchmarks/rasterizer.py")]
+    programs += [("python", f"benchmarks/{name}.py") for name in ("compaction", "judge", "rasterizer")]
     helps = "\n".join(help_of(words, monkeypatch, capsys) for words in programs)
     known = set(re.findall(r"--[a-z][\w.-]*", helps)) | OF_OTHERS | {"--help"}
     unknown = {
