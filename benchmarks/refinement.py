@@ -130,7 +130,7 @@ def _train_one(output: Path, name: str, command: str, steps: int, threads: int |
     Raises:
         PointSplatError: if it fails, or was done by another command.
     """
-    from pointsplat_ns.nerfstudio_plugin.running import finished, run
+    from pointsplat_ns.nerfstudio_plugin.running import finished, remove_interrupted, run
 
     logs = output / "logs"
     note = logs / f"{name}.command"
@@ -139,6 +139,7 @@ def _train_one(output: Path, name: str, command: str, steps: int, threads: int |
     if finished(output / name / "pointsplat" / TIMESTAMP, steps):
         print(f"{name}: trained already")
         return
+    remove_interrupted(output / name / "pointsplat" / TIMESTAMP)
     logs.mkdir(parents=True, exist_ok=True)
     note.write_text(command, "utf-8")
     run(command, logs / f"{name}.txt", threads)

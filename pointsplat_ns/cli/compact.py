@@ -87,7 +87,7 @@ def compact(
         shard: of a folder: only a part of its scenes; 2/5 is the second of five. Under torchrun each process takes its
             part.
         threads: how many to use, in each process. By default the number is chosen while the work goes on, and is lower
-            while other programs keep the machine busy. It does not change the result.
+            while other programs keep the machine busy. Another number may change results by rounding.
         json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps

@@ -13,6 +13,14 @@ UNSEEN = "room2"
 TIMESTAMP = "demo"
 """Folder name of the runs, the same in each call, so that finished ones are found again."""
 
+ROOMS = ("room0", "room1", UNSEEN)
+
+FOLDERS = ("rooms", "scenes", "refiner", "pictures")
+"""What the demo makes in its folder, besides files."""
+
+INSTEAD = "start over with --force, or name another --output"
+"""Advice where a training of another number of steps has finished."""
+
 TRAINING_MINUTES = 15
 """Duration of training on two cores, see `docs/benchmarks.md`."""
 
@@ -25,12 +33,13 @@ def demo(
     frames: int = 60,
     width: int = 256,
     height: int = 192,
-    fresh: bool = False,
+    force: bool = False,
 ) -> None:
     """Compact the scene that ships and draw it before and after, which takes a minute. Then continue with training,
     which may be stopped: train small scenes, prune them, train the refiner, evaluate it on an unseen room, and export.
 
-    The commands that it runs are printed. After an interruption, a second call continues with what is not finished.
+    The commands that it runs are printed. After an interruption, a second call continues with what is not finished. It
+    never removes a training that has finished, except with --force.
 
     Args:
         output: folder for all results.
@@ -40,12 +49,17 @@ def demo(
         frames: photos of each room.
         width: of a photo, pixels.
         height: of a photo, pixels.
-        fresh: start over.
+        force: start over: first remove rooms, trainings and pictures of an earlier demo in the folder.
     """
+    from pointsplat_ns.nerfstudio_plugin.running import finished
     from pointsplat_ns.system.packages import need
 
-    if fresh and output.exists():
-        shutil.rmtree(output)
+    for folder in FOLDERS if force else ():
+        if (output / folder).exists():
+            shutil.rmtree(output / folder)
+    scenes, refiner = training_folders(output)
+    for training, steps in [*((scene, scene_steps) for scene in scenes.values()), (refiner, refiner_steps)]:
+        finished(training, steps, INSTEAD)  # another number of steps is refused before anything is made
     compact_example(output, keep)
     need("nerfstudio", "the rest of the demo, which trains,")
     print(
@@ -55,6 +69,15 @@ def demo(
         flush=True,
     )
     train_and_judge(output, keep, scene_steps, refiner_steps, (frames, width, height))
+
+
+def training_folders(output: Path) -> tuple[dict[str, Path], Path]:
+    """Folders of the trained scenes by the names of their rooms, and that of the trained refiner."""
+    from pointsplat_ns.io.runs import REFINER_METHOD
+    from pointsplat_ns.nerfstudio_plugin.commands import SCENE_METHOD, run_folder
+
+    scenes = {name: run_folder(output / "scenes", name, SCENE_METHOD, TIMESTAMP) for name in ROOMS}
+    return scenes, run_folder(output / "refiner", "rooms", REFINER_METHOD, TIMESTAMP)
 
 
 def compact_example(output: Path, keep: float) -> None:
@@ -89,37 +112,31 @@ def train_and_judge(
         refiner_steps: training steps of the refiner.
         photos: number of photos of each room, their width and height in pixels.
     """
-    from pointsplat_ns.io.runs import REFINER_METHOD
-    from pointsplat_ns.nerfstudio_plugin.commands import (
-        SCENE_METHOD,
-        evaluate_command,
-        run_folder,
-        train_refiner_command,
-        train_scene_command,
-    )
+    from pointsplat_ns.nerfstudio_plugin.commands import evaluate_command, train_refiner_command, train_scene_command
     from pointsplat_ns.nerfstudio_plugin.pointsplat.report import show_report
     from pointsplat_ns.nerfstudio_plugin.pointsplat.results import read_evaluation
-    from pointsplat_ns.nerfstudio_plugin.running import finished, run
+    from pointsplat_ns.nerfstudio_plugin.running import finished, remove_interrupted, run
     from pointsplat_ns.rooms import write_room
 
     start = time.perf_counter()
     rooms, scenes, refiners = output / "rooms", output / "scenes", output / "refiner"
-    names = ["room0", "room1", UNSEEN]
-    for name in names:
+    scene_runs, trained = training_folders(output)
+    for name in ROOMS:
         if not (rooms / name).is_dir():
             print(write_room(rooms / name, int(name[4:]), *photos))
-    for name in names:
-        if not finished(run_folder(scenes, name, SCENE_METHOD, TIMESTAMP), scene_steps):
+    for name, scene_run in scene_runs.items():
+        if not finished(scene_run, scene_steps, INSTEAD):
+            remove_interrupted(scene_run)
             run(train_scene_command(rooms / name, scenes, name, scene_steps, TIMESTAMP, seed_points=20_000))
-    trained = run_folder(refiners, "rooms", REFINER_METHOD, TIMESTAMP)
-    if not finished(trained, refiner_steps):
+    if not finished(trained, refiner_steps, INSTEAD):
+        remove_interrupted(trained)
         options = {"pipeline.model.keep": keep, "pipeline.model.size": "tiny"}
         run(train_refiner_command(scenes, refiners, "rooms", refiner_steps, TIMESTAMP, (UNSEEN,), options))
     evaluation, pictures = output / "evaluation.json", output / "pictures"
     run(evaluate_command(trained, evaluation, pictures))
     refined, small = output / f"{UNSEEN}_refined.ply", output / f"{UNSEEN}_compact.ply"
     run(shlex.join(["pointsplat", "export", str(trained), "-o", str(refined), "--force"]))
-    dense, views = run_folder(scenes, UNSEEN, SCENE_METHOD, TIMESTAMP), output / "compact.png"
+    dense, views = scene_runs[UNSEEN], output / "compact.png"
     words = ["pointsplat", "compact", str(dense), "--keep", f"{keep:g}", "-o", str(small), "--picture", str(views)]
     run(shlex.join([*words, "--force"]))
 

@@ -38,7 +38,7 @@ def lod(
         sh: SH bands of every level: all, up to a degree, or auto, those without which renders stay within 40 dB.
         force: overwrite existing files.
         threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
-            programs keep the machine busy. It does not change the result.
+            programs keep the machine busy. Another number may change results by rounding.
         json_output: print the manifest, and nothing else on standard output.
     """
     import pointsplat_ns as ps

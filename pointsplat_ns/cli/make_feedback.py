@@ -35,7 +35,7 @@ def make_feedback(
         seed: seed of the initial weights and of all choices.
         start: go on from this network, with a third of the learning rate, instead of from one that does nothing yet.
         threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
-            programs keep the machine busy. Another number sums in another order.
+            programs keep the machine busy. Another number may change results by rounding.
     """
     import functools
     import math

@@ -56,7 +56,7 @@ def prune(
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
         threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
-            programs keep the machine busy. It does not change the result.
+            programs keep the machine busy. Another number may change results by rounding.
         json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps

@@ -53,7 +53,8 @@ def tradeoff(
         target_mb: and of at most so many megabytes.
         force: start over, and overwrite results in the folder.
         threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
-            programs keep the machine busy. Frames are timed on all.
+            programs keep the machine busy. Another number may change results by rounding. Frames are timed
+            on all.
         json_output: print what is in tradeoff.json, and nothing else on standard output.
     """
     import pointsplat_ns as ps

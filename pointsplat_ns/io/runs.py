@@ -47,6 +47,8 @@ class Run:
     checkpoint: Path
     """The newest complete checkpoint, or the one that was asked for."""
     step: int
+    planned_steps: int | None
+    """Steps that the training was to take in all, as configured; None if ``config.yml`` gives no number."""
     method_name: str
     experiment_name: str
     """As configured; empty or "unnamed" where the user gave none."""
@@ -71,6 +73,13 @@ class Run:
         if self.method_name == REFINER_METHOD:  # a refiner for many scenes
             return False
         return self.method_name.startswith("splatfacto") or self.model_fields.keys() >= _SPLATFACTO_FIELDS
+
+    @property
+    def steps_if_finished(self) -> int | None:
+        """Steps of a training that has finished; None if it was interrupted. If it is not known how many steps it was
+        to take, it counts as finished."""
+        done = self.step + 1
+        return None if self.planned_steps is not None and done < self.planned_steps else done
 
     @property
     def rasterize_mode(self) -> Literal["classic", "antialiased"]:
@@ -120,11 +129,13 @@ def open_run(path: Path | str, need_data: bool = True) -> Run:
             raise SceneError(f"{config_path}: names no data folder; expected the photos that the run was trained on")
         data = Path()
     transform, scale = _transforms(folder / TRANSFORMS_NAME)
+    planned = root.fields.get("max_num_iterations")
     return Run(
         folder=folder,
         config_path=config_path,
         checkpoint=checkpoint,
         step=step,
+        planned_steps=planned if isinstance(planned, int) else None,
         method_name=str(root.fields.get("method_name") or ""),
         experiment_name=str(root.fields.get("experiment_name") or ""),
         timestamp=str(root.fields.get("timestamp") or ""),

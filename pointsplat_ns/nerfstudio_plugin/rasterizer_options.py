@@ -10,7 +10,8 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.backends import use_gsplat
-from pointsplat_ns.rasterizer.compiled.blending import KERNELS
+from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
+from pointsplat_ns.system.kernels import Kernels
 
 VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """Evaluation background of scenes trained with random backgrounds: the viewer's colour, as in Splatfacto."""
@@ -28,16 +29,31 @@ class RasterizerOptions:
     quality: Literal["exact", "balanced", "fast"] = "exact"
     """Accuracy that training gives up for speed (measured in docs/rasterizer.md). Evaluation is always exact."""
 
+    def kernels(self) -> dict[str, Kernels]:
+        """All compiled kernels that a training uses on a CPU, by what they do."""
+        return {
+            "projection": projection.KERNELS,
+            "colours": colors.KERNELS,
+            "lists of tiles": tiles.KERNELS,
+            "blending": blending.KERNELS,
+        }
+
     def engine(self, device: torch.device) -> str:
         """What draws, in a line for the log."""
         if self.backend != "torch" and use_gsplat(self.backend, device):
             return "rasterizer: gsplat"
         if device.type != "cpu":
             return "rasterizer: torch"
-        why = "as --pipeline.model.compiled is False" if self.compiled is False else KERNELS.why_missing
-        return (
-            f"rasterizer: torch, several times slower than compiled kernels: {why}" if why else "rasterizer: compiled"
-        )
+        if self.compiled is False:
+            missing = dict.fromkeys(self.kernels(), "as --pipeline.model.compiled is False")
+        else:
+            missing = {what: why for what, kernels in self.kernels().items() if (why := kernels.why_missing)}
+        if not missing:
+            return "rasterizer: compiled"
+        why = "; ".join(dict.fromkeys(missing.values()))
+        if len(missing) == len(self.kernels()):
+            return f"rasterizer: torch, several times slower than compiled kernels: {why}"
+        return f"rasterizer: compiled, but torch does {', '.join(missing)}, which is slower: {why}"
 
     def rasterize(self, training: bool, **arguments) -> tuple[Tensor, Tensor, dict]:
         """:func:`~pointsplat_ns.rasterizer.rasterization` with these options; exact outside of training."""

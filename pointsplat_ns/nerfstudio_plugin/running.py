@@ -31,15 +31,41 @@ class StoppedError(Exception):
     """Work in a thread that was stopped because the whole program is."""
 
 
-def finished(run: Path, steps: int) -> bool:
-    """Whether the training in a run's folder reached its last step. The folder of an interrupted one is removed."""
-    try:
-        if open_run(run, need_data=False).step == steps - 1:
-            return True
-    except SceneError:
-        pass
+def finished(run: Path, steps: int, instead: str = "name another --output") -> bool:
+    """Whether the training in a run's folder has finished. Nothing is changed.
+
+    Args:
+        run: the folder, which need not exist.
+        steps: number of training steps that are wanted.
+        instead: advice to the user if a training of another number of steps has finished there.
+
+    Raises:
+        SceneError: if a training of another number of steps has finished there.
+    """
+    done = _steps_if_finished(run)
+    if done is not None and done != steps:
+        wanted = f"expected one of {steps} or none"
+        raise SceneError(f"{run}: holds a finished training of {done} steps; {wanted}; {instead}")
+    return done is not None
+
+
+def remove_interrupted(run: Path) -> None:
+    """Remove the folder of an interrupted training, if there is one: the next training would leave its old checkpoints
+    beside the new ones.
+
+    Raises:
+        SceneError: if the training there has finished.
+    """
+    if _steps_if_finished(run) is not None:
+        raise SceneError(f"{run}: holds a finished training; expected an interrupted one or none; remove it yourself")
     shutil.rmtree(run, ignore_errors=True)
-    return False
+
+
+def _steps_if_finished(run: Path) -> int | None:
+    try:
+        return open_run(run, need_data=False).steps_if_finished
+    except SceneError:  # no folder, or no checkpoint yet
+        return None
 
 
 def run(command: str, log: Path | None = None, threads: int | None = None, stop: threading.Event | None = None) -> None:

@@ -40,7 +40,8 @@ class StoppableTrainerConfig(TrainerConfig):
 
     threads: int | None = None
     """Number of threads of a training on a CPU. By default it is chosen while the training goes on, and is lower while
-    other programs keep the machine busy; the environment variable OMP_NUM_THREADS has the same effect as this."""
+    other programs keep the machine busy; the environment variable OMP_NUM_THREADS has the same effect as this.
+    Another number may change results by rounding."""
 
     def save_config(self) -> None:
         """As nerfstudio's, but whole or not at all."""

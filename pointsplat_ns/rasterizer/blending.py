@@ -15,6 +15,7 @@ from types import ModuleType
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.rasterizer import blocks
 from pointsplat_ns.rasterizer.compiled import blending as compiled_blending
@@ -59,6 +60,7 @@ class Blend(torch.autograd.Function):
         return image, final
 
     @staticmethod
+    @once_differentiable
     @full_precision
     def backward(ctx, grad_image, grad_final):
         means2d, cov2d, det, opacities, colors, final = ctx.saved_tensors

@@ -91,9 +91,10 @@ def count_meaningless(
 
 
 def project_scene(scene: Gaussians, view: View) -> Projected:
-    """What a view shows of a scene, as :func:`~pointsplat_ns.render` projects it."""
+    """What a view shows of a scene, as :func:`~pointsplat_ns.render` projects it: on the scene's device."""
+    viewmat = view.viewmat.to(scene.device)  # float32 would move a camera that is far from the origin
     return project(
-        scene.means, scene.quats, scene.stds, scene.alphas, view.viewmat, view.K, view.width, view.height,
+        scene.means, scene.quats, scene.stds, scene.alphas, viewmat, view.K.to(scene.means), view.width, view.height,
         near_plane=view.near_plane, far_plane=math.inf, antialiased=view.rasterize_mode == "antialiased",
     )  # fmt: skip
 

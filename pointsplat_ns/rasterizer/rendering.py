@@ -93,9 +93,9 @@ def rasterization(
     colour above 6e30, whose gradients float32 could not hold) is not drawn, gets a zero gradient and is
     counted in ``meta["skipped"]``.
 
-    The same input gives the same bits, forward and backward, on the same machine, on one thread or two. With three or
-    more, some exponentials are rounded in another way, which moves images and gradients by 1e-6 of their size; so may
-    another machine, device or version of torch.
+    The same input gives the same bits, forward and backward, on the same machine and number of threads. One thread and
+    two give the same image, and by compiled kernels the same gradients. Otherwise another number rounds in another way,
+    which moves images and gradients by 1e-6 of their size; so may another machine, device or version of torch.
 
     Args:
         means: centres, world space.

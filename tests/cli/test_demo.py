@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from making import ball
+from making import ball, write_run
 from pointsplat_ns.cli import demo as module
 from pointsplat_ns.cli import main
 from pointsplat_ns.io import read_ply, write_ply
@@ -94,6 +94,41 @@ def test_the_demo_runs_end_to_end_and_does_nothing_twice(
     main(["demo", "--output", str(output), *small])
     assert before == {p: p.stat().st_mtime_ns for p in output.rglob("*.ckpt")}
     assert not any(command.startswith("ns-train") for command in commands)
+
+
+@pytest.fixture()
+def earlier(tmp_path) -> tuple[Path, list[Path]]:
+    """The folder of a demo that has finished, of 900 and 300 steps, and its checkpoints."""
+    scenes, refiner = module.training_folders(tmp_path / "demo")
+    return tmp_path / "demo", [*(write_run(scene, 900, 900) for scene in scenes.values()), write_run(refiner, 300, 300)]
+
+
+@pytest.mark.parametrize("option", ["--scene-steps", "--refiner-steps"])
+def test_the_demo_keeps_finished_trainings_of_another_number_of_steps_and_says_what_to_do(
+    option, earlier, commands, capfd
+):
+    output, checkpoints = earlier
+    with pytest.raises(SystemExit) as end:
+        main(["demo", "--output", str(output), option, "12"])
+    said = capfd.readouterr().err
+    assert end.value.code == 1 and all(checkpoint.is_file() for checkpoint in checkpoints)
+    run, steps = checkpoints[0 if "scene" in option else 3].parents[1], 900 if "scene" in option else 300
+    assert said == (
+        f"error: {run}: holds a finished training of {steps} steps; expected one of 12 or none; "
+        "start over with --force, or name another --output\n"
+    )
+    assert not commands, "it asks before it makes anything"
+
+
+def test_with_force_the_demo_starts_over_and_leaves_files_of_others_alone(
+    earlier, small_example, commands, no_training
+):
+    output, checkpoints = earlier
+    (output / "notes.txt").write_text("of the user")
+    with pytest.raises(SystemExit) as end:
+        main(["demo", "--output", str(output), "--scene-steps", "12", "--force"])
+    assert end.value.code == 130 and not any(checkpoint.exists() for checkpoint in checkpoints)
+    assert (output / "notes.txt").is_file() and (output / "example_compact.ply").is_file()
 
 
 def test_the_demo_says_which_command_failed(tmp_path, capfd, monkeypatch):

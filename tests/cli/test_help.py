@@ -65,6 +65,16 @@ def test_the_list_of_commands_has_one_sentence_for_each_and_the_exit_statuses(ca
         assert f"  {status:<5}{meaning}\n" in text
 
 
+def test_all_say_the_same_of_the_number_of_threads(capsys):
+    sentence = "Another number may change results by rounding."
+    helps = {name: words_of(shown(capsys, name, "--help")) for name in EXAMPLES}
+    with_threads = [name for name, text in helps.items() if "--threads" in text]
+    assert {"prune", "compact", "lod", "tradeoff", "make-feedback"} <= {*with_threads}
+    assert [name for name in with_threads if sentence not in helps[name]] == []
+    for page in ("training.md", "reliability.md"):
+        assert sentence in " ".join((PAGE.parent / page).read_text("utf-8").split())
+
+
 def test_the_documentation_has_the_same_exit_statuses():
     rows = re.findall(r"(?m)^\| (\d+) \| (.+?) \|$", PAGE.read_text("utf-8"))
     assert {int(status): meaning for status, meaning in rows} == STATUSES

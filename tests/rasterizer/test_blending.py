@@ -1,7 +1,11 @@
 """Options of blending that must not change the image, or change it by what they say."""
 
+import importlib
+import pkgutil
+
 import pytest
 import torch
+from torch.autograd.function import once_differentiable
 
 from making import camera_askew
 from pointsplat_ns.errors import PointSplatError
@@ -101,6 +105,28 @@ def test_long_chunks_of_few_tiles_equal_short_ones(n, size, monkeypatch):
     long = draw(scene)
     monkeypatch.setattr(frame, "_LONGEST_CHUNK", CHUNK)
     assert_same(long, draw(scene), 1e-12)  # products and sums in another order
+
+
+@pytest.mark.parametrize("compiled", [False, None])
+def test_a_gradient_of_a_gradient_is_an_error_and_not_zero(compiled):
+    *scene, sh = make_scene(n=20)
+    view, K = camera_askew(torch.float32)
+    colors = sh.detach()[:, 0].requires_grad_()
+    image, _, _ = rasterization(*(t.detach() for t in scene), colors, view[None], K[None], 32, 24, compiled=compiled)
+    (gradient,) = torch.autograd.grad(image.square().sum(), colors, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.square().sum().backward()
+
+
+def test_every_function_of_the_package_with_a_gradient_of_its_own_says_that_this_has_none():
+    for part in ("rasterizer", "refiner", "metrics"):
+        package = importlib.import_module(f"pointsplat_ns.{part}")
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            importlib.import_module(module.name)
+    ours = [kind for kind in torch.autograd.Function.__subclasses__() if kind.__module__.startswith("pointsplat_ns.")]
+    assert {"Blend", "Project", "Color", "CompiledSimilarity"} <= {kind.__name__ for kind in ours}
+    marked = once_differentiable(lambda ctx: None).__code__  # that of the wrapper, one for all
+    assert [kind for kind in ours if kind.backward.__code__ is not marked] == []
 
 
 @pytest.mark.parametrize("compiled", [False, None])

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 import torch.nn.functional as F
 
 import pointsplat_ns as ps
 from making import box_room
-from pointsplat_ns.rasterizer import pixels_of
+from pointsplat_ns.rasterizer import pixels_of, projection
 from pointsplat_ns.rasterizer.pixel_walk import sum_over_pixels
 from pointsplat_ns.rasterizer.projection import project_scene
 
@@ -46,6 +48,23 @@ def test_quality_is_handed_on(room, views):
 def test_options_that_mean_nothing_are_refused(room, views, options, said):
     with pytest.raises(ValueError, match=said):
         ps.render(room, views, **options)
+
+
+def test_a_view_goes_to_the_device_of_the_scene_in_the_precision_that_a_render_takes(room, views, monkeypatch):
+    given = []
+    monkeypatch.setattr(projection, "project", lambda *arguments, **_: given.extend(arguments))
+    view = dataclasses.replace(views[0], viewmat=views[0].viewmat.double(), K=views[0].K.double())
+    project_scene(room.to(device="meta"), view)  # a device that every machine has, for want of CUDA
+    *_, viewmat, K, width, height = given
+    assert (viewmat.device.type, viewmat.dtype) == ("meta", torch.float64), "places cameras far from the origin exactly"
+    assert (K.device.type, K.dtype) == ("meta", torch.float32) and (width, height) == (48, 36)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_a_scene_on_cuda_is_projected_from_a_view_on_the_cpu(room, views):
+    wanted, seen = project_scene(room, views[0]), project_scene(room.to(device="cuda"), views[0])
+    assert torch.equal(seen.ids.cpu(), wanted.ids)
+    torch.testing.assert_close(seen.means2d.cpu(), wanted.means2d, rtol=0, atol=1e-3)  # pixels: rounded in another way
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])

@@ -320,6 +320,18 @@ def run_of(folder: Path, name: str) -> Path:
     return path
 
 
+def write_run(folder: Path, steps: int, planned: int) -> Path:
+    """The folder of a run that took some of the steps that it was to take, with a checkpoint, which it gives."""
+    checkpoint = folder / "nerfstudio_models" / f"step-{steps - 1:09d}.ckpt"
+    checkpoint.parent.mkdir(parents=True)
+    torch.save({}, checkpoint)
+    (folder / "config.yml").write_text(
+        f"!!python/object:a.Trainer\nmax_num_iterations: {planned}\npipeline: !!python/object:a.Pipeline\n"
+        "  datamanager: !!python/object:a.Data {}\n  model: !!python/object:a.Model {}\n"
+    )
+    return checkpoint
+
+
 def without_data(runs: Path, folder: Path) -> Path:
     """A copy of runs, whose data is where nobody finds it: below ``gone_from_here``."""
     shutil.copytree(runs, folder)

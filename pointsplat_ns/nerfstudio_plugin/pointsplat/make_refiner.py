@@ -22,7 +22,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.recipe import (
     scene_settings,
 )
 from pointsplat_ns.nerfstudio_plugin.pointsplat.results import REFINER_NAME, VARIANTS, read_evaluation
-from pointsplat_ns.nerfstudio_plugin.running import StoppedError, finished, run
+from pointsplat_ns.nerfstudio_plugin.running import StoppedError, finished, remove_interrupted, run
 from pointsplat_ns.refiner import read_refiner, save_refiner
 from pointsplat_ns.rooms import write_room
 from pointsplat_ns.system.packages import need
@@ -69,6 +69,7 @@ def make_refiner(
     Raises:
         DataError: if ``rooms`` or ``steps`` is out of range.
         MissingPackageError: if nerfstudio is not installed.
+        SceneError: if a training of another number of steps has finished in the folder.
         PointSplatError: if a command fails.
 
     Example:
@@ -91,6 +92,7 @@ def make_refiner(
     trained = run_folder(output / "refiners", name, REFINER_METHOD, TIMESTAMP)
     evaluation, pictures = output / f"{name}.json", output / "pictures" / name
     if not finished(trained, steps):
+        remove_interrupted(trained)
         evaluation.unlink(missing_ok=True)
         run(refiner_command(output / "scenes", output / "refiners", name, TIMESTAMP, size, steps, seed))
     if not evaluation.is_file():
@@ -132,6 +134,7 @@ def _make_scenes(output: Path, seeds: tuple[int, ...], workers: int) -> None:
         trained = run_folder(output / "scenes", settings.name, SCENE_METHOD, TIMESTAMP)
         if finished(trained, settings.steps):
             return
+        remove_interrupted(trained)
         data = output / "rooms" / settings.name
         if not data.is_dir():
             size = (settings.width, settings.height)

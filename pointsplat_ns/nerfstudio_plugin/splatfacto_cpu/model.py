@@ -34,12 +34,14 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.geometry.neighbours import nearest
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
+from pointsplat_ns.metrics import structural_similarity
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.nerfstudio_plugin.cameras import need_pinhole
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
 from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND, RasterizerOptions
 from pointsplat_ns.rasterizer.rendering import Colors
+from pointsplat_ns.system.kernels import Kernels
 from pointsplat_ns.system.threads import one_thread
 
 LONE_POINT_SCALE = 0.01
@@ -71,6 +73,10 @@ class SplatfactoCpuModelConfig(RasterizerOptions, SplatfactoModelConfig):
     """Splatfacto's config and the options of the rasterizer"""
 
     _target: type = field(default_factory=lambda: SplatfactoCpuModel)
+
+    def kernels(self) -> dict[str, Kernels]:
+        """Those of the rasterizer and of the loss."""
+        return {**super().kernels(), "SSIM": structural_similarity.KERNELS}
 
 
 class SplatfactoCpuModel(SplatfactoModel):
