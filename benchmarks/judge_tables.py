@@ -22,13 +22,8 @@ HEADS = {"covered_psnr": ("covered PSNR", number(2))} | {
 }
 """Columns by what a row calls them: their heads, and how a value is written."""
 
-AHEAD = {
-    "covered_psnr": "over the pixels that the dense scene covers",
-    "dense_psnr": "over all pixels",
-    "photo_psnr": "against held-out photos",
-}
-"""What leads are taken of, and its name. The first does not see a halo about an object, the second does. An empty
-background adds as much to the PSNR of both sides over all pixels, so that it does not move their difference."""
+AHEAD = {"covered_psnr": "against the dense scene's renders", "photo_psnr": "against held-out photos"}
+"""What leads are taken of, and its name."""
 
 BEHIND = {"prune": None, "compact": ("prune",)}
 """Whose leads are told, and over whom; None: over all modes of splat-transform."""
