@@ -119,7 +119,7 @@ def open_run(path: Path | str, need_data: bool = True) -> Run:
         if need_data:
             raise SceneError(f"{config_path}: names no data folder; expected the photos that the run was trained on")
         data = Path()
-    transform, scale = _transforms(folder / TRANSFORMS_NAME)
+    transform, scale = read_transforms(folder / TRANSFORMS_NAME)
     return Run(
         folder=folder,
         config_path=config_path,
@@ -216,8 +216,12 @@ def _find_data(data: Path, folder: Path, config_path: Path) -> Path:
     )
 
 
-def _transforms(path: Path) -> tuple[Tensor, float]:
-    """The dataparser's transform (3, 4) and scale; the identity and 1 if the run saved none."""
+def read_transforms(path: Path) -> tuple[Tensor, float]:
+    """The transform (3, 4) and the scale of a ``dataparser_transforms.json``; the identity and 1 if there is none.
+
+    Raises:
+        SceneError: if the file is not one.
+    """
     if not path.is_file():
         return torch.eye(4)[:3], 1.0
     try:
