@@ -33,6 +33,9 @@ RUN_SUFFIXES = (".ckpt", ".yml", ".yaml")
 REFINER_METHOD = "pointsplat"
 """nerfstudio's name of the method that trains refiners."""
 
+_MOST_TRANSFORM_BYTES = 1 << 16
+"""Of a dataparser's transform; nerfstudio writes some hundreds."""
+
 _SPLATFACTO_FIELDS = {"sh_degree", "densify_grad_thresh", "rasterize_mode"}
 """Model settings that only Splatfacto and methods derived from it have."""
 
@@ -225,6 +228,8 @@ def read_transforms(path: Path) -> tuple[Tensor, float]:
     if not path.is_file():
         return torch.eye(4)[:3], 1.0
     try:
+        if path.stat().st_size > _MOST_TRANSFORM_BYTES:
+            raise ValueError(f"{path.stat().st_size} bytes")
         content = json.loads(path.read_text("utf-8"))
         transform = torch.tensor(content["transform"], dtype=torch.float32)
         scale = float(content["scale"])
