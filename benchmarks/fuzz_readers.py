@@ -254,13 +254,13 @@ pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConf
 @reader
 def frame_of_run(folder: Path) -> Read:
     """``dataparser_transforms.json`` of a run."""
-    from pointsplat_ns.io.runs import TRANSFORMS_NAME, _transforms
+    from pointsplat_ns.io.runs import TRANSFORMS_NAME, read_transforms
 
     path = folder / TRANSFORMS_NAME
 
     def read(data: bytes) -> object:
         path.write_bytes(data)
-        return _transforms(path)
+        return read_transforms(path)
 
     return read
 

@@ -1,9 +1,11 @@
-"""Readers of JSON and other texts, apart from those of runs: camera paths, poses, results, what commands go on from."""
+"""Readers of JSON and other texts, apart from those of runs: camera paths, poses, results, what commands go on from.
+COLMAP's binary files of poses are here as well."""
 
 from __future__ import annotations
 
 import io
 import json
+import struct
 from pathlib import Path
 
 from fuzz_registry import Read, reader
@@ -21,6 +23,67 @@ def camera_path(folder: Path) -> Read:
         return read_path(path)
 
     return read
+
+
+@reader
+def camera_json(folder: Path) -> Read:
+    """``cameras.json`` of 3DGS and ``transforms.json`` of nerfstudio, beside transforms into the frame of a scene."""
+    from pointsplat_ns.io.camera_files import read_views
+
+    path = folder / "a.json"
+    rows = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
+    (folder / "dataparser_transforms.json").write_text(json.dumps({"transform": rows, "scale": 0.5}))
+
+    def read(data: bytes) -> object:
+        path.write_bytes(data)
+        return read_views(path)
+
+    return read
+
+
+def _colmap(folder: Path, name: str) -> Read:
+    """Reads a COLMAP model of one image once bytes are in one of its files."""
+    from pointsplat_ns.io.camera_files import read_views
+
+    files = {
+        "cameras.bin": struct.pack("<QIiQQ4d", 1, 1, 1, 8, 6, 8.0, 8.0, 4.0, 3.0),
+        "images.bin": struct.pack("<QI7dI2sQ", 1, 1, 1.0, *6 * (0.0,), 1, b"a\0", 0),
+        "cameras.txt": b"1 PINHOLE 8 6 8 8 4 3\n",
+        "images.txt": b"1 1 0 0 0 0 0 0 1 a\n\n",
+    }
+    for file in files:
+        if file.endswith(name[-4:]):
+            (folder / file).write_bytes(files[file])
+
+    def read(data: bytes) -> object:
+        (folder / name).write_bytes(data)
+        return read_views(folder)
+
+    return read
+
+
+@reader
+def colmap_cameras(folder: Path) -> Read:
+    """``cameras.bin`` of a COLMAP model."""
+    return _colmap(folder, "cameras.bin")
+
+
+@reader
+def colmap_images(folder: Path) -> Read:
+    """``images.bin`` of a COLMAP model."""
+    return _colmap(folder, "images.bin")
+
+
+@reader
+def colmap_cameras_text(folder: Path) -> Read:
+    """``cameras.txt`` of a COLMAP model."""
+    return _colmap(folder, "cameras.txt")
+
+
+@reader
+def colmap_images_text(folder: Path) -> Read:
+    """``images.txt`` of a COLMAP model."""
+    return _colmap(folder, "images.txt")
 
 
 def _replica(folder: Path, name: str) -> Read:

@@ -15,6 +15,7 @@ from torch import Tensor
 from pointsplat_ns.compression.compact import Compacted, compact_scene, resolve_options
 from pointsplat_ns.compression.level_folder import check_folder
 from pointsplat_ns.compression.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
+from pointsplat_ns.compression.posed_scene import read_posed
 from pointsplat_ns.compression.prune import check_options, prune_scene
 from pointsplat_ns.compression.repair import Effort, RepairBudget
 from pointsplat_ns.compression.trained_refiner import (
@@ -25,6 +26,7 @@ from pointsplat_ns.compression.trained_refiner import (
 )
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.camera_files import is_camera_file
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.runs import REFINER_METHOD, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
@@ -129,7 +131,8 @@ def prune(
         opacity_weight: lambda of "paper", "authors" and "log-volume", in [0, 1]; by default the paper's 0.3.
         clean: first remove what cannot be drawn and what is seen from nowhere; ``keep`` refers to the scene as given.
         fine_tune: steps of optimising what was kept against the given scene's own renders.
-        views: where to look from, if anything has to be rendered: views, or the run whose dataset has the poses. By
+        views: where to look from, if anything has to be rendered: views, the run whose dataset has the poses, or a file
+            of cameras (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model). By
             default those of the run that ``scene`` names, or poses sampled in free space.
         progress: True shows a bar; a function is called with what is being done and the share done of it.
 
@@ -139,7 +142,7 @@ def prune(
     Raises:
         BudgetError: if no such scene can be made.
         SceneError: if no Gaussian can be drawn, or the file is not usable.
-        DataError: if views are needed and cannot be had.
+        DataError: if views are needed and cannot be had, or most of those of a file see nothing of the scene.
         PointSplatError: if there is no such method, or an option does not fit it.
 
     Example:
@@ -252,7 +255,7 @@ def compact(
         if targets is None:
             result = compact_scene(dense, refiner, keep, by, sh, source, report, clean, budget)
         else:
-            given = views if isinstance(views, Views) else None
+            given = views if isinstance(views, Views) else source.given
             subject = subject_of(dense, _run_of(scene, views), given, refiner, target_format)
             result = find_scene(subject, targets, method, repairs_of(effort), report)
     _log((*result.target.splitlines(), *result.verdict.splitlines(), *result.notes))
@@ -347,7 +350,12 @@ def _read(scene: Source, views: Views | str | Path | None) -> tuple[Gaussians, V
     A ``pointsplat`` run is refused: its scene has been pruned already.
     """
     if isinstance(views, (str, Path)) and not Path(views).exists():
-        raise SceneError(f"{views}: no such file or folder; expected views, or a run whose dataset has the poses")
+        raise SceneError(
+            f"{views}: no such file or folder; expected views, a run whose dataset has the poses, or a file of cameras"
+        )
+    if isinstance(views, (str, Path)) and is_camera_file(views):
+        dense, views = read_posed(scene, views)
+        return dense, ViewSource(dense, given=views)
     dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
     if isinstance(views, Views):
         return dense, ViewSource(dense, given=views)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.api import Source, load
 from pointsplat_ns.compression.placing import axis_named
+from pointsplat_ns.compression.posed_scene import need_seen, views_for
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
@@ -17,7 +19,7 @@ from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.system.packages import need
 from pointsplat_ns.system.progress import Progress, tracked
-from pointsplat_ns.viewing.camera_path import Shot, camera_path
+from pointsplat_ns.viewing.camera_path import FPS, LONGEST_SIDE, Shot, camera_path
 from pointsplat_ns.viewing.film import Cast, Split, frames_of
 from pointsplat_ns.viewing.video import check_output, write_frames
 from pointsplat_ns.views import RasterizeMode, Views
@@ -34,6 +36,7 @@ def render_path(
     other: Source | None = None,
     *,
     path: str | Path | Views = "auto",
+    views: Views | str | Path | None = None,
     split: Split = "side-by-side",
     labels: Sequence[str] | None = None,
     up: str | None = None,
@@ -54,13 +57,16 @@ def render_path(
         path: "dataset" goes exactly through the poses of the run's dataset; "walk" past sampled views, smoothly and
             upright; "orbit" about what they show, or round on the spot in a room; "auto" is "dataset" if there is one,
             else "walk". Or a camera path that nerfstudio's viewer saved (JSON), or views to go through.
+        views: what "dataset", "walk" and "orbit" are made of, in place of the dataset's poses: views, or a file of
+            cameras (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model).
         split: two scenes are shown "side-by-side", or with a line that wipes ("wipe") from one to the other.
         labels: what is written on two scenes; by default their names and counts. An empty list writes nothing.
         up: the axis that is up in the scene ("z", "-y"), for walks and orbits; by default it is estimated.
         width: of the picture of one scene, pixels; by default that of the saved path, or of the photos, at most 960.
         height: of the same.
         fps: frames a second; by default 24, or what the saved path says.
-        seconds: how long; by default 10, or as long as it takes to show every pose of a dataset or a saved path.
+        seconds: how long; by default 10, or as long as it takes to show every pose of a dataset or a saved path. Of
+            ``views`` a folder gets one frame each by default.
         force: overwrite what is there.
         progress: True shows a bar with the time left; a function is called with the share done.
 
@@ -69,7 +75,8 @@ def render_path(
 
     Raises:
         SceneError: if a scene is not usable, or the output cannot be written.
-        DataError: if there are no views to make a path of, or the saved path is not usable.
+        DataError: if there are no views to make a path of, the saved path is not usable, or most views of a file see
+            nothing of the scene.
         PointSplatError: if a size, speed or length means nothing.
 
     Example:
@@ -86,10 +93,15 @@ def render_path(
     upward = None if up is None else axis_named(up)
     kind = check_output(output, force)
     sources = [scene] if other is None else [scene, other]
+    given = views_for(scene, views).resized(LONGEST_SIDE) if isinstance(views, (str, Path)) else views
     loaded = [source if isinstance(source, Gaussians) else load(source) for source in sources]
-    views = _source(scene, loaded[0], path if isinstance(path, Views) else None)
-    way = "dataset" if isinstance(path, Views) else path
-    chosen = camera_path(loaded[0], views, way, shot, kind == "picture", upward)
+    if given is not None and isinstance(views, (str, Path)):
+        need_seen(loaded[0], given, views)
+    way: str | Path = path if not isinstance(path, Views) else "dataset"
+    if given is not None and kind == "frames" and seconds is None and way in ("auto", "dataset"):
+        shot = replace(shot, seconds=max(1, len(given)) / (fps or FPS))
+    looked_from = _source(scene, loaded[0], path if isinstance(path, Views) else given)
+    chosen = camera_path(loaded[0], looked_from, way, shot, kind == "picture", upward)
     modes = [_mode(source, chosen.views.rasterize_mode) for source in sources]
     if labels is None:
         labels = [f"{_name(s, i)}, {len(g):,} Gaussians" for i, (s, g) in enumerate(zip(sources, loaded, strict=True))]

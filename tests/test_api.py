@@ -195,7 +195,7 @@ def test_views_may_be_those_of_a_run(scene, trained_walls, caplog):
 
 
 def test_views_of_a_run_that_is_not_there_are_refused(scene, tmp_path):
-    with pytest.raises(ps.SceneError, match="gone: no such file or folder; expected views, or a run"):
+    with pytest.raises(ps.SceneError, match="gone: no such file or folder; expected views, a run"):
         ps.prune(scene, "10%", views=tmp_path / "gone")
 
 

@@ -16,6 +16,7 @@ from making import ball, decoded, run_of
 from pointsplat_ns.cli import main
 from pointsplat_ns.geometry.cameras import viewmats_to_opengl
 from pointsplat_ns.viewing.split_screen import pixels_of
+from posing import inria, written
 
 SMALL = {"width": 64, "height": 48, "fps": 10}
 
@@ -177,3 +178,23 @@ def test_news_of_merging_does_not_begin_pictures_anew(scene, monkeypatch):
         assert not begun
         viewer._changed(True)
         assert begun == [viewer]
+
+
+def test_a_folder_gets_a_frame_for_each_pose_of_a_file(scene, files, tmp_path):
+    views = ps.sample_views(scene, 4, 64, 48)
+    poses = written(inria(views), tmp_path / "cameras.json")
+    main(["render", str(files / "ball.ply"), "--poses", str(poses), "-o", str(tmp_path / "frames")])
+    frames = frames_in(tmp_path / "frames")
+    assert len(frames) == 4
+    for view, frame in zip(views, frames, strict=True):
+        assert np.abs(frame - pixels_of(ps.render(scene, view)).astype(int)).max() <= 1
+    given = ps.render_path(scene, tmp_path / "two", views=views, path="walk", seconds=0.2, **SMALL)
+    assert given == len(frames_in(tmp_path / "two")) == 2
+
+
+def test_poses_of_a_file_that_see_nothing_are_refused(scene, tmp_path):
+    content = inria(ps.sample_views(scene, 4, 64, 48))
+    for camera in content:
+        camera["position"][1] -= 1e4
+    with pytest.raises(ps.DataError, match="0 of 4 cameras see anything of the scene"):
+        ps.render_path(scene, tmp_path / "a.png", views=written(content, tmp_path / "cameras.json"))

@@ -12,9 +12,11 @@ from pointsplat_ns.cli.printing import Json, print_distributions, print_json, pr
 from pointsplat_ns.cli.scene_options import (
     Bands,
     Output,
+    Poses,
     Scene,
     check_output,
     check_outputs,
+    check_poses,
     file_bytes,
     in_format_of,
     output_beside,
@@ -39,6 +41,7 @@ def compact(
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: float | None = None,
+    poses: Poses = None,
     picture: Path | None = None,
     html: Path | None = None,
     html_limit: float = 60.0,
@@ -53,7 +56,7 @@ def compact(
 
     A trained refiner repairs the smaller scene in one pass; then learned steps bring it closer to the dense scene's
     renders. After each, renders are compared with the dense scene's in other views, and what does not help is left
-    out. Views are the poses of the run's dataset if it is found, else sampled in free space.
+    out. Views are those of --poses, else the poses of the run's dataset if it is found, else sampled in free space.
 
     A folder that holds config.yml is a run: one scene. Any other folder is a folder of scenes: all files with Gaussians
     below it, and the newest Splatfacto run of each experiment. What is finished is left alone, so that the same command
@@ -77,6 +80,8 @@ def compact(
             and --sh: count, SH degree and whether to repair are decided by what the scene needs.
         target_ms: and of at most so many milliseconds a frame. Without --target-db, find the best within the limits.
         target_mb: and of at most so many megabytes, in the format of the output.
+        poses: a file of cameras to look from: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
+            COLMAP model; for one scene.
         picture: a .png file for images of some views: dense, before and after the repair, side by side.
         html: an .html file that opens offline in a browser, to fly through the scene before and after, with a wipe
             between them.
@@ -97,7 +102,7 @@ def compact(
     if is_folder_of_scenes(scene):
         with fixed_threads(threads):
             compact_folder(
-                scene, output, picture, html, dry_run, json_output, keep=keep, refiner=refiner, by=by, sh=sh,
+                scene, output, poses, picture, html, dry_run, json_output, keep=keep, refiner=refiner, by=by, sh=sh,
                 clean=clean, effort=effort, seconds=seconds, target_db=target_db, target_ms=target_ms,
                 target_mb=target_mb, jobs=1 if jobs is None else jobs, shard=shard, force=force,
             )  # fmt: skip
@@ -105,12 +110,14 @@ def compact(
     if jobs is not None or shard is not None:
         raise ps.SceneError(f"{scene}: one scene; --jobs and --shard are for a folder of scenes")
     from pointsplat_ns.compression.compact import resolve_options
+    from pointsplat_ns.compression.posed_scene import read_posed
     from pointsplat_ns.compression.repair import RepairBudget
     from pointsplat_ns.io import read_scene
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.pages.scene_page import check_limit
     from pointsplat_ns.tradeoff.targets import targets_of
 
+    check_poses(poses)
     output = output or output_beside(scene, "compact")
     check_outputs(None if dry_run else output, picture, force)
     check_output(html, ".html", force)
@@ -121,11 +128,11 @@ def compact(
     RepairBudget(effort, seconds)
     targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
     with fixed_threads(threads):
-        dense = read_scene(scene)
+        dense, views = (read_scene(scene), scene) if poses is None else read_posed(scene, poses)
         result = ps.compact(
             dense, keep, trained, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds, target_db=target_db,
             target_ms=target_ms, target_mb=target_mb, target_format=format_to_write(output).budget_suffix,
-            views=scene, progress=True,
+            views=views, progress=True,
         )  # fmt: skip
     if not dry_run:
         ps.save(result.scene, output, progress=True)

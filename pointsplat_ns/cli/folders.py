@@ -31,6 +31,7 @@ def need_one_scene(path: Path) -> None:
 def compact_folder(
     folder: Path,
     output: Path | None,
+    poses: Path | None,
     picture: Path | None,
     html: Path | None,
     dry_run: bool,
@@ -42,7 +43,7 @@ def compact_folder(
     Args:
         folder: the folder.
         output: the folder for results.
-        picture, html, dry_run: what is refused here.
+        poses, picture, html, dry_run: what is refused here.
         json_output: print JSON in place of a table.
         options: further ones of :func:`pointsplat_ns.compact_folder`.
 
@@ -54,8 +55,9 @@ def compact_folder(
     from pointsplat_ns.compression.scene_folder import TABLE_NAME, output_folder
     from pointsplat_ns.system.processes import torchrun_rank
 
-    for name, given in (("--picture", picture is not None), ("--html", html is not None), ("--dry-run", dry_run)):
-        if given:
+    refused = {"--poses": poses, "--picture": picture, "--html": html, "--dry-run": dry_run or None}
+    for name, given in refused.items():
+        if given is not None:
             raise ps.SceneError(f"{name} is for one scene; {folder} is a folder of scenes")
     target = output or output_folder(folder, "compact")
     results = ps.compact_folder(folder, target, progress=True, **options)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from pointsplat_ns.cli.folders import need_one_scene
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Bands, Output, Scene, output_beside
+from pointsplat_ns.cli.scene_options import Bands, Output, Poses, Scene, check_poses, output_beside
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.levels import Levels
@@ -19,6 +19,7 @@ def lod(
     levels: tuple[str, ...] = ("50%", "25%", "10%", "3%"),
     output: Output = None,
     sh: Bands = "all",
+    poses: Poses = None,
     force: bool = False,
     threads: int | None = None,
     json_output: Json = False,
@@ -26,8 +27,8 @@ def lod(
     """Make levels of detail: the scene merged to fewer and fewer Gaussians in one pass, the error of each measured.
 
     Each level is merged from the one before, so that every Gaussian has one parent in the next coarser level. Renders
-    are compared with the dense scene's, from the poses of the run's dataset if it is found, else from poses sampled in
-    free space.
+    are compared with the dense scene's, from --poses, else from the poses of the run's dataset if it is found, else
+    from poses sampled in free space.
 
     Args:
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
@@ -36,6 +37,8 @@ def lod(
         output: the folder for the levels (level_0.ply is the finest), their parents, the manifest lod.json and the
             picture lod.png; by default beside the scene: room_lod for room.ply, lod in the folder of a run.
         sh: SH bands of every level: all, up to a degree, or auto, those without which renders stay within 40 dB.
+        poses: a file of cameras to look from: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
+            COLMAP model.
         force: overwrite existing files.
         threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
             programs keep the machine busy. Another number may change results by rounding.
@@ -46,9 +49,10 @@ def lod(
     from pointsplat_ns.system.threads import fixed_threads
 
     need_one_scene(scene)
+    check_poses(poses)
     folder = output or output_beside(scene, "lod").with_suffix("")
     with fixed_threads(threads):
-        made = ps.lod(scene, levels, sh=sh, folder=folder, force=force, progress=True)
+        made = ps.lod(scene, levels, sh=sh, views=poses, folder=folder, force=force, progress=True)
     if json_output:
         print_json({"output": folder, **json.loads((folder / MANIFEST).read_text("utf-8"))})
     else:

@@ -10,8 +10,10 @@ from pointsplat_ns.cli.printing import Json, print_distributions, print_json, pr
 from pointsplat_ns.cli.scene_options import (
     Bands,
     Output,
+    Poses,
     Scene,
     check_outputs,
+    check_poses,
     in_format_of,
     output_beside,
     warn_if_larger,
@@ -27,6 +29,7 @@ def prune(
     sh: Bands = "all",
     clean: bool = False,
     fine_tune: int = 0,
+    poses: Poses = None,
     plot: Path | None = None,
     dry_run: bool = False,
     force: bool = False,
@@ -35,8 +38,8 @@ def prune(
 ) -> None:
     """Make a scene smaller: keep the Gaussians that matter, or merge them, from the scene alone.
 
-    If something has to be rendered, the poses are those of the run's dataset if it is found; for a file they are
-    sampled in free space.
+    If something has to be rendered, the poses are those of --poses, else those of the run's dataset if it is found; for
+    a file they are sampled in free space.
 
     Args:
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
@@ -52,6 +55,8 @@ def prune(
         sh: SH bands to keep: all, up to a degree, or auto, those without which renders stay within 40 dB.
         clean: first remove what cannot be drawn and what is seen from nowhere; --keep refers to the scene as read.
         fine_tune: steps of optimising the result against the dense scene's own renders.
+        poses: a file of cameras to look from: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
+            COLMAP model. They must be of this scene.
         plot: a .png file for a plot of the distributions of opacity and volume, before and after.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
@@ -60,20 +65,22 @@ def prune(
         json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
+    from pointsplat_ns.compression.posed_scene import read_posed
     from pointsplat_ns.compression.prune import check_options
     from pointsplat_ns.io import read_scene
     from pointsplat_ns.system.threads import fixed_threads
 
     need_one_scene(scene)
+    check_poses(poses)
     output = output or output_beside(scene, "pruned")
     check_outputs(None if dry_run else output, plot, force)
     keep = in_format_of(keep, output)
     check_options(keep, by, sh, opacity_weight, fine_tune)
     with fixed_threads(threads):
-        dense = read_scene(scene)
+        dense, views = (read_scene(scene), scene) if poses is None else read_posed(scene, poses)
         start = time.perf_counter()
         small = ps.prune(
-            dense, keep, by, sh=sh, opacity_weight=opacity_weight, clean=clean, fine_tune=fine_tune, views=scene,
+            dense, keep, by, sh=sh, opacity_weight=opacity_weight, clean=clean, fine_tune=fine_tune, views=views,
             progress=True,
         )  # fmt: skip
     seconds = time.perf_counter() - start

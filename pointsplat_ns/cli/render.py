@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Scene
+from pointsplat_ns.cli.scene_options import Poses, Scene, check_poses
 
 
 def render(
@@ -17,6 +17,7 @@ def render(
     other: tyro.conf.Positional[Path | None] = None,
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None,
     path: str = "auto",
+    poses: Poses = None,
     split: Literal["side-by-side", "wipe"] = "side-by-side",
     labels: tuple[str, ...] | None = None,
     up: str | None = None,
@@ -37,6 +38,8 @@ def render(
         path: dataset (exactly through the poses of the run's dataset), walk (past sampled views), orbit (about what
             they show), auto (dataset if there is one, else walk), or a camera path that nerfstudio's viewer saved
             (.json).
+        poses: a file of cameras in place of those of the dataset: cameras.json of 3DGS, transforms.json of nerfstudio,
+            or the folder of a COLMAP model. A folder then gets one frame for each, unless --seconds says otherwise.
         split: how two scenes are shown.
         labels: what is written on two scenes; by default their names and counts. "" writes nothing on one.
         up: the axis that is up in the scene, for walks and orbits: x, y, z, -x, -y or -z; by default it is estimated.
@@ -51,9 +54,10 @@ def render(
     import pointsplat_ns as ps
 
     start = time.perf_counter()
+    check_poses(poses)
     output = output or _beside(scene)
     count = ps.render_path(
-        scene, output, other, path=path, split=split, labels=labels, up=up, width=width, height=height,
+        scene, output, other, path=path, views=poses, split=split, labels=labels, up=up, width=width, height=height,
         fps=fps, seconds=seconds, force=force, progress=True,
     )  # fmt: skip
     files = output.iterdir() if output.is_dir() else [output]

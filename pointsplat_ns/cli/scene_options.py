@@ -9,6 +9,7 @@ import tyro
 
 Scene = tyro.conf.Positional[Path]
 Output = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
+Poses = Path | None
 Bands = Literal["all", "auto", "0", "1", "2", "3"]
 
 
@@ -81,6 +82,24 @@ def _check_free(path: Path, force: bool) -> None:
         raise SceneError(f"{path}: is a folder; expected the name of a file to write")
     if path.exists() and not force:
         raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
+
+
+def check_poses(poses: Path | None) -> None:
+    """Check that a path can hold cameras, before it is taken for where views come from.
+
+    Args:
+        poses: the file or folder; None for none.
+
+    Raises:
+        SceneError: if it is a run or a scene.
+    """
+    from pointsplat_ns.errors import SceneError
+    from pointsplat_ns.io.camera_files import ACCEPTED, is_camera_file
+
+    if poses is not None and not is_camera_file(poses):
+        raise SceneError(
+            f"{poses}: a run or a scene; expected {ACCEPTED}; the poses of a run's own dataset need no --poses"
+        )
 
 
 def in_format_of(keep: str, output: Path) -> str:

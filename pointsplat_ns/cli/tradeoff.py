@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING, Literal
 
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Output, Scene, output_beside
+from pointsplat_ns.cli.scene_options import Output, Poses, Scene, check_poses, output_beside
 
 if TYPE_CHECKING:
     from pointsplat_ns.tradeoff.points import Quality, Tradeoff
@@ -21,6 +21,7 @@ def tradeoff(
     repairs: tuple[Literal["none", "refiner", "quick", "thorough"], ...] = ("none", "quick"),
     views: int = 10,
     side: int = 640,
+    poses: Poses = None,
     drawn: tuple[Literal["exact", "fast", "half"], ...] = ("exact", "fast", "half"),
     target_db: float | None = None,
     target_ms: float | None = None,
@@ -47,6 +48,8 @@ def tradeoff(
         repairs: what may repair: nothing, the refiner alone, or compact's efforts quick and thorough.
         views: largest number of views; without photos at most 12.
         side: largest side of their images, pixels; photos are reduced.
+        poses: a file of cameras to look from: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
+            COLMAP model; no photos are used then.
         drawn: how frames may be drawn: exact, of all scenes; fast and half (so, and at half the resolution) of a few.
         target_db: find the smallest scene of at least this PSNR against the dense scene's renders.
         target_ms: and of at most so many milliseconds a frame. Without --target-db, find the best within the limits.
@@ -61,11 +64,12 @@ def tradeoff(
     from pointsplat_ns.system.threads import fixed_threads
     from pointsplat_ns.tradeoff.outputs import JSON
 
+    check_poses(poses)
     folder = output or output_beside(scene, "tradeoff").with_suffix("")
     with fixed_threads(threads):
         found = ps.measure_tradeoff(
-            scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, side=side, drawn=drawn,
-            target_db=target_db, target_ms=target_ms, target_mb=target_mb, force=force, progress=True,
+            scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, side=side, poses=poses,
+            drawn=drawn, target_db=target_db, target_ms=target_ms, target_mb=target_mb, force=force, progress=True,
         )  # fmt: skip
     if json_output:
         print_json({"output": folder, **json.loads((folder / JSON).read_text("utf-8"))})

@@ -33,6 +33,9 @@ RUN_SUFFIXES = (".ckpt", ".yml", ".yaml")
 REFINER_METHOD = "pointsplat"
 """nerfstudio's name of the method that trains refiners."""
 
+_MOST_TRANSFORM_BYTES = 1 << 16
+"""Of a dataparser's transform; nerfstudio writes some hundreds."""
+
 _SPLATFACTO_FIELDS = {"sh_degree", "densify_grad_thresh", "rasterize_mode"}
 """Model settings that only Splatfacto and methods derived from it have."""
 
@@ -128,7 +131,7 @@ def open_run(path: Path | str, need_data: bool = True) -> Run:
         if need_data:
             raise SceneError(f"{config_path}: names no data folder; expected the photos that the run was trained on")
         data = Path()
-    transform, scale = _transforms(folder / TRANSFORMS_NAME)
+    transform, scale = read_transforms(folder / TRANSFORMS_NAME)
     planned = root.fields.get("max_num_iterations")
     return Run(
         folder=folder,
@@ -227,11 +230,17 @@ def _find_data(data: Path, folder: Path, config_path: Path) -> Path:
     )
 
 
-def _transforms(path: Path) -> tuple[Tensor, float]:
-    """The dataparser's transform (3, 4) and scale; the identity and 1 if the run saved none."""
+def read_transforms(path: Path) -> tuple[Tensor, float]:
+    """The transform (3, 4) and the scale of a ``dataparser_transforms.json``; the identity and 1 if there is none.
+
+    Raises:
+        SceneError: if the file is not one.
+    """
     if not path.is_file():
         return torch.eye(4)[:3], 1.0
     try:
+        if path.stat().st_size > _MOST_TRANSFORM_BYTES:
+            raise ValueError(f"{path.stat().st_size} bytes")
         content = json.loads(path.read_text("utf-8"))
         transform = torch.tensor(content["transform"], dtype=torch.float32)
         scale = float(content["scale"])

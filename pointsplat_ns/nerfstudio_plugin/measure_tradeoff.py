@@ -6,6 +6,7 @@ import functools
 from dataclasses import replace
 from pathlib import Path
 
+from pointsplat_ns.compression.posed_scene import read_posed
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
@@ -32,6 +33,7 @@ def measure_tradeoff(
     repairs: tuple[str, ...] = ("none", "quick"),
     views: int = 10,
     side: int = 640,
+    poses: str | Path | None = None,
     drawn: tuple[str, ...] = ("exact", "fast", "half"),
     target_db: float | None = None,
     target_ms: float | None = None,
@@ -56,6 +58,7 @@ def measure_tradeoff(
         repairs: some of "none", "refiner", "quick" and "thorough", the efforts of :func:`pointsplat_ns.compact`.
         views: largest number of views; without photos at most 12.
         side: largest side of their images, pixels; photos are reduced.
+        poses: a file of cameras to look from, as ``views`` of :func:`pointsplat_ns.prune`; no photos are used then.
         drawn: how frames may be drawn: "exact", of all scenes; "fast" and "half" (so, and at half the resolution), of a
             few where that may pay. A search for targets draws exactly.
         target_db: least PSNR against the dense scene's renders, dB, mean over views.
@@ -70,7 +73,7 @@ def measure_tradeoff(
     Raises:
         BudgetError: if no scene meets the targets, or they mean nothing.
         SceneError: if the scene or the folder is not usable, or the folder holds points of another sweep.
-        DataError: if there is no view.
+        DataError: if there is no view, or most of those of ``poses`` see nothing of the scene.
         PointSplatError: if there is no such method or repair, or a number means nothing.
         KeyboardInterrupt: after the results of an interrupted sweep were written.
 
@@ -88,9 +91,11 @@ def measure_tradeoff(
     options = Options(points, within, tuple(by), tuple(repairs), views, side, tuple(drawn))
     targets = targets_of(target_db, target_ms, target_mb)
     path, folder = Path(scene), Path(folder)
-    dense = read_scene(path)
+    dense, given = (read_scene(path), None) if poses is None else read_posed(path, poses)
     check_folder(folder, force)
-    subject = replace(subject_of(dense, path), name=name_of(path), sha256=source_file(path).sha256)
+    subject = subject_of(dense, path, given)
+    file = None if poses is None else Path(poses)
+    subject = replace(subject, name=name_of(path), sha256=source_file(path).sha256, poses=file)
     with progress_bar(progress) as report:
         sweep = Sweep(subject, folder, options, report)
         if targets is None:

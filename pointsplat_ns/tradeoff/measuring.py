@@ -47,6 +47,8 @@ class Subject:
     """What repairs begin with; None for the one that ships."""
     suffix: str = ".ply"
     """Of the format that smaller scenes are written in."""
+    poses: Path | None = None
+    """The file of cameras that it is looked at from, as commands name it; None if there is none."""
 
 
 class Measurer:
@@ -80,7 +82,7 @@ class Measurer:
         """Time of a frame of the dense scene that others are given in proportion to; None before it was measured. What
         was measured earlier goes here before anything is judged."""
         self.notes: dict[str, None] = {}
-        self.naming = Naming(subject.path, subject.name, len(self.dense), self.dense.sh_degree)
+        self.naming = Naming(subject.path, subject.name, len(self.dense), self.dense.sh_degree, subject.poses)
         self._kept: dict[Setting, Made] = {}
         self._progress = progress
         progress("looking for views", 0.0)

@@ -104,6 +104,8 @@ class Naming:
     """Number of Gaussians in it."""
     sh_degree: int
     """And their SH degree."""
+    poses: Path | None = None
+    """The file of cameras that the scene is looked at from, as commands name it."""
 
     def key(self, setting: Setting) -> str:
         """A short name that can be part of a file's name."""
@@ -127,6 +129,8 @@ class Naming:
         percentages may be rounded."""
         program = "prune" if setting.repair == "none" else "compact"
         words = ["pointsplat", program, str(self.path), "--keep", str(setting.count)]
+        if self.poses is not None:
+            words += ["--poses", str(self.poses)]
         if program == "compact" or setting.by != "merge":
             words += ["--by", setting.by]
         if setting.sh_degree != self.sh_degree:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import math
 import time
@@ -23,6 +24,7 @@ from pointsplat_ns.tradeoff.outputs import OUTPUTS, write_outputs
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, speed_of
 from pointsplat_ns.tradeoff.settings import DENSE, DRAWN, REPAIRS, Drawn, Setting, check_drawn, check_repairs
 from pointsplat_ns.tradeoff.walk import MOST_DRAWINGS, Plan, drawings, walk
+from pointsplat_ns.views import Views
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -93,6 +95,11 @@ def check_folder(folder: Path, force: bool) -> None:
             )
 
 
+def _digest(views: Views) -> str:
+    """A text that tells cameras apart."""
+    return hashlib.sha256(views.viewmats.numpy().tobytes() + views.Ks.numpy().tobytes()).hexdigest()[:16]
+
+
 class Sweep:
     """Measures settings of a scene.
 
@@ -122,6 +129,8 @@ class Sweep:
             "width": views.width,
             "height": views.height,
         }
+        if subject.poses is not None:
+            identity["poses"] = _digest(views)
         self.journal = Journal(folder, identity)
         if self.journal.dense is not None:
             self.measurer.dense_ms = self.journal.dense.frame_ms

@@ -15,7 +15,6 @@ from making import BENCHMARKS, box_room
 from peers import peer
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import write_ply
-from pointsplat_ns.metrics import psnr
 from pointsplat_ns.rasterizer import render, render_with_alpha
 
 PATHS = sorted((BENCHMARKS / "paths").glob("*.json"))
@@ -166,7 +165,7 @@ def scene_of(judge_scenes, judge_paths, dense: Gaussians, path: Path, width: int
     return judge_scenes.JudgedScene("small", dense, looks, "")
 
 
-def test_covered_pixels_are_those_of_the_dense_scene_and_others_count_for_all_pixels(judge_scenes, judge_paths, folder):
+def test_covered_psnr_counts_a_fault_beside_the_object_and_no_empty_background(judge_scenes, judge_paths, folder):
     path = write_path(folder, views=[{"eye": [0, -2, 0], "at": [0, 0, 0]}])
     dense, other = ball(), ball(0.7)
     beside = ball()
@@ -180,8 +179,7 @@ def test_covered_pixels_are_those_of_the_dense_scene_and_others_count_for_all_pi
     expected = -10 * math.log10(float((render(other, view) - image).square().double().mean()) / covered)
     assert found[0]["covered_psnr"] == pytest.approx(expected, abs=1e-3)
     assert found[0]["dense_psnr"] > found[0]["covered_psnr"] + 7  # what the background gives
-    assert found[1]["covered_psnr"] == pytest.approx(found[0]["covered_psnr"], abs=0.01)
-    assert found[1]["dense_psnr"] < found[0]["dense_psnr"] - 3  # the fault beside the object
+    assert found[1]["covered_psnr"] < found[0]["covered_psnr"] - 1  # the fault beside the object
     assert found[2]["covered_psnr"] == found[2]["dense_psnr"] == 100
     assert all(measures["photo_psnr"] is None and measures["dense_lpips"] is None for measures in found)
 
@@ -339,7 +337,7 @@ def test_leads_are_of_prune_over_the_best_mode_and_of_compact_over_prune_at_each
         ("prune", 960, "rock"): (-1.0, a),
     }
     titles = [shown.title for shown in tables.lead_tables(rows)]
-    assert [title.split(", PSNR")[0] for title in titles[::2]] == [
+    assert [title.split(", PSNR")[0] for title in titles] == [
         "320 pixels wide: prune minus the best mode of splat-transform",
         "960 pixels wide: prune minus the best mode of splat-transform",
         "320 pixels wide: compact minus prune",

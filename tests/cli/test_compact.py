@@ -19,8 +19,10 @@ from pointsplat_ns.compression import trained_refiner
 from pointsplat_ns.compression.repair import STEPS
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, read_scene, write_ply
+from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.pruning import METHODS, prune
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
+from posing import write_colmap_text
 
 
 def room(n: int = 150) -> Gaussians:
@@ -266,3 +268,14 @@ def test_a_scene_is_repaired_as_long_as_asked_and_what_it_brought_and_cost_is_sa
 def test_a_time_or_effort_that_means_nothing_is_refused_before_the_scene_is_read(tmp_path, ply, helps, capsys):
     said = refusal(capsys, tmp_path / "small.ply", tmp_path / "gone.ply", "--refiner", helps, "--seconds", "-1")
     assert "the time to repair is -1 s; expected 0 or more" in said
+
+
+@pytest.mark.parametrize("budget", [{"keep": "50%"}, {"target_db": 5}])
+def test_poses_of_a_file_are_compared_in(budget, ply, tmp_path):
+    views = sample_views(room(), 5, 64, 48)
+    model = write_colmap_text(views, tmp_path / "sparse")
+    words = [word for name, value in budget.items() for word in (f"--{name.replace('_', '-')}", value)]
+    run("compact", ply, *words, "--effort", "instant", "--poses", model, "-o", tmp_path / "small.ply")
+    result = api.compact(ply, **budget, effort="instant", views=model)
+    torch.testing.assert_close(result.views.viewmats, views.viewmats.double())
+    assert same(read_ply(tmp_path / "small.ply"), result.scene)

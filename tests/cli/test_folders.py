@@ -66,6 +66,7 @@ def test_a_scene_that_fails_ends_it_with_status_1_after_the_others(folder, tmp_p
 @pytest.mark.parametrize(
     "words, said",
     [
+        (("compact", "rooms", "--poses", "a.json"), "--poses is for one scene; rooms is a folder of scenes"),
         (("compact", "rooms", "--picture", "a.png"), "--picture is for one scene; rooms is a folder of scenes"),
         (("compact", "rooms", "--html", "a.html"), "--html is for one scene; rooms is a folder of scenes"),
         (("compact", "rooms", "--dry-run"), "--dry-run is for one scene"),

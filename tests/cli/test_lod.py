@@ -15,6 +15,7 @@ from making import ball
 from pointsplat_ns.cli import main
 from pointsplat_ns.cli.lod import lod
 from pointsplat_ns.compression.levels import DEFAULT_LEVELS
+from posing import nerfstudio, written
 
 
 @pytest.fixture()
@@ -120,3 +121,16 @@ def test_what_is_no_scene_is_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):
         run("lod", tmp_path / "gone.ply")
     assert "gone.ply: no such file; expected a scene (.compressed.ply, .ply" in capsys.readouterr().err
+
+
+def test_levels_are_compared_from_the_poses_of_a_file(ply, tmp_path):
+    views = ps.sample_views(ps.load(ply), 4, 64, 48)
+    poses = written(nerfstudio(views), tmp_path / "transforms.json")
+    run("lod", ply, "--levels", "50%", "--poses", poses, "-o", tmp_path / "by_command")
+    manifest = json.loads((tmp_path / "by_command" / "lod.json").read_text("utf-8"))
+    assert manifest["views"]["origin"] == "given views"
+    ps.lod(ply, ["50%"], views=poses).save(tmp_path / "by_api")
+    assert contents(tmp_path / "by_command") == contents(tmp_path / "by_api")
+    with pytest.raises(SystemExit):
+        run("lod", ply, "--poses", ply, "-o", tmp_path / "other")
+    assert not (tmp_path / "other").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 import shutil
@@ -12,15 +13,19 @@ from pathlib import Path
 import pytest
 import torch
 
-from making import box_room, normal_scene, same
+import pointsplat_ns as ps
+from making import ball, box_room, normal_scene, same
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.trained_refiner import open_refiner_run, scenes_of_run
 from pointsplat_ns.io import read_ply, read_scene, write_ply
+from pointsplat_ns.io.camera_files import read_views
+from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning import METHODS, prune, select
 from pointsplat_ns.system import progress
+from posing import inria, written
 
 SEED = 5
 
@@ -372,3 +377,37 @@ def test_the_command_as_installed_refuses_with_status_1_and_one_line(tmp_path):
     assert done.returncode == 1 and done.stdout == ""
     assert done.stderr.startswith("error: gone: no such file") and done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture()
+def posed(tmp_path) -> tuple[Path, Path]:
+    """A room, and a file of cameras in it."""
+    scene = ball(300, opacity=1.0, bright=1.0)
+    write_ply(scene, tmp_path / "room.ply")
+    return tmp_path / "room.ply", written(inria(sample_views(scene, 5, 64, 48)), tmp_path / "cameras.json")
+
+
+def test_poses_of_a_file_are_looked_from(posed, tmp_path, capsys):
+    room, poses = posed
+    run("prune", room, "--keep", "20%", "--by", "lightgaussian", "--poses", poses, "-o", tmp_path / "small.ply")
+    assert "given views" in capsys.readouterr().out
+    views = read_views(poses)
+    assert same(read_ply(tmp_path / "small.ply"), ps.prune(read_ply(room), "20%", "lightgaussian", views=views))
+    assert same(read_ply(tmp_path / "small.ply"), ps.prune(room, "20%", "lightgaussian", views=poses))
+
+
+def test_poses_in_another_frame_are_refused_before_the_work(posed, tmp_path, capsys):
+    room, poses = posed
+    content = json.loads(poses.read_text())
+    for camera in content:
+        camera["position"][0] += 1e4
+    written(content, poses)
+    error = refusal(capsys, tmp_path / "small.ply", "prune", room, "--poses", poses)
+    assert f"{poses}: 0 of 5 cameras see anything of the scene" in error and "dataparser_transforms.json" in error
+
+
+@pytest.mark.parametrize("name", ["room.ply", "."])
+def test_poses_that_are_no_cameras_are_refused(name, posed, tmp_path, capsys):
+    room, _ = posed
+    error = refusal(capsys, tmp_path / "small.ply", "prune", room, "--poses", tmp_path / name)
+    assert "expected cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model" in error

@@ -19,6 +19,7 @@ from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.tradeoff import judging, machine, outputs
 from pointsplat_ns.tradeoff.journal import POINTS
+from posing import inria, write_colmap_binary, written
 
 FEW = ("--views", "2", "--repairs", "none", "--drawn", "exact")
 
@@ -137,3 +138,16 @@ def test_the_command_line_has_the_options_and_defaults_of_the_function():
     function, command = inspect.signature(ps.measure_tradeoff).parameters, inspect.signature(tradeoff).parameters
     assert set(function) - {"folder", "progress"} == set(command) - {"output", "threads", "json_output"}
     assert all(function[name].default == command[name].default for name in set(function) & set(command))
+
+
+def test_scenes_are_judged_from_the_poses_of_a_file_and_commands_name_it(ply, views, tmp_path, capsys):
+    poses = written(inria(views), tmp_path / "cameras.json")
+    run("tradeoff", ply, "--points", "2", *FEW, "--poses", poses)
+    folder = ply.with_name("room_tradeoff")
+    content = json.loads((folder / "tradeoff.json").read_text("utf-8"))
+    assert content["views_origin"] == "given views" and "48 x 36 pixels" in capsys.readouterr().out
+    command = shlex.split(content["points"][1]["command"])
+    assert command[command.index("--poses") + 1] == str(poses)
+    other = write_colmap_binary(views[[1, 0, 2]], tmp_path / "sparse")
+    assert "its points are of another sweep (poses:" in refusal(capsys, ply, "--points", "2", *FEW, "--poses", other)
+    assert "views: 'given views', now" in refusal(capsys, ply, "--points", "2", *FEW)

@@ -72,7 +72,8 @@ def test_without_transforms_the_frame_is_the_datas_own(make_run):
     "content",
     ["{", "[]", '{"scale": 1}', '{"transform": [[1, 0], [0, 1]], "scale": 1}', '{"transform": "no", "scale": 1}',
      json.dumps({"transform": torch.eye(4)[:3].tolist(), "scale": 0}),
-     json.dumps({"transform": [[float("nan")] * 4] * 3, "scale": 1})],
+     json.dumps({"transform": [[float("nan")] * 4] * 3, "scale": 1}),
+     json.dumps({"transform": torch.eye(4)[:3].tolist(), "scale": 1, "note": "x" * 100_000})],
 )  # fmt: skip
 def test_damaged_transforms_are_said(make_run, content):
     folder = make_run()

@@ -1,0 +1,8 @@
+"""Readers of files of cameras, one module per format: poses and intrinsics that others wrote, as views.
+
+Every file may come from a stranger: it is read within limits, and refused in one line.
+"""
+
+from pointsplat_ns.io.camera_files.registry import ACCEPTED, is_camera_file, read_views, transforms_beside
+
+__all__ = ["ACCEPTED", "is_camera_file", "read_views", "transforms_beside"]

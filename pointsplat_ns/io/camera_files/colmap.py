@@ -1,0 +1,238 @@
+"""A COLMAP model: a folder with ``cameras.bin`` and ``images.bin``, or ``cameras.txt`` and ``images.txt``.
+
+Poses are from world to camera: a quaternion wxyz and a translation, OpenCV axes. Of a camera's parameters the focal
+lengths and the principal point are taken. Points are skipped and never held in memory.
+
+Source: the format as https://colmap.github.io/format.html and COLMAP's own list of camera models define it.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import torch
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.geometry.quaternions import rotation_matrices
+from pointsplat_ns.io.camera_files.cameras import MOST_CAMERAS, Camera, CameraFile, Motion, need_count
+from pointsplat_ns.io.files import logger, one_line
+
+MODELS = {
+    "SIMPLE_PINHOLE": (0, 1, 3), "PINHOLE": (1, 2, 4), "SIMPLE_RADIAL": (2, 1, 4), "RADIAL": (3, 1, 5),
+    "OPENCV": (4, 2, 8), "OPENCV_FISHEYE": (5, 2, 8), "FULL_OPENCV": (6, 2, 12), "FOV": (7, 2, 5),
+    "SIMPLE_RADIAL_FISHEYE": (8, 1, 4), "RADIAL_FISHEYE": (9, 1, 5), "THIN_PRISM_FISHEYE": (10, 2, 12),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (11, 2, 16), "SIMPLE_DIVISION": (12, 1, 4), "DIVISION": (13, 2, 5),
+    "SIMPLE_FISHEYE": (14, 1, 3), "FISHEYE": (15, 2, 4), "EUCM": (16, 2, 6),
+}  # fmt: skip
+"""Number in binary files, number of focal lengths, and number of parameters of COLMAP's camera models. The principal
+point follows the focal lengths, and the distortion that."""
+
+FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
+
+_LONGEST_LINE = 4096
+"""Of a camera or an image, bytes; also of the name of a photo. Lines of points are longer, and skipped in pieces."""
+
+_POINT_BYTES = 24
+"""Of a point in an image, in binary: x, y and the number of its 3D point."""
+
+
+class _Lens(NamedTuple):
+    """A camera of COLMAP: what took some of the images."""
+
+    size: tuple[float, float]
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    bent: bool
+    """Whether it has distortion."""
+
+
+class _Image(NamedTuple):
+    name: str
+    pose: tuple[float, ...]
+    """Quaternion wxyz and translation, world to camera."""
+    camera: int
+
+
+def is_model(path: Path) -> bool:
+    """Whether a path is a COLMAP model: its folder, or one of the two files in it."""
+    folder = path if path.is_dir() else path.parent
+    return (path.is_dir() or path.name in FILES) and any((folder / name).is_file() for name in FILES)
+
+
+def colmap_cameras(path: Path) -> CameraFile:
+    """The cameras of a COLMAP model; ``path`` is its folder, or one of the files in it.
+
+    Raises:
+        DataError: if a file is missing or damaged, or an image has no usable pose or camera.
+    """
+    folder = path if path.is_dir() else path.parent
+    kind = next((kind for kind in ("bin", "txt") if (folder / f"images.{kind}").is_file()), "bin")
+    cameras_path, images_path = folder / f"cameras.{kind}", folder / f"images.{kind}"
+    for needed in (cameras_path, images_path):
+        if not needed.is_file():
+            raise DataError(
+                f"{needed}: no such file; expected a COLMAP model: cameras.bin and images.bin, or both as .txt"
+            )
+    try:
+        if kind == "bin":
+            with cameras_path.open("rb") as stream:
+                lenses = _binary_lenses(stream, cameras_path)
+            with images_path.open("rb") as stream:
+                images = list(_binary_images(stream, images_path))
+        else:
+            with cameras_path.open("rb") as stream:
+                lenses = _text_lenses(stream, cameras_path)
+            with images_path.open("rb") as stream:
+                images = list(_text_images(stream, images_path))
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be read ({error.strerror or one_line(error)})") from error
+    need_count(images_path, len(images))
+    lost = next((image for image in images if image.camera not in lenses), None)
+    if lost is not None:
+        raise DataError(
+            f"{images_path}: {lost.name[:60]} was taken by camera {lost.camera}, which {cameras_path.name} lacks; "
+            "expected two files of one model"
+        )
+    bent = sum(lenses[image.camera].bent for image in images)
+    if bent:
+        logger.info("%s: the lens distortion of %d of %d cameras is ignored", folder, bent, len(images))
+    return CameraFile(_posed(images, lenses, images_path), Motion(torch.eye(4, dtype=torch.float64)[:3]))
+
+
+def _posed(images: list[_Image], lenses: dict[int, _Lens], path: Path) -> list[Camera]:
+    """Images as cameras, their poses inverted."""
+    poses = torch.tensor([image.pose for image in images], dtype=torch.float64)
+    # The length of a quaternion is free, within what can be squared.
+    lengths = poses[:, :4].norm(dim=1)
+    bad = (~(poses.isfinite().all(1) & (lengths > 1e-6) & (lengths < 1e6))).nonzero()
+    if len(bad):
+        index = int(bad[0])
+        raise DataError(
+            f"{path}: the pose of camera {index} ({images[index].name[:60]}) is no rigid motion; expected a quaternion "
+            "and a translation, all finite; correct it or leave it out"
+        )
+    matrices = invert_rigid(torch.cat([rotation_matrices(poses[:, :4]), poses[:, 4:, None]], dim=2))
+    return [
+        Camera(image.name, pose, *lenses[image.camera][:3])
+        for image, pose in zip(images, matrices.flatten(1).tolist(), strict=True)
+    ]
+
+
+def _lens(name: str, size: tuple[float, float], params: tuple[float, ...]) -> _Lens:
+    _, focals, _ = MODELS[name]
+    bent = "FISHEYE" in name or any(params[focals + 2 :])
+    return _Lens(size, (params[0], params[focals - 1]), (params[focals], params[focals + 1]), bent)
+
+
+def _text_lenses(stream: BinaryIO, path: Path) -> dict[int, _Lens]:
+    """The lines "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"."""
+    lenses = {}
+    for line in _lines(stream, path):
+        words = line.split()
+        try:
+            name, size = words[1], (float(words[2]), float(words[3]))
+            if name not in MODELS:
+                raise _no_model(path, name)
+            params = tuple(float(word) for word in words[4:])
+            if len(params) != MODELS[name][2]:
+                raise ValueError
+            lenses[int(words[0])] = _lens(name, size, params)
+        except (ValueError, IndexError) as error:
+            raise DataError(
+                f"{path}: {line[:60]!r} is no camera; expected a number, a model, width, height and parameters"
+            ) from error
+        need_count(path, len(lenses))
+    return lenses
+
+
+def _text_images(stream: BinaryIO, path: Path) -> Iterator[_Image]:
+    """The lines "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME". After each comes a line of points, empty or not."""
+    for count, line in enumerate(_lines(stream, path), 1):
+        need_count(path, count)
+        words = line.split(maxsplit=9)
+        try:
+            image = _Image(words[9], tuple(float(word) for word in words[1:8]), int(words[8]))
+        except (ValueError, IndexError) as error:
+            raise DataError(
+                f"{path}: {line[:60]!r} is no image; expected a number, a quaternion wxyz, a translation, a camera "
+                "and a name, and a line of points after it"
+            ) from error
+        yield image
+        while (piece := stream.readline(1 << 16)) and not piece.endswith(b"\n"):
+            pass
+
+
+def _lines(stream: BinaryIO, path: Path) -> Iterator[str]:
+    """Lines that are neither empty nor comments."""
+    while line := stream.readline(_LONGEST_LINE):
+        if line.startswith(b"#"):
+            while line and not line.endswith(b"\n"):
+                line = stream.readline(_LONGEST_LINE)
+            continue
+        if len(line) == _LONGEST_LINE and not line.endswith(b"\n"):
+            raise DataError(f"{path}: a line of more than {_LONGEST_LINE} bytes; expected a camera or an image")
+        text = line.decode("utf-8", "replace").strip()
+        if text:
+            yield text
+
+
+def _binary_lenses(stream: BinaryIO, path: Path) -> dict[int, _Lens]:
+    """A count, and for each camera its number, model, width, height and parameters."""
+    names = {number: name for name, (number, _, _) in MODELS.items()}
+    lenses = {}
+    for _ in range(_count(stream, path, 24)):
+        number, model, width, height = struct.unpack("<IiQQ", _exactly(stream, 24, path))
+        if model not in names:
+            raise _no_model(path, str(model))
+        name = names[model]
+        params = struct.unpack(f"<{MODELS[name][2]}d", _exactly(stream, 8 * MODELS[name][2], path))
+        lenses[number] = _lens(name, (float(width), float(height)), params)
+    return lenses
+
+
+def _binary_images(stream: BinaryIO, path: Path) -> Iterator[_Image]:
+    """A count, and for each image its number, quaternion, translation, camera, name (ended by 0) and points, after
+    their count."""
+    total = os.fstat(stream.fileno()).st_size
+    for _ in range(_count(stream, path, 73)):
+        _, *pose, camera = struct.unpack("<I7dI", _exactly(stream, 64, path))
+        start = stream.tell()
+        name, end, _ = stream.read(_LONGEST_LINE).partition(b"\0")
+        if not end:
+            raise DataError(f"{path}: no end of an image's name within {_LONGEST_LINE} bytes; expected a COLMAP model")
+        stream.seek(start + len(name) + 1)
+        (points,) = struct.unpack("<Q", _exactly(stream, 8, path))
+        if points * _POINT_BYTES > total - stream.tell():
+            raise DataError(
+                f"{path}: an image with {points} points, for which the file has no room; it is damaged or incomplete"
+            )
+        stream.seek(points * _POINT_BYTES, os.SEEK_CUR)
+        yield _Image(name.decode("utf-8", "replace"), tuple(pose), camera)
+
+
+def _count(stream: BinaryIO, path: Path, least: int) -> int:
+    """The count that a binary file begins with, checked against its size; ``least`` bytes follow for each."""
+    (count,) = struct.unpack("<Q", _exactly(stream, 8, path))
+    room = (os.fstat(stream.fileno()).st_size - 8) // least
+    if not 0 < count <= min(room, MOST_CAMERAS):
+        raise DataError(
+            f"{path}: says that it has {count} entries and has room for {room}; expected 1 to {MOST_CAMERAS}, as "
+            "COLMAP writes them"
+        )
+    return count
+
+
+def _exactly(stream: BinaryIO, size: int, path: Path) -> bytes:
+    data = stream.read(size)
+    if len(data) < size:
+        raise DataError(f"{path}: ends too early; it is damaged or incomplete")
+    return data
+
+
+def _no_model(path: Path, name: str) -> DataError:
+    return DataError(f"{path}: a camera of model {name[:40]}; expected one of {', '.join(MODELS)}")

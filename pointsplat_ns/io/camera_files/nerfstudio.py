@@ -1,0 +1,142 @@
+"""``transforms.json`` of nerfstudio, instant-ngp and NeRF-synthetic.
+
+``frames`` have ``transform_matrix``, from camera to world, OpenGL axes (x right, y up, z back). ``fl_x``, ``fl_y``,
+``cx``, ``cy``, ``w``, ``h`` and the distortion stand in each frame or once for all; NeRF-synthetic has only
+``camera_angle_x``, the horizontal field of view in radians. ``applied_transform`` (3 x 4) and ``applied_scale`` say how
+the world of the original photos was moved before the file was saved.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import torch
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.io.camera_files.cameras import Camera, CameraFile, Motion, finite, need_count, rigid
+from pointsplat_ns.io.files import logger
+
+SYNTHETIC_SIZE = (800, 800)
+"""Width and height, pixels, of the photos of NeRF-synthetic, whose files do not say them."""
+
+_LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FISHEYE")
+"""Kinds of cameras that have a focal length."""
+
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+_FLIP = (1.0, -1.0, -1.0, 1.0)
+"""Signs of the columns of a pose that turn OpenGL's axes into OpenCV's."""
+
+_OLD_APPLIED = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
+"""What nerfstudio takes for ``applied_transform`` beside a COLMAP model, if the file, of an early version, has none."""
+
+
+def nerfstudio_cameras(content: dict[str, Any], path: Path) -> CameraFile:
+    """The cameras of a ``transforms.json``.
+
+    Args:
+        content: of the JSON.
+        path: of the file, for errors, and to look up the size of the photos if the file has none.
+
+    Raises:
+        DataError: if a frame has no usable pose or intrinsics, or a camera has no focal length (a panorama).
+    """
+    frames = content["frames"]
+    need_count(path, len(frames))
+    size = functools.cache(lambda: _size_of_photos(frames[0], path))
+    found = []
+    bent = 0
+    for index, frame in enumerate(frames):
+        if not isinstance(frame, dict):
+            raise DataError(f"{path}: camera {index} is no frame; expected an object with 'transform_matrix'")
+        # A frame may have none of these, or hundreds of others.
+        said = {name: frame.get(name, content.get(name)) for name in _NAMES}
+        found.append(_camera(frame, said, index, path, size))
+        bent += said["camera_model"] in ("OPENCV_FISHEYE", "FISHEYE") or any(finite(said[k]) for k in _DISTORTION)
+    if bent:
+        logger.info("%s: the lens distortion of %d of %d cameras is ignored", path, bent, len(found))
+    return CameraFile(found, _saved_motion(content, path))
+
+
+_NAMES = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "camera_model", *_DISTORTION)
+
+
+def _camera(frame: dict[str, Any], said: dict[str, Any], index: int, path: Path, size: Any) -> Camera:
+    kind = said["camera_model"]
+    if kind is not None and kind not in _LENSES:
+        raise DataError(f"{path}: camera {index} is {str(kind)[:40]!r}; expected one of {', '.join(_LENSES)}")
+    width, height = finite(said["w"]), finite(said["h"])
+    if width is None or height is None:
+        width, height = size()
+    fx = finite(said["fl_x"]) or _focal(width, finite(said["camera_angle_x"]))
+    fy = finite(said["fl_y"]) or _focal(height, finite(said["camera_angle_y"])) or fx
+    if fx is None or fy is None:
+        raise DataError(f"{path}: camera {index} has no focal length; expected a number 'fl_x' or 'camera_angle_x'")
+    cx, cy = finite(said["cx"]), finite(said["cy"])
+    name = frame.get("file_path")
+    return Camera(
+        name if isinstance(name, str) else "",
+        _pose(frame.get("transform_matrix"), index, path),
+        (width, height),
+        (fx, fy),
+        (0.5 * width if cx is None else cx, 0.5 * height if cy is None else cy),
+    )
+
+
+def _pose(rows: Any, index: int, path: Path) -> list[float]:
+    """16 numbers of a pose with OpenCV axes; NaN where a number is not finite."""
+    if not (isinstance(rows, list) and len(rows) in (3, 4) and all(isinstance(r, list) and len(r) == 4 for r in rows)):
+        raise DataError(f"{path}: camera {index} has no pose; expected 'transform_matrix', 4 x 4 numbers")
+    numbers = [[finite(value) for value in row] for row in rows]
+    flat = [
+        math.nan if number is None else sign * number
+        for row in numbers
+        for number, sign in zip(row, _FLIP, strict=True)
+    ]
+    return flat if len(rows) == 4 else [*flat, 0.0, 0.0, 0.0, 1.0]
+
+
+def _focal(side: float, angle: float | None) -> float | None:
+    """Focal length, pixels, of a field of view in radians."""
+    return 0.5 * side / math.tan(0.5 * angle) if angle is not None and 0 < angle < math.pi else None
+
+
+def _saved_motion(content: dict[str, Any], path: Path) -> Motion:
+    """What moved the original world to that of the file."""
+    rows = content.get("applied_transform")
+    if rows is None:
+        rows = _OLD_APPLIED if (path.parent / "colmap" / "sparse" / "0").is_dir() else torch.eye(4)[:3].tolist()
+    scale = finite(content.get("applied_scale", 1.0))
+    try:
+        transform = torch.tensor(rows, dtype=torch.float64)
+    except (ValueError, TypeError, RuntimeError, OverflowError):
+        transform = torch.empty(0)
+    if transform.shape != (3, 4) or scale is None or not 0 < scale:
+        raise DataError(
+            f"{path}: its 'applied_transform' or 'applied_scale' is not usable; expected 3 x 4 numbers and a number "
+            "above 0"
+        )
+    return Motion(rigid(transform[None], f"{path}: its 'applied_transform'")[0], scale)
+
+
+def _size_of_photos(frame: Any, path: Path) -> tuple[float, float]:
+    """Width and height, pixels, of the first photo if it lies where the file says, else those of NeRF-synthetic."""
+    from PIL import Image
+
+    name = frame.get("file_path") if isinstance(frame, dict) else None
+    relative = PurePosixPath(name if isinstance(name, str) and "\0" not in name else "")
+    if not relative.is_absolute() and ".." not in relative.parts:  # nothing outside of the folder is opened
+        for suffix in ("", ".png"):
+            photo = path.parent / f"{relative}{suffix}"
+            try:
+                if photo.is_file():
+                    with Image.open(photo) as opened:
+                        return opened.width, opened.height
+            except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+                continue
+    width, height = SYNTHETIC_SIZE
+    logger.info("%s: no 'w' and 'h', and no photo to measure; taken for %d x %d pixels", path, width, height)
+    return width, height

@@ -1,0 +1,102 @@
+"""The formats of files of cameras: which one a path holds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.io.camera_files.cameras import CameraFile, Motion, rigid, views_of
+from pointsplat_ns.io.camera_files.colmap import colmap_cameras, is_model
+from pointsplat_ns.io.camera_files.inria import inria_cameras
+from pointsplat_ns.io.camera_files.nerfstudio import nerfstudio_cameras
+from pointsplat_ns.io.files import logger, one_line, require_file, require_memory
+from pointsplat_ns.io.formats import SOG_META, format_named
+from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, TRANSFORMS_NAME, read_transforms
+from pointsplat_ns.views import Views
+
+ACCEPTED = "cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model"
+
+MOST_BYTES = 64_000_000
+"""Maximum size of JSON: 100,000 frames have about as much."""
+
+_BYTES_OF_VALUES = 24
+"""Most memory, bytes, that a byte of JSON takes once it is read: empty lists are the worst."""
+
+
+def is_camera_file(path: Path | str) -> bool:
+    """Whether a path is no run and no scene, so that it can only hold cameras. What is in a file is not looked at."""
+    path = Path(path)
+    if path.is_dir():
+        return is_model(path) or not any((path / name).is_file() for name in (CONFIG_NAME, SOG_META))
+    return path.suffix.lower() not in RUN_SUFFIXES and format_named(path.name) is None
+
+
+def transforms_beside(path: Path | str) -> Path | None:
+    """The ``dataparser_transforms.json`` in a folder, or beside a file or folder; None if there is none."""
+    path = Path(path)
+    places = (path / TRANSFORMS_NAME, path.parent / TRANSFORMS_NAME)
+    return next((place for place in places if place.is_file()), None)
+
+
+def read_views(path: Path | str, transforms: Path | None = None) -> Views:
+    """Read the cameras of a file.
+
+    Lens distortion is ignored, which is logged. Cameras whose pictures have another size than most get that size: they
+    see the same field of view, by other focal lengths.
+
+    Args:
+        path: INRIA's ``cameras.json``, nerfstudio's ``transforms.json``, or the folder of a COLMAP model.
+        transforms: the ``dataparser_transforms.json`` of the run that the scene is from: it moves poses of the last two
+            into the frame of the scene. By default the one beside ``path``, if there is one. Poses of ``cameras.json``
+            are in the scene's frame already.
+
+    Returns:
+        C views, float64 on the CPU, over black, in the order of the names of their photos.
+
+    Raises:
+        SceneError: if there is no such file, or the transforms are not usable.
+        DataError: if the file is none of these, too large or damaged, or a camera is not usable.
+
+    Example:
+        >>> import json, tempfile, torch
+        >>> frames = [{"file_path": "a.png", "transform_matrix": torch.eye(4).tolist()}]
+        >>> content = {"fl_x": 50, "w": 64, "h": 48, "frames": frames}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "transforms.json")
+        ...     _ = path.write_text(json.dumps(content))
+        ...     views = read_views(path)
+        >>> len(views), views.width, views.height
+        (1, 64, 48)
+    """
+    path = Path(path)
+    found = colmap_cameras(path) if is_model(path) else _json_cameras(path)
+    transforms = transforms or transforms_beside(path)
+    if found.saved is None or transforms is None:
+        return views_of(path, found.cameras)
+    transform, scale = read_transforms(transforms)
+    exact = rigid(transform.double()[None], f"{transforms}: its transform")[0]
+    logger.info("%s: poses are moved into the frame of the scene, as %s says", path, transforms)
+    return views_of(path, found.cameras, found.saved.undone_before(Motion(exact, scale)))
+
+
+def _json_cameras(path: Path) -> CameraFile:
+    """The cameras of a JSON file: a list is INRIA's, an object with frames nerfstudio's."""
+    if path.is_dir():
+        raise DataError(f"{path}: a folder without cameras.bin or cameras.txt; expected {ACCEPTED}")
+    path = require_file(path, ACCEPTED)
+    size = path.stat().st_size
+    if size > MOST_BYTES:
+        raise DataError(f"{path}: {size / 1e6:.0f} MB; expected cameras of at most {MOST_BYTES / 1e6:.0f} MB")
+    require_memory(path, _BYTES_OF_VALUES * size)
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: cannot be read as JSON ({one_line(error, 80)}); expected {ACCEPTED}") from error
+    if isinstance(content, list):
+        return inria_cameras(content, path)
+    if isinstance(content, dict) and isinstance(content.get("frames"), list):
+        return nerfstudio_cameras(content, path)
+    if isinstance(content, dict) and "camera_path" in content:
+        raise DataError(f"{path}: a camera path of nerfstudio's viewer, for `render --path`; expected {ACCEPTED}")
+    raise DataError(f"{path}: JSON without a list of cameras; expected {ACCEPTED}")

@@ -1,0 +1,461 @@
+"""Files of cameras are read as their own projects read them; anything else is refused in one line, without harm."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import struct
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+import pointsplat_ns as ps
+from pointsplat_ns.geometry.cameras import invert_rigid, viewmats_to_opengl
+from pointsplat_ns.geometry.quaternions import rotation_matrices
+from pointsplat_ns.io.camera_files import cameras, is_camera_file, read_views, registry, transforms_beside
+from posing import (
+    colmap_binary,
+    inria,
+    name_of,
+    nerfstudio,
+    write_colmap_binary,
+    write_colmap_text,
+    written,
+)
+
+SEED = 3
+
+IDENTITY = torch.eye(4).tolist()
+
+
+def some_views(count: int = 12, width: int = 64, height: int = 48, centred: bool = False) -> ps.Views:
+    """Cameras that stand and look anywhere."""
+    generator = torch.Generator().manual_seed(SEED)
+    matrices = torch.cat(
+        [
+            rotation_matrices(torch.randn(count, 4, generator=generator, dtype=torch.float64)),
+            torch.randn(count, 3, 1, generator=generator, dtype=torch.float64),
+        ],
+        dim=2,
+    )
+    cx, cy = (width / 2, height / 2) if centred else (30.5, 25.25)
+    K = torch.tensor([[50.0, 0, cx], [0, 52.0, cy], [0, 0, 1]], dtype=torch.float64)
+    return ps.Views(invert_rigid(matrices), K.repeat(count, 1, 1), width, height, torch.zeros(3))
+
+
+def need_same(found: ps.Views, expected: ps.Views, within: float = 1e-9) -> None:
+    assert (len(found), found.width, found.height) == (len(expected), expected.width, expected.height)
+    torch.testing.assert_close(found.viewmats, expected.viewmats.double(), rtol=0, atol=within)
+    torch.testing.assert_close(found.Ks, expected.Ks.double(), rtol=0, atol=within)
+
+
+def without(content: dict, *names: str) -> dict:
+    return {name: value for name, value in content.items() if name not in names}
+
+
+def framed(**changes) -> dict:
+    """A ``transforms.json`` of one frame, which is changed; None takes a part away."""
+    content = nerfstudio(some_views(1))
+    content["frames"][0] = {k: v for k, v in {**content["frames"][0], **changes}.items() if v is not None}
+    return content
+
+
+def turned(row: int, column: int, value: float) -> dict:
+    """A ``transforms.json`` of one frame, a number of whose pose is changed."""
+    rows = [list(line) for line in IDENTITY]
+    rows[row][column] = value
+    return framed(transform_matrix=rows)
+
+
+WRITERS = {
+    "inria": lambda views, folder: written(inria(views), folder / "cameras.json"),
+    "nerfstudio": lambda views, folder: written(nerfstudio(views), folder / "transforms.json"),
+    "colmap text": lambda views, folder: write_colmap_text(views, folder / "sparse"),
+    "colmap binary": lambda views, folder: write_colmap_binary(views, folder / "sparse"),
+}
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_cameras_are_those_that_were_written(kind, tmp_path):
+    views = some_views(centred=kind == "inria")
+    path = WRITERS[kind](views, tmp_path)
+    assert is_camera_file(path)
+    need_same(read_views(path), views)
+
+
+def test_a_camera_of_3dgs_looks_along_its_third_column(tmp_path):
+    entry = {
+        "id": 0, "img_name": "a", "width": 60, "height": 40, "fx": 30.0, "fy": 30.0,
+        "position": [1.0, 2.0, 3.0], "rotation": [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]],
+    }  # fmt: skip
+    view = read_views(written([entry], tmp_path / "cameras.json"))[0]
+    ahead, below = torch.tensor([[3.0, 2.0, 3.0, 1.0], [3.0, 2.0, 2.0, 1.0]], dtype=torch.float64)  # z is up
+    torch.testing.assert_close((view.viewmat @ ahead)[:3], torch.tensor([0.0, 0.0, 2.0]).double())
+    torch.testing.assert_close((view.viewmat @ below)[:3], torch.tensor([0.0, 1.0, 2.0]).double())
+
+
+def test_a_camera_of_nerfstudio_looks_along_its_negative_third_column(tmp_path):
+    view = read_views(written(framed(transform_matrix=IDENTITY), tmp_path / "transforms.json"))[0]
+    above = torch.tensor([0.0, 1.0, -2.0, 1.0], dtype=torch.float64)
+    torch.testing.assert_close((view.viewmat @ above)[:3], torch.tensor([0.0, -1.0, 2.0]).double())
+
+
+def test_colmap_models_are_what_nerfstudio_reads(tmp_path):
+    utils = pytest.importorskip("nerfstudio.data.utils.colmap_parsing_utils")
+    for folder, suffix in ((write_colmap_text(some_views(), tmp_path / "a"), "text"),
+                           (write_colmap_binary(some_views(), tmp_path / "b"), "binary")):  # fmt: skip
+        end = {"text": "txt", "binary": "bin"}[suffix]
+        images = getattr(utils, f"read_images_{suffix}")(folder / f"images.{end}")
+        by_name = {image.name: image for image in images.values()}
+        views = read_views(folder)
+        for index, view in enumerate(views):
+            image = by_name[name_of(index)]
+            torch.testing.assert_close(view.viewmat[:3, :3], torch.from_numpy(image.qvec2rotmat()))
+            torch.testing.assert_close(view.viewmat[:3, 3], torch.from_numpy(image.tvec))
+
+
+def test_poses_are_moved_to_where_nerfstudio_trains(tmp_path):
+    parsers = pytest.importorskip("nerfstudio.data.dataparsers.nerfstudio_dataparser")
+    views = some_views()
+    applied = [[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0.5]]
+    content = {**nerfstudio(views), "applied_transform": applied, "applied_scale": 2.0}
+    path = written(content, tmp_path / "transforms.json")
+    (tmp_path / "images").mkdir()
+    for frame in content["frames"]:
+        Image.new("RGB", (64, 48)).save(tmp_path / frame["file_path"])
+    config = parsers.NerfstudioDataParserConfig(data=tmp_path, eval_mode="all", load_3D_points=False)
+    outputs = config.setup().get_dataparser_outputs("train")
+    outputs.save_dataparser_transform(tmp_path / "dataparser_transforms.json")
+    by_name = dict(zip((p.name for p in outputs.image_filenames), outputs.cameras.camera_to_worlds, strict=True))
+    expected = torch.stack([by_name[name_of(index)] for index in range(len(views))])
+    # nerfstudio computes in float32
+    torch.testing.assert_close(viewmats_to_opengl(read_views(path).viewmats).float(), expected, rtol=0, atol=2e-6)
+
+
+def moved_as(transform: torch.Tensor, scale: float) -> str:
+    return json.dumps({"transform": transform.tolist(), "scale": scale})
+
+
+TURN = torch.tensor([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+@pytest.mark.parametrize("beside", [True, False])
+def test_transforms_move_poses_of_datasets_but_not_those_of_3dgs(kind, beside, tmp_path):
+    views = some_views(centred=kind == "inria")
+    path = WRITERS[kind](views, tmp_path)
+    if not beside:
+        (tmp_path / "elsewhere").mkdir()
+    place = tmp_path / ("" if beside else "elsewhere") / "dataparser_transforms.json"
+    place.write_text(moved_as(TURN, 0.25))
+    assert transforms_beside(path) == (place if beside else None)
+    poses = invert_rigid(views.viewmats)
+    if kind != "inria":
+        poses = torch.cat([TURN, torch.tensor([[0.0, 0, 0, 1]])]).double() @ poses
+        poses[:, :3, 3] *= 0.25
+    need_same(read_views(path, None if beside else place), replace(views, viewmats=invert_rigid(poses)))
+
+
+def test_transforms_that_are_no_rigid_motion_are_refused(tmp_path):
+    path = written(nerfstudio(some_views()), tmp_path / "transforms.json")
+    (tmp_path / "dataparser_transforms.json").write_text(moved_as(2 * TURN, 1.0))
+    with pytest.raises(ps.DataError, match=r"dataparser_transforms.json: its transform is no rigid motion"):
+        read_views(path)
+
+
+def test_intrinsics_may_stand_in_each_frame(tmp_path):
+    content = nerfstudio(some_views(2))
+    for index, frame in enumerate(content["frames"]):
+        frame.update(fl_x=40.0 + index, cx=10.0 + index)
+    found = read_views(written(without(content, "fl_x"), tmp_path / "transforms.json"))
+    assert found.Ks[:, 0, 0].tolist() == [40.0, 41.0] and found.Ks[:, 0, 2].tolist() == [10.0, 11.0]
+
+
+@pytest.mark.parametrize(("photo", "size"), [(None, (800, 800)), ("a.png", (60, 40)), ("broken", (800, 800))])
+def test_nerf_synthetic_has_an_angle_and_no_size(photo, size, tmp_path, caplog):
+    caplog.set_level("INFO")
+    frame = {"file_path": "./a", "rotation": 0.01, "transform_matrix": IDENTITY}
+    path = written({"camera_angle_x": math.pi / 2, "frames": [frame]}, tmp_path / "transforms_train.json")
+    if photo == "broken":
+        (tmp_path / "a.png").write_bytes(b"\x89PNG")
+    elif photo:
+        Image.new("RGB", (60, 40)).save(tmp_path / photo)
+    found = read_views(path)
+    assert (found.width, found.height) == size
+    focal = size[0] / 2
+    assert found.Ks[0].tolist() == [
+        [pytest.approx(focal), 0, size[0] / 2],
+        [0, pytest.approx(focal), size[1] / 2],
+        [0, 0, 1],
+    ]
+    assert ("taken for 800 x 800 pixels" in caplog.text) == (size == (800, 800))
+
+
+def test_no_photo_outside_of_the_folder_is_opened(tmp_path):
+    Image.new("RGB", (60, 40)).save(tmp_path / "a.png")
+    (tmp_path / "in").mkdir()
+    for name in ("../a.png", str(tmp_path / "a.png"), "a\0.png", "a" * 5000, "\ud800"):
+        content = {"camera_angle_x": 1.0, "frames": [{"file_path": name, "transform_matrix": IDENTITY}]}
+        assert read_views(written(content, tmp_path / "in" / "transforms.json")).width == 800
+
+
+def test_an_early_file_beside_a_colmap_model_has_the_transform_that_nerfstudio_applied_then(tmp_path):
+    content = nerfstudio(some_views(1))
+    (tmp_path / "dataparser_transforms.json").write_text(moved_as(torch.eye(4)[:3], 1.0))
+    (tmp_path / "colmap/sparse/0").mkdir(parents=True)
+    early = read_views(written(content, tmp_path / "transforms.json"))
+    applied = [[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+    need_same(early, read_views(written({**content, "applied_transform": applied}, tmp_path / "transforms.json")))
+
+
+@pytest.mark.parametrize(
+    ("model", "number", "extra"), [("OPENCV", 4, (0.1, 0.0, 0.0, 0.0)), ("OPENCV_FISHEYE", 5, (0.0, 0.0, 0.0, 0.0))]
+)
+def test_distortion_is_left_out_and_said_to_be(model, number, extra, tmp_path, caplog):
+    caplog.set_level("INFO")
+    views = some_views(3)
+    text = write_colmap_text(views, tmp_path / "text", model, extra)
+    binary = write_colmap_binary(views, tmp_path / "binary", number, extra)
+    file = written({**nerfstudio(views), "camera_model": model, "k1": extra[0]}, tmp_path / "transforms.json")
+    for path in (text, binary, file):
+        caplog.clear()
+        need_same(read_views(path), views)
+        assert f"{path}: the lens distortion of 3 of 3 cameras is ignored" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "focal", "centre"),
+    [
+        ("SIMPLE_PINHOLE", "50 30 20", (50, 50), (30, 20)),
+        ("PINHOLE", "50 51 30 20", (50, 51), (30, 20)),
+        ("SIMPLE_RADIAL", "50 30 20 0.1", (50, 50), (30, 20)),
+        ("RADIAL", "50 30 20 0.1 0.2", (50, 50), (30, 20)),
+        ("FULL_OPENCV", "50 51 30 20 1 2 3 4 5 6 7 8", (50, 51), (30, 20)),
+        ("FOV", "50 51 30 20 1", (50, 51), (30, 20)),
+        ("SIMPLE_RADIAL_FISHEYE", "50 30 20 1", (50, 50), (30, 20)),
+        ("RADIAL_FISHEYE", "50 30 20 1 2", (50, 50), (30, 20)),
+        ("THIN_PRISM_FISHEYE", "50 51 30 20 1 2 3 4 5 6 7 8", (50, 51), (30, 20)),
+    ],
+)
+def test_focal_lengths_and_principal_point_of_each_model_of_colmap(model, params, focal, centre, tmp_path):
+    folder = write_colmap_text(some_views(1), tmp_path)
+    (folder / "cameras.txt").write_text(f"3 {model} 64 48 {params}\n")
+    K = read_views(folder).Ks[0]
+    assert K.diagonal()[:2].tolist() == [*focal] and K[:2, 2].tolist() == [*centre]
+
+
+def test_the_folder_of_a_colmap_model_may_be_named_by_its_files_and_have_both_kinds(tmp_path):
+    folder = write_colmap_text(some_views(2), tmp_path)
+    write_colmap_binary(some_views(), folder)
+    for name in ("", "images.bin", "cameras.txt"):
+        assert len(read_views(folder / name)) == 12
+
+
+def test_views_are_in_the_order_of_names_with_numbers_by_size(tmp_path):
+    views = some_views()
+    content = nerfstudio(views)
+    content["frames"].sort(key=lambda frame: frame["file_path"])  # frame_10 comes before frame_2
+    need_same(read_views(written(content, tmp_path / "transforms.json")), views)
+
+
+def test_cameras_of_other_sizes_see_the_same_at_the_most_common_size(tmp_path):
+    content = inria(some_views(3, centred=True))
+    content[1].update(width=128, height=24, fx=100.0, fy=26.0)
+    found = read_views(written(content, tmp_path / "cameras.json"))
+    need_same(found, some_views(3, centred=True))
+
+
+def inria_with(**changes) -> list:
+    return [*inria(some_views(1, centred=True)), {**inria(some_views(1, centred=True))[0], **changes}]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "cannot be read as JSON"),
+        ("[" * 100_000, "cannot be read as JSON"),
+        ('{"frames": ' + "[" * 100_000, "cannot be read as JSON"),
+        ("9" * 10_000, "cannot be read as JSON"),
+        ("3", "JSON without a list of cameras"),
+        ('"cameras"', "JSON without a list of cameras"),
+        ({}, "JSON without a list of cameras"),
+        ({"frames": {"0": 1}}, "JSON without a list of cameras"),
+        ({"camera_path": []}, "a camera path of nerfstudio's viewer, for `render --path`"),
+        ([], "0 cameras; expected 1 to 100000"),
+        ({"frames": []}, "0 cameras; expected 1 to 100000"),
+        ([3], "camera 0 has no pose"),
+        (inria_with(position=[1, 2]), "camera 1 has no pose"),
+        (inria_with(rotation=[[1, 0], [0, 1]]), "camera 1 has no pose"),
+        (inria_with(rotation=[1, 2, 3]), "camera 1 has no pose"),
+        (inria_with(position=[math.nan, 0, 0]), "the pose of camera 1 is no rigid motion"),
+        (inria_with(position=["1", 0, 0]), "the pose of camera 1 is no rigid motion"),
+        (inria_with(position=[10**400, 0, 0]), "the pose of camera 1 is no rigid motion"),
+        (inria_with(position=[1e10, 0, 0]), r"camera 1 \(frame_0.png\) is too far away"),
+        (inria_with(rotation=[[2, 0, 0], [0, 2, 0], [0, 0, 2]]), "the pose of camera 1 is no rigid motion"),
+        (inria_with(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]), "the pose of camera 1 is no rigid motion"),
+        (inria_with(rotation=[[0, 0, 0]] * 3), "the pose of camera 1 is no rigid motion"),
+        (inria_with(fx="50"), "camera 1 has no intrinsics"),
+        (inria_with(fx=math.inf), "camera 1 has no intrinsics"),
+        (inria_with(fx=0), "camera 1 .* has no usable focal length"),
+        (inria_with(fy=-3.0), "camera 1 .* has no usable focal length"),
+        (inria_with(fx=1e12), "camera 1 .* has no usable focal length"),
+        (inria_with(width=0), "camera 1 .* has a picture of no usable size"),
+        (inria_with(width=10.5), "camera 1 .* has a picture of no usable size"),
+        (inria_with(height=10**7), "camera 1 .* has a picture of no usable size"),
+        ({"fl_x": 5, "w": 4, "h": 4, "frames": [3]}, "camera 0 is no frame"),
+        (framed(transform_matrix=None), "camera 0 has no pose"),
+        (framed(transform_matrix=[[1, 2, 3]] * 4), "camera 0 has no pose"),
+        (turned(0, 3, math.inf), "the pose of camera 0 is no rigid motion"),
+        (turned(0, 0, 1.1), "the pose of camera 0 is no rigid motion"),
+        (turned(1, 1, 1e200), "the pose of camera 0 is no rigid motion"),
+        (turned(3, 3, 2.0), "the pose of camera 0 is no rigid motion"),
+        (framed(fl_x=0), "camera 0 has no focal length"),
+        (framed(cx=1e9), "camera 0 .* has its principal point far outside"),
+        (framed(camera_model="EQUIRECTANGULAR"), "camera 0 is 'EQUIRECTANGULAR'; expected one of SIMPLE_PINHOLE"),
+        (framed(camera_model=[1]), r"camera 0 is '\[1\]'"),
+        ({**framed(), "applied_transform": [[1, 2]]}, "its 'applied_transform' or 'applied_scale' is not usable"),
+        ({**framed(), "applied_transform": "north"}, "its 'applied_transform' or 'applied_scale' is not usable"),
+        ({**framed(), "applied_scale": 0}, "its 'applied_transform' or 'applied_scale' is not usable"),
+        ({**framed(), "applied_transform": [[0, 0, 0, 0]] * 3}, "its 'applied_transform' is no rigid motion"),
+        (without(framed(), "fl_x", "fl_y"), "camera 0 has no focal length"),
+    ],
+)  # fmt: skip
+def test_other_json_is_refused_in_one_line(content, message, tmp_path):
+    path = written(content, tmp_path / "cameras.json")
+    with pytest.raises(ps.DataError, match=message) as raised:
+        read_views(path)
+    assert str(raised.value).startswith(str(path)) and "\n" not in str(raised.value) and len(str(raised.value)) < 600
+
+
+def colmap_texts(cameras_text: str | None = None, images_text: str | None = None):
+    def write(folder: Path) -> Path:
+        write_colmap_text(some_views(2), folder)
+        for name, text in (("cameras.txt", cameras_text), ("images.txt", images_text)):
+            if text is not None:
+                (folder / name).write_text(text)
+        return folder
+
+    return write
+
+
+def colmap_bytes(at: int, value: bytes, file: str = "images.bin"):
+    """A binary model with bytes replaced from a place on."""
+
+    def write(folder: Path) -> Path:
+        write_colmap_binary(some_views(2), folder)
+        data = bytearray((folder / file).read_bytes())
+        data[at : at + len(value)] = value
+        (folder / file).write_bytes(data)
+        return folder
+
+    return write
+
+
+def cut(file: str, size: int):
+    def write(folder: Path) -> Path:
+        write_colmap_binary(some_views(2), folder)
+        os.truncate(folder / file, size)
+        return folder
+
+    return write
+
+
+NAME_AT = 8 + 64
+"""Where the name of the first image begins."""
+
+POINTS_AT = NAME_AT + len(name_of(0)) + 1
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (colmap_texts("3 PINHOLE 64 48 50 50 30\n"), "cameras.txt: '3 PINHOLE 64 48 50 50 30' is no camera"),
+        (colmap_texts("3 PINHOLE sixty 48 50 50 30 20\n"), "is no camera"),
+        (colmap_texts("3 EQUIRECTANGULAR 64 48 64 48\n"), "a camera of model EQUIRECTANGULAR; expected one of SIMPLE"),
+        (colmap_texts("4 PINHOLE 64 48 50 50 30 20\n"), "frame_0.png was taken by camera 3, which cameras.txt lacks"),
+        (colmap_texts("3 PINHOLE 64 48 nan 50 30 20\n"), "camera 0 .frame_0.png. has no usable focal length"),
+        (colmap_texts("# nothing\n"), "was taken by camera 3"),
+        (colmap_texts(None, "# nothing\n"), "images.txt: 0 cameras"),
+        (colmap_texts(None, "1 1 0 0 0 0 0 0 3\n\n"), "images.txt: '1 1 0 0 0 0 0 0 3' is no image"),
+        (colmap_texts(None, "1 1 0 0 0 0 0 x 3 a.png\n\n"), "is no image"),
+        (colmap_texts(None, "1 0 0 0 0 0 0 0 3 a.png\n\n"), "the pose of camera 0 .a.png. is no rigid motion"),
+        (colmap_texts(None, "1 1 0 0 0 inf 0 0 3 a.png\n\n"), "the pose of camera 0 .a.png. is no rigid motion"),
+        (colmap_texts(None, "1 1 0 0 0 0 0 0 3 " + "a" * 10_000), "a line of more than 4096 bytes"),
+        (colmap_bytes(0, struct.pack("<Q", 2**63)), r"images.bin: says that it has \d+ entries and has room for 2"),
+        (colmap_bytes(0, struct.pack("<Q", 0)), "images.bin: says that it has 0 entries"),
+        (colmap_bytes(0, struct.pack("<Q", 2**63), "cameras.bin"), "cameras.bin: says that it has"),
+        (colmap_bytes(8 + 4, struct.pack("<d", math.nan)), "the pose of camera 0 .frame_0.png. is no rigid motion"),
+        (colmap_bytes(8 + 60, struct.pack("<I", 9)), "was taken by camera 9"),
+        (colmap_bytes(POINTS_AT, struct.pack("<Q", 2**62)), "an image with 4611686018427387904 points, for which the"),
+        (colmap_bytes(12, struct.pack("<i", 11), "cameras.bin"), "cameras.bin: ends too early"),
+        (colmap_bytes(12, struct.pack("<i", -1), "cameras.bin"), "a camera of model -1; expected one of SIMPLE"),
+        (colmap_bytes(16, struct.pack("<Q", 2**64 - 1), "cameras.bin"), "has a picture of no usable size"),
+        (cut("images.bin", 0), "images.bin: ends too early"),
+        (cut("images.bin", NAME_AT + 3), r"images.bin: says that it has 2 entries and has room for 0"),
+        (cut("images.bin", 170), "images.bin: (ends too early|no end of an image's name)"),
+        (cut("cameras.bin", 40), "cameras.bin: ends too early"),
+    ],
+)
+def test_damaged_colmap_models_are_refused_in_one_line(write, message, tmp_path):
+    folder = write(tmp_path / "sparse")
+    with pytest.raises(ps.DataError, match=message) as raised:
+        read_views(folder)
+    assert str(raised.value).startswith(str(folder)) and "\n" not in str(raised.value)
+
+
+def test_a_name_without_an_end_is_refused(tmp_path):
+    folder = write_colmap_binary(some_views(1), tmp_path)
+    _, images = colmap_binary(some_views(1))
+    (folder / "images.bin").write_bytes(images[:NAME_AT] + b"a" * 20_000)
+    with pytest.raises(ps.DataError, match="no end of an image's name within 4096 bytes"):
+        read_views(folder)
+
+
+def test_points_take_no_memory(tmp_path):
+    """One image with two million points, of which the file holds none on the disk, and one of text as long."""
+    folder = write_colmap_binary(some_views(1), tmp_path / "binary")
+    data = bytearray((folder / "images.bin").read_bytes())
+    data[POINTS_AT:] = struct.pack("<Q", 2_000_000)
+    (folder / "images.bin").write_bytes(data)
+    os.truncate(folder / "images.bin", len(data) + 24 * 2_000_000)
+    text = write_colmap_text(some_views(1), tmp_path / "text")
+    (text / "images.txt").write_text("1 1 0 0 0 0 0 0 3 a.png\n" + "1.5 2.5 -1 " * 1_000_000 + "\n")
+    for path in (folder, text):
+        read_views(path)
+        tracemalloc.start()
+        try:
+            assert len(read_views(path)) == 1
+            assert tracemalloc.get_traced_memory()[1] < 1e6
+        finally:
+            tracemalloc.stop()
+
+
+def test_missing_and_huge_files_and_other_folders_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(ps.SceneError, match="no such file; expected cameras.json of 3DGS, transforms.json"):
+        read_views(tmp_path / "nothing.json")
+    with pytest.raises(ps.DataError, match="a folder without cameras.bin or cameras.txt; expected"):
+        read_views(tmp_path)
+    folder = write_colmap_binary(some_views(2), tmp_path / "sparse")
+    (folder / "cameras.bin").unlink()
+    with pytest.raises(ps.DataError, match="cameras.bin: no such file; expected a COLMAP model"):
+        read_views(folder)
+    path = written(nerfstudio(some_views()), tmp_path / "transforms.json")
+    monkeypatch.setattr(cameras, "MOST_CAMERAS", 3)
+    with pytest.raises(ps.DataError, match="12 cameras; expected 1 to 3"):
+        read_views(path)
+    monkeypatch.setattr(registry, "MOST_BYTES", 10)
+    with pytest.raises(ps.DataError, match="expected cameras of at most"):
+        read_views(path)
+
+
+@pytest.mark.parametrize("name", ["room.ply", "a.ckpt", "config.yml", "meta.json", "room.sog"])
+def test_scenes_and_runs_are_no_files_of_cameras(name, tmp_path):
+    (tmp_path / name).touch()
+    assert not is_camera_file(tmp_path / name)
+    if name in ("config.yml", "meta.json"):
+        assert not is_camera_file(tmp_path)
