@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator
 
 import pytest
 
 from pointsplat_ns.compression import repair
 from pointsplat_ns.looking import view_source
-from pointsplat_ns.looking.sampling import views_about
 from pointsplat_ns.rooms import light
 
 
 @pytest.fixture(scope="session", autouse=True)
 def small_views_by_default() -> Iterator[None]:
-    """Where no views are given, those that renders are compared in have a 25th of the pixels that users get."""
+    """Where no views are given, those that renders are compared in have 64 x 48 pixels."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(view_source, "views_about", functools.partial(views_about, width=64, height=48))
+        patch.setattr(view_source, "RESOLUTION", (64, 48))
         yield
 
 

@@ -14,7 +14,6 @@ import os
 
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")  # only one thread can be forked
 
-import functools
 import importlib
 import pkgutil
 import random
@@ -184,7 +183,6 @@ def prepare(place: Path, training: bool) -> None:
 
     from pointsplat_ns.compression import repair
     from pointsplat_ns.looking import view_source
-    from pointsplat_ns.looking.sampling import views_about
     from pointsplat_ns.rooms import light
 
     os.chdir(place)
@@ -202,7 +200,7 @@ def prepare(place: Path, training: bool) -> None:
     results = {"settings": {}, "average": rows, "scenes": {"a": {"seen_in_training": True, **rows}}}
     Path("evaluation.json").write_text(json.dumps({"results": results}))
     # Tiny views, few steps and coarse rooms: what is looked at is files.
-    view_source.views_about = functools.partial(views_about, width=48, height=36)
+    view_source.RESOLUTION = (48, 36)
     repair.STEPS["quick"] = 2
     light.TEXEL, light.LUMEL = 0.2, 1.0
     if training:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import time
@@ -16,16 +15,15 @@ from typing import Any
 import torch
 from held_out import COLUMNS, REFERENCES, Scene, compare, load, photos_of
 
-from pointsplat_ns.compression.closeness import Closeness, DenseReference
-from pointsplat_ns.compression.compact import as_far_as_it_helps, helps
+from pointsplat_ns.compression.closeness import Closeness
+from pointsplat_ns.compression.compact import Comparison, as_far_as_it_helps, helps
 from pointsplat_ns.compression.fine_tune import fine_tune
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, open_refiner_run
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import open_run
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.view_source import COMPARED_SIDE, COMPARED_VIEWS
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
@@ -147,16 +145,14 @@ class Judge:
         return f"{run.experiment_name}/{run.method_name}/{run.timestamp} step {run.step}"
 
     @cached_property
-    def rule(self) -> DenseReference | None:
+    def rule(self) -> Comparison | None:
         """The dense scene as seen from sampled poses, by which ``pointsplat compact`` of a PLY decides how far to
         refine; None if no free place to look from was found."""
         try:
-            views = sample_views(self.scene.dense, COMPARED_VIEWS).resized(COMPARED_SIDE)
+            return Comparison(self.scene.dense, ViewSource(self.scene.dense))
         except DataError as error:
             self.tell(f"{self.scene.name}: {error}")
             return None
-        mode = self.scene.views.rasterize_mode
-        return DenseReference(self.scene.dense, dataclasses.replace(views, rasterize_mode=mode))
 
     def dense_row(self) -> None:
         """The scene itself against its photos."""
@@ -304,7 +300,7 @@ class Selected:
     @cached_property
     def before(self) -> Closeness | None:
         """How close it comes to the dense scene, from the poses of the rule."""
-        return None if self._judge.rule is None else self._judge.rule.closeness(self.scene)
+        return None if self._judge.rule is None else self._judge.rule.reference.closeness(self.scene)
 
     @torch.no_grad()
     def refined(self, trained: Trained) -> tuple[Gaussians, float]:

@@ -1,4 +1,4 @@
-"""What repairing a merged scene brings, in dB over seconds: the refiner, fine-tuning, Adam, and ``compact``'s repair.
+"""What repairing a merged scene brings, in dB over seconds: fine-tuning, Adam, and ``compact``'s repair.
 
     python benchmarks/repair.py scenes/rock.ply outputs/diorama/splatfacto-cpu/RUN --keep 10% --seconds 5 10 20
 
@@ -21,7 +21,6 @@ from torch import Tensor
 
 import pointsplat_ns as ps
 from pointsplat_ns.compression.closeness import DenseReference
-from pointsplat_ns.compression.compact import as_far_as_it_helps, helps
 from pointsplat_ns.compression.fine_tune import fine_tune
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
@@ -46,10 +45,10 @@ class Row:
     gaussians: int
     keep: str
     kind: str
-    """merge, refiner, fine-tune (``prune --fine-tune``), Adam (repair without its network) or repair (``compact``)."""
+    """merge, fine-tune (``prune --fine-tune``), Adam (repair without its network) or repair (``compact``)."""
     steps: int
     seconds: float
-    """Wall-clock time after merging. That of the refiner includes finding out how far it helps."""
+    """Wall-clock time after merging."""
     cpu_seconds: float
     psnr_a: float
     """Mean PSNR against the dense scene's renders in the first set of sampled views, dB."""
@@ -92,13 +91,8 @@ def rows_of(path: Path, keep: str, seconds: list[float], fine_tune_steps: list[i
         return Row(name_of(path), len(dense), keep, kind, steps, wall, cpu, **judge.psnr(scene))
 
     yield row("merge", merged, 0, now())
-    started = now()
     reference = DenseReference(dense, views)
-    before = reference.closeness(merged)
-    refined, _, after = as_far_as_it_helps(reference, before, merged, ps.load_refiner()(merged))
-    refined, close = (refined, after) if helps(before, after) else (merged, before)
-    psnr = reference.psnr_of_covered(close.psnr)
-    yield row("refiner", refined, 0, started)
+    psnr = reference.psnr_of_covered(reference.closeness(merged).psnr)
     for steps in fine_tune_steps:
         started = now()
         tuned = fine_tune(merged, ps.sample_views(dense, FINE_TUNED_ON), dense, steps)
@@ -106,7 +100,7 @@ def rows_of(path: Path, keep: str, seconds: list[float], fine_tune_steps: list[i
     for budget in (RepairBudget("quick"), *(RepairBudget(seconds=limit) for limit in seconds)):
         for kind, network in (("Adam", None), ("repair", shipped_feedback_refiner(dense.device))):
             started = now()
-            repaired = repair(refined, dense, source, budget, network=network, psnr=psnr)
+            repaired = repair(merged, dense, source, budget, network=network, psnr=psnr)
             yield row(kind, repaired.scene, repaired.steps, started)
 
 
@@ -125,7 +119,7 @@ def plot(rows: list[Row], path: Path) -> None:
     for axis, key in zip(axes, scenes, strict=False):
         here = [row for row in rows if (row.scene, row.keep) == key]
         start = next(row for row in here if row.kind == "merge")
-        for kind in ("refiner", "fine-tune", "Adam", "repair"):
+        for kind in ("fine-tune", "Adam", "repair"):
             points = sorted((row.cpu_seconds, gain(row, start)) for row in here if row.kind == kind)
             if points:
                 axis.plot(*zip(*points, strict=True), marker="o", label=kind)

@@ -203,21 +203,23 @@ def compact(
 ) -> Compacted:
     """Make a scene smaller, repair it, and check by rendering how far that helps.
 
-    A trained refiner repairs it in one pass. Then learned steps bring it closer to the given scene's own renders, no
-    photos, for as long as ``effort`` or ``seconds`` says. What does not bring renders closer is left out.
+    Learned steps bring the smaller scene closer to the given scene's own renders, no photos, for as long as ``effort``
+    or ``seconds`` says. A trained refiner, if one is given, comes before them. What does not bring renders closer in
+    pictures of every size is left out.
 
     With targets, count, SH degree and whether to repair are decided by what the scene needs: the smallest file that has
     ``target_db`` and is within the limits of time and size; among limits alone, the best within them.
 
     Args:
         scene: N Gaussians, or where to read them: a PLY, a checkpoint, or a Splatfacto run.
-        keep: how much, as for :func:`prune`; an "auto" PSNR is met before refinement. By default what the refiner was
-            trained with.
-        refiner: from :func:`load_refiner`; by default the one that ships.
-        by: the method, as for :func:`prune`; by default the one that the refiner was trained with.
+        keep: how much, as for :func:`prune`; an "auto" PSNR is met before repairs. By default what the refiner was
+            trained with, and a tenth without one.
+        refiner: from :func:`load_refiner`; by default none.
+        by: the method, as for :func:`prune`; by default the one that the refiner was trained with, and "merge" without
+            one.
         sh: SH bands to keep, as for :func:`prune`.
         clean: as for :func:`prune`.
-        effort: "instant" is only the refiner; "quick" and "thorough" take 48 and 400 steps.
+        effort: "instant" takes no steps; "quick" and "thorough" take 48 and 400.
         seconds: repair for so long, instead; Ctrl-C ends it earlier, and what has been reached is kept.
         target_db: least PSNR against the given scene's renders, dB, mean over views; those of held-out photos where the
             run's are found.
@@ -245,7 +247,6 @@ def compact(
         >>> result.psnr > 15, result.seconds > 0
         (True, True)
     """
-    refiner = refiner or load_refiner()
     budget = RepairBudget(effort, seconds)
     _, method = resolve_options(refiner, keep, by, sh)  # before the scene is read
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)

@@ -9,7 +9,7 @@ from pointsplat_ns.compression.compact import compact_scene, resolve_options
 from pointsplat_ns.compression.repair import Effort, RepairBudget
 from pointsplat_ns.compression.scene_folder import WHOLE, Command, Shard, output_folder, settle_folder
 from pointsplat_ns.compression.scene_task import Made, Options, SceneResult
-from pointsplat_ns.compression.trained_refiner import load_refiner
+from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.view_source import ViewSource
@@ -53,7 +53,7 @@ def compact_folder(
         output: folder for ``NAME.ply`` and its record ``NAME.ply.json`` of each scene, and the table ``scenes.csv``;
             by default beside ``folder``: ``scenes_compact`` for ``scenes``.
         keep: as for :func:`compact`.
-        refiner: what :func:`load_refiner` takes.
+        refiner: what :func:`load_refiner` takes, or "shipped"; None for no refiner.
         by: as for :func:`compact`.
         sh: as for :func:`compact`.
         clean: as for :func:`compact`.
@@ -100,7 +100,7 @@ def compact_folder(
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
     options: Options = {
         "keep": str(budget),
-        "refiner": source_file(trained.source).sha256,
+        "refiner": None if trained is None else source_file(trained.source).sha256,
         "by": method,
         "sh": sh,
         "clean": clean,
@@ -119,7 +119,7 @@ def compact_folder(
     return sorted(gathered(results), key=lambda result: result.name)
 
 
-_refiner_on = functools.cache(load_refiner)
+_refiner_on = functools.cache(refiner_at)
 
 
 def _compacted(

@@ -1,4 +1,4 @@
-"""``pointsplat compact``: make a scene smaller and refine it in one go."""
+"""``pointsplat compact``: make a scene smaller and repair it in one go."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ def compact(
 ) -> None:
     """Make any scene smaller and repair it, or all scenes of a folder. No photos are needed.
 
-    A trained refiner repairs the smaller scene in one pass; then learned steps bring it closer to the dense scene's
-    renders. After each, renders are compared with the dense scene's in other views, and what does not help is left
-    out. Views are those of --poses, else the poses of the run's dataset if it is found, else sampled in free space.
+    Learned steps bring the smaller scene closer to the dense scene's renders. Renders are then compared with the dense
+    scene's in other views, and what does not help in pictures of every size is left out. Views are those of --poses,
+    else the poses of the run's dataset if it is found, else sampled in free space.
 
     A folder that holds config.yml is a run: one scene. Any other folder is a folder of scenes: all files with Gaussians
     below it, and the newest Splatfacto run of each experiment. What is finished is left alone, so that the same command
@@ -67,11 +67,11 @@ def compact(
         output: the file to write, of any format as for prune; by default beside the scene: room_compact.ply for
             room.ply, compact.ply in the folder of a run. For a folder of scenes, another folder; by default
             rooms_compact beside rooms.
-        keep: how much, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before refinement. By default
-            what the refiner was trained with.
-        refiner: a trained pointsplat run (its folder or config.yml), or a .safetensors file; by default the refiner
-            that ships. --using is the same.
-        by: the method of prune; by default the one that the refiner was trained with.
+        keep: how much, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before repairs. By default
+            what the refiner was trained with; without one 0.1.
+        refiner: a trained network that refines the scene before the steps: a pointsplat run (its folder or config.yml),
+            a .safetensors file, or shipped, the one that ships; by default none. --using is the same.
+        by: the method of prune; by default the one that the refiner was trained with; without one merge.
         sh: SH bands to keep, as for prune: all, up to a degree, or auto.
         clean: as for prune: first remove what cannot be drawn and what is seen from nowhere.
         effort: how long to repair then: not at all (instant), 48 steps (quick, about as long as merging takes), or 400.
@@ -112,6 +112,7 @@ def compact(
     from pointsplat_ns.compression.compact import resolve_options
     from pointsplat_ns.compression.posed_scene import read_posed
     from pointsplat_ns.compression.repair import RepairBudget
+    from pointsplat_ns.compression.trained_refiner import refiner_at
     from pointsplat_ns.io import read_scene
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.pages.scene_page import check_limit
@@ -123,7 +124,7 @@ def compact(
     check_output(html, ".html", force)
     check_limit(html_limit)
     keep = None if keep is None else in_format_of(keep, output)
-    trained = ps.load_refiner(refiner)
+    trained = refiner_at(refiner)
     resolve_options(trained, keep, by, sh)
     RepairBudget(effort, seconds)
     targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)

@@ -21,7 +21,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.looking.content import content_box, content_diagonal, in_units
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.view_source import COMPARED_SIDE, ViewSource
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.progress import Progress, silent
@@ -174,7 +174,7 @@ def clean_scene(dense: Gaussians, at_least: int, views: ViewSource, progress: Pr
 def _reference(dense: Gaussians, views: ViewSource) -> DenseReference | None:
     """Renders of the dense scene; None if there are no views."""
     try:
-        return DenseReference(dense, views.views(CHECKED_VIEWS).resized(COMPARED_SIDE))
+        return DenseReference(dense, views.scored(CHECKED_VIEWS))
     except DataError:
         return None
 

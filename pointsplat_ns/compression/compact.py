@@ -12,10 +12,11 @@ import torch
 from pointsplat_ns.compression.closeness import Closeness, DenseReference, views_text
 from pointsplat_ns.compression.prune import check_options, prune_scene
 from pointsplat_ns.compression.repair import RepairBudget, Repaired, repair
-from pointsplat_ns.compression.trained_refiner import TrainedRefiner
+from pointsplat_ns.compression.trained_refiner import TrainedRefiner, default_device
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.looking.windows import WindowRenders, sides_of
 from pointsplat_ns.pruning import Keep, method_named, need_usable
 from pointsplat_ns.pruning.finishing import top_of_parabola
 from pointsplat_ns.system.progress import Progress, silent
@@ -24,6 +25,15 @@ from pointsplat_ns.views import Views
 MIN_GAIN = 0.1
 """Least gain of PSNR, in dB, for which refinement is kept: the sign of a smaller gain depends on the views."""
 
+
+MOST_LOSS = 0.05
+"""Loss of PSNR, in dB, that a refinement or repair may cost in the smallest or the full size of pictures."""
+
+CLEAR_GAIN = 0.5
+"""Gain of PSNR, in dB, from which on no part of a change is tried in place of the whole."""
+
+KEEP = 0.1
+"""Share of the Gaussians that is kept by default."""
 
 NO_REPAIR = RepairBudget("instant")
 
@@ -97,7 +107,7 @@ class Compacted:
 
 def compact_scene(
     dense: Gaussians,
-    refiner: TrainedRefiner,
+    refiner: TrainedRefiner | None = None,
     keep: Keep | str | None = None,
     by: str | None = None,
     sh: str = "all",
@@ -106,26 +116,29 @@ def compact_scene(
     clean: bool = False,
     budget: RepairBudget = NO_REPAIR,
 ) -> Compacted:
-    """Make a scene smaller, refine it if that helps, and repair it as long as the budget says.
+    """Make a scene smaller, refine it if a network is given, and repair it as long as the budget says.
 
-    The pruned and the refined scene are rendered and compared with renders of the dense scene, by the mean squared
-    error over all pixels of all views. On scenes unlike its training scenes, a refiner's residuals tend to have the
+    The smaller scene is rendered and compared with renders of the dense scene. A refiner's residuals tend to have the
     right direction but to be too large. So half of the residuals are tried as well, and the share at the minimum of the
     parabola through the errors at 0, 1/2 and 1, where the error is least if renders change linearly with the residuals.
-    The best is kept if it :func:`helps`. A requested PSNR (``auto``) is reached before refinement, so that it holds in
-    any case. Then the scene is repaired (:func:`~pointsplat_ns.compression.repair.repair`), from views other than those
-    compared; that, too, is kept as far as it helps.
+    The best is kept if it :func:`helps` at every size of picture. A requested PSNR (``auto``) is reached before
+    refinement, so that it holds in any case. Then the scene is repaired
+    (:func:`~pointsplat_ns.compression.repair.repair`), from views other than those compared; that, too, is kept as far
+    as it helps.
 
     Args:
         dense: N Gaussians.
-        refiner: its device is also used for rendering.
-        keep: ratio, count, size or PSNR; by default the refiner's training setting.
-        by: a method of :data:`~pointsplat_ns.pruning.METHODS`; by default the refiner's training setting.
+        refiner: None for none. Its device is also used for rendering.
+        keep: ratio, count, size or PSNR; by default the refiner's training setting, or a tenth.
+        by: a method of :data:`~pointsplat_ns.pruning.METHODS`; by default the refiner's training setting, or merging.
         sh: as for :func:`~pointsplat_ns.compression.prune.prune_scene`.
         views: views that renders are compared in; by default sampled in free space.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
         clean: as for :func:`~pointsplat_ns.compression.prune.prune_scene`.
         budget: how long to repair.
+
+    Returns:
+        Scenes on the device of ``dense``.
 
     Raises:
         BudgetError, SceneError, PointSplatError: as :func:`~pointsplat_ns.compression.prune.prune_scene`.
@@ -134,54 +147,78 @@ def compact_scene(
     """
     start = time.perf_counter()
     keep, by = resolve_options(refiner, keep, by, sh)
-    weight = refiner.settings.opacity_weight if method_named(by).weighs_opacity else None
+    weight = refiner.settings.opacity_weight if refiner is not None and method_named(by).weighs_opacity else None
     need_usable(dense)
-    _need_sh_degree(dense, sh, refiner)
+    if refiner is not None:
+        _need_sh_degree(dense, sh, refiner)
     views = views or ViewSource(dense)
     smaller = prune_scene(dense, keep, by, sh, weight, views, progress=progress, clean=clean)
-    progress("refining", 0.0)
-    pruned, refined = smaller.scene, refiner(smaller.scene)
-    strength, reference, before, after = 1.0, None, None, None
-    unsound = int((pruned.usable() & ~refined.usable()).sum())
-    verdict = ""
+    pruned, device = smaller.scene, refiner.device if refiner is not None else default_device()
+    judge, before, missing = None, None, ""
     try:
         progress("comparing renders", 0.0)
-        reference = DenseReference(dense.to(refiner.device), views.compared())
-        before = reference.closeness(pruned.to(refiner.device))
+        judge = Comparison(dense.to(device), views)
+        before = judge.reference.closeness(pruned.to(device))
     except DataError as error:
-        verdict = f"refinement left out: it cannot be compared with the dense scene ({error})"
-    if unsound:
-        verdict = f"refinement left out: {unsound:,} of {len(refined):,} refined Gaussians are not finite"
-    elif reference is not None and before is not None:
-        refined, strength, after = as_far_as_it_helps(reference, before, pruned, refined, progress)
-        verdict = _verdict(before, after, strength)
+        missing = f"it cannot be compared with the dense scene ({error})"
+    refined, strength, after, verdict = pruned, 1.0, None, f"not refined or repaired: {missing}" if missing else ""
+    if refiner is not None:
+        progress("refining", 0.0)
+        refined = refiner(pruned)
+        unsound = int((pruned.usable() & ~refined.usable()).sum())
+        if missing:
+            verdict = f"refinement left out: {missing}"
+        elif unsound:
+            verdict = f"refinement left out: {unsound:,} of {len(refined):,} refined Gaussians are not finite"
+        elif judge is not None and before is not None:
+            refined, strength, after = as_far_as_it_helps(judge, before, pruned, refined, progress)
+            verdict = _verdict(before, after, strength)
     accepted = before is not None and after is not None and helps(before, after)
     notes = smaller.notes
     if views.origin and views.origin not in notes:
         notes = (*notes, views.origin)
     scene, close = (refined, after) if accepted else (pruned, before)
     repaired, after_repair = None, None
-    if reference is not None and close is not None and not budget.empty and close.psnr < math.inf:
+    if judge is not None and close is not None and not budget.empty and close.psnr < math.inf:
         progress("repairing", 0.0)
-        device = reference.renders[0].device
         shown = functools.partial(progress, "repairing")
-        unrepaired = scene.to(device)
-        psnr = reference.psnr_of_covered(close.psnr)
-        repaired = repair(unrepaired, dense.to(device), views, budget, shown, psnr=psnr)
-        after_repair, share = reference.closeness(repaired.scene), 1.0
-        if not helps(close, after_repair):
-            stepped_back, share, after_repair = as_far_as_it_helps(
-                reference, close, unrepaired, repaired.scene, after=after_repair
-            )
-            repaired = replace(repaired, scene=stepped_back)
-        verdict += "\n" + _repair_verdict(close, after_repair, repaired, share)
+        psnr = judge.reference.psnr_of_covered(close.psnr)
+        repaired = repair(scene.to(device), dense.to(device), views, budget, shown, psnr=psnr)
+        kept, share, after_repair = as_far_as_it_helps(judge, close, scene, repaired.scene)
+        repaired = replace(repaired, scene=kept)
+        verdict = "\n".join(filter(None, (verdict, _repair_verdict(close, after_repair, repaired, share))))
         if helps(close, after_repair):
             scene = repaired.scene
     seconds = time.perf_counter() - start
+    reference = None if judge is None else judge.reference
     return Compacted(
         *(scene, pruned, refined, strength, accepted, verdict, notes, reference, before, after, seconds),
         *(repaired, after_repair),
     )
+
+
+class Comparison:
+    """Compares scenes with the dense one: in whole pictures of a middle size, and in windows of the smallest and the
+    full size, where nothing that helps in the others may harm.
+
+    Args:
+        dense: N Gaussians, on the device that renders.
+        views: where views come from.
+
+    Raises:
+        DataError: if there are no views.
+    """
+
+    def __init__(self, dense: Gaussians, views: ViewSource):
+        self.reference = DenseReference(dense, views.compared())
+        self.device = dense.device
+        whole = views.whole()
+        sides = sides_of(whole.width, whole.height)
+        self._others = WindowRenders(dense, whole, (sides[0], sides[-1])) if len(sides) > 1 else None
+
+    def psnrs(self, scene: Gaussians) -> list[float]:
+        """PSNR of a scene in the smallest and the full size, dB; empty where pictures have one size only."""
+        return [] if self._others is None else self._others.psnrs(scene)
 
 
 def as_compacted(dense: Gaussians, pruned: Gaussians, views: ViewSource, notes: tuple[str, ...]) -> Compacted:
@@ -198,17 +235,21 @@ def as_compacted(dense: Gaussians, pruned: Gaussians, views: ViewSource, notes: 
     return Compacted(pruned, pruned, pruned, 1.0, False, verdict, notes, reference, before, None, 0.0)
 
 
-def resolve_options(refiner: TrainedRefiner, keep: Keep | str | None, by: str | None, sh: str) -> tuple[Keep, str]:
+def resolve_options(
+    refiner: TrainedRefiner | None, keep: Keep | str | None, by: str | None, sh: str
+) -> tuple[Keep, str]:
     """Check the options of :func:`compact_scene` that do not depend on the scene, before a scene is read.
 
     Returns:
-        ``keep``, parsed if it is text, and ``by``; those that the refiner was trained with if they are None.
+        ``keep``, parsed if it is text, and ``by``. If they are None, those that the refiner was trained with; without
+        a refiner, a tenth and merging.
 
     Raises:
         BudgetError, PointSplatError: as :func:`~pointsplat_ns.compression.prune.check_options`.
     """
-    by = refiner.settings.by if by is None else by
-    return check_options(refiner.settings.keep if keep is None else keep, by, sh), by
+    usual = (KEEP, "merge") if refiner is None else (refiner.settings.keep, refiner.settings.by)
+    by = usual[1] if by is None else by
+    return check_options(usual[0] if keep is None else keep, by, sh), by
 
 
 def _need_sh_degree(dense: Gaussians, sh: str, refiner: TrainedRefiner) -> None:
@@ -232,55 +273,43 @@ def at_strength(before: Gaussians, after: Gaussians, strength: float) -> Gaussia
 
 
 def as_far_as_it_helps(
-    reference: DenseReference,
-    before: Closeness,
-    pruned: Gaussians,
-    refined: Gaussians,
-    progress: Progress = silent,
-    after: Closeness | None = None,
+    judge: Comparison, before: Closeness, old: Gaussians, new: Gaussians, progress: Progress = silent
 ) -> tuple[Gaussians, float, Closeness]:
-    """The scene at the best share of a refinement or repair that helps, that share, and its errors; at full strength if
-    none helps.
+    """The scene at the best share of a refinement or repair that helps, that share, and its errors; at full strength
+    if none helps. The scene is on the device of ``old``.
 
     Args:
-        reference: the dense scene's renders.
-        before: errors of ``pruned`` against them.
-        pruned, refined: the scenes before and after.
+        judge: what compares.
+        before: errors of ``old``.
+        old, new: the scenes before and after.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
-        after: errors of ``refined``, if they are known.
     """
-    device = reference.renders[0].device
-    tried = {} if after is None else {1.0: after}
-    _try_strengths(tried, reference, before, pruned.to(device), refined.to(device), progress)
-    helping = [share for share in tried if helps(before, tried[share])]
-    strength = min(helping, key=lambda share: tried[share].error, default=1.0)
-    return at_strength(pruned, refined, strength), strength, tried[strength]
+    start, end = old.to(judge.device), new.to(judge.device)
+    tried: dict[float, Closeness] = {}
+    least = [psnr - MOST_LOSS for psnr in judge.psnrs(start)]
 
-
-def _try_strengths(
-    tried: dict[float, Closeness],
-    reference: DenseReference,
-    before: Closeness,
-    pruned: Gaussians,
-    refined: Gaussians,
-    progress: Progress,
-) -> None:
-    """Add errors by the strength tried to those that are known; 1 is then always among them."""
-
-    def attempt(strength: float) -> None:
+    def attempt(strength: float) -> bool:
+        """Whether a share of the change helps."""
         done = len(tried)
-        tried[strength] = reference.closeness(
-            at_strength(pruned, refined, strength), lambda share: progress("comparing renders", (done + share) / 3)
+        scene = at_strength(start, end, strength)
+        tried[strength] = judge.reference.closeness(
+            scene, lambda share: progress("comparing renders", (done + share) / 3)
         )
+        if not helps(before, tried[strength]):
+            return False
+        return all(psnr >= bound for psnr, bound in zip(judge.psnrs(scene), least, strict=True))
 
-    if 1.0 not in tried:
-        attempt(1.0)
-    if tried[1.0].errors != before.errors:
-        attempt(0.5)
+    helping = [1.0] if attempt(1.0) else []
+    if tried[1.0].errors != before.errors and (not helping or tried[1.0].psnr < before.psnr + CLEAR_GAIN):
+        helping += [0.5] if attempt(0.5) else []
         bottom = bottom_of_parabola(before.error, tried[0.5].error, tried[1.0].error)
         if 0.05 < bottom < 0.95 and abs(bottom - 0.5) > 0.05:  # closer ones hardly differ from those tried
-            attempt(bottom)
+            helping += [bottom] if attempt(bottom) else []
     progress("comparing renders", 1.0)
+    if not helping and helps(before, tried[1.0]):  # it harms at another size
+        return old, 1.0, before
+    strength = min(helping, key=lambda share: tried[share].error, default=1.0)
+    return at_strength(start, end, strength).to(old.device), strength, tried[strength]
 
 
 def bottom_of_parabola(at_zero: float, at_half: float, at_one: float) -> float:

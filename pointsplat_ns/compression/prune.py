@@ -121,7 +121,7 @@ def prune_scene(
     else:
         scene = prune(start, count, by, _seen_from(by, views), opacity_weight, report, notes.append)
     if fine_tune_steps:
-        tuned = views.views(SCORED_VIEWS)
+        tuned = views.scored(SCORED_VIEWS)
         scene = fine_tune(scene, tuned, dense, fine_tune_steps, progress=functools.partial(progress, "fine-tuning"))
         notes.append(f"fine-tuned {fine_tune_steps} steps against the dense scene's renders in {len(tuned)} views")
     return Pruned(scene, (*notes, views.origin) if views.origin else tuple(notes))
@@ -168,7 +168,7 @@ def _pruner(
         known = views.known(MERGED_FROM)
         return lambda count: prune(scene, count, by, known)
     progress(0.0)
-    scores = score_of(scene, method, functools.partial(views.views, SCORED_VIEWS), opacity_weight, progress)
+    scores = score_of(scene, method, functools.partial(views.scored, SCORED_VIEWS), opacity_weight, progress)
     return lambda count: scene[select(scores, count)]
 
 
@@ -183,7 +183,7 @@ def _seen_from(by: str, views: ViewSource) -> Views | Callable[[], Views] | None
     """The views that a method sees the scene from: only known ones for merging, which needs none."""
     method = method_named(by)
     if method.needs_views:
-        return functools.partial(views.views, SCORED_VIEWS)
+        return functools.partial(views.scored, SCORED_VIEWS)
     return views.known(MERGED_FROM) if method.score is None else None
 
 

@@ -61,6 +61,11 @@ class TrainedRefiner:
         return next(self.network.parameters()).device
 
 
+def default_device() -> torch.device:
+    """CUDA if available, else the CPU."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
 def load_refiner(path: Path | str | None = None, device: torch.device | str | None = None) -> TrainedRefiner:
     """Load a trained refiner.
 
@@ -79,8 +84,7 @@ def load_refiner(path: Path | str | None = None, device: torch.device | str | No
         >>> len(refiner(ps.prune(ps.example_room()[::10], keep=500)))
         500
     """
-    if device is None:
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = default_device() if device is None else device
     if path is None and not PRETRAINED.is_file():
         raise WeightsError(
             f"{PRETRAINED}: the refiner that ships is not there; name another (--refiner RUN_OR_FILE), or make it with "
@@ -98,6 +102,25 @@ def load_refiner(path: Path | str | None = None, device: torch.device | str | No
     else:
         network, settings = _read_run(open_refiner_run(path, need_data=False))
     return TrainedRefiner(network.to(device).eval(), settings, path)
+
+
+SHIPPED = "shipped"
+"""Name of the refiner that ships, where a path may stand."""
+
+
+def refiner_at(path: Path | str | None, device: torch.device | str | None = None) -> TrainedRefiner | None:
+    """A trained refiner, or none.
+
+    Args:
+        path: as for :func:`load_refiner`, or :data:`SHIPPED`; None for no refiner.
+        device: where to run it.
+
+    Raises:
+        WeightsError, SceneError: as :func:`load_refiner`.
+    """
+    if path is None:
+        return None
+    return load_refiner(None if str(path) == SHIPPED else path, device)
 
 
 def open_refiner_run(path: Path | str, need_data: bool) -> Run:

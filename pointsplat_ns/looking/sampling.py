@@ -114,8 +114,8 @@ def sample_views(
     what the views before them have not shown, in the middle of the picture rather than at its edge; a small depth image
     tests that nothing is in the way. Ask for all the views at once that are wanted, as they then complete each other.
 
-    Where the SH of a scene tell from where its photos were taken (:mod:`pointsplat_ns.looking.traces`), cameras stand
-    about there and look at what photos showed.
+    Where the Gaussians say from where photos were taken (:mod:`pointsplat_ns.looking.traces`), half of the cameras
+    stand about there and look at what photos showed.
 
     Args:
         scene: N Gaussians.
@@ -170,14 +170,16 @@ def views_about(
     box, inside = _upright(surface, photos, up)
     small = in_units(thinned(scene, PROBED), centre, diagonal)
     generator = torch.Generator().manual_seed(seed)
-    kinds: list[tuple[bool, tuple[Tensor, Tensor] | None]] = [(inside, None), (not inside, None)]
-    if photos is not None:
-        kinds.insert(0, (inside, photos))
-    for kind, about in kinds:
-        taken = _Search(small, surface, box, kind, width, height, generator, about).views(count)
-        if len(taken) >= (1 if about is None else 0.5 * count):
-            break
-    else:
+
+    def found(inside: bool, about: tuple[Tensor, Tensor] | None, count: int) -> Tensor:
+        return _Search(small, surface, box, inside, width, height, generator, about).views(count)
+
+    near_photos = found(inside, photos, count // 2) if photos is not None and count > 1 else torch.empty(0, 4, 4)
+    others = found(inside, None, count - len(near_photos))
+    if len(others) == 0:
+        others = found(not inside, None, count - len(near_photos))
+    taken = _alternating(near_photos.double(), others)
+    if len(taken) == 0:
         raise DataError(
             "no free place to look at the scene from was found; give a run whose data is at hand, which has poses"
         )
@@ -185,6 +187,12 @@ def views_about(
     viewmats = taken.clone()
     viewmats[:, :3, 3] = translation * (diagonal / UNITS) - rotation @ centre
     return _views(viewmats, width, height, NEAR_PLANE * diagonal)
+
+
+def _alternating(first: Tensor, second: Tensor) -> Tensor:
+    """Matrices (n, 4, 4) and (m, 4, 4) in turn, (n + m, 4, 4), so that a few of them are of both kinds."""
+    ranks = torch.cat([(torch.arange(len(some)) + 0.5) / max(1, len(some)) for some in (first, second)])
+    return torch.cat([first, second])[ranks.argsort(stable=True)]
 
 
 @torch.no_grad()

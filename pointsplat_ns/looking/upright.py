@@ -35,8 +35,10 @@ _YAW = 5.0
 _SLAB = 0.1
 """Thickness of the slabs that points are counted in by height, units; two neighbours hold one level surface."""
 
-_TIE = 0.02
-"""A world axis that scores less than the best direction by no more than this is taken in its place."""
+_USUAL = (0.5, 0.75)
+"""Least score of the z axis, as a share of the best direction's, to be taken in its place; and of the y axis, as a
+share of the score of the one taken. Most scenes stand along y, as COLMAP's first camera does, or along z, as
+nerfstudio's do; and in a room, walls are as flat as the floor."""
 
 _WEAK = 0.05
 """Scores below this are found in scenes without any level or vertical surface."""
@@ -45,9 +47,9 @@ _PHOTOS_LEVEL = 0.1
 """Weight of how level the places of photos lie. On a desk that was walked around half of it would be enough; without
 it, the desk's up is 88 degrees wrong."""
 
-_CUSTOM = 0.02
+_CUSTOM = 0.25
 """How far above the middle the weight must lie along a world axis that usually points up, as a share of the height, to
-say that it points down."""
+say that it points down. Bouquets and plants are widest at their top."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +103,8 @@ def _across(axes: Tensor) -> Tensor:
 def upright_axis(surface: Surface, photos: tuple[Tensor, Tensor] | None = None) -> Tensor:
     """The axis (3,) that a scene stands along, float64, of length 1 and of either sign.
 
-    The z or y axis of the world where it fits about as well as any other direction, and the z axis where the scene
-    gives no evidence.
+    The y axis of the world, or the z axis, where it fits about as well as any other direction, and the z axis where
+    the scene gives no evidence.
 
     Args:
         surface: points of the scene.
@@ -165,9 +167,10 @@ def _axis(content: _Content, photos: tuple[Tensor, Tensor] | None) -> Tensor | N
     best = float(scores.max())
     if best < _WEAK:
         return None
-    usual = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
-    scores = scores_of(usual)
-    return usual[scores.argmax()] if float(scores.max()) >= best - _TIE else found[0]
+    z, y = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
+    score_z, score_y = scores_of(torch.stack([z, y])).tolist()
+    axis, reached = (z, score_z) if score_z >= _USUAL[0] * best else (found[0], best)
+    return y if score_y >= _USUAL[1] * reached else axis
 
 
 def levelness(axes: Tensor, places: Tensor, shares: Tensor) -> Tensor:

@@ -16,13 +16,14 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run
 from pointsplat_ns.looking.sampling import views_about
 from pointsplat_ns.looking.traces import photo_places
+from pointsplat_ns.looking.windows import RESOLUTION, middle_sized
 from pointsplat_ns.views import RasterizeMode, View, Views, spread_indices
 
 MERGED_FROM = 48
 """Maximum number of known views that merging looks from."""
 
-COMPARED_VIEWS, COMPARED_SIDE = 12, 400
-"""Maximum number of views that renders are compared in, and maximum of their longer side in pixels."""
+COMPARED_VIEWS = 12
+"""Maximum number of views that renders are compared in."""
 
 SAMPLED_AT_ONCE = 32
 """Number of further views sampled at a time."""
@@ -37,6 +38,8 @@ class ViewSource:
         run: the file or folder that the scene was read from. If it is a run whose data is found, its training poses
             are used.
         dataset_views: function that reads the poses of a run's dataset.
+        resolution: width and height, pixels, of the pictures that people look at. By default given views and photos
+            have their own, and sampled views 1920 x 1080.
     """
 
     def __init__(
@@ -45,7 +48,9 @@ class ViewSource:
         given: Views | None = None,
         run: Path | str | None = None,
         dataset_views: Callable[[Path | str], Views] | None = None,
+        resolution: tuple[int, int] | None = None,
     ):
+        self._resolution = resolution
         self._scene, self._given, self._run, self._dataset_views = scene, given, run, dataset_views
         self.origin = ""
         """Text that says where views came from; empty until there are some."""
@@ -83,13 +88,19 @@ class ViewSource:
             if len(self._given) == 0:
                 raise DataError("the views given are empty; expected at least one view")
             self.origin = "given views"
-            return self._given.spread(count)
+            return self._at_resolution(self._given.spread(count))
         if self._of_dataset is not None:
             self.origin = "poses of the dataset"
-            return self._of_dataset.spread(count)
-        views = views_about(self._scene, self._photos, count)
-        where = "in free space" if self._photos is None else "about where photos were taken, as the Gaussians tell"
+            return self._at_resolution(self._of_dataset.spread(count))
+        views = self._sampled(count, 0)
+        where = "in free space" if self._photos is None else "in free space, half of them where photos were taken"
         self.origin = f"poses sampled {where}{self.missing}"
+        return views
+
+    def _sampled(self, count: int, seed: int) -> Views:
+        """Sampled views, which get the run's rasterize mode."""
+        width, height = self._resolution or RESOLUTION
+        views = views_about(self._scene, self._photos, count, width=width, height=height, seed=seed)
         return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
 
     @cached_property
@@ -103,13 +114,25 @@ class ViewSource:
             return None
         return self.views(count)
 
-    def compared(self) -> Views:
-        """The views that renders are compared in: at most 12, with a longer side of at most 400 pixels."""
-        return self._compared
+    def _at_resolution(self, views: Views) -> Views:
+        """Views with the longer side of the resolution, if one was asked for."""
+        return views if self._resolution is None else views.resized(max(self._resolution))
+
+    def whole(self) -> Views:
+        """The views that renders are compared in, at their full size: at most :data:`COMPARED_VIEWS`."""
+        return self._whole
 
     @cached_property
-    def _compared(self) -> Views:
-        return self.views(COMPARED_VIEWS).resized(COMPARED_SIDE)
+    def _whole(self) -> Views:
+        return self.views(COMPARED_VIEWS)
+
+    def compared(self) -> Views:
+        """The views that renders are compared in, at :func:`~pointsplat_ns.looking.windows.middle_side`."""
+        return middle_sized(self._whole)
+
+    def scored(self, count: int) -> Views:
+        """At most ``count`` views for scores and for fine-tuning, of the size of :meth:`compared`."""
+        return middle_sized(self.views(count))
 
     def others(self, seed: int = 0) -> Iterator[View]:
         """Views to optimise on, without end: none of those that :meth:`compared` gives, and of the same size.
@@ -127,12 +150,14 @@ class ViewSource:
         known = self.given if self.given is not None else self._of_dataset
         if known is not None and len(known) > 2 * len(compared):
             left = sorted(set(range(len(known))) - set(spread_indices(len(known), COMPARED_VIEWS)))
-            rest, generator = known.resized(COMPARED_SIDE), random.Random(seed)
+            rest, generator = middle_sized(self._at_resolution(known)), random.Random(seed)
             while True:
                 for index in generator.sample(left, len(left)):
                     yield rest[index]
         for batch in counted(1):
-            sampled = views_about(self._scene, self._photos, SAMPLED_AT_ONCE, seed=SAMPLED_AT_ONCE * seed + batch)
-            sampled = dataclasses.replace(sampled, background=compared.background, rasterize_mode=self._rasterize_mode)
+            sampled = middle_sized(self._sampled(SAMPLED_AT_ONCE, SAMPLED_AT_ONCE * seed + batch))
+            sampled = dataclasses.replace(
+                sampled, background=compared.background, rasterize_mode=compared.rasterize_mode
+            )
             for index in random.Random(batch).sample(range(len(sampled)), len(sampled)):
                 yield sampled[index]

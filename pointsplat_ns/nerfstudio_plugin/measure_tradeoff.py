@@ -128,7 +128,7 @@ def subject_of(
         dense: the scene.
         path: where it was read from, or the run whose dataset has the poses; None if it is in memory only.
         views: given ones, in place of any others; there are no photos of them.
-        refiner: what repairs begin with; by default the one that ships.
+        refiner: what repairs begin with; by default nothing, and the one that ships where it repairs alone.
         suffix: of the format that smaller scenes are written in.
     """
     has_photos = path is not None and views is None and may_be_run(path)

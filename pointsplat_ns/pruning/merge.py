@@ -33,9 +33,10 @@ from pointsplat_ns.geometry.quaternions import quaternions_of
 from pointsplat_ns.looking.content import content_size, in_units, positions_in_units, some_of, thinned, views_in_units
 from pointsplat_ns.looking.sampling import PROBED, is_room
 from pointsplat_ns.looking.traces import how_much_seen, photo_places
+from pointsplat_ns.looking.windows import RESOLUTION
 from pointsplat_ns.pruning.covariance import TINY, shadow, unpack
 from pointsplat_ns.pruning.duplicates import Copies, Reduced
-from pointsplat_ns.pruning.finishing import SIDE, Finish, Reference
+from pointsplat_ns.pruning.finishing import Finish, Reference
 from pointsplat_ns.pruning.matching import cheapest_pairs
 from pointsplat_ns.pruning.merge_state import OPAQUE, grown, start
 from pointsplat_ns.pruning.pair_costs import costs_of
@@ -259,7 +260,7 @@ class Merging:
         if self.views is None and len(members) >= FEWEST_SEEN:
             content = in_units(scene, self.centre, self.size)
             self.photos = photo_places(content)
-            self.views = viewpoints(content, self.photos, SIDE, 3 * SIDE // 4)
+            self.views = viewpoints(content, self.photos, *RESOLUTION)
         weights, self.seen = self._weights()
         self.state = start(scene, self.members, weights, self.centre, self.size)
         self.tree = Tree(torch.arange(len(self.members), dtype=torch.int32))
@@ -287,12 +288,11 @@ class Merging:
         """The Gaussians that remain, as a scene; if that is asked for, with members that changed groups, where small
         renders do not gain by leaving them."""
         groups = self._groups().in_order()
-        scene, finish = self._finished(groups)
         if regroups and bool((groups.sizes > 1).any()):
             other = self._regrouped(groups).in_order()
-            made, chosen = self._finished(other)
-            if chosen.psnr is None or finish.psnr is None or chosen.psnr >= finish.psnr:
-                groups, scene, finish = other, made, chosen
+            if self._closeness(other) >= self._closeness(groups):
+                groups = other
+        scene, finish = self._finished(groups)
         assignment = torch.full((len(self.scene),), -1)
         assignment[self.members] = groups.place
         return Merged(scene, assignment, finish)
@@ -368,12 +368,21 @@ class Merging:
                 now = self.scene[self.members] if len(self.members) < len(self.scene) else self.scene
             self.reference = Reference(in_units(now, self.centre, self.size), self.views)
 
+    def _closeness(self, groups: Groups) -> float:
+        """PSNR in windows of groups with the default finish, dB; 0 if the scene is not rendered."""
+        return 0.0 if self.reference is None else self.reference.psnr(self._in_units(groups)(Finish()))
+
+    def _in_units(self, groups: Groups) -> Callable[[Finish], Gaussians]:
+        """As :meth:`_made`, with the scene in units of the content."""
+        make = self._made(groups)
+        return lambda finish: in_units(make(finish), self.centre, self.size)
+
     def _finished(self, groups: Groups) -> tuple[Gaussians, Finish]:
         """The scene of groups with the finish that suits it, and that."""
         make = self._made(groups)
         if self.reference is None or not bool((groups.sizes > 1).any()):
             return make(Finish()), Finish()
-        finish = self.reference.best(lambda tried: in_units(make(tried), self.centre, self.size))
+        finish = self.reference.best(self._in_units(groups))
         return make(finish), finish
 
     def _sh(self, groups: Groups, alone: Tensor) -> tuple[Tensor, Tensor]:

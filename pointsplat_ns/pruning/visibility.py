@@ -64,7 +64,8 @@ class Shown:
             views: of the scene, in its own unit.
         """
         pixels = torch.zeros(len(scene), dtype=torch.float64)
-        for seen in each_view(views.spread(LOOKED_AT).resized(SIDE), len(scene), lambda view: pixels_of(scene, view)):
+        small = views.spread(LOOKED_AT).resized(SIDE)
+        for seen in each_view(list(small), len(scene), lambda view: pixels_of(scene, view)):
             pixels += seen
         stds = scene.stds[members].double().sort(dim=1).values
         expected = weights.double() * scene.alphas[members].double() * stds[:, 1] * stds[:, 2]

@@ -51,7 +51,7 @@ def make(
         new_views: where views come from. It is called anew for each scene, so that time and result are those of the
             command, which finds nothing prepared.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
-        refiner: what repairs begin with; by default the one that ships.
+        refiner: what repairs begin with; by default nothing, and the one that ships where it repairs alone.
 
     Raises:
         KeyboardInterrupt: also where a repair would be content with what it has reached.
@@ -63,7 +63,9 @@ def make(
         pruned = prune_scene(dense, setting.count, setting.by, sh, views=new_views(), progress=progress)
         scene, notes = pruned.scene, pruned.notes
     else:
-        refiner, budget = refiner or load_refiner(), RepairBudget(EFFORTS[setting.repair])
+        if setting.repair == "refiner":
+            refiner = refiner or load_refiner()
+        budget = RepairBudget(EFFORTS[setting.repair])
         compacted = compact_scene(dense, refiner, setting.count, setting.by, sh, new_views(), progress, budget=budget)
         if compacted.repaired is not None and compacted.repaired.interrupted:
             raise KeyboardInterrupt

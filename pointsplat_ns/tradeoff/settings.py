@@ -18,7 +18,7 @@ from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.views import View
 
 Repair = Literal["none", "refiner", "quick", "thorough"]
-"""Nothing; the refiner alone; the refiner and 48 steps; the refiner and 400 steps."""
+"""Nothing; the refiner alone; 48 steps; 400 steps."""
 
 REPAIRS: tuple[Repair, ...] = get_args(Repair)
 

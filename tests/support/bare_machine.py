@@ -9,7 +9,6 @@ small as in the other tests.
 
 from __future__ import annotations
 
-import functools
 import importlib
 import io
 import json
@@ -62,10 +61,9 @@ def outcome(words: list[str]) -> dict:
 if __name__ == "__main__":
     sys.addaudithook(no_network)
     from pointsplat_ns.looking import view_source
-    from pointsplat_ns.looking.sampling import views_about
     from pointsplat_ns.rooms import light
 
-    view_source.views_about = functools.partial(views_about, width=64, height=48)
+    view_source.RESOLUTION = (64, 48)
     light.TEXEL, light.LUMEL = 0.1, 0.5
     commands, results = map(Path, sys.argv[1:])
     results.write_text(json.dumps([outcome(words) for words in json.loads(commands.read_text("utf-8"))]))

@@ -1,0 +1,173 @@
+"""Windows of pictures at the size people look at.
+
+3DGS rasterizers widen every projected Gaussian by 0.3 pixels, so a scene that is right in small pictures may be wrong
+in large ones, and the other way. A window is a part of a picture at one of several sizes, from small to full. A window
+costs as much as a small picture of as many pixels, and shows what the large picture shows.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.each_view import each_view
+from pointsplat_ns.rasterizer import render_with_alpha
+from pointsplat_ns.views import View, Views
+
+RESOLUTION = (1920, 1080)
+"""Width and height of sampled views, pixels: the size that most people look at."""
+
+WINDOW = 320
+"""Longer side of a window, pixels, and of the smallest picture."""
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Windows of views, by the size of the whole picture that they are parts of."""
+
+    sides: tuple[int, ...]
+    """Longer sides of the whole pictures, pixels, ascending."""
+    views: tuple[tuple[View, ...], ...]
+    """Windows for each side, one of each view."""
+
+    def flat(self) -> list[View]:
+        """All windows, side by side."""
+        return [view for views in self.views for view in views]
+
+
+def sides_of(width: int, height: int) -> tuple[int, ...]:
+    """Longer sides of the pictures that windows are taken from, pixels: :data:`WINDOW`, the whole size, and their
+    geometric mean. The whole size alone if it is no larger than a window.
+
+    Example:
+        >>> sides_of(1920, 1080), sides_of(540, 360), sides_of(64, 48)
+        ((320, 784, 1920), (320, 416, 540), (64,))
+    """
+    longest = max(width, height)
+    return (longest,) if longest <= WINDOW else (WINDOW, round(math.sqrt(WINDOW * longest)), longest)
+
+
+def middle_sized(views: Views) -> Views:
+    """Views at the middle of their :func:`sides_of`: large enough to show what people see, small enough to be drawn
+    often."""
+    sides = sides_of(views.width, views.height)
+    return views.resized(sides[len(sides) // 2])
+
+
+def window(view: View, side: int, at: tuple[float, float] = (0.5, 0.5)) -> View:
+    """A window of a picture that is reduced to a longer side of ``side`` pixels.
+
+    Args:
+        view: the whole picture.
+        side: longer side of the reduced picture, pixels; not above the view's own.
+        at: centre of the window, as shares of width and height. The window is moved so that it lies in the picture.
+    """
+    scale = min(1.0, side / max(view.width, view.height))
+    whole = [max(1, round(scale * size)) for size in (view.width, view.height)]
+    part = [min(1.0, WINDOW / max(whole)) * size for size in whole]
+    size = [max(1, round(length)) for length in part]
+    first = [
+        min(max(round(share * all_ - 0.5 * own), 0), all_ - own)
+        for share, all_, own in zip(at, whole, size, strict=True)
+    ]
+    K = view.K.clone()
+    K[0] *= whole[0] / view.width
+    K[1] *= whole[1] / view.height
+    K[0, 2] -= first[0]
+    K[1, 2] -= first[1]
+    return replace(view, K=K, width=size[0], height=size[1])
+
+
+def windows_of(views: Views, alphas: Sequence[Tensor], sides: Sequence[int] | None = None, seed: int = 0) -> Windows:
+    """One window of each view at each side; that of the smallest shows the whole picture.
+
+    Args:
+        views: C views of any size.
+        alphas: C pictures (h, w) of what the scene covers, of any size: windows lie where there is something.
+        sides: longer sides of the whole pictures, pixels; by default :func:`sides_of`.
+        seed: of where they lie.
+    """
+    chosen = random.Random(seed)
+    sides = tuple(sides or sides_of(views.width, views.height))
+    return Windows(
+        sides,
+        tuple(
+            tuple(window(view, side, _somewhere(alpha, chosen)) for view, alpha in zip(views, alphas, strict=True))
+            for side in sides
+        ),
+    )
+
+
+def _somewhere(alpha: Tensor, chosen: random.Random) -> tuple[float, float]:
+    """A position in a picture, as shares of width and height, drawn by alpha (h, w)."""
+    weights = alpha.double().flatten().cumsum(0)
+    if not 0 < float(weights[-1]) < math.inf:
+        return 0.5, 0.5
+    drawn = torch.tensor(chosen.random(), dtype=torch.float64) * weights[-1]
+    row, column = divmod(min(int(torch.searchsorted(weights, drawn)), len(weights) - 1), alpha.shape[1])
+    return (column + 0.5) / alpha.shape[1], (row + 0.5) / alpha.shape[0]
+
+
+class WindowRenders:
+    """Renders of a dense scene in windows, that other scenes are compared with.
+
+    Args:
+        dense: N Gaussians.
+        views: C views of it.
+        sides: as for :func:`windows_of`.
+        seed: of where windows lie.
+    """
+
+    @torch.no_grad()
+    def __init__(self, dense: Gaussians, views: Views, sides: Sequence[int] | None = None, seed: int = 0):
+        small = [alpha[..., 0] for _, alpha in each_view(list(views.resized(64)), len(dense), _drawn(dense))]
+        self.windows = windows_of(views, small, sides, seed)
+        drawn = list(each_view(self.windows.flat(), len(dense), _drawn(dense)))
+        self.renders: list[Tensor] = [image for image, _ in drawn]
+        per_side = len(views)
+        self.covered = [
+            sum(float(alpha.double().mean()) for _, alpha in drawn[i * per_side : (i + 1) * per_side]) / per_side
+            for i in range(len(self.windows.sides))
+        ]
+        """Share of the pixels that the dense scene covers, for each side, in [0, 1]."""
+
+    @torch.no_grad()
+    def errors(self, scene: Gaussians) -> list[list[float]]:
+        """Mean squared error of each window, for each side."""
+        pictures = each_view(self.windows.flat(), len(scene), _drawn(scene))
+        errors = [
+            float((image.double() - target.double()).square().mean())
+            for (image, _), target in zip(pictures, self.renders, strict=True)
+        ]
+        count = len(self.windows.views[0])
+        return [errors[i : i + count] for i in range(0, len(errors), count)]
+
+    def psnrs(self, scene: Gaussians) -> list[float]:
+        """PSNR of what the dense scene covers, for each side, dB; at most 100."""
+        return [
+            psnr_of(sum(errors) / len(errors), covered)
+            for errors, covered in zip(self.errors(scene), self.covered, strict=True)
+        ]
+
+    def psnr(self, scene: Gaussians) -> float:
+        """Mean of :meth:`psnrs` over the sides, dB."""
+        found = self.psnrs(scene)
+        return sum(found) / len(found)
+
+
+def psnr_of(error: float, covered: float = 1.0) -> float:
+    """PSNR, dB, at most 100, of a mean squared error over all pixels, of which the dense scene covers a share: over the
+    covered ones, so that empty background does not make it better."""
+    if not error > 1e-10 * (covered or 1.0):
+        return math.nan if error != error else 100.0
+    return -10 * math.log10(error / (covered or 1.0))
+
+
+def _drawn(scene: Gaussians):
+    return lambda view: render_with_alpha(scene, view)
