@@ -18,6 +18,9 @@ from nerfstudio.configs import external_methods
 
 from making import SHARED_DATA
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking import sampling
+from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.views import Views
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 WALL_DISTANCE = 2.0
@@ -240,3 +243,15 @@ def make_hollow_ball() -> Callable[..., Gaussians]:
 def hollow_ball(make_hollow_ball) -> Gaussians:
     """Shared by all tests here, so do not write to it."""
     return make_hollow_ball()
+
+
+@pytest.fixture(scope="session")
+def ball_views(hollow_ball: Gaussians) -> Views:
+    """Four small views from within."""
+    return sample_views(hollow_ball, 4, 64, 48)
+
+
+@pytest.fixture()
+def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search for views ends at the first places that show nothing, not at the fourth: each time takes seconds."""
+    monkeypatch.setattr(sampling, "_FRUITLESS", 1)

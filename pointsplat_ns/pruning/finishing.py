@@ -15,8 +15,8 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.windows import WindowRenders
 from pointsplat_ns.views import Views
 
-LOOKED_AT = 12
-"""Number of views whose windows are compared. 6 lose up to 0.2 dB, 24 gain none."""
+LOOKED_AT = 8
+"""Number of views whose windows are compared. Of 6, 12 and 24, 12 are as good as 24, and 6 lose up to 0.2 dB."""
 
 DEEPENINGS = (0.0, 0.15, 0.3)
 SPREADS = (-0.1, 0.0, 0.05)
