@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from pointsplat_ns.api import compact, example_room, load, lod, lpips, prune, refine
+    from pointsplat_ns.api import compact, example_room, load, lod, lpips, plot_views, prune, refine
     from pointsplat_ns.compression.compact import Compacted
     from pointsplat_ns.compression.distributions import plot_distributions
     from pointsplat_ns.compression.levels import Levels
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.views import View, Views
 
 _PUBLIC = {
-    "pointsplat_ns.api": ("compact", "example_room", "load", "lod", "lpips", "prune", "refine"),
+    "pointsplat_ns.api": ("compact", "example_room", "load", "lod", "lpips", "plot_views", "prune", "refine"),
     "pointsplat_ns.compression.compact": ("Compacted",),
     "pointsplat_ns.compression.distributions": ("plot_distributions",),
     "pointsplat_ns.compression.levels": ("Levels",),
@@ -111,6 +111,7 @@ __all__ = [
     "place",
     "plot_comparison",
     "plot_distributions",
+    "plot_views",
     "prune",
     "psnr",
     "rasterization",

@@ -15,6 +15,7 @@ from torch import Tensor
 from pointsplat_ns.compression.compact import Compacted, compact_scene, resolve_options
 from pointsplat_ns.compression.level_folder import check_folder
 from pointsplat_ns.compression.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
+from pointsplat_ns.compression.pictures import plot_views as draw_views
 from pointsplat_ns.compression.posed_scene import read_posed
 from pointsplat_ns.compression.prune import check_options, prune_scene
 from pointsplat_ns.compression.repair import Effort, RepairBudget
@@ -32,6 +33,7 @@ from pointsplat_ns.io.runs import REFINER_METHOD, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.looking.windows import parse_resolution
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
 from pointsplat_ns.pruning import Keep
@@ -112,6 +114,7 @@ def prune(
     clean: bool = False,
     fine_tune: int = 0,
     views: Views | str | Path | None = None,
+    resolution: tuple[int, int] | str | None = None,
     progress: bool | Progress = False,
 ) -> Gaussians:
     """Make a scene smaller: merge neighbours, or keep the Gaussians that matter, from the scene alone.
@@ -134,6 +137,9 @@ def prune(
         views: where to look from, if anything has to be rendered: views, the run whose dataset has the poses, or a file
             of cameras (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model). By
             default those of the run that ``scene`` names, or poses sampled in free space.
+        resolution: width and height of the pictures that people look at, pixels: (1920, 1080) or "1920x1080". What is
+            decided by rendering is decided at this size. By default that of the photos or of given views, else
+            1920 x 1080.
         progress: True shows a bar; a function is called with what is being done and the share done of it.
 
     Returns:
@@ -152,7 +158,7 @@ def prune(
         (1000, 0.1)
     """
     budget = check_options(keep, by, sh, opacity_weight, fine_tune)  # before the scene is read
-    dense, source = _read(scene, views)
+    dense, source = _read(scene, views, resolution)
     with progress_bar(progress) as report:
         pruned = prune_scene(dense, budget, by, sh, opacity_weight, source, fine_tune, report, clean)
     _log(pruned.notes)
@@ -199,6 +205,7 @@ def compact(
     target_mb: float | None = None,
     target_format: str = ".ply",
     views: Views | str | Path | None = None,
+    resolution: tuple[int, int] | str | None = None,
     progress: bool | Progress = False,
 ) -> Compacted:
     """Make a scene smaller, repair it, and check by rendering how far that helps.
@@ -228,6 +235,7 @@ def compact(
         target_format: of the file whose size counts, as the end of its name: ".ply", ".spz", ".sog", ...
         views: where renders are compared, as for :func:`prune`; at most 12 are taken. If there are more than twice as
             many, the scene is repaired from the others, else on views sampled in free space.
+        resolution: as for :func:`prune`.
         progress: True shows a bar; a function is called with what is being done and the share done of it.
 
     Returns:
@@ -251,7 +259,7 @@ def compact(
     _, method = resolve_options(refiner, keep, by, sh)  # before the scene is read
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
     format_to_write(target_format)
-    dense, source = _read(scene, views)
+    dense, source = _read(scene, views, resolution)
     with progress_bar(progress) as report:
         if targets is None:
             result = compact_scene(dense, refiner, keep, by, sh, source, report, clean, budget)
@@ -269,6 +277,7 @@ def lod(
     *,
     sh: str = "all",
     views: Views | str | Path | None = None,
+    resolution: tuple[int, int] | str | None = None,
     folder: str | Path | None = None,
     force: bool = False,
     progress: bool | Progress = False,
@@ -283,6 +292,7 @@ def lod(
         levels: how much each level keeps, as for :func:`prune` but for "auto"; in any order.
         sh: SH bands of every level, as for :func:`prune`.
         views: where renders are compared, as for :func:`prune`; at most 12 are taken.
+        resolution: as for :func:`prune`.
         folder: where to write each level as soon as it is there, a manifest and a picture; see :meth:`Levels.save`.
         force: overwrite existing files in ``folder``.
         progress: True shows a bar; a function is called with what is being done and the share done of it.
@@ -307,12 +317,46 @@ def lod(
     check_options(1.0, "merge", sh)
     if folder is not None:
         check_folder(Path(folder), len(budgets), force)
-    dense, view_source = _read(scene, views)
+    dense, view_source = _read(scene, views, resolution)
     source = None if isinstance(scene, Gaussians) else source_file(scene)
     with progress_bar(progress) as report:
         made = make_levels(dense, levels, sh, view_source, source, folder, force, report)
     _log(made.notes)
     return made
+
+
+def plot_views(
+    scene: Source,
+    path: str | Path,
+    *,
+    views: Views | str | Path | None = None,
+    resolution: tuple[int, int] | str | None = None,
+) -> str:
+    """Draw the views that decisions about a scene are made in: a sheet of up to 16 pictures.
+
+    Args:
+        scene: N Gaussians, or where to read them.
+        path: the PNG file to write.
+        views: as for :func:`prune`.
+        resolution: as for :func:`prune`.
+
+    Returns:
+        Text: where the views come from, what is taken to be up, and what share of the visible content they show.
+
+    Raises:
+        SceneError: if the scene is not usable, or the file cannot be written.
+        DataError: if there are no views.
+
+    Example:
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     text = ps.plot_views(ps.example_room()[::20], f"{folder}/sheet.png", resolution="64x48")
+        >>> "of the visible content" in text
+        True
+    """
+    dense, source = _read(scene, views, resolution)
+    return draw_views(dense.detach().to("cpu"), source, path)
 
 
 def lpips(pred: Tensor, target: Tensor, net: Literal["alex", "vgg"] = "alex") -> Tensor:
@@ -345,22 +389,25 @@ def lpips(pred: Tensor, target: Tensor, net: Literal["alex", "vgg"] = "alex") ->
     return cached_lpips(net, pred.device)(pred, target)
 
 
-def _read(scene: Source, views: Views | str | Path | None) -> tuple[Gaussians, ViewSource]:
+def _read(
+    scene: Source, views: Views | str | Path | None, resolution: tuple[int, int] | str | None
+) -> tuple[Gaussians, ViewSource]:
     """The Gaussians to make fewer, and where renders of them are compared.
 
     A ``pointsplat`` run is refused: its scene has been pruned already.
     """
+    size = parse_resolution(resolution)
     if isinstance(views, (str, Path)) and not Path(views).exists():
         raise SceneError(
             f"{views}: no such file or folder; expected views, a run whose dataset has the poses, or a file of cameras"
         )
     if isinstance(views, (str, Path)) and is_camera_file(views):
         dense, views = read_posed(scene, views)
-        return dense, ViewSource(dense, given=views)
+        return dense, ViewSource(dense, given=views, resolution=size)
     dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
     if isinstance(views, Views):
-        return dense, ViewSource(dense, given=views)
-    return dense, ViewSource(dense, run=_run_of(scene, views), dataset_views=dataset_views)
+        return dense, ViewSource(dense, given=views, resolution=size)
+    return dense, ViewSource(dense, run=_run_of(scene, views), dataset_views=dataset_views, resolution=size)
 
 
 def _run_of(scene: Source, views: Views | str | Path | None) -> Path | None:

@@ -13,6 +13,7 @@ from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.looking.windows import parse_resolution
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
 from pointsplat_ns.pruning import Keep
@@ -37,6 +38,7 @@ def compact_folder(
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: float | None = None,
+    resolution: tuple[int, int] | str | None = None,
     jobs: int = 1,
     shard: str | None = None,
     force: bool = False,
@@ -62,6 +64,7 @@ def compact_folder(
         target_db: what each scene has to reach, as for :func:`compact`.
         target_ms: as for :func:`compact`.
         target_mb: as for :func:`compact`; of PLY files.
+        resolution: as for :func:`prune`.
         jobs: number of processes. More than one share the cores; a program that asks for them must be a file, with what
             it does under ``if __name__ == "__main__":``, as for any Python program that starts processes.
         shard: only a part of the scenes: "2/5" is the second of five.
@@ -95,7 +98,7 @@ def compact_folder(
     connect_torchrun()
     device = str(torchrun_device())
     trained = _refiner_on(refiner, device)
-    repair = RepairBudget(effort, seconds)
+    repair, size = RepairBudget(effort, seconds), parse_resolution(resolution)
     budget, method = resolve_options(trained, keep, by, sh)
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
     options: Options = {
@@ -106,12 +109,13 @@ def compact_folder(
         "clean": clean,
         "effort": effort if seconds is None else None,
         "seconds": seconds,
+        "resolution": None if size is None else "x".join(map(str, size)),
     }
     if targets is not None:
         options = {**options, "keep": None, "target_db": target_db, "target_ms": target_ms, "target_mb": target_mb}
         make = functools.partial(_found, refiner, device, targets, method, repairs_of(effort))
     else:
-        make = functools.partial(_compacted, refiner, device, budget, method, sh, clean, repair)
+        make = functools.partial(_compacted, refiner, device, budget, method, sh, clean, repair, size)
     with progress_bar(progress if rank == 0 else False) as report:
         results = settle_folder(
             folder, target, Command("compact", make, options), jobs, part.within(rank, world_size), force, report
@@ -130,11 +134,12 @@ def _compacted(
     sh: str,
     clean: bool,
     budget: RepairBudget,
+    resolution: tuple[int, int] | None,
     path: Path,
 ) -> Made:
     """One scene of a folder, made smaller."""
     dense = read_scene(path)
-    source = ViewSource(dense, run=path, dataset_views=dataset_views)
+    source = ViewSource(dense, run=path, dataset_views=dataset_views, resolution=resolution)
     result = compact_scene(dense, _refiner_on(refiner, device), keep, by, sh, source, clean=clean, budget=budget)
     if result.repaired is not None and result.repaired.interrupted:
         raise KeyboardInterrupt  # which is meant for all scenes, not for the repair of this one

@@ -13,6 +13,7 @@ from pointsplat_ns.cli.scene_options import (
     Bands,
     Output,
     Poses,
+    Resolution,
     Scene,
     check_output,
     check_outputs,
@@ -42,6 +43,7 @@ def compact(
     target_ms: float | None = None,
     target_mb: float | None = None,
     poses: Poses = None,
+    resolution: Resolution = None,
     picture: Path | None = None,
     html: Path | None = None,
     html_limit: float = 60.0,
@@ -82,6 +84,8 @@ def compact(
         target_mb: and of at most so many megabytes, in the format of the output.
         poses: a file of cameras to look from: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
             COLMAP model; for one scene.
+        resolution: size of the pictures that people look at, in pixels; what is decided by rendering is decided at this
+            size. By default that of the photos where there are any, else 1920x1080.
         picture: a .png file for images of some views: dense, before and after the repair, side by side.
         html: an .html file that opens offline in a browser, to fly through the scene before and after, with a wipe
             between them.
@@ -104,7 +108,7 @@ def compact(
             compact_folder(
                 scene, output, poses, picture, html, dry_run, json_output, keep=keep, refiner=refiner, by=by, sh=sh,
                 clean=clean, effort=effort, seconds=seconds, target_db=target_db, target_ms=target_ms,
-                target_mb=target_mb, jobs=1 if jobs is None else jobs, shard=shard, force=force,
+                target_mb=target_mb, resolution=resolution, jobs=1 if jobs is None else jobs, shard=shard, force=force,
             )  # fmt: skip
         return
     if jobs is not None or shard is not None:
@@ -115,6 +119,7 @@ def compact(
     from pointsplat_ns.compression.trained_refiner import refiner_at
     from pointsplat_ns.io import read_scene
     from pointsplat_ns.io.formats import format_to_write
+    from pointsplat_ns.looking.windows import parse_resolution
     from pointsplat_ns.pages.scene_page import check_limit
     from pointsplat_ns.tradeoff.targets import targets_of
 
@@ -126,6 +131,7 @@ def compact(
     keep = None if keep is None else in_format_of(keep, output)
     trained = refiner_at(refiner)
     resolve_options(trained, keep, by, sh)
+    parse_resolution(resolution)
     RepairBudget(effort, seconds)
     targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
     with fixed_threads(threads):
@@ -133,7 +139,7 @@ def compact(
         result = ps.compact(
             dense, keep, trained, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds, target_db=target_db,
             target_ms=target_ms, target_mb=target_mb, target_format=format_to_write(output).budget_suffix,
-            views=views, progress=True,
+            views=views, resolution=resolution, progress=True,
         )  # fmt: skip
     if not dry_run:
         ps.save(result.scene, output, progress=True)

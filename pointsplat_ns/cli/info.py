@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Scene
+from pointsplat_ns.cli.scene_options import Resolution, Scene, check_output
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_info import SceneInfo
@@ -14,20 +15,35 @@ WIDTH = 40
 """Characters of the longest bar."""
 
 
-def info(scene: Scene, json_output: Json = False) -> None:
+def info(
+    scene: Scene,
+    views: Path | None = None,
+    resolution: Resolution = None,
+    force: bool = False,
+    json_output: Json = False,
+) -> None:
     """Look at a scene: counts, SH, opacities, sizes, bounds, rows that look wrong, and what files of it would weigh.
 
     Args:
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
+        views: a .png file for a sheet of the views that other commands look at the scene from, where no poses are given.
+        resolution: size of these views, in pixels. By default that of the photos where there are any, else 1920x1080.
+        force: overwrite an existing file.
         json_output: print JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
+    from pointsplat_ns.looking.windows import parse_resolution
 
+    parse_resolution(resolution)
+    check_output(views, ".png", force)
     found = ps.info(scene)
+    sheet = None if views is None else ps.plot_views(scene, views, resolution=resolution)
     if json_output:
         print_json(found.as_dict())
-    else:
-        _print(found)
+        return
+    _print(found)
+    if sheet is not None:
+        print(sheet)
 
 
 def _print(found: SceneInfo) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from pointsplat_ns.cli.folders import need_one_scene
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Bands, Output, Poses, Scene, check_poses, output_beside
+from pointsplat_ns.cli.scene_options import Bands, Output, Poses, Resolution, Scene, check_poses, output_beside
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.levels import Levels
@@ -20,6 +20,7 @@ def lod(
     output: Output = None,
     sh: Bands = "all",
     poses: Poses = None,
+    resolution: Resolution = None,
     force: bool = False,
     threads: int | None = None,
     json_output: Json = False,
@@ -39,6 +40,8 @@ def lod(
         sh: SH bands of every level: all, up to a degree, or auto, those without which renders stay within 40 dB.
         poses: a file of cameras to look from: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
             COLMAP model.
+        resolution: size of the pictures that people look at, in pixels; what is decided by rendering is decided at this
+            size. By default that of the photos where there are any, else 1920x1080.
         force: overwrite existing files.
         threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
             programs keep the machine busy. Another number may change results by rounding.
@@ -52,7 +55,9 @@ def lod(
     check_poses(poses)
     folder = output or output_beside(scene, "lod").with_suffix("")
     with fixed_threads(threads):
-        made = ps.lod(scene, levels, sh=sh, views=poses, folder=folder, force=force, progress=True)
+        made = ps.lod(
+            scene, levels, sh=sh, views=poses, resolution=resolution, folder=folder, force=force, progress=True
+        )
     if json_output:
         print_json({"output": folder, **json.loads((folder / MANIFEST).read_text("utf-8"))})
     else:

@@ -11,6 +11,7 @@ from pointsplat_ns.cli.scene_options import (
     Bands,
     Output,
     Poses,
+    Resolution,
     Scene,
     check_outputs,
     check_poses,
@@ -30,6 +31,7 @@ def prune(
     clean: bool = False,
     fine_tune: int = 0,
     poses: Poses = None,
+    resolution: Resolution = None,
     plot: Path | None = None,
     dry_run: bool = False,
     force: bool = False,
@@ -57,6 +59,8 @@ def prune(
         fine_tune: steps of optimising the result against the dense scene's own renders.
         poses: a file of cameras to look from: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
             COLMAP model. They must be of this scene.
+        resolution: size of the pictures that people look at, in pixels; what is decided by rendering is decided at this
+            size. By default that of the photos where there are any, else 1920x1080.
         plot: a .png file for a plot of the distributions of opacity and volume, before and after.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
@@ -68,6 +72,7 @@ def prune(
     from pointsplat_ns.compression.posed_scene import read_posed
     from pointsplat_ns.compression.prune import check_options
     from pointsplat_ns.io import read_scene
+    from pointsplat_ns.looking.windows import parse_resolution
     from pointsplat_ns.system.threads import fixed_threads
 
     need_one_scene(scene)
@@ -75,13 +80,14 @@ def prune(
     output = output or output_beside(scene, "pruned")
     check_outputs(None if dry_run else output, plot, force)
     keep = in_format_of(keep, output)
+    parse_resolution(resolution)
     check_options(keep, by, sh, opacity_weight, fine_tune)
     with fixed_threads(threads):
         dense, views = (read_scene(scene), scene) if poses is None else read_posed(scene, poses)
         start = time.perf_counter()
         small = ps.prune(
             dense, keep, by, sh=sh, opacity_weight=opacity_weight, clean=clean, fine_tune=fine_tune, views=views,
-            progress=True,
+            resolution=resolution, progress=True,
         )  # fmt: skip
     seconds = time.perf_counter() - start
     if not dry_run:

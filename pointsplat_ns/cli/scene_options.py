@@ -10,6 +10,7 @@ import tyro
 Scene = tyro.conf.Positional[Path]
 Output = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
 Poses = Path | None
+Resolution = Annotated[str | None, tyro.conf.arg(metavar="WxH")]
 Bands = Literal["all", "auto", "0", "1", "2", "3"]
 
 

@@ -239,7 +239,8 @@ def make_levels(
 
     before = torch.arange(len(dense), device=dense.device)  # [N] index in the level before of the one that each is in
     start = time.perf_counter()
-    for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), views.known(MERGED_FROM)):
+    known = views.known(MERGED_FROM)
+    for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), known, views.resolution):
         seconds = time.perf_counter() - start
         parents = _parents(before, merged.assignment, len(made[-1].scene) if made else len(dense))
         if out is not None:

@@ -13,9 +13,15 @@ from pointsplat_ns.compression.closeness import Closeness
 from pointsplat_ns.compression.compact import Compacted
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import replacing
+from pointsplat_ns.looking.coverage import coverage
+from pointsplat_ns.looking.sampling import estimated_up
+from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import spread_indices
+
+_SHEET, _SHEET_SIDE = (4, 4), 320
+"""Rows and columns of a sheet of views, and longer side of its pictures, pixels."""
 
 SHOWN_VIEWS = 3
 """Number of views in the image, spread over those compared."""
@@ -69,6 +75,36 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> st
 def _title(name: str, scene: Gaussians, close: Closeness | None) -> str:
     size = f"{len(scene):,} Gaussians, {ply_bytes(len(scene), scene.sh_degree) / 1e6:.2f} MB"
     return f"{name}\n{size}" + (f", {close.psnr:.2f} dB" if close is not None else "")
+
+
+@torch.no_grad()
+def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
+    """Draw what the views show that decisions about a scene are made in.
+
+    Args:
+        dense: N Gaussians on the CPU.
+        source: where views come from.
+        path: the PNG file to write.
+
+    Returns:
+        Text: where the views come from, what is taken to be up, and what share of the visible content they show.
+
+    Raises:
+        DataError: if there are no views.
+        SceneError: if the file cannot be written.
+    """
+    views = source.views(MERGED_FROM)
+    pictures = [render(dense, view) for view in views.spread(_SHEET[0] * _SHEET[1]).resized(_SHEET_SIDE)]
+    share = coverage(dense, views)
+    columns = _SHEET[1]
+    rows = [pictures[first : first + columns] for first in range(0, len(pictures), columns)]
+    rows[-1] += [torch.ones_like(pictures[0])] * (columns - len(rows[-1]))
+    side_by_side(rows, [""] * columns, path)
+    up = ", ".join(f"{value:.2f}" for value in estimated_up(dense).tolist())
+    return (
+        f"{path}: {len(pictures)} of {len(views)} views of {views.width} x {views.height} pixels; {source.origin}\n"
+        f"up is taken to be {up}; at least two of the views show {share:.0%} of the visible content"
+    )
 
 
 def side_by_side(rows: Sequence[Sequence[ArrayLike]], titles: list[str], path: Path | str) -> None:

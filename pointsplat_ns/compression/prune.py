@@ -119,7 +119,8 @@ def prune_scene(
         scene = found.scene
         notes.append(f"as {kind.name} {found.size / 1e6:.2f} MB; {len(found.tried)} counts tried")
     else:
-        scene = prune(start, count, by, _seen_from(by, views), opacity_weight, report, notes.append)
+        seen_from = _seen_from(by, views)
+        scene = prune(start, count, by, seen_from, opacity_weight, report, notes.append, views.resolution)
     if fine_tune_steps:
         tuned = views.scored(SCORED_VIEWS)
         scene = fine_tune(scene, tuned, dense, fine_tune_steps, progress=functools.partial(progress, "fine-tuning"))
@@ -166,7 +167,7 @@ def _pruner(
     method = method_named(by)
     if method.score is None:
         known = views.known(MERGED_FROM)
-        return lambda count: prune(scene, count, by, known)
+        return lambda count: prune(scene, count, by, known, resolution=views.resolution)
     progress(0.0)
     scores = score_of(scene, method, functools.partial(views.scored, SCORED_VIEWS), opacity_weight, progress)
     return lambda count: scene[select(scores, count)]

@@ -59,6 +59,11 @@ class ViewSource:
         self._rasterize_mode: RasterizeMode = "classic"
 
     @property
+    def resolution(self) -> tuple[int, int]:
+        """Width and height of sampled views, pixels."""
+        return self._resolution or RESOLUTION
+
+    @property
     def given(self) -> Views | None:
         """The views that were given, if any."""
         return self._given if self._given is not None and len(self._given) else None
@@ -99,7 +104,7 @@ class ViewSource:
 
     def _sampled(self, count: int, seed: int) -> Views:
         """Sampled views, which get the run's rasterize mode."""
-        width, height = self._resolution or RESOLUTION
+        width, height = self.resolution
         views = views_about(self._scene, self._photos, count, width=width, height=height, seed=seed)
         return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
 

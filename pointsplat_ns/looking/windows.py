@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.rasterizer import render_with_alpha
@@ -22,6 +23,9 @@ from pointsplat_ns.views import View, Views
 
 RESOLUTION = (1920, 1080)
 """Width and height of sampled views, pixels: the size that most people look at."""
+
+LARGEST = 16384
+"""Largest width or height of a resolution, pixels."""
 
 WINDOW = 320
 """Longer side of a window, pixels, and of the smallest picture."""
@@ -39,6 +43,24 @@ class Windows:
     def flat(self) -> list[View]:
         """All windows, side by side."""
         return [view for views in self.views for view in views]
+
+
+def parse_resolution(text: str | tuple[int, int] | None) -> tuple[int, int] | None:
+    """Width and height of pictures, pixels, as in "1920x1080"; None stays None.
+
+    Raises:
+        PointSplatError: if it is neither.
+
+    Example:
+        >>> parse_resolution("1920x1080"), parse_resolution((640, 480))
+        ((1920, 1080), (640, 480))
+    """
+    if text is None:
+        return None
+    parts = text.lower().split("x") if isinstance(text, str) else [str(part) for part in text]
+    if len(parts) != 2 or not all(part.strip().isdecimal() and 1 <= int(part) <= LARGEST for part in parts):
+        raise PointSplatError(f"resolution is {text!r}; expected width and height in pixels, such as 1920x1080")
+    return int(parts[0]), int(parts[1])
 
 
 def sides_of(width: int, height: int) -> tuple[int, ...]:

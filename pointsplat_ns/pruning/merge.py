@@ -82,7 +82,11 @@ class Merged:
 
 
 def merge(
-    scene: Gaussians, k: int, progress: Callable[[float], None] | None = None, views: Views | None = None
+    scene: Gaussians,
+    k: int,
+    progress: Callable[[float], None] | None = None,
+    views: Views | None = None,
+    resolution: tuple[int, int] = RESOLUTION,
 ) -> Merged:
     """Replace a scene by ``k`` Gaussians that look the same.
 
@@ -97,6 +101,7 @@ def merge(
         views: where the scene is looked at from, such as the poses of its photos; what they do not show is merged
             first. By default from about where photos were taken, if the scene tells
             (:mod:`~pointsplat_ns.looking.traces`), else from free places in it, in all directions.
+        resolution: width and height of the pictures, pixels, where no views are given.
 
     Returns:
         Exactly ``k`` Gaussians. Deterministic.
@@ -104,7 +109,7 @@ def merge(
     Raises:
         BudgetError: if ``k`` is not in 1..N, or fewer than ``k`` Gaussians can be drawn.
     """
-    return next(merge_levels(scene, [k], progress, views))
+    return next(merge_levels(scene, [k], progress, views, resolution))
 
 
 def merge_levels(
@@ -112,6 +117,7 @@ def merge_levels(
     counts: Sequence[int],
     progress: Callable[[float], None] | None = None,
     views: Views | None = None,
+    resolution: tuple[int, int] = RESOLUTION,
 ) -> Iterator[Merged]:
     """Replace a scene by fewer and fewer Gaussians in one pass.
 
@@ -123,6 +129,7 @@ def merge_levels(
         counts: number of Gaussians of each level, in 1..N, descending without repetition.
         progress: called with the share done of all levels, in [0, 1].
         views: where the scene is looked at from; by default from free places in it.
+        resolution: as for :func:`merge`.
 
     Yields:
         A level for each count, as soon as it is reached.
@@ -136,12 +143,16 @@ def merge_levels(
             raise BudgetError(f"cannot merge {n} Gaussians into {k}; expected 1 to {n}")
     if any(fewer >= more for more, fewer in itertools.pairwise(counts)):
         raise BudgetError(f"levels of {', '.join(map(str, counts))} Gaussians; expected descending counts")
-    return _levels(scene, counts, progress or (lambda share: None), views)
+    return _levels(scene, counts, progress or (lambda share: None), views, resolution)
 
 
 @torch.no_grad()
 def _levels(
-    scene: Gaussians, counts: Sequence[int], report: Callable[[float], None], views: Views | None
+    scene: Gaussians,
+    counts: Sequence[int],
+    report: Callable[[float], None],
+    views: Views | None,
+    resolution: tuple[int, int],
 ) -> Iterator[Merged]:
     n = len(scene)
     if n in counts:
@@ -160,7 +171,7 @@ def _levels(
         if reduced is None or left < len(reduced.members):
             with one_thread_each():
                 reduced = copies.reduced(left)
-                merging = Merging(reduced.scene, reduced.members, views)
+                merging = Merging(reduced.scene, reduced.members, views, resolution)
         while len(merging) > k:
             with one_thread_each():
                 merging.round(k)
@@ -247,9 +258,16 @@ class Merging:
         scene: N Gaussians on the CPU.
         members: (n,) ascending indices of those that take part.
         views: where the scene is looked at from; by default from free places in it.
+        resolution: as for :func:`merge`.
     """
 
-    def __init__(self, scene: Gaussians, members: Tensor, views: Views | None):
+    def __init__(
+        self,
+        scene: Gaussians,
+        members: Tensor,
+        views: Views | None,
+        resolution: tuple[int, int] = RESOLUTION,
+    ):
         self.scene = scene
         # Along a space-filling curve, neighbours are near each other in memory.
         self.members = members[curve_keys(unit_cells(scene.means[members])).argsort(stable=True)]
@@ -260,7 +278,7 @@ class Merging:
         if self.views is None and len(members) >= FEWEST_SEEN:
             content = in_units(scene, self.centre, self.size)
             self.photos = photo_places(content)
-            self.views = viewpoints(content, self.photos, *RESOLUTION)
+            self.views = viewpoints(content, self.photos, *resolution)
         weights, self.seen = self._weights()
         self.state = start(scene, self.members, weights, self.centre, self.size)
         self.tree = Tree(torch.arange(len(self.members), dtype=torch.int32))

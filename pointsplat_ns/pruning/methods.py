@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.windows import RESOLUTION
 from pointsplat_ns.pruning.budget import Keep, resolve_keep
 from pointsplat_ns.pruning.coverage import coverage_score
 from pointsplat_ns.pruning.merge import merge
@@ -115,6 +116,7 @@ def prune(
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
     note: Callable[[str], None] | None = None,
+    resolution: tuple[int, int] = RESOLUTION,
 ) -> Gaussians:
     """Prune a scene to a number of Gaussians.
 
@@ -127,6 +129,7 @@ def prune(
         opacity_weight: lambda of the methods that weigh opacity; by default the paper's.
         progress: called with the share done, in [0, 1].
         note: called with a line of text on what was chosen for this scene.
+        resolution: width and height of the pictures that merging looks at where no views are given, pixels.
 
     Returns:
         Exactly the number of Gaussians that ``keep`` resolves to.
@@ -142,7 +145,8 @@ def prune(
     count = resolve_keep(len(scene), keep, scene.sh_degree)
     need_usable(scene)
     if method.score is None:
-        merged = merge(scene, count, progress=progress, views=views if isinstance(views, Views) else None)
+        given = views if isinstance(views, Views) else None
+        merged = merge(scene, count, progress=progress, views=given, resolution=resolution)
         if note is not None:
             note(merged.finish.note)
         return merged.scene
