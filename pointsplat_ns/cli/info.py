@@ -26,7 +26,7 @@ def info(
 
     Args:
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
-        views: a .png file for a sheet of the views that other commands look at the scene from, where no poses are given.
+        views: a .png file for a sheet of the views that other commands look at the scene from, if no poses are given.
         resolution: size of these views, in pixels. By default that of the photos where there are any, else 1920x1080.
         force: overwrite an existing file.
         json_output: print JSON, and nothing else on standard output.

@@ -11,7 +11,8 @@ from making import ball, box_room
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.view_source import COMPARED_SIDE, COMPARED_VIEWS, ViewSource
+from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
+from pointsplat_ns.looking.windows import sides_of
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.views import Views
 
@@ -77,12 +78,20 @@ def test_given_views_go_before_all_others(scene, trained_walls):
         ViewSource(scene, given[:0]).views(3)
 
 
-def test_renders_are_compared_in_few_small_views(scene):
+def test_renders_are_compared_in_few_views_of_a_middle_size(scene):
     given = sample_views(scene, 2, 900, 600)
     many = given[[0, 1] * 20]
     compared = ViewSource(scene, given=many).compared()
     assert len(compared) == COMPARED_VIEWS
-    assert max(compared.width, compared.height) == COMPARED_SIDE
+    assert compared.width == sides_of(900, 600)[1] and ViewSource(scene, given=many).whole().width == 900
+
+
+def test_a_resolution_that_is_asked_for_is_that_of_sampled_views_and_bounds_given_ones(scene):
+    asked = ViewSource(scene, resolution=(96, 54)).views(2)
+    assert (asked.width, asked.height) == (96, 54)
+    given = sample_views(scene, 2, 900, 600)
+    assert ViewSource(scene, given=given, resolution=(300, 200)).views(2).width == 300
+    assert next(ViewSource(scene, given=given, resolution=(300, 200)).others()).width == 300
 
 
 def test_views_are_spread_resized_and_checked(ball_views):
@@ -103,5 +112,5 @@ def test_sampled_poses_of_a_scene_whose_sh_tell_of_its_photos_say_so(monkeypatch
     monkeypatch.setattr("pointsplat_ns.looking.view_source.photo_places", lambda scene: asked.append(scene) or told)
     source = ViewSource(box_room(0))
     assert len(source.views(3)) and len(source.compared())
-    assert source.origin == "poses sampled about where photos were taken, as the Gaussians tell"
+    assert source.origin == "poses sampled in free space, half of them where photos were taken"
     assert len(asked) == 1  # what takes seconds is asked once
