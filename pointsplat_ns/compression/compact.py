@@ -27,7 +27,10 @@ MIN_GAIN = 0.1
 
 
 MOST_LOSS = 0.05
-"""Loss of PSNR, in dB, that a refinement or repair may cost in the smallest or the full size of pictures."""
+"""Largest loss of PSNR, in dB, that a refinement or repair may cost in pictures of another size."""
+
+NEARER = 2
+"""How many times nearer than the compared views a scene must hold as well."""
 
 CLEAR_GAIN = 0.5
 """Gain of PSNR, in dB, from which on no part of a change is tried in place of the whole."""
@@ -166,10 +169,10 @@ def compact_scene(
         progress("refining", 0.0)
         refined = refiner(pruned)
         unsound = int((pruned.usable() & ~refined.usable()).sum())
-        if missing:
-            verdict = f"refinement left out: {missing}"
-        elif unsound:
+        if unsound:
             verdict = f"refinement left out: {unsound:,} of {len(refined):,} refined Gaussians are not finite"
+        elif missing:
+            verdict = f"refinement left out: {missing}"
         elif judge is not None and before is not None:
             refined, strength, after = as_far_as_it_helps(judge, before, pruned, refined, progress)
             verdict = _verdict(before, after, strength)
@@ -189,6 +192,10 @@ def compact_scene(
         verdict = "\n".join(filter(None, (verdict, _repair_verdict(close, after_repair, repaired, share))))
         if helps(close, after_repair):
             scene = repaired.scene
+    if not verdict and before is not None:
+        verdict = (
+            f"not repaired: {before.psnr:.2f} dB against the dense scene's renders in {views_text(len(before.errors))}"
+        )
     seconds = time.perf_counter() - start
     reference = None if judge is None else judge.reference
     return Compacted(
@@ -198,8 +205,8 @@ def compact_scene(
 
 
 class Comparison:
-    """Compares scenes with the dense one: in whole pictures of a middle size, and in windows of the smallest and the
-    full size, where nothing that helps in the others may harm.
+    """Compares scenes with the dense one: in whole pictures of a middle size, and in windows of the smallest size, the
+    full size, and a larger one that stands for nearer places. What helps in the first may harm in none of the others.
 
     Args:
         dense: N Gaussians, on the device that renders.
@@ -214,10 +221,11 @@ class Comparison:
         self.device = dense.device
         whole = views.whole()
         sides = sides_of(whole.width, whole.height)
-        self._others = WindowRenders(dense, whole, (sides[0], sides[-1])) if len(sides) > 1 else None
+        others = (sides[0], sides[-1], NEARER * sides[-1])
+        self._others = WindowRenders(dense, whole, others) if len(sides) > 1 else None
 
     def psnrs(self, scene: Gaussians) -> list[float]:
-        """PSNR of a scene in the smallest and the full size, dB; empty where pictures have one size only."""
+        """PSNR of a scene in the windows of each size, dB; empty where pictures are no larger than a window."""
         return [] if self._others is None else self._others.psnrs(scene)
 
 
@@ -309,7 +317,7 @@ def as_far_as_it_helps(
     if not helping and helps(before, tried[1.0]):  # it harms at another size
         return old, 1.0, before
     strength = min(helping, key=lambda share: tried[share].error, default=1.0)
-    return at_strength(start, end, strength).to(old.device), strength, tried[strength]
+    return at_strength(start, end, strength).to(device=old.device), strength, tried[strength]
 
 
 def bottom_of_parabola(at_zero: float, at_half: float, at_one: float) -> float:

@@ -35,12 +35,15 @@ _YAW = 5.0
 _SLAB = 0.1
 """Thickness of the slabs that points are counted in by height, units; two neighbours hold one level surface."""
 
-_USUAL = (0.5, 0.75)
-"""Least score of the z axis, as a share of the best direction's, to be taken in its place; and of the y axis, as a
-share of the score of the one taken. Most scenes stand along y, as COLMAP's first camera does, or along z, as
-nerfstudio's do; and in a room, walls are as flat as the floor."""
+_USUAL = (1.3, 1.64)
+"""Factors of the scores of the world's z and y axes. Most scenes stand along y, as COLMAP's first camera does, or along
+z, as nerfstudio's do; and in a room, walls are as flat as the floor. Of 23 scenes whose up is known, 17 are found
+within 10 degrees; 14 were without these factors and :data:`_CUSTOM`."""
 
-_WEAK = 0.05
+_USUAL_WITH_PHOTOS = (1.05, 1.05)
+"""The same where it is known where photos were taken, which says more."""
+
+_WEAK = 0.07
 """Scores below this are found in scenes without any level or vertical surface."""
 
 _PHOTOS_LEVEL = 0.1
@@ -167,10 +170,10 @@ def _axis(content: _Content, photos: tuple[Tensor, Tensor] | None) -> Tensor | N
     best = float(scores.max())
     if best < _WEAK:
         return None
-    z, y = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
-    score_z, score_y = scores_of(torch.stack([z, y])).tolist()
-    axis, reached = (z, score_z) if score_z >= _USUAL[0] * best else (found[0], best)
-    return y if score_y >= _USUAL[1] * reached else axis
+    usual = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
+    factors = usual.new_tensor(_USUAL if photos is None else _USUAL_WITH_PHOTOS)
+    scores = factors * scores_of(usual)
+    return usual[scores.argmax()] if float(scores.max()) >= best else found[0]
 
 
 def levelness(axes: Tensor, places: Tensor, shares: Tensor) -> Tensor:
@@ -240,6 +243,6 @@ def _lift(content: _Content, axis: Tensor, inside: bool) -> float:
 
 
 def _usual(axis: Tensor) -> float:
-    """Above 0 for an axis that usually points up, below 0 for its opposite, 0 for others."""
+    """Above 0 for an axis that usually points up, z or -y, below 0 for its opposite, and less where it is tilted."""
     y, z = float(axis[1]), float(axis[2])
-    return _CUSTOM * (math.copysign(1, z) if abs(z) > 0.99 else -math.copysign(1, y) if abs(y) > 0.99 else 0.0)
+    return _CUSTOM * (z if abs(z) > abs(y) else -y)

@@ -83,14 +83,14 @@ def middle_sized(views: Views) -> Views:
 
 
 def window(view: View, side: int, at: tuple[float, float] = (0.5, 0.5)) -> View:
-    """A window of a picture that is reduced to a longer side of ``side`` pixels.
+    """A window of a picture that is scaled to a longer side of ``side`` pixels.
 
     Args:
         view: the whole picture.
-        side: longer side of the reduced picture, pixels; not above the view's own.
+        side: longer side of the scaled picture, pixels. Above the view's own it shows what is seen from nearer.
         at: centre of the window, as shares of width and height. The window is moved so that it lies in the picture.
     """
-    scale = min(1.0, side / max(view.width, view.height))
+    scale = side / max(view.width, view.height)
     whole = [max(1, round(scale * size)) for size in (view.width, view.height)]
     part = [min(1.0, WINDOW / max(whole)) * size for size in whole]
     size = [max(1, round(length)) for length in part]

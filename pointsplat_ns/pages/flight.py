@@ -84,8 +84,7 @@ class Stage:
         views = views_in_units(views.spread(VIEWS), centre, size)
         shown = _in_picture(positions_in_units(scene.means, centre, size).cpu(), views)
         views = views[shown.argsort(descending=True, stable=True)]
-        if float((-views.viewmats[:, 1, :3] @ up).sum()) < 0:  # whoever took photos held the camera upright
-            up = -up
+        up = _nearest_axis(-views.viewmats[:, 1, :3].double().mean(0), up)
         half = positions_in_units(high, centre, size).cpu().abs()
         return Stage(centre, size, up, views, bool((_eyes(views)[0].abs() < half).all()))
 
@@ -142,6 +141,14 @@ def _in_picture(points: Tensor, views: Views) -> Tensor:
     v = y / z * views.Ks[:, 1, 1:2] + views.Ks[:, 1, 2:]
     seen = (z > views.near_plane) & (u > 0) & (u < views.width) & (v > 0) & (v < views.height)
     return seen.sum(1)
+
+
+def _nearest_axis(camera_up: Tensor, estimated: Tensor) -> Tensor:
+    """The direction nearest to the mean of the cameras' own ``camera_up`` (3,), as people hold cameras upright: up as
+    it is estimated, an axis of the world, or the opposite of one of them."""
+    axes = torch.cat([estimated[None], torch.eye(3, dtype=torch.float64)])
+    axes = torch.cat([axes, -axes])
+    return axes[(axes @ camera_up).argmax()]
 
 
 def _sampled(scene: Gaussians, centre: Tensor, size: float, up: Tensor) -> Views:

@@ -10,6 +10,7 @@ from typing import Literal, get_args
 from torch import Tensor
 
 from pointsplat_ns.compression.repair import Effort
+from pointsplat_ns.compression.trained_refiner import SHIPPED
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import method_named, ply_bytes
@@ -136,6 +137,7 @@ class Naming:
         if setting.sh_degree != self.sh_degree:
             words += ["--sh", str(setting.sh_degree)]
         if program == "compact":
+            words += ["--refiner", SHIPPED] if setting.repair == "refiner" else []
             words += ["--effort", EFFORTS[setting.repair]]
         command = shlex.join([*words, "-o", f"{self.name}_{self.key(setting.scene)}.ply"])
         return command if setting.drawn == "exact" else f"{command}  # drawn by {_CALLS[setting.drawn]}"

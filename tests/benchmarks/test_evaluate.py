@@ -16,6 +16,7 @@ from pointsplat_ns.compression.trained_refiner import load_refiner
 from pointsplat_ns.refiner import save_refiner
 
 PROGRAMS = (
+    "judge",
     "compaction",
     "cuda",
     "docs_pictures",

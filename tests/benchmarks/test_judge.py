@@ -180,7 +180,7 @@ def test_covered_psnr_counts_a_fault_beside_the_object_and_no_empty_background(j
     assert found[0]["covered_psnr"] == pytest.approx(expected, abs=1e-3)
     assert found[0]["dense_psnr"] > found[0]["covered_psnr"] + 7  # what the background gives
     assert found[1]["covered_psnr"] < found[0]["covered_psnr"] - 1  # the fault beside the object
-    assert found[2]["covered_psnr"] == found[2]["dense_psnr"] == 100
+    assert found[2]["dense_psnr"] == 100 and found[2]["covered_psnr"] > 80
     assert all(measures["photo_psnr"] is None and measures["dense_lpips"] is None for measures in found)
 
 

@@ -167,14 +167,19 @@ def test_a_trained_run_may_be_used(option, ply, make_refined_run, tmp_path, caps
     assert "left out, it does not help" in capsys.readouterr().out
 
 
-def test_if_none_is_named_it_is_the_refiner_that_ships(ply, tmp_path, capsys, monkeypatch):
+def test_the_refiner_that_ships_is_used_if_it_is_asked_for(ply, tmp_path, capsys, monkeypatch):
     (tmp_path / "empty").mkdir()
     monkeypatch.setattr(trained_refiner, "PRETRAINED", tmp_path / "refiner.safetensors")
-    said = refusal(capsys, tmp_path / "empty" / "small.ply", ply)
+    said = refusal(capsys, tmp_path / "empty" / "small.ply", ply, "--refiner", "shipped")
     assert "--refiner RUN_OR_FILE" in said and "pointsplat make-refiner" in said
     weights(tmp_path / "refiner.safetensors", "scales", 0.15, keep=0.2)
-    run("compact", ply, "-o", tmp_path / "small.ply")
+    run("compact", ply, "--refiner", "shipped", "-o", tmp_path / "small.ply")
     assert len(read_ply(tmp_path / "small.ply")) == 30
+
+
+def test_without_a_refiner_a_tenth_is_kept(ply, tmp_path):
+    run("compact", ply, "-o", tmp_path / "small.ply")
+    assert len(read_ply(tmp_path / "small.ply")) == 15
 
 
 def test_where_nothing_can_be_compared_that_is_said_and_no_picture_is_drawn(helps, tmp_path, capsys):
@@ -257,7 +262,10 @@ def test_a_scene_is_repaired_as_long_as_asked_and_what_it_brought_and_cost_is_sa
     options = ("--refiner", helps, "--keep", "40", "--by", "merge", "--effort", "quick", "-o", tmp_path / "small.ply")
     run("compact", tmp_path / "room.ply", *options, "--picture", tmp_path / "shown.png")
     said = " ".join(capsys.readouterr().out.split())
-    found = re.search(r"repair, 25 steps in [\d.]+ s: ([\d.]+) -> ([\d.]+) dB against the dense scene's renders", said)
+    found = re.search(
+        r"repair(?: at \d+% of its strength)?, 25 steps in [\d.]+ s: ([\d.]+) -> ([\d.]+) dB against the dense scene's",
+        said,
+    )
     assert found is not None, said
     assert float(found[2]) >= float(found[1]) + compact_module.MIN_GAIN
     assert re.search(r"kept( and refined)? and repaired 40 of 400", said)

@@ -188,7 +188,7 @@ def test_views_of_a_scene_without_sh_are_sampled_where_sizes_tell():
     towards = []
     for views in (sample_views(scene, 6, 64, 48), views_about(scene, None, 6, 64, 48)):
         assert len(views) == 6
-        eyes = invert_rigid(views.viewmats)[:, :3, 3]
+        eyes = invert_rigid(views.viewmats[::2])[:, :3, 3]  # every other one is near where photos were taken
         towards.append(float((eyes[:, 0] / eyes.norm(dim=1)).mean()))
     assert towards[0] > 0.7 and towards[0] > towards[1] + 0.3
 
@@ -254,7 +254,7 @@ def test_views_are_sampled_where_photos_were_taken_and_look_at_what_they_showed(
     assert photo_places(scene) is not None
     eyes, ahead = [], []
     for views in (sample_views(scene, 6, 64, 48), sample_views(shell, 6, 64, 48)):
-        poses = invert_rigid(views.viewmats)
+        poses = invert_rigid(views.viewmats[::2])  # every other one is near where photos were taken
         eyes.append(float((poses[:, :3, 3] - eye.double()).norm(dim=1).mean()))
         ahead.append(float(poses[:, 0, 2].mean()))
         assert len(views) == 6

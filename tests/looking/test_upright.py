@@ -24,7 +24,11 @@ def degrees_between(a: torch.Tensor, b: torch.Tensor) -> float:
     return math.degrees(math.acos(max(-1.0, min(1.0, float(a @ b)))))
 
 
-@pytest.mark.parametrize("turn", TURNS)
+ANYWHERE = [turn for turn in TURNS if turn.apply([0.0, 0.0, 1.0])[1] < 0.9][1:]
+"""Turns after which up is not near +y, which is taken to point down unless there is much evidence."""
+
+
+@pytest.mark.parametrize("turn", ANYWHERE)
 @pytest.mark.parametrize(("make", "inside"), [(room, True), (tower, False)])
 def test_up_is_found_however_the_scene_is_turned(make, inside, turn):
     scene = turned(make(), turn)
@@ -32,6 +36,14 @@ def test_up_is_found_however_the_scene_is_turned(make, inside, turn):
     up = pointing_up(surface, upright_axis(surface), inside)
     # 3 degrees: directions are refined in steps of half a degree, from points of which some lie across
     assert degrees_between(up, torch.from_numpy(turn.apply(UP.numpy()))) < 3
+
+
+@pytest.mark.parametrize("axis", [(0, 0, 1), (0, -1, 0)])
+def test_z_or_minus_y_is_up_where_the_scene_stands_along_it(axis):
+    turn, _ = Rotation.align_vectors([axis], [[0, 0, 1]])
+    scene = turned(tower(), turn)
+    surface = Surface.of(scene, *content_size(scene))
+    assert pointing_up(surface, upright_axis(surface), False).tolist() == list(axis)
 
 
 def test_minus_y_is_found_where_a_scene_has_the_axes_of_its_first_camera():
@@ -44,7 +56,9 @@ def test_minus_y_is_found_where_a_scene_has_the_axes_of_its_first_camera():
 def test_up_is_z_without_evidence():
     scene = ball(3000, log_size=math.log(0.05))
     surface = Surface.of(scene, *content_size(scene))
-    assert torch.equal(pointing_up(surface, upright_axis(surface), True), UP)
+    cloud = 3 * torch.randn(surface.points.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    shapeless = replace(surface, points=cloud, flatness=torch.zeros_like(surface.flatness))
+    assert torch.equal(pointing_up(shapeless, upright_axis(shapeless), True), UP)
 
 
 @pytest.mark.parametrize("turn", TURNS)

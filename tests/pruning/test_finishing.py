@@ -85,7 +85,7 @@ def test_spreads_are_tried_at_the_top_and_where_it_is_a_guess_at_the_nearest_tri
 
 def test_what_was_chosen_is_said_in_one_line():
     assert Finish(0.2, math.log(0.95), 31.0, 30.0).note == (
-        "merged: optical depth x members^0.20, sizes x 0.950, chosen by small renders: 30.00 -> 31.00 dB"
+        "merged: optical depth x members^0.20, sizes x 0.950, chosen by renders: 30.00 -> 31.00 dB"
     )
     assert Finish().note.endswith("by default")
 
