@@ -26,5 +26,6 @@ def test_every_repair_is_a_row_and_a_point_of_the_picture(trained_walls, tmp_pat
     assert (tmp_path / "repair.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_sampled_views_are_held_against_poses_of_photos(trained_walls, run_benchmark):
-    assert "wall-a" in run_benchmark("sampled_views", wall_of(trained_walls), "--views", "1", "--side", "32")
+def test_merging_without_poses_is_held_against_merging_with_them(trained_walls, run_benchmark):
+    said = run_benchmark("sampled_views", wall_of(trained_walls), "--views", "1", "--keep", "0.5")
+    assert "| wall-a | 50% |" in said and "without poses, against renders: mean" in said

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -92,6 +93,11 @@ def test_a_resolution_that_is_asked_for_is_that_of_sampled_views_and_bounds_give
     given = sample_views(scene, 2, 900, 600)
     assert ViewSource(scene, given=given, resolution=(300, 200)).views(2).width == 300
     assert next(ViewSource(scene, given=given, resolution=(300, 200)).others()).width == 300
+
+
+def test_views_that_are_sampled_beside_too_few_known_ones_are_drawn_as_these_are(scene):
+    given = dataclasses.replace(sample_views(scene, 2, 64, 48), rasterize_mode="antialiased")
+    assert next(ViewSource(scene, given=given).others()).rasterize_mode == "antialiased"
 
 
 def test_views_are_spread_resized_and_checked(ball_views):
