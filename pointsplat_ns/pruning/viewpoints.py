@@ -12,8 +12,8 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
-from pointsplat_ns.looking.content import UNITS, thinned
-from pointsplat_ns.looking.sampling import PROBED, views_about
+from pointsplat_ns.looking.content import UNITS
+from pointsplat_ns.looking.sampling import views_about
 from pointsplat_ns.views import View, Views
 
 VIEWPOINTS = 48
@@ -39,7 +39,7 @@ def viewpoints(scene: Gaussians, photos: tuple[Tensor, Tensor] | None, width: in
     """Views from free places in a scene in units of its content, see :func:`~pointsplat_ns.looking.content.in_units`;
     None if there are none. ``photos`` is what :func:`~pointsplat_ns.looking.traces.photo_places` says of the scene."""
     try:
-        return views_about(thinned(scene, PROBED), photos, VIEWPOINTS, width, height, seed=SEED)
+        return views_about(scene, photos, VIEWPOINTS, width, height, seed=SEED)
     except DataError:
         return None
 
