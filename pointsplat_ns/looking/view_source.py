@@ -164,5 +164,7 @@ class ViewSource:
             sampled = dataclasses.replace(
                 sampled, background=compared.background, rasterize_mode=compared.rasterize_mode
             )
-            for index in random.Random(batch).sample(range(len(sampled)), len(sampled)):
-                yield sampled[index]
+            for turn, index in enumerate(random.Random(batch).sample(range(len(sampled)), len(sampled))):
+                view = sampled[index]
+                # Every fourth view has the opposite background, as nobody knows before which the scene is shown.
+                yield dataclasses.replace(view, background=1 - view.background) if turn % 4 == 3 else view

@@ -139,6 +139,9 @@ def _somewhere(alpha: Tensor, chosen: random.Random) -> tuple[float, float]:
 class WindowRenders:
     """Renders of a dense scene in windows, that other scenes are compared with.
 
+    Errors are means over two backgrounds, the views' own and its opposite (white for black): nobody knows before which
+    a scene will be shown, and a scene that fits one may be too transparent or too opaque for the other.
+
     Args:
         dense: N Gaussians.
         views: C views of it.
@@ -151,7 +154,8 @@ class WindowRenders:
         small = [alpha[..., 0] for _, alpha in each_view(list(views.resized(64)), len(dense), _drawn(dense))]
         self.windows = windows_of(views, small, sides, seed)
         drawn = list(each_view(self.windows.flat(), len(dense), _drawn(dense)))
-        self.renders: list[Tensor] = [image for image, _ in drawn]
+        self.renders = drawn
+        self._other = (1 - 2 * views.background).to(dense.means)  # from a background to its opposite
         per_side = len(views)
         self.covered = [
             sum(float(alpha.double().mean()) for _, alpha in drawn[i * per_side : (i + 1) * per_side]) / per_side
@@ -163,10 +167,11 @@ class WindowRenders:
     def errors(self, scene: Gaussians) -> list[list[float]]:
         """Mean squared error of each window, for each side."""
         pictures = each_view(self.windows.flat(), len(scene), _drawn(scene))
-        errors = [
-            float((image.double() - target.double()).square().mean())
-            for (image, _), target in zip(pictures, self.renders, strict=True)
-        ]
+        errors = []
+        for (image, alpha), (target, covered) in zip(pictures, self.renders, strict=True):
+            apart = image.double() - target.double()
+            over_other = apart - (alpha - covered).double() * self._other
+            errors.append(0.5 * float(apart.square().mean() + over_other.square().mean()))
         count = len(self.windows.views[0])
         return [errors[i : i + count] for i in range(0, len(errors), count)]
 
