@@ -192,8 +192,12 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
     return "\n\n".join(part.strip() for part in parts) + "\n"
 
 
-SCENES = """Nothing is tuned on scenes of the list "judged". Scenes of no list are "other".
-[benchmarks.md](../benchmarks.md#merging-beside-splat-transform) says where the scenes come from."""
+LEARNED = ("mujoco_tabletop", "pc_playbot", "pc_statue_st_peter", "lounge")
+"""Scenes of the list "judged" that the network of ``compact``'s repairs was trained on (FEEDBACK.md beside it)."""
+
+SCENES = f"""No constant is chosen on scenes of the list "judged". Scenes of no list are "other".
+[benchmarks.md](../benchmarks.md#merging-beside-splat-transform) says where the scenes come from.
+The network that sets the steps of `compact` was trained on {", ".join(LEARNED)}."""
 
 TIME = """CPU seconds and peak memory of one process, with starting, reading and writing: mean and largest over scenes.
 splat-transform stands for the mode of the best PSNR."""
