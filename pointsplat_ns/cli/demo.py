@@ -146,7 +146,7 @@ def train_and_judge(
     show_report(results)
     config = shlex.quote(str(trained / "config.yml"))
     print(f"{refined}: open it in any 3DGS viewer, or run ns-viewer --load-config {config}")
-    print(f"{small}: the same room by pointsplat compact and the refiner that ships; {views} shows it")
+    print(f"{small}: the same room by pointsplat compact; {views} shows it")
     print(f"{picture}: photo, dense, pruned and refined side by side, of a room that the refiner never saw")
     print(f"done in {(time.perf_counter() - start) / 60:.1f} minutes")
 
