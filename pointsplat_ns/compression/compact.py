@@ -188,10 +188,10 @@ def compact_scene(
         psnr = judge.reference.psnr_of_covered(close.psnr)
         repaired = repair(scene.to(device), dense.to(device), views, budget, shown, psnr=psnr)
         kept, share, after_repair = as_far_as_it_helps(judge, close, scene, repaired.scene)
-        repaired = replace(repaired, scene=kept)
         verdict = "\n".join(filter(None, (verdict, _repair_verdict(close, after_repair, repaired, share))))
         if helps(close, after_repair):
-            scene = repaired.scene
+            repaired = replace(repaired, scene=kept)
+            scene = kept
     if not verdict and before is not None:
         verdict = (
             f"not repaired: {before.psnr:.2f} dB against the dense scene's renders in {views_text(len(before.errors))}"

@@ -81,3 +81,21 @@ def test_info_prints_a_page_or_json(scene, capsys):
     assert "400 Gaussians of SH degree 2" in said and "suspicious: nothing" in said and ".splat" in said
     run("info", scene, "--json")
     assert json.loads(capsys.readouterr().out) == ps.info(scene).as_dict()
+
+
+def test_info_draws_where_a_scene_is_looked_at_from(scene, tmp_path, capsys):
+    sheet = tmp_path / "sheet.png"
+    run("info", scene, "--views", sheet, "--resolution", "64x48")
+    said = capsys.readouterr().out
+    assert "of 64 x 48 pixels; poses sampled in free space" in said and "up is taken to be" in said
+    assert "of the visible content" in said and sheet.read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(SystemExit):
+        run("info", scene, "--views", sheet)
+    assert "exists already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["info", "prune", "compact", "lod"])
+def test_a_resolution_that_means_nothing_is_refused(command, scene, capsys):
+    with pytest.raises(SystemExit):
+        run(command, scene, "--resolution", "wide")
+    assert "expected width and height in pixels, such as 1920x1080" in capsys.readouterr().err

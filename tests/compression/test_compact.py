@@ -351,3 +351,26 @@ def test_what_most_views_pay_for_is_left_out(scene, views, monkeypatch):
     assert same(result.scene, pruned) and result.after_repair.psnr > result.before.psnr + 3
     assert result.verdict.startswith("refinement left out, it is farther in most views: ")
     assert "repair left out, it is farther in most views (5 steps in 0.5 s)" in result.verdict
+
+
+def test_a_repair_that_harms_pictures_of_another_size_is_left_out(scene, monkeypatch):
+    """Thinner Gaussians may be right in pictures of a middle size, and wrong in large ones."""
+    large = sample_views(scene, 2, 640, 480)
+    pruned = prune(scene, 0.5, "opacity")
+    better = pruned.replace(scales=pruned.scales + 0.1)
+    monkeypatch.setattr(compact_module, "repair", lambda *_, **others: Repaired(better, 5, 0.5, False))
+    budget = RepairBudget("quick", 1.0)
+    refiner = trained(tiny_refiner())
+    assert compacted(scene, refiner, large, budget=budget).repair_accepted
+    psnrs = iter([[30.0, 30.0, 30.0], *([[31.0, 31.0, 29.9]] * 3)])
+    monkeypatch.setattr(compact_module.Comparison, "psnrs", lambda self, scene: next(psnrs, [31.0, 31.0, 29.9]))
+    monkeypatch.setattr(compact_module, "helps", lambda before, after: after.psnr > before.psnr)
+    left = compacted(scene, None, large, budget=budget, by="opacity", keep=0.5)
+    assert not left.repair_accepted and same(left.scene, left.pruned)
+    assert left.verdict.startswith("repair left out")
+
+
+def test_without_a_refiner_the_scene_is_only_pruned_and_compared(scene, views):
+    result = compact_scene(scene, views=ViewSource(scene, given=views))
+    assert same(result.scene, result.pruned) and result.after is None and len(result.scene) == len(scene) // 10
+    assert result.verdict.startswith(f"not repaired: {result.psnr:.2f} dB")

@@ -8,9 +8,10 @@ import torch
 from upright_scenes import TURNS, room, tower, turned
 
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.sampling import look_at, sample_views
-from pointsplat_ns.rasterizer import render, render_depth
+from pointsplat_ns.rasterizer import pixels_of, render, render_depth
 
 
 def places_of(views):
@@ -139,3 +140,26 @@ def test_nothing_nearer_than_the_near_plane_is_drawn(hollow_ball):
     assert render(hollow_ball, views).max() > 0 and render(hollow_ball, beyond).max() == 0
     assert beyond[0].near_plane == beyond.resized(8).near_plane == beyond[[0]].near_plane == 1e5
     assert render_depth(hollow_ball, views[0])[1].max() > 0 and render_depth(hollow_ball, beyond[0])[1].max() == 0
+
+
+def test_a_view_that_a_few_large_gaussians_fill_is_not_taken(make_hollow_ball):
+    """A ball of small Gaussians with a cloud of large ones beside it: nobody takes photos from within a cloud."""
+    generator = torch.Generator().manual_seed(5)
+    ball = make_hollow_ball(6000)
+    ball = ball.replace(scales=ball.scales - 1.5)
+    cloud = make_hollow_ball(60)
+    middle = ball.means.mean(0) + torch.tensor([6.0, 0.0, 0.0])
+    means = middle + 1.5 * torch.randn(60, 3, generator=generator)
+    cloud = cloud.replace(means=means, scales=torch.full_like(cloud.scales, -0.3))
+    scene = Gaussians(*(torch.cat(pair) for pair in zip(ball.tensors(), cloud.tensors(), strict=True)))
+    views = sample_views(scene, 8, 96, 72)
+    subtended = []
+    for view in views:
+        shares = pixels_of(scene, view)
+        away = (scene.means.double() - places_of(views).mean(0)).norm(dim=1)
+        subtended.append(float((shares * scene.stds.amax(1) / away).sum() / shares.sum()))
+    assert len(views) >= 1 and max(subtended) < 0.2
+
+
+def test_a_scene_of_few_large_gaussians_has_views_as_well(make_hollow_ball):
+    assert len(sample_views(make_hollow_ball(40), 4, 64, 48)) == 4

@@ -47,6 +47,12 @@ def test_a_window_of_full_size_is_a_crop_of_the_whole_picture(scene, views, at):
     assert float((render(fine, part) - crop).abs().mean()) < 1e-4
 
 
+def test_a_window_beyond_the_full_size_shows_what_is_seen_from_nearer(views):
+    near, full = window(views[0], 1280, (0.25, 0.75)), window(views[0], 640, (0.25, 0.75))
+    assert (near.width, near.height) == (full.width, full.height)
+    torch.testing.assert_close(near.K[:2, :2], 2 * full.K[:2, :2])
+
+
 def test_the_smallest_window_is_the_reduced_picture(scene, views):
     part = window(views[0], WINDOW, (0.9, 0.1))
     small = views.resized(WINDOW)[0]
@@ -89,6 +95,13 @@ def test_the_scene_itself_is_not_wrong_in_any_window_and_a_wider_one_is(scene, v
     wider = renders.psnrs(scene.replace(scales=scene.scales + 0.1))
     assert all(5 < psnr < 60 for psnr in wider)
     assert renders.psnr(scene) == 100.0
+
+
+def test_an_error_of_opacity_alone_counts_before_the_background_that_shows_it(scene, views):
+    """Black Gaussians before black: their opacity does not show, and it does before white."""
+    black = scene.replace(features_dc=torch.full_like(scene.features_dc, -10.0), features_rest=scene.features_rest * 0)
+    renders = WindowRenders(black, views)
+    assert renders.psnr(black.replace(opacities=black.opacities - 1)) < 50
 
 
 @pytest.mark.parametrize("covered", [1.0, 0.25])
