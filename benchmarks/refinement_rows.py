@@ -16,7 +16,7 @@ import torch
 from held_out import COLUMNS, REFERENCES, Scene, compare, load, photos_of
 
 from pointsplat_ns.compression.closeness import Closeness
-from pointsplat_ns.compression.compact import Comparison, as_far_as_it_helps, helps
+from pointsplat_ns.compression.compact import Comparison, as_far_as_it_helps
 from pointsplat_ns.compression.fine_tune import fine_tune
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, open_refiner_run
 from pointsplat_ns.errors import DataError, PointSplatError
@@ -208,9 +208,8 @@ class Judge:
         if self.rule is None or selected.before is None or not _sound(refined, selected.scene):
             return selected.scene, 0.0, 0.0
         start = time.perf_counter()
-        best, strength, after = as_far_as_it_helps(self.rule, selected.before, selected.scene, refined)
-        kept = helps(selected.before, after)
-        return best if kept else selected.scene, strength if kept else 0.0, time.perf_counter() - start
+        change = as_far_as_it_helps(self.rule, selected.before, selected.scene, refined)
+        return change.scene, 0.0 if change.left_out else change.strength, time.perf_counter() - start
 
     def _fine_tuned(self, scene: Gaussians, steps: int, photos: bool) -> tuple[Gaussians, float]:
         """Fine-tuned at training poses, no more of them than steps, and seconds with rendering what is wanted."""

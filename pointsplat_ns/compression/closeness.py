@@ -23,6 +23,13 @@ class Closeness:
     """Mean squared error of each view."""
     ssim: float | None
     """Mean over views; None if views are smaller than SSIM's window."""
+    width: int | None = None
+    """Of the pictures, pixels, if it is known."""
+
+    @property
+    def where(self) -> str:
+        """Text: in how many views, and how wide they are."""
+        return views_text(len(self.errors)) + ("" if self.width is None else f" of {self.width} pixels")
 
     @property
     def error(self) -> float:
@@ -73,7 +80,8 @@ class DenseReference:
                 similarities.append(float(ssim(image, target)))
             if progress is not None:
                 progress((index + 1) / len(self.renders))
-        return Closeness(tuple(errors), sum(similarities) / len(similarities) if similarities else None)
+        similarity = sum(similarities) / len(similarities) if similarities else None
+        return Closeness(tuple(errors), similarity, self.views.width)
 
     def psnr_of_covered(self, psnr: float) -> float:
         """A PSNR over all pixels of all views, dB, if all that is wrong lies in the pixels that the dense scene covers:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from pointsplat_ns.compression.closeness import Closeness, DenseReference, views_text
+from pointsplat_ns.compression.closeness import Closeness, DenseReference
 from pointsplat_ns.compression.prune import check_options, prune_scene
 from pointsplat_ns.compression.repair import RepairBudget, Repaired, repair
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner, default_device
@@ -164,6 +164,7 @@ def compact_scene(
         before = judge.reference.closeness(pruned.to(device))
     except DataError as error:
         missing = f"it cannot be compared with the dense scene ({error})"
+    accepted = False
     refined, strength, after, verdict = pruned, 1.0, None, f"not refined or repaired: {missing}" if missing else ""
     if refiner is not None:
         progress("refining", 0.0)
@@ -174,9 +175,10 @@ def compact_scene(
         elif missing:
             verdict = f"refinement left out: {missing}"
         elif judge is not None and before is not None:
-            refined, strength, after = as_far_as_it_helps(judge, before, pruned, refined, progress)
-            verdict = _verdict(before, after, strength)
-    accepted = before is not None and after is not None and helps(before, after)
+            change = as_far_as_it_helps(judge, before, pruned, refined, progress)
+            after, strength, accepted = change.closeness, change.strength, not change.left_out
+            refined = change.scene if accepted else refined
+            verdict = _verdict(before, change)
     notes = smaller.notes
     if views.origin and views.origin not in notes:
         notes = (*notes, views.origin)
@@ -187,15 +189,14 @@ def compact_scene(
         shown = functools.partial(progress, "repairing")
         psnr = judge.reference.psnr_of_covered(close.psnr)
         repaired = repair(scene.to(device), dense.to(device), views, budget, shown, psnr=psnr)
-        kept, share, after_repair = as_far_as_it_helps(judge, close, scene, repaired.scene)
-        verdict = "\n".join(filter(None, (verdict, _repair_verdict(close, after_repair, repaired, share))))
-        if helps(close, after_repair):
-            repaired = replace(repaired, scene=kept)
-            scene = kept
+        change = as_far_as_it_helps(judge, close, scene, repaired.scene)
+        after_repair = change.closeness
+        verdict = "\n".join(filter(None, (verdict, _repair_verdict(close, change, repaired))))
+        if not change.left_out:
+            scene = change.scene
+            repaired = replace(repaired, scene=scene)
     if not verdict and before is not None:
-        verdict = (
-            f"not repaired: {before.psnr:.2f} dB against the dense scene's renders in {views_text(len(before.errors))}"
-        )
+        verdict = f"not repaired: {before.psnr:.2f} dB against the dense scene's renders in {before.where}"
     seconds = time.perf_counter() - start
     reference = None if judge is None else judge.reference
     return Compacted(
@@ -280,11 +281,24 @@ def at_strength(before: Gaussians, after: Gaussians, strength: float) -> Gaussia
     return Gaussians(**{name: torch.where(value.isfinite(), value, a) for (name, a), value in values})
 
 
+@dataclass(frozen=True, eq=False)
+class Change:
+    """As much of a refinement or repair as helps."""
+
+    scene: Gaussians
+    """The scene with it; the one before, if nothing of it helps."""
+    strength: float
+    """Share of the change, in (0, 1]; 1 if nothing of it helps."""
+    closeness: Closeness
+    """Errors of ``scene``; of the whole change, if nothing of it helps."""
+    left_out: str
+    """Why nothing of it is taken; empty if it helps."""
+
+
 def as_far_as_it_helps(
     judge: Comparison, before: Closeness, old: Gaussians, new: Gaussians, progress: Progress = silent
-) -> tuple[Gaussians, float, Closeness]:
-    """The scene at the best share of a refinement or repair that helps, that share, and its errors; at full strength
-    if none helps. The scene is on the device of ``old``.
+) -> Change:
+    """The best share of a refinement or repair that helps; a scene on the device of ``old``.
 
     Args:
         judge: what compares.
@@ -314,10 +328,10 @@ def as_far_as_it_helps(
         if 0.05 < bottom < 0.95 and abs(bottom - 0.5) > 0.05:  # closer ones hardly differ from those tried
             helping += [bottom] if attempt(bottom) else []
     progress("comparing renders", 1.0)
-    if not helping and helps(before, tried[1.0]):  # it harms at another size
-        return old, 1.0, before
-    strength = min(helping, key=lambda share: tried[share].error, default=1.0)
-    return at_strength(start, end, strength).to(device=old.device), strength, tried[strength]
+    if not helping:
+        return Change(old, 1.0, tried[1.0], _left_out(before, tried[1.0]))
+    strength = min(helping, key=lambda share: tried[share].error)
+    return Change(at_strength(start, end, strength).to(old.device), strength, tried[strength], "")
 
 
 def bottom_of_parabola(at_zero: float, at_half: float, at_one: float) -> float:
@@ -345,7 +359,7 @@ def _gains(before: Closeness, after: Closeness) -> bool:
 def _figures(before: Closeness, after: Closeness) -> str:
     """Errors before and after in words."""
     count, better = len(before.errors), _closer_in(before, after)
-    figures = f"{before.psnr:.2f} -> {after.psnr:.2f} dB against the dense scene's renders in {views_text(count)}"
+    figures = f"{before.psnr:.2f} -> {after.psnr:.2f} dB against the dense scene's renders in {before.where}"
     if before.ssim is not None and after.ssim is not None:
         figures += f", SSIM {before.ssim:.3f} -> {after.ssim:.3f}"
     return f"{figures}, worst view {before.worst:.2f} -> {after.worst:.2f} dB, closer in {better} of {count}"
@@ -358,27 +372,30 @@ def _closer_in(before: Closeness, after: Closeness) -> int:
 
 def _left_out(before: Closeness, after: Closeness) -> str:
     """Why what brought these errors was left out."""
+    if helps(before, after):
+        return "it harms pictures of another size"
     if _gains(before, after):
         return "it is farther in most views"
     return "it does not help" if after.psnr <= before.psnr else f"it brings less than {MIN_GAIN:g} dB"
 
 
-def _verdict(before: Closeness, after: Closeness, strength: float) -> str:
+def _verdict(before: Closeness, change: Change) -> str:
     """One line of text: what refinement gained, or why it was left out."""
-    figures = _figures(before, after)
-    if helps(before, after):
-        return f"refinement{_at(strength)}: {figures}"
-    if after.errors == before.errors:
-        return f"refinement left out: it changes nothing, {before.psnr:.2f} dB in {views_text(len(before.errors))}"
-    return f"refinement left out, {_left_out(before, after)}: {figures}"
+    figures = _figures(before, change.closeness)
+    if not change.left_out:
+        return f"refinement{_at(change.strength)}: {figures}"
+    if change.closeness.errors == before.errors:
+        return f"refinement left out: it changes nothing, {before.psnr:.2f} dB in {before.where}"
+    return f"refinement left out, {change.left_out}: {figures}"
 
 
-def _repair_verdict(before: Closeness, after: Closeness, repaired: Repaired, strength: float) -> str:
+def _repair_verdict(before: Closeness, change: Change, repaired: Repaired) -> str:
     """One line of text: what the repair gained and cost, or why it was left out."""
     cost = f"{repaired.steps} steps in {repaired.seconds:.1f} s" + (", interrupted" if repaired.interrupted else "")
-    if helps(before, after):
-        return f"repair{_at(strength)}, {cost}: {_figures(before, after)}"
-    return f"repair left out, {_left_out(before, after)} ({cost}): {_figures(before, after)}"
+    figures = _figures(before, change.closeness)
+    if not change.left_out:
+        return f"repair{_at(change.strength)}, {cost}: {figures}"
+    return f"repair left out, {change.left_out} ({cost}): {figures}"
 
 
 def _at(strength: float) -> str:
