@@ -6,8 +6,7 @@ All is done in units of the content (its diagonal is 10), so that the scene's ow
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -192,15 +191,13 @@ def views_about(
     sizes = _widths(fine) / math.sqrt(max(1, len(scene) // _BLUR_PROBED))
     generator = torch.Generator().manual_seed(seed)
 
-    def found(inside: bool, about: tuple[Tensor, Tensor] | None, count: int, sharp: bool = True) -> Tensor:
-        search = _Search(small, fine, sizes if sharp else None, surface, box, inside, width, height, generator, about)
-        return search.views(count)
+    def found(inside: bool, about: tuple[Tensor, Tensor] | None, count: int) -> Tensor:
+        return _Search(small, fine, sizes, surface, box, inside, width, height, generator, about).views(count)
 
     near_photos = found(inside, photos, count // 2) if photos is not None and count > 1 else torch.empty(0, 4, 4)
     others = found(inside, None, count - len(near_photos))
-    for kind, sharp in ((not inside, True), (inside, False), (not inside, False)):
-        if len(near_photos) + len(others) == 0:
-            others = found(kind, None, count, sharp)
+    if len(near_photos) + len(others) == 0:
+        others = found(not inside, None, count)
     taken = _alternating(near_photos.double(), others)
     if len(taken) == 0:
         raise DataError(
@@ -325,8 +322,8 @@ class _Search:
     small: Gaussians
     fine: Gaussians
     """More of the scene's Gaussians."""
-    sizes: Tensor | None
-    """Widths (n,) of the Gaussians of ``fine`` as they are in the scene; None if views may be blurred."""
+    sizes: Tensor
+    """Widths (n,) of the Gaussians of ``fine`` as they are in the scene."""
     surface: Surface
     box: UprightBox
     inside: bool
@@ -335,6 +332,11 @@ class _Search:
     generator: torch.Generator
     photos: tuple[Tensor, Tensor] | None
     """Places (P, 3) where photos were taken, and their shares (P,), if that is known."""
+    most_blur: float = field(init=False)
+    """Largest blur of a view, radians. It doubles with each round that finds too few views."""
+
+    def __post_init__(self) -> None:
+        self.most_blur = max(_BLURRED, _COARSE * float(self.sizes.median()) / (0.5 * UNITS))
 
     def views(self, count: int) -> Tensor:
         """At most ``count`` world-to-camera matrices (n, 4, 4)."""
@@ -357,6 +359,8 @@ class _Search:
                     owner[best] = -1
                     refused += 1
             fruitless = 0 if len(taken) > before else fruitless + 1
+            if len(taken) < min(count, before + _ROUND):  # rather blurred views than few places
+                self.most_blur *= 2
         return torch.stack(taken) if taken else torch.empty(0, 4, 4, dtype=torch.float64)
 
     def _candidates(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -453,20 +457,14 @@ class _Search:
         too_near = (alpha > 0.5) & (depth < close)
         if float(alpha.mean()) < _COVERED[self.inside] or float(too_near.float().mean()) >= _NEAR_PIXELS:
             return False
-        return self.sizes is None or self._blur(viewmat, self.sizes) <= self._most_blur
+        return self._blur(viewmat) <= self.most_blur
 
-    @cached_property
-    def _most_blur(self) -> float:
-        """Largest blur of a view, radians."""
-        assert self.sizes is not None
-        return max(_BLURRED, _COARSE * float(self.sizes.median()) / (0.5 * UNITS))
-
-    def _blur(self, viewmat: Tensor, sizes: Tensor) -> float:
+    def _blur(self, viewmat: Tensor) -> float:
         """Median of what Gaussians subtend in a view, radians, by their shares of the picture; 0 of an empty one."""
         view = _views(viewmat[None], self.width, self.height, NEAR_PLANE * UNITS).resized(_BLUR_SIDE)[0]
         shares = pixels_of(self.fine, view).double()
         away = (self.fine.means.double() @ viewmat[:3, :3].T + viewmat[:3, 3]).norm(dim=1)
-        subtended, order = (sizes.double() / away.clamp_min(NEAR_PLANE)).sort()
+        subtended, order = (self.sizes.double() / away.clamp_min(NEAR_PLANE)).sort()
         below = shares[order].cumsum(0)
         if not float(below[-1]) > 0:
             return 0.0
