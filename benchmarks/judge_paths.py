@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.looking.sampling import look_at
+from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views
 

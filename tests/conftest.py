@@ -18,7 +18,7 @@ from nerfstudio.configs import external_methods
 
 from making import SHARED_DATA
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking import sampling
+from pointsplat_ns.looking import search
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.views import Views
 
@@ -254,4 +254,4 @@ def ball_views(hollow_ball: Gaussians) -> Views:
 @pytest.fixture()
 def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """The search for views ends at the first places that show nothing, not at the fourth: each time takes seconds."""
-    monkeypatch.setattr(sampling, "_FRUITLESS", 1)
+    monkeypatch.setattr(search, "_FRUITLESS", 1)

@@ -26,7 +26,8 @@ from pointsplat_ns.looking.content import (
     positions_in_units,
     views_in_units,
 )
-from pointsplat_ns.looking.sampling import NEAR_PLANE, estimated_up, look_at, sample_views
+from pointsplat_ns.looking.poses import NEAR_PLANE, look_at
+from pointsplat_ns.looking.sampling import estimated_up, sample_views
 from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.system.progress import Progress, silent

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from making import EYES, photographed
-from pointsplat_ns.looking.sampling import look_at
+from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.views import Views
 
 

@@ -10,7 +10,8 @@ from upright_scenes import TURNS, room, tower, turned
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import content_box
-from pointsplat_ns.looking.sampling import look_at, sample_views
+from pointsplat_ns.looking.poses import look_at
+from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.rasterizer import pixels_of, render, render_depth
 
 

@@ -11,7 +11,8 @@ from upright_scenes import room
 from making import EYES, ball, normal_scene, photographed
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
-from pointsplat_ns.looking.sampling import is_room, look_at, sample_views, views_about
+from pointsplat_ns.looking.poses import look_at
+from pointsplat_ns.looking.sampling import is_room, sample_views, views_about
 from pointsplat_ns.looking.traces import MOST_FACTOR, correlation, how_much_seen, log_norms, photo_places
 from pointsplat_ns.pruning.merge import merge
 from pointsplat_ns.rasterizer import render

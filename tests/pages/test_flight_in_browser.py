@@ -23,7 +23,7 @@ from making import ball, cloud
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import read_spz
 from pointsplat_ns.looking.content import in_units
-from pointsplat_ns.looking.sampling import look_at
+from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.pages.flight import Stage
 from sweeps import room_views
 

@@ -16,7 +16,7 @@ from making import ball, box_room
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import read_spz
 from pointsplat_ns.looking.content import in_units
-from pointsplat_ns.looking.sampling import look_at
+from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.pages.flight import REACH, VIEWS, Stage
 from sweeps import room_views
 

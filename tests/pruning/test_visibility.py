@@ -9,7 +9,7 @@ import torch
 
 from making import ball, normal_scene
 from pointsplat_ns.gaussians import SH_C0, Gaussians
-from pointsplat_ns.looking.sampling import look_at
+from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.pruning import merge as merging
 from pointsplat_ns.pruning.merge import merge
 from pointsplat_ns.pruning.regrouping import masses_of, moments

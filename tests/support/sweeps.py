@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 import pointsplat_ns as ps
-from pointsplat_ns.looking.sampling import look_at
+from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.tradeoff.points import Point, Quality, Tradeoff, picture_path
 

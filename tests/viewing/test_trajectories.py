@@ -9,7 +9,7 @@ import torch
 
 import pointsplat_ns as ps
 from pointsplat_ns.geometry.cameras import invert_rigid
-from pointsplat_ns.looking.sampling import look_at
+from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.viewing.trajectories import along, fitted, orbit, up_of, walk
 
 

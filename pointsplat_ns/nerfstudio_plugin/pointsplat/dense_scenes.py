@@ -23,7 +23,8 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import content_hash
 from pointsplat_ns.io.ply import read_ply
-from pointsplat_ns.looking.sampling import BACKGROUND, sample_views
+from pointsplat_ns.looking.poses import BACKGROUND
+from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.memory_cache import CacheKey, MemoryCache
 from pointsplat_ns.rasterizer import render
