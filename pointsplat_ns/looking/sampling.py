@@ -85,8 +85,14 @@ def views_about(
     height: int = 240,
     seed: int = 0,
     up: Tensor | None = None,
+    sharp: bool = True,
 ) -> Views:
-    """As :func:`sample_views`, with what :func:`~pointsplat_ns.looking.traces.photo_places` says of the scene."""
+    """As :func:`sample_views`, with what :func:`~pointsplat_ns.looking.traces.photo_places` says of the scene.
+
+    Args:
+        sharp: whether views that a few large Gaussians fill are left out, as nobody takes such photos. Renders are then
+            compared where they matter; without it, views stand in more places.
+    """
     if count < 1:
         raise DataError(f"{count} views asked for; expected at least 1")
     if min(width, height) < 1:
@@ -100,8 +106,10 @@ def views_about(
     photos = _places_in_units(photos, centre, diagonal)
     box, inside = _upright(surface, photos, up)
     small = in_units(thinned(scene, PROBED), centre, diagonal)
-    fine = in_units(thinned(scene, _BLUR_PROBED), centre, diagonal)
-    sizes = _widths(fine) / math.sqrt(max(1, len(scene) // _BLUR_PROBED))
+    fine, sizes = None, None
+    if sharp:
+        fine = in_units(thinned(scene, _BLUR_PROBED), centre, diagonal)
+        sizes = _widths(fine) / math.sqrt(max(1, len(scene) // _BLUR_PROBED))
     generator = torch.Generator().manual_seed(seed)
 
     def found(inside: bool, about: tuple[Tensor, Tensor] | None, count: int) -> Tensor:

@@ -104,10 +104,10 @@ class Search:
     """A search for views, all of it in units of the content."""
 
     small: Gaussians
-    fine: Gaussians
-    """More of the scene's Gaussians."""
-    sizes: Tensor
-    """Widths (n,) of the Gaussians of ``fine`` as they are in the scene."""
+    fine: Gaussians | None
+    """More of the scene's Gaussians; None if views may be blurred."""
+    sizes: Tensor | None
+    """Widths (n,) of these Gaussians as they are in the scene."""
     surface: Surface
     box: UprightBox
     inside: bool
@@ -120,7 +120,8 @@ class Search:
     """Largest blur of a view, radians. It doubles with each round that finds too few views."""
 
     def __post_init__(self) -> None:
-        self.most_blur = max(_BLURRED, _COARSE * float(self.sizes.median()) / (0.5 * UNITS))
+        typical = 0.0 if self.sizes is None else float(self.sizes.median()) / (0.5 * UNITS)
+        self.most_blur = max(_BLURRED, _COARSE * typical)
 
     def views(self, count: int) -> Tensor:
         """At most ``count`` world-to-camera matrices (n, 4, 4)."""
@@ -244,7 +245,10 @@ class Search:
         return self._blur(viewmat) <= self.most_blur
 
     def _blur(self, viewmat: Tensor) -> float:
-        """Median of what Gaussians subtend in a view, radians, by their shares of the picture; 0 of an empty one."""
+        """Median of what Gaussians subtend in a view, radians, by their shares of the picture; 0 of an empty one, and
+        if views may be blurred."""
+        if self.fine is None or self.sizes is None:
+            return 0.0
         view = views_of(viewmat[None], self.width, self.height, NEAR_PLANE * UNITS).resized(_BLUR_SIDE)[0]
         shares = pixels_of(self.fine, view).double()
         away = (self.fine.means.double() @ viewmat[:3, :3].T + viewmat[:3, 3]).norm(dim=1)

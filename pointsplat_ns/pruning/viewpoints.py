@@ -39,7 +39,7 @@ def viewpoints(scene: Gaussians, photos: tuple[Tensor, Tensor] | None, width: in
     """Views from free places in a scene in units of its content, see :func:`~pointsplat_ns.looking.content.in_units`;
     None if there are none. ``photos`` is what :func:`~pointsplat_ns.looking.traces.photo_places` says of the scene."""
     try:
-        return views_about(scene, photos, VIEWPOINTS, width, height, seed=SEED)
+        return views_about(scene, photos, VIEWPOINTS, width, height, seed=SEED, sharp=False)
     except DataError:
         return None
 
