@@ -15,12 +15,13 @@ Row = dict[str, Any]
 
 TUNING = (
     *("apt_bathroom", "bouquet", "pc_flowers", "pc_statue_massa", "plant_pilea", "kettle_pod"),
-    *("pc_statue_angel", "pc_statue_narcissus", "kitchen", "fox", "room", "room5"),
+    *("pc_statue_angel", "pc_statue_narcissus", "kitchen", "fox", "final_3dgs", "vr_project", "room", "room5"),
 )
 """Scenes that ``merge`` may be tuned on."""
 JUDGED = (
     *("apt_kitchen_balcony", "cake_fraisier", "mujoco_tabletop", "pc_playbot", "rock", "pc_statue_angel_kneeling"),
     *("pc_statue_angel_with_candlestick", "pc_statue_st_peter", "pc_statue_trumpet", "lounge", "diorama"),
+    *("ethiopianHead", "dataset_perso", "lego_dense"),
 )
 """Scenes that nothing is tuned on: they were named before the first measurement. See docs/benchmarks.md."""
 
