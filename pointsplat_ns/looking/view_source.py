@@ -166,5 +166,6 @@ class ViewSource:
             )
             for turn, index in enumerate(random.Random(batch).sample(range(len(sampled)), len(sampled))):
                 view = sampled[index]
-                # Every fourth view has the opposite background, as nobody knows before which the scene is shown.
-                yield dataclasses.replace(view, background=1 - view.background) if turn % 4 == 3 else view
+                # Nobody knows before which background a scene without known views is shown: every fourth has another.
+                other = known is None and turn % 4 == 3
+                yield dataclasses.replace(view, background=1 - view.background) if other else view

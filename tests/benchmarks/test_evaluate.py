@@ -16,7 +16,6 @@ from pointsplat_ns.compression.trained_refiner import load_refiner
 from pointsplat_ns.refiner import save_refiner
 
 PROGRAMS = (
-    "judge",
     "compaction",
     "cuda",
     "docs_pictures",
@@ -25,6 +24,8 @@ PROGRAMS = (
     "formats",
     "frame_times",
     "fuzzing",
+    "judge",
+    "judge_record",
     "kills",
     "mutants",
     "opensplat",

@@ -95,6 +95,12 @@ def test_a_resolution_that_is_asked_for_is_that_of_sampled_views_and_bounds_give
     assert next(ViewSource(scene, given=given, resolution=(300, 200)).others()).width == 300
 
 
+def test_a_scene_without_known_views_is_repaired_before_another_background_as_well(scene):
+    views = ViewSource(scene, resolution=(64, 48)).others()
+    behind = [next(views).background.tolist() for _ in range(8)]
+    assert behind.count([1.0, 1.0, 1.0]) == 2 and behind.count([0.0, 0.0, 0.0]) == 6
+
+
 def test_views_that_are_sampled_beside_too_few_known_ones_are_drawn_as_these_are(scene):
     given = dataclasses.replace(sample_views(scene, 2, 64, 48), rasterize_mode="antialiased")
     assert next(ViewSource(scene, given=given).others()).rasterize_mode == "antialiased"

@@ -145,9 +145,9 @@ def test_a_tiny_room_is_seen_as_the_same_room_in_other_units(rooms, tmp_path):
     manager = manager_of(tmp_path / "tiny.ply")
     camera, data = manager.scenes[0].rendered_eval[0]
     _, wanted = manager_of(rooms / "one.ply").scenes[0].rendered_eval[0]
-    # float32 of numbers 1000 times smaller; gsplat's near plane of 0.01 units hid the whole room
+    # float32 of numbers 1000 times smaller, half a level of 255; gsplat's near plane of 0.01 units hid the whole room
     assert wanted["image"].std() > 0.05
-    torch.testing.assert_close(data["image"], wanted["image"], atol=1e-3, rtol=0)
+    torch.testing.assert_close(data["image"], wanted["image"], atol=2e-3, rtol=0)
     model = pipeline_of(tmp_path / "tiny.ply", keep=1.0).model.eval()
     drawn = model.draw(manager.scenes[0].read_dense(), manager.scenes[0], camera)["rgb"]
     torch.testing.assert_close(drawn, data["image"], atol=1e-6, rtol=0)
