@@ -56,8 +56,8 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> st
         return f"{path}: not drawn, as there is no view to draw"
     views, renders = result.reference.views, result.reference.renders
     shown = spread_indices(len(views), SHOWN_VIEWS)
-    names, scenes = ["dense", "before refinement"], [result.pruned]
-    titles = [_title("dense", dense, None), _title("before refinement", result.pruned, result.before)]
+    names, scenes = ["dense", "pruned"], [result.pruned]
+    titles = [_title("dense", dense, None), _title("pruned", result.pruned, result.before)]
     if result.after is not None:
         share = "" if result.strength == 1 else f" at {result.strength:.0%}"
         names.append(f"refined{share}" if result.accepted else "refined (left out)")
