@@ -82,7 +82,7 @@ def test_refinement_that_helps_is_written_and_shown(ply, helps, tmp_path, capsys
     before, after = map(float, re.search(r"(?m)^refinement: ([\d.]+) -> ([\d.]+) dB .* in 12 views", said).groups())
     assert after > before
     assert "\nposes sampled in free space\n" in said and "SH degree" in said
-    assert "shown.png: dense, before refinement, refined, side by side" in said
+    assert "shown.png: dense, pruned, refined, side by side" in said
     height, width, _ = matplotlib.image.imread(tmp_path / "shown.png").shape
     assert width == 1600 and height > 1200  # three columns and rows of 4 to 3, and a line of titles
     assert [p.name for p in output.parent.iterdir()] == ["small.ply"]
