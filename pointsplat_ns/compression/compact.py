@@ -308,7 +308,11 @@ def as_far_as_it_helps(
     """
     start, end = old.to(judge.device), new.to(judge.device)
     tried: dict[float, Closeness] = {}
-    least = [psnr - MOST_LOSS for psnr in judge.psnrs(start)]
+
+    @functools.cache
+    def least() -> list[float]:
+        """What a share of the change must reach in pictures of other sizes; rendered only if one helps at all."""
+        return [psnr - MOST_LOSS for psnr in judge.psnrs(start)]
 
     def attempt(strength: float) -> bool:
         """Whether a share of the change helps."""
@@ -319,7 +323,7 @@ def as_far_as_it_helps(
         )
         if not helps(before, tried[strength]):
             return False
-        return all(psnr >= bound for psnr, bound in zip(judge.psnrs(scene), least, strict=True))
+        return all(psnr >= bound for bound, psnr in zip(least(), judge.psnrs(scene), strict=True))
 
     helping = [1.0] if attempt(1.0) else []
     if tried[1.0].errors != before.errors and (not helping or tried[1.0].psnr < before.psnr + CLEAR_GAIN):

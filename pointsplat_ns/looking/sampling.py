@@ -24,7 +24,7 @@ PROBED = 5_000
 """Number of Gaussians, at most, of the depth images that test a view."""
 
 _BLUR_PROBED = 40_000
-"""Number of Gaussians, at most, of the pictures in which that is measured. 5,000 of them are too few: large ones then
+"""Number of Gaussians, at most, of the pictures in which blur is measured. 5,000 of them are too few: large ones then
 hide the others."""
 
 _MOSTLY = 0.85

@@ -95,8 +95,8 @@ def window(view: View, side: int, at: tuple[float, float] = (0.5, 0.5)) -> View:
     part = [min(1.0, WINDOW / max(whole)) * size for size in whole]
     size = [max(1, round(length)) for length in part]
     first = [
-        min(max(round(share * all_ - 0.5 * own), 0), all_ - own)
-        for share, all_, own in zip(at, whole, size, strict=True)
+        min(max(round(share * full - 0.5 * own), 0), full - own)
+        for share, full, own in zip(at, whole, size, strict=True)
     ]
     K = view.K.clone()
     K[0] *= whole[0] / view.width
@@ -153,12 +153,11 @@ class WindowRenders:
     def __init__(self, dense: Gaussians, views: Views, sides: Sequence[int] | None = None, seed: int = 0):
         small = [alpha[..., 0] for _, alpha in each_view(list(views.resized(64)), len(dense), _drawn(dense))]
         self.windows = windows_of(views, small, sides, seed)
-        drawn = list(each_view(self.windows.flat(), len(dense), _drawn(dense)))
-        self.renders = drawn
+        self.renders = list(each_view(self.windows.flat(), len(dense), _drawn(dense)))
         self._other = (1 - 2 * views.background).to(dense.means)  # from a background to its opposite
         per_side = len(views)
         self.covered = [
-            sum(float(alpha.double().mean()) for _, alpha in drawn[i * per_side : (i + 1) * per_side]) / per_side
+            sum(float(alpha.double().mean()) for _, alpha in self.renders[i * per_side : (i + 1) * per_side]) / per_side
             for i in range(len(self.windows.sides))
         ]
         """Share of the pixels that the dense scene covers, for each side, in [0, 1]."""

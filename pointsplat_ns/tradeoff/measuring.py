@@ -44,7 +44,7 @@ class Subject:
     held_out: HeldOut | None = None
     """Its held-out photos; None if it cannot have any."""
     refiner: TrainedRefiner | None = None
-    """What repairs begin with; None for the one that ships."""
+    """What repairs begin with; None for nothing, and for the one that ships where it repairs alone."""
     suffix: str = ".ply"
     """Of the format that smaller scenes are written in."""
     poses: Path | None = None

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
+from pointsplat_ns.io.camera_files.cameras import finite
 from pointsplat_ns.io.files import logger, one_line, require_file
 from pointsplat_ns.views import Views
 
@@ -68,24 +69,13 @@ def read_path(path: Path | str) -> SavedPath:
     Ks = torch.zeros(len(cameras), 3, 3, dtype=torch.float64)
     Ks[:, 0, 0] = Ks[:, 1, 1] = torch.tensor(focals, dtype=torch.float64)
     Ks[:, 0, 2], Ks[:, 1, 2], Ks[:, 2, 2] = width / 2, height / 2, 1.0
-    fps = _number(content.get("fps"))
+    fps = finite(content.get("fps"))
     views = Views(viewmats_from_opengl(torch.stack(poses)), Ks, width, height, torch.zeros(3))
     return SavedPath(views, fps if fps is not None and 0 < fps <= 1000 else None)
 
 
-def _number(value: Any) -> float | None:
-    """A finite number; None for anything else."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return None
-    try:
-        number = float(value)
-    except OverflowError:
-        return None
-    return number if math.isfinite(number) else None
-
-
 def _size(value: Any, name: str, path: Path) -> int:
-    number = _number(value)
+    number = finite(value)
     if number is None or number != int(number) or not 1 <= number <= MOST_PIXELS:
         raise DataError(f"{path}: {name} is {str(value)[:40]}; expected 1 to {MOST_PIXELS} pixels")
     return int(number)
@@ -94,7 +84,7 @@ def _size(value: Any, name: str, path: Path) -> int:
 def _camera(camera: Any, index: int, height: int, path: Path) -> tuple[Tensor, float]:
     """Pose (3, 4) from camera to world, OpenGL axes, and focal length in pixels."""
     values = camera.get("camera_to_world") if isinstance(camera, dict) else None
-    numbers = [_number(value) for value in values] if isinstance(values, list) and len(values) == 16 else [None]
+    numbers = [finite(value) for value in values] if isinstance(values, list) and len(values) == 16 else [None]
     if any(number is None for number in numbers):
         raise DataError(f"{path}: camera {index} has no pose; expected 'camera_to_world', 16 finite numbers")
     pose = torch.tensor(numbers, dtype=torch.float64).view(4, 4)
@@ -107,7 +97,7 @@ def _camera(camera: Any, index: int, height: int, path: Path) -> tuple[Tensor, f
         raise DataError(
             f"{path}: camera {index} is farther than {_FARTHEST:g} units from the origin; expected it nearer"
         )
-    fov = _number(camera.get("fov"))
+    fov = finite(camera.get("fov"))
     if fov is None or not 0.1 <= fov <= 179:
         raise DataError(f"{path}: fov of camera {index} is {str(camera.get('fov'))[:40]}; expected 0.1 to 179 degrees")
     return pose[:3], 0.5 * height / math.tan(math.radians(fov) / 2)
