@@ -22,7 +22,7 @@ INSTEAD = "start over with --force, or name another --output"
 """Advice where a training of another number of steps has finished."""
 
 TRAINING_MINUTES = 15
-"""Duration of training on two cores, see `docs/benchmarks.md`."""
+"""Duration of training on two cores, minutes."""
 
 
 def demo(
@@ -81,7 +81,7 @@ def training_folders(output: Path) -> tuple[dict[str, Path], Path]:
 
 
 def compact_example(output: Path, keep: float) -> None:
-    """Compact the scene that ships with the refiner that ships, and draw both.
+    """Compact the scene that ships, and draw it before and after.
 
     Args:
         output: folder for the scene, the smaller one and the image.

@@ -54,7 +54,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     ),
     "rooms": (("two rooms of 40 photos", "pointsplat rooms -o rooms --seeds 0 1 --frames 40"),),
     "make-refiner": (
-        ("the refiner that ships, again", "pointsplat make-refiner"),
+        ("a refiner for rooms", "pointsplat make-refiner"),
         ("a small one of four rooms", "pointsplat make-refiner -o outputs/mine --rooms 4 --steps 300"),
     ),
     "make-feedback": (

@@ -1,4 +1,4 @@
-"""``pointsplat make-refiner``: makes the refiner that ships, from scratch."""
+"""``pointsplat make-refiner``: makes a refiner from nothing, on built-in rooms."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def make_refiner(
 ) -> None:
     """Train a refiner from scratch: generate rooms, train a scene of each, train the network, evaluate on unseen rooms.
 
-    The refiner that `pointsplat compact` uses was made by this command. It needs no data, no photos and no GPU; two
-    idle cores take less than an hour. After an interruption, a second call continues with what is not finished.
+    `pointsplat compact --refiner` takes the result. It needs no data, no photos and no GPU. After an interruption, a
+    second call continues with what is not finished.
 
     Args:
         output: folder for all results.

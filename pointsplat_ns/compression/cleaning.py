@@ -3,8 +3,8 @@
 Two rules. A Gaussian that cannot be drawn goes: a value is NaN or infinite, or it is fainter than the rasterizer draws.
 And one that is seen from nowhere goes: cameras stand at places in free space and look in all directions, and it gets no
 blend weight (opacity on a pixel times the transmittance in front of it) on any pixel of any image. So a large
-background that is seen stays, and so does a lamp that hangs in the air. docs/cleaning.md has the figures, and those of
-the rules that were measured and left out.
+background that is seen stays, and so does a lamp that hangs in the air. docs/cleaning.md says when
+it pays.
 """
 
 from __future__ import annotations

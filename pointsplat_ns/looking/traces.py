@@ -10,7 +10,7 @@ many Gaussians is one where photos were taken. Without SH, sizes tell, if less: 
 photo, so that Gaussians are small near the places of photos and large far from them.
 
 None of this is in the literature that we know of; it was found on trained scenes whose poses are known, see
-``docs/pruning.md``.
+``docs/concepts/sampled_views.md``.
 """
 
 from __future__ import annotations

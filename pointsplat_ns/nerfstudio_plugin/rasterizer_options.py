@@ -27,7 +27,7 @@ class RasterizerOptions:
     """Draw with compiled kernels on a CPU: None if there is a C++ compiler (it takes four seconds, once), True warns if
     there is none, False leaves it to torch, which is several times slower."""
     quality: Literal["exact", "balanced", "fast"] = "exact"
-    """Accuracy that training gives up for speed (measured in docs/rasterizer.md). Evaluation is always exact."""
+    """Accuracy that training gives up for speed (see docs/rasterizer.md). Evaluation is always exact."""
 
     def kernels(self) -> dict[str, Kernels]:
         """All compiled kernels that a training uses on a CPU, by what they do."""

@@ -150,7 +150,7 @@ def test_readme_shows_the_whole_way_in_python():
 
 
 def test_readme_is_short():
-    assert len((ROOT / "README.md").read_text("utf-8").split()) <= 650
+    assert len((ROOT / "README.md").read_text("utf-8").split()) <= 500
 
 
 def test_options_named_in_text_exist(monkeypatch, capsys):

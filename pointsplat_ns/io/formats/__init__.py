@@ -1,6 +1,6 @@
 """The files that scenes are exchanged in, beside the plain PLY: one module for each, and a registry of all.
 
-All of them keep numbers in few bits. What each loses is measured in ``docs/formats.md``. Readers check counts and sizes
+All of them keep numbers in few bits. ``docs/formats.md`` says what each loses. Readers check counts and sizes
 against the size of the file before memory is taken, and bound what is decompressed.
 """
 

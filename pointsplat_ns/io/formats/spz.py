@@ -45,7 +45,7 @@ FRACTION_BITS = 12
 
 SH_BITS = (6, 5)
 """Bits that are kept of SH coefficients, of degree 1 and of the others, up to 8. Fewer compress better. The format's
-own programs keep 5 and 4, which cost a capture 7.5 dB (``docs/formats.md``)."""
+own programs keep 5 and 4, in a file a seventh smaller."""
 
 _MAGIC = b"NGSP"
 _GZIP = b"\x1f\x8b"

@@ -1,4 +1,7 @@
-"""Makes the refiner that ships, from scratch: rooms, scenes trained on them, refiner training, evaluation, card."""
+"""Makes a refiner from nothing: rooms, scenes trained on them, refiner training, evaluation, card.
+
+The refiner that ships was trained on other scenes; its card in ``pointsplat_ns/refiner/pretrained`` names them.
+"""
 
 from __future__ import annotations
 

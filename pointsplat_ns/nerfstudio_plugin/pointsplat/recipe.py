@@ -1,4 +1,4 @@
-"""The training data of the refiner that ships: different rooms, and scenes trained on them with varied settings."""
+"""The training data of ``pointsplat make-refiner``: different rooms, and scenes trained on them with varied settings."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def card_text(about: dict[str, Any], results: dict[str, Any], command: str, para
         if not scene["seen_in_training"]:
             rows += [_row(name, variant, scene[variant]) for variant in ("dense", "pruned", "refined")]
     rows += [_row("**mean of these**", v, results["average_unseen"][v]) for v in ("dense", "pruned", "refined")]
-    return f"""# The refiner that ships with pointsplat_ns
+    return f"""# A refiner from built-in rooms
 
 A network of {parameters:,} parameters ({results["settings"]["size"]}, dual-branch encoder) that repairs 3D Gaussian
 Splatting scenes after they were merged to {100 * about["keep"]:g} % of their Gaussians. One forward pass, no photos.

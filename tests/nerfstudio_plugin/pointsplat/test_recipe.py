@@ -1,4 +1,4 @@
-"""The recipe of the refiner that ships: its rooms differ, and its commands are ones that ns-train understands."""
+"""The recipe of ``make-refiner``: its rooms differ, and its commands are ones that ns-train understands."""
 
 from __future__ import annotations
 
