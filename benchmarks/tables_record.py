@@ -1,4 +1,4 @@
-"""Writes the record of the paper's tables, docs/record/results.md and its figure, from what ``pointsplat tables`` measured.
+"""Writes docs/record/results.md and its figure from what ``pointsplat tables`` measured.
 
     python benchmarks/tables_record.py docs/record/results.json
 
@@ -32,8 +32,8 @@ FIGURE = "results_figure4.png"
 
 PAGE = """# The paper's networks and scores on two rooms
 
-`benchmarks/tables_record.py` writes this page from [results.json](results.json), which [`pointsplat tables`](../tables.md)
-measured on two rooms of `pointsplat rooms`:
+`benchmarks/tables_record.py` writes this page from [results.json](results.json), which
+[`pointsplat tables`](../tables.md) measured on two rooms of `pointsplat rooms`:
 
 ```bash
 pointsplat tables outputs/room52 outputs/room53 -o results --views 5 --side 320 --scoring-views 12 \\
@@ -43,10 +43,10 @@ pointsplat tables outputs/room52 outputs/room53 -o results --views 5 --side 320 
 
 - Pictures are small: {sizes}. `prune` and `compact` are measured [at larger sizes](judge.md).
 - The scenes are not of the paper's datasets. The paper's figures do not compare.
-- Fine-tuning is 60 steps; the published baselines take thousands. The networks (size `small`) learned in 690 steps at most;
-  the published ones learned far longer. Two seeds of one training can differ by more than the two networks do.
-- PSNR (dB), SSIM and LPIPS (AlexNet) are means over scenes, against held-out photos. "Renders" means against the dense scene's
-  renders in the same poses. "Loses most" names the scene that loses most PSNR, with its PSNR and the difference.
+- Fine-tuning is 60 steps; the published baselines take thousands. The networks (size `small`) learned in 690 steps at
+  most; the published ones learned far longer. Two seeds of one training can differ by more than the two networks do.
+- PSNR (dB), SSIM and LPIPS (AlexNet) are means over scenes, against held-out photos. "Renders" means against the dense
+  scene's renders in the same poses. "Loses most" names the scene that loses most PSNR, its PSNR and the difference.
 - \\*: nothing is fine-tuned or refined.
 - Measured on {machines}.
 """
@@ -99,7 +99,7 @@ def page(groups: list[Group]) -> str:
         machines="; ".join(sorted({about.machine for about in abouts})),
     )
     tables = [markdown_table(table) for group in groups for table in tables_of(group)]
-    figure = f"![Distributions of opacity and volume]({FIGURE})\n\n*Figure 4: opacity and volume of the Gaussians kept.*\n"
+    figure = f"![Opacity and volume]({FIGURE})\n\n*Figure 4: opacity and volume of the Gaussians kept.*\n"
     return "\n".join([text, *tables, figure])
 
 

@@ -1,4 +1,4 @@
-"""The training data of ``pointsplat make-refiner``: different rooms, and scenes trained on them with varied settings."""
+"""The training data of ``pointsplat make-refiner``: rooms, and scenes trained on them with varied settings."""
 
 from __future__ import annotations
 
