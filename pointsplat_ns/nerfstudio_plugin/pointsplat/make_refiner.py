@@ -1,6 +1,6 @@
 """Makes a refiner from nothing: rooms, scenes trained on them, refiner training, evaluation, card.
 
-The refiner that ships was trained on other scenes; its card in ``pointsplat_ns/refiner/pretrained`` names them.
+It did not make the refiner that ships, whose card in ``pointsplat_ns/refiner/pretrained`` names its scenes.
 """
 
 from __future__ import annotations
