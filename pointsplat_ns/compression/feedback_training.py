@@ -30,7 +30,7 @@ from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, save_feedback_refiner
 from pointsplat_ns.system import processes
-from pointsplat_ns.system.thread_choice import ThreadChoice
+from pointsplat_ns.system.threads import suitable_threads
 from pointsplat_ns.views import Views
 
 STEPS = (FEWEST_STEPS, 12, 24, MOST_STEPS)
@@ -154,7 +154,7 @@ def train_feedback(
     rate = RATE if start is None else RATE_GOING_ON
     adam = torch.optim.Adam(network.parameters(), lr=rate, betas=(0.9, 0.99))
     metadata = {"scenes": [scene.name for scene in scenes], "keep": [*scenes[0].pruned], "repairs_per_update": at_once}
-    began, threads = time.monotonic(), ThreadChoice()
+    began = time.monotonic()
     saved, update, done = began, 0, 0.0
     while done < 1:
         adam.param_groups[0]["lr"] = rate * min(1, (update + 1) / WARM_UP) * share_of_rates(done)
@@ -165,7 +165,7 @@ def train_feedback(
             steps = generator.choice(STEPS)
             its_own = random.Random(generator.getrandbits(64))
             if number % size == rank:
-                with threads.step(steps, scene.dense.device):
+                with suitable_threads(scene.dense.device):
                     (-roll_out(network, scene, budget, steps, its_own) * (size / at_once)).backward()
         processes.average_gradients(network.parameters())
         if torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0).isfinite():

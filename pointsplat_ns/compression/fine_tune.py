@@ -12,7 +12,7 @@ from pointsplat_ns.compression.optimiser import RATES, Optimiser
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer import render
-from pointsplat_ns.system.thread_choice import ThreadChoice
+from pointsplat_ns.system.threads import suitable_threads
 from pointsplat_ns.views import Views
 
 
@@ -53,14 +53,14 @@ def fine_tune(
     optimiser = Optimiser(scene, {**RATES, **(rates or {})})
     target_images: dict[int, Tensor] = {}
     order: list[int] = []
-    generator, threads = random.Random(seed), ThreadChoice()
+    generator = random.Random(seed)
     for step in range(steps):
         if not order:
             order = generator.sample(range(len(views)), len(views))
         index = order.pop()
         if index not in target_images:
             target_images[index] = _target(targets, views, index, scene)
-        with threads.step(device=scene.device):
+        with suitable_threads(scene.device):
             optimiser.step(views[index], target_images[index])
         if progress is not None:
             progress((step + 1) / steps)

@@ -18,8 +18,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, shipped_feedback_refiner
-from pointsplat_ns.system.thread_choice import ThreadChoice
-from pointsplat_ns.system.threads import one_thread
+from pointsplat_ns.system.threads import one_thread, suitable_threads
 
 Effort = Literal["instant", "quick", "thorough"]
 
@@ -120,11 +119,11 @@ def repair(
     if network == "shipped":
         network = shipped_feedback_refiner(scene.device)
     feedback = Feedback(scene, len(dense))
-    examples, threads, share = views.others(), ThreadChoice(), share_of_start(psnr)
+    examples, share = views.others(), share_of_start(psnr)
     steps, done, interrupted = 0, 0.0, False
     try:
         while done < 1 and not budget.empty:
-            with threads.step(device=scene.device):
+            with suitable_threads(scene.device):
                 view = next(examples)
                 with torch.no_grad():
                     target = render(dense, view)

@@ -21,7 +21,7 @@ from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.pruning import PruneSettings, method_named
 from pointsplat_ns.refiner import Refiner, WeightsError, preset, read_metadata, read_refiner
 from pointsplat_ns.refiner.weights import PRETRAINED
-from pointsplat_ns.system.thread_choice import unstalled_threads
+from pointsplat_ns.system.threads import suitable_threads
 
 DEFAULTS = {"keep": 0.1, "score": "merge"}
 """Pruning settings of files of weights whose metadata has none; named as in the earliest files, so that any name of the
@@ -52,7 +52,7 @@ class TrainedRefiner:
         Raises:
             SceneError: if the SH degree exceeds the network's.
         """
-        with unstalled_threads(self.device):
+        with suitable_threads(self.device):
             return self.network(scene.to(self.device)).to(scene.device)
 
     @property

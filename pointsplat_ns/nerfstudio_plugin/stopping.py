@@ -27,8 +27,7 @@ from pointsplat_ns.io.files import one_line, replacing
 from pointsplat_ns.io.runs import step_of
 from pointsplat_ns.nerfstudio_plugin.rasterizer_options import RasterizerOptions
 from pointsplat_ns.system.memory import keep_freed_memory
-from pointsplat_ns.system.thread_choice import ThreadChoice
-from pointsplat_ns.system.threads import fixed_threads
+from pointsplat_ns.system.threads import fixed_threads, suitable_threads
 
 STATE = "pointsplat"
 """Key in checkpoints of what a trainer needs to go on as if it had not been stopped; nerfstudio ignores it."""
@@ -39,8 +38,8 @@ class StoppableTrainerConfig(TrainerConfig):
     """nerfstudio's trainer config, with the number of threads"""
 
     threads: int | None = None
-    """Number of threads of a training on a CPU. By default it is chosen while the training goes on, and is lower while
-    other programs keep the machine busy; the environment variable OMP_NUM_THREADS has the same effect as this.
+    """Number of threads of a training on a CPU. By default all that torch has, and one while other programs keep the
+    machine busy; the environment variable OMP_NUM_THREADS has the same effect as this.
     Another number may change results by rounding."""
 
     def save_config(self) -> None:
@@ -62,8 +61,8 @@ class StoppableTrainerConfig(TrainerConfig):
 class StoppableTrainer(Trainer):
     """nerfstudio's trainer. It removes the run folder if the input cannot be used, and reuses freed memory on a CPU.
 
-    Steps on a CPU use the number of threads that suits them
-    (:class:`~pointsplat_ns.system.thread_choice.ThreadChoice`).
+    Steps on a CPU use one thread while other programs keep the machine busy
+    (:func:`~pointsplat_ns.system.threads.suitable_threads`).
 
     Checkpoints and the other files of a run are written beside and renamed, so that one that is there is whole,
     however the training ended.
@@ -104,7 +103,6 @@ class StoppableTrainer(Trainer):
         outputs = getattr(self.pipeline.datamanager, "train_dataparser_outputs", None)
         if outputs is not None:
             outputs.save_dataparser_transform = functools.partial(_save_whole, outputs.save_dataparser_transform)
-        self._thread_choice = ThreadChoice()
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         self.callbacks.append(TrainingCallback(before, self._stop_if_asked, update_every_num_iters=1))
 
@@ -137,7 +135,7 @@ class StoppableTrainer(Trainer):
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
         """One step, with the number of threads that suits it."""
-        with self._thread_choice.step(device=torch.device(self.device)):
+        with suitable_threads(torch.device(self.device)):
             return self.one_step(step)
 
     def one_step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:

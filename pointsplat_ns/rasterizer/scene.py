@@ -12,11 +12,8 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.rendering import Colors, QualityName, rasterization
-from pointsplat_ns.system.thread_choice import ThreadChoice
-from pointsplat_ns.system.threads import one_thread
+from pointsplat_ns.system.threads import one_thread, suitable_threads
 from pointsplat_ns.views import View, Views
-
-_RENDERS = ThreadChoice()
 
 
 def render(
@@ -70,7 +67,7 @@ def render_with_alpha(
 ) -> tuple[Tensor, Tensor]:
     """What :func:`render` gives of one view, and what share of each pixel the scene covers: (H, W, 3) and (H, W, 1),
     both in [0, 1]. Arguments and errors as there."""
-    with _RENDERS.step(_work(scene, view), scene.device):
+    with suitable_threads(scene.device):
         colors = scene.features_dc, scene.features_rest
         image, alpha = _rasterized(scene, view, colors, sh_degree=scene.sh_degree, quality=quality, backend=backend)
         return (image + (1 - alpha) * view.background.to(image)).clamp(0, 1), alpha
@@ -120,7 +117,7 @@ def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
     Returns:
         Expected depth (H, W) along the camera's z axis, scene units, and alpha (H, W) in [0, 1].
     """
-    with _RENDERS.step(_work(scene, view), scene.device):
+    with suitable_threads(scene.device):
         colors = scene.means  # any: only depths are rendered
         depth, alpha = _rasterized(scene, view, colors, render_mode="ED")
     return depth[..., 0], alpha[..., 0]
@@ -139,15 +136,10 @@ def pixels_of(scene: Gaussians, view: View) -> Tensor:
     """
     scene = scene.detach().to(torch.promote_types(scene.dtype, torch.float32))
     colors = torch.zeros_like(scene.means[:, :1]).requires_grad_()
-    with _RENDERS.step(_work(scene, view), scene.device), torch.enable_grad():
+    with suitable_threads(scene.device), torch.enable_grad():
         image, _ = _rasterized(scene, view, colors)
         (pixels,) = torch.autograd.grad(image.sum(), colors)
     return pixels[:, 0]
-
-
-def _work(scene: Gaussians, view: View) -> int:
-    """How much work an image is, roughly: Gaussians are projected, and pixels blended."""
-    return len(scene) + view.width * view.height
 
 
 def _alphas(scene: Gaussians) -> Tensor:

@@ -1,9 +1,19 @@
-"""Pieces of work on several threads, and how many there may be."""
+"""Pieces of work on several threads, and how many threads torch uses.
+
+Threads that share one operation wait for one another at its end. Where other programs keep the cores busy, one of them
+is always late, and a step on two threads can take ten times as long as on one. :func:`suitable_threads` therefore uses
+all threads or one: twice a second it times a small operation on both.
+"""
 
 from __future__ import annotations
 
+import functools
+import logging
+import math
 import os
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -12,6 +22,9 @@ from typing import TypeVar
 import torch
 
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.system.cores import cores
+
+logger = logging.getLogger("pointsplat_ns")
 
 Item = TypeVar("Item")
 
@@ -20,12 +33,12 @@ ENVIRONMENT = "OMP_NUM_THREADS"
 
 
 class Chosen(threading.local):
-    """What :mod:`~pointsplat_ns.system.thread_choice` has chosen for this thread of Python."""
+    """The choice of :func:`suitable_threads` in one thread of Python."""
 
     most: int | None = None
-    """Number of threads that were chosen from; None where nothing is chosen."""
+    """Number of threads that torch had before; None where nothing is chosen."""
     settled: bool = False
-    """Whether the number of threads is settled, so that none is chosen: a step is measured, or work is in pieces."""
+    """Whether no other number may be chosen: within a step, or where work is in pieces."""
 
 
 chosen = Chosen()
@@ -108,3 +121,99 @@ def fixed_threads(count: int | None) -> Iterator[None]:
             os.environ.pop(ENVIRONMENT, None)
         else:
             os.environ[ENVIRONMENT] = variable
+
+
+class Load:
+    """Whether other programs make torch's threads wait for one another.
+
+    A look shares a small operation between threads: they stall if it takes 1.5 times as long as on one of them. The
+    machine is looked at three times before the first step, and then every 0.5 s; the pause doubles with each look that
+    finds threads stalling, up to 8 s, and halves with each other. Threads count as stalling while one of the latest
+    three looks says so, as some looks find nothing on a busy machine. A look takes some milliseconds.
+
+    Args:
+        seconds: called with a number of threads and a bound; gives the seconds that a piece of work takes on so many
+            threads, or any time above the bound once that is reached.
+        clock: gives the time, seconds.
+    """
+
+    def __init__(self, seconds: Callable[[int, float], float], clock: Callable[[], float] = time.monotonic):
+        self._seconds, self._clock = seconds, clock
+        self._looks: deque[bool] = deque(maxlen=3)  # whether threads stalled
+        self._due, self._pause = -math.inf, 0.5
+        self._told = False
+
+    def stalls(self, count: int) -> bool:
+        """Whether ``count`` threads stall, by the latest looks. If one is due, looks first."""
+        while len(self._looks) < 3 or self._clock() >= self._due:
+            bound = 1.5 * self._seconds(1, math.inf)
+            stalled = self._seconds(count, bound) > bound
+            self._looks.append(stalled)
+            self._pause = min(2 * self._pause, 8.0) if stalled else max(self._pause / 2, 0.5)
+            self._due = self._clock() + self._pause
+        if all(self._looks) and not self._told:
+            self._told = True
+            logger.warning(
+                "this machine is busy with other programs: torch's threads wait for one another, so one is used "
+                "instead of %d for now; --threads or %s overrules that", count, ENVIRONMENT,
+            )  # fmt: skip
+        return any(self._looks)
+
+
+@functools.cache
+def _numbers() -> torch.Tensor:
+    with torch.inference_mode(False):  # else they could be written to in that mode alone
+        return torch.ones(1 << 17, device="cpu", dtype=torch.float32)
+
+
+def shared_operations(count: int, bound: float) -> float:
+    """Seconds that 100 operations on 0.5 MB take on so many threads, or those so far once they exceed ``bound``."""
+    numbers, before = _numbers(), torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        numbers.mul_(1.0)  # starts the threads
+        start = time.perf_counter()
+        seconds = 0.0
+        for _ in range(100):
+            numbers.mul_(1.0)
+            seconds = time.perf_counter() - start
+            if seconds > bound:
+                break
+        return seconds
+    finally:
+        torch.set_num_threads(before)
+
+
+machine = Load(shared_operations)
+"""What is known of this machine: one for the process, so that looks are not repeated."""
+
+
+@contextmanager
+def suitable_threads(device: torch.device | None = None) -> Iterator[None]:
+    """Let torch use all its threads while the context is open, or one if they stall just now.
+
+    At most as many are used as the process has cores. Nothing is chosen for a GPU, where ``OMP_NUM_THREADS`` is set,
+    nor within another such context. A result must not depend on the choice, which depends on the load: use it for
+    work that gives the same bits on one thread and several, or for which a tolerance is stated.
+
+    Args:
+        device: the device that computes; None for the CPU.
+
+    Example:
+        >>> for image in range(3):
+        ...     with suitable_threads():
+        ...         _ = torch.ones(1000).sum()
+    """
+    before, outer = torch.get_num_threads(), chosen.most
+    on_cpu = device is None or device.type == "cpu"
+    if not on_cpu or chosen.settled or most_threads() <= 1 or ENVIRONMENT in os.environ:
+        yield
+        return
+    chosen.most = min(most_threads(), cores())
+    chosen.settled = True
+    try:
+        torch.set_num_threads(1 if chosen.most > 1 and machine.stalls(chosen.most) else chosen.most)
+        yield
+    finally:
+        torch.set_num_threads(before)
+        chosen.most, chosen.settled = outer, False

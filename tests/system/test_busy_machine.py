@@ -1,0 +1,169 @@
+"""The number of threads on a busy machine: by looks at a machine that is made up, and by a real one."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import threading
+
+import pytest
+import torch
+
+from pointsplat_ns.system import threads
+from pointsplat_ns.system.threads import (
+    Load,
+    fixed_threads,
+    in_threads,
+    most_threads,
+    one_thread,
+    one_thread_each,
+    shared_operations,
+    suitable_threads,
+)
+
+CORES = 4
+
+
+class Machine:
+    """A clock, and threads that stall when they are told to."""
+
+    def __init__(self):
+        self.now, self.stalled, self.looks = 0.0, False, 0
+        self.load = Load(self.seconds, lambda: self.now)
+
+    def seconds(self, count: int, bound: float) -> float:
+        self.looks += count > 1
+        seconds = 0.001 if count == 1 or not self.stalled else min(bound + 0.02, 1.0)
+        self.now += seconds
+        return seconds
+
+    def stalls(self, after: float = 0.0) -> bool:
+        self.now += after
+        return self.load.stalls(CORES)
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """Four cores, of which torch uses all, in a machine that is made up."""
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(threads, "cores", lambda: CORES)
+    made_up = Machine()
+    monkeypatch.setattr(threads, "machine", made_up.load)
+    before = torch.get_num_threads()
+    torch.set_num_threads(CORES)
+    yield made_up
+    torch.set_num_threads(before)
+
+
+def used(device: torch.device | None = None) -> int:
+    with suitable_threads(device):
+        return torch.get_num_threads()
+
+
+def test_all_threads_are_used_while_they_do_not_stall_else_one(machine):
+    assert used() == CORES
+    machine.stalled, machine.now = True, 10.0
+    assert used() == 1 and torch.get_num_threads() == CORES
+
+
+def test_looks_are_rare(machine):
+    machine.stalls()
+    assert machine.looks == 3
+    for _ in range(1000):
+        machine.stalls()
+    assert machine.looks == 3, "no time has gone by"
+    start = machine.now
+    for _ in range(1000):
+        machine.stalls(after=0.01)
+    assert (machine.looks - 3) * 0.002 < 0.01 * (machine.now - start)
+
+
+def test_one_bad_look_is_enough_and_three_good_ones_are_needed(machine):
+    machine.stalls()
+    machine.stalled = True
+    assert machine.stalls(after=1)
+    machine.stalled = False
+    assert [machine.stalls(after=2) for _ in range(3)] == [True, True, False]
+
+
+def test_while_threads_stall_looks_get_rarer_and_all_are_used_soon_after(machine):
+    machine.stalled = True
+    for _ in range(600):
+        assert machine.stalls(after=0.1)
+    assert machine.looks < 15
+    machine.stalled = False
+    assert [machine.stalls(after=1) for _ in range(20)][-1] is False
+
+
+def test_that_the_machine_is_the_limit_is_said_once(machine, caplog):
+    with caplog.at_level(logging.WARNING, "pointsplat_ns"):
+        machine.stalls()
+        assert not caplog.records
+        machine.stalled = True
+        for _ in range(30):
+            machine.stalls(after=2)
+    [record] = caplog.records
+    assert "busy" in record.getMessage() and "--threads" in record.getMessage()
+
+
+def test_the_callers_threads_are_restored_also_after_an_error(machine):
+    machine.stalled = True
+    with pytest.raises(KeyboardInterrupt), suitable_threads():
+        assert torch.get_num_threads() == 1
+        raise KeyboardInterrupt
+    assert torch.get_num_threads() == CORES and most_threads() == CORES
+    assert used() == 1, "it goes on choosing"
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_nothing_is_chosen_where_the_user_has(machine, count):
+    machine.stalled = True
+    with fixed_threads(count):
+        assert used() == count
+    assert torch.get_num_threads() == CORES and "OMP_NUM_THREADS" not in os.environ
+
+
+def test_nothing_is_chosen_for_a_gpu(machine):
+    machine.stalled = True
+    assert used(torch.device("cuda")) == CORES
+
+
+def test_no_more_threads_than_cores(machine, monkeypatch):
+    monkeypatch.setattr(threads, "cores", lambda: 1)
+    assert used() == 1 and machine.looks == 0
+
+
+def test_a_step_within_a_step_is_left_alone(machine):
+    with suitable_threads():
+        machine.stalled = True
+        machine.now += 10
+        assert used() == CORES
+
+
+def test_pieces_that_do_not_wait_use_all_threads_in_a_step_on_one(machine):
+    machine.stalled = True
+    meet = threading.Barrier(CORES)  # passed only if so many are there at once
+    with suitable_threads():
+        assert torch.get_num_threads() == 1
+        in_threads(lambda item: meet.wait(30), range(CORES))
+
+
+def test_a_real_look_works_in_every_mode_of_torch_and_changes_nothing():
+    before = torch.get_num_threads()
+    threads._numbers.cache_clear()
+    with torch.inference_mode():
+        assert shared_operations(1, math.inf) > 0
+    assert shared_operations(1, math.inf) > 0
+    with suitable_threads():
+        assert 1 <= torch.get_num_threads() <= before
+    assert torch.get_num_threads() == before
+
+
+def test_contexts_of_one_thread_restore_the_callers(machine):
+    for context in (one_thread, one_thread_each):
+        with pytest.raises(ValueError), context():
+            assert torch.get_num_threads() == 1
+            assert most_threads() == (1 if context is one_thread else CORES)
+            raise ValueError
+        assert torch.get_num_threads() == CORES and most_threads() == CORES
