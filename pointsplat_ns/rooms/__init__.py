@@ -1,8 +1,8 @@
 """Built-in synthetic rooms: procedural, furnished, lit, with highlights that move with the viewer."""
 
-from pointsplat_ns.rooms.camera_path import STYLES, capture_path
+from pointsplat_ns.rooms.camera_path import capture_path
 from pointsplat_ns.rooms.render import default_intrinsics, render_room
 from pointsplat_ns.rooms.room import Room, make_room
 from pointsplat_ns.rooms.write import write_room
 
-__all__ = ["STYLES", "Room", "capture_path", "default_intrinsics", "make_room", "render_room", "write_room"]
+__all__ = ["Room", "capture_path", "default_intrinsics", "make_room", "render_room", "write_room"]

@@ -4,19 +4,14 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.rooms.building import Light
-from pointsplat_ns.rooms.light import BakedRoom
-from pointsplat_ns.rooms.raycast import dot, surface, trace_camera, unit
+from pointsplat_ns.rooms.raycast import dot, surface, trace, unit
 from pointsplat_ns.rooms.room import Room
 from pointsplat_ns.system.threads import one_thread
 
-SUBPIXELS = 2  # rays per pixel and axis
-_BAND = 1 << 15  # rays of a band of rows
-FOCAL = 0.62  # focal length over width: 78 degrees across
-
 
 def default_intrinsics(width: int, height: int) -> Tensor:
-    """(3, 3) intrinsics in pixels of the rooms' camera, the first pixel's centre at (0.5, 0.5)."""
-    focal = FOCAL * width
+    """(3, 3) intrinsics in pixels of a camera that sees 78 degrees across, the first pixel's centre at (0.5, 0.5)."""
+    focal = 0.62 * width
     return torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
 
 
@@ -28,7 +23,7 @@ def render_room(
     height: int,
     highlights: bool = True,
 ) -> tuple[Tensor, Tensor]:
-    """A photo of a room, by ray casting.
+    """A photo of a room, by ray casting with 2 x 2 rays a pixel.
 
     Args:
         room: the room.
@@ -51,98 +46,65 @@ def render_room(
         ((24, 32, 3), (24, 32))
     """
     c2w, K = c2w.float(), K.float()
-    step = max(_BAND // (width * SUBPIXELS**2), 1)
-    bands = []
+    eye, rotation = c2w[:3, 3:], c2w[:3, :3]
     with one_thread(), torch.no_grad():
-        for first in range(0, height, step):
-            band = K.clone()
-            band[1, 2] -= first
-            bands.append(_render_band(room, c2w, band, width, min(step, height - first), highlights))
-    rgb, depth = zip(*bands, strict=True)
-    return torch.cat(rgb), torch.cat(depth)
+        fine, rows = _camera_rays(K, width, height, 2), max((1 << 14) // width, 1)
+        bands = [_shaded(room, eye, rotation @ rays, K, highlights) for rays in fine.split(rows * width, 1)]
+        display = 1.0 - torch.exp(torch.cat(bands) * (-1.6 * room.baked.exposure))
+        rgb = display.view(height, 2, width, 2, 3).mean(dim=(1, 3)).clamp(0, 1) ** (1 / 2.2)
+        rays = _camera_rays(K, width, height, 1)
+        depth = [trace(room.solids, eye, rotation @ part)[0] for part in rays.split(rows * width, 1)]
+    return rgb, torch.cat(depth).view(height, width)
 
 
-def _render_band(
-    room: Room, c2w: Tensor, K: Tensor, width: int, height: int, highlights: bool
-) -> tuple[Tensor, Tensor]:
-    """:func:`render_room` for some rows: small enough that intermediate results stay in the cache."""
-    prims, baked = room.spec.primitives, room.baked
-    rays = _camera_rays(K, width, height, SUBPIXELS)
-    depth, index = trace_camera(prims, c2w, rays, K, SUBPIXELS)
-    radiance = _shade(baked, c2w, rays, K, depth, index, highlights)
-    display = 1.0 - torch.exp(-radiance * (1.6 * baked.exposure))  # [SH, SW, 3]
-    display = display.reshape(height, SUBPIXELS, width, SUBPIXELS, 3).mean(dim=(1, 3))
-    center, _ = trace_camera(prims, c2w, _camera_rays(K, width, height, 1), K, 1)
-    return display.clamp(0, 1) ** (1 / 2.2), center
+def _camera_rays(K: Tensor, width: int, height: int, side: int) -> Tensor:
+    """(3, M) camera-space directions with z = 1 through the middles of ``side`` x ``side`` parts of all pixels."""
+    x, y = ((torch.arange(count * side) + 0.5) / side for count in (width, height))
+    v, u = torch.meshgrid((y - K[1, 2]) / K[1, 1], (x - K[0, 2]) / K[0, 0], indexing="ij")
+    return torch.stack([u, v, torch.ones_like(u)]).flatten(1)
 
 
-def _camera_rays(K: Tensor, width: int, height: int, subpixels: int) -> Tensor:
-    """(3, H * s, W * s) camera-space directions with z = 1 through the middles of all subpixels."""
-    x = (torch.arange(width * subpixels) + 0.5) / subpixels
-    y = (torch.arange(height * subpixels) + 0.5) / subpixels
-    v, u = torch.meshgrid(y, x, indexing="ij")
-    return torch.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], torch.ones_like(u)])
-
-
-def _shade(
-    baked: BakedRoom, c2w: Tensor, rays: Tensor, K: Tensor, depth: Tensor, index: Tensor, highlights: bool
-) -> Tensor:
-    """Radiance (SH, SW, 3): texture times baked light, plus what shines, plus highlights."""
-    shape = depth.shape
-    z = depth.reshape(-1)
-    direction = c2w[:3, :3] @ rays.reshape(3, -1)
-    points = c2w[:3, 3:] + direction * z
-    hits = surface(baked.spec.primitives, points, index.reshape(-1))
-    view = -unit(direction)
+def _shaded(room: Room, eye: Tensor, ways: Tensor, K: Tensor, highlights: bool) -> Tensor:
+    """Radiance (M, 3) along rays from a camera: texture times baked light, plus what shines, plus highlights."""
+    baked = room.baked
+    z, index = trace(room.solids, eye, ways)
+    points = eye + ways * z
+    hits = surface(room.solids, points, index)
+    view = -unit(ways)
     facing = dot(view, hits.normal).abs().clamp(min=0.05)
-    # A sample's patch is z / f wide and stretched by 1 / facing one way: the geometric mean of both.
-    footprint = z / (K[0, 0] * SUBPIXELS) / facing.sqrt()
-    color = baked.texture.sample_footprint(hits.chart, hits.u, hits.v, footprint)
-    light = baked.light.sample(hits.chart, hits.u, hits.v, torch.zeros_like(hits.chart))
-    emission = baked.emission[hits.chart]
+    # A sample's patch is z / 2f wide and stretched by 1 / facing one way: the geometric mean of both.
+    footprint = z / (2 * K[0, 0]) / facing.sqrt()
+    color = baked.texture.sample(hits.chart, hits.u, hits.v, footprint)
+    light = baked.light.sample(hits.chart, hits.u, hits.v, torch.zeros_like(z))
+    emission, gloss = baked.emission[hits.chart, None], baked.gloss[hits.chart]
     # What shines is shown as painted, whatever the room's exposure.
-    radiance = color * (light[:, :3] + emission[:, None] / baked.exposure)
-    if highlights:
-        for k, source in enumerate(baked.spec.lights):
-            seen = light[:, 3 + k] * baked.gloss[hits.chart]
-            part = (seen > 1e-3).nonzero()[:, 0]
-            shininess = baked.shininess[hits.chart[part]]
-            at, normal, to_viewer = (values.index_select(1, part) for values in (points, hits.normal, view))
-            lobe = _highlight(source, at, normal, to_viewer, shininess)
-            tint = torch.tensor(source.color)
-            radiance.index_add_(0, part, (seen[part] * lobe)[:, None] * (tint / tint.max() / baked.exposure))
-    return radiance.reshape(*shape, 3)
+    radiance = color * torch.where(emission > 0, emission / baked.exposure, light[:, :3])
+    for number, source in enumerate(room.lights if highlights else ()):
+        seen = light[:, 3 + number] * gloss
+        part = (seen > 1e-3).nonzero()[:, 0]
+        shininess = baked.shininess[hits.chart[part]]
+        lobe = seen[part] * _highlight(source, points[:, part], hits.normal[:, part], view[:, part], shininess)
+        tint = torch.tensor(source.color)
+        radiance.index_add_(0, part, lobe[:, None] * (tint / tint.max() / baked.exposure))
+    return radiance
 
 
 def _highlight(light: Light, points: Tensor, normal: Tensor, view: Tensor, shininess: Tensor) -> Tensor:
     """Blinn-Phong highlight (M,) of one light at points (3, M), in [0, 4].
 
-    The half vector is taken to the point of the light nearest to where the mirrored view ray meets
-    its plane (a representative point, Karis 2013), so that a window gives a window-shaped gleam.
-    Schlick's factor, four times the strength at grazing view, follows the half vector.
+    The half vector is taken to the point of the light nearest to where the mirrored view ray meets its plane (a
+    representative point, Karis 2013), so that a window gives a window-shaped gleam. Schlick's factor, four times the
+    strength at grazing view, follows the half vector.
     """
     mirrored = 2 * dot(view, normal) * normal - view
-    way = unit(_representative(light, points, mirrored) - points)
-    half = unit(way + view)
-    cosine = dot(half, normal).clamp(min=1e-6)
-    lobe = torch.exp(shininess * torch.log(cosine))
-    if light.normal is not None:
-        leaving = -dot(way, light.normal)
-        lobe = lobe * leaving.clamp(0, 0.3) / 0.3  # a soft end at the light's own plane
-    lobe = lobe * (dot(way, normal) / 0.1).clamp(0, 1)  # and at the surface's horizon
-    return lobe * (1 + 3 * (1 - dot(half, view).clamp(0, 1)) ** 5)
-
-
-def _representative(light: Light, points: Tensor, mirrored: Tensor) -> Tensor:
-    """(3, M) or (3, 1) points of a light."""
-    center = torch.tensor(light.center)[:, None]
-    if light.normal is None:
-        return center
-    slope = dot(mirrored, light.normal).clamp(max=-1e-3)
-    distance = dot(center - points, light.normal) / slope
-    meet = points + mirrored * distance.clamp(0, 100) - center
-    target = center
+    target = torch.tensor(light.center)[:, None]
+    distance = dot(target - points, light.normal) / dot(mirrored, light.normal).clamp(max=-1e-3)
+    meet = points + mirrored * distance.clamp(0, 100) - target
     for edge in (light.edge_u, light.edge_v):
-        along = (dot(meet, edge) / dot(edge, edge)).clamp(-1, 1)
-        target = target + along * torch.tensor(edge)[:, None]
-    return target
+        target = target + (dot(meet, edge) / dot(edge, edge)).clamp(-1, 1) * torch.tensor(edge)[:, None]
+    way = unit(target - points)
+    half = unit(way + view)
+    lobe = dot(half, normal).clamp(min=1e-6) ** shininess
+    # Soft ends at the light's own plane and at the surface's horizon.
+    lobe = lobe * -dot(way, light.normal).clamp(-0.3, 0) / 0.3 * (dot(way, normal) / 0.1).clamp(0, 1)
+    return lobe * (1 + 3 * (1 - dot(half, view).clamp(0, 1)) ** 5)

@@ -36,7 +36,6 @@ def write_room(
     width: int = 320,
     height: int = 240,
     progress: bool | Progress = True,
-    style: str = "rounds",
 ) -> Path:
     """Write photos, depth images and poses of a room in the Replica layout, atomically.
 
@@ -47,7 +46,6 @@ def write_room(
         width: width of a photo, pixels, at least 8.
         height: height of a photo, pixels, at least 8.
         progress: True shows a bar; a function is called with the name of the task and the share of it that is done.
-        style: style of the camera path, see :func:`~pointsplat_ns.rooms.camera_path.capture_path`.
 
     Returns:
         ``folder``.
@@ -74,9 +72,9 @@ def write_room(
             raise DataError(f"{folder}: exists and is not an empty folder; remove it or name another")
         (partial / "results").mkdir(parents=True)
         room = make_room(seed)
-        poses = capture_path(room, frames, seed, style)
+        poses = capture_path(room, frames, seed)
         K = default_intrinsics(width, height)
-        for number in tracked(range(frames), f"Room {seed} ({room.spec.kind})", frames, progress):
+        for number in tracked(range(frames), f"Room {seed}", frames, progress):
             rgb, depth = render_room(room, poses[number], K, width, height)
             pixels = (rgb * 255).round().to(torch.uint8).numpy()
             raw = (depth * DEPTH_SCALE).round().clamp(0, 65534).numpy().astype(np.uint16)

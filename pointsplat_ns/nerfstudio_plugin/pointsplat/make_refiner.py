@@ -140,8 +140,7 @@ def _make_scenes(output: Path, seeds: tuple[int, ...], workers: int) -> None:
         remove_interrupted(trained)
         data = output / "rooms" / settings.name
         if not data.is_dir():
-            size = (settings.width, settings.height)
-            write_room(data, seed, settings.frames, *size, progress=stop_or_go_on, style=settings.style)
+            write_room(data, seed, settings.frames, settings.width, settings.height, stop_or_go_on)
         command = settings.train_command(data, output / "scenes", TIMESTAMP)
         run(command, output / "logs" / f"{settings.name}.txt", threads=1, stop=stop)
 

@@ -10,14 +10,12 @@ from typing import Any
 import numpy as np
 
 from pointsplat_ns.nerfstudio_plugin.commands import train_refiner_command, train_scene_command
-from pointsplat_ns.rooms.camera_path import STYLES
 
 TRAIN_SEEDS = tuple(range(100, 116))
 """Seeds of the rooms that the refiner is trained on."""
 
 UNSEEN_SEEDS = (50, 51, 52, 53)
-"""Seeds of the rooms that the refiner is evaluated on. It is not trained on them, and no setting was chosen by their
-results."""
+"""Seeds of the rooms that the refiner is evaluated on."""
 
 KEEP = 0.1
 """Share of the Gaussians that scenes are merged to in training."""
@@ -25,14 +23,9 @@ KEEP = 0.1
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """How one room is captured, and how a Splatfacto scene is trained on it.
-
-    The room itself (layout, size, furniture, textures, lights) also depends on ``seed``, see
-    :func:`~pointsplat_ns.rooms.room.make_room`.
-    """
+    """How the room of a seed is captured, and how a Splatfacto scene is trained on it."""
 
     seed: int
-    style: str
     frames: int
     width: int
     height: int
@@ -68,7 +61,6 @@ def scene_settings(seed: int) -> SceneSettings:
     width, height = ((256, 192), (240, 180), (256, 160), (208, 208))[rng.integers(4)]
     return SceneSettings(
         seed=seed,
-        style=STYLES[rng.choice(len(STYLES), p=(0.5, 0.25, 0.25))],
         frames=int(rng.integers(45, 81)),
         width=width,
         height=height,
@@ -117,8 +109,8 @@ A network of {parameters:,} parameters ({results["settings"]["size"]}, dual-bran
 Splatting scenes after they were merged to {100 * about["keep"]:g} % of their Gaussians. One forward pass, no photos.
 
 - **Data:** {len(about["scenes"])} furnished rooms that the package makes itself ({about["scenes"][0]} to
-  {about["scenes"][-1]}: layout, size, furniture, textures, lights, path and size of the pictures all differ), each
-  trained with `splatfacto-cpu` at settings of its own (`pointsplat_ns/nerfstudio_plugin/pointsplat/recipe.py`). No
+  {about["scenes"][-1]}: size, furniture, textures, lights, path and size of the pictures all differ), each trained with
+  `splatfacto-cpu` at settings of its own (`pointsplat_ns/nerfstudio_plugin/pointsplat/recipe.py`). No
   downloaded data.
 - **Made by:** `{about["command"]}`
 - **Training:** {about["steps"]:,} steps, each one scene and two views, against the dense scene's own renders. The
