@@ -23,10 +23,6 @@ from pointsplat_ns.refiner import Refiner, WeightsError, preset, read_metadata, 
 from pointsplat_ns.refiner.weights import PRETRAINED
 from pointsplat_ns.system.threads import suitable_threads
 
-DEFAULTS = {"keep": 0.1, "score": "merge"}
-"""Pruning settings of files of weights whose metadata has none; named as in the earliest files, so that any name of the
-method in the metadata takes precedence (see :func:`settings_from`)."""
-
 _PREFIX = "_model.refiner."
 
 
@@ -156,28 +152,25 @@ def scenes_of_run(run: Run) -> tuple[dict[str, Path], str]:
 
 
 def settings_from(saved: Mapping[str, Any]) -> PruneSettings:
-    """Pruning settings from a run's model settings or a file's metadata. Earlier versions called ``by`` ``score``, and
-    saved an opacity weight also for methods that have none.
+    """Pruning settings from a run's model settings or a file's metadata, in which methods without an opacity weight may
+    have one.
 
     Raises:
         KeyError: if a setting is missing.
         PointSplatError, TypeError, ValueError, OverflowError: if one is not usable.
     """
-    by = saved["by"] if "by" in saved else saved["score"]
-    saved_weight = saved.get("opacity_weight")
+    by, saved_weight = saved["by"], saved.get("opacity_weight")
     weight = None if saved_weight is None else float(saved_weight)
     return PruneSettings(float(saved["keep"]), by, weight if method_named(by).weighs_opacity else None)
 
 
 def network_options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The network options in a run's model settings, as changes to the preset of its size. Settings that a run of an
-    earlier version lacks have their defaults.
+    """The network options in a run's model settings, as changes to the preset of its size.
 
     Raises:
-        KeyError: if the setting ``encoder`` is missing.
+        KeyError: if one is missing.
     """
-    defaults = {"use_appearance": True, "use_position": True, "norm": "scene"}
-    return {"encoder": settings["encoder"], **{name: settings.get(name, value) for name, value in defaults.items()}}
+    return {name: settings[name] for name in ("encoder", "use_appearance", "use_position", "norm")}
 
 
 def _read_run(run: Run) -> tuple[Refiner, PruneSettings]:
@@ -204,7 +197,7 @@ def _settings_of_file(path: Path) -> PruneSettings:
     """Pruning settings from the metadata of a file of weights."""
     metadata = read_metadata(path)
     try:
-        return settings_from({**DEFAULTS, **metadata})
+        return settings_from({"keep": 0.1, "by": "merge", **metadata})
     except (PointSplatError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise WeightsError(
             f"{path}: metadata not understood ({one_line(error)}); train or download it again"

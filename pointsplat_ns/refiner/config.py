@@ -29,10 +29,6 @@ class RefinerConfigError(PointSplatError, ValueError):
     """A refiner configuration that is not valid."""
 
 
-_FORMER_GAINS = ("scales_gain", "quats_gain", "opacities_gain", "features_dc_gain", "features_rest_gain")
-"""Settings in older files that no longer exist: factors on residuals, which were always 1."""
-
-
 @dataclass
 class RefinerConfig:
     """All settings of a refiner's network.
@@ -166,10 +162,6 @@ class RefinerConfig:
         Raises:
             RefinerConfigError: if a field is unknown or the fields contradict one another.
         """
-        values = dict(values)
-        for name in _FORMER_GAINS:
-            gain = values.pop(name, 1.0)
-            _require(gain == 1.0, f"{name} is {gain!r}; expected 1.0, as residuals are no longer multiplied by factors")
         fields = {field.name for field in dataclasses.fields(cls)}
         unknown = sorted(set(values) - fields)
         _require(not unknown, f"unknown refiner settings {', '.join(unknown)}; a newer version may have written them")

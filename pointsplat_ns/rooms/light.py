@@ -46,7 +46,7 @@ class ChartGrids:
         for image in images:
             pyramids.append([image])
             for _ in range(levels - 1):
-                image = F.adaptive_avg_pool2d(image, [max(1, size // 2) for size in image.shape[1:]])
+                image = F.adaptive_avg_pool2d(image, (max(1, image.shape[1] // 2), max(1, image.shape[2] // 2)))
                 pyramids[-1].append(image)
         shapes = torch.tensor([[image.shape[1:] for image in pyramid] for pyramid in pyramids])
         counts = shapes.prod(-1).reshape(-1)

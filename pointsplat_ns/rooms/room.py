@@ -110,11 +110,11 @@ def _furnish(b: Builder, pal: Palette, plan: _Plan) -> None:
 
     for _ in range(1 + int(rng.integers(2))):
         w = float(rng.uniform(1.1, 1.8))
-        if at := plan.spot((w + 0.6, 0.2, height - 0.9), low=0.9):
-            _window(b, at, pal, w)
-    if at := plan.spot((1.0, 0.9, 2.05)):
-        b.box(at, (0, 0.02, 1.0), (0.9, 0.04, 2.0), pal.wood)
-        b.box(at, (0.38, 0.06, 1.0), (0.12, 0.06, 0.04), pal.metal, round=True)
+        if spot := plan.spot((w + 0.6, 0.2, height - 0.9), low=0.9):
+            _window(b, spot, pal, w)
+    if spot := plan.spot((1.0, 0.9, 2.05)):
+        b.box(spot, (0, 0.02, 1.0), (0.9, 0.04, 2.0), pal.wood)
+        b.box(spot, (0.38, 0.06, 1.0), (0.12, 0.06, 0.04), pal.metal, round=True)
     _middle(b, pal, plan)
     # Width, depth and height of a piece, and the height to leave free above it, metres.
     pieces: list[tuple[Callable[[Builder, Frame, Palette, Vec], None], Vec, float]] = [
@@ -127,13 +127,13 @@ def _furnish(b: Builder, pal: Palette, plan: _Plan) -> None:
     ]
     for build, usual, above in pieces:
         w, d, h = (float(value * rng.uniform(0.92, 1.1)) for value in usual)
-        if at := plan.spot((w, d, h + above)):
-            build(b, at.moved(0, 0.025), pal, (w, d, h))
+        if spot := plan.spot((w, d, h + above)):
+            build(b, spot.moved(0, 0.025), pal, (w, d, h))
     for _ in range(8):
         w, h, low = (float(rng.uniform(*bounds)) for bounds in ((0.45, 0.95), (0.4, 0.75), (1.05, 1.4)))
-        if at := plan.spot((w, 0.05, h), low, tries=4):
+        if spot := plan.spot((w, 0.05, h), low, tries=4):
             art = Material(tex.picture([*pal.accents, pal.pale]), gloss=0.08)
-            b.box(at, (0, 0.015, low + h / 2), (w, 0.03, h), pal.wood, front=art)
+            b.box(spot, (0, 0.015, low + h / 2), (w, 0.03, h), pal.wood, front=art)
 
 
 def _window(b: Builder, at: Frame, pal: Palette, width: float) -> None:

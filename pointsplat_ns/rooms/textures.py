@@ -37,7 +37,7 @@ class Canvas:
         """Octaves of :meth:`noise`, each half as large and half as strong, in [0, 1]."""
         weights = [0.5**octave for octave in range(octaves)]
         parts = [weight * self.noise(max(scale * weight, 0.015), stretch) for weight in weights]
-        return sum(parts) / sum(weights)
+        return np.sum(parts, axis=0) / sum(weights)
 
     def fill(self, color: Color) -> np.ndarray:
         return np.broadcast_to(np.asarray(color, np.float32), (*self.x.shape, 3)).copy()

@@ -53,8 +53,7 @@ def network(head: str = "scales", moved: float = 0.2) -> Refiner:
     [
         ({}, PruneSettings(0.1, "merge")),
         ({"keep": 0.3, "by": "coverage", "steps": 5}, PruneSettings(0.3, "coverage")),
-        ({"keep": 0.3, "score": "coverage", "steps": 5}, PruneSettings(0.3, "coverage")),
-        ({"keep": "0.3", "score": "paper", "opacity_weight": "0.7"}, PruneSettings(0.3, "paper", 0.7)),
+        ({"keep": "0.3", "by": "paper", "opacity_weight": "0.7"}, PruneSettings(0.3, "paper", 0.7)),
         ({"keep": 0.3, "by": "merge", "opacity_weight": 0.3}, PruneSettings(0.3, "merge")),
         ({"keep": 500}, PruneSettings(500, "merge")),
     ],
@@ -81,7 +80,7 @@ def test_a_file_of_weights_refines(tmp_path):
         {"keep": "some"},
         {"keep": 1.5},
         {"keep": 10**400},
-        {"score": "best"},
+        {"by": "best"},
         {"keep": None},
         {"opacity_weight": []},
         {"opacity_weight": -(10**400)},
@@ -249,7 +248,7 @@ def test_code_in_the_config_is_never_run(make_refined_run, tmp_path):
 
 def test_settings_tell_ratios_from_counts():
     assert settings_from({"keep": 0.3, "by": "paper", "opacity_weight": 0.2}) == PruneSettings(0.3, "paper", 0.2)
-    saved = settings_from({"keep": 500.0, "score": "volume", "opacity_weight": 0.2})
+    saved = settings_from({"keep": 500.0, "by": "volume", "opacity_weight": 0.2})
     assert saved == PruneSettings(500, "volume") and type(saved.keep) is int
     assert type(settings_from({"keep": 1, "by": "volume"}).keep) is float, "1 is everything, as 1.0 is"
     for keep in (0.0, -1.0, 1.5, 2.5, math.nan, math.inf):

@@ -50,22 +50,6 @@ def test_unknown_names_are_refused():
         RefinerConfig.from_dict({"color_space": 1})
 
 
-def test_factors_on_residuals_that_older_files_hold_are_read_if_they_are_one():
-    config = preset("tiny")
-    assert RefinerConfig.from_dict({**config.to_dict(), "scales_gain": 1.0, "features_rest_gain": 1}) == config
-
-
-def test_factors_on_residuals_that_older_files_hold_are_refused_if_they_are_not_one():
-    with pytest.raises(RefinerConfigError, match="quats_gain is 0.5; expected 1.0"):
-        RefinerConfig.from_dict({**preset("tiny").to_dict(), "quats_gain": 0.5})
-
-
-def test_reading_a_configuration_leaves_what_was_read_as_it_was():
-    values = {**preset("tiny").to_dict(), "quats_gain": 1.0}
-    RefinerConfig.from_dict(values)
-    assert values["quats_gain"] == 1.0
-
-
 def test_the_ablations_of_table_4_have_fewer_parameters_than_the_whole():
     def count(**changes):
         return sum(p.numel() for p in Refiner(preset("tiny", **changes)).encoder.parameters())

@@ -35,14 +35,6 @@ _NO_SEEDS = ("load_seed_points", "load_3D_points")
 """Dataparser settings that load seed points; a trained scene does not need them."""
 
 
-_FORMER_DATAPARSERS = {
-    "pointsplat_ns.data.replica.ReplicaDataParserConfig": (
-        "pointsplat_ns.nerfstudio_plugin.replica.dataparser.ReplicaDataParserConfig"
-    ),
-}
-"""Dataparser names in runs of earlier versions -> current names."""
-
-
 def dataparser_of(run: Run) -> DataParser:
     """The dataparser that a run was trained with, with the same settings.
 
@@ -55,10 +47,10 @@ def dataparser_of(run: Run) -> DataParser:
     from nerfstudio.configs.dataparser_configs import all_dataparsers
 
     classes = {f"{type(c).__module__}.{type(c).__qualname__}": type(c) for c in all_dataparsers.values()}
-    name = _FORMER_DATAPARSERS.get(run.dataparser_class, run.dataparser_class)
+    name = run.dataparser_class
     if name not in classes:
         raise SceneError(
-            f"{run.config_path}: trained with the dataparser {run.dataparser_class or 'of another kind'}, which is not "
+            f"{run.config_path}: trained with the dataparser {name or 'of another kind'}, which is not "
             "installed here; install the plugin that provides it"
         )
     config = classes[name]()

@@ -27,7 +27,7 @@ class TrainingState:
         """Identities of the scenes that the network has been trained on, also before it was resumed."""
         self.skipped: Counter[str] = Counter()
         """Number of steps skipped because a loss or a gradient was not finite, by scene, over all processes."""
-        self.counted: dict[str, int] = {}
+        self.counted: Counter[str] = Counter()
         """Number of steps accumulated for the next update, by part."""
         self.waiting: list[str] = []
         """Parts with accumulated gradients that were not due for an update at the latest step."""
@@ -48,7 +48,6 @@ class TrainingState:
             held = [(p, p.grad) for p in parameters if p.grad is not None] if before else []
             if before == 0:
                 self.counted[name] = 0
-            self.counted.setdefault(name, before if held else 0)  # a checkpoint of an earlier version
             gathered += held
             for parameter in parameters:
                 parameter.grad = None
@@ -79,11 +78,11 @@ class TrainingState:
         state: dict[str, Any] = {"trained_on": sorted(self.trained_on), "skipped": dict(self.skipped)}
         if self.waiting:
             state["gradients"] = {name: [p.grad for p in self._parts[name]] for name in self.waiting}
-            state["counted"] = {name: self.counted[name] for name in self.waiting if name in self.counted}
+            state["counted"] = {name: self.counted[name] for name in self.waiting}
         return state
 
     def load(self, state: Mapping[str, Any], scenes: Iterable[str]) -> None:
-        """Load the state of a checkpoint. Checkpoints of earlier versions have only ``trained_on``.
+        """Load the state of a checkpoint.
 
         Args:
             state: the result of :meth:`to_dict`.
@@ -93,7 +92,8 @@ class TrainingState:
             for parameter, gradient in zip(self._parts[name], gradients, strict=True):
                 parameter.grad = None if gradient is None else gradient.to(parameter)
         self.waiting = list(state.get("gradients", {}))
+        self.counted.clear()  # and not another one, as the trainer holds it
         self.counted.update(state.get("counted", {}))
         there = set(scenes)
-        self.skipped = Counter({name: count for name, count in state.get("skipped", {}).items() if name in there})
+        self.skipped = Counter({name: count for name, count in state["skipped"].items() if name in there})
         self.trained_on |= set(state["trained_on"])

@@ -153,5 +153,5 @@ class SplatfactoCpuTrainer(StoppableTrainer):
         if folder is not None:
             path = folder / f"step-{self._start_step - 1:09d}.ckpt"
         state = None if path is None else torch.load(path, map_location="cpu", weights_only=True, mmap=True).get(STATE)
-        if state is not None:  # checkpoints of earlier versions have none
+        if state is not None:  # those of nerfstudio's own methods have none
             restore_training_state(self.pipeline, state)

@@ -163,15 +163,6 @@ def test_an_unknown_dataparser_and_an_unknown_setting_are_refused(wall_config, w
         dataparser_of(open_run(run))
 
 
-def test_a_run_whose_dataparser_has_moved_since_is_still_understood(wall_config, wall_scene, tmp_path):
-    run = make_run(tmp_path, wall_config, wall_scene)
-    text = (run / "config.yml").read_text()
-    former = text.replace("pointsplat_ns.nerfstudio_plugin.replica.dataparser.", "pointsplat_ns.data.replica.")
-    assert "!!python/object:pointsplat_ns.data.replica.ReplicaDataParserConfig" in former
-    (run / "config.yml").write_text(former)
-    assert type(dataparser_of(open_run(run)).config) is ReplicaDataParserConfig
-
-
 def test_code_in_a_config_is_never_run(wall_config, wall_scene, tmp_path):
     run = make_run(tmp_path, wall_config, wall_scene)
     config, trap = run / "config.yml", tmp_path / "sprung"

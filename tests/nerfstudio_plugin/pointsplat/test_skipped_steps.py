@@ -178,5 +178,3 @@ def test_the_count_of_a_scene_that_is_gone_is_gone(three_rooms):
     pipeline = dense_config(three_rooms, Path("unused"), 1).pipeline.setup(device="cpu", test_mode="val")
     pipeline.set_extra_state({"trained_on": [], "skipped": {"room1": 3, "cellar": 8}})
     assert pipeline.training_state.skipped == {"room1": 3}
-    pipeline.set_extra_state({"trained_on": []})  # a checkpoint of an earlier version
-    assert pipeline.training_state.skipped.total() == 0

@@ -64,9 +64,3 @@ def test_what_is_saved_is_taken_up_by_another_training(parts):
     assert resumed.trained_on == {"a/1", "b/1"} and resumed.skipped == {"a": 2}
     assert resumed.waiting == ["encoder"] and resumed.counted == {"encoder": 1}
     assert others["encoder"][0].grad.tolist() == [5.0, 5.0] and others["heads"][0].grad is None
-
-
-def test_a_checkpoint_of_an_earlier_version_says_only_what_was_trained_on(parts):
-    state = TrainingState(parts)
-    state.load({"trained_on": ["a/1"]}, ["a"])
-    assert state.trained_on == {"a/1"} and state.skipped.total() == 0 and state.waiting == []
