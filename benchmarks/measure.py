@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, CHUNK, TILE, TRANSMITTANCE_MIN
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, BLENDED_AT_ONCE, TILE, TRANSMITTANCE_MIN
 from pointsplat_ns.rasterizer.projection import Projected
 from pointsplat_ns.rasterizer.tiles import TileList
 
@@ -139,7 +139,7 @@ def count_pairs(seen: Projected, tiles: TileList, width: int, height: int) -> di
     values = torch.cat([seen.means2d, seen.conics, seen.opacities[:, None]], dim=1)
 
     needed = evaluated = 0
-    block = max(1, 2**22 // (CHUNK * TILE * TILE))
+    block = max(1, 2**22 // (BLENDED_AT_ONCE * TILE * TILE))
     for begin in range(0, int((lengths > 0).sum()), block):
         of = torch.arange(begin, min(begin + block, len(order)), device=ids.device)
         of = of[lengths[of] > 0]
@@ -149,8 +149,8 @@ def count_pairs(seen: Projected, tiles: TileList, width: int, height: int) -> di
         through = inside.float()
         first = 0
         while of.numel():
-            left = (lengths[of] - first).clamp_max(CHUNK)
-            step = torch.arange(CHUNK, device=ids.device)
+            left = (lengths[of] - first).clamp_max(BLENDED_AT_ONCE)
+            step = torch.arange(BLENDED_AT_ONCE, device=ids.device)
             there = step < left[:, None]
             place = (starts[of][:, None] + first + step).clamp_max(ids.numel() - 1)
             alpha = _alphas(values[ids[place]], x, y).masked_fill_(~there[..., None], 0.0)
@@ -158,7 +158,7 @@ def count_pairs(seen: Projected, tiles: TileList, width: int, height: int) -> di
             needed += int(((alpha > 0) & (after > TRANSMITTANCE_MIN)).sum())
             evaluated += int(left.sum()) * TILE * TILE
             through = after[:, -1].where(after[:, -1] > TRANSMITTANCE_MIN, torch.zeros_like(through))
-            first += CHUNK
+            first += BLENDED_AT_ONCE
             go = (through > 0).any(1) & (lengths[of] > first)
             of, x, y, through = of[go], x[go], y[go], through[go]
     visible = int(torch.unique(ids).numel())

@@ -7,9 +7,6 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from cachetools import LRUCache
 
-FALLBACK_BYTES = 1 << 30
-"""Size of a cache if the machine's free memory cannot be read."""
-
 Value = TypeVar("Value")
 
 
@@ -20,7 +17,7 @@ def free_memory_share(share: float = 0.25) -> int:
 
         return int(share * psutil.virtual_memory().available)
     except (ImportError, OSError):
-        return FALLBACK_BYTES
+        return 1 << 30  # the machine's free memory cannot be read
 
 
 class CacheKey(Generic[Value]):

@@ -11,13 +11,8 @@ from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica
 REPLICA_SCENES = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
 """The scenes of NICE-SLAM's Replica, which the paper follows; it does not say which three it tests on."""
 
-REPLICA_SIZE, REPLICA_FRAMES = (1200, 680), 2000
-"""Of each of them. The rooms that this package makes may have the same names, but not this size and number."""
-
 SCANNETPP_PARSERS = ("ScanNetppDataParserConfig", "SeededScanNetppDataParserConfig")
 """nerfstudio's and ours."""
-
-_SCANNETPP_SCENE = re.compile(r"[0-9a-f]{10}")
 
 
 def paper_dataset(run: Run) -> str:
@@ -34,7 +29,8 @@ def paper_dataset(run: Run) -> str:
         except DataError:
             return ""
         size = (scene.params.width, scene.params.height)
-        return "Replica" if size == REPLICA_SIZE and len(scene) == REPLICA_FRAMES else ""
-    if parser in SCANNETPP_PARSERS and _SCANNETPP_SCENE.fullmatch(name) and (run.data / "dslr").is_dir():
+        # The rooms that this package makes may have the same names, but not this size and number.
+        return "Replica" if size == (1200, 680) and len(scene) == 2000 else ""
+    if parser in SCANNETPP_PARSERS and re.fullmatch(r"[0-9a-f]{10}", name) and (run.data / "dslr").is_dir():
         return "ScanNet++"
     return ""

@@ -20,13 +20,6 @@ SHORT_SPIN = {"GOMP_SPINCOUNT": "20000"}
 machine slows the thread that they wait for. Threads that sleep at once (OMP_WAIT_POLICY=PASSIVE) wake too late."""
 
 
-STOP_SECONDS = 5.0
-"""Time that a command has to end after it was told to; then it is killed."""
-
-_LOOK_SECONDS = 0.2
-"""Time between looks at whether a command shall be stopped."""
-
-
 class StoppedError(Exception):
     """Work in a thread that was stopped because the whole program is."""
 
@@ -111,14 +104,14 @@ def _status(
         try:
             while stop is None or not stop.is_set():
                 try:
-                    return process.wait(None if stop is None else _LOOK_SECONDS)
+                    return process.wait(None if stop is None else 0.2)  # s between looks at whether it shall stop
                 except subprocess.TimeoutExpired:
                     continue
             raise StoppedError(shlex.join(words))
         except BaseException:
             process.terminate()
             try:
-                process.wait(STOP_SECONDS)
+                process.wait(5.0)  # s to end after it was told to; then it is killed
             except subprocess.TimeoutExpired:
                 process.kill()
             raise

@@ -17,10 +17,6 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.cameras import flip_camera_axes
 
-POSES_AGREE = 1e-3
-"""Largest difference of a rotation's entries, and of places as a share of how far cameras stand apart, between poses of
-``transforms.json`` and COLMAP's that are the same: six decimals are written, and one pose sets the frame of all."""
-
 
 @dataclass
 class SeededScanNetppDataParserConfig(ScanNetppDataParserConfig):
@@ -141,7 +137,7 @@ def _frame_of(folder: Path, poses: dict[str, np.ndarray]) -> np.ndarray:
     centers = np.stack(ours)[:, :3, 3]
     apart = max(float(np.ptp(centers, axis=0).max()), 1e-9)
     worst = max(differences[:, :3, :3].max(), differences[:, :3, 3].max() / apart if len(ours) > 1 else 0.0)
-    if not worst <= POSES_AGREE:  # NaN fails too
+    if not worst <= 1e-3:  # NaN fails too; transforms.json has six decimals
         raise DataError(
             f"{folder}: COLMAP's poses of {len(ours)} photos are not those of transforms.json, moved as a whole (they "
             f"differ by {worst:.2g}); {advice}"

@@ -15,9 +15,6 @@ from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.views import Views
 
-LIMIT_MB = 60.0
-"""Size of a page, at most, unless another is asked for: about two million Gaussians of SH degree 3."""
-
 
 def write_page(
     scenes: Gaussians | Sequence[Gaussians],
@@ -27,7 +24,7 @@ def write_page(
     title: str | None = None,
     notes: Sequence[str] = (),
     views: Views | None = None,
-    limit_mb: float = LIMIT_MB,
+    limit_mb: float = 60.0,
     progress: bool | Progress = False,
 ) -> Path:
     """Write one HTML file that opens offline and shows a scene to fly through, or two with a wipe between them.

@@ -31,7 +31,7 @@ TILE = 8
 SLACK = 1e-3
 """Pixels added around each ellipse, so that rounding never drops a pixel that is drawn."""
 
-CHUNK = 16
+BLENDED_AT_ONCE = 16
 """Gaussians blended at once for each tile, before the saturated tiles are dropped."""
 
 

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.constants import ALPHA_MAX, CHUNK, EXACT, TILE, Quality
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, BLENDED_AT_ONCE, EXACT, TILE, Quality
 from pointsplat_ns.rasterizer.quadratics import PIXELS, basis_of, table_of
 from pointsplat_ns.rasterizer.tiles import Footprints, TileList
 
@@ -69,13 +69,13 @@ class Frame:
         self.pairs_count = tiles.gaussians.numel()
         self.gaussians = F.pad(tiles.gaussians, (0, 1), value=tiles.order.numel())  # the last pair is padding
         pairs = _BLOCK_PAIRS_GPU if lengths.is_cuda else _BLOCK_PAIRS
-        self.block = max(1, min(pairs // CHUNK, self.occupied))  # tiles
+        self.block = max(1, min(pairs // BLENDED_AT_ONCE, self.occupied))  # tiles
         self.capacity = pairs
 
     def chunk_size(self, tiles: int, longest: int) -> int:
         """Gaussians to blend at once: more where few tiles are left, no more than their lists hold."""
-        size = min(self.capacity // max(tiles, 1), longest + CHUNK - 1, _LONGEST_CHUNK)
-        return max(size // CHUNK, 1) * CHUNK
+        size = min(self.capacity // max(tiles, 1), longest + BLENDED_AT_ONCE - 1, _LONGEST_CHUNK)
+        return max(size // BLENDED_AT_ONCE, 1) * BLENDED_AT_ONCE
 
     def inside(self, tiles: Tiles) -> Tensor:
         """1 for the pixels of tiles (B,) that are in the image, (B, 64)."""

@@ -17,7 +17,7 @@ from pointsplat_ns.refiner.encoder import make_norm
 from pointsplat_ns.refiner.patches import Order, add_by_patches, by_patches
 from pointsplat_ns.refiner.rows import by_rows, rows_at_a_time
 from pointsplat_ns.refiner.sparse_ops import segment_max, segment_mean, submanifold_conv
-from pointsplat_ns.refiner.structure import Level, Structure
+from pointsplat_ns.refiner.structure import GridLevel, Structure
 
 
 class SubmanifoldConv(nn.Module):
@@ -32,7 +32,7 @@ class SubmanifoldConv(nn.Module):
         self.weight = nn.Parameter(torch.empty(27, in_channels, out_channels).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
 
-    def forward(self, x: Tensor, level: Level, then: Callable[[Tensor], Tensor] | None = None) -> Tensor:
+    def forward(self, x: Tensor, level: GridLevel, then: Callable[[Tensor], Tensor] | None = None) -> Tensor:
         """``[M, Cin] -> [M, Cout]``; ``then`` is applied row by row, to the result of each cell once."""
         if level.cell_of is not None:
             x = segment_mean(x, level.cell_of, level.num_cells)
@@ -84,7 +84,7 @@ class Block(nn.Module):
         self.hidden = channels * config.mlp_ratio
         self.mlp = nn.Sequential(nn.Linear(channels, self.hidden), nn.GELU(), nn.Linear(self.hidden, channels))
 
-    def forward(self, x: Tensor, level: Level, order: Order | None) -> Tensor:
+    def forward(self, x: Tensor, level: GridLevel, order: Order | None) -> Tensor:
         """``[M, C] -> [M, C]``; ``order`` along the curve that the patches follow, None for memory order."""
         x = self.conv(x, level, then=self.conv_out).add_(x)
         x = self._add(x, lambda part: self.attention(self.norm1(part)), 3 * x.shape[1], self.attention.patch, order)
@@ -120,7 +120,7 @@ class Stage(nn.Module):
         super().__init__()
         self.blocks = nn.ModuleList(Block(channels, heads, config, rate) for rate in drop_paths)
 
-    def forward(self, x: Tensor, level: Level, curves: list[int]) -> Tensor:
+    def forward(self, x: Tensor, level: GridLevel, curves: list[int]) -> Tensor:
         """``[M, C] -> [M, C]``; ``curves`` are indices into the level's orders."""
         for i, block in enumerate(self.blocks):
             x = block(x, level, level.orders[curves[i % len(curves)]])

@@ -42,7 +42,7 @@ TABLE_LIMIT = 2**26
 
 
 @dataclass(frozen=True)
-class Level:
+class GridLevel:
     """One resolution: its M points (cells, at all levels but the first) in memory order."""
 
     size: int
@@ -60,7 +60,7 @@ class Structure:
     cube: UnitCube
     order: Tensor  # [N] scene index of the point at each place in memory
     inverse: Tensor  # [N] place in memory of each Gaussian of the scene
-    levels: list[Level]
+    levels: list[GridLevel]
     cells_per_side: float  # of the first level, along the unit cube
     built_for: tuple  # the settings that it depends on
     usable: Tensor | None = None  # [T] mask of the scene's Gaussians that it covers, N of them; None: it covers all
@@ -76,8 +76,8 @@ class Structure:
         def move(value):
             if isinstance(value, (Tensor, UnitCube)):
                 return value.to(device)
-            if isinstance(value, Level):
-                return Level(**{f.name: move(getattr(value, f.name)) for f in dataclasses.fields(value)})
+            if isinstance(value, GridLevel):
+                return GridLevel(**{f.name: move(getattr(value, f.name)) for f in dataclasses.fields(value)})
             if isinstance(value, (list, tuple)):
                 return type(value)(move(item) for item in value)
             return value
@@ -118,7 +118,7 @@ def build_structure(scene: Gaussians, config: RefinerConfig) -> Structure:
         cells = fine.index_select(0, first.index_select(0, cell_first)) >> s
         cluster, next_first = _runs(depths, shifts[i + 1]) if i + 1 < len(shifts) else (None, None)
         levels.append(
-            Level(
+            GridLevel(
                 size=len(first),
                 cell_of=None if len(cells) == len(first) else cell_of,
                 num_cells=len(cells),

@@ -8,9 +8,6 @@ from pathlib import Path
 
 _M_TRIM_THRESHOLD, _M_MMAP_MAX, _M_ARENA_MAX = -1, -4, -8  # of mallopt(3)
 
-_ARENAS = 2
-"""Enough for a thread that draws and the others."""
-
 
 def keep_freed_memory() -> bool:
     """Let the process reuse freed memory instead of returning it to the system.
@@ -34,7 +31,7 @@ def share_freed_memory() -> bool:
     Returns:
         Whether the setting was made.
     """
-    return _set({_M_ARENA_MAX: _ARENAS})
+    return _set({_M_ARENA_MAX: 2})  # enough for a thread that draws and the others
 
 
 def _set(values: dict[int, int]) -> bool:

@@ -16,13 +16,7 @@ from pathlib import Path
 CACHE_VARIABLE = "POINTSPLAT_CACHE"
 """Environment variable with the folder for what is built; by default pointsplat_ns in the user's cache folder."""
 
-_COMPILERS = ("c++", "g++", "clang++")
 _FLAGS = ("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
-_MACHINES = ("-march=native", "-mcpu=native", "")
-"""Flags for code of this very processor; compilers know one or the other."""
-
-_SECONDS = 120.0
-"""Time that a compiler gets."""
 
 
 class NativeCodeError(Exception):
@@ -63,7 +57,7 @@ def load_native(source: Path) -> ctypes.CDLL:
 def _compiler() -> str:
     """Path of a C++ compiler."""
     named = os.environ.get("CXX")
-    found = next(filter(None, map(shutil.which, [named] if named else _COMPILERS)), None)
+    found = next(filter(None, map(shutil.which, [named] if named else ("c++", "g++", "clang++"))), None)
     if found is None:
         raise NativeCodeError(f"CXX is {named}, which is not there" if named else "there is no C++ compiler")
     return found
@@ -71,7 +65,12 @@ def _compiler() -> str:
 
 def _target(compiler: str) -> tuple[str, bytes]:
     """The flag for this processor, and what the compiler then defines: its version and what the processor can do."""
-    for machine in _MACHINES:
+    # Flags for code of this very processor: compilers know one or the other.
+    for machine in (
+        "-march=native",
+        "-mcpu=native",
+        "",
+    ):
         arguments = [compiler, *filter(None, [machine]), "-dM", "-E", "-x", "c++", os.devnull]
         ran = _run(arguments)
         if ran.returncode == 0:
@@ -95,7 +94,8 @@ def _build(compiler: str, machine: str, source: Path, library: Path) -> None:
 
 def _run(arguments: list[str]) -> subprocess.CompletedProcess[bytes]:
     try:
-        return subprocess.run(arguments, capture_output=True, stdin=subprocess.DEVNULL, timeout=_SECONDS, check=False)
+        # For a compiler.
+        return subprocess.run(arguments, capture_output=True, stdin=subprocess.DEVNULL, timeout=120.0, check=False)
     except (OSError, subprocess.SubprocessError) as error:
         raise NativeCodeError(f"{arguments[0]}: {_first_line(str(error))}") from error
 

@@ -16,9 +16,6 @@ import torch
 import torch.distributed as dist
 from torch import nn
 
-FOREVER = datetime.timedelta(days=1000)
-"""How long processes of ``torchrun`` wait for one another; the last scene of one may take long."""
-
 
 def torchrun_rank() -> tuple[int, int]:
     """Rank of this process and number of processes that ``torchrun`` started together; 0 and 1 without it."""
@@ -48,7 +45,8 @@ def connect_torchrun(backend: Literal["gloo", "nccl"] = "gloo") -> None:
         return
     if backend == "nccl":
         torch.cuda.set_device(local_rank())  # nccl gathers objects through the current device
-    dist.init_process_group(backend, timeout=FOREVER)
+    # The last scene of one process may take long.
+    dist.init_process_group(backend, timeout=datetime.timedelta(days=1000))
     atexit.register(dist.destroy_process_group)
 
 

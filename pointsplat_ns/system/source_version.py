@@ -6,11 +6,6 @@ import functools
 import subprocess
 from pathlib import Path
 
-PACKAGE = Path(__file__).parents[1]
-
-SECONDS = 20.0
-"""Within which git has to answer."""
-
 
 @functools.cache
 def source_commit() -> str:
@@ -33,10 +28,8 @@ def source_commit() -> str:
 def _git(*words: str) -> str | None:
     """What git says of the package's folder; None if it fails or is not there."""
     try:
-        done = subprocess.run(
-            ["git", "-C", str(PACKAGE), *words], stdin=subprocess.DEVNULL, capture_output=True, text=True,
-            timeout=SECONDS,
-        )  # fmt: skip
+        command = ["git", "-C", str(Path(__file__).parents[1]), *words]
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=20.0)
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout if done.returncode == 0 else None

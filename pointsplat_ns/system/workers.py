@@ -31,9 +31,6 @@ MOST_DEATHS = 10
 """Number of processes that may be killed at one item, as by a lack of memory, before it is given up. Where they are
 killed at random, so many are hardly ever killed at the same one."""
 
-_MOST_IDLE_DEATHS = 20
-"""Number of processes that may end, one after the other, before they are given an item."""
-
 
 def threads_for(jobs: int) -> int:
     """Number of threads that each of several processes may use: what the environment variable ``OMP_NUM_THREADS`` says,
@@ -104,7 +101,7 @@ def in_processes(
                     workers.remove(worker)
                     how = worker.end()
                     idle_deaths = idle_deaths + 1 if number is None else 0
-                    if idle_deaths == _MOST_IDLE_DEATHS:
+                    if idle_deaths == 20:  # ended one after the other, before they were given an item
                         raise RuntimeError(f"{idle_deaths} processes in a row ended at once; the last {how}") from None
                     if number is not None:
                         deaths[number] += 1

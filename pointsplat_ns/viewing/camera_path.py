@@ -17,14 +17,7 @@ from pointsplat_ns.viewing.saved_path import MOST_FRAMES, MOST_PIXELS, read_path
 from pointsplat_ns.viewing.trajectories import STOPS, along, fitted, orbit, walk
 from pointsplat_ns.views import Views
 
-NAMED_PATHS = ("auto", "dataset", "walk", "orbit")
-
 FPS = 24.0
-SECONDS = 10.0
-
-SIZE = (960, 540)
-"""Width and height of pictures where no dataset or saved path has one, pixels."""
-
 LONGEST_SIDE = 960
 """Maximum of the longer side of pictures from the poses of photos if no size is asked for, pixels."""
 
@@ -87,7 +80,7 @@ def camera_path(
         DataError: if there are no views, or the file is no camera path.
         SceneError: if there is no such file.
     """
-    if str(path) not in NAMED_PATHS:
+    if str(path) not in ("auto", "dataset", "walk", "orbit"):
         saved = read_path(path)
         fps = shot.fps or saved.fps or FPS
         frames = 1 if one else len(saved.views) if shot.seconds is None else _frames(shot.seconds, fps)
@@ -100,7 +93,7 @@ def camera_path(
     if path == "dataset" and known is None:
         raise DataError(f"no poses of a dataset{source.missing}; expected a run whose photos are found, or views")
     fps = shot.fps or FPS
-    frames = 1 if one else _frames(SECONDS if shot.seconds is None else shot.seconds, fps)
+    frames = 1 if one else _frames(10.0 if shot.seconds is None else shot.seconds, fps)
     if known is not None and path in ("auto", "dataset"):
         if shot.seconds is None and not one:
             frames = max(frames, len(known))
@@ -109,7 +102,7 @@ def camera_path(
         skipped = f", {len(known) - frames} of {len(known)} left out" if frames < len(known) and not one else ""
         return CameraPath(views, fps, f"along the {source.origin}{skipped}")
     stops = known.spread(2 * STOPS) if known is not None else views_upright(scene, source, STOPS, up)
-    stops = _sized(stops, shot, SIZE if known is None else _reduced(known))
+    stops = _sized(stops, shot, (960, 540) if known is None else _reduced(known))
     if path == "orbit":
         low, high = content_box(scene)
         return CameraPath(orbit(stops, frames, 0.5 * (low + high).cpu(), up), fps, f"a turn, by {source.origin}")

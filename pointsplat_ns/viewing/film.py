@@ -16,12 +16,6 @@ from pointsplat_ns.views import RasterizeMode, View, Views
 
 Split = Literal["side-by-side", "wipe"]
 
-WIPE_SECONDS = 6.0
-"""How long the line takes to go to one side, to the other, and back to the middle."""
-
-_REACH = 0.4
-"""How far from the middle the line goes, as a share of the picture's width."""
-
 
 @dataclass(frozen=True, eq=False)
 class Cast:
@@ -46,7 +40,8 @@ def frames_of(cast: Cast, views: Views, fps: float) -> Iterator[np.ndarray]:
 def frame_of(cast: Cast, view: View, seconds: float = 0.0) -> np.ndarray:
     """One frame (H, W, 3) uint8, at a time that places the line of a wipe."""
     if cast.second is not None and cast.split == "wipe":
-        at = 0.5 + _REACH * math.sin(2 * math.pi * seconds / WIPE_SECONDS)
+        # To one side, 0.4 of the width from the middle, to the other and back within 6 s.
+        at = 0.5 + 0.4 * math.sin(2 * math.pi * seconds / 6.0)
         column = round(at * view.width)
         pictures = [Wipe(cast.first, cast.second, view, column, cast.modes)]
     else:

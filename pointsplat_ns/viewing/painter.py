@@ -14,12 +14,9 @@ from torch import Tensor
 
 from pointsplat_ns.io.files import logger, one_line
 from pointsplat_ns.viewing.schedule import Schedule, Step
-from pointsplat_ns.viewing.selection import Shown
+from pointsplat_ns.viewing.selection import ShownScene
 from pointsplat_ns.viewing.split_screen import Wipe, pixels_of, with_line
 from pointsplat_ns.views import RasterizeMode, View
-
-_BAND_PIXELS = 32_768
-"""Pixels, at least, that are drawn between two looks at whether the camera has moved."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +46,8 @@ class Sight:
     """What is to be seen."""
 
     camera: Camera
-    first: Shown
-    second: Shown | None
+    first: ShownScene
+    second: ShownScene | None
     line: float
     """How much of the picture's width the first takes, in [0, 1]."""
     modes: tuple[RasterizeMode, RasterizeMode]
@@ -64,7 +61,8 @@ def paint(step: Step[Sight]) -> Iterator[np.ndarray | None]:
     column = round(sight.line * view.width)
     wipe = Wipe(first, second, view, column, sight.modes, "fast" if step.moving else "exact")
     yield None
-    bands, rows = [], max(_BAND_PIXELS // (8 * view.width), 1)
+    # 32,768 pixels, at least, between two looks at whether the camera has moved.
+    bands, rows = [], max(32_768 // (8 * view.width), 1)
     for top in range(0, wipe.rows, rows):
         bands.append(wipe.draw(top, min(top + rows, wipe.rows)))
         yield None

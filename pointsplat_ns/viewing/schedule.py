@@ -14,9 +14,6 @@ from typing import Generic, TypeVar
 
 R = TypeVar("R")
 
-FULL_SIDE = 960
-"""Longer side of the whole picture, pixels, to begin with."""
-
 MOVING_SIDE = 240
 """Smallest longer side while the camera moves. If that is too slow, Gaussians are left out."""
 
@@ -28,13 +25,6 @@ MOVING_SECONDS = 0.15
 
 REST_SECONDS = 0.3
 """How long a camera has to be still before the whole picture is begun."""
-
-_BETWEEN = 4.0
-"""If the whole picture is larger than this many times the side of the first, one of a size between them comes first."""
-
-_FIRST_EFFORT = 0.1
-_CHANGE = (0.2, 1.5)
-"""Least and largest change of effort from one picture to the next."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +53,7 @@ class Schedule(Generic[R]):
         clock: gives seconds.
     """
 
-    def __init__(self, full_side: int = FULL_SIDE, clock: Callable[[], float] = time.monotonic):
+    def __init__(self, full_side: int = 960, clock: Callable[[], float] = time.monotonic):
         self._full_side, self._clock = full_side, clock
         self._changed = threading.Condition()
         self._request: R | None = None
@@ -73,7 +63,7 @@ class Schedule(Generic[R]):
         """Longer side of what has been drawn of the newest request; 0 for nothing."""
         self._complete = True
         self._closed = False
-        self._effort = _FIRST_EFFORT
+        self._effort = 0.1
         """Share of the work of the whole picture that is done while the camera moves."""
 
     def submit(self, request: R, full_side: int | None = None) -> None:
@@ -122,7 +112,7 @@ class Schedule(Generic[R]):
         """Say that a step was drawn, and how long it took."""
         with self._changed:
             if step.moving:
-                low, high = _CHANGE
+                low, high = (0.2, 1.5)  # least and largest change from one picture to the next
                 change = math.sqrt(MOVING_SECONDS / max(seconds, 1e-3))  # by the root, so that it does not swing
                 self._effort = min(max(self._effort * min(max(change, low), high), self._least()), 1.0)
             if step.number == self._number:
@@ -144,5 +134,6 @@ class Schedule(Generic[R]):
             side = min(max(round(full * math.sqrt(self._effort)), smallest), full)
             share = max(min(self._effort / (smallest / full) ** 2, 1.0), LEAST_SHARE)
             return Step(self._request, self._number, side, share, moving=True, whole=side == full and share == 1.0)
-        side = full if full <= _BETWEEN * self._drawn or self._drawn > smallest else round(math.sqrt(full * smallest))
+        # A picture of a size between comes first if the whole one is more than four times as large as the first.
+        side = full if full <= 4.0 * self._drawn or self._drawn > smallest else round(math.sqrt(full * smallest))
         return Step(self._request, self._number, side, 1.0, moving=False, whole=side == full)

@@ -26,7 +26,7 @@ _SMALLEST_PART = 20_000
 
 
 @dataclass(eq=False)
-class Shown:
+class ShownScene:
     """A scene as it is shown, and how it was made."""
 
     scene: Gaussians
@@ -65,13 +65,13 @@ class Selection:
     ):
         self.scene = keep_usable(scene, "the scene")
         """All Gaussians that can be drawn."""
-        self.shown = Shown(self.scene, "all")
+        self.shown = ShownScene(self.scene, "all")
         """What is shown now."""
         self.news = ""
         """What the thread is doing; empty for nothing."""
         self.whole = self.shown
         """All of it."""
-        self._merged: dict[int, Shown] = {}
+        self._merged: dict[int, ShownScene] = {}
         self._source, self._report, self._rest = source, changed, rest
         self._wanted = 100
         self._changed = threading.Condition()
@@ -102,13 +102,13 @@ class Selection:
     def _count(self, percent: int) -> int:
         return resolve_keep(len(self.scene), percent / 100)
 
-    def _at(self, percent: int) -> Shown:
+    def _at(self, percent: int) -> ShownScene:
         """The scene at a budget, of what is at hand."""
         if percent == 100:
             return self.whole
         if percent in self._merged:
             return self._merged[percent]
-        return Shown(self.scene[select(self._scores, self._count(percent))], "chosen by coverage")
+        return ShownScene(self.scene[select(self._scores, self._count(percent))], "chosen by coverage")
 
     @cached_property
     def _scores(self) -> Tensor:
@@ -130,14 +130,14 @@ class Selection:
             except Stopped:
                 continue
             except (PointSplatError, MemoryError, RuntimeError) as error:
-                merged = Shown(self._at(wanted).scene, f"chosen by coverage, as merging failed: {error}")
+                merged = ShownScene(self._at(wanted).scene, f"chosen by coverage, as merging failed: {error}")
             with self._changed:
                 self._keep(wanted, merged)
                 if wanted == self._wanted:
                     self.shown, self.news = merged, ""
             self._report(True)
 
-    def _merge(self, percent: int) -> Shown:
+    def _merge(self, percent: int) -> ShownScene:
         def report(share: float) -> None:
             if self._closed or self._wanted != percent:
                 raise Stopped
@@ -148,9 +148,9 @@ class Selection:
 
         report(0.0)
         views = self._source.known(MERGED_FROM)
-        return Shown(prune(self.scene, self._count(percent), views=views, progress=report), "merged")
+        return ShownScene(prune(self.scene, self._count(percent), views=views, progress=report), "merged")
 
-    def _keep(self, percent: int, merged: Shown) -> None:
+    def _keep(self, percent: int, merged: ShownScene) -> None:
         """Keep what was merged, and of the others as many as take no more memory than the scene itself."""
         self._merged.pop(percent, None)
         while self._merged and sum(len(s.scene) for s in self._merged.values()) + len(merged.scene) > len(self.scene):

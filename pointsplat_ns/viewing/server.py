@@ -20,9 +20,6 @@ import websockets.server as websockets_server
 
 from pointsplat_ns.errors import PointSplatError
 
-TRIED = 20
-"""Number of ports that are tried, the one that is asked for first."""
-
 _SERVER: Any = websockets_server
 """viser starts its server by ``serve`` of this module, which has it under an old name only."""
 
@@ -69,7 +66,7 @@ def free_port(host: str, port: int) -> int:
     """
     if not 0 <= port < 65536:
         raise PointSplatError(f"port {port}; expected 0 to 65535")
-    last = min(port + TRIED, 65536) if port else 1
+    last = min(port + 20, 65536) if port else 1  # number of ports to try
     failed = ""
     for candidate in range(port, last):
         try:

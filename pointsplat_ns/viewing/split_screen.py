@@ -22,15 +22,6 @@ from pointsplat_ns.views import RasterizeMode, View
 if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont
 
-_THICK = 640
-"""Pictures from this width on have a line of two pixels, others of one."""
-
-_TEXT = 0.03
-"""Height of labels, as a share of the picture's."""
-
-_SMALLEST_TEXT = 11
-"""Least height of labels, pixels."""
-
 
 class Wipe:
     """The picture of one or two scenes from one view: the first left of a column, the second from there on. What is not
@@ -88,7 +79,7 @@ def with_line(pixels: np.ndarray, column: int) -> np.ndarray:
     if not 0 < column < pixels.shape[1]:
         return pixels
     pixels = pixels.copy()
-    thick = 2 if pixels.shape[1] >= _THICK else 1
+    thick = 2 if pixels.shape[1] >= 640 else 1
     left = column - thick // 2
     pixels[:, max(left - 1, 0) : left + thick + 1] //= 3
     pixels[:, left : left + thick] = 255
@@ -103,7 +94,7 @@ def with_labels(pixels: np.ndarray, labels: Sequence[str], column: int) -> np.nd
     from PIL import Image, ImageDraw
 
     height, width = pixels.shape[:2]
-    size = max(round(_TEXT * height), _SMALLEST_TEXT)
+    size = max(round(0.03 * height), 11)  # pixels
     image = Image.fromarray(pixels)
     draw = ImageDraw.Draw(image, "RGBA")
     font, pad = _font(size), size // 2

@@ -18,18 +18,6 @@ from pointsplat_ns.views import Views
 STOPS = 12
 """Maximum number of views that a walk passes."""
 
-_FACING = 0.7
-"""Least share of the views that have what all look at before them, for a scene that is looked at from outside."""
-
-_OPEN = math.radians(100)
-"""A gap this wide between the sides that a scene is seen from, radians, is not crossed: nobody looked from there."""
-
-_ALIKE = 0.01
-"""Mean squares of horizontal axes along two directions that differ by less do not tell one from the other."""
-
-_TO_CENTRE = 0.02
-"""Weight, per view, of the content's centre in what all look at; it decides where all look the same way."""
-
 
 def along(views: Views, frames: int) -> Views:
     """A smooth path exactly through views, in their order: each is one of its frames.
@@ -112,7 +100,7 @@ def orbit(views: Views, frames: int, centre: Tensor, up: Tensor | None = None) -
     focus = _looked_at(places, ahead, centre.double())
     time = 2 * math.pi * torch.arange(frames, dtype=torch.float64) / frames
     still = np.zeros(frames)
-    if float((((focus - places) * ahead).sum(1) > 0).double().mean()) < _FACING:
+    if float((((focus - places) * ahead).sum(1) > 0).double().mean()) < 0.7:
         nearest = int((places - focus).norm(dim=1).argmin())
         yaw, pitch = _angles(ahead, up)
         angles = torch.stack([yaw[nearest] + time, pitch.median().expand(frames)], dim=1)
@@ -134,7 +122,7 @@ def up_of(views: Views) -> Tensor:
     turns = torch.from_numpy(_poses(views)[1])
     right, up = turns[:, :, 0], -turns[:, :, 1].mean(0)
     sizes, directions = torch.linalg.eigh(right.T @ right / len(right))
-    if float(sizes[1] - sizes[0]) > _ALIKE:
+    if float(sizes[1] - sizes[0]) > 0.01:  # less does not tell one axis from the other
         up = directions[:, 0] * torch.sign(directions[:, 0] @ up)
     return up / up.norm().clamp_min(1e-300)
 
@@ -242,7 +230,7 @@ def _upright(eyes: Tensor, angles: Tensor, up: Tensor) -> Tensor:
 def _looked_at(places: Tensor, ahead: Tensor, centre: Tensor) -> Tensor:
     """The point (3,) nearest to the optical axes of cameras, drawn a little to ``centre``."""
     across = torch.eye(3, dtype=torch.float64) - ahead[:, :, None] * ahead[:, None]
-    pull = _TO_CENTRE * len(places) * torch.eye(3, dtype=torch.float64)
+    pull = 0.02 * len(places) * torch.eye(3, dtype=torch.float64)  # decides where all look the same way
     return torch.linalg.solve(across.sum(0) + pull, (across @ places[:, :, None]).sum(0)[:, 0] + pull @ centre)
 
 
@@ -251,7 +239,7 @@ def _swing(sides: Tensor, time: Tensor) -> Tensor:
     sides = sides.sort().values
     gaps = torch.cat([sides[1:] - sides[:-1], sides[:1] + 2 * math.pi - sides[-1:]])
     widest = int(gaps.argmax())
-    if float(gaps[widest]) < _OPEN:
+    if float(gaps[widest]) < math.radians(100):  # nobody looked from there: not crossed
         return sides[0] + time
     arc = 2 * math.pi - float(gaps[widest])
     return sides[(widest + 1) % len(sides)] + arc * 0.5 * (1 + time.sin())

@@ -21,9 +21,6 @@ Kind = Literal["video", "frames", "picture"]
 ENCODER = "libx264"
 """ffmpeg's encoder of H.264; PyAV's wheels have it, builds of one's own may lack it."""
 
-CRF = 18
-"""x264's constant rate factor: at 18 most people see no loss."""
-
 _FRAME = re.compile(r"frame_\d{5,}\.png")
 
 
@@ -137,7 +134,7 @@ def _write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
         try:
             with av.open(str(part), "w", format="mp4", options={"movflags": "+faststart"}) as container:
                 rate = Fraction(fps).limit_denominator(1001)
-                stream = container.add_stream(ENCODER, rate=rate, options={"crf": str(CRF)})
+                stream = container.add_stream(ENCODER, rate=rate, options={"crf": str(18)})
                 for pixels in frames:
                     if count == 0:
                         stream.height, stream.width = pixels.shape[:2]

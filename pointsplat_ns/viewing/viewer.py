@@ -26,20 +26,11 @@ from pointsplat_ns.rasterizer import render_depth
 from pointsplat_ns.system.memory import share_freed_memory
 from pointsplat_ns.viewing.camera_path import views_upright
 from pointsplat_ns.viewing.painter import Camera, Painter, Sight
-from pointsplat_ns.viewing.schedule import FULL_SIDE, Step
-from pointsplat_ns.viewing.selection import Selection, Shown
+from pointsplat_ns.viewing.schedule import Step
+from pointsplat_ns.viewing.selection import Selection, ShownScene
 from pointsplat_ns.viewing.server import start_server
 from pointsplat_ns.viewing.trajectories import up_of
 from pointsplat_ns.views import RasterizeMode, View, Views
-
-STARTS = 12
-"""Number of views that the camera can be put at."""
-
-_GONE_SECONDS = 1.0
-"""A while after which the socket of a page that has gone is closed."""
-
-_QUALITY = {True: 75, False: 95}
-"""JPEG's, of pictures while the camera moves and of others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +65,7 @@ class Viewer:
         share_freed_memory()  # each page that comes has a thread that draws
         first = exhibits[0]
         self._exhibits = exhibits
-        self._starts = views_upright(first.scene, first.source, STARTS, up)
+        self._starts = views_upright(first.scene, first.source, 12, up)
         self.origin = first.source.origin
         """Text that says where the first view comes from."""
         self._up = up_of(self._starts) if up is None else up
@@ -136,7 +127,7 @@ class Viewer:
         hint = "left of the line the first scene" if two else "left of the line what is kept, right of it all"
         self._line = gui.add_slider("Wipe, %", 0, 100, 1, 50 if two else 100, hint=hint)
         self._line.on_update(lambda _: self._redraw())
-        self._side = gui.add_slider("Pixels", 240, 1920, 80, FULL_SIDE, hint="longer side of the picture at rest")
+        self._side = gui.add_slider("Pixels", 240, 1920, 80, 960, hint="longer side of the picture at rest")
         self._side.on_update(lambda _: self._redraw())
         gui.add_button("Next view").on_click(lambda event: self._next(event.client))
         gui.add_button("This view, level").on_click(lambda event: self._put(event.client))
@@ -170,7 +161,7 @@ class Viewer:
 
         def show(pixels: np.ndarray, step: Step[Sight], seconds: float) -> None:
             stands_in = step.moving and not step.whole
-            client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=_QUALITY[stands_in])
+            client.scene.set_background_image(pixels, format="jpeg", jpeg_quality={True: 75, False: 95}[stands_in])
             size = f"{pixels.shape[1]} x {pixels.shape[0]}"
             share = "" if step.share == 1 else f", {step.share:.0%} of the Gaussians"
             state = "moving: " if stands_in else ""
@@ -188,7 +179,7 @@ class Viewer:
         self._notes.pop(client.client_id, None)
         if painter is not None:
             painter.schedule.close()  # without waiting, as the server's own thread calls this
-        later = threading.Timer(_GONE_SECONDS, self._forget_gone)
+        later = threading.Timer(1.0, self._forget_gone)  # s until its socket is closed
         later.daemon = True
         later.start()
 
@@ -211,7 +202,7 @@ class Viewer:
             invert_rigid(pose[None])[0], float(camera.fov), float(camera.aspect), start.background, start.near_plane
         )
         first = self._selections[0]
-        second: Shown | None = self._selections[1].shown if len(self._selections) == 2 else first.whole
+        second: ShownScene | None = self._selections[1].shown if len(self._selections) == 2 else first.whole
         modes = self._exhibits[0].mode, self._exhibits[-1].mode
         sight = Sight(seen, first.shown, second, self._line.value / 100, modes)
         painter.schedule.submit(sight, int(self._side.value))

@@ -15,7 +15,7 @@ import pointsplat_ns as ps
 from making import ball
 from pointsplat_ns.viewing.painter import Camera, Painter, Sight, paint
 from pointsplat_ns.viewing.schedule import Step
-from pointsplat_ns.viewing.selection import Shown
+from pointsplat_ns.viewing.selection import ShownScene
 from pointsplat_ns.viewing.split_screen import pixels_of
 
 
@@ -32,8 +32,8 @@ def camera(scene) -> Camera:
 
 
 def sight(camera: Camera, scene: ps.Gaussians, second: ps.Gaussians | None = None, line: float = 1.0) -> Sight:
-    other = None if second is None else Shown(second, "all")
-    return Sight(camera, Shown(scene, "all"), other, line, ("classic", "classic"))
+    other = None if second is None else ShownScene(second, "all")
+    return Sight(camera, ShownScene(scene, "all"), other, line, ("classic", "classic"))
 
 
 def step(of: Sight, side: int = 400, moving: bool = False) -> Step[Sight]:

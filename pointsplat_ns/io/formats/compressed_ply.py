@@ -31,7 +31,7 @@ from pointsplat_ns.io.formats.coding import (
 from pointsplat_ns.io.ply_header import Element, Header, read_header, warn_render_mode
 from pointsplat_ns.system.progress import Progress, silent
 
-CHUNK = 256
+CHUNK_GAUSSIANS = 256
 """Gaussians that share bounds."""
 
 LOG_SCALES = (-20.0, 20.0)
@@ -86,7 +86,7 @@ def read_compressed_ply(path: Path | str) -> Gaussians:
 def compressed_ply_bytes(count: int, sh_degree: int) -> int:
     """Size of a compressed PLY of ``count`` Gaussians, bytes."""
     rest = 3 * ((sh_degree + 1) ** 2 - 1)
-    chunks = -(-count // CHUNK)
+    chunks = -(-count // CHUNK_GAUSSIANS)
     return len(_header_text(count, rest)) + 4 * len(_BOUNDS) * chunks + (16 + rest) * count
 
 
@@ -123,7 +123,7 @@ def _finite_scales(scene: Gaussians) -> Array:
 
 
 def _header_text(count: int, rest: int) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {-(-count // CHUNK)}"]
+    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {-(-count // CHUNK_GAUSSIANS)}"]
     lines += [f"property float {name}" for name in _BOUNDS]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
     if rest:
@@ -146,7 +146,7 @@ def _check(header: Header, chunk: Element, vertex: Element, sh: Element | None, 
         wrong = [prop for prop in names if dict(element.properties).get(prop) != kind]
         if wrong:
             raise SceneError(f"{path}: element {name!r} lacks the {kind} property {wrong[0]!r}")
-    wanted = -(-vertex.count // CHUNK)
+    wanted = -(-vertex.count // CHUNK_GAUSSIANS)
     if chunk.count != wanted:
         raise SceneError(f"{path}: {chunk.count} chunks for {vertex.count} Gaussians; expected {wanted}")
     rest = 0
@@ -173,7 +173,7 @@ def _dtype(element: Element) -> np.dtype:
 
 
 def _decode(chunk: Array, vertex: Array, sh: Array | None, rest: int) -> Gaussians:
-    of = np.arange(len(vertex)) // CHUNK
+    of = np.arange(len(vertex)) // CHUNK_GAUSSIANS
     position, rotation, scale, color = (vertex[name] for name in _PACKED)
 
     def between(word: Array, bits: tuple[tuple[int, int], ...], names: tuple[str, ...]) -> Array:
@@ -217,7 +217,7 @@ def _pack(shares: Array, bits: tuple[tuple[int, int], ...]) -> Array:
 
 def _bounds(values: Array) -> tuple[Array, Array]:
     """Lowest and highest values (chunks, 3) of each chunk, as float32 that hold all of them."""
-    starts = np.arange(0, len(values), CHUNK)
+    starts = np.arange(0, len(values), CHUNK_GAUSSIANS)
     if not len(starts):
         return np.empty((0, 3)), np.empty((0, 3))
     return np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
@@ -225,7 +225,7 @@ def _bounds(values: Array) -> tuple[Array, Array]:
 
 def _shares(values: Array, bounds: Array) -> Array:
     """Where values (N, 3) lie between the bounds (chunks, 6) that are written, 0 where these are equal."""
-    of = np.arange(len(values)) // CHUNK
+    of = np.arange(len(values)) // CHUNK_GAUSSIANS
     low, high = bounds[of, :3].astype(np.float64), bounds[of, 3:].astype(np.float64)
     span = high - low
     return np.where(span > 0, (values - low) / np.where(span > 0, span, 1), 0.0)

@@ -36,22 +36,6 @@ network. Merged scenes need little repair, and high rates overfit: after 300 ste
 0.4 dB at 1e-4 and 0.1 dB at 2e-4. At 3e-4 and above (400 steps) it lost, although the two training rooms gained more at
 higher rates. Scenes pruned by the paper's score need more repair; there 1e-3 learns faster."""
 
-PAPER_RATES = dict.fromkeys(RATES, 1e-5)
-"""The paper's rates: 1e-5 for all parts, divided by 10 (``schedule="step"``) at :data:`STEP_AT` of the steps."""
-
-AUTHORS_RATES = {
-    **dict.fromkeys(RATES, 3e-5),
-    **dict.fromkeys(("means", "scales", "quats"), 1e-5),
-    "features_rest": 1e-6,
-}
-"""The rates of the authors' released code, which uses the cosine schedule."""
-
-STEP_AT, STEP_FACTOR = 0.6, 0.1
-"""The step schedule multiplies the rates by STEP_FACTOR at this share of the steps: 6,000 of 10,000 in the paper."""
-
-WARM_UP = 0.05
-"""Share of the steps over which the rates rise to their peak, before the cosine decay."""
-
 
 @dataclass
 class PointSplatTrainerConfig(StoppableTrainerConfig):
@@ -115,7 +99,15 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
             raise PointSplatError(f"--rate-factor {self.rate_factor:g}: expected a finite number above 0")
         config = copy.deepcopy(self)
         steps = config.first_step() + config.max_num_iterations
-        rates = {"fast": RATES, "paper": PAPER_RATES, "authors": AUTHORS_RATES}[self.rates]
+        rates = {
+            "fast": RATES,
+            "paper": dict.fromkeys(RATES, 1e-5),  # with schedule="step"
+            "authors": {  # of the released code, with the cosine schedule
+                **dict.fromkeys(RATES, 3e-5),
+                **dict.fromkeys(("means", "scales", "quats"), 1e-5),
+                "features_rest": 1e-6,
+            },
+        }[self.rates]
         for name, group in config.optimizers.items():
             if group["optimizer"].lr == RATES.get(name):
                 group["optimizer"].lr = rates[name]
@@ -123,12 +115,10 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
             schedule = group["scheduler"]
             if isinstance(schedule, CosineDecaySchedulerConfig) and schedule.max_steps == 0:
                 if self.schedule == "step":
-                    milestones = (max(1, round(STEP_AT * steps)),)
-                    group["scheduler"] = MultiStepSchedulerConfig(
-                        max_steps=steps, gamma=STEP_FACTOR, milestones=milestones
-                    )
+                    milestones = (max(1, round(0.6 * steps)),)  # 6,000 of 10,000 in the paper
+                    group["scheduler"] = MultiStepSchedulerConfig(max_steps=steps, gamma=0.1, milestones=milestones)
                     continue
-                schedule.warm_up_end = max(1, round(WARM_UP * steps))
+                schedule.warm_up_end = max(1, round(0.05 * steps))
                 schedule.max_steps = max(steps, schedule.warm_up_end + 1)  # the cosine divides by the difference
         _, together = torchrun_rank()
         if together > 1:  # nerfstudio, which did not start them, takes each for one alone

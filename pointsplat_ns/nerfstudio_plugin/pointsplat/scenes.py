@@ -31,9 +31,6 @@ from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND
 from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
 from pointsplat_ns.views import RasterizeMode
 
-_NO_SEEDS = ("load_seed_points", "load_3D_points")
-"""Dataparser settings that load seed points; a trained scene does not need them."""
-
 
 def dataparser_of(run: Run) -> DataParser:
     """The dataparser that a run was trained with, with the same settings.
@@ -62,7 +59,8 @@ def dataparser_of(run: Run) -> DataParser:
             )
         if isinstance(value, Tagged):
             continue  # a Python object: keep the default
-        setattr(config, field_name, False if field_name in _NO_SEEDS else value)
+        # Seed points are not needed.
+        setattr(config, field_name, False if field_name in ("load_seed_points", "load_3D_points") else value)
     config.data = run.data
     return config.setup()
 

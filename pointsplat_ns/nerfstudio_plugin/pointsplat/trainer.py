@@ -21,9 +21,6 @@ from pointsplat_ns.system import processes
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.config import PointSplatTrainerConfig
 
-ALL = "all"
-"""Stands for every part of the network in ``gradient_accumulation_steps``."""
-
 
 class AveragingOptimizers(Optimizers):
     """nerfstudio's optimisers, with gradients averaged over accumulated steps and over processes.
@@ -63,7 +60,7 @@ class PointSplatTrainer(StoppableTrainer):
     def __init__(self, config, local_rank: int = 0, world_size: int = 1) -> None:
         super().__init__(config, local_rank, world_size)
         steps = self.config.gradient_accumulation_steps
-        self.gradient_accumulation_steps = defaultdict(lambda: steps.get(ALL, 1), steps)
+        self.gradient_accumulation_steps = defaultdict(lambda: steps.get("all", 1), steps)
 
     def setup_optimizers(self) -> AveragingOptimizers:
         """The optimisers.
@@ -74,9 +71,9 @@ class PointSplatTrainer(StoppableTrainer):
         """
         groups = self.pipeline.get_param_groups()
         for name, steps in self.config.gradient_accumulation_steps.items():
-            if name not in (*groups, ALL) or steps < 1:
+            if name not in (*groups, "all") or steps < 1:
                 raise PointSplatError(
-                    f"--gradient-accumulation-steps {name} {steps}: expected {ALL} or one of {', '.join(groups)}, and "
+                    f"--gradient-accumulation-steps {name} {steps}: expected all or one of {', '.join(groups)}, and "
                     "at least 1"
                 )
         if self.config.max_skipped_steps < 0:

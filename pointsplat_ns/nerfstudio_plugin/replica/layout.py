@@ -30,13 +30,8 @@ removed. Beyond one percent the matrix holds a scale or a shear and is not a cam
 FARTHEST = 1e18
 """Poses with larger numbers count as lost tracking: float32, in which scenes are trained, cannot square them."""
 
-UNKNOWN_DEPTH = (0, 65535)
-"""Raw 16-bit depths that mean "not measured": empty and saturated."""
-
 PixelCenters = Literal["auto", "integer", "half"]
 
-_PHOTO = re.compile(r"^frame(\d+)\.(jpg|jpeg|png)$", re.IGNORECASE)
-_DEPTH = re.compile(r"^depth(\d+)\.png$", re.IGNORECASE)
 _LAYOUT_HINT = "a scene folder holds traj.txt and results/frame*.jpg"
 
 
@@ -128,10 +123,10 @@ def load_replica(folder: Path, check_sizes: bool = True) -> ReplicaScene:
         hint = f"it contains the scenes {', '.join(scenes)}: name one of them" if scenes else _LAYOUT_HINT
         raise DataError(f"{folder}: not a scene of the Replica layout; {hint}")
     params = read_cam_params(folder)
-    photos = _numbered(folder / "results", _PHOTO, "frame*.jpg or frame*.png")
+    photos = _numbered(folder / "results", r"frame(\d+)\.(jpg|jpeg|png)", "frame*.jpg or frame*.png")
     if not photos:
         raise DataError(f"{folder / 'results'}: no photo found; expected frame000000.jpg (or .png) and so on")
-    depths = _numbered(folder / "results", _DEPTH, "depth*.png")
+    depths = _numbered(folder / "results", r"depth(\d+)\.png", "depth*.png")
     poses = read_trajectory(folder / "traj.txt")
     numbers = sorted(photos)
     if len(poses) != len(numbers):
@@ -275,7 +270,7 @@ def read_depth(path: Path, params: PinholeParams) -> np.ndarray:
         raise DataError(f"{path}: pixels of mode {image.mode}; expected a 16-bit grey depth image")
     raw = np.asarray(_decoded(path, image)).astype(np.int64)
     depth = raw.astype(np.float32) / np.float32(params.scale)
-    depth[np.isin(raw, UNKNOWN_DEPTH)] = 0.0
+    depth[np.isin(raw, (0, 65535))] = 0.0  # empty and saturated: not measured
     return depth
 
 
@@ -305,13 +300,13 @@ def _check_size(path: Path, size: tuple[int, int], params: PinholeParams) -> Non
         )
 
 
-def _numbered(folder: Path, pattern: re.Pattern, wanted: str) -> dict[int, Path]:
+def _numbered(folder: Path, pattern: str, wanted: str) -> dict[int, Path]:
     """The files of a folder whose names match, by the number in the name."""
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder; expected {wanted} in it")
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
-        match = pattern.match(path.name)
+        match = re.fullmatch(pattern, path.name, re.IGNORECASE)
         if match is None:
             continue
         number = int(match.group(1))

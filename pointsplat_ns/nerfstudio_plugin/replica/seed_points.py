@@ -6,19 +6,10 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.replica.layout import ReplicaScene, read_depth, read_photo
 from pointsplat_ns.system.progress import tracked
 
-MAX_FRAMES = 200
-"""Maximum number of depth images read: neighbouring frames of a video see the same surfaces."""
-
-SAMPLES_PER_POINT = 40
-"""Pixels unprojected per point wanted: enough to average several in most voxels."""
-
 EDGE = 0.05
 """A pixel whose depth differs from a neighbour's by more than this share is taken to lie on an outline, where
 sensors and resampling produce points between two surfaces. On a plane, depth changes this much from one pixel to
 the next only at grazing angles (over 85 degrees for usual lenses)."""
-
-WORTH_A_BAR = 20
-"""Least number of depth images for a progress bar: fewer take about a second."""
 
 
 def fuse_depth(
@@ -29,10 +20,10 @@ def fuse_depth(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Unprojects the depth images of a scene and thins them to about ``num_points`` points.
 
-    Reads at most :data:`MAX_FRAMES` frames, evenly spaced, one at a time, and keeps at most
-    ``num_points * SAMPLES_PER_POINT`` pixels in total, so time and memory do not grow with the
-    length of the capture. Each occupied voxel gives one point, the mean of its pixels. The voxel size
-    is chosen so that no more than ``num_points`` are left. Deterministic.
+    Reads at most 200 frames, evenly spaced, one at a time: neighbouring frames of a video see the same surfaces. Keeps
+    at most ``40 * num_points`` pixels in total, several for most voxels, so that time and memory do not grow with the
+    length of the capture. Each occupied voxel gives one point, the mean of its pixels. The voxel size is chosen so that
+    no more than ``num_points`` are left. Deterministic.
 
     Args:
         scene: The frames to use (pass training frames only), with depth.
@@ -50,12 +41,12 @@ def fuse_depth(
     depths = scene.depths
     if depths is None:
         raise DataError(f"{scene.folder}: no depth images; expected one for every photo")
-    chosen = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), MAX_FRAMES)).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), 200)).round().astype(int))
     params = scene.params
-    budget = max(num_points * SAMPLES_PER_POINT // len(chosen), 1)
+    budget = max(num_points * 40 // len(chosen), 1)
     step = max(int(np.ceil(np.sqrt(params.width * params.height / budget))), 1)
     all_xyz, all_rgb = [], []
-    shown = progress and len(chosen) >= WORTH_A_BAR
+    shown = progress and len(chosen) >= 20  # fewer take about a second
     for order, index in enumerate(tracked(chosen, "Seed points from depth", len(chosen), shown)):
         depth = read_depth(depths[index], params)
         valid = _inner(depth)

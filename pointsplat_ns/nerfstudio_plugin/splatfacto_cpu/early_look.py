@@ -21,18 +21,8 @@ if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras
     from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
-FIRST_PICTURE, FIRST_SHARE = 50, 1 / 64
-"""The first picture is made after so many steps, and after this share of them; each further one after twice as many."""
-
-PICTURE_SIDE = 400
-"""Maximum of the longer side of the render in a picture, pixels."""
-
 MOST_TIME = 0.02
 """Largest share of the time that pictures take."""
-
-_WARM_UP, _TIMED_STEPS, _TIMED_SECONDS, _TIMED_RENDERS = 2, 5, 3.0, 2
-"""Steps that are not timed; the least steps and seconds that an estimate is made from; how often a view is rendered to
-time it, as the first time is slower."""
 
 
 class EarlyLook:
@@ -73,11 +63,11 @@ class EarlyLook:
     def _estimate(self, step: int) -> None:
         factor, now = self._factor_at(step), time.perf_counter()
         if factor != self._factor:
-            self._factor, self._timed_from, self._timed_since = factor, step + _WARM_UP, now
+            self._factor, self._timed_from, self._timed_since = factor, step + 2, now  # steps that are not timed
         if step <= self._timed_from:
             self._timed_since = now
         steps, seconds = step - self._timed_from, now - self._timed_since
-        if steps < _TIMED_STEPS or seconds < _TIMED_SECONDS:
+        if steps < 5 or seconds < 3.0:  # too few for an estimate
             return
         self._timed_from = self._last  # until the resolution rises
         per_step, left = seconds / steps, range(step, self._last)
@@ -98,7 +88,7 @@ class EarlyLook:
         camera = copy.deepcopy(dataset.cameras[:1])
         camera.rescale_output_resolution(1 / factor)
         times = []
-        for _ in range(_TIMED_RENDERS):
+        for _ in range(2):  # the first time is slower
             start = time.perf_counter()
             self._render(camera)
             times.append(time.perf_counter() - start)
@@ -147,7 +137,7 @@ class EarlyLook:
         frames: Any = self._pipeline.datamanager.fixed_indices_eval_dataloader
         camera, data = next(iter(frames))
         camera = copy.deepcopy(camera)
-        camera.rescale_output_resolution(min(1.0, PICTURE_SIDE / float(max(camera.width.max(), camera.height.max()))))
+        camera.rescale_output_resolution(min(1.0, 400 / float(max(camera.width.max(), camera.height.max()))))
         outputs = self._render(camera)
         photo = data["image"].to(model.device)
         photo = photo / 255 if photo.dtype == torch.uint8 else photo
@@ -166,7 +156,7 @@ def picture_steps(count: int) -> list[int]:
         >>> picture_steps(30)
         [30]
     """
-    steps, after = [], max(FIRST_PICTURE, math.ceil(count * FIRST_SHARE))
+    steps, after = [], max(50, math.ceil(count * (1 / 64)))
     while after < 0.75 * count:
         steps.append(after)
         after *= 2

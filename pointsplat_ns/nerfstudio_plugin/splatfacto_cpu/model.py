@@ -47,9 +47,6 @@ from pointsplat_ns.system.threads import one_thread
 LONE_POINT_SCALE = 0.01
 """Standard deviation, in scene units, of the first Gaussian of a scene with a single seed point."""
 
-HALF_LEVEL = 0.5 / 255
-"""Half a step of an 8-bit colour. Seed colours keep this distance from 0 and 1, so that their logits are finite."""
-
 
 class LpipsMetric:
     """LPIPS, called like nerfstudio's metrics. Not a module, so that checkpoints do not hold its weights."""
@@ -146,7 +143,7 @@ class SplatfactoCpuModel(SplatfactoModel):
         elif self.config.sh_degree > 0:
             features_dc = RGB2SH(colors / 255)
         else:  # colours are optimised as logits
-            features_dc = torch.logit(colors / 255, eps=HALF_LEVEL)
+            features_dc = torch.logit(colors / 255, eps=0.5 / 255)  # half a step of an 8-bit colour: finite logits
         values = {
             "means": points,
             "scales": _distance_to_others(points, 3).log().repeat(1, 3),

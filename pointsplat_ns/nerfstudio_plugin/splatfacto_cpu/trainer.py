@@ -24,9 +24,6 @@ from pointsplat_ns.system.small_numbers import tiny_as_zero
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainerConfig
 
-PICTURES_NAME = "pictures"
-"""Folder in a run's folder."""
-
 
 class CheckingOptimizers(Optimizers):
     """nerfstudio's optimisers, which leave out an update that would not be finite.
@@ -84,7 +81,7 @@ class SplatfactoCpuTrainer(StoppableTrainer):
             raise PointSplatError(f"--max-skipped-in-a-row {self.config.max_skipped_in_a_row}: expected at least 0")
         super().setup(test_mode)
         if self.config.early_look and test_mode == "val":
-            pictures = self.base_dir / PICTURES_NAME
+            pictures = self.base_dir / "pictures"
             look = EarlyLook(self.pipeline, pictures, self._start_step, self.config.max_num_iterations)
 
             def after_training(step: int) -> None:

@@ -52,7 +52,7 @@ class _Task(ctypes.Structure):
     )
 
 
-class Inputs(NamedTuple):
+class KernelInputs(NamedTuple):
     """What is blended."""
 
     table: Tensor  # [M, 6 + D]
@@ -60,7 +60,7 @@ class Inputs(NamedTuple):
     quality: Quality
 
 
-class Tape(NamedTuple):
+class KernelTape(NamedTuple):
     """What the backward pass needs of the forward pass."""
 
     before: Tensor  # [chunks, 64] transmittance in front of each chunk of a tile's list
@@ -80,7 +80,7 @@ def can_blend(colors: Tensor, wanted: bool | None) -> bool:
 
 def inputs_of(
     means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor, quality: Quality
-) -> Inputs:
+) -> KernelInputs:
     """As :meth:`~pointsplat_ns.rasterizer.frame.Inputs.of`, without what only torch needs."""
     count, channels = colors.shape
     tensors = [tensor.contiguous() for tensor in (means2d, cov2d, det, opacities, colors)]
@@ -89,7 +89,7 @@ def inputs_of(
         count >= _FEW_PAIRS, KERNELS.library.pointsplat_tabulate, *(tensor.data_ptr() for tensor in tensors), count,
         channels, table.data_ptr(), next_row.data_ptr(),
     )  # fmt: skip
-    return Inputs(table, channels, quality)
+    return KernelInputs(table, channels, quality)
 
 
 def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list[Tensor]:
@@ -104,7 +104,7 @@ def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list
     return grads
 
 
-def _task(footprints: Footprints, tiles: TileList, inputs: Inputs, chunks: Tensor, next_tile: Tensor) -> _Task:
+def _task(footprints: Footprints, tiles: TileList, inputs: KernelInputs, chunks: Tensor, next_tile: Tensor) -> _Task:
     """A task without its outputs. It keeps none of the tensors alive."""
     region, quality = tiles.region, inputs.quality
     return _Task(
@@ -117,8 +117,8 @@ def _task(footprints: Footprints, tiles: TileList, inputs: Inputs, chunks: Tenso
 
 
 def blend_region(
-    footprints: Footprints, tiles: TileList, inputs: Inputs, image: Tensor, final: Tensor, keep_tape: bool
-) -> Tape | None:
+    footprints: Footprints, tiles: TileList, inputs: KernelInputs, image: Tensor, final: Tensor, keep_tape: bool
+) -> KernelTape | None:
     """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); the tape if it is wanted."""
     library = KERNELS.library
     size = library.pointsplat_chunk()
@@ -130,14 +130,14 @@ def blend_region(
     task.image, task.final, task.blended = image.data_ptr(), final.data_ptr(), blended.data_ptr()
     task.before = before.data_ptr() if keep_tape and len(before) else None
     on_threads(tiles.gaussians.numel() >= _FEW_PAIRS, library.pointsplat_blend, ctypes.byref(task))
-    return Tape(before, blended, chunks) if keep_tape else None
+    return KernelTape(before, blended, chunks) if keep_tape else None
 
 
 def differentiate_region(
     footprints: Footprints,
     tiles: TileList,
-    inputs: Inputs,
-    tape: Tape,
+    inputs: KernelInputs,
+    tape: KernelTape,
     final: Tensor,  # [tiles, 64]
     grad_image: Tensor,  # [tiles, D, 64]
     grad_final: Tensor,  # [tiles, 64]
