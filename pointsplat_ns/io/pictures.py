@@ -9,8 +9,6 @@ from torch import Tensor
 
 from pointsplat_ns.io.files import replacing
 
-JPEG_QUALITY = 90
-
 
 def write_picture(picture: Tensor, path: Path) -> None:
     """Write an image (H, W, 3), clamped to [0, 1], as a PNG; as a JPEG if the path ends in ``.jpg``.
@@ -23,6 +21,6 @@ def write_picture(picture: Tensor, path: Path) -> None:
     image = Image.fromarray((255 * picture.clamp(0, 1)).round().to(torch.uint8).cpu().numpy())
     with replacing(path) as part:
         if path.suffix == ".jpg":
-            image.save(part, format="JPEG", quality=JPEG_QUALITY)
+            image.save(part, format="JPEG", quality=90)
         else:
             image.save(part, format="PNG")

@@ -25,7 +25,6 @@ _TYPES = {
     "int": "int32", "int32": "int32", "uint": "uint32", "uint32": "uint32",
     "float": "float32", "float32": "float32", "double": "float64", "float64": "float64",
 }  # fmt: skip
-_NAMES = _TYPES.keys()
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -98,7 +97,13 @@ def read_header(stream: BinaryIO, path: Path) -> Header:
             elements.append((words[1], int(words[2][:19]), []))
         elif keyword == "property" and elements and len(words) == 3 and words[1] in _TYPES:
             elements[-1][2].append((words[2], _TYPES[words[1]]))
-        elif keyword == "property" and elements and len(words) == 5 and words[1] == "list" and {*words[2:4]} <= _NAMES:
+        elif (
+            keyword == "property"
+            and elements
+            and len(words) == 5
+            and words[1] == "list"
+            and {*words[2:4]} <= _TYPES.keys()
+        ):
             elements[-1][2].append((words[4], f"list {_TYPES[words[2]]} {_TYPES[words[3]]}"))
         else:
             raise SceneError(f"{path}: PLY header line {number} is not understood: {line[:80]!r}")

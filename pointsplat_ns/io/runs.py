@@ -25,19 +25,11 @@ from pointsplat_ns.io.splatfacto import is_complete
 
 CONFIG_NAME = "config.yml"
 TRANSFORMS_NAME = "dataparser_transforms.json"
-CHECKPOINT_FOLDER = "nerfstudio_models"
-
 RUN_SUFFIXES = (".ckpt", ".yml", ".yaml")
 """Of the files that lead to a run."""
 
 REFINER_METHOD = "pointsplat"
 """nerfstudio's name of the method that trains refiners."""
-
-_MOST_TRANSFORM_BYTES = 1 << 16
-"""Of a dataparser's transform; nerfstudio writes some hundreds."""
-
-_SPLATFACTO_FIELDS = {"sh_degree", "densify_grad_thresh", "rasterize_mode"}
-"""Model settings that only Splatfacto and methods derived from it have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +67,12 @@ class Run:
         """Whether the checkpoint holds one Gaussian scene: Splatfacto or a method derived from it."""
         if self.method_name == REFINER_METHOD:  # a refiner for many scenes
             return False
-        return self.method_name.startswith("splatfacto") or self.model_fields.keys() >= _SPLATFACTO_FIELDS
+        needed = {
+            "sh_degree",
+            "densify_grad_thresh",
+            "rasterize_mode",
+        }  # also methods derived from Splatfacto have these
+        return self.method_name.startswith("splatfacto") or self.model_fields.keys() >= needed
 
     @property
     def steps_if_finished(self) -> int | None:
@@ -194,7 +191,7 @@ def _checkpoint(folder: Path, configured: Any, chosen: Path | None) -> tuple[Pat
     if chosen is not None:
         return chosen, step_of(chosen) or 0
     inside = folder / configured if isinstance(configured, Path) and not configured.is_absolute() else None
-    place = inside if inside is not None and inside.is_dir() else folder / CHECKPOINT_FOLDER
+    place = inside if inside is not None and inside.is_dir() else folder / "nerfstudio_models"
     steps = {}
     for file in place.glob("step-*.ckpt"):
         step = step_of(file)
@@ -239,7 +236,7 @@ def read_transforms(path: Path) -> tuple[Tensor, float]:
     if not path.is_file():
         return torch.eye(4)[:3], 1.0
     try:
-        if path.stat().st_size > _MOST_TRANSFORM_BYTES:
+        if path.stat().st_size > (1 << 16):  # nerfstudio writes some hundreds
             raise ValueError(f"{path.stat().st_size} bytes")
         content = json.loads(path.read_text("utf-8"))
         transform = torch.tensor(content["transform"], dtype=torch.float32)

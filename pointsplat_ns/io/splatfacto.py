@@ -19,8 +19,6 @@ PREFIXES = ("_model.gauss_params.", "_model.module.gauss_params.", "_model.", "_
 """Prefixes of the parameters' keys in ``pipeline``: current, then those before nerfstudio 1.0, each also with the
 wrapper of distributed training."""
 
-_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
-
 NAMES = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
 """Names of the parameters of Gaussians, in checkpoints and in Splatfacto's optimisers."""
 
@@ -117,7 +115,8 @@ def _is_dense(value: Any) -> TypeGuard[Tensor]:
     return (
         isinstance(value, Tensor)
         and not value.is_nested
-        and (value.dtype, value.layout, value.device.type) in {(dtype, torch.strided, "cpu") for dtype in _FLOATS}
+        and (value.dtype, value.layout, value.device.type)
+        in {(dtype, torch.strided, "cpu") for dtype in (torch.float16, torch.bfloat16, torch.float32, torch.float64)}
     )
 
 

@@ -8,9 +8,6 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer.constants import QUALITIES, Quality
 
-RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-RASTERIZE_MODES = ("classic", "antialiased")
-
 
 def check_tensors(
     means: Tensor,
@@ -106,8 +103,8 @@ def check_options(
             raise ValueError(f"{name} is {value}; expected a number from 0")
     if not memory_budget > 0:
         raise ValueError(f"memory_budget is {memory_budget}; expected a number of bytes above 0")
-    _check_name("render_mode", render_mode, RENDER_MODES)
-    _check_name("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
+    _check_name("render_mode", render_mode, ("RGB", "D", "ED", "RGB+D", "RGB+ED"))
+    _check_name("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
     if not isinstance(quality, Quality):
         _check_name("quality", quality, tuple(QUALITIES))
 

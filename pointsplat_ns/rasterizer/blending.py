@@ -25,13 +25,12 @@ from pointsplat_ns.rasterizer.precision import full_precision
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
 from pointsplat_ns.rasterizer.tiles import Footprints, Region
 
-_BYTES_PER_PAIR = 192  # of RGB in float32: lists, tape, gradient sums; 75 MB for 0.30 M pairs, less what images take
-
 
 def bytes_per_pair(colors: Tensor) -> int:
     """Bytes that a pair of tile and Gaussian takes with colours (M, D): each channel has a gradient sum."""
     size = colors.element_size()
-    return _BYTES_PER_PAIR * size // 4 + (colors.shape[1] - 3) * size
+    # 192 bytes a pair of RGB in float32: lists, tape, gradient sums.
+    return 192 * size // 4 + (colors.shape[1] - 3) * size
 
 
 def engine_of(colors: Tensor, compiled: bool | None) -> ModuleType:

@@ -23,9 +23,6 @@ from pointsplat_ns.rasterizer.projection import Projected
 from pointsplat_ns.rasterizer.quadratics import LOG2E, PIXELS
 from pointsplat_ns.rasterizer.tiles import Footprints
 
-_BLOCK_VALUES = 2**20
-"""Values of one (B, L, 64) array: 4 MB in float32, of which a walk holds a dozen."""
-
 
 class PixelBlock(NamedTuple):
     """Every Gaussian of a block of tiles on every pixel, front to back along L. Where ``alpha`` is zero it is not
@@ -72,7 +69,8 @@ def sum_over_pixels(
     begin = 0
     while begin < occupied:
         longest = int(lengths[begin])
-        size = max(1, min(_BLOCK_VALUES // (longest * PIXELS), occupied - begin))
+        # Arrays (B, L, 64) of 4 MB in float32, of which a walk holds a dozen.
+        size = max(1, min(2**20 // (longest * PIXELS), occupied - begin))
         tiles = order[begin : begin + size]
         place = torch.arange(longest, device=tiles.device)
         listed = place < lengths[begin : begin + size, None]  # (B, L)

@@ -28,7 +28,6 @@ PIXELS = TILE * TILE
 MOMENTS = 6
 """Sums over pixels that are kept of each pair: of g times w, w^2, dv, dv^2, w dv and 1."""
 
-_NEVER = -1e4  # log2 alpha of the padding
 LOG2E, _LN2 = 1.0 / math.log(2.0), math.log(2.0)
 _X, _Y, _R, _A, _D = range(5)  # columns of the table
 QUADRATIC, COLOR = 5, 11
@@ -54,7 +53,7 @@ def table_of(means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, col
     zero = torch.zeros_like(a)
     columns = [*means2d.unbind(-1), r, a, d, opacities.log2(), zero, zero, -0.5 * a, ar, -0.5 * (ar * r + d)]
     table = F.pad(torch.cat([torch.stack(columns, dim=-1), colors], dim=-1), (0, 0, 0, 1))
-    table[-1, QUADRATIC] = _NEVER
+    table[-1, QUADRATIC] = -1e4  # log2 alpha of the padding
     return table
 
 

@@ -16,8 +16,6 @@ C1 = 0.4886025119029199
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
 
-_BLOCK = 4096  # Gaussians whose coefficients are read at once on a CPU: 0.8 MB at degree 3
-
 
 def check_degree(degree: int) -> None:
     """Raise a ValueError unless the degree is 0 to 3."""
@@ -91,7 +89,8 @@ def unit_rows(vectors: Tensor) -> tuple[Tensor, Tensor]:
 
 def _blocks(count: int, on_cpu: bool) -> list[slice]:
     """Pieces of the work: on a CPU the coefficients of one piece stay in the cache, and no copy of all is made."""
-    step = _BLOCK if on_cpu else max(count, 1)
+    # On a CPU 0.8 MB of coefficients at degree 3 at once.
+    step = 4096 if on_cpu else max(count, 1)
     return [slice(start, min(start + step, count)) for start in range(0, count, step)]
 
 

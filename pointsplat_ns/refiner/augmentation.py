@@ -16,12 +16,6 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.quaternions import rotation_matrices, zero_as_identity
 from pointsplat_ns.rasterizer.spherical_harmonics import C0, sh_basis
 
-GAINS = (0.7, 1.4)
-"""Range of the factors on colour channels."""
-
-UPRIGHT = 0.5
-"""Share of random rotations that are about the z axis only. Most scenes have z up, but files may have any axis up."""
-
 
 @dataclass(frozen=True, eq=False)
 class Transform:
@@ -84,17 +78,17 @@ class Transform:
 
 
 def random_transform(generator: torch.Generator | None = None) -> Transform:
-    """A transform drawn at random: any rotation, or one about z (:data:`UPRIGHT`); mirrored or not; gains and order of
-    the colour channels.
+    """A transform drawn at random: any rotation, or (half of them, as most scenes have z up) one about z; mirrored or
+    not; gains and order of the colour channels.
 
     Args:
         generator: on the CPU; torch's own by default.
     """
-    upright, mirrored = (torch.rand(2, generator=generator) < torch.tensor([UPRIGHT, 0.5])).tolist()
+    upright, mirrored = (torch.rand(2, generator=generator) < torch.tensor([0.5, 0.5])).tolist()
     quat = torch.randn(4, generator=generator, dtype=torch.float64)
     if upright:
         quat[1:3] = 0.0
-    low, high = GAINS
+    low, high = (0.7, 1.4)  # of the factors on colour channels
     gains = low * (high / low) ** torch.rand(3, generator=generator, dtype=torch.float64)
     return Transform(quat / quat.norm(), mirrored, gains, torch.randperm(3, generator=generator))
 

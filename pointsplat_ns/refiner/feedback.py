@@ -26,9 +26,6 @@ PARAMETERS = ("means", "scales", "quats", "opacities", "features_dc", "features_
 FEATURES = 39
 """Numbers that the network sees of a Gaussian, see :mod:`pointsplat_ns.compression.feedback`."""
 
-WIDTH, DEPTH = 64, 2
-"""Size and number of the hidden layers."""
-
 REACH = 2.0
 """Bound of the logarithms of the factors: from 1/7 to 7."""
 
@@ -50,9 +47,9 @@ class FeedbackRefiner(nn.Module):
         super().__init__()
         layers: list[nn.Module] = []
         width = FEATURES
-        for _ in range(DEPTH):
-            layers += [nn.Linear(width, WIDTH), nn.SiLU()]
-            width = WIDTH
+        for _ in range(2):
+            layers += [nn.Linear(width, 64), nn.SiLU()]
+            width = 64
         last = nn.Linear(width, len(PARAMETERS))
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)

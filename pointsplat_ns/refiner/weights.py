@@ -21,10 +21,6 @@ PRETRAINED = Path(__file__).parent / "pretrained" / "refiner.safetensors"
 """The refiner that ships; ``CARD.md`` beside it describes its training and results."""
 
 
-_FLOATS = ("F64", "F32", "F16", "BF16")
-"""Types of parameters in a file, as safetensors calls them."""
-
-
 class WeightsError(PointSplatError):
     """A file that does not hold a usable refiner."""
 
@@ -78,7 +74,7 @@ def checked_tensors(file: Any, expected: dict[str, torch.Tensor], path: Path) ->
             f"{_shape(expected, wrong[0])}; the file is damaged or of another version"
         )
     for name, tensor in found.items():
-        if (tensor.get_dtype() in _FLOATS) != expected[name].is_floating_point():
+        if (tensor.get_dtype() in ("F64", "F32", "F16", "BF16")) != expected[name].is_floating_point():
             raise WeightsError(f"{path}: {name} is of type {tensor.get_dtype()}; the file is damaged")
     require_memory(path, path.stat().st_size)
     state = {name: file.get_tensor(name) for name in names}

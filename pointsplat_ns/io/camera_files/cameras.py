@@ -27,12 +27,6 @@ _RIGID = 1e-3
 _FARTHEST = 1e9
 """Largest coordinate of a camera: squares of it are numbers in float32."""
 
-_SHORTEST, _LONGEST = 1e-3, 1e5
-"""Focal lengths in units of the picture's side: fields of view of 179.9 and 0.0006 degrees."""
-
-_OFF_CENTRE = 100.0
-"""Largest distance of the principal point from the picture's corner, in units of its side."""
-
 
 class Camera(NamedTuple):
     """One camera as a file has it, unchecked."""
@@ -150,9 +144,10 @@ def views_of(path: Path, cameras: Sequence[Camera], motion: Motion | None = None
     _need(path, cameras, poses[:, :3, 3].abs().amax(1) <= _FARTHEST, "is too far away", f"at most {_FARTHEST:g} units")
     whole = (sizes == sizes.floor()) & (sizes >= 1) & (sizes <= MOST_PIXELS)
     _need(path, cameras, whole.all(1), "has a picture of no usable size", f"1 to {MOST_PIXELS} pixels a side")
-    long = (focals >= _SHORTEST * sizes) & (focals <= _LONGEST * sizes)
+    long = (focals >= 1e-3 * sizes) & (focals <= 1e5 * sizes)  # fields of view of 179.9 and 0.0006 degrees
     _need(path, cameras, long.all(1), "has no usable focal length", "a positive number of pixels")
-    near = (centres.abs() <= _OFF_CENTRE * sizes).all(1)
+    # Principal points at most 100 sides of the picture away from its corner.
+    near = (centres.abs() <= 100.0 * sizes).all(1)
     _need(path, cameras, near, "has its principal point far outside of the picture", "one in or near it")
     counts = Counter((int(width), int(height)) for width, height in sizes.tolist())
     width, height = max(counts, key=lambda size: (counts[size], size[0] * size[1]))

@@ -19,19 +19,10 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.camera_files.cameras import Camera, CameraFile, Motion, finite, need_count, rigid
 from pointsplat_ns.io.files import logger
 
-SYNTHETIC_SIZE = (800, 800)
-"""Width and height, pixels, of the photos of NeRF-synthetic, whose files do not say them."""
-
 _LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FISHEYE")
 """Kinds of cameras that have a focal length."""
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-
-_FLIP = (1.0, -1.0, -1.0, 1.0)
-"""Signs of the columns of a pose that turn OpenGL's axes into OpenCV's."""
-
-_OLD_APPLIED = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
-"""What nerfstudio takes for ``applied_transform`` beside a COLMAP model, if the file, of an early version, has none."""
 
 
 def nerfstudio_cameras(content: dict[str, Any], path: Path) -> CameraFile:
@@ -94,7 +85,7 @@ def _pose(rows: Any, index: int, path: Path) -> list[float]:
     flat = [
         math.nan if number is None else sign * number
         for row in numbers
-        for number, sign in zip(row, _FLIP, strict=True)
+        for number, sign in zip(row, (1.0, -1.0, -1.0, 1.0), strict=True)  # OpenGL's axes to OpenCV's
     ]
     return flat if len(rows) == 4 else [*flat, 0.0, 0.0, 0.0, 1.0]
 
@@ -108,7 +99,9 @@ def _saved_motion(content: dict[str, Any], path: Path) -> Motion:
     """What moved the original world to that of the file."""
     rows = content.get("applied_transform")
     if rows is None:
-        rows = _OLD_APPLIED if (path.parent / "colmap" / "sparse" / "0").is_dir() else torch.eye(4)[:3].tolist()
+        rows = torch.eye(4)[:3].tolist()
+        if (path.parent / "colmap" / "sparse" / "0").is_dir():  # as nerfstudio takes a file of an early version
+            rows = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
     scale = finite(content.get("applied_scale", 1.0))
     try:
         transform = torch.tensor(rows, dtype=torch.float64)
@@ -137,6 +130,6 @@ def _size_of_photos(frame: Any, path: Path) -> tuple[float, float]:
                         return opened.width, opened.height
             except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
                 continue
-    width, height = SYNTHETIC_SIZE
+    width, height = (800, 800)  # of NeRF-synthetic, whose files do not say them
     logger.info("%s: no 'w' and 'h', and no photo to measure; taken for %d x %d pixels", path, width, height)
     return width, height

@@ -20,9 +20,6 @@ ACCEPTED = "cameras.json of 3DGS, transforms.json of nerfstudio, or the folder o
 MOST_BYTES = 64_000_000
 """Maximum size of JSON: 100,000 frames have about as much."""
 
-_BYTES_OF_VALUES = 24
-"""Most memory, bytes, that a byte of JSON takes once it is read: empty lists are the worst."""
-
 
 def is_camera_file(path: Path | str) -> bool:
     """Whether a path is no run and no scene, so that it can only hold cameras. What is in a file is not looked at."""
@@ -88,7 +85,7 @@ def _json_cameras(path: Path) -> CameraFile:
     size = path.stat().st_size
     if size > MOST_BYTES:
         raise DataError(f"{path}: {size / 1e6:.0f} MB; expected cameras of at most {MOST_BYTES / 1e6:.0f} MB")
-    require_memory(path, _BYTES_OF_VALUES * size)
+    require_memory(path, 24 * size)  # most memory that a byte of JSON takes: empty lists are the worst
     try:
         content = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:

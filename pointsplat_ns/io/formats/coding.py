@@ -26,12 +26,6 @@ SATURATED = 0.25
 """Opacity bytes 0 and 255 are read as 0.25 and 254.75: in the middle of what is written as these bytes, and with a
 logit that is finite. A logit of infinity would be dropped by some programs."""
 
-FREE_BYTES = 1 << 22
-"""Decompressed content up to this size is taken from a file of any size: 200,000 Gaussians, were they all equal."""
-
-MAX_RATIO = 1032
-"""Beyond that, the largest ratio of decompressed to compressed bytes. It is deflate's own limit."""
-
 _OF_DECODERS = (
     ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError, SyntaxError, EOFError,
     NotImplementedError, RuntimeError, struct.error, zlib.error, lzma.LZMAError, zipfile.BadZipFile,
@@ -89,7 +83,8 @@ def require_plausible(path: Path, unpacked: int, packed: int, count: int, rest: 
     Raises:
         SceneError: if so.
     """
-    if unpacked > max(FREE_BYTES, MAX_RATIO * packed):
+    # From a file of any size 4 MB, 200,000 equal Gaussians; beyond that, deflate's own largest ratio.
+    if unpacked > max(1 << 22, 1032 * packed):
         raise SceneError(
             f"{path}: the header declares {count} Gaussians of {unpacked} bytes in all, more than {packed} compressed "
             "bytes can hold"

@@ -20,7 +20,6 @@ JSON_BYTES = 8192
 
 _EXTENSION = "KHR_gaussian_splatting"
 _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
-_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def glb_bytes(count: int, sh_degree: int) -> int:
@@ -46,7 +45,7 @@ def encode_glb(scene: Gaussians, progress: Progress = silent) -> bytes:
             "bufferView": len(accessors),
             "componentType": _BYTE if array.dtype == np.uint8 else _FLOAT,
             "count": len(array),
-            "type": _TYPES[array.shape[1]],
+            "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[array.shape[1]],
         }
         if array.dtype == np.uint8:
             accessor["normalized"] = True

@@ -28,9 +28,6 @@ from pointsplat_ns.io.formats.coding import (
 )
 
 _HEADER, _SECTION = 4096, 1024
-_SH_RANGE = 1.5
-"""SH of compression 2 lie within this where the header names no range."""
-
 _FLOATS = ("<f4", "<f2", "<f2")
 _MEANS = ("<f4", "<u2", "<u2")
 _SH = ("<f4", "<f2", "u1")
@@ -89,7 +86,8 @@ def read_ksplat(path: Path | str) -> Gaussians:
             found = sum(section.count for section in sections)
             raise SceneError(f"{path}: {total} Gaussians declared, {found} in its sections")
         low, high = struct.unpack_from("<ff", data, 36)
-        bounds = (low or -_SH_RANGE, high or _SH_RANGE)
+        # Where the header names no range, SH of compression 2 lie within 1.5.
+        bounds = (low or -1.5, high or 1.5)
         rest = max((section.rest for section in sections), default=0)
         require_memory(path, 2 * 4 * total * (14 + 3 * rest))
         blocks = Blocks(data, path, _HEADER + room * _SECTION)

@@ -10,19 +10,10 @@ from torch import Tensor
 LEVELS = 256
 """Entries of a codebook of numbers."""
 
-MAX_COLORS = 65_536
-"""Entries, at most, of a palette of SH; an index has 16 bits."""
-
-GROUP = 1024
-"""Gaussians per entry of a palette where there are few, and entries that palettes are multiples of."""
-
 _SAMPLE = 1 << 17
 """Numbers that a codebook is made from, and rows that the first split of a palette is made from."""
 
-_STEPS_1D, _STEPS = 20, 6
 _BRANCH, _DEPTH = 64, 6  # clusters that rows are split into, and how often
-_BINS, _PER_BIN = (64, 4096), 16
-_BLOCK = 1 << 22  # distances computed at once, 16 MB
 
 
 def codebook(values: Tensor) -> tuple[Tensor, Tensor]:
@@ -41,7 +32,7 @@ def codebook(values: Tensor) -> tuple[Tensor, Tensor]:
     if book is None:
         ordered = torch.cat([flat[:: -(-flat.numel() // _SAMPLE)], flat.amin()[None], flat.amax()[None]])
         book = _spread(ordered)
-        for _ in range(_STEPS_1D):
+        for _ in range(20):
             index = _nearest(book, ordered)
             count = torch.bincount(index, minlength=LEVELS)
             total = torch.zeros(LEVELS, dtype=torch.float64).index_add_(0, index, ordered.double())
@@ -60,7 +51,7 @@ def _spread(values: Tensor) -> Tensor:
     """256 numbers as dense as the cube root of the density of the values, which is best for the mean squared error
     where numbers are many (Panter and Dite 1951)."""
     low, high = float(values.amin()), float(values.amax())
-    bins = min(max(values.numel() // _PER_BIN, _BINS[0]), _BINS[1])
+    bins = min(max(values.numel() // 16, 64), 4096)
     density = torch.histc(values, bins, low, high).double().pow(1 / 3)
     below = torch.cat([density.new_zeros(1), density.cumsum(0)])
     wanted = (torch.arange(LEVELS, dtype=torch.float64) + 0.5) / LEVELS * below[-1]
@@ -76,8 +67,8 @@ def _nearest(book: Tensor, values: Tensor) -> Tensor:
 
 def palette_size(count: int) -> int:
     """Entries of the palette for so many Gaussians: a power of two, at most what an index reaches."""
-    size = GROUP
-    while 2 * size <= min(count, MAX_COLORS):
+    size = 1024  # Gaussians per entry where there are few
+    while 2 * size <= min(count, 65_536):  # an index has 16 bits
         size *= 2
     return size
 
@@ -152,7 +143,7 @@ def _means(rows: Tensor, k: int, generator: torch.Generator) -> Tensor:
     if len(rows) <= k:
         return rows
     centres = rows[torch.randperm(len(rows), generator=generator)[:k]].clone()
-    for _ in range(_STEPS):
+    for _ in range(6):
         index = _assign(rows, centres)
         count = torch.bincount(index, minlength=k)
         total = torch.zeros_like(centres).index_add_(0, index, rows)
@@ -164,5 +155,5 @@ def _means(rows: Tensor, k: int, generator: torch.Generator) -> Tensor:
 def _assign(rows: Tensor, centres: Tensor) -> Tensor:
     """Index (N,) of the centre nearest to each row."""
     half = 0.5 * centres.square().sum(dim=1)
-    step = max(_BLOCK // len(centres), 1)
+    step = max((1 << 22) // len(centres), 1)  # distances at once, 16 MB
     return torch.cat([(half - part @ centres.T).argmin(dim=1) for part in rows.split(step)])

@@ -42,9 +42,6 @@ from pointsplat_ns.system.progress import Progress, silent
 MAX_SIDE = 16_383
 """Pixels of a side of a WebP image, at most."""
 
-LOWEST_LOG_SCALE = -30.0
-"""Log-scales below this, such as those of flat axes, are written as this."""
-
 _ACROSS = 64  # palette entries in one row of pixels
 _LARGEST = 252  # alpha of a quaternion's pixel is this plus the index of its largest component
 
@@ -211,7 +208,7 @@ def _parts(scene: Gaussians, progress: Progress) -> dict[str, bytes]:
     mins, maxs = (logs.min(axis=0), logs.max(axis=0)) if n else (np.zeros(3), np.zeros(3))
     span = np.where(maxs > mins, maxs - mins, 1.0)
     steps = np.rint((logs - mins) / span * 65535).astype(np.int64)
-    scales, scale_index = codebook(scene.scales.clamp_min(LOWEST_LOG_SCALE))
+    scales, scale_index = codebook(scene.scales.clamp_min(-30.0))  # as of flat axes
     colors, color_index = codebook(scene.features_dc)
     largest, others = smallest_three(unit_quats(scene))
     meta: dict[str, Any] = {

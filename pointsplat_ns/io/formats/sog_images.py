@@ -20,12 +20,6 @@ PARTS = tuple(
 )
 """Names of the images that are written; a scene without SH has no shN."""
 
-MAX_META_BYTES = 1 << 22
-"""A meta.json has about 20 kB."""
-
-_SPARE = 1 << 16
-"""Pixels that an image may have beyond four times as many as are needed; some programs round sides up."""
-
 
 class Images:
     """The parts of one SOG file.
@@ -65,7 +59,7 @@ class Images:
 
     def meta(self) -> dict[str, Any]:
         """The content of ``meta.json``."""
-        content = json.loads(self._bytes(META, MAX_META_BYTES))
+        content = json.loads(self._bytes(META, 1 << 22))  # one has about 20 kB
         if not isinstance(content, dict):
             raise SceneError(f"{self.path}: {META} holds a {type(content).__name__}; expected an object")
         return content
@@ -88,7 +82,7 @@ class Images:
 
         if not isinstance(name, str) or PurePosixPath(name).name != name or "\\" in name:
             raise SceneError(f"{self.path}: an image called {name!r}; expected the name of a file beside {META}")
-        most = 4 * least + _SPARE
+        most = 4 * least + (1 << 16)  # some programs round sides up
         data = self._bytes(name, 4 * most)
         across, down = webp_size(data)  # opening an image takes the memory of its pixels already
         if across * down < least or across * down > most or width not in (None, across):

@@ -48,10 +48,7 @@ SH_BITS = (6, 5)
 own programs keep 5 and 4, in a file a seventh smaller."""
 
 _MAGIC = b"NGSP"
-_GZIP = b"\x1f\x8b"
 _HEADER = struct.Struct("<4sIIBBBB")  # magic, version, Gaussians, SH degree, bits after the point, flags, streams
-_HEADER_4 = 32
-_ANTIALIASED, _EXTENDED = 1, 2
 _COLOR_SCALE = 0.15
 _XYZW = np.array([1, 2, 3, 0])  # SPZ has w last
 
@@ -88,15 +85,15 @@ def read_spz(path: Path | str) -> Gaussians:
     path = require_file(path, "an SPZ file")
     with damage_named(path, "SPZ"):
         data = load_bytes(path)
-        if data[:2] == _GZIP:
+        if data[:2] == b"\x1f\x8b":
             head, parts = _parts_of_gzip(data, path)
         elif data[:4] == _MAGIC:
             head, parts = _parts_of_zstd(data, path)
         else:
             raise SceneError(f"{path}: not an SPZ file (starts with {data[:4]!r}); expected gzip or {_MAGIC!r}")
-        if head.flags & _ANTIALIASED:
+        if head.flags & 1:  # antialiased
             warn_antialiased(path)
-        if head.flags & _EXTENDED:
+        if head.flags & 2:  # extended
             logger.warning("%s: not read: the extensions of the SPZ file", path)
         if head.degree > MAX_SH_DEGREE:
             logger.warning("%s: SH degree %d, read up to degree %d", path, head.degree, MAX_SH_DEGREE)
@@ -144,7 +141,7 @@ def encode_spz(
         progress("compressing", index / len(parts))
         streams.append(ZstdCompressor(level=12).compress(part))
     head = _HEADER.pack(_MAGIC, 4, n, scene.sh_degree, bits, flags, len(parts))
-    head += struct.pack("<I12x", _HEADER_4)
+    head += struct.pack("<I12x", 32)  # where the table of sizes begins
     table = b"".join(struct.pack("<QQ", len(s), len(p)) for s, p in zip(streams, parts, strict=True))
     return b"".join([head, table, *streams])
 
@@ -206,7 +203,7 @@ def _parts_of_zstd(data: bytes, path: Path) -> tuple[_Head, list[bytes | memoryv
     require_plausible(path, sum(head.sizes), len(data), head.count, (head.degree + 1) ** 2 - 1)
     sizes = [size for size in head.sizes if size]
     table = int(Blocks(data, path, _HEADER.size).take("<u4", 1)[0])
-    if head.streams != len(sizes) or table < _HEADER_4:
+    if head.streams != len(sizes) or table < 32:
         raise SceneError(
             f"{path}: {head.streams} streams listed at byte {table}; expected {len(sizes)} from byte 32 on"
         )

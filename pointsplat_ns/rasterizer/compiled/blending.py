@@ -22,12 +22,6 @@ from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
 from pointsplat_ns.rasterizer.tiles import Footprints, TileList
 from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
 
-MOST_CHANNELS = 4
-"""Channels that the kernels are made for: colours and depth."""
-
-_GEOMETRY = 6
-"""Columns of the table in front of the colours."""
-
 _FEW_PAIRS = 2000
 """Pairs that one thread blends sooner than several can be asked."""
 
@@ -75,7 +69,8 @@ def can_blend(colors: Tensor, wanted: bool | None) -> bool:
         colors: of the projected Gaussians.
         wanted: None where a machine without a compiler is no reason for a warning.
     """
-    return 1 <= colors.shape[1] <= MOST_CHANNELS and KERNELS.usable_for(wanted, colors)
+    # The kernels are made for colours and depth.
+    return 1 <= colors.shape[1] <= 4 and KERNELS.usable_for(wanted, colors)
 
 
 def inputs_of(
@@ -84,7 +79,8 @@ def inputs_of(
     """As :meth:`~pointsplat_ns.rasterizer.frame.Inputs.of`, without what only torch needs."""
     count, channels = colors.shape
     tensors = [tensor.contiguous() for tensor in (means2d, cov2d, det, opacities, colors)]
-    table, next_row = colors.new_empty(count, _GEOMETRY + channels), torch.zeros(1, dtype=torch.int64)
+    # Six columns of geometry, then the colours.
+    table, next_row = colors.new_empty(count, 6 + channels), torch.zeros(1, dtype=torch.int64)
     on_threads(
         count >= _FEW_PAIRS, KERNELS.library.pointsplat_tabulate, *(tensor.data_ptr() for tensor in tensors), count,
         channels, table.data_ptr(), next_row.data_ptr(),

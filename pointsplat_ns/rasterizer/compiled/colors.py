@@ -16,9 +16,6 @@ from torch.autograd.function import once_differentiable
 from pointsplat_ns.rasterizer.spherical_harmonics import Color
 from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
 
-_SEVERAL = 4000
-"""Gaussians from which on more than one thread is asked."""
-
 
 class _Colors(ctypes.Structure):
     """``struct Colors`` of the kernels."""
@@ -109,7 +106,8 @@ def _task(
 def _call(task: _Colors) -> None:
     next_range = torch.zeros(1, dtype=torch.int64)
     task.next = next_range.data_ptr()
-    on_threads(task.count >= _SEVERAL, KERNELS.library.pointsplat_color, ctypes.byref(task))
+    # Fewer are drawn sooner by one thread.
+    on_threads(task.count >= 4000, KERNELS.library.pointsplat_color, ctypes.byref(task))
 
 
 def _as_torch() -> bool:

@@ -21,9 +21,6 @@ from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
 _SEVERAL = 4
 """Ranges of Gaussians from which on more than one thread is asked."""
 
-_SUMS = 12
-"""Sums for the gradient of the camera: of its rotation by rows, then of its centre."""
-
 
 class _Camera(ctypes.Structure):
     """``struct Camera`` of the kernels."""
@@ -168,7 +165,8 @@ class CompiledProject(torch.autograd.Function):
         out = [torch.empty_like(t) if n else None for t, n in zip(scene, ctx.needs_input_grad, strict=False)]
         ranges = -(-scene[0].shape[0] // library.pointsplat_range())
         of_camera = any(ctx.needs_input_grad[4:6])
-        sums = torch.empty(ranges, _SUMS, dtype=torch.float64) if of_camera else None
+        # Of the camera's rotation by rows, then of its centre.
+        sums = torch.empty(ranges, 12, dtype=torch.float64) if of_camera else None
         next_range = torch.zeros(1, dtype=torch.int64)
 
         def pointer(tensor: Tensor | None) -> int | None:

@@ -17,9 +17,6 @@ from pointsplat_ns.rasterizer.constants import ALPHA_MIN, SLACK
 from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, Pairs, Region
 from pointsplat_ns.system.kernels import Kernels, on_threads
 
-_SEVERAL = 4000
-"""Gaussians from which on more than one thread is asked."""
-
 
 class _Grid(ctypes.Structure):
     """``struct Grid`` of the kernels."""
@@ -96,7 +93,8 @@ def ellipses_of(
         _Grid.of(grid), _Ellipses.of(found), *(tensor.data_ptr() for tensor in given), alpha_min,
         next_range.data_ptr(),
     )  # fmt: skip
-    on_threads(len(order) >= _SEVERAL, KERNELS.library.pointsplat_ellipses, ctypes.byref(task))
+    # Fewer are done sooner by one thread.
+    on_threads(len(order) >= 4000, KERNELS.library.pointsplat_ellipses, ctypes.byref(task))
     return found
 
 
@@ -113,7 +111,7 @@ def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> Pairs:
         _Grid.of(grid), _Ellipses.of(ellipses), *region, tiles, starts.data_ptr(), strips.data_ptr(),
         counts.data_ptr(), offsets.data_ptr(), next=next_range.data_ptr(),
     )  # fmt: skip
-    on_threads(count >= _SEVERAL, library.pointsplat_strips, ctypes.byref(task))
+    on_threads(count >= 4000, library.pointsplat_strips, ctypes.byref(task))  # fewer are done sooner by one thread
     library.pointsplat_count(ctypes.byref(task))
     offsets = torch.cumsum(offsets, 0)
     gaussians, places = (offsets.new_empty(int(offsets[-1])) for _ in range(2))
