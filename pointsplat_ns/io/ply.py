@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
@@ -23,12 +22,15 @@ from pointsplat_ns.io.ply_header import Element, Header, read_header, warn_rende
 CHUNK_ROWS = 16384
 """Rows copied at a time, about 4 MB: small enough for the processor's cache."""
 
-_MEANS = ["x", "y", "z"]
-_NORMALS = ["nx", "ny", "nz"]
-_DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
-_OPACITY = ["opacity"]
-_SCALES = ["scale_0", "scale_1", "scale_2"]
-_QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
+_COLUMNS = {
+    "means": ["x", "y", "z"],
+    "normals": ["nx", "ny", "nz"],
+    "features_dc": ["f_dc_0", "f_dc_1", "f_dc_2"],
+    "opacities": ["opacity"],
+    "scales": ["scale_0", "scale_1", "scale_2"],
+    "quats": ["rot_0", "rot_1", "rot_2", "rot_3"],
+}
+"""Vertex properties of the attributes; normals are written as zeros and not read."""
 
 _FILE_DEGREES = (0, 1, 2, 3, 4)
 """SH degrees that files have. Of degree 4, the highest band is not read."""
@@ -90,17 +92,10 @@ def write_ply(scene: Gaussians, path: Path | str) -> None:
 
     scene = keep_usable(scene.detach().to("cpu", torch.float32), path)
     rest = scene.features_rest.transpose(1, 2).reshape(len(scene), 3 * scene.features_rest.shape[1])
-    columns: list[tuple[list[str], Tensor]] = [
-        (_MEANS, scene.means),
-        (_NORMALS, torch.zeros_like(scene.means)),
-        (_DC, scene.features_dc),
-        (_rest_names(rest.shape[1]), rest),
-        (_OPACITY, scene.opacities),
-        (_SCALES, scene.scales),
-        (_QUATS, scene.quats),
-    ]
-    names = [name for group, _ in columns for name in group]
-    table = torch.cat([values for _, values in columns], dim=1).numpy().astype("<f4", copy=False)
+    values = [scene.means, torch.zeros_like(scene.means), scene.features_dc, rest]
+    values += [scene.opacities, scene.scales, scene.quats]
+    names = _column_names(rest.shape[1])
+    table = torch.cat(values, dim=1).numpy().astype("<f4", copy=False)
     rows = np.ascontiguousarray(table).view([(name, "<f4") for name in names]).reshape(len(scene))
     with replacing(path, ply_bytes(len(scene), scene.sh_degree)) as part:
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(part))
@@ -110,7 +105,7 @@ def ply_bytes(count: int, sh_degree: int) -> int:
     """Size of the 3DGS PLY of ``count`` Gaussians, bytes: an ASCII header, then 17 numbers a Gaussian (normals
     included) and three for each SH coefficient beyond the constant one, as float32."""
     rest = 3 * ((sh_degree + 1) ** 2 - 1)
-    names = [*_MEANS, *_NORMALS, *_DC, *_rest_names(rest), *_OPACITY, *_SCALES, *_QUATS]
+    names = _column_names(rest)
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     lines += [f"property float {name}" for name in names] + ["end_header"]
     return sum(len(line) + 1 for line in lines) + 4 * len(names) * count
@@ -118,6 +113,12 @@ def ply_bytes(count: int, sh_degree: int) -> int:
 
 def _rest_names(count: int) -> list[str]:
     return [f"f_rest_{i}" for i in range(count)]
+
+
+def _column_names(rest: int) -> list[str]:
+    """All vertex properties in the order of files, with so many of SH beyond the constant one."""
+    names = [*_COLUMNS["means"], *_COLUMNS["normals"], *_COLUMNS["features_dc"], *_rest_names(rest)]
+    return [*names, *_COLUMNS["opacities"], *_COLUMNS["scales"], *_COLUMNS["quats"]]
 
 
 class _GaussiansAlone(io.FileIO):
@@ -159,7 +160,7 @@ def _gaussian_element(header: Header, path: Path) -> Element:
 
 def _report_unread(header: Header, vertex: Element, path: Path) -> None:
     """Warn of what a file holds beside the Gaussians."""
-    known = {*_MEANS, *_NORMALS, *_DC, *_OPACITY, *_SCALES, *_QUATS}
+    known = {name for names in _COLUMNS.values() for name in names}
     others = [name for name, _ in vertex.properties if name not in known and not name.startswith("f_rest_")]
     unread = [f"the vertex properties {', '.join(others[:4])}{'...' if len(others) > 4 else ''}"] if others else []
     unread += [f"the element {element.name!r}" for element in header.elements if element != vertex and element.count]
@@ -183,12 +184,12 @@ def _num_rest(vertex: Element, path: Path) -> int:
     present = {name for name, _ in vertex.properties}
     if "packed_position" in present:
         raise SceneError(f"{path}: a compressed PLY (property 'packed_position'); expected a plain one")
-    if {*_SCALES[:2], *_OPACITY} <= present and _SCALES[2] not in present:
+    if {"scale_0", "scale_1", "opacity"} <= present and "scale_2" not in present:
         raise SceneError(
             f"{path}: lacks the vertex property 'scale_2', as 2D Gaussians (2DGS) do; expected 3D Gaussians"
         )
     rest = sorted(int(name[7:]) for name in present if re.fullmatch(r"f_rest_(0|[1-9]\d{0,5})", name))
-    required = [*_MEANS, *_DC, *_OPACITY, *_SCALES, *_QUATS]
+    required = [name for attribute, names in _COLUMNS.items() if attribute != "normals" for name in names]
     counts = [3 * ((degree + 1) ** 2 - 1) for degree in _FILE_DEGREES]
     if rest and rest[-1] + 1 in counts:
         required += _rest_names(rest[-1] + 1)
@@ -210,11 +211,7 @@ def _scene(rows: np.ndarray, k: int, in_file: int) -> Gaussians:
     from numpy.lib.recfunctions import structured_to_unstructured
 
     columns = {
-        "means": _MEANS,
-        "scales": _SCALES,
-        "quats": _QUATS,
-        "opacities": _OPACITY,
-        "features_dc": _DC,
+        **{name: _COLUMNS[name] for name in ("means", "scales", "quats", "opacities", "features_dc")},
         # Channel-major in the file, channel last in a scene.
         "features_rest": [f"f_rest_{channel * in_file + i}" for i in range(k) for channel in range(3)],
     }

@@ -18,31 +18,26 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.quaternions import zero_as_identity
 from pointsplat_ns.refiner.sparse_ops import permute
 
-TRIM = 0.01
-"""Share of the positions at each end of each axis that are not part of the scene's core."""
 
-TRIM_FROM = 8
-"""Least number of Gaussians for which positions are trimmed: of fewer, an outlier cannot be recognised."""
+@dataclass(frozen=True)
+class InputRanges:
+    """What brings the network's input to order 1. Trained weights depend on these numbers."""
 
-MARGIN = 0.5
-"""How far the box may reach beyond the core, as a share of the core's longest side."""
+    opacity_limit: float = 12.0
+    """Opacity logits are clamped to this either way: beyond, opacity is 0 or 1 within 1e-5."""
+    opacity_unit: float = 4.0
+    """Opacity logits are divided by this."""
+    log_scale_centre: float = -5.0
+    """Typical log of a standard deviation in the unit cube: 4 cm in a room of 6 m."""
+    log_scale_unit: float = 2.0
+    """Log-scales, centred, are divided by this."""
+    log_scale_limit: float = 6.0
+    """Then they are clamped to this either way."""
+    sh_limit: float = 8.0
+    """SH coefficients are clamped to this either way; displayable colours need no more than 1.8."""
 
-LOGIT_LIMIT = 12.0
-"""Opacity logits are clamped to this either way: beyond, opacity is 0 or 1 within 1e-5."""
 
-LOGIT_UNIT = 4.0
-"""Opacity logits are divided by this, which brings their usual range to about 1."""
-
-LOG_SCALE_CENTRE = -5.0
-"""Typical log of a standard deviation in the unit cube: 4 cm in a room of 6 m."""
-
-LOG_SCALE_UNIT = 2.0
-"""Log-scales, centred, are divided by this and clamped to :data:`LOG_SCALE_LIMIT` either way."""
-
-LOG_SCALE_LIMIT = 6.0
-
-SH_LIMIT = 8.0
-"""SH coefficients are clamped to this either way; displayable colours need no more than 1.8."""
+RANGES = InputRanges()
 
 
 @dataclass(frozen=True)
@@ -78,10 +73,10 @@ def unit_cube(means: Tensor) -> UnitCube:
     """
     axes = means.detach().T.contiguous()  # [3, N]
     n = axes.shape[1]
-    trim = max(1, math.ceil(TRIM * n)) if n >= TRIM_FROM else 0
+    trim = max(1, math.ceil(0.01 * n)) if n >= 8 else 0
     low, high = (value.double() for value in axes.aminmax(dim=1))
     core_low, core_high = (axes.kthvalue(k, dim=1).values.double() for k in (trim + 1, n - trim))
-    reach = MARGIN * (core_high - core_low).max()
+    reach = 0.5 * (core_high - core_low).max()
     if reach > 0:
         low, high = torch.maximum(low, core_low - reach), torch.minimum(high, core_high + reach)
     extent = (high - low).max()
@@ -114,15 +109,17 @@ def gaussian_features(scene: Gaussians, cube: UnitCube, num_rest: int, dtype: to
         num_rest: coefficients a channel that the network reads beyond the constant one.
         dtype: floating type of the network.
     """
-    log_scales = (cube.log_scales(scene.scales) - LOG_SCALE_CENTRE) / LOG_SCALE_UNIT
+    log_scale_limit, sh_limit = RANGES.log_scale_limit, RANGES.sh_limit
+    log_scales = (cube.log_scales(scene.scales) - RANGES.log_scale_centre) / RANGES.log_scale_unit
+    logits = scene.opacities.clamp(-RANGES.opacity_limit, RANGES.opacity_limit) / RANGES.opacity_unit
     quats, quat_scale = canonical_quats(scene.quats)
-    rest = scene.features_rest.flatten(1).clamp(-SH_LIMIT, SH_LIMIT).to(dtype)
+    rest = scene.features_rest.flatten(1).clamp(-sh_limit, sh_limit).to(dtype)
     return Features(
         positions=cube.positions(scene.means).to(dtype),
         quats=quats.to(dtype),
-        scales=log_scales.clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).to(dtype),
-        opacities=(scene.opacities.clamp(-LOGIT_LIMIT, LOGIT_LIMIT) / LOGIT_UNIT).to(dtype),
-        features_dc=scene.features_dc.clamp(-SH_LIMIT, SH_LIMIT).to(dtype),
+        scales=log_scales.clamp(-log_scale_limit, log_scale_limit).to(dtype),
+        opacities=logits.to(dtype),
+        features_dc=scene.features_dc.clamp(-sh_limit, sh_limit).to(dtype),
         features_rest=torch.nn.functional.pad(rest, (0, 3 * num_rest - rest.shape[1])),
         quat_scale=quat_scale,
     )

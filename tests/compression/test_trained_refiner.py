@@ -100,14 +100,6 @@ def test_a_run_is_a_refiner_too(make_refined_run, tmp_path):
     assert same(loaded(scene), scene.replace(opacities=scene.opacities + 0.5))
 
 
-def test_a_run_from_before_the_method_was_called_by_is_read(make_refined_run, tmp_path):
-    run = make_refined_run(tmp_path, tmp_path / "nowhere", keep=0.25, by="opacity")
-    text = (run / "config.yml").read_text()
-    assert "\n    by: opacity\n" in text
-    (run / "config.yml").write_text(text.replace("\n    by: opacity\n", "\n    score: opacity\n"))
-    assert load_refiner(run).settings == PruneSettings(0.25, "opacity")
-
-
 def test_anything_else_is_no_refiner(tmp_path):
     (tmp_path / "scene.ply").touch()
     with pytest.raises(WeightsError, match="scene.ply: a .ply file; expected a trained pointsplat run"):

@@ -28,12 +28,8 @@ from pointsplat_ns.io.formats.coding import (
 )
 
 _HEADER, _SECTION = 4096, 1024
-_FLOATS = ("<f4", "<f2", "<f2")
-_MEANS = ("<f4", "<u2", "<u2")
-_SH = ("<f4", "<f2", "u1")
-_STEPS = (1, 32767, 32767)
-MAX_DEGREE = 2
-"""Highest SH degree of the format."""
+_TYPES = {"means": ("<f4", "<u2", "<u2"), "floats": ("<f4", "<f2", "<f2"), "sh": ("<f4", "<f2", "u1")}
+"""Types of numbers by compression, 0 to 2."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +96,7 @@ def _section(data: bytes, index: int, compression: int, path: Path) -> _Section:
     count, capacity, size, buckets, block, stored, steps, full, partial, degree = struct.unpack_from(
         "<IIIIfH2xI4xIIH", data, _HEADER + index * _SECTION
     )
-    if degree > MAX_DEGREE or count > capacity:
+    if degree > 2 or count > capacity:
         raise SceneError(
             f"{path}: a section of SH degree {degree} with {count} of {capacity} Gaussians; expected degree 0 to 2"
         )
@@ -108,7 +104,9 @@ def _section(data: bytes, index: int, compression: int, path: Path) -> _Section:
         raise SceneError(
             f"{path}: {buckets} buckets of {stored} bytes, {full} full and {partial} partly; expected 12 bytes each"
         )
-    return _Section(count, capacity, size, buckets, block, stored, steps or _STEPS[compression], full, partial, degree)
+    return _Section(
+        count, capacity, size, buckets, block, stored, steps or (32767 if compression else 1), full, partial, degree
+    )
 
 
 def _decode(
@@ -118,11 +116,11 @@ def _decode(
     stored = blocks.take("u1", section.buckets, section.bucket_bytes)
     row = np.dtype(
         [
-            ("means", _MEANS[compression], 3),
-            ("stds", _FLOATS[compression], 3),
-            ("quats", _FLOATS[compression], 4),
+            ("means", _TYPES["means"][compression], 3),
+            ("stds", _TYPES["floats"][compression], 3),
+            ("quats", _TYPES["floats"][compression], 4),
             ("rgba", "u1", 4),
-            ("sh", _SH[compression], (3 * section.rest,)),
+            ("sh", _TYPES["sh"][compression], (3 * section.rest,)),
         ]
     )
     rows = blocks.take(row, section.capacity)[: section.count]
