@@ -16,7 +16,6 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_depth, read_photo
 from pointsplat_ns.rooms import capture_path, default_intrinsics, make_room, render_room, write_room
 from pointsplat_ns.rooms.raycast import chart_points, trace
-from pointsplat_ns.rooms.textures import Canvas
 
 pytestmark = pytest.mark.xdist_group("rooms")  # one worker computes the light of each room for all tests of this file
 
@@ -90,29 +89,6 @@ def test_depth_is_the_distance_to_the_walls_along_the_optical_axis(room):
     assert wall.float().mean() > 0.1 and float(z.max()) <= depth / 2 + 1e-4
 
 
-def test_matte_surfaces_keep_their_colour_from_view_to_view(room, poses):
-    first, second = 4, 6
-    color_a, depth_a = picture(room, poses[first], highlights=False)
-    color_b, depth_b = picture(room, poses[second], highlights=False)
-    K = default_intrinsics(WIDTH, HEIGHT)
-    there = (unproject(poses[first], depth_a) - poses[second][:3, 3]) @ poses[second][:3, :3]
-    z = there[:, 2]
-    safe = z.clamp(min=0.1)
-    u, v = there[:, 0] / safe * K[0, 0] + K[0, 2], there[:, 1] / safe * K[1, 1] + K[1, 2]
-    inside = (z > 0.1) & (u > 1) & (u < WIDTH - 1) & (v > 1) & (v < HEIGHT - 1)
-    grid = torch.stack([u / WIDTH * 2 - 1, v / HEIGHT * 2 - 1], dim=-1)[None, None]
-
-    def look(image):
-        sampled = torch.nn.functional.grid_sample(image[None], grid, align_corners=False)
-        return sampled[0, :, 0].T
-
-    seen = inside & ((look(depth_b[None])[:, 0] - z).abs() < 0.02 * z)
-    assert int(seen.sum()) > 0.3 * WIDTH * HEIGHT
-    error = (look(color_b.permute(2, 0, 1)) - color_a.reshape(-1, 3)).abs().mean(dim=-1)[seen]
-    # Interpolating a picture blurs its edges; elsewhere colours agree to a few grey levels.
-    assert float(error.median()) < 0.02 and float(error.mean()) < 0.05
-
-
 def test_highlights_brighten_only_and_move_with_the_viewer(room, poses):
     peaks = []
     for k in range(0, 40, 4):
@@ -137,9 +113,8 @@ def clearance(room, points):
     return torch.minimum(walls, offset.clamp(min=0).norm(dim=-1).amin(dim=-1))
 
 
-@pytest.mark.parametrize("seeds", [range(6), range(6, 40)])
-def test_cameras_keep_clear_of_furniture_move_smoothly_and_look_level(seeds):
-    for seed in seeds:
+def test_cameras_keep_clear_of_furniture_move_smoothly_and_look_level():
+    for seed in range(40):
         room = make_room(seed)
         poses = capture_path(room, 80, seed)
         assert float(clearance(room, poses[:, :3, 3]).min()) >= 0.3, seed
@@ -154,15 +129,9 @@ def test_cameras_keep_clear_of_furniture_move_smoothly_and_look_level(seeds):
         assert float(poses[:, 2, 3].max() - poses[:, 2, 3].min()) > 0.25
 
 
-@pytest.mark.parametrize("frames", [2, 6, 7])
-def test_a_path_has_the_frames_that_were_asked_for(room, frames):
-    assert capture_path(room, frames, 3).shape == (frames, 4, 4)
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-def test_the_walk_sees_nearly_all_of_the_shell_from_several_places(seed):
-    room = make_room(seed)
-    poses = capture_path(room, 80, seed)
+def test_the_walk_sees_nearly_all_of_the_shell_from_several_places():
+    room = make_room(1)
+    poses = capture_path(room, 80, 1)
     width, height = 64, 48
     K = default_intrinsics(width, height)
     v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
@@ -196,25 +165,6 @@ def test_pictures_are_neither_black_nor_blown_out_and_have_texture(seed):
         assert torch.isfinite(depth).all() and float(depth.min()) > 0.1
 
 
-def test_walls_hide_what_is_behind_them(room, poses):
-    farthest = float(torch.tensor(room.size).norm())
-    for pose in poses[::8]:
-        depth = picture(room, pose)[1]
-        points = unproject(pose, depth)
-        half = torch.tensor(room.size) / 2
-        assert torch.all((points - room.solids.center[0]).abs() <= half + 1e-4)
-        assert float(depth.max()) < farthest
-
-
-def test_every_material_paints_colours_in_range():
-    for seed in range(6):
-        room = make_room(seed)
-        for number, material in enumerate(room.materials):
-            image = material.paint(Canvas(0.8, 0.5, 40, 25, seed=number))
-            assert image.shape == (25, 40, 3) and np.isfinite(image).all()
-            assert image.min() >= -1e-6 and image.max() < 1.5
-
-
 def test_pictures_hang_on_walls_the_right_way_round(room):
     # On the inner side of each wall: a larger v is lower, a larger u further right for who faces it.
     for face in range(4):
@@ -233,6 +183,8 @@ def test_a_written_room_reads_back_as_a_replica_scene_without_a_warning(written,
     assert scene.params.principal_point() == (32.0, 24.0)
     assert {p.name for p in written.iterdir()} == {"results", "traj.txt", "cam_params.json"}
     room = room_of(1)
+    camera = json.loads((written / "cam_params.json").read_text())["camera"]
+    assert (camera["cx"], camera["cy"], camera["scale"]) == (31.5, 23.5, 6553.5)  # Replica's own convention
     expected = capture_path(room, 6, 1)
     assert np.allclose(scene.poses, expected.numpy(), atol=1e-6)  # nine digits, then made orthonormal
     rgb, depth = render_room(room, expected[2], default_intrinsics(64, 48), 64, 48)
@@ -274,11 +226,6 @@ def test_impossible_requests_are_refused_in_one_line(tmp_path):
         make_room(-1)
     with pytest.raises(DataError, match="at least 2 frames"):
         write_room(tmp_path / "r", 0, frames=1)
-
-
-def test_camera_file_states_replicas_own_convention(written):
-    camera = json.loads((written / "cam_params.json").read_text())["camera"]
-    assert (camera["cx"], camera["cy"], camera["scale"]) == (31.5, 23.5, 6553.5)
 
 
 @pytest.mark.parametrize("place", ["/proc/room", "/dev/null/room", "file/room", "x" * 256, "x" * 300 + "/room"])
