@@ -138,7 +138,7 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None) -> It
 
 
 def _require_space(path: Path, folder: Path, size: int) -> None:
-    """Refuse to begin with what the disk has no room for. Beside it, what is replaced stays until the end.
+    """Refuse to write a file that the disk has no room for. A file that it replaces stays until the end.
 
     Raises:
         SceneError: if there is less than ``size`` bytes.
@@ -152,7 +152,7 @@ def _require_space(path: Path, folder: Path, size: int) -> None:
 
 
 def lack_of_room(error: OSError, part: Path | None) -> str:
-    """What to add to an error of a file, or of a folder of files, for which the disk has no room; else nothing.
+    """Hint for an error of a file or a folder if the disk has no room for it; else an empty text.
 
     Args:
         error: of writing it.

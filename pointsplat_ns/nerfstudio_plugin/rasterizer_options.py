@@ -39,7 +39,7 @@ class RasterizerOptions:
         }
 
     def engine(self, device: torch.device) -> str:
-        """What draws, in a line for the log."""
+        """Name of the rasterizer in use, a line for the log."""
         if self.backend != "torch" and use_gsplat(self.backend, device):
             return "rasterizer: gsplat"
         if device.type != "cpu":

@@ -172,7 +172,7 @@ class StoppableTrainer(Trainer):
                     other.unlink()
 
     def state_to_resume(self) -> dict[str, Any]:
-        """What the training depends on beside weights, optimisers and schedules; nothing by default."""
+        """State of the training beside weights, optimisers and schedules; empty by default."""
         return {}
 
     @contextmanager

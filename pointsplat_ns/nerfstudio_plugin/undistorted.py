@@ -76,7 +76,7 @@ class UndistortedDataset(InputDataset):
         return data
 
     def _pinholes(self) -> Cameras:
-        """What is left of the cameras (C,) when their lenses are undone."""
+        """Pinhole cameras (C,) of undistorted photos."""
         cameras = self.lens_cameras
         lenses = _has_lens(cameras)
         if not lenses.any():

@@ -51,7 +51,7 @@ _SIZE = (960, 600)
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """Where scenes of one place are looked at from."""
+    """Views that scenes of one place are looked at from."""
 
     centre: Tensor  # [3] float64, of the content, scene units
     size: float  # of the content, scene units
@@ -105,7 +105,7 @@ class Stage:
         return {"name": name, "amount": f"{len(scene):,} Gaussians, {megabytes:.2f} MB as .ply", "spz": spz}
 
     def data(self, packed: Sequence[dict[str, str]]) -> dict[str, Any]:
-        """What ``flight.js`` reads.
+        """Data for ``flight.js``.
 
         Args:
             packed: what :meth:`packed` gives of one or two scenes; the first is shown on the left.
@@ -133,7 +133,7 @@ def _eyes(views: Views) -> Tensor:
 
 
 def _in_picture(points: Tensor, views: Views) -> Tensor:
-    """How many of some points (N, 3), at most a few thousand of them, views (C) have in their pictures, (C,)."""
+    """Number of points (N, 3) in the picture of each view, (C,); at most a few thousand points are counted."""
     points = points[:: max(1, len(points) // 4096)]
     x, y, z = (views.viewmats[:, :3, :3] @ points.T + views.viewmats[:, :3, 3:]).unbind(1)
     u = x / z * views.Ks[:, 0, :1] + views.Ks[:, 0, 2:]

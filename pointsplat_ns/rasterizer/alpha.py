@@ -45,7 +45,7 @@ def alphas_(log2_alpha: Tensor, alpha_min: float, may_clamp: bool = True) -> Ten
 
 
 def is_clamped(alpha: Tensor) -> Tensor:
-    """Where alpha is held at ALPHA_MAX: it has no gradient there."""
+    """Mask of alpha that is clamped to ALPHA_MAX, where it has no gradient."""
     return alpha >= CLAMPED
 
 

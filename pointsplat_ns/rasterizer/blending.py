@@ -34,7 +34,7 @@ def bytes_per_pair(colors: Tensor) -> int:
 
 
 def engine_of(colors: Tensor, compiled: bool | None) -> ModuleType:
-    """What blends colours (M, D): the module with ``inputs_of``, ``blend_region``, ``differentiate_region`` and
+    """The module that blends colours (M, D), with ``inputs_of``, ``blend_region``, ``differentiate_region`` and
     ``chain``."""
     return compiled_blending if compiled_blending.can_blend(colors, compiled) else blocks
 

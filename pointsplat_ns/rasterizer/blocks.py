@@ -23,7 +23,7 @@ inputs_of = Inputs.of
 
 
 class Tape(NamedTuple):
-    """What the backward pass needs of the forward pass."""
+    """Results of the forward pass that the backward pass needs."""
 
     frame: Frame
     chunks: list[list[Chunk]]  # by block

@@ -37,7 +37,7 @@ BLENDED_AT_ONCE = 16
 
 @dataclass(frozen=True)
 class Quality:
-    """What is given up for speed."""
+    """Thresholds that trade accuracy for speed."""
 
     alpha_min: float = ALPHA_MIN
     """A Gaussian is not drawn on a pixel where its alpha is lower."""

@@ -49,7 +49,7 @@ def _sums_behind(terms: Tensor, behind: Tensor, out: Tensor) -> Tensor:
 
 
 def _pass_chunk(inputs: Inputs, pairs: Quadratics, before: Tensor, work: WorkArrays) -> tuple[Tensor, Tensor, Tensor]:
-    """What forward and backward pass compute alike, in the work arrays 0, 1 and that of the transmittances.
+    """Alpha and transmittance of a chunk, for both passes, in the work arrays 0, 1 and that of the transmittances.
 
     Returns:
         Alphas and 1 - alpha (B, S, 64), and transmittances as if no pixel were ever finished (B, S + 1, 64).

@@ -40,7 +40,7 @@ class Grid(NamedTuple):
 
 
 class Ellipses(NamedTuple):
-    """What tells the tiles of each Gaussian, in depth order."""
+    """Ellipses of the Gaussians in depth order, from which their tiles follow."""
 
     order: Tensor  # [M] int64, rows of the projected Gaussians
     cameras: Tensor  # [M] int64

@@ -25,7 +25,7 @@ MEMORY_BUDGET = 2**31
 
 
 class BlendOptions(NamedTuple):
-    """How to blend."""
+    """Options of blending."""
 
     quality: Quality = EXACT
     compiled: bool | None = None
@@ -47,7 +47,7 @@ class Tiles(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """What the backward pass keeps of one chunk of one block."""
+    """Tensors of one chunk of one block that the backward pass needs."""
 
     tiles: Tiles
     rows: Tensor | None  # [B] which tiles of the block are left; None while all are
@@ -91,7 +91,7 @@ class Frame:
 
 
 class Inputs(NamedTuple):
-    """What is blended."""
+    """Projected Gaussians to blend."""
 
     table: Tensor  # [M + 1, 11 + D]
     channels: int

@@ -91,7 +91,7 @@ def count_meaningless(
 
 
 def project_scene(scene: Gaussians, view: View) -> Projected:
-    """What a view shows of a scene, as :func:`~pointsplat_ns.render` projects it: on the scene's device."""
+    """Projection of a scene to a view, as in :func:`~pointsplat_ns.render`, on the scene's device."""
     viewmat = view.viewmat.to(scene.device)  # float32 would move a camera that is far from the origin
     return project(
         scene.means, scene.quats, scene.stds, scene.alphas, viewmat, view.K.to(scene.means), view.width, view.height,

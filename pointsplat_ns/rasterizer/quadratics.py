@@ -42,7 +42,7 @@ def basis_of(like: Tensor) -> Tensor:
 
 
 def table_of(means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
-    """What a pair gathers of its Gaussian, (M + 1, 11 + D); the last row is the padding, which is never seen.
+    """Rows that pairs gather, one for each Gaussian, (M + 1, 11 + D); the last row is padding, which is never drawn.
 
     x, y (pixels), r, a, d (log2 per pixels^2), then the coefficients of log2 alpha on the basis as far as
     they do not depend on the tile, then the colour.
@@ -58,7 +58,7 @@ def table_of(means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, col
 
 
 class Quadratics(NamedTuple):
-    """Those of a chunk of Gaussians in each tile of a block, and the colours of these Gaussians."""
+    """Quadratics of a chunk of Gaussians in each tile of a block, and the colours of these Gaussians."""
 
     s: Tensor  # [B * S] w at the tile's centre, pixels
     ey: Tensor  # [B * S] dv at the tile's centre, pixels

@@ -29,7 +29,7 @@ def _cat(tensors: list[Tensor], dim: int = 0) -> Tensor:
 
 
 def finite_colors(seen: Projected, *rest) -> tuple[Projected, Tensor, Tensor]:
-    """What a camera sees without the Gaussians whose colour is NaN or too large, the colours, and the ids dropped."""
+    """Projected Gaussians and colours without those whose colour is NaN or too large, and the ids of these."""
     colors = _colors_of(seen, *rest)
     dropped = seen.ids[:0]
     limit = torch.finfo(colors.dtype).max ** LARGEST_COLOR

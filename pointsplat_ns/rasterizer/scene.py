@@ -23,7 +23,7 @@ def render(
     reduced: int = 1,
     backend: Literal["torch", "gsplat", "auto"] = "torch",
 ) -> Tensor:
-    """What a scene looks like from one view or several, over the views' background. Differentiable in the scene.
+    """Render a scene from one view or several, over the views' background. Differentiable in the scene.
 
     Args:
         scene: N Gaussians, on any device; the picture is rendered there.
@@ -65,8 +65,8 @@ def render_with_alpha(
     quality: QualityName = "exact",
     backend: Literal["torch", "gsplat", "auto"] = "torch",
 ) -> tuple[Tensor, Tensor]:
-    """What :func:`render` gives of one view, and what share of each pixel the scene covers: (H, W, 3) and (H, W, 1),
-    both in [0, 1]. Arguments and errors as there."""
+    """Picture (H, W, 3) of one view and its alpha (H, W, 1), both in [0, 1]. Arguments and errors are those of
+    :func:`render`."""
     with suitable_threads(scene.device):
         colors = scene.features_dc, scene.features_rest
         image, alpha = _rasterized(scene, view, colors, sh_degree=scene.sh_degree, quality=quality, backend=backend)
@@ -108,7 +108,7 @@ def _enlarged(picture: Tensor, view: View) -> Tensor:
 
 
 def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
-    """How far what a view shows is, and how much of it there is.
+    """Depth and alpha of each pixel of a view.
 
     Args:
         scene: N Gaussians, on any device; the images are rendered there.

@@ -125,7 +125,7 @@ class Footprints:
 
 
 def _spread(first: Tensor, lengths: Tensor, amounts: Tensor | int, bins: int) -> list[int]:
-    """What each bin gets when each item gives its amount to ``lengths`` bins from ``first`` on."""
+    """Sum of each bin, where each item adds its amount to ``lengths`` bins from ``first`` on."""
     amounts = torch.where(lengths > 0, amounts, 0)  # a negative length is none
     steps = torch.zeros(bins + 1, dtype=torch.int64, device=first.device)
     steps.index_add_(0, first.clamp(0, bins), amounts)

@@ -21,7 +21,7 @@ from pointsplat_ns.refiner.sparse_ops import permute
 
 @dataclass(frozen=True)
 class InputRanges:
-    """What brings the network's input to order 1. Trained weights depend on these numbers."""
+    """Units and limits that bring the network's input to order 1. Trained weights depend on them."""
 
     opacity_limit: float = 12.0
     """Opacity logits are clamped to this either way: beyond, opacity is 0 or 1 within 1e-5."""

@@ -12,7 +12,7 @@ Vec = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Material:
-    """How a surface looks."""
+    """Appearance of a surface."""
 
     paint: Painter  # its colour, linear light
     gloss: float = 0.0  # strength of the highlight, 0 for a matte surface

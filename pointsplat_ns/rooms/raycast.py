@@ -97,7 +97,7 @@ def occluded(solids: Solids, origins: Tensor, target: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays met surfaces: chart (M,), which is 6 x solid + face, u and v (M,) in [0, 1], normal (3, M)."""
+    """Hits of rays on surfaces: chart (M,), which is 6 x solid + face, u and v (M,) in [0, 1], normal (3, M)."""
 
     chart: Tensor
     u: Tensor

@@ -17,7 +17,7 @@ from pointsplat_ns.system.native_code import NativeCodeError, load_native
 
 
 class Kernels:
-    """What a C++ file does faster than torch.
+    """Functions of a C++ file that are faster than torch.
 
     Args:
         what: a name of it, for warnings.

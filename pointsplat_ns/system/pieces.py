@@ -14,8 +14,9 @@ CHUNK = 1 << 16
 def in_pieces(
     function: Callable[[Tensor], Tensor], members: Tensor, *shape: int, dtype: torch.dtype = torch.float64
 ) -> Tensor:
-    """What a function makes of members (n,): of some at once (m,), in (m, *shape), and so of all, (n, *shape). Small
-    results that are kept between large pieces would hold on to the memory of these."""
+    """Results (n, *shape) of a function for all members (n,), computed for a piece (m,) of them at a time.
+
+    They are written into one tensor: small results kept apart would hold on to the memory of the large pieces."""
     result = torch.empty(len(members), *shape, dtype=dtype)
     for these in torch.arange(len(members)).split(CHUNK):
         result[these] = function(members[these]).to(dtype)

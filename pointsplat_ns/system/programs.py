@@ -34,7 +34,7 @@ of the one that started it, which is one that holds scenes."""
 
 @dataclass(frozen=True)
 class Usage:
-    """What a program took."""
+    """Time and memory of a program."""
 
     seconds: float
     cpu_seconds: float | None

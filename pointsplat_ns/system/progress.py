@@ -90,7 +90,7 @@ def _lines(stream: IO[str]) -> Iterator[Progress]:
 
 
 def _left(share: float, gained: float, taken: float) -> str:
-    """What is left of a task, in words; empty if nothing can be said.
+    """Time left of a task, in words; empty if nothing can be said.
 
     Args:
         share: that is done.

@@ -26,7 +26,7 @@ def source_commit() -> str:
 
 
 def _git(*words: str) -> str | None:
-    """What git says of the package's folder; None if it fails or is not there."""
+    """Output of a git command in the package's folder; None if it fails or is not there."""
     try:
         command = ["git", "-C", str(Path(__file__).parents[1]), *words]
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=20.0)

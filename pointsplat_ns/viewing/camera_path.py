@@ -24,7 +24,7 @@ LONGEST_SIDE = 960
 
 @dataclass(frozen=True)
 class Shot:
-    """How a path is filmed; None is chosen by what is shown."""
+    """Settings of a film; None is chosen by the scene."""
 
     width: int | None = None
     """Of a picture, pixels."""

@@ -19,7 +19,7 @@ Split = Literal["side-by-side", "wipe"]
 
 @dataclass(frozen=True, eq=False)
 class Cast:
-    """What a film shows."""
+    """Scenes of a film, and how they share the picture."""
 
     first: Gaussians
     second: Gaussians | None = None

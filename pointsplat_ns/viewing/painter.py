@@ -43,7 +43,7 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What is to be seen."""
+    """Request for a picture: camera, scenes and dividing line."""
 
     camera: Camera
     first: ShownScene

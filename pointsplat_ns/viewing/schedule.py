@@ -81,7 +81,7 @@ class Schedule(Generic[R]):
             self._changed.notify_all()
 
     def next(self, timeout: float | None = None) -> Step[R] | None:
-        """What to draw now; waits until there is something.
+        """The next step to draw; waits until there is one.
 
         Args:
             timeout: seconds to wait at most; by default without end.

@@ -169,7 +169,7 @@ def _posed(views: Views, viewmats: Tensor, place: np.ndarray, knots: list[int] |
 
 
 def _distances(places: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """How far views are from each other, (C, C): the way in units of its mean, plus the angle in radians."""
+    """Distances between views, (C, C): that of positions in units of its mean, plus the angle in radians."""
     way = np.linalg.norm(places[:, None] - places[None], axis=2)
     trace = np.einsum("aij,bij->ab", turns, turns)
     return way / max(float(way.mean()), 1e-300) + np.arccos(np.clip((trace - 1) / 2, -1, 1))

@@ -25,7 +25,7 @@ _FRAME = re.compile(r"frame_\d{5,}\.png")
 
 
 def kind_of(output: Path | str) -> Kind:
-    """What a path asks for: a video (.mp4), one picture (.png), or a folder of pictures (no suffix).
+    """Kind of output that a path names: a video (.mp4), one picture (.png), or a folder of pictures (no suffix).
 
     Raises:
         SceneError: if it has another suffix.
@@ -42,7 +42,7 @@ def kind_of(output: Path | str) -> Kind:
 
 
 def check_output(output: Path | str, force: bool) -> Kind:
-    """What a path asks for, checked before the long work.
+    """Kind of output that a path names, checked before the long work.
 
     Raises:
         SceneError: as :func:`kind_of`, or if there is something that must not be overwritten.

@@ -86,7 +86,7 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Where it is seen."""
+        """Address of the page."""
         host = self._server.get_host()
         host = "127.0.0.1" if host in ("", "0.0.0.0") else host
         return f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
@@ -135,7 +135,7 @@ class Viewer:
         self._describe()
 
     def _describe(self) -> None:
-        """What is shown of each scene, and the command that writes it."""
+        """Text on the part of each scene that is shown, with the command that writes it."""
         for exhibit, selection, note in zip(self._exhibits, self._selections, self._budgets, strict=True):
             shown, whole = selection.shown, len(selection.scene)
             lines = [f"{len(shown.scene):,} of {whole:,} Gaussians, {shown.how}"]
@@ -237,7 +237,7 @@ class Viewer:
 
 
 def _chooser(selection: Selection) -> Callable[[Any], None]:
-    """What a budget's slider does."""
+    """Callback of a budget's slider."""
 
     def choose(event: Any) -> None:
         selection.choose(event.target.value)

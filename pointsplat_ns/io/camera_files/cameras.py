@@ -68,7 +68,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class CameraFile:
-    """What a file says."""
+    """Content of a camera file."""
 
     cameras: Sequence[Camera]
     saved: Motion | None = None

@@ -96,7 +96,7 @@ def _focal(side: float, angle: float | None) -> float | None:
 
 
 def _saved_motion(content: dict[str, Any], path: Path) -> Motion:
-    """What moved the original world to that of the file."""
+    """Transform from the original world to that of the file."""
     rows = content.get("applied_transform")
     if rows is None:
         rows = torch.eye(4)[:3].tolist()

@@ -51,7 +51,7 @@ class Format:
 
     @property
     def budget_suffix(self) -> str:
-        """What follows a size in a budget, such as ``.spz`` in 5MB.spz."""
+        """Suffix of a size in a budget, such as ``.spz`` in 5MB.spz."""
         return self.suffix if self.suffix.startswith(".") else ".sog"
 
     def fits(self, path: Path) -> bool:
@@ -61,7 +61,7 @@ class Format:
 
 
 def _writer(encode: Callable[[Gaussians, Progress], bytes]) -> Writer:
-    """What writes encoded bytes to a file, whole or not at all."""
+    """A function that writes encoded bytes to a file, whole or not at all."""
 
     def write(scene: Gaussians, path: Path, progress: Progress) -> None:
         data = encode(scene, progress)
@@ -107,7 +107,7 @@ def format_named(name: str) -> Format | None:
 
 
 def format_to_read(path: Path) -> Format | None:
-    """The format of a file or SOG folder: what its first bytes say, else what its name says; None if neither does.
+    """The format of a file or SOG folder by its first bytes, else by its name; None if neither is known.
 
     Raises:
         SceneError: if the file cannot be read, or its format is written only.

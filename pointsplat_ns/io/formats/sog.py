@@ -166,7 +166,7 @@ def _read_sh(images: Images, n: int, meta: dict[str, Any]) -> Array:
 
 
 def _looked_up(part: dict[str, Any], pixels: Array, channels: int) -> Array:
-    """What bytes stand for: entries of a codebook, or shares between bounds in version 1. (N, channels) float32."""
+    """Values (N, channels) float32 of bytes: entries of a codebook, or shares between bounds in version 1."""
     book = part.get("codebook")
     if book is None:
         low, high = (np.broadcast_to(_numbers(part[name]), channels) for name in ("mins", "maxs"))

@@ -95,7 +95,7 @@ class EarlyLook:
         return min(times)
 
     def _render(self, camera: Cameras) -> dict[str, Tensor]:
-        """What a model in evaluation makes of a camera."""
+        """Render of a camera by a model in evaluation mode."""
         model = self._pipeline.model
         training = model.training
         model.eval()
@@ -105,7 +105,7 @@ class EarlyLook:
             model.train(training)
 
     def _factor_at(self, step: int) -> int:
-        """How many times smaller than the photos images are at a step."""
+        """Factor by which images are smaller than the photos at a step."""
         config = self._pipeline.model.config
         return 2 ** max(config.num_downscales - step // config.resolution_schedule, 0)
 

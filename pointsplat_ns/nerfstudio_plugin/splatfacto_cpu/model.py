@@ -72,7 +72,7 @@ class SplatfactoCpuModelConfig(RasterizerOptions, SplatfactoModelConfig):
     _target: type = field(default_factory=lambda: SplatfactoCpuModel)
 
     def kernels(self) -> dict[str, Kernels]:
-        """Those of the rasterizer and of the loss."""
+        """Compiled kernels of the rasterizer and of the loss."""
         return {**super().kernels(), "SSIM": structural_similarity.KERNELS}
 
 

@@ -47,7 +47,7 @@ class _Task(ctypes.Structure):
 
 
 class KernelInputs(NamedTuple):
-    """What is blended."""
+    """Projected Gaussians in the kernels' layout."""
 
     table: Tensor  # [M, 6 + D]
     channels: int
@@ -55,7 +55,7 @@ class KernelInputs(NamedTuple):
 
 
 class KernelTape(NamedTuple):
-    """What the backward pass needs of the forward pass."""
+    """Results of the forward pass that the backward pass needs."""
 
     before: Tensor  # [chunks, 64] transmittance in front of each chunk of a tile's list
     blended: Tensor  # [tiles] int64, Gaussians passed before all pixels were finished

@@ -86,7 +86,7 @@ def _zeros_like(coefficients: Tensor) -> Tensor:
 
 
 def _pointers(coefficients: Tensor, rest: Tensor | None) -> tuple[int, int]:
-    """Where the first coefficients and the others begin."""
+    """Addresses of the first coefficients and of the others."""
     first = coefficients.data_ptr()
     return first, first + 3 * coefficients.element_size() if rest is None else rest.data_ptr()
 
