@@ -15,9 +15,6 @@ from pointsplat_ns.rasterizer.constants import ALPHA_MAX, BLENDED_AT_ONCE, EXACT
 from pointsplat_ns.rasterizer.quadratics import PIXELS, basis_of, table_of
 from pointsplat_ns.rasterizer.tiles import Footprints, TileList
 
-_BLOCK_PAIRS = 2**13  # pairs evaluated at once: 2 MB a work array in float32. Not by the number of threads: how lists
-# are cut decides how sums are rounded, and an image must not depend on how many threads are free
-_BLOCK_PAIRS_GPU = 2**18
 _LONGEST_CHUNK = 1024
 
 MEMORY_BUDGET = 2**31
@@ -68,7 +65,9 @@ class Frame:
         self.sorted = Tiles(ids, x, y, tiles.offsets[ids], tiles.offsets[ids + 1])
         self.pairs_count = tiles.gaussians.numel()
         self.gaussians = F.pad(tiles.gaussians, (0, 1), value=tiles.order.numel())  # the last pair is padding
-        pairs = _BLOCK_PAIRS_GPU if lengths.is_cuda else _BLOCK_PAIRS
+        # Pairs at once: on a CPU 2 MB a work array in float32. They do not depend on the number of threads: how
+        # lists are cut decides how sums are rounded.
+        pairs = 2**18 if lengths.is_cuda else 2**13
         self.block = max(1, min(pairs // BLENDED_AT_ONCE, self.occupied))  # tiles
         self.capacity = pairs
 

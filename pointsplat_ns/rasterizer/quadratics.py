@@ -28,8 +28,7 @@ PIXELS = TILE * TILE
 MOMENTS = 6
 """Sums over pixels that are kept of each pair: of g times w, w^2, dv, dv^2, w dv and 1."""
 
-LOG2E, _LN2 = 1.0 / math.log(2.0), math.log(2.0)
-_X, _Y, _R, _A, _D = range(5)  # columns of the table
+LOG2E = 1.0 / math.log(2.0)
 QUADRATIC, COLOR = 5, 11
 """First columns of the coefficients and of the colours."""
 
@@ -72,7 +71,7 @@ def gather(table: Tensor, ids: Tensor, x: Tensor, y: Tensor) -> Quadratics:
     """The quadratics and colours of the pairs ``ids`` (B * S,) of tiles centred at x, y (B,)."""
     rows = table.index_select(0, ids)
     size = ids.numel() // x.numel()
-    mx, my, r, a, d = (rows[:, column] for column in (_X, _Y, _R, _A, _D))
+    mx, my, r, a, d = rows[:, :QUADRATIC].unbind(1)
     ey = (y[:, None] - my.view(-1, size)).view(-1)
     s = (x[:, None] - mx.view(-1, size)).view(-1).addcmul_(r, ey, value=-1.0)
     a_s, d_ey = a * s, d * ey
@@ -108,7 +107,7 @@ def mean_slopes(coefficients: Tensor) -> tuple[Tensor, Tensor]:
 
     The gradient of log alpha by the mean is minus its gradient by the pixel.
     """
-    _, cu, cv, cuu, cuv, cvv = (coefficients * -_LN2).unbind(-1)
+    _, cu, cv, cuu, cuv, cvv = (coefficients * -math.log(2.0)).unbind(-1)
     return torch.stack([cu, 2 * cuu, cuv], dim=-1), torch.stack([cv, cuv, 2 * cvv], dim=-1)
 
 
