@@ -67,11 +67,8 @@ class Run:
         """Whether the checkpoint holds one Gaussian scene: Splatfacto or a method derived from it."""
         if self.method_name == REFINER_METHOD:  # a refiner for many scenes
             return False
-        needed = {
-            "sh_degree",
-            "densify_grad_thresh",
-            "rasterize_mode",
-        }  # also methods derived from Splatfacto have these
+        # Methods derived from Splatfacto have these settings, too.
+        needed = {"sh_degree", "densify_grad_thresh", "rasterize_mode"}
         return self.method_name.startswith("splatfacto") or self.model_fields.keys() >= needed
 
     @property
