@@ -14,7 +14,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.windows import RESOLUTION
 from pointsplat_ns.pruning.budget import Keep, resolve_keep
 from pointsplat_ns.pruning.coverage import coverage_score
-from pointsplat_ns.pruning.merge import merge
+from pointsplat_ns.pruning.merging import merge
 from pointsplat_ns.pruning.scores import (
     area_score,
     authors_score,
