@@ -160,9 +160,7 @@ def _surroundings(first: Flat, second: Flat, oij: Tensor, ci: Tensor, cj: Tensor
     return cover, colour / cover.clamp_min(MIN_DIVISOR)
 
 
-def _replacement(
-    first: Flat, second: Flat, u: Tensor, v: Tensor, both: Tensor, settings: MergeSettings
-) -> Replacement:
+def _replacement(first: Flat, second: Flat, u: Tensor, v: Tensor, both: Tensor, settings: MergeSettings) -> Replacement:
     """The replacement of each pair, whose centres are (u, v) apart and which covers ``both`` twice."""
     mi, mj = first.alpha * first.area, second.alpha * second.area
     wi = mi / (mi + mj).clamp_min_(MIN_DIVISOR)

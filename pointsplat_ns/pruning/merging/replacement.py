@@ -71,9 +71,7 @@ def replace_pairs(state: State, first: Tensor, second: Tensor, settings: MergeSe
     return after, shares
 
 
-def _replacements(
-    state: State, i: Tensor, j: Tensor, settings: MergeSettings
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _replacements(state: State, i: Tensor, j: Tensor, settings: MergeSettings) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Share of the first member, mean, covariance and opacity of the replacements of pairs (m,), (m,)."""
     ai, aj = state.alphas[i], state.alphas[j]
     mi, mj = ai * rms_area(state.cov[i]), aj * rms_area(state.cov[j])

@@ -49,9 +49,7 @@ def sampled_viewpoints(scene: Gaussians, width: int, height: int, settings: Merg
     """
     photos = photo_places(scene)
     try:
-        views = views_about(
-            scene, photos, settings.sampled_views, width, height, seed=settings.view_seed, sharp=False
-        )
+        views = views_about(scene, photos, settings.sampled_views, width, height, seed=settings.view_seed, sharp=False)
     except DataError:
         return None
     return Viewpoints(views, given=False, photos=photos)

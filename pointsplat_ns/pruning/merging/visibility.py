@@ -30,8 +30,10 @@ class PixelCounts:
 
     def neighbourhood_shares(self, settings: MergeSettings) -> Tensor:
         """Visibility factor of the neighbourhood of each Gaussian along the curve, (n,) float32 in (0, 1]."""
-        sums = (means_around(pixels, settings.occlusion_neighbours) for pixels in (self.covered, self.expected))
-        return _visibility(*sums, settings.min_share_neighbours, settings)
+        covered, expected = (
+            means_around(pixels, settings.occlusion_neighbours) for pixels in (self.covered, self.expected)
+        )
+        return _visibility(covered, expected, settings.min_share_neighbours, settings)
 
     def single_shares(self, settings: MergeSettings) -> Tensor:
         """Visibility factor of each Gaussian by itself, (n,) float32 in (0, 1]."""

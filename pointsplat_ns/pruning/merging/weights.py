@@ -29,9 +29,7 @@ class Weights:
     visibility: Tensor  # [n] float32 in (0, 1], factor of the mass in regrouping
 
 
-def visibility_weights(
-    participants: Participants, viewpoints: Viewpoints | None, settings: MergeSettings
-) -> Weights:
+def visibility_weights(participants: Participants, viewpoints: Viewpoints | None, settings: MergeSettings) -> Weights:
     """Weights of the participants (n,); equal for all without viewpoints."""
     scene, members = participants.scene, participants.members
     if viewpoints is None:
