@@ -183,27 +183,30 @@ def first_step(
     weights = visibility_weights(participants, viewpoints, settings)
     state = initial_state(participants, weights.area, settings)
     tree = Tree.of_single(len(participants))
-    reference = None
-    if viewpoints is not None and len(state) <= settings.max_count_rendered:
+
+    def dense() -> Gaussians:
         whole = len(participants) == len(participants.scene)
-        dense = participants.scene if whole else participants.scene[participants.members]
-        reference = _reference(participants, dense, viewpoints, settings)
+        return participants.scene if whole else participants.scene[participants.members]
+
+    reference = _reference(participants, viewpoints, len(state), dense, settings)
     return Step(participants, viewpoints, weights, state, tree, reference)
 
 
 def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
     """The step after some more pairs are merged; at least ``k`` Gaussians remain."""
-    participants, viewpoints, reference = step.participants, step.viewpoints, step.reference
+    participants, viewpoints = step.participants, step.viewpoints
     n = len(step.state)
     most = max(1, min(n - k, int(n * settings.round_share)))
     near = other_neighbours(step.state.means, settings.neighbours)
     first, second = cheapest_pairs(near, pair_costs(step.state, near, settings), most, settings.matching_passes)
     state, shares = replace_pairs(step.state, first, second, settings)
     tree = step.tree.after_round(first, second, shares)
-    if reference is None and viewpoints is not None and len(state) <= settings.max_count_rendered:
+
+    def remaining() -> Gaussians:
         groups = merged_groups(participants, state, tree)
-        remaining = scene_maker(participants, groups, settings)(Finish(settings.default_depth_exponent))
-        reference = _reference(participants, remaining, viewpoints, settings)
+        return scene_maker(participants, groups, settings)(Finish(settings.default_depth_exponent))
+
+    reference = step.reference or _reference(participants, viewpoints, len(state), remaining, settings)
     return Step(participants, viewpoints, step.weights, state, tree, reference)
 
 
@@ -236,7 +239,14 @@ def finished(step: Step, regroup: bool, settings: MergeSettings) -> tuple[Groups
 
 
 def _reference(
-    participants: Participants, dense: Gaussians, viewpoints: Viewpoints, settings: MergeSettings
-) -> WindowRenders:
-    """Windows of renders of the scene that results are compared with."""
-    return WindowRenders(participants.in_units(dense), viewpoints.views.spread(settings.finish_views))
+    participants: Participants,
+    viewpoints: Viewpoints | None,
+    count: int,
+    dense: Callable[[], Gaussians],
+    settings: MergeSettings,
+) -> WindowRenders | None:
+    """Windows of renders that results are compared with, of ``count`` Gaussians ``dense``; None if they are too many or
+    there are no viewpoints."""
+    if viewpoints is None or count > settings.max_count_rendered or settings.finish_views < 1:
+        return None
+    return WindowRenders(participants.in_units(dense()), viewpoints.views.spread(settings.finish_views))

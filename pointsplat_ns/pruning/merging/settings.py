@@ -30,11 +30,14 @@ class MergeSettings:
     rendered as soon as rounds have made it this small."""
 
     sampled_views: int = 48
-    """Number of views that are sampled where none are given. In a lounge whose SH do not tell where its photos were
-    taken, 48 gain 0.3 dB over 16 in held-out poses (10 % kept); 96 gain no more."""
+    """Number of views that are sampled where none are given; 0 turns sampling off. In a lounge whose SH do not tell
+    where its photos were taken, 48 gain 0.3 dB over 16 in held-out poses (10 % kept); 96 gain no more."""
 
     view_seed: int = 1
     """Seed of the sampled views."""
+
+    find_photo_places: bool = True
+    """Whether the scene is asked where its photos were taken, so that sampled views and weights start from there."""
 
     min_distance: float = 0.1
     """Distance that is added in quadrature to the distance of a Gaussian from a camera, as a share of the content's
@@ -166,7 +169,8 @@ class MergeSettings:
     # Finish (finishing.py)
 
     finish_views: int = 8
-    """Number of views whose windows are compared. Of 6, 12 and 24, 12 are as good as 24, and 6 lose up to 0.2 dB."""
+    """Number of views whose windows are compared; 0 turns renders off, so that members always change groups and the
+    finish is the default one. Of 6, 12 and 24, 12 are as good as 24, and 6 lose up to 0.2 dB."""
 
     default_depth_exponent: float = 0.15
     """Depth exponent of scenes that are not rendered, and of the comparison with regrouped ones."""

@@ -42,12 +42,12 @@ def sampled_viewpoints(scene: Gaussians, width: int, height: int, settings: Merg
     Args:
         scene: N Gaussians.
         width, height: size of the pictures, pixels.
-        settings: ``sampled_views`` and ``view_seed``.
+        settings: ``sampled_views``, ``view_seed`` and ``find_photo_places``.
 
     Returns:
-        The viewpoints; None if no place in the scene is free.
+        The viewpoints; None if no place in the scene is free, or no view is asked for.
     """
-    photos = photo_places(scene)
+    photos = photo_places(scene) if settings.find_photo_places else None
     try:
         views = views_about(scene, photos, settings.sampled_views, width, height, seed=settings.view_seed, sharp=False)
     except DataError:

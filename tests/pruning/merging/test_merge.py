@@ -342,10 +342,18 @@ def test_members_change_groups_unless_renders_lose_by_it(monkeypatch, gain):
     assert torch.equal(merged.assignment, as_merged.assignment) == (gain < 0)
 
 
-@pytest.mark.parametrize(("max_count", "rendered"), [(800, True), (0, False)])
-def test_a_scene_too_large_to_render_is_rendered_once_it_is_small_enough(max_count, rendered):
-    settings = replace(RENDERED, max_count_rendered=max_count)
-    merged = merge(wall(), 400, settings=settings)  # of 1600
+@pytest.mark.parametrize(
+    ("changes", "rendered"),
+    [
+        ({"max_count_rendered": 800}, True),
+        ({"max_count_rendered": 0}, False),
+        ({"finish_views": 0}, False),
+        ({"sampled_views": 0}, False),
+        ({"min_count_rendered": 2000}, False),
+    ],
+)
+def test_a_scene_is_rendered_as_soon_as_it_is_small_enough_and_not_if_it_is_turned_off(changes, rendered):
+    merged = merge(wall(), 400, settings=replace(RENDERED, **changes))  # of 1600
     assert len(merged.scene) == 400
     assert (merged.finish.psnr is not None) == rendered and (merged.finish == Finish()) != rendered
 

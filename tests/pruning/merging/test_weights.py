@@ -8,9 +8,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from making import ball, cloud, normal_scene
+from making import ball, cloud, normal_scene, photographed
 from pointsplat_ns.gaussians import SH_C0, Gaussians
-from pointsplat_ns.looking.content import views_in_units
+from pointsplat_ns.looking.content import content_size, in_units, views_in_units
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.pruning.merging import DEFAULTS, merge, weights
 from pointsplat_ns.pruning.merging.participants import Participants
@@ -80,6 +80,14 @@ def test_without_a_free_place_there_are_no_viewpoints():
     fog = ball(200)
     fog = fog.replace(opacities=torch.full((200, 1), -math.inf))
     assert sampled_viewpoints(fog, 32, 24, DEFAULTS) is None
+
+
+def test_photo_places_are_found_unless_that_is_turned_off():
+    content = photographed()
+    content = in_units(content, *content_size(content))
+    settings = replace(DEFAULTS, sampled_views=2)
+    assert sampled_viewpoints(content, 32, 24, settings).photos is not None
+    assert sampled_viewpoints(content, 32, 24, replace(settings, find_photo_places=False)).photos is None
 
 
 def two_walls(rows: int = 32) -> Gaussians:
