@@ -41,7 +41,7 @@ def shares_by_definition(masses, run, first):
 
 @settings(max_examples=200, deadline=None)
 @given(
-    st.lists(st.sampled_from([0.0, 0.25, 0.5, 1.0, 3.0, 700.0]), min_size=1, max_size=40),
+    st.lists(st.sampled_from([0.0, 0.25, 0.5, 1.0, 3.0, 700.0]), max_size=40),
     st.integers(1, 7),
     st.data(),
 )
@@ -60,10 +60,6 @@ def test_shares_do_not_depend_on_the_unit_of_mass_and_never_overflow(shift):
     assert torch.allclose(mass_shares(masses + shift, 12), mass_shares(masses, 12), atol=1e-9)
 
 
-def test_no_item_has_no_share():
-    assert mass_shares(torch.zeros(0, dtype=torch.float64), 12, 4).shape == (0,)
-
-
 def test_no_region_is_emptied_at_ten_percent_where_other_scores_empty_one():
     # A wall of large opaque Gaussians, and a far larger number of faint and small ones that make up another.
     generator = torch.Generator().manual_seed(3)
@@ -77,15 +73,6 @@ def test_no_region_is_emptied_at_ten_percent_where_other_scores_empty_one():
     kept = {by: select(score_of(scene, METHODS[by]), 200) for by in ("coverage", "paper", "area", "opacity")}
     regions = {by: len(cell[indices].unique()) for by, indices in kept.items()}
     assert regions["coverage"] == 32 and max(regions["paper"], regions["area"]) < 20
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_best_of_every_run_has_all_of_its_share(dtype):
-    generator = torch.Generator().manual_seed(4)
-    masses = 5 * torch.randn(5 + 100 * 12, generator=generator, dtype=dtype)
-    shares = mass_shares(masses, 12, first=5)[5:].view(100, 12)
-    assert (shares.amax(dim=1) == 1).all() and (shares > 0).all()
-    assert torch.equal(shares.argmax(dim=1), masses[5:].view(100, 12).argmax(dim=1))
 
 
 def test_unusable_gaussians_leave_the_others_alone():

@@ -74,19 +74,15 @@ def test_gives_exactly_k_that_can_be_drawn(k):
     assert len(sizes_of(merged)) == k and bool((sizes_of(merged) >= 1).all())
 
 
-def test_keeping_all_returns_the_scene_bit_for_bit_even_with_nan():
-    scene = cloud(20)
-    scene.means[3] = math.nan
-    assert same(*(some.map(lambda value: value.nan_to_num(7.0)) for some in (merge(scene, 20).scene, scene)))
-
-
-def test_a_gaussian_that_is_merged_with_no_other_is_unchanged_to_the_bit():
+def test_a_gaussian_that_is_merged_with_no_other_is_unchanged_to_the_bit_and_so_is_a_scene_of_which_all_are_kept():
     scene = cloud(200)
     merged = merge(scene, 150)
     single = (sizes_of(merged) == 1).nonzero()[:, 0]
     assert len(single) > 50
     where = torch.stack([(merged.assignment == index).nonzero()[0, 0] for index in single])
     assert same(merged.scene[single], scene[where])
+    scene.means[3] = math.nan
+    assert same(*(some.map(lambda value: value.nan_to_num(7.0)) for some in (merge(scene, 200).scene, scene)))
 
 
 def test_the_same_input_gives_the_same_output():
@@ -172,6 +168,12 @@ def extreme_scenes() -> dict[str, Gaussians]:
     logits[::2], logits[1::2] = math.inf, -math.inf
     return {
         "log-scales of +-80": base.replace(scales=spread),
+        "points of colour": base.replace(
+            scales=torch.full_like(base.scales, -60.0), features_dc=base.features_dc * 1e30
+        ),
+        "needles": base.replace(scales=base.scales + torch.tensor([20.0, -20.0, -20.0])),
+        "huge and far": base.replace(means=base.means * 1e30, scales=torch.full_like(base.scales, 60.0)),
+        "nearly transparent": base.replace(opacities=torch.full_like(base.opacities, -300.0)),
         "a single giant": base.replace(scales=giant),
         "a zero axis": base.replace(scales=flat),
         "zero scales": base.replace(scales=torch.full_like(base.scales, -math.inf)),
@@ -192,8 +194,9 @@ def extreme_scenes() -> dict[str, Gaussians]:
 @pytest.mark.parametrize("k", [1, 20, 59])
 @pytest.mark.parametrize("name", list(extreme_scenes()))
 def test_extremes_give_k_drawable_gaussians(name, k):
+    """Without views, and with one that shows some of it."""
     scene = extreme_scenes()[name]
-    merged = merge(scene, k).scene
+    merged = merge(scene, k, views=one_view(2.0) if k == 20 else None).scene
     assert len(merged) == k and merged.dtype == scene.dtype
     assert bool(merged.usable().all())
 

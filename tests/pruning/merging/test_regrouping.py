@@ -92,24 +92,6 @@ def test_the_unit_of_length_does_not_matter(unit):
     assert torch.equal(found, expected) and not torch.equal(found, group)
 
 
-@pytest.mark.parametrize("what", ["points", "one place", "transparent", "needles", "huge", "colours"])
-def test_extremes_give_groups_and_finite_moments(what):
-    scene, group = cloud(200), random_groups(cloud(200), 20)
-    changed = {
-        "points": {"scales": torch.full_like(scene.scales, -60.0)},
-        "one place": {"means": torch.zeros_like(scene.means), "scales": torch.full_like(scene.scales, -60.0)},
-        "transparent": {"opacities": torch.full_like(scene.opacities, -300.0)},
-        "needles": {"scales": scene.scales + torch.tensor([20.0, -20.0, -20.0])},
-        "huge": {"means": scene.means * 1e30, "scales": torch.full_like(scene.scales, 60.0)},
-        "colours": {"features_dc": scene.features_dc * 1e30},
-    }[what]
-    scene = scene.replace(**changed)
-    groups = moments_of(scene, group, 20)
-    assert all(bool(values.isfinite().all()) for values in (groups.means, groups.cov, groups.colours, groups.shares))
-    torch.testing.assert_close(torch.zeros(20).double().index_add_(0, group, groups.shares), torch.ones(20).double())
-    assert torch.equal(after(scene, group, 20).unique(), torch.arange(20))
-
-
 @pytest.mark.parametrize("count", [1, 2, DEFAULTS.regrouping_candidates - 1])
 def test_there_may_be_fewer_groups_than_candidates(count):
     scene, group = cloud(200), random_groups(cloud(200), count)
