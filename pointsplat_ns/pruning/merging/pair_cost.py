@@ -34,7 +34,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pointsplat_ns.pruning.merging.projections import DIRECTIONS, MIN_DIVISOR, Projections, area_of, directions_of
+from pointsplat_ns.pruning.merging.projections import DIRECTIONS, MIN_DIVISOR_32, Projections, area_of, directions_of
 from pointsplat_ns.pruning.merging.replacement import growth
 from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
 from pointsplat_ns.pruning.merging.state import State
@@ -147,7 +147,7 @@ def overlap_of_sum(uu: Tensor, uv: Tensor, vv: Tensor, areas: Tensor, u: Tensor,
         areas: product of both areas.
         u, v: from one centre to the other.
     """
-    inverse = (uu * vv).addcmul_(uv, uv, value=-1).clamp_min_(MIN_DIVISOR).reciprocal_()
+    inverse = (uu * vv).addcmul_(uv, uv, value=-1).clamp_min_(MIN_DIVISOR_32).reciprocal_()
     distance = (vv * u).addcmul_(uv, v, value=-2).mul_(u).addcmul_(uu * v, v).mul_(inverse).clamp_min_(0)
     return distance.mul_(-0.5).exp_().mul_(inverse.sqrt_()).mul_(areas)
 
@@ -157,13 +157,13 @@ def _surroundings(first: Flat, second: Flat, oij: Tensor, ci: Tensor, cj: Tensor
     on_first = second.alpha * oij / first.area
     cover = first.alpha / 2 + on_first.sum(1, keepdim=True)
     colour = torch.baddbmm((first.alpha / 2 * ci)[:, None], on_first[:, None], cj)[:, 0]
-    return cover, colour / cover.clamp_min(MIN_DIVISOR)
+    return cover, colour / cover.clamp_min(MIN_DIVISOR_32)
 
 
 def _replacement(first: Flat, second: Flat, u: Tensor, v: Tensor, both: Tensor, settings: MergeSettings) -> Replacement:
     """The replacement of each pair, whose centres are (u, v) apart and which covers ``both`` twice."""
     mi, mj = first.alpha * first.area, second.alpha * second.area
-    wi = mi / (mi + mj).clamp_min_(MIN_DIVISOR)
+    wi = mi / (mi + mj).clamp_min_(MIN_DIVISOR_32)
     wj = 1 - wi
     wu, wv = wi * wj * u, wi * wj * v
     uu = (wu * u).addcmul_(wi, first.uu).addcmul_(wj, second.uu)

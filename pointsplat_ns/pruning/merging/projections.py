@@ -34,7 +34,7 @@ ROUNDNESS = 1e-5
 """Variance that is added to a projection along both axes, as a share of its summed variances, so that float32 tells
 thin projections from lines: widths are at least 0.3 % of lengths."""
 
-MIN_DIVISOR = 1e-30
+MIN_DIVISOR_32 = 1e-30
 """Lower bound of float32 denominators, which keeps quotients finite; the smallest normal float32 is 1e-38."""
 
 
@@ -113,4 +113,4 @@ class Projections:
 
 def area_of(uu: Tensor, uv: Tensor, vv: Tensor) -> Tensor:
     """Areas of projections with these covariances, in units of 2 pi: root of the determinant."""
-    return (uu * vv).addcmul_(uv, uv, value=-1).clamp_min_(MIN_DIVISOR).sqrt_()
+    return (uu * vv).addcmul_(uv, uv, value=-1).clamp_min_(MIN_DIVISOR_32).sqrt_()

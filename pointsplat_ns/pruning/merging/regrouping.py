@@ -22,7 +22,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.merging.covariance import MIN_DIVISOR, covariances_of, outer, rms_area, unpack
 from pointsplat_ns.pruning.merging.groups import Groups, first_members
 from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.replacement import grown
+from pointsplat_ns.pruning.merging.replacement import enlarged
 from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
 from pointsplat_ns.pruning.merging.state import bounded_colours
 from pointsplat_ns.system.pieces import CHUNK, in_pieces
@@ -75,7 +75,7 @@ def regrouped(participants: Participants, groups: Groups, visibility: Tensor, se
         common.shares.float(),
         first_members(participants, group, count),
         common.means,
-        grown(common.cov, alphas, settings),
+        enlarged(common.cov, alphas, settings),
         alphas.clamp_max(settings.max_opacity),
         torch.bincount(group, minlength=count).to(torch.int32),
     )

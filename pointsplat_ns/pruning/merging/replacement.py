@@ -86,10 +86,10 @@ def _replacements(state: State, i: Tensor, j: Tensor, settings: MergeSettings) -
     u, v = ((apart * axis).sum(1) for axis in axes)
     mass = ai * projected_area(si) + aj * projected_area(sj) - ai * aj * overlap(si, sj, u, v)
     alphas = mass.clamp_min(0) / projected_area(sk).clamp_min(MIN_DIVISOR)
-    return wi, mean, grown(cov, alphas, settings), alphas.clamp_max(settings.max_opacity)
+    return wi, mean, enlarged(cov, alphas, settings), alphas.clamp_max(settings.max_opacity)
 
 
-def grown(cov: Tensor, alphas: Tensor, settings: MergeSettings) -> Tensor:
+def enlarged(cov: Tensor, alphas: Tensor, settings: MergeSettings) -> Tensor:
     """Covariances (n, 6) with the area that needed opacities (n,) above ``max_opacity`` ask for."""
     return cov * growth(alphas, settings)[:, None]
 
