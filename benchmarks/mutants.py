@@ -102,17 +102,18 @@ PARTS = {
         ),
     ),
     "merge": Part(
+        ("pointsplat_ns/pruning/merging/*.py",),
         tuple(
-            f"pointsplat_ns/pruning/{name}.py"
-            for name in ("merge", "merge_state", "pair_costs", "matching", "covariance", "finishing")
+            f"tests/pruning/merging/test_{name}.py"
+            for name in ("covariance", "matching", "pair_cost", "finishing", "regrouping", "weights")
         ),
-        tuple(f"tests/pruning/test_{name}.py" for name in ("covariance", "matching", "pair_costs", "finishing")),
         (
-            "tests/pruning/test_merge.py",
+            "tests/pruning/merging/test_merge.py",
             "tests/pruning/test_methods.py",
             _SAME_RESULT,
             "tests/compression/test_threads_agree.py",
         ),
+        left_out=("__init__.py", "settings.py"),
     ),
     "refiner": Part(
         ("pointsplat_ns/refiner/*.py",),

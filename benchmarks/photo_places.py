@@ -30,10 +30,13 @@ from pointsplat_ns.looking.content import content_size, positions_in_units, view
 from pointsplat_ns.looking.sampling import estimated_up
 from pointsplat_ns.looking.traces import Witnesses, photo_places
 from pointsplat_ns.looking.view_source import MERGED_FROM
+from pointsplat_ns.looking.windows import RESOLUTION
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning import cut_sh
-from pointsplat_ns.pruning.merge import Merging
-from pointsplat_ns.pruning.viewpoints import NOT_SHOWN, weights_seen
+from pointsplat_ns.pruning.merging import DEFAULTS
+from pointsplat_ns.pruning.merging.participants import Participants
+from pointsplat_ns.pruning.merging.rounds import first_step
+from pointsplat_ns.pruning.merging.viewpoints import view_weights
 
 ANY = 500
 """Number of places that the poses are compared with."""
@@ -71,9 +74,9 @@ def asked(run: Path, sh: int) -> Map:
     at_eyes, at_any = witnesses.votes(eyes), witnesses.votes(anywhere)
     more = (at_eyes[:, None] > at_any).float().mean()
     away = float(torch.cdist(anywhere, eyes).amin(1).mean()) / size
-    blind = Merging(dense, torch.arange(len(dense)), None)
-    given = blind.state.weights.clamp_min(1e-12).log()
-    in_photos = log_sizes(dense[blind.members], poses.spread(MERGED_FROM), *content_size(dense))
+    blind = first_step(Participants.of(dense, torch.arange(len(dense))), None, RESOLUTION, DEFAULTS)
+    given = blind.weights.area.clamp_min(1e-12).log()
+    in_photos = log_sizes(dense[blind.participants.members], poses.spread(MERGED_FROM), *content_size(dense))
     seen = in_photos > in_photos.max() - SEEN
     alike = torch.corrcoef(torch.stack([in_photos[seen], given[seen]]))[0, 1]
     distance = "not told"
@@ -97,7 +100,7 @@ def up_of_cameras(poses: ps.Views) -> Tensor:
 def log_sizes(scene: ps.Gaussians, poses: ps.Views, centre: Tensor, size: float) -> Tensor:
     """Logarithms of how large a unit of area at each Gaussian is in the photos of these poses, (N,)."""
     means, views = positions_in_units(scene.means, centre, size), views_in_units(poses, centre, size)
-    return weights_seen(means, views, NOT_SHOWN).clamp_min(1e-12).log()
+    return view_weights(means, views, DEFAULTS.outside_weight, DEFAULTS).clamp_min(1e-12).log()
 
 
 def mapped(name: str, witnesses: Witnesses, eyes: Tensor) -> Map:

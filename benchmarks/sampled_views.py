@@ -21,7 +21,7 @@ from pointsplat_ns.looking.view_source import MERGED_FROM
 from pointsplat_ns.looking.windows import psnr_of
 from pointsplat_ns.metrics import finite_psnr
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.pruning.merge import merge
+from pointsplat_ns.pruning.merging import merge
 from pointsplat_ns.rasterizer.scene import render_with_alpha
 
 

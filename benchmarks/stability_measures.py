@@ -17,10 +17,11 @@ import pointsplat_ns as ps
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.content import content_size
-from pointsplat_ns.pruning import merge_state
-from pointsplat_ns.pruning.matching import cheapest_pairs
-from pointsplat_ns.pruning.merge import NEIGHBOURS, merge
-from pointsplat_ns.pruning.pair_costs import costs_of
+from pointsplat_ns.pruning.merging import DEFAULTS, merge
+from pointsplat_ns.pruning.merging.matching import cheapest_pairs
+from pointsplat_ns.pruning.merging.pair_cost import pair_costs
+from pointsplat_ns.pruning.merging.participants import Participants
+from pointsplat_ns.pruning.merging.state import initial_state
 from pointsplat_ns.pruning.scores import log_volume_score, paper_score
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, pup_score
 from pointsplat_ns.rasterizer import rasterization, rasterize_reference
@@ -192,9 +193,9 @@ def _scores(given: Case, scene: Gaussians, truth: Gaussians) -> Iterator[tuple[s
 def _merge(given: Case, scene: Gaussians, truth: Gaussians) -> dict[str, float]:
     centre, size = content_size(truth)  # of equal Gaussians it is a matter of ties, and only a unit
     everyone, equal = torch.arange(len(truth)), torch.ones(len(truth))
-    states = [merge_state.start(part, everyone, equal, centre, size) for part in (scene, truth)]
-    near = other_neighbours(states[1].means, NEIGHBOURS)
-    costs, wanted = costs_of(states[0], near), costs_of(states[1], near, torch.float64)
+    states = [initial_state(Participants(part, everyone, centre, size), equal, DEFAULTS) for part in (scene, truth)]
+    near = other_neighbours(states[1].means, DEFAULTS.neighbours)
+    costs, wanted = pair_costs(states[0], near), pair_costs(states[1], near, dtype=torch.float64)
     there = near != torch.arange(len(near))[:, None]
     most = max(1, len(truth) // 2)
     chosen = [_pairs(near, values, most) for values in (costs, wanted)]

@@ -18,7 +18,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.looking.windows import WindowRenders, sides_of
 from pointsplat_ns.pruning import Keep, method_named, need_usable
-from pointsplat_ns.pruning.finishing import top_of_parabola
+from pointsplat_ns.pruning.merging.finishing import top_of_parabola
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.views import Views
 
@@ -347,7 +347,7 @@ def bottom_of_parabola(at_zero: float, at_half: float, at_one: float) -> float:
     """
     if not all(map(math.isfinite, (at_zero, at_half, at_one))):
         return math.nan
-    return top_of_parabola((0.0, 0.5, 1.0), [-at_zero, -at_half, -at_one], beyond=0.0)
+    return top_of_parabola((0.0, 0.5, 1.0), [-at_zero, -at_half, -at_one], margin=0.0)
 
 
 def helps(before: Closeness, after: Closeness) -> bool:

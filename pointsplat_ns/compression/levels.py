@@ -33,7 +33,7 @@ from pointsplat_ns.io.files import keep_usable
 from pointsplat_ns.io.source import SourceFile
 from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, found_by_trying, need_usable, parse_keep, resolve_keep
-from pointsplat_ns.pruning.merge import merge_levels
+from pointsplat_ns.pruning.merging import merge_levels
 from pointsplat_ns.system.progress import Progress, silent
 
 DEFAULT_LEVELS = ("50%", "25%", "10%", "3%")

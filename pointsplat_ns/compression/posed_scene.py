@@ -14,7 +14,7 @@ from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.io.camera_files import read_views, transforms_beside
 from pointsplat_ns.io.runs import CONFIG_NAME, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
-from pointsplat_ns.pruning.viewpoints import in_picture
+from pointsplat_ns.pruning.merging.viewpoints import in_picture
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.views import Views
 

@@ -28,7 +28,7 @@ class Megabytes:
 
     value: float
     suffix: str = ".ply"
-    """Of the format that is counted."""
+    """Suffix of the file format."""
 
     def __post_init__(self) -> None:
         kind = format_named(self.suffix)
@@ -85,7 +85,7 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3) -> int:
     if isinstance(keep, WithinPsnr):
         raise BudgetError("keep is auto, which is found by rendering; expected a ratio, a count or a size here")
     if isinstance(keep, Megabytes):
-        return _that_fit(n, keep, sh_degree)
+        return _count_that_fits(n, keep, sh_degree)
     if isinstance(keep, bool) or not isinstance(keep, Real):
         raise BudgetError(f"keep is {keep!r}; {WANTED}")
     if n < 1:
@@ -100,8 +100,7 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3) -> int:
 
 
 def found_by_trying(keep: Keep) -> bool:
-    """Whether the count that a budget means depends on the scene that is made: a PSNR, or the size of a compressed
-    file."""
+    """Whether only trials tell the count of a budget: of a PSNR, or of the size of a compressed file."""
     return isinstance(keep, WithinPsnr) or isinstance(keep, Megabytes) and keep.bytes_of is None
 
 
@@ -118,14 +117,14 @@ def check_size(keep: Megabytes, n: int) -> int:
     return math.floor(keep.value * 1e6)
 
 
-def _that_fit(n: int, keep: Megabytes, sh_degree: int) -> int:
-    """How many of ``n`` Gaussians fit into a file."""
+def _count_that_fits(n: int, keep: Megabytes, sh_degree: int) -> int:
+    """Largest number of Gaussians, at most ``n``, whose file is no larger than the budget."""
     bytes_of, limit = keep.bytes_of, check_size(keep, n)
     if bytes_of is None:
         raise BudgetError(
             f"keep is {keep}, which is found by writing; expected a ratio, a count or the size of a .ply here"
         )
-    # The size grows with the count, if not evenly: headers hold its digits, and chunks are begun.
+    # The size never falls with the count, but grows unevenly: headers hold its digits, and chunks are padded.
     count = bisect.bisect_right(range(1, n + 1), limit, key=lambda count: bytes_of(count, sh_degree))
     if count < 1:
         least = bytes_of(1, sh_degree)

@@ -2,8 +2,8 @@
 
 A score over the whole scene empties regions whose Gaussians are small or faint, even if many of them together form a
 surface. Here Gaussians compete only with their neighbours. A neighbourhood is a run of a few Gaussians along a
-space-filling curve, so it is small where the scene is dense and large where it is sparse. Each keeps the same share of
-its mass, so that no region is emptied.
+space-filling curve: small where the scene is dense, large where it is sparse. Each neighbourhood keeps the same share
+of its mass, so no region is emptied.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Exact copies: Gaussians that equal others in every parameter, to the bit.
 
-Broken files have thousands of them, such as rows of zeros. They look like one Gaussian, and become one before a scene
-is merged.
+Broken files have thousands of them, such as rows of zeros. Copies of one kind look like one Gaussian, and become one
+before a scene is merged.
 """
 
 from __future__ import annotations
@@ -14,12 +14,10 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
-
-CHUNK = 1 << 16
-"""Number of Gaussians processed at once where many numbers of each are needed."""
+from pointsplat_ns.system.pieces import CHUNK
 
 NODES = 16
-"""Of the quadrature in :func:`stacked`: enough for 4 digits."""
+"""Number of nodes of the quadrature in :func:`stacked`: enough for 4 digits."""
 
 _INTEGERS = {2: torch.int16, 4: torch.int32, 8: torch.int64}
 _FACTOR = 0x2545F4914F6CDD1D
@@ -31,8 +29,8 @@ class Reduced:
     """A scene without some of its copies."""
 
     scene: Gaussians
-    members: Tensor  # [m] ascending indices in ``scene`` of those that take part
-    index: Tensor  # [N] index in ``scene`` of what each Gaussian of the original became
+    members: Tensor  # [m] ascending indices in ``scene`` of the members that are left
+    index: Tensor  # [N] index in ``scene`` of the Gaussian that each of the original became
 
 
 class Copies:
@@ -40,50 +38,50 @@ class Copies:
 
     Args:
         scene: N Gaussians on the CPU.
-        members: (n,) ascending indices of those that are compared; nothing of them is NaN.
+        members: (n,) ascending indices of the Gaussians that are compared, without NaN.
     """
 
     def __init__(self, scene: Gaussians, members: Tensor):
         self.scene, self.members = scene, members
         self.first = _first_equal(scene, members)  # [n] index in ``members`` of the first that each equals
         self.distinct = int((self.first == torch.arange(len(members))).sum())
-        """Number of members that differ."""
+        """Number of different members."""
 
     def __len__(self) -> int:
         return len(self.members)
 
     def reduced(self, k: int) -> Reduced:
-        """The scene with ``k`` of the members, at least :attr:`distinct` and at most n. Second copies go last; of each
-        kind, those that go become one with the first, which then looks like all of them."""
+        """The scene with ``k`` of the members, at least :attr:`distinct` and at most n. Of each kind, the last copies
+        are removed, and the first one is changed so that it looks like itself and the removed ones together."""
         n = len(self)
-        everyone = torch.arange(len(self.scene))
+        index = torch.arange(len(self.scene))
         if k == n:
-            return Reduced(self.scene, self.members, everyone)
+            return Reduced(self.scene, self.members, index)
         rank = _ranks(self.first)
-        gone = torch.ones(n, dtype=torch.bool)
-        gone[rank.sort(stable=True).indices[:k]] = False
-        counts = torch.bincount(self.first[gone], minlength=n) + 1
-        grown = (counts > 1).nonzero()[:, 0]
-        rows = self.members[grown]
+        removed = torch.ones(n, dtype=torch.bool)
+        removed[rank.sort(stable=True).indices[:k]] = False
+        counts = torch.bincount(self.first[removed], minlength=n) + 1
+        changed = (counts > 1).nonzero()[:, 0]
+        rows = self.members[changed]
         opacities, scales = self.scene.opacities.clone(), self.scene.scales.clone()
-        alphas, growth = stacked(torch.sigmoid(opacities[rows, 0].double()), counts[grown])
+        alphas, growth = stacked(torch.sigmoid(opacities[rows, 0].double()), counts[changed])
         opacities[rows, 0] = torch.logit(alphas).to(opacities.dtype)
         scales[rows] = (scales[rows].double() + growth[:, None]).to(scales.dtype)
-        stays = torch.ones(len(self.scene), dtype=torch.bool)
-        stays[self.members[gone]] = False
-        everyone[self.members[gone]] = self.members[self.first[gone]]
-        place = stays.cumsum(0) - 1
-        scene = self.scene.replace(opacities=opacities, scales=scales)[stays]
-        return Reduced(scene, place[self.members[~gone]], place[everyone])
+        kept = torch.ones(len(self.scene), dtype=torch.bool)
+        kept[self.members[removed]] = False
+        index[self.members[removed]] = self.members[self.first[removed]]
+        place = kept.cumsum(0) - 1
+        scene = self.scene.replace(opacities=opacities, scales=scales)[kept]
+        return Reduced(scene, place[self.members[~removed]], place[index])
 
 
 def stacked(alphas: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """What one Gaussian must be to look like several equal ones at the same place.
+    """Opacity and size of one Gaussian that looks like several equal ones at the same place.
 
     Copies of opacity a let the share (1 - a G)^n through, where G falls from 1 at the centre, and where a G is below
     :data:`ALPHA_MIN` they are not drawn. So the one is as opaque as all of them at the centre, and as much larger as it
     takes to cover as much: the integral of 1 - (1 - a G)^n over a plane, where the area element is proportional to
-    dG / G. That is smaller for copies that are hardly drawn themselves.
+    dG / G.
 
     Args:
         alphas: (m,) float64 opacities in [0, 1].
@@ -112,8 +110,8 @@ def stacked(alphas: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
 def _first_equal(scene: Gaussians, members: Tensor) -> Tensor:
     """Index in ``members`` (n,) of the first that each equals in every parameter, itself if there is none before.
 
-    Those that share a hash of their positions are hashed whole, and compared with the first of the same hash. Two that
-    differ and share that as well hide copies of the second; nothing else can go wrong.
+    Members that share a hash of their positions are hashed over all parameters, and compared with the first member of
+    the same hash. If two different members share that hash as well, copies of the second are not found.
     """
     n = len(members)
     first = torch.arange(n)
@@ -152,7 +150,7 @@ def _repeated(keys: Tensor) -> Tensor:
 
 
 def _ranks(kind: Tensor) -> Tensor:
-    """How many before each have the same ``kind`` (n,)."""
+    """Number of earlier members of the same ``kind`` (n,), for each."""
     ranked, order = kind.sort(stable=True)
     starts = torch.searchsorted(ranked, ranked)
     ranks = torch.empty_like(kind)

@@ -1,4 +1,4 @@
-"""The registry of pruning methods, and :func:`prune`, which applies any of them."""
+"""The registry of pruning methods, and :func:`prune`, which applies one of them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.windows import RESOLUTION
 from pointsplat_ns.pruning.budget import Keep, resolve_keep
 from pointsplat_ns.pruning.coverage import coverage_score
-from pointsplat_ns.pruning.merge import merge
+from pointsplat_ns.pruning.merging import merge
 from pointsplat_ns.pruning.scores import (
     area_score,
     authors_score,
@@ -124,12 +124,12 @@ def prune(
         scene: N Gaussians.
         keep: ratio, count or size (see :func:`~pointsplat_ns.pruning.budget.resolve_keep`).
         by: one of :data:`METHODS`. Methods with a score keep Gaussians unchanged, in their original order.
-        views: views for methods that need them, or a function that returns them. Merging looks from them if they are
-            given as such, and from free places in the scene otherwise.
+        views: views for methods that need them, or a function that returns them. Merging uses views that are given as
+            such; for a function or None it samples views of its own.
         opacity_weight: lambda of the methods that weigh opacity; by default the paper's.
         progress: called with the share done, in [0, 1].
-        note: called with a line of text on what was chosen for this scene.
-        resolution: width and height of the pictures that merging looks at where no views are given, pixels.
+        note: called with a line of text on the numbers that merging chose for this scene.
+        resolution: width and height of the views that merging samples, pixels.
 
     Returns:
         Exactly the number of Gaussians that ``keep`` resolves to.

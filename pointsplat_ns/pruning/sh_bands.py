@@ -1,9 +1,9 @@
-"""Cutting the bands of spherical harmonics, and the energy that is lost by it.
+"""Cutting the bands of spherical harmonics (SH), and the energy that is lost by it.
 
 The basis is orthonormal on the sphere: the mean square, over all directions, of a coefficient's contribution to a
 colour is its square divided by 4 pi, and dropping coefficients is the best approximation by the others. So the energy
-lost is known without rendering. The visible error is not: a scene is only seen from some directions, and errors of real
-scenes were up to 9 dB away from what the energy predicts. So :mod:`~pointsplat_ns.compression.budget_search` renders to
+lost is known without rendering. The visible error is not: a scene is seen from some directions only, and errors of real
+scenes were up to 9 dB away from the energy's prediction. So :mod:`~pointsplat_ns.compression.budget_search` renders to
 decide which degree to keep.
 """
 
@@ -25,11 +25,11 @@ def band_energies(scene: Gaussians) -> list[float]:
     Gaussians that cannot be drawn are left out; the clamping of colours at 0 is ignored.
     """
     weights = area_score(scene)
-    seen = weights > -math.inf  # NaN fails too
-    if not bool(seen.any()):
+    drawn = weights > -math.inf  # NaN fails too
+    if not bool(drawn.any()):
         return [0.0] * scene.sh_degree
-    weights = torch.softmax(weights[seen], dim=0)
-    squares = weights @ scene.features_rest[seen].double().square().mean(dim=2) / (4 * math.pi)  # (K,)
+    weights = torch.softmax(weights[drawn], dim=0)
+    squares = weights @ scene.features_rest[drawn].double().square().mean(dim=2) / (4 * math.pi)  # (K,)
     return [float(squares[d * d - 1 : (d + 1) ** 2 - 1].sum()) for d in range(1, scene.sh_degree + 1)]
 
 

@@ -25,11 +25,10 @@ LIGHTGAUSSIAN_BETA = 0.1
 LIGHTGAUSSIAN_LARGEST = 0.9
 """Rank of the normalising volume, as a share of all Gaussians sorted by descending volume."""
 
-
-LEAST_DETERMINED = 1e-9
-"""Lower bound of the eigenvalues of a Hessian block of unit diagonal (PUP-3DGS). What no view determines has
-eigenvalues of 0, whose computed values and logarithms are rounding errors; with this bound the score tells what the
-others are."""
+MIN_EIGENVALUE = 1e-9
+"""Lower bound of the eigenvalues of a Hessian block of unit diagonal (PUP-3DGS). Parameters that no view determines
+have eigenvalues of 0, whose computed values and logarithms are rounding errors. With this bound the score depends on
+the other eigenvalues."""
 
 
 def lightgaussian_score(
@@ -66,9 +65,9 @@ def lightgaussian_score(
 
     with torch.no_grad():
         for index in _indices(views, progress):
-            seen = _project(scene.means, scene.stds, scene, views, index)
-            through = sum_over_pixels(seen, views.width, views.height, 1, passed)[:, 0]
-            total.index_add_(0, seen.ids, (seen.opacities * through).double())
+            projected = _project(scene.means, scene.stds, scene, views, index)
+            through = sum_over_pixels(projected, views.width, views.height, 1, passed)[:, 0]
+            total.index_add_(0, projected.ids, (projected.opacities * through).double())
         if bool(usable.any()):
             logs = log_volume(scene)
             ranked = logs[usable].sort(descending=True).values
@@ -93,8 +92,8 @@ def pup_score(scene: Gaussians, views: Views, progress: Callable[[float], None] 
 
     Returns:
         Scores (N,), float64: -Inf where the picture does not depend on one of the six parameters (as where no view sees
-        the Gaussian), NaN where it cannot be drawn. What the views leave undetermined together counts as determined a
-        little, see :data:`LEAST_DETERMINED`.
+        the Gaussian), NaN where it cannot be drawn. Combinations of parameters that no view determines count
+        as slightly determined, see :data:`MIN_EIGENVALUE`.
 
     Raises:
         DataError: if there is no view.
@@ -106,24 +105,24 @@ def sensitivity(scene: Gaussians, views: Views, progress: Callable[[float], None
     """The 6 x 6 Hessian blocks of :func:`pup_score`, (N, 6, 6) float64: mean x, y, z, then the standard
     deviations, per scene unit squared."""
     _need_a_view(views)
-    # All of it in float64: in float32 small eigenvalues, and so the scores of what views hardly determine, are rounding
-    # errors. In a room a quarter of the better half were others.
+    # In float32, small eigenvalues, and so the scores of Gaussians that few pixels show, are rounding errors. In a room
+    # a quarter of the better half differed from float64.
     scene = scene.to(torch.float64)
     total = torch.zeros(len(scene), 6, 6, dtype=torch.float64, device=scene.device)
     for index in _indices(views, progress):
         means, stds = (value.detach().requires_grad_() for value in (scene.means, scene.stds))
         with torch.enable_grad():
-            seen = _project(means, stds, scene, views, index)
-            colors = sh_to_color(seen.directions, scene.sh.detach()[seen.ids], scene.sh_degree)
-            in_plane = torch.cat([seen.opacities.log()[:, None], seen.means2d, seen.cov2d], dim=1)
-            shape = _jacobian(in_plane, means, stds, seen.ids)  # (M, 6, 6)
-            color = _jacobian(colors, means, stds, seen.ids)  # (M, 3, 6)
+            projected = _project(means, stds, scene, views, index)
+            colors = sh_to_color(projected.directions, scene.sh.detach()[projected.ids], scene.sh_degree)
+            in_plane = torch.cat([projected.opacities.log()[:, None], projected.means2d, projected.cov2d], dim=1)
+            shape = _jacobian(in_plane, means, stds, projected.ids)  # (M, 6, 6)
+            color = _jacobian(colors, means, stds, projected.ids)  # (M, 3, 6)
         with torch.no_grad():
-            sums = _second_moments(seen, colors.detach(), views).double()
+            sums = _second_moments(projected, colors.detach(), views).double()
             squares, cross, weight = sums[:, :36].view(-1, 6, 6), sums[:, 36:54].view(-1, 3, 6), sums[:, 54]
             mixed = shape.mT @ cross.mT @ color
             block = shape.mT @ squares @ shape + mixed + mixed.mT + weight[:, None, None] * (color.mT @ color)
-            total.index_add_(0, seen.ids, block)
+            total.index_add_(0, projected.ids, block)
     return total
 
 
@@ -132,18 +131,18 @@ def log_determinant(blocks: Tensor) -> Tensor:
     diagonal has a zero.
 
     Each block is first scaled to a unit diagonal, so that neither 1e-30 nor 1e30 under- or overflows. Its eigenvalues
-    are then bounded by :data:`LEAST_DETERMINED`.
+    are then bounded by :data:`MIN_EIGENVALUE`.
     """
     diagonal = blocks.diagonal(dim1=-2, dim2=-1)
     ok = (diagonal > 0).all(-1) & blocks.isfinite().all(-1).all(-1)
     root = torch.where(ok[:, None], diagonal, 1.0).sqrt()
     unit = torch.where(ok[:, None, None], blocks, torch.eye(blocks.shape[-1]).to(blocks))
     values = torch.linalg.eigvalsh(unit / root[:, :, None] / root[:, None, :])
-    result = values.clamp_min(LEAST_DETERMINED).log().sum(-1) + 2 * root.log().sum(-1)
+    result = values.clamp_min(MIN_EIGENVALUE).log().sum(-1) + 2 * root.log().sum(-1)
     return torch.where(ok, result, -math.inf)
 
 
-def _second_moments(seen: Projected, colors: Tensor, views: Views) -> Tensor:
+def _second_moments(projected: Projected, colors: Tensor, views: Views) -> Tensor:
     """(M, 55): for the gradient ``r phi`` of a channel by (log opacity, mean x, y, covariance xx, xy, yy), with r its
     gradient by log alpha, and the weight w of the colour: sums of r^2 phi phi^T, of r w phi (by channel), of w^2."""
     background = views.background.to(colors)
@@ -175,7 +174,7 @@ def _second_moments(seen: Projected, colors: Tensor, views: Views) -> Tensor:
         squares = (phi * square[..., None, :]) @ phi.mT  # (B, L, 6, 6)
         return torch.cat([squares.flatten(-2), *cross, (weight * weight).sum(-1, keepdim=True)], dim=-1)
 
-    return sum_over_pixels(seen, views.width, views.height, 55, values)
+    return sum_over_pixels(projected, views.width, views.height, 55, values)
 
 
 def _jacobian(outputs: Tensor, means: Tensor, stds: Tensor, ids: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.level_errors import FARTHER, displacement, distance_seen
 from pointsplat_ns.compression.level_folder import file_names
 from pointsplat_ns.pruning import ply_bytes
-from pointsplat_ns.pruning.merge import merge, merge_levels
+from pointsplat_ns.pruning.merging import merge, merge_levels
 
 ASKED = ("50%", "25%", "10%", "3%")
 

@@ -16,16 +16,16 @@ import pytest
 from pointsplat_ns.rasterizer.compiled import blending
 
 COMPUTE = """
-import hashlib, json, sys
+import dataclasses, json
 import torch
 import pointsplat_ns as ps
 from pointsplat_ns.compression.optimiser import gradients_of
 from pointsplat_ns.compression.repair import RepairBudget, repair
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.pruning import finishing
+from pointsplat_ns.pruning.merging import DEFAULTS, merge
 from pointsplat_ns.system.threads import fixed_threads
 
-finishing.LOOKED_AT = 1  # to be quick
+quick = dataclasses.replace(DEFAULTS, finish_views=1)
 
 room = ps.example_room()
 both = torch.cat([torch.arange(len(room)), torch.arange(5001)])  # more than torch shares between threads, and odd
@@ -39,7 +39,7 @@ refiner = ps.load_refiner()
 def results():
     yield "image", {"image": ps.render(scene, views[0])}
     yield "gradients", gradients_of(scene, views[0], target)
-    yield "merged", dict(ps.prune(scene, keep=20_000).items())
+    yield "merged", dict(merge(scene, 20_000, settings=quick).scene.items())
     yield "refined", dict(refiner(small).items())
     source = ViewSource(scene, given=ps.sample_views(scene, 30, width=160, height=120))
     yield "repaired", dict(repair(small, scene, source, Steps()).scene.items())

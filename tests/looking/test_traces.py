@@ -14,7 +14,7 @@ from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.sampling import is_room, sample_views, views_about
 from pointsplat_ns.looking.traces import MOST_FACTOR, correlation, how_much_seen, log_norms, photo_places
-from pointsplat_ns.pruning.merge import merge
+from pointsplat_ns.pruning.merging import merge
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.views import Views

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.morton import curve_keys, unit_cells
 from pointsplat_ns.pruning import METHODS, score_of, select
 from pointsplat_ns.pruning.coverage import coverage_score, mass_shares
 
@@ -42,7 +41,7 @@ def shares_by_definition(masses, run, first):
 
 @settings(max_examples=200, deadline=None)
 @given(
-    st.lists(st.sampled_from([0.0, 0.25, 0.5, 1.0, 3.0, 700.0]), min_size=1, max_size=40),
+    st.lists(st.sampled_from([0.0, 0.25, 0.5, 1.0, 3.0, 700.0]), max_size=40),
     st.integers(1, 7),
     st.data(),
 )
@@ -61,30 +60,6 @@ def test_shares_do_not_depend_on_the_unit_of_mass_and_never_overflow(shift):
     assert torch.allclose(mass_shares(masses + shift, 12), mass_shares(masses, 12), atol=1e-9)
 
 
-def test_no_item_has_no_share():
-    assert mass_shares(torch.zeros(0, dtype=torch.float64), 12, 4).shape == (0,)
-
-
-def test_the_curve_interleaves_the_bits_of_the_grid():
-    generator = torch.Generator().manual_seed(1)
-    cells = torch.rand(200, 3, generator=generator)
-    grid = (cells * (2**20 - 1)).long().tolist()
-    wanted = [
-        sum(((value >> bit) & 1) << (3 * bit + 2 - axis) for bit in range(20) for axis, value in enumerate(point))
-        for point in grid
-    ]
-    assert curve_keys(cells).tolist() == wanted
-
-
-def test_cells_hold_what_is_near_and_clamp_what_is_far():
-    generator = torch.Generator().manual_seed(2)
-    means = torch.randn(5000, 3, generator=generator)
-    means[7] = 1e30
-    cells = unit_cells(means)
-    assert cells.min() >= 0 and cells.max() <= 1 and cells[7].tolist() == [1.0, 1.0, 1.0]
-    assert (cells.std(dim=0) > 0.05).all()  # one outlier has not squeezed the others together
-
-
 def test_no_region_is_emptied_at_ten_percent_where_other_scores_empty_one():
     # A wall of large opaque Gaussians, and a far larger number of faint and small ones that make up another.
     generator = torch.Generator().manual_seed(3)
@@ -98,15 +73,6 @@ def test_no_region_is_emptied_at_ten_percent_where_other_scores_empty_one():
     kept = {by: select(score_of(scene, METHODS[by]), 200) for by in ("coverage", "paper", "area", "opacity")}
     regions = {by: len(cell[indices].unique()) for by, indices in kept.items()}
     assert regions["coverage"] == 32 and max(regions["paper"], regions["area"]) < 20
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_best_of_every_run_has_all_of_its_share(dtype):
-    generator = torch.Generator().manual_seed(4)
-    masses = 5 * torch.randn(5 + 100 * 12, generator=generator, dtype=dtype)
-    shares = mass_shares(masses, 12, first=5)[5:].view(100, 12)
-    assert (shares.amax(dim=1) == 1).all() and (shares > 0).all()
-    assert torch.equal(shares.argmax(dim=1), masses[5:].view(100, 12).argmax(dim=1))
 
 
 def test_unusable_gaussians_leave_the_others_alone():

@@ -11,7 +11,7 @@ from making import cloud, same
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import duplicates
 from pointsplat_ns.pruning.duplicates import Copies, stacked
-from pointsplat_ns.pruning.merge import merge, merge_levels
+from pointsplat_ns.pruning.merging import merge, merge_levels
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
 

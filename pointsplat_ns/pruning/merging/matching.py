@@ -1,4 +1,4 @@
-"""Disjoint pairs of neighbours, the cheapest first."""
+"""Which pairs go: disjoint pairs of neighbours, the cheapest first."""
 
 from __future__ import annotations
 
@@ -7,19 +7,17 @@ import math
 import torch
 from torch import Tensor
 
+from pointsplat_ns.pruning.merging.settings import DEFAULTS
+from pointsplat_ns.system.pieces import CHUNK
 from pointsplat_ns.system.threads import in_threads
-
-PASSES = 6
-"""Number of times that pairs are looked for among those still free."""
-
-CHUNK = 1 << 16
-"""Number of rows processed at once, to save memory."""
 
 _SCATTER = 2654435761
 """Odd, so that multiplying by it modulo 2^32 permutes the numbers of pairs (Knuth's multiplicative hashing)."""
 
 
-def cheapest_pairs(near: Tensor, costs: Tensor, most: int) -> tuple[Tensor, Tensor]:
+def cheapest_pairs(
+    near: Tensor, costs: Tensor, most: int, passes: int = DEFAULTS.matching_passes
+) -> tuple[Tensor, Tensor]:
     """Disjoint pairs of neighbours.
 
     Each pass takes the pairs that are the cheapest for both of their members, among the Gaussians still free. Ties are
@@ -27,9 +25,10 @@ def cheapest_pairs(near: Tensor, costs: Tensor, most: int) -> tuple[Tensor, Tens
 
     Args:
         near: (n, k) int32, indices of the neighbours of each Gaussian; its own index means none.
-        costs: (n, k) float32, at least 0, from the view of each; where both have the other as a neighbour, the mean of
-            both costs counts.
+        costs: (n, k) float32, at least 0, of merging each with each neighbour. Where two are neighbours of each other,
+            the mean of their two costs counts.
         most: largest number of pairs.
+        passes: number of passes.
 
     Returns:
         First and second members, (E,) int64 each; at least one pair if there is any neighbour and ``most`` is not 0.
@@ -39,7 +38,7 @@ def cheapest_pairs(near: Tensor, costs: Tensor, most: int) -> tuple[Tensor, Tens
     free = torch.ones(n, dtype=torch.bool)
     rows = torch.arange(n)
     firsts, seconds, prices = [], [], []
-    for _ in range(PASSES):
+    for _ in range(passes):
         best = torch.full((n,), torch.iinfo(torch.int64).max)
         for these in rows.split(CHUNK):
             keys = _keys(these, costs)
@@ -73,8 +72,8 @@ def cheapest_pairs(near: Tensor, costs: Tensor, most: int) -> tuple[Tensor, Tens
 
 
 def _symmetric(near: Tensor, costs: Tensor) -> Tensor:
-    """Costs (n, k) with each pair once: the mean of both views in the row of the smaller index, infinite in that of the
-    other, and infinite for a Gaussian with itself."""
+    """Costs (n, k) with each pair once: the mean of its two costs in the row of the smaller index, infinity in the row
+    of the other. A Gaussian with itself costs infinity."""
     result = torch.empty_like(costs)
 
     def fill(me: Tensor) -> None:

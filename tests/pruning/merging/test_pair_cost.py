@@ -8,15 +8,27 @@ import pytest
 import torch
 
 from pointsplat_ns.gaussians import SH_C0, Gaussians
-from pointsplat_ns.pruning import covariance as algebra
-from pointsplat_ns.pruning import pair_costs
-from pointsplat_ns.pruning.merge_state import GROWTH, MOST_SURPLUS, OPAQUE, State, start
+from pointsplat_ns.pruning.merging import DEFAULTS
+from pointsplat_ns.pruning.merging import covariance as algebra
+from pointsplat_ns.pruning.merging.pair_cost import costs_in_plane, pair_costs
+from pointsplat_ns.pruning.merging.participants import Participants
+from pointsplat_ns.pruning.merging.projections import (
+    DIRECTIONS,
+    MAX_WIDTH,
+    PLANE_AXES,
+    TO_PLANE,
+    TRIPLES,
+    Projections,
+    in_content_units,
+)
+from pointsplat_ns.pruning.merging.state import State, initial_state
 
 
-def state_of(scene: Gaussians) -> State:
-    """The state before the first round, of all Gaussians, in units of 1 around the origin."""
+def state_of(scene: Gaussians, size: float = 1.0) -> State:
+    """The state before the first round, of all Gaussians, around the origin."""
     n = len(scene)
-    return start(scene, torch.arange(n), torch.ones(n), torch.zeros(3, dtype=torch.float64), 1.0)
+    participants = Participants(scene, torch.arange(n), torch.zeros(3, dtype=torch.float64), size)
+    return initial_state(participants, torch.ones(n), DEFAULTS)
 
 
 def disks(seed: int = 1, logits: tuple[float, float] = (0.3, -0.6)) -> Gaussians:
@@ -32,16 +44,20 @@ def disks(seed: int = 1, logits: tuple[float, float] = (0.3, -0.6)) -> Gaussians
     )
 
 
-def seen_from(state: State, way: int, dtype: torch.dtype) -> pair_costs.Seen:
-    seen = pair_costs.Seen.of(state, dtype)
-    seen.look(state, torch.arange(len(state)), way)
-    return seen
+def costs_along(
+    state: State, direction: int, i: torch.Tensor, j: torch.Tensor, dtype: torch.dtype = torch.float32
+) -> torch.Tensor:
+    """Costs (m, k) in one direction, float64."""
+    projections = Projections.empty(state, dtype)
+    projections.fill(state, torch.arange(len(state)), direction)
+    return costs_in_plane(projections, i, j, DEFAULTS).double()
 
 
-def seen_along_z(state: State) -> pair_costs.Seen:
-    way = int(pair_costs.DIRECTIONS[:, 2].abs().argmax())
-    assert float(pair_costs.DIRECTIONS[way, 2].abs()) == 1.0
-    return seen_from(state, way, torch.float32)
+def cost_along_z(scene: Gaussians) -> float:
+    """The cost of merging the first of two Gaussians with the second, along the z axis."""
+    direction = int(DIRECTIONS[:, 2].abs().argmax())
+    assert float(DIRECTIONS[direction, 2].abs()) == 1.0
+    return float(costs_along(state_of(scene), direction, torch.tensor([0]), torch.tensor([[1]])))
 
 
 @pytest.mark.parametrize(("logits", "grows"), [((0.3, -0.6), False), ((6.0, 6.0), True)])
@@ -49,7 +65,7 @@ def test_the_cost_is_the_integral_that_it_claims_to_be(logits, grows):
     """Against a sum over a fine grid in the plane, in float64."""
     scene = disks(logits=logits)
     state = state_of(scene)
-    got = float(seen_along_z(state).costs(torch.tensor([0]), torch.tensor([[1]])))
+    got = cost_along_z(scene)
     axis = torch.linspace(-0.6, 0.7, 1301, dtype=torch.float64)
     grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1)
     cov = algebra.unpack(state.cov)[:, :2, :2]
@@ -69,21 +85,23 @@ def test_the_cost_is_the_integral_that_it_claims_to_be(logits, grows):
     merged_cov = (w[:, None, None] * (cov + apart[:, :, None] * apart[:, None])).sum(0)
     alpha = (alphas * areas).sum() - alphas[0] * alphas[1] * both
     alpha = alpha / torch.linalg.det(merged_cov).sqrt()
-    assert (float(alpha) > OPAQUE) == grows
-    merged_cov = merged_cov * (alpha / OPAQUE).clamp(1, MOST_SURPLUS) ** GROWTH
-    alpha = alpha.clamp_max(OPAQUE)
+    assert (float(alpha) > DEFAULTS.max_opacity) == grows
+    merged_cov = (
+        merged_cov * (alpha / DEFAULTS.max_opacity).clamp(1, DEFAULTS.max_growth_ratio) ** DEFAULTS.growth_exponent
+    )
+    alpha = alpha.clamp_max(DEFAULTS.max_opacity)
     merged = splat(mean, merged_cov)
     on = alphas[1] * both / areas[0]
     cover = alphas[0] / 2 + on
     colours = scene.features_dc.double() * SH_C0
     around = (alphas[0] / 2 * colours[0] + on * colours[1]) / cover
     f = colours - around
-    assumed = 3 * pair_costs.LOCAL_CONTRAST**2
+    assumed = 3 * DEFAULTS.min_contrast**2
     parts = torch.stack([alphas[0] * first, alphas[1] * second, -alpha * merged])
     change = torch.einsum("cij,cd->ijd", parts, torch.cat([f, (w[:, None] * f).sum(0)[None]]))
     shape = parts.sum(0).square().sum() * pixel
     blend = float(change.square().sum() * pixel + assumed * shape)
-    through = 3 * pair_costs.BACKGROUND_CONTRAST**2 * math.exp(-4 * float(cover))
+    through = 3 * DEFAULTS.background_contrast**2 * math.exp(-4 * float(cover))
     want = blend / max(float(cover), 0.5) ** 2 + through * float(shape)
     assert got == pytest.approx(want, rel=2e-3)  # float32, where six terms nearly cancel
 
@@ -91,25 +109,21 @@ def test_the_cost_is_the_integral_that_it_claims_to_be(logits, grows):
 def test_members_of_different_colours_cost_more_than_of_equal_ones():
     scene = disks()
     colours = torch.tensor([[1.0, 1, 1], [-1.0, -1, -1]])
-    i, j = torch.tensor([0]), torch.tensor([[1]])
-    equal, different = (
-        float(seen_along_z(state_of(scene.replace(features_dc=values))).costs(i, j))
-        for values in (colours[[0, 0]], colours)
-    )
+    equal, different = (cost_along_z(scene.replace(features_dc=values)) for values in (colours[[0, 0]], colours))
     assert different > 10 * equal > 0
 
 
-def test_shadows_of_all_directions_are_those_of_the_covariance():
+def test_the_matrices_of_all_directions_project_covariances():
     g = torch.Generator().manual_seed(3)
     six = algebra.covariances(torch.randn(5, 3, generator=g).double(), torch.randn(5, 4, generator=g).double())
-    for axes, matrix in zip(pair_costs.AXES, pair_costs.TO_SHADOW, strict=True):
-        want = algebra.flatten(six, axes[:, 0].expand(5, 3), axes[:, 1].expand(5, 3))
+    for axes, matrix in zip(PLANE_AXES, TO_PLANE, strict=True):
+        want = algebra.project(six, axes[:, 0].expand(5, 3), axes[:, 1].expand(5, 3))
         torch.testing.assert_close(six @ matrix, want)
 
 
-def test_every_direction_has_two_sides_across():
-    across = (pair_costs.DIRECTIONS[pair_costs.SIDES] @ pair_costs.DIRECTIONS[pair_costs.SIDES].mT).abs()
-    assert float((across - torch.eye(3, dtype=torch.float64)).abs().max()) < 0.6  # at least 53 degrees apart
+def test_every_direction_has_two_others_nearly_perpendicular():
+    cosines = (DIRECTIONS[TRIPLES] @ DIRECTIONS[TRIPLES].mT).abs()
+    assert float((cosines - torch.eye(3, dtype=torch.float64)).abs().max()) < 0.6  # at least 53 degrees apart
 
 
 def test_sizes_are_in_units_of_the_scene_and_bounded_where_they_are_wide_beyond_any_view():
@@ -122,9 +136,8 @@ def test_sizes_are_in_units_of_the_scene_and_bounded_where_they_are_wide_beyond_
         features_dc=torch.zeros(4, 3),
         features_rest=torch.zeros(4, 0, 3),
     )
-    state = start(scene, torch.arange(4), torch.ones(4), torch.zeros(3, dtype=torch.float64), 2.0)
-    _, cov = pair_costs._scaled(state, torch.arange(len(state)))
-    expected = torch.tensor([0.25, 10.0, 250.0, pair_costs.WIDEST], dtype=torch.float64)
+    _, cov = in_content_units(state_of(scene, size=2.0), torch.arange(4))
+    expected = torch.tensor([0.25, 10.0, 250.0, MAX_WIDTH], dtype=torch.float64)
     torch.testing.assert_close(cov[:, 0].sqrt(), expected, rtol=1e-6, atol=0.0)  # sizes are given in float32
 
 
@@ -141,7 +154,7 @@ def test_costs_are_finite_and_not_negative_at_the_extremes():
         features_rest=torch.zeros(n, 0, 3),
     )
     others = torch.arange(n, dtype=torch.int32).expand(n, n)
-    costs = pair_costs.costs_of(state_of(scene), others)
+    costs = pair_costs(state_of(scene), others)
     assert bool(costs.isfinite().all()) and bool((costs >= 0).all())
 
 
@@ -159,8 +172,8 @@ def test_float32_costs_rank_pairs_as_float64_does():
     )
     state = state_of(scene)
     i, j = torch.arange(n), torch.randint(0, n, (n, 8), generator=g)
-    single = pair_costs.costs_of(state, j.to(torch.int32)).double()
-    for way in range(len(pair_costs.DIRECTIONS)):
-        a, b = (seen_from(state, way, dtype).costs(i, j).double() for dtype in (torch.float64, torch.float32))
+    single = pair_costs(state, j.to(torch.int32)).double()
+    for direction in range(len(DIRECTIONS)):
+        a, b = (costs_along(state, direction, i, j, dtype) for dtype in (torch.float64, torch.float32))
         assert float((a - b).abs().max()) < 1e-3 * float(a.max())
     assert bool(single.isfinite().all())

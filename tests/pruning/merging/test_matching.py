@@ -6,8 +6,8 @@ import math
 
 import torch
 
-from pointsplat_ns.pruning import matching
-from pointsplat_ns.pruning.matching import cheapest_pairs
+from pointsplat_ns.pruning.merging import matching
+from pointsplat_ns.pruning.merging.matching import cheapest_pairs
 
 
 def ring(n: int) -> torch.Tensor:
@@ -35,7 +35,7 @@ def test_the_cheapest_pair_of_all_is_the_first():
     assert {int(first), int(second)} == {3, 4}
 
 
-def test_a_pair_costs_the_mean_of_both_views():
+def test_a_pair_costs_the_mean_of_its_two_costs():
     near, costs = ring(4), torch.full((4, 2), 1.0)
     costs[0, 1], costs[1, 0] = 0.0, 1.8  # 0.9 together: still less than the others
     assert {int(member) for member in torch.cat(cheapest_pairs(near, costs.clone(), 1))} == {0, 1}
@@ -43,7 +43,7 @@ def test_a_pair_costs_the_mean_of_both_views():
     assert {int(member) for member in torch.cat(cheapest_pairs(near, costs, 1))} != {0, 1}
 
 
-def test_a_pair_that_only_one_of_them_knows_is_found():
+def test_a_pair_of_which_only_one_is_a_neighbour_is_found():
     near = torch.tensor([[1], [2], [1]], dtype=torch.int32)
     first, second = cheapest_pairs(near, torch.tensor([[0.1], [5.0], [5.0]]), 1)
     assert (int(first), int(second)) == (0, 1)

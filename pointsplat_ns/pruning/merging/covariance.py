@@ -1,0 +1,131 @@
+"""Covariances of Gaussians, their projections onto planes, and the overlaps of these, in batches, float64.
+
+A symmetric 3 x 3 matrix is stored as its six numbers (xx, xy, xz, yy, yz, zz), a symmetric 2 x 2 matrix as its three
+(uu, uv, vv). A picture shows the projection of a Gaussian onto a plane. So sizes are areas, not volumes, in units of
+2 pi times squared scene units: the integral of a projection of peak 1 is its area.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.quaternions import rotation_matrices
+
+MIN_DIVISOR = 1e-300
+"""Lower bound of float64 denominators, which keeps quotients finite; the smallest normal float64 is 2e-308."""
+
+MAX_LOG_SCALE = 40.0
+"""Bound of the absolute value of log-scales: products of four standard deviations and their squares stay in float64."""
+
+MAX_LOG_ASPECT = 11.5
+"""Axes shorter than exp(-this) (1e-5) of the longest are set to that length, which float64 still tells from zero."""
+
+
+def covariances(log_scales: Tensor, quats: Tensor) -> Tensor:
+    """Covariances (N, 6) of Gaussians with log-scales (N, 3), +-Inf allowed, and quaternions (N, 4), float64."""
+    logs = log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
+    logs = torch.maximum(logs, logs.amax(dim=1, keepdim=True) - MAX_LOG_ASPECT)
+    axes = rotation_matrices(quats) * logs.exp()[:, None]
+    return pack(axes @ axes.transpose(1, 2))
+
+
+def covariances_of(scene: Gaussians, rows: Tensor) -> Tensor:
+    """Covariances (m, 6) of the Gaussians ``rows`` (m,) of a scene, float64."""
+    return covariances(scene.scales[rows].double(), scene.quats[rows].double())
+
+
+def pack(matrix: Tensor) -> Tensor:
+    """(N, 6) of symmetric (N, 3, 3)."""
+    return matrix.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+
+
+def unpack(six: Tensor) -> Tensor:
+    """(N, 3, 3) of (N, 6)."""
+    return six[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].view(-1, 3, 3)
+
+
+def outer(vector: Tensor) -> Tensor:
+    """(N, 6): vector times its transpose, of (N, 3)."""
+    x, y, z = vector.unbind(1)
+    return torch.stack([x * x, x * y, x * z, y * y, y * z, z * z], dim=1)
+
+
+def adjugate(six: Tensor) -> Tensor:
+    """(N, 6): determinant times inverse. Its quadratic form of a unit vector is the squared area of the projection
+    along that vector."""
+    a, b, c, d, e, f = six.unbind(1)
+    rows = [d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b]
+    return torch.stack(rows, dim=1)
+
+
+def bilinear(six: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """u^T M v, (N,), of matrices (N, 6) and vectors (N, 3)."""
+    a, b, c, d, e, f = six.unbind(1)
+    ux, uy, uz = u.unbind(1)
+    vx, vy, vz = v.unbind(1)
+    return ux * (a * vx + b * vy + c * vz) + uy * (b * vx + d * vy + e * vz) + uz * (c * vx + e * vy + f * vz)
+
+
+def rms_area(six: Tensor) -> Tensor:
+    """Root mean square, over all directions, of the area of the projection, (N,): the square root of a third of the sum
+    of the squared products of each two standard deviations."""
+    sides = adjugate(six)
+    return ((sides[:, 0] + sides[:, 3] + sides[:, 5]).clamp_min(0) / 3).sqrt()
+
+
+def thinnest_axes(six: Tensor) -> Tensor:
+    """Unit vectors (N, 3) near the axis of least variance; any axis if no variance is the least.
+
+    This axis is the dominant eigenvector of the adjugate. Squaring the matrix three times makes it dominate (power
+    iteration).
+    """
+    matrix = unpack(adjugate(six))
+    for _ in range(3):
+        matrix = matrix / matrix.diagonal(dim1=1, dim2=2).sum(1).clamp_min(MIN_DIVISOR)[:, None, None]
+        matrix = matrix @ matrix
+    column = matrix.diagonal(dim1=1, dim2=2).argmax(1)
+    vector = matrix[torch.arange(len(matrix), device=six.device), column]
+    length = vector.norm(dim=1, keepdim=True)
+    return torch.where(length > MIN_DIVISOR, vector / length.clamp_min(MIN_DIVISOR), vector.new_tensor([0.0, 0.0, 1.0]))
+
+
+def plane_axes(normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Two unit vectors (N, 3) that span the plane perpendicular to each unit normal (Duff et al. 2017, JCGT 6(1))."""
+    x, y, z = normal.unbind(1)
+    sign = torch.where(z >= 0, 1.0, -1.0).to(normal)
+    a = -1 / (sign + z)
+    b = x * y * a
+    return (
+        torch.stack([1 + sign * x * x * a, sign * b, -sign * x], dim=1),
+        torch.stack([b, sign + y * y * a, -y], dim=1),
+    )
+
+
+def project(six: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Covariances (N, 3) of the projections onto the planes of unit vectors ``u`` and ``v`` (N, 3)."""
+    return torch.stack([bilinear(six, u, u), bilinear(six, u, v), bilinear(six, v, v)], dim=1)
+
+
+def projected_area(flat: Tensor) -> Tensor:
+    """Areas (N,) of projections with covariances (N, 3): root of the determinant."""
+    return (flat[:, 0] * flat[:, 2] - flat[:, 1] ** 2).clamp_min(0).sqrt()
+
+
+def overlap(first: Tensor, second: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Integral over the plane of the product of two projections of peak 1, (N,).
+
+    The product of two Gaussians is a Gaussian. Its integral is the product of their areas, divided by the area of the
+    summed covariance, times exp(-d^2 / 2) with d the Mahalanobis distance of the centres under that covariance. It is
+    no larger than the smaller area, also where the area of the sum, of projections like lines, is lost to rounding.
+
+    Args:
+        first, second: (N, 3) covariances of the projections.
+        u, v: (N,) each, from one centre to the other.
+    """
+    both = first + second
+    area = projected_area(both).clamp_min(MIN_DIVISOR)
+    distance = (both[:, 2] * u * u - 2 * both[:, 1] * u * v + both[:, 0] * v * v) / area / area
+    large, small = (order(projected_area(first), projected_area(second)) for order in (torch.maximum, torch.minimum))
+    return small * (large / area).clamp_max(1) * torch.exp(-0.5 * distance.clamp_min(0))

@@ -1,0 +1,77 @@
+"""The scene of groups: one Gaussian for each, with the numbers of a finish."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.quaternions import quaternions_of
+from pointsplat_ns.pruning.merging.covariance import MIN_DIVISOR, unpack
+from pointsplat_ns.pruning.merging.finishing import Finish
+from pointsplat_ns.pruning.merging.groups import Groups
+from pointsplat_ns.pruning.merging.participants import Participants
+from pointsplat_ns.pruning.merging.settings import MergeSettings
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX
+from pointsplat_ns.system.pieces import CHUNK
+
+
+def scene_maker(participants: Participants, groups: Groups, settings: MergeSettings) -> Callable[[Finish], Gaussians]:
+    """A function from a finish to the scene of K groups. A group of one member is that member to the bit."""
+    scene, counts = participants.scene, groups.counts.double()
+    single = (counts == 1)[:, None]
+    sh = _mean_sh(participants, groups, single[:, 0])
+    log_scales, quats = _axes(groups.cov)
+    means = torch.where(single, scene.means[groups.first], groups.means.to(scene.dtype))
+    quats = torch.where(single, scene.quats[groups.first], quats.to(scene.dtype))
+
+    def make(finish: Finish) -> Gaussians:
+        alphas = deepened(groups.alphas, counts, finish.depth_exponent, settings.max_opacity)
+        logits = torch.logit(alphas, 1e-7)[:, None].to(scene.dtype)
+        sizes = (log_scales + finish.size_change).to(scene.dtype)
+        return Gaussians(
+            means,
+            torch.where(single, scene.scales[groups.first], sizes),
+            quats,
+            torch.where(single, scene.opacities[groups.first], logits),
+            *sh,
+        )
+
+    return make
+
+
+def deepened(alphas: Tensor, counts: Tensor, exponent: float, max_opacity: float) -> Tensor:
+    """Opacities (n,) of Gaussians of ``counts`` (n,) members: 1 - (1 - alpha)^(counts^exponent), their optical depth
+    times counts^exponent."""
+    depth = -torch.log1p(-alphas.clamp_max(max_opacity)) * counts.double() ** exponent
+    return (-torch.expm1(-depth)).clamp_max(ALPHA_MAX)
+
+
+def _mean_sh(participants: Participants, groups: Groups, single: Tensor) -> tuple[Tensor, Tensor]:
+    """SH coefficients (K, 3) and (K, (d+1)^2 - 1, 3): means over the members by mass. Those of a group of one,
+    ``single`` (K,), are its own to the bit."""
+    scene, group = participants.scene, groups.group
+    wide = torch.promote_types(scene.dtype, torch.float32)
+    means = []
+    for values in (scene.features_dc, scene.features_rest):
+        mean = torch.zeros(len(groups), *values.shape[1:], dtype=wide)
+        for rows in torch.arange(len(group)).split(CHUNK):
+            own = values[participants.members[rows]].to(wide)
+            mean.index_add_(0, group[rows], own * groups.shares[rows].to(wide).view(-1, *[1] * (own.dim() - 1)))
+            of_single = single[group[rows]]
+            mean[group[rows][of_single]] = own[of_single]
+        means.append(mean.to(scene.dtype))
+    return means[0], means[1]
+
+
+def _axes(cov: Tensor) -> tuple[Tensor, Tensor]:
+    """Log-scales (n, 3) and quaternions (n, 4) of covariances (n, 6)."""
+    scales, quats = torch.empty(len(cov), 3, dtype=torch.float64), torch.empty(len(cov), 4, dtype=torch.float64)
+    for rows in torch.arange(len(cov)).split(CHUNK):
+        variances, axes = torch.linalg.eigh(unpack(cov[rows]))
+        axes[:, :, 0] *= torch.linalg.det(axes).sign()[:, None]
+        scales[rows] = 0.5 * variances.clamp_min(MIN_DIVISOR).log()
+        quats[rows] = quaternions_of(axes)
+    return scales, quats

@@ -1,0 +1,99 @@
+"""What a pair becomes: one Gaussian of the pair's common mass, centre, covariance and colour.
+
+With the mass ``m = a A`` of opacity a and root mean square area A, and the shares ``w_i = m_i / (m_i + m_j)``,
+``w_j = 1 - w_i``, a pair (i, j) becomes k with
+
+    mean        mu_k = w_i mu_i + w_j mu_j
+    covariance   S_k = w_i S_i + w_j S_j + w_i w_j (mu_i - mu_j)(mu_i - mu_j)^T
+    colour       c_k = w_i c_i + w_j c_j
+    opacity      a_k = (a_i P_i + a_j P_j - a_i a_j <G_i, G_j>) / P_k
+
+P is the area of the projection along the thinnest axis of S_k, and <G_i, G_j> the overlap of both projections, which
+both members cover and the replacement covers once. Where a_k is above the largest opacity, the area grows instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.pruning.merging.covariance import (
+    MIN_DIVISOR,
+    outer,
+    overlap,
+    plane_axes,
+    project,
+    projected_area,
+    rms_area,
+    thinnest_axes,
+)
+from pointsplat_ns.pruning.merging.settings import MergeSettings
+from pointsplat_ns.pruning.merging.state import State
+from pointsplat_ns.system.pieces import CHUNK
+
+
+def replace_pairs(state: State, first: Tensor, second: Tensor, settings: MergeSettings) -> tuple[State, Tensor]:
+    """Replace disjoint pairs, each in the place of its first member.
+
+    Args:
+        state: n Gaussians.
+        first, second: (E,) each, indices of the members.
+        settings: ``max_opacity``, ``growth_exponent``, ``max_growth_ratio``.
+
+    Returns:
+        The state of n - E Gaussians, and the share of the first member in each pair's mass, (E,) float32.
+    """
+    stays = torch.ones(len(state), dtype=torch.bool)
+    stays[second] = False
+    place = stays.cumsum(0) - 1
+    after = replace(
+        state,
+        means=state.means[stays],
+        cov=state.cov[stays],
+        alphas=state.alphas[stays],
+        colours=state.colours[stays],
+        weights=state.weights[stays],
+        counts=state.counts[stays],
+    )
+    shares = torch.empty(len(first))
+    for part in torch.arange(len(first)).split(CHUNK):
+        i, j = first[part], second[part]
+        k = place[i]
+        wi, after.means[k], after.cov[k], after.alphas[k] = _replacements(state, i, j, settings)
+        share = wi.float()
+        other = (1 - wi).float()
+        after.colours[k] = share[:, None] * state.colours[i] + other[:, None] * state.colours[j]
+        after.weights[k] = share * state.weights[i] + other * state.weights[j]
+        after.counts[k] = state.counts[i] + state.counts[j]
+        shares[part] = share
+    return after, shares
+
+
+def _replacements(state: State, i: Tensor, j: Tensor, settings: MergeSettings) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Share of the first member, mean, covariance and opacity of the replacements of pairs (m,), (m,)."""
+    ai, aj = state.alphas[i], state.alphas[j]
+    mi, mj = ai * rms_area(state.cov[i]), aj * rms_area(state.cov[j])
+    total = mi + mj
+    wi = torch.where(total > MIN_DIVISOR, mi / total.clamp_min(MIN_DIVISOR), 0.5)
+    wj = 1 - wi
+    apart = state.means[i] - state.means[j]
+    mean = wi[:, None] * state.means[i] + wj[:, None] * state.means[j]
+    cov = wi[:, None] * state.cov[i] + wj[:, None] * state.cov[j] + (wi * wj)[:, None] * outer(apart)
+    axes = plane_axes(thinnest_axes(cov))
+    si, sj, sk = (project(c, *axes) for c in (state.cov[i], state.cov[j], cov))
+    u, v = ((apart * axis).sum(1) for axis in axes)
+    mass = ai * projected_area(si) + aj * projected_area(sj) - ai * aj * overlap(si, sj, u, v)
+    alphas = mass.clamp_min(0) / projected_area(sk).clamp_min(MIN_DIVISOR)
+    return wi, mean, enlarged(cov, alphas, settings), alphas.clamp_max(settings.max_opacity)
+
+
+def enlarged(cov: Tensor, alphas: Tensor, settings: MergeSettings) -> Tensor:
+    """Covariances (n, 6) with the area that needed opacities (n,) above ``max_opacity`` ask for."""
+    return cov * growth(alphas, settings)[:, None]
+
+
+def growth(alphas: Tensor, settings: MergeSettings) -> Tensor:
+    """Factor of the area of Gaussians that need opacities ``alphas``, any shape; 1 up to ``max_opacity``."""
+    return (alphas / settings.max_opacity).clamp(1, settings.max_growth_ratio) ** settings.growth_exponent

@@ -1,0 +1,252 @@
+"""The loop of merging: rounds of pairs until the count is reached, then the scene of what remains.
+
+Everything is computed on one thread each, in pieces that several threads take: the result is the same bits on any
+number of threads, and no thread waits for another within an operation.
+
+Memory: besides the scene itself about 0.4 kB a Gaussian. SH coefficients are read twice, in pieces: for the principal
+axes of colours, and at the end for the means of members.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.neighbours import other_neighbours
+from pointsplat_ns.looking.content import views_in_units
+from pointsplat_ns.looking.windows import RESOLUTION, WindowRenders
+from pointsplat_ns.pruning.duplicates import Copies, Reduced
+from pointsplat_ns.pruning.merging.finishing import Finish, best_finish
+from pointsplat_ns.pruning.merging.groups import Groups, merged_groups
+from pointsplat_ns.pruning.merging.matching import cheapest_pairs
+from pointsplat_ns.pruning.merging.merged_scene import scene_maker
+from pointsplat_ns.pruning.merging.pair_cost import pair_costs
+from pointsplat_ns.pruning.merging.participants import Participants, drawable
+from pointsplat_ns.pruning.merging.regrouping import regrouped
+from pointsplat_ns.pruning.merging.replacement import replace_pairs
+from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
+from pointsplat_ns.pruning.merging.state import State, initial_state
+from pointsplat_ns.pruning.merging.tree import Tree
+from pointsplat_ns.pruning.merging.viewpoints import Viewpoints, sampled_viewpoints
+from pointsplat_ns.pruning.merging.weights import Weights, visibility_weights
+from pointsplat_ns.system.threads import one_thread_each
+from pointsplat_ns.views import Views
+
+
+@dataclass(frozen=True, eq=False)
+class Merged:
+    """The result of merging."""
+
+    scene: Gaussians
+    """K Gaussians in the order of their first members. Those not merged with any other are unchanged to the bit."""
+    assignment: Tensor  # [N] int64, index in ``scene`` of the Gaussian that each was merged into; -1 if dropped
+    finish: Finish
+    """The numbers chosen for this scene."""
+
+
+def merge(
+    scene: Gaussians,
+    k: int,
+    progress: Callable[[float], None] | None = None,
+    views: Views | None = None,
+    resolution: tuple[int, int] = RESOLUTION,
+    settings: MergeSettings = DEFAULTS,
+) -> Merged:
+    """Replace a scene by ``k`` Gaussians that look the same.
+
+    Gaussians too faint to be drawn are dropped first. Of the others, exact copies become one, and the rest is merged in
+    pairs, cheapest first.
+
+    Args:
+        scene: N Gaussians. Those that are not :meth:`~pointsplat_ns.gaussians.Gaussians.usable` are dropped, unless
+            ``k`` is N.
+        k: number of Gaussians in the result; N returns the scene itself.
+        progress: called with the share done, in [0, 1].
+        views: views in which the result should look the same, such as the poses of the scene's photos. Gaussians
+            outside of all of them are merged first. By default views are sampled from where photos were taken if the
+            scene tells (:mod:`~pointsplat_ns.looking.traces`), else from free places in it, in all directions.
+        resolution: width and height of sampled views, pixels.
+        settings: the tuned numbers.
+
+    Returns:
+        Exactly ``k`` Gaussians. Deterministic.
+
+    Raises:
+        BudgetError: if ``k`` is not in 1..N, or fewer than ``k`` Gaussians can be drawn.
+    """
+    return next(merge_levels(scene, [k], progress, views, resolution, settings))
+
+
+def merge_levels(
+    scene: Gaussians,
+    counts: Sequence[int],
+    progress: Callable[[float], None] | None = None,
+    views: Views | None = None,
+    resolution: tuple[int, int] = RESOLUTION,
+    settings: MergeSettings = DEFAULTS,
+) -> Iterator[Merged]:
+    """Replace a scene by fewer and fewer Gaussians in one pass.
+
+    Each level is merged from the one before: Gaussians that are one in a level are one in all that follow. So several
+    levels are not regrouped, and each is a little worse than what :func:`merge` makes.
+
+    Args:
+        scene: N Gaussians, see :func:`merge`.
+        counts: number of Gaussians of each level, in 1..N, descending without repetition.
+        progress: called with the share done of all levels, in [0, 1].
+        views, resolution, settings: as for :func:`merge`.
+
+    Yields:
+        A level for each count, as soon as it is reached.
+
+    Raises:
+        BudgetError: if a count is not in 1..N, the counts do not descend, or the first is more than can be drawn.
+    """
+    n = len(scene)
+    for k in counts:
+        if not 1 <= k <= n:
+            raise BudgetError(f"cannot merge {n} Gaussians into {k}; expected 1 to {n}")
+    if any(fewer >= more for more, fewer in itertools.pairwise(counts)):
+        raise BudgetError(f"levels of {', '.join(map(str, counts))} Gaussians; expected descending counts")
+    return _levels(scene, counts, progress or (lambda share: None), views, resolution, settings)
+
+
+@torch.no_grad()
+def _levels(
+    scene: Gaussians,
+    counts: Sequence[int],
+    report: Callable[[float], None],
+    views: Views | None,
+    resolution: tuple[int, int],
+    settings: MergeSettings,
+) -> Iterator[Merged]:
+    n = len(scene)
+    if n in counts:
+        report(0.0 if len(counts) > 1 else 1.0)
+        yield Merged(scene, torch.arange(n, device=scene.device), Finish(settings.default_depth_exponent))
+        counts = counts[1:]
+    if not counts:
+        return
+    dense = scene.to(device="cpu")
+    with one_thread_each():
+        copies = Copies(dense, drawable(dense, counts[0]))
+    first, last = len(copies), counts[-1]
+    reduced: Reduced | None = None
+    for k in counts:
+        left = max(k, copies.distinct)
+        if reduced is None or left < len(reduced.members):
+            with one_thread_each():
+                reduced = copies.reduced(left)
+                step = first_step(Participants.of(reduced.scene, reduced.members), views, resolution, settings)
+        while len(step.state) > k:
+            with one_thread_each():
+                step = one_round(step, k, settings)
+            report(0.95 * (first - len(step.state)) / max(first - last, 1))
+        with one_thread_each():
+            groups, result, finish = finished(step, regroup=len(counts) == 1, settings=settings)
+        if k == last:
+            report(1.0)
+        of_reduced = torch.full((len(reduced.scene),), -1)
+        of_reduced[step.participants.members] = groups.group
+        assignment = of_reduced[reduced.index]
+        yield Merged(result.to(scene.device), assignment.to(scene.device), finish)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """Everything that is known between two rounds."""
+
+    participants: Participants
+    viewpoints: Viewpoints | None
+    weights: Weights
+    state: State
+    tree: Tree
+    reference: WindowRenders | None
+    """Renders of the scene, or of what remained once it was few enough to render."""
+
+
+def first_step(
+    participants: Participants, views: Views | None, resolution: tuple[int, int], settings: MergeSettings
+) -> Step:
+    """The step before the first round; ``views`` and ``resolution`` as for :func:`merge`."""
+    viewpoints: Viewpoints | None = None
+    if views is not None:
+        viewpoints = Viewpoints(views_in_units(views, participants.centre, participants.size), given=True)
+    elif len(participants) >= settings.min_count_rendered:
+        viewpoints = sampled_viewpoints(participants.in_units(participants.scene), *resolution, settings)
+    weights = visibility_weights(participants, viewpoints, settings)
+    state = initial_state(participants, weights.area, settings)
+    tree = Tree.of_single(len(participants))
+
+    def dense() -> Gaussians:
+        whole = len(participants) == len(participants.scene)
+        return participants.scene if whole else participants.scene[participants.members]
+
+    reference = _reference(participants, viewpoints, len(state), dense, settings)
+    return Step(participants, viewpoints, weights, state, tree, reference)
+
+
+def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
+    """The step after some more pairs are merged; at least ``k`` Gaussians remain."""
+    participants, viewpoints = step.participants, step.viewpoints
+    n = len(step.state)
+    most = max(1, min(n - k, int(n * settings.round_share)))
+    near = other_neighbours(step.state.means, settings.neighbours)
+    first, second = cheapest_pairs(near, pair_costs(step.state, near, settings), most, settings.matching_passes)
+    state, shares = replace_pairs(step.state, first, second, settings)
+    tree = step.tree.after_round(first, second, shares)
+
+    def remaining() -> Gaussians:
+        groups = merged_groups(participants, state, tree)
+        return scene_maker(participants, groups, settings)(Finish(settings.default_depth_exponent))
+
+    reference = step.reference or _reference(participants, viewpoints, len(state), remaining, settings)
+    return Step(participants, viewpoints, step.weights, state, tree, reference)
+
+
+def finished(step: Step, regroup: bool, settings: MergeSettings) -> tuple[Groups, Gaussians, Finish]:
+    """The groups of a step, in the order of their first members, and their scene with the finish that suits it.
+
+    Args:
+        step: after the last round.
+        regroup: whether members may change groups. They do unless renders lose by it.
+        settings: of regrouping and finishing.
+    """
+    participants, reference = step.participants, step.reference
+    finish = Finish(settings.default_depth_exponent)
+    groups = merged_groups(participants, step.state, step.tree).in_order()
+    make = scene_maker(participants, groups, settings)
+    if not groups.any_merged:
+        return groups, make(finish), finish
+
+    def psnr(make: Callable[[Finish], Gaussians], finish: Finish) -> float:
+        return 0.0 if reference is None else reference.psnr(participants.in_units(make(finish)))
+
+    if regroup and settings.regrouping_rounds > 0:
+        changed = regrouped(participants, groups, step.weights.visibility, settings).in_order()
+        make_changed = scene_maker(participants, changed, settings)
+        if psnr(make_changed, finish) >= psnr(make, finish):
+            groups, make = changed, make_changed
+    if reference is not None:
+        finish = best_finish(lambda trial: psnr(make, trial), settings)
+    return groups, make(finish), finish
+
+
+def _reference(
+    participants: Participants,
+    viewpoints: Viewpoints | None,
+    count: int,
+    dense: Callable[[], Gaussians],
+    settings: MergeSettings,
+) -> WindowRenders | None:
+    """Windows of renders that results are compared with, of ``count`` Gaussians ``dense``; None if they are too many or
+    there are no viewpoints."""
+    if viewpoints is None or count > settings.max_count_rendered or settings.finish_views < 1:
+        return None
+    return WindowRenders(participants.in_units(dense()), viewpoints.views.spread(settings.finish_views))

@@ -1,0 +1,192 @@
+"""The settings of merging: every tuned number, with its meaning and its unit.
+
+A number that only keeps float32 or float64 in range stands beside the formula that needs it. All other numbers are
+here. A field says how it is turned off where it stands for a rule of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class MergeSettings:
+    """Settings of :func:`~pointsplat_ns.pruning.merging.merge`, in the order of its steps.
+
+    Example:
+        >>> from dataclasses import replace
+        >>> replace(DEFAULTS, regrouping_rounds=0).neighbours  # everything as by default, but no regrouping
+        8
+    """
+
+    # Viewpoints (viewpoints.py)
+
+    min_count_rendered: int = 2_000
+    """Smallest number of Gaussians for which views are sampled. A smaller scene without given views is merged with
+    equal weights, without renders, in less time than sampling takes."""
+
+    max_count_rendered: int = 2_000_000
+    """Largest number of Gaussians that are rendered as the reference of regrouping and finishing. A larger scene is
+    rendered as soon as rounds have made it this small."""
+
+    sampled_views: int = 48
+    """Number of views that are sampled where none are given; 0 turns sampling off. In a lounge whose SH do not tell
+    where its photos were taken, 48 gain 0.3 dB over 16 in held-out poses (10 % kept); 96 gain no more."""
+
+    view_seed: int = 1
+    """Seed of the sampled views."""
+
+    find_photo_places: bool = True
+    """Whether the scene is asked where its photos were taken, so that sampled views and weights start from there."""
+
+    min_distance: float = 0.1
+    """Distance that is added in quadrature to the distance of a Gaussian from a camera, as a share of the content's
+    diagonal. Without it (0), one camera that happens to be close would outweigh all others."""
+
+    outside_weight: float = 1e-5
+    """Factor of the weight of a Gaussian in a given view whose picture it is outside of; 1 turns the rule off. A
+    Gaussian outside of all photos has never been trained. On such a scene (fox, 30 % kept) 0.02 gives 29.9 dB in
+    held-out views, 1e-3 30.6, 1e-5 30.9."""
+
+    picture_margin: float = 0.05
+    """Margin around a picture that still counts as inside of it, as a share of its width and height."""
+
+    # Traces of photos in the scene (weights.py, looking/traces.py). An exponent of 0 turns a rule off.
+
+    trace_exponent_given: float = 0.5
+    """Exponent of the trace factor where views are given. The visibility share tells a part of the same. On two
+    captures (second trainings, 50 to 3 % kept) 0.5 gains 0.0 to 0.6 dB over 1; on two others -0.2 to 0.2."""
+
+    trace_exponent_photos: float = 1.0
+    """Exponent of the trace factor where the scene tells where its photos were taken."""
+
+    trace_exponent_room: float = 0.25
+    """Exponent of the trace factor in a room that does not tell where its photos were taken. In held-out poses of three
+    rooms 0.25 gains 0.1 to 0.5 dB, in sampled views of another room it loses 0.1; larger exponents gain and lose
+    more."""
+
+    trace_exponent_object: float = 0.0
+    """The same for an object that is seen from outside; no exponent gains there."""
+
+    # Occlusion (visibility.py)
+
+    occlusion_views: int = 48
+    """Largest number of views in which covered pixels are counted. Over 16, 48 gain 0.2 to 0.7 dB in a lounge, with
+    its poses and without, and -0.2 to 0.4 in eight other scenes, for a second or two."""
+
+    occlusion_side: int = 112
+    """Longer side of the pictures in which covered pixels are counted, pixels."""
+
+    occlusion_max_count: int = 500_000
+    """Largest number of Gaussians that are drawn to count covered pixels; of more, every second (third, ...) is drawn,
+    larger. In a lounge of 445,000, half or a quarter is as good as all (0.0 dB); in a bouquet of 117,000, a quarter
+    loses 0.4 of the 1.4 dB that counting gains at 10 %."""
+
+    occlusion_neighbours: int = 17
+    """Number of Gaussians along the curve, an odd number, over which pixels are summed for the pair cost; 1 turns the
+    rule off. Of two Gaussians in the same place one hides the other, and it does not matter which."""
+
+    unoccluded_quantile: float = 0.9
+    """Quantile of the shares of covered pixels that counts as not occluded, in [0, 1]. Expected pixels have no absolute
+    unit, so shares are relative to this one."""
+
+    min_share_neighbours: float = 1e-4
+    """Lower bound of the visibility share of a neighbourhood, before the exponent; 1 turns occlusion off in the pair
+    cost. It is above 0, because real cameras may stand elsewhere."""
+
+    min_share_single: float = 0.16
+    """Lower bound of the visibility share of a single Gaussian, before the exponent; 1 turns occlusion off in
+    regrouping. It is above 0, because other views may show the Gaussian. Of 0.25, 0.09 and 0.01, smaller bounds gain up
+    to 0.3 dB on objects and on two captures, and lose as much in two built-in rooms."""
+
+    occlusion_exponent: float = 0.5
+    """Exponent of visibility shares; 0 turns occlusion off. Together with the trace factor, 1 gains 1.1 dB on one
+    capture at 10 % and loses up to 0.3 on another; 0.5 gains on all three that it was tried on."""
+
+    # Neighbours and pairs (rounds.py, matching.py)
+
+    neighbours: int = 8
+    """Number of nearest centres that a Gaussian may be merged with."""
+
+    round_share: float = 0.4
+    """Largest share of the remaining Gaussians that one round merges away. Smaller shares are greedier and measured
+    worse: the cost of a pair does not include earlier losses of its members, and even thinning keeps losses small."""
+
+    matching_passes: int = 6
+    """Number of passes of a round that look for pairs among the Gaussians that are still free."""
+
+    # Cost of a pair (pair_cost.py, state.py)
+
+    colour_axes: int = 8
+    """Number of principal axes of the colours, all SH bands, on which colours are compared. They hold nearly all of the
+    variance."""
+
+    max_colour: float = 10.0
+    """Bound of the absolute value of a colour coefficient in costs and in regrouping, colour units. A few broken
+    colours must not hide all others."""
+
+    min_contrast: float = 0.01
+    """Contrast with the surroundings that is assumed in addition to the measured one, per channel, colour units."""
+
+    background_contrast: float = 0.3
+    """Contrast with the far background that is assumed where few Gaussians overlap, per channel, colour units; 0 turns
+    the cost of holes off."""
+
+    background_decay: float = 4.0
+    """Decay of the cost of holes with the cover: exp(-decay * cover)."""
+
+    min_cover: float = 0.5
+    """Lower bound of the cover, the summed opacity of all Gaussians at a place, in the denominator of the cost."""
+
+    # Replacement of a pair (replacement.py)
+
+    max_opacity: float = 0.99
+    """Largest opacity of a replacement. If its mass needs more, its area grows instead."""
+
+    growth_exponent: float = 0.6
+    """Exponent of the growth of the area by the ratio of needed opacity to ``max_opacity``: 0 opens holes, 1 smears
+    edges."""
+
+    max_growth_ratio: float = 4.0
+    """Upper bound of that ratio. Two Gaussians seldom reach 2; for points without area it would be infinite."""
+
+    # Regrouping (regrouping.py)
+
+    regrouping_rounds: int = 2
+    """Number of times that members change groups; 0 turns the step off. In a third round about 3 % change."""
+
+    regrouping_candidates: int = 6
+    """Number of nearest groups that a member may change to."""
+
+    regrouping_roundness: float = 0.02
+    """Variance that is added to the covariance of a group along each axis, as a share of its mean variance: a flat
+    group accepts members slightly beside it."""
+
+    regrouping_contrast: float = 0.3
+    """Difference of colour, root of the sum of squares over channels, that counts as one standard deviation, colour
+    units."""
+
+    # Finish (finishing.py)
+
+    finish_views: int = 8
+    """Number of views whose windows are compared; 0 turns renders off, so that members always change groups and the
+    finish is the default one. Of 6, 12 and 24, 12 are as good as 24, and 6 lose up to 0.2 dB."""
+
+    default_depth_exponent: float = 0.15
+    """Depth exponent of scenes that are not rendered, and of the comparison with regrouped ones."""
+
+    depth_exponents: tuple[float, float, float] = (0.0, 0.15, 0.3)
+    """Depth exponents that are tried by renders, ascending."""
+
+    depth_exponent_margin: float = 0.15
+    """How far outside of ``depth_exponents`` the chosen one may lie."""
+
+    size_changes: tuple[float, float, float] = (-0.1, 0.0, 0.05)
+    """Changes of the log-scales of merged Gaussians that are tried by renders, ascending."""
+
+    size_change_margin: float = 0.05
+    """How far outside of ``size_changes`` the chosen one may lie."""
+
+
+DEFAULTS = MergeSettings()
+"""The settings that scenes are merged with by default."""
