@@ -5,20 +5,18 @@ The command line is a thin layer over these: what it can do, one call here can d
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
 from torch import Tensor
 
-from pointsplat_ns.compression.compact import Compacted, compact_scene, resolve_options
+from pointsplat_ns.compacting import Source, compact_source, goal_of, log, prune_source, read_source
+from pointsplat_ns.compression.compact import Compacted
 from pointsplat_ns.compression.level_folder import check_folder
 from pointsplat_ns.compression.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
 from pointsplat_ns.compression.pictures import plot_views as draw_views
-from pointsplat_ns.compression.posed_scene import read_posed
-from pointsplat_ns.compression.prune import check_options, prune_scene
-from pointsplat_ns.compression.repair import Effort, RepairBudget
+from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
 from pointsplat_ns.compression.trained_refiner import (
     TrainedRefiner,
     load_refiner,
@@ -27,26 +25,13 @@ from pointsplat_ns.compression.trained_refiner import (
 )
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.camera_files import is_camera_file
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.runs import REFINER_METHOD, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
-from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.looking.windows import parse_resolution
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.system.progress import Progress, progress_bar
-from pointsplat_ns.tradeoff.finding import find_scene
-from pointsplat_ns.tradeoff.settings import repairs_of
-from pointsplat_ns.tradeoff.targets import targets_of
 from pointsplat_ns.views import Views
-
-logger = logging.getLogger("pointsplat_ns")
-
-Source = Gaussians | str | Path
-"""A dense scene, or where to read it."""
 
 EXAMPLE = Path(__file__).parent / "examples" / "room.ply"
 """The scene that ships."""
@@ -86,7 +71,7 @@ def load(path: str | Path, scene: str | None = None) -> Gaussians:
     refiner = load_refiner(path)
     settings = refiner.settings
     refined = refine(settings.prune(read_scene(scenes[chosen])), refiner)
-    _log((f"{chosen}: pruned by {settings.by} (keep {settings.keep:g}) and refined, as in the training",))
+    log((f"{chosen}: pruned by {settings.by} (keep {settings.keep:g}) and refined, as in the training",))
     return refined
 
 
@@ -157,12 +142,9 @@ def prune(
         >>> len(ps.prune(room, keep=1000)), round(len(ps.prune(room, keep="10%", by="coverage")) / len(room), 2)
         (1000, 0.1)
     """
-    budget = check_options(keep, by, sh, opacity_weight, fine_tune)  # before the scene is read
-    dense, source = _read(scene, views, resolution)
-    with progress_bar(progress) as report:
-        pruned = prune_scene(dense, budget, by, sh, opacity_weight, source, fine_tune, report, clean)
-    _log(pruned.notes)
-    return pruned.scene
+    request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune)
+    _, pruned, _ = prune_source(scene, request, views, resolution, progress)
+    return pruned
 
 
 def refine(scene: Gaussians, refiner: TrainedRefiner | None = None) -> Gaussians:
@@ -255,19 +237,10 @@ def compact(
         >>> result.psnr > 15, result.seconds > 0
         (True, True)
     """
-    budget = RepairBudget(effort, seconds)
-    _, method = resolve_options(refiner, keep, by, sh)  # before the scene is read
-    targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
+    request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds))
     format_to_write(target_format)
-    dense, source = _read(scene, views, resolution)
-    with progress_bar(progress) as report:
-        if targets is None:
-            result = compact_scene(dense, refiner, keep, by, sh, source, report, clean, budget)
-        else:
-            given = views if isinstance(views, Views) else source.given
-            subject = subject_of(dense, _run_of(scene, views), given, refiner, target_format)
-            result = find_scene(subject, targets, method, repairs_of(effort), report)
-    _log((*result.target.splitlines(), *result.verdict.splitlines(), *result.notes))
+    goal = goal_of(request, keep, target_db, target_ms, target_mb, target_format)
+    _, result = compact_source(scene, request, goal, views, resolution, progress)
     return result
 
 
@@ -314,14 +287,14 @@ def lod(
         [(1572, True), (786, True), (100, True)]
     """
     budgets = parse_levels(levels)  # this and the next before the scene is read
-    check_options(1.0, "merge", sh)
+    PruneRequest(1.0, sh=sh)
     if folder is not None:
         check_folder(Path(folder), len(budgets), force)
-    dense, view_source = _read(scene, views, resolution)
+    dense, view_source = read_source(scene, views, resolution)
     source = None if isinstance(scene, Gaussians) else source_file(scene)
     with progress_bar(progress) as report:
         made = make_levels(dense, levels, sh, view_source, source, folder, force, report)
-    _log(made.notes)
+    log(made.notes)
     return made
 
 
@@ -355,7 +328,7 @@ def plot_views(
         >>> "of the visible content" in text
         True
     """
-    dense, source = _read(scene, views, resolution)
+    dense, source = read_source(scene, views, resolution)
     return draw_views(dense.detach().to("cpu"), source, path)
 
 
@@ -389,40 +362,8 @@ def lpips(pred: Tensor, target: Tensor, net: Literal["alex", "vgg"] = "alex") ->
     return cached_lpips(net, pred.device)(pred, target)
 
 
-def _read(
-    scene: Source, views: Views | str | Path | None, resolution: tuple[int, int] | str | None
-) -> tuple[Gaussians, ViewSource]:
-    """The Gaussians to make fewer, and where renders of them are compared.
-
-    A ``pointsplat`` run is refused: its scene has been pruned already.
-    """
-    size = parse_resolution(resolution)
-    if isinstance(views, (str, Path)) and not Path(views).exists():
-        raise SceneError(
-            f"{views}: no such file or folder; expected views, a run whose dataset has the poses, or a file of cameras"
-        )
-    if isinstance(views, (str, Path)) and is_camera_file(views):
-        dense, views = read_posed(scene, views)
-        return dense, ViewSource(dense, given=views, resolution=size)
-    dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
-    if isinstance(views, Views):
-        return dense, ViewSource(dense, given=views, resolution=size)
-    return dense, ViewSource(dense, run=_run_of(scene, views), dataset_views=dataset_views, resolution=size)
-
-
-def _run_of(scene: Source, views: Views | str | Path | None) -> Path | None:
-    """The file or folder whose dataset may have the poses."""
-    named = scene if views is None else views
-    return Path(named) if isinstance(named, (str, Path)) else None
-
-
 def _is_refiner_run(path: str | Path) -> bool:
     try:
         return may_be_run(path) and open_run(path, need_data=False).method_name == REFINER_METHOD
     except SceneError:
         return False  # a scene that stands alone, or nothing that can be read: who reads it says which
-
-
-def _log(lines: tuple[str, ...]) -> None:
-    for line in lines:
-        logger.info("%s", line)

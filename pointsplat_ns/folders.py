@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from pathlib import Path
 
-from pointsplat_ns.compression.compact import compact_scene, resolve_options
-from pointsplat_ns.compression.repair import Effort, RepairBudget
+from pointsplat_ns.compression.compact import compact_scene
+from pointsplat_ns.compression.requests import CompactRequest, Effort, RepairBudget
 from pointsplat_ns.compression.scene_folder import WHOLE, Command, Shard, output_folder, settle_folder
 from pointsplat_ns.compression.scene_task import Made, Options, SceneResult
 from pointsplat_ns.compression.trained_refiner import refiner_at
@@ -98,13 +99,13 @@ def compact_folder(
     connect_torchrun()
     device = str(torchrun_device())
     trained = _refiner_on(refiner, device)
-    repair, size = RepairBudget(effort, seconds), parse_resolution(resolution)
-    budget, method = resolve_options(trained, keep, by, sh)
+    size = parse_resolution(resolution)
+    request = CompactRequest.of(trained, keep, by, sh, clean, RepairBudget(effort, seconds))
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
     options: Options = {
-        "keep": str(budget),
+        "keep": str(request.prune.budget),
         "refiner": None if trained is None else source_file(trained.source).sha256,
-        "by": method,
+        "by": request.prune.by,
         "sh": sh,
         "clean": clean,
         "effort": effort if seconds is None else None,
@@ -113,9 +114,9 @@ def compact_folder(
     }
     if targets is not None:
         options = {**options, "keep": None, "target_db": target_db, "target_ms": target_ms, "target_mb": target_mb}
-        make = functools.partial(_found, refiner, device, targets, method, repairs_of(effort))
+        make = functools.partial(_found, refiner, device, targets, request.prune.by, repairs_of(effort))
     else:
-        make = functools.partial(_compacted, refiner, device, budget, method, sh, clean, repair, size)
+        make = functools.partial(_compacted, refiner, device, replace(request, refiner=None), size)
     with progress_bar(progress if rank == 0 else False) as report:
         results = settle_folder(
             folder, target, Command("compact", make, options), jobs, part.within(rank, world_size), force, report
@@ -129,18 +130,14 @@ _refiner_on = functools.cache(refiner_at)
 def _compacted(
     refiner: str | Path | None,
     device: str,
-    keep: Keep,
-    by: str,
-    sh: str,
-    clean: bool,
-    budget: RepairBudget,
+    request: CompactRequest,
     resolution: tuple[int, int] | None,
     path: Path,
 ) -> Made:
-    """One scene of a folder, made smaller."""
+    """One scene of a folder, made smaller. The request comes without its refiner, as other processes load their own."""
     dense = read_scene(path)
     source = ViewSource(dense, run=path, dataset_views=dataset_views, resolution=resolution)
-    result = compact_scene(dense, _refiner_on(refiner, device), keep, by, sh, source, clean=clean, budget=budget)
+    result = compact_scene(dense, replace(request, refiner=_refiner_on(refiner, device)), source)
     if result.repaired is not None and result.repaired.interrupted:
         raise KeyboardInterrupt  # which is meant for all scenes, not for the repair of this one
     return Made(result.scene, len(dense), result.psnr)

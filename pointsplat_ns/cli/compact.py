@@ -26,6 +26,7 @@ from pointsplat_ns.cli.scene_options import (
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.compact import Compacted
+    from pointsplat_ns.compression.trained_refiner import TrainedRefiner
     from pointsplat_ns.gaussians import Gaussians
 
 
@@ -113,15 +114,10 @@ def compact(
         return
     if jobs is not None or shard is not None:
         raise ps.SceneError(f"{scene}: one scene; --jobs and --shard are for a folder of scenes")
-    from pointsplat_ns.compression.compact import resolve_options
-    from pointsplat_ns.compression.posed_scene import read_posed
-    from pointsplat_ns.compression.repair import RepairBudget
-    from pointsplat_ns.compression.trained_refiner import refiner_at
-    from pointsplat_ns.io import read_scene
+    from pointsplat_ns.compacting import compact_source, goal_of
+    from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
     from pointsplat_ns.io.formats import format_to_write
-    from pointsplat_ns.looking.windows import parse_resolution
     from pointsplat_ns.pages.scene_page import check_limit
-    from pointsplat_ns.tradeoff.targets import targets_of
 
     check_poses(poses)
     output = output or output_beside(scene, "compact")
@@ -129,18 +125,10 @@ def compact(
     check_output(html, ".html", force)
     check_limit(html_limit)
     keep = None if keep is None else in_format_of(keep, output)
-    trained = refiner_at(refiner)
-    resolve_options(trained, keep, by, sh)
-    parse_resolution(resolution)
-    RepairBudget(effort, seconds)
-    targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
+    request = CompactRequest.of(_loaded(refiner), keep, by, sh, clean, RepairBudget(effort, seconds))
+    goal = goal_of(request, keep, target_db, target_ms, target_mb, format_to_write(output).budget_suffix)
     with fixed_threads(threads):
-        dense, views = (read_scene(scene), scene) if poses is None else read_posed(scene, poses)
-        result = ps.compact(
-            dense, keep, trained, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds, target_db=target_db,
-            target_ms=target_ms, target_mb=target_mb, target_format=format_to_write(output).budget_suffix,
-            views=views, resolution=resolution, progress=True,
-        )  # fmt: skip
+        dense, result = compact_source(scene, request, goal, poses, resolution, progress=True)
     if not dry_run:
         ps.save(result.scene, output, progress=True)
         warn_if_larger(keep, output)
@@ -165,6 +153,15 @@ def compact(
         print(shown)
     if html is not None:
         print(f"{html}: {file_bytes(html) / 1e6:.2f} MB, to fly through in a browser")
+
+
+def _loaded(refiner: Path | None) -> TrainedRefiner | None:
+    """The trained refiner at a path; None for none."""
+    if refiner is None:
+        return None
+    from pointsplat_ns.compression.trained_refiner import refiner_at
+
+    return refiner_at(refiner)
 
 
 def _write_page(path: Path, dense: Gaussians, result: Compacted, html: Path, limit_mb: float) -> None:

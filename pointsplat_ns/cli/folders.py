@@ -12,22 +12,6 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_task import SceneResult
 
 
-def need_one_scene(path: Path) -> None:
-    """Refuse a folder of scenes where a single scene is expected.
-
-    Raises:
-        SceneError: if it is one.
-    """
-    from pointsplat_ns.errors import SceneError
-    from pointsplat_ns.io.scene import ACCEPTED, is_folder_of_scenes
-
-    if is_folder_of_scenes(path):
-        raise SceneError(
-            f"{path}: a folder without config.yml, so no run; expected {ACCEPTED}; of the commands, compact takes a "
-            "folder of scenes"
-        )
-
-
 def compact_folder(
     folder: Path,
     output: Path | None,

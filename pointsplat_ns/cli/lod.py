@@ -6,9 +6,17 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pointsplat_ns.cli.folders import need_one_scene
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Bands, Output, Poses, Resolution, Scene, check_poses, output_beside
+from pointsplat_ns.cli.scene_options import (
+    Bands,
+    Output,
+    Poses,
+    Resolution,
+    Scene,
+    check_poses,
+    need_one_scene,
+    output_beside,
+)
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.levels import Levels

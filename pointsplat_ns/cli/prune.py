@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
-from pointsplat_ns.cli.folders import need_one_scene
 from pointsplat_ns.cli.printing import Json, print_distributions, print_json, print_result, scene_result
 from pointsplat_ns.cli.scene_options import (
     Bands,
@@ -16,6 +14,7 @@ from pointsplat_ns.cli.scene_options import (
     check_outputs,
     check_poses,
     in_format_of,
+    need_one_scene,
     output_beside,
     warn_if_larger,
 )
@@ -69,10 +68,8 @@ def prune(
         json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
-    from pointsplat_ns.compression.posed_scene import read_posed
-    from pointsplat_ns.compression.prune import check_options
-    from pointsplat_ns.io import read_scene
-    from pointsplat_ns.looking.windows import parse_resolution
+    from pointsplat_ns.compacting import prune_source
+    from pointsplat_ns.compression.requests import PruneRequest
     from pointsplat_ns.system.threads import fixed_threads
 
     need_one_scene(scene)
@@ -80,16 +77,9 @@ def prune(
     output = output or output_beside(scene, "pruned")
     check_outputs(None if dry_run else output, plot, force)
     keep = in_format_of(keep, output)
-    parse_resolution(resolution)
-    check_options(keep, by, sh, opacity_weight, fine_tune)
+    request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune)
     with fixed_threads(threads):
-        dense, views = (read_scene(scene), scene) if poses is None else read_posed(scene, poses)
-        start = time.perf_counter()
-        small = ps.prune(
-            dense, keep, by, sh=sh, opacity_weight=opacity_weight, clean=clean, fine_tune=fine_tune, views=views,
-            resolution=resolution, progress=True,
-        )  # fmt: skip
-    seconds = time.perf_counter() - start
+        dense, small, seconds = prune_source(scene, request, poses, resolution, progress=True)
     if not dry_run:
         ps.save(small, output, progress=True)
         warn_if_larger(keep, output)

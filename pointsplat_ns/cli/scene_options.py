@@ -34,6 +34,22 @@ def output_beside(scene: Path, suffix: str) -> Path:
     return scene.with_name(f"{scene.stem}_{suffix}.ply")
 
 
+def need_one_scene(path: Path) -> None:
+    """Refuse a folder of scenes where a single scene is expected.
+
+    Raises:
+        SceneError: if it is one.
+    """
+    from pointsplat_ns.errors import SceneError
+    from pointsplat_ns.io.scene import ACCEPTED, is_folder_of_scenes
+
+    if is_folder_of_scenes(path):
+        raise SceneError(
+            f"{path}: a folder without config.yml, so no run; expected {ACCEPTED}; of the commands, compact takes a "
+            "folder of scenes"
+        )
+
+
 def check_outputs(scene: Path | None, picture: Path | None, force: bool) -> None:
     """Check output paths before the long computations.
 
@@ -94,10 +110,12 @@ def check_poses(poses: Path | None) -> None:
     Raises:
         SceneError: if it is a run or a scene.
     """
+    if poses is None:
+        return
     from pointsplat_ns.errors import SceneError
     from pointsplat_ns.io.camera_files import ACCEPTED, is_camera_file
 
-    if poses is not None and not is_camera_file(poses):
+    if not is_camera_file(poses):
         raise SceneError(
             f"{poses}: a run or a scene; expected {ACCEPTED}; the poses of a run's own dataset need no --poses"
         )

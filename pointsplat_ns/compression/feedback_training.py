@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.compression.closeness import DenseReference
-from pointsplat_ns.compression.feedback import FEWEST_STEPS, MOST_STEPS, Feedback
+from pointsplat_ns.compression.feedback import REPAIR, Feedback
 from pointsplat_ns.compression.optimiser import gradients_of
 from pointsplat_ns.compression.repair import share_of_rates, share_of_start
 from pointsplat_ns.errors import DataError
@@ -33,7 +33,7 @@ from pointsplat_ns.system import processes
 from pointsplat_ns.system.threads import suitable_threads
 from pointsplat_ns.views import Views
 
-STEPS = (FEWEST_STEPS, 12, 24, MOST_STEPS)
+STEPS = (REPAIR.fewest_steps, 12, 24, REPAIR.most_steps)
 """Lengths of the repairs that the network learns from."""
 
 AT_ONCE, TIMES = 32, 6

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.optimiser import RATES, Optimiser
+from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, optimised
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer import render
-from pointsplat_ns.system.threads import suitable_threads
-from pointsplat_ns.views import Views
+from pointsplat_ns.views import View, Views
 
 
 def fine_tune(
@@ -50,21 +49,27 @@ def fine_tune(
         raise DataError("no view to fine-tune on; expected at least one pose")
     if not isinstance(targets, Gaussians) and len(targets) != len(views):
         raise DataError(f"{len(targets)} pictures for {len(views)} views; expected one each")
-    optimiser = Optimiser(scene, {**RATES, **(rates or {})})
-    target_images: dict[int, Tensor] = {}
-    order: list[int] = []
-    generator = random.Random(seed)
+    scene = scene.map(lambda value: value.detach().clone())
+    adam = Adam(scene, AdamSettings(), {**RATES, **(rates or {})})
+    scenes = optimised(scene, adam, _examples(views, targets, scene, seed))
     for step in range(steps):
-        if not order:
-            order = generator.sample(range(len(views)), len(views))
-        index = order.pop()
-        if index not in target_images:
-            target_images[index] = _target(targets, views, index, scene)
-        with suitable_threads(scene.device):
-            optimiser.step(views[index], target_images[index])
+        scene = next(scenes)
         if progress is not None:
             progress((step + 1) / steps)
-    return optimiser.scene
+    return scene
+
+
+def _examples(
+    views: Views, targets: Gaussians | Sequence[Tensor], like: Gaussians, seed: int
+) -> Iterator[tuple[View, Tensor]]:
+    """Views in random order, each once before any is repeated, and their target images; without end."""
+    images: dict[int, Tensor] = {}
+    generator = random.Random(seed)
+    while True:
+        for index in reversed(generator.sample(range(len(views)), len(views))):
+            if index not in images:
+                images[index] = _target(targets, views, index, like)
+            yield views[index], images[index]
 
 
 def _target(targets: Gaussians | Sequence[Tensor], views: Views, index: int, like: Gaussians) -> Tensor:

@@ -27,6 +27,7 @@ from pointsplat_ns.compression.level_errors import (
 )
 from pointsplat_ns.compression.level_folder import LevelFolder
 from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable
@@ -199,7 +200,7 @@ def make_levels(
     Args:
         dense: N Gaussians. Those that cannot be drawn are left out first, and their number is logged.
         levels: see :func:`parse_levels`; in any order.
-        sh: SH bands of every level, as for :func:`~pointsplat_ns.compression.prune.prune_scene`.
+        sh: SH bands of every level, as for :class:`~pointsplat_ns.compression.requests.PruneRequest`.
         views: source of the views that renders are compared in; merging looks from them where they need not be sampled.
             By default poses sampled in free space.
         source: the file that ``dense`` was read from, for the manifest.
@@ -219,7 +220,7 @@ def make_levels(
     dense = keep_usable(dense, "the dense scene")
     views = views or ViewSource(dense)
     progress("rendering the dense scene", 0.0)
-    cut = prune_scene(dense, 1.0, sh=sh, views=views)
+    cut = prune_scene(dense, PruneRequest(1.0, sh=sh), views)
     counts = level_counts(budgets, len(dense), cut.scene.sh_degree)
     notes, reference, distance = cut.notes, None, None
     afar: list[FarReference] = []

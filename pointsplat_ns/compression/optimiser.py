@@ -1,7 +1,12 @@
-"""One step of Adam at a time on the parameters of a scene, so that its renders match target images."""
+"""Optimises the parameters of a scene by Adam, so that its renders match target images.
+
+The loss of a view is that of 3DGS: 0.8 L1 + 0.2 (1 - SSIM).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -11,7 +16,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.metrics import SSIM_WINDOW
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.rasterizer import render
-from pointsplat_ns.system.threads import one_thread
+from pointsplat_ns.system.threads import one_thread, suitable_threads
 from pointsplat_ns.views import View
 
 RATES = {
@@ -22,49 +27,109 @@ RATES = {
     "features_dc": 2.5e-3,
     "features_rest": 2.5e-3 / 20,
 }
-"""Learning rates of Adam, as in 3DGS."""
+"""Learning rates by parameter, as in 3DGS."""
 
 SSIM_WEIGHT = 0.2
 """Weight of 1 - SSIM in the loss, as in 3DGS; L1 has the rest."""
 
 
-class Optimiser:
-    """Adam on 0.8 L1 + 0.2 (1 - SSIM), one view a step. The number of Gaussians does not change.
+@dataclass(frozen=True)
+class AdamSettings:
+    """Settings of Adam."""
 
-    Values that are not finite (the logit of opacity 1, the log-scale of a flat axis) do not change. A gradient that is
-    not finite counts as 0.
+    faster: float = 1.0
+    """Factor on the learning rates."""
+    betas: tuple[float, float] = (0.9, 0.999)
+    """Decays of the averages of the gradient and of its square."""
+    damping: float = 0.0
+    """Adam's epsilon, as a share of the root mean square of a parameter's gradient over what is seen in the first step
+    that sees any. 0 leaves an epsilon of 1e-15."""
+
+
+class Adam:
+    """Averages of the gradients of a scene's parameters, and the steps that follow from them.
 
     Args:
-        scene: K Gaussians; they are copied.
+        scene: K Gaussians, at the start.
+        settings: decays and damping.
         rates: learning rates by parameter name; that of the means is multiplied by the extent of the scene.
     """
 
-    def __init__(self, scene: Gaussians, rates: dict[str, float]):
+    def __init__(self, scene: Gaussians, settings: AdamSettings, rates: Mapping[str, float] = RATES):
         reach = extent(scene)
-        self._scene = scene.map(lambda value: value.detach().clone())
-        groups = [
-            {"params": [value], "lr": rates[name] * (reach if name == "means" else 1.0)}
-            for name, value in self._scene.items()
-            if value.numel()
-        ]
-        self._adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        self.rates = {name: settings.faster * rates[name] * (reach if name == "means" else 1.0) for name in RATES}
+        self._settings = settings
+        self._first = {name: torch.zeros_like(value) for name, value in scene.items()}
+        self._second = {name: torch.zeros_like(value) for name, value in scene.items()}
+        self._damping = dict.fromkeys(RATES, 0.0)
+        self._directions: dict[str, Tensor] = {}
+        self._steps = 0
 
-    @property
-    def scene(self) -> Gaussians:
-        """The scene as it is now."""
-        return self._scene.map(torch.clone)
+    @torch.no_grad()
+    def observe(self, gradients: dict[str, Tensor]) -> None:
+        """Take in the gradients of the loss in one view, all finite, by parameter."""
+        self._steps += 1
+        beta, square_beta = self._settings.betas
+        for name in RATES:
+            gradient = gradients[name]
+            if self._settings.damping:
+                self._damping[name] = self._damping[name] or self._settings.damping * seen_rms(gradient)
+            self._first[name].lerp_(gradient, 1 - beta)
+            self._second[name].mul_(square_beta).addcmul_(gradient, gradient, value=1 - square_beta)
+            root = (self._second[name] / self._whole(1)).sqrt_()
+            self._directions[name] = (self._first[name] / self._whole(0)).div_(root.add_(self._epsilon(name)))
 
-    def step(self, view: View, target: Tensor) -> None:
-        """Take one step.
+    def moves(self, share: float, factors: Tensor | None = None) -> dict[str, Tensor]:
+        """The step of each parameter: Adam's, multiplied by factors.
 
         Args:
-            view: what is rendered.
-            target: (H, W, 3) image that it should look like, in [0, 1].
+            share: of the learning rates.
+            factors: (K, 6), one a kind of parameter; None is 1.
         """
-        gradients = gradients_of(self._scene, view, target)
-        for name, value in self._scene.items():
-            value.grad = gradients[name]
-        self._adam.step()
+        moves = {}
+        for kind, name in enumerate(RATES):
+            step = self._directions[name]
+            if factors is not None:
+                step = step * factors[:, kind].to(step).view(-1, *[1] * (step.dim() - 1))
+            moves[name] = step * (-share * self.rates[name])
+        return moves
+
+    def moved(self, scene: Gaussians, share: float = 1.0, factors: Tensor | None = None) -> Gaussians:
+        """A scene after a step; arguments as for :meth:`moves`."""
+        moves = self.moves(share, factors)
+        return Gaussians(**{name: value + moves[name] for name, value in scene.items()})
+
+    def _whole(self, which: int) -> float:
+        """The sum of the weights in an average that began at 0."""
+        return 1 - self._settings.betas[which] ** self._steps
+
+    def _epsilon(self, name: str) -> float:
+        return max(self._damping[name], 1e-15)
+
+
+def optimised(
+    scene: Gaussians,
+    adam: Adam,
+    examples: Iterator[tuple[View, Tensor]],
+    choose: Callable[[Gaussians], tuple[float, Tensor | None]] = lambda scene: (1.0, None),
+) -> Iterator[Gaussians]:
+    """Scenes after each step, without end. Values that are not finite (the logit of opacity 1, the log-scale of a flat
+    axis) do not change.
+
+    Args:
+        scene: K Gaussians; not changed.
+        adam: made of the scene.
+        examples: views, and the image (H, W, 3) in [0, 1] that each should show; without end.
+        choose: from the scene before a step to its share of the learning rates and its factors, see
+            :meth:`Adam.moves`. It is called when the gradients of the step are known.
+    """
+    scene = scene.detach()
+    while True:
+        with suitable_threads(scene.device):
+            view, target = next(examples)
+            adam.observe(gradients_of(scene, view, target))
+            scene = adam.moved(scene, *choose(scene))
+        yield scene
 
 
 def extent(scene: Gaussians) -> float:

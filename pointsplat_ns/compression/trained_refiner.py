@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from pointsplat_ns.compression.requests import default_device
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.discovery import find_runs_and_plys, shown_scene
@@ -55,11 +56,6 @@ class TrainedRefiner:
     def device(self) -> torch.device:
         """Device of the network."""
         return next(self.network.parameters()).device
-
-
-def default_device() -> torch.device:
-    """CUDA if available, else the CPU."""
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def load_refiner(path: Path | str | None = None, device: torch.device | str | None = None) -> TrainedRefiner:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pointsplat_ns.compression.compact import Compacted, compact_scene
 from pointsplat_ns.compression.prune import prune_scene
-from pointsplat_ns.compression.repair import RepairBudget
+from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, RepairBudget
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
@@ -60,13 +60,14 @@ def make(
     sh = str(setting.sh_degree) if setting.sh_degree < dense.sh_degree else "all"
     compacted = None
     if setting.repair == "none":
-        pruned = prune_scene(dense, setting.count, setting.by, sh, views=new_views(), progress=progress)
+        pruned = prune_scene(dense, PruneRequest(setting.count, setting.by, sh), new_views(), progress)
         scene, notes = pruned.scene, pruned.notes
     else:
         if setting.repair == "refiner":
             refiner = refiner or load_refiner()
         budget = RepairBudget(EFFORTS[setting.repair])
-        compacted = compact_scene(dense, refiner, setting.count, setting.by, sh, new_views(), progress, budget=budget)
+        request = CompactRequest.of(refiner, setting.count, setting.by, sh, repair=budget)
+        compacted = compact_scene(dense, request, new_views(), progress)
         if compacted.repaired is not None and compacted.repaired.interrupted:
             raise KeyboardInterrupt
         scene, notes = compacted.scene, compacted.notes

@@ -4,7 +4,7 @@ A *way* is a method, an SH degree and a repair; along a way only the number of G
 loss in dB (:mod:`~pointsplat_ns.tradeoff.loss`), which is the same at each run, and never at times, which are not.
 
 1. The first way, the first method with all SH bands and no repair, at a tenth. Then each repair there. One that gains
-   :data:`~pointsplat_ns.compression.compact.MIN_GAIN` over what came before it is used from here on.
+   ``ACCEPTANCE.min_gain`` (:mod:`~pointsplat_ns.compression.acceptance`) over what came before it is used from here on.
 2. This way at three tenths and at three hundredths.
 3. A lower SH degree matters if leaving out its bands of the dense scene costs no more than merging to a tenth did: then
    the lowest such degree is measured at a tenth. If it loses less there than the first way does at the same size of the
@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pointsplat_ns.compression.compact import MIN_GAIN
+from pointsplat_ns.compression.acceptance import ACCEPTANCE
 from pointsplat_ns.pruning import resolve_keep
 from pointsplat_ns.tradeoff.loss import loss_of, recommend
 from pointsplat_ns.tradeoff.points import Point
@@ -91,7 +91,7 @@ def walk(
     for repair in plan.repairs[1:]:
         repaired = replace(way, repair=repair)
         yield repaired
-        if loss(repaired) <= loss(way) - MIN_GAIN:
+        if loss(repaired) <= loss(way) - ACCEPTANCE.min_gain:
             way = repaired
     for count in others:
         yield replace(way, count=count)

@@ -1,0 +1,182 @@
+"""From options and the place of a scene to a smaller scene: the way of both the public functions and the commands."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pointsplat_ns.compression.requests import CompactRequest, PruneRequest
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.scene import read_scene
+from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.looking.windows import parse_resolution
+from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.views import Views
+
+if TYPE_CHECKING:
+    from pointsplat_ns.compression.compact import Compacted
+    from pointsplat_ns.compression.requests import Effort
+    from pointsplat_ns.tradeoff.targets import Targets
+
+logger = logging.getLogger("pointsplat_ns")
+
+Source = Gaussians | str | Path
+"""A dense scene, or where to read it."""
+
+Looked = Views | str | Path | None
+"""Views, the run whose dataset has the poses, a file of cameras, or None for those that the scene's run has."""
+
+Resolution = tuple[int, int] | str | None
+"""Width and height of pictures, pixels."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What a search for the cheapest scene has to meet."""
+
+    targets: Targets
+    effort: Effort
+    """How long scenes may be repaired."""
+    suffix: str
+    """Of the format whose files' sizes count."""
+
+
+def prune_source(
+    scene: Source,
+    request: PruneRequest,
+    views: Looked = None,
+    resolution: Resolution = None,
+    progress: bool | Progress = False,
+) -> tuple[Gaussians, Gaussians, float]:
+    """Read a scene and prune it; notes are logged. Arguments as of :func:`pointsplat_ns.prune`.
+
+    Returns:
+        The dense scene, the smaller one, and the seconds that pruning took.
+    """
+    from pointsplat_ns.compression.prune import prune_scene
+
+    dense, source = read_source(scene, views, resolution)
+    start = time.perf_counter()
+    with progress_bar(progress) as report:
+        pruned = prune_scene(dense, request, source, report)
+    seconds = time.perf_counter() - start
+    log(pruned.notes)
+    return dense, pruned.scene, seconds
+
+
+def compact_source(
+    scene: Source,
+    request: CompactRequest,
+    goal: Goal | None = None,
+    views: Looked = None,
+    resolution: Resolution = None,
+    progress: bool | Progress = False,
+) -> tuple[Gaussians, Compacted]:
+    """Read a scene and compact it; verdicts and notes are logged. Arguments as of :func:`pointsplat_ns.compact`.
+
+    Args:
+        scene: N Gaussians, or where to read them.
+        request: how. A goal takes only its method and refiner, and decides the rest.
+        goal: what a search has to meet; None for no search.
+        views: where renders are compared.
+        resolution: size of the pictures.
+        progress: True shows a bar; a function is called with the current task and the share of it that is done.
+
+    Returns:
+        The dense scene and the result.
+    """
+    dense, source = read_source(scene, views, resolution)
+    with progress_bar(progress) as report:
+        if goal is None:
+            from pointsplat_ns.compression.compact import compact_scene
+
+            result = compact_scene(dense, request, source, report)
+        else:
+            from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
+            from pointsplat_ns.tradeoff.finding import find_scene
+            from pointsplat_ns.tradeoff.settings import repairs_of
+
+            given = views if isinstance(views, Views) else source.given
+            subject = subject_of(dense, run_of(scene, views), given, request.refiner, goal.suffix)
+            result = find_scene(subject, goal.targets, request.prune.by, repairs_of(goal.effort), report)
+    log((*result.target.splitlines(), *result.verdict.splitlines(), *result.notes))
+    return dense, result
+
+
+def goal_of(
+    request: CompactRequest,
+    keep: object,
+    db: float | None,
+    ms: float | None,
+    mb: float | None,
+    suffix: str,
+) -> Goal | None:
+    """The goal of a search; None if no target is given.
+
+    Args:
+        request: what is asked for beside targets.
+        keep: None if how much to keep is not asked for; a search decides it.
+        db: least PSNR against the dense scene's renders, dB.
+        ms: longest time of a frame, milliseconds.
+        mb: largest file, in units of 10^6 bytes.
+        suffix: end of the names of files whose size counts.
+
+    Raises:
+        BudgetError: if a target is not positive, or an option was given that a search decides.
+    """
+    if db is ms is mb is None:
+        return None
+    from pointsplat_ns.tradeoff.targets import targets_of
+
+    targets = targets_of(db, ms, mb, keep, request.prune.sh, request.prune.clean, request.repair.seconds)
+    return None if targets is None else Goal(targets, request.repair.effort, suffix)
+
+
+def read_source(scene: Source, views: Looked, resolution: Resolution) -> tuple[Gaussians, ViewSource]:
+    """The dense scene, and where renders of it are compared. Arguments as of :func:`pointsplat_ns.prune`.
+
+    Raises:
+        SceneError: if a file is missing or damaged, or the scene is a ``pointsplat`` run, which is pruned already.
+        DataError: if a file of cameras is not usable, or most of them see nothing of the scene.
+    """
+    size = parse_resolution(resolution)
+    if isinstance(views, (str, Path)):
+        from pointsplat_ns.io.camera_files import is_camera_file
+
+        if not Path(views).exists():
+            raise SceneError(
+                f"{views}: no such file or folder; expected views, a run whose dataset has the poses, or a file of "
+                "cameras"
+            )
+        if is_camera_file(views):
+            from pointsplat_ns.compression.posed_scene import read_posed
+
+            dense, views = read_posed(scene, views)
+            return dense, ViewSource(dense, given=views, resolution=size)
+    dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
+    if isinstance(views, Views):
+        return dense, ViewSource(dense, given=views, resolution=size)
+    return dense, ViewSource(dense, run=run_of(scene, views), dataset_views=_dataset_views, resolution=size)
+
+
+def run_of(scene: Source, views: Looked) -> Path | None:
+    """The file or folder whose dataset may have the poses."""
+    named = scene if views is None else views
+    return Path(named) if isinstance(named, (str, Path)) else None
+
+
+def log(lines: tuple[str, ...]) -> None:
+    """Log lines of text at level INFO."""
+    for line in lines:
+        logger.info("%s", line)
+
+
+def _dataset_views(run: Path | str) -> Views:
+    """The poses of a run's dataset. Read by the plugin, which is not imported before."""
+    from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+
+    return dataset_views(run)

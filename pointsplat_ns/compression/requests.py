@@ -1,0 +1,209 @@
+"""The options of pruning and compacting: each checked once, before a scene is read, and passed on as one object."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import torch
+
+from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.pruning import (
+    Keep,
+    Megabytes,
+    Method,
+    WithinPsnr,
+    check_size,
+    found_by_trying,
+    method_named,
+    parse_keep,
+    resolve_keep,
+)
+from pointsplat_ns.pruning.methods import check_opacity_weight
+
+if TYPE_CHECKING:
+    from pointsplat_ns.compression.trained_refiner import TrainedRefiner
+
+SH_CHOICES = ("all", "auto", "0", "1", "2", "3")
+"""Values of the option ``sh``."""
+
+COMPACT_KEEP = 0.1
+"""Share of the Gaussians that ``compact`` keeps by default."""
+
+
+Effort = Literal["instant", "quick", "thorough"]
+
+STEPS: dict[Effort, int] = {"instant": 0, "quick": 48, "thorough": 400}
+"""Steps of each effort. Those of "quick" take about as long as merging 100,000 to a million Gaussians."""
+
+
+def default_device() -> torch.device:
+    """CUDA if available, else the CPU."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+@dataclass(frozen=True)
+class RepairBudget:
+    """How long to repair.
+
+    Raises:
+        PointSplatError: if it is not a positive time or one of :data:`STEPS`.
+    """
+
+    effort: Effort = "quick"
+    """A number of steps, see :data:`STEPS`: the result is the same however fast the machine is."""
+    seconds: float | None = None
+    """Wall-clock time, which goes before ``effort``: the result depends on the machine."""
+
+    def __post_init__(self) -> None:
+        if self.effort not in STEPS:
+            raise PointSplatError(f"effort is {self.effort!r}; expected one of {', '.join(STEPS)}")
+        if self.seconds is not None and not 0 <= self.seconds < math.inf:
+            raise PointSplatError(f"the time to repair is {self.seconds:g} s; expected 0 or more")
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is no time for any step."""
+        return self.seconds == 0 if self.seconds is not None else STEPS[self.effort] == 0
+
+    def share_done(self, steps: int, seconds: float) -> float:
+        """Share of the budget that ``steps`` steps, which took ``seconds``, have used; 1 or more at the end. The budget
+        must not be empty."""
+        return seconds / self.seconds if self.seconds is not None else steps / STEPS[self.effort]
+
+    def steps_in_all(self, steps: int, done: float) -> int | None:
+        """Number of steps that fit the budget, if ``steps`` steps have used a share ``done`` of it; None if that is not
+        known yet."""
+        if self.seconds is None:
+            return STEPS[self.effort]
+        return round(steps / done) if done else None
+
+
+NO_REPAIR = RepairBudget("instant")
+
+
+@dataclass(frozen=True)
+class PruneRequest:
+    """How to prune a scene.
+
+    Raises:
+        BudgetError: if ``keep`` is no budget.
+        PointSplatError: if there is no such method, or an option does not fit it.
+
+    Example:
+        >>> PruneRequest("30%", sh="1").count_of(1000, sh_degree=1)
+        300
+    """
+
+    keep: Keep | str
+    """Ratio, count, size of the file, or the PSNR that renders must reach against those of the dense scene."""
+    by: str = "merge"
+    """One of :data:`~pointsplat_ns.pruning.METHODS`."""
+    sh: str = "all"
+    """"all" keeps the SH bands, a digit cuts them to that degree, "auto" cuts them to the lowest degree whose renders
+    reach :data:`~pointsplat_ns.compression.budget_search.SH_PSNR` against those of the dense scene."""
+    opacity_weight: float | None = None
+    """Lambda of the methods that weigh opacity; None is the paper's."""
+    clean: bool = False
+    """Whether to remove first what no picture needs (:mod:`~pointsplat_ns.compression.cleaning`). ``keep`` still refers
+    to the dense scene, and the result has exactly as many Gaussians."""
+    fine_tune: int = 0
+    """Number of steps of optimising the result against renders of the dense scene."""
+    budget: Keep = field(init=False)
+    """``keep``, parsed if it is text."""
+
+    def __post_init__(self) -> None:
+        check_opacity_weight(self.method, self.opacity_weight)
+        if self.sh not in SH_CHOICES:
+            raise PointSplatError(f"sh is {self.sh!r}; expected all, auto or a degree from 0 to 3")
+        if self.fine_tune < 0:
+            raise PointSplatError(f"{self.fine_tune} steps of fine-tuning; expected 0 for none, or more")
+        budget = parse_keep(self.keep) if isinstance(self.keep, str) else self.keep
+        if isinstance(budget, WithinPsnr) and not 0 < budget.value < math.inf:
+            raise BudgetError(f"the wanted PSNR is {budget.value} dB; expected a positive number, such as 35")
+        object.__setattr__(self, "budget", budget)
+
+    @property
+    def method(self) -> Method:
+        """The method called ``by``."""
+        return method_named(self.by)
+
+    def count_of(self, n: int, sh_degree: int) -> int | None:
+        """Number of Gaussians to keep of ``n``; None if only trying counts tells it (a PSNR, or the size of a
+        compressed file).
+
+        Args:
+            n: number of Gaussians in the dense scene.
+            sh_degree: SH degree of the result, on which the number that fits a file depends.
+
+        Raises:
+            BudgetError: if the budget does not fit the scene.
+        """
+        if not found_by_trying(self.budget):
+            return resolve_keep(n, self.budget, sh_degree)
+        if isinstance(self.budget, Megabytes):
+            check_size(self.budget, n)
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class CompactRequest:
+    """How to compact a scene: prune it, refine it if there is a refiner, and repair it."""
+
+    prune: PruneRequest
+    refiner: TrainedRefiner | None = None
+    """None for none."""
+    repair: RepairBudget = NO_REPAIR
+    """How long to repair."""
+
+    @classmethod
+    def of(
+        cls,
+        refiner: TrainedRefiner | None = None,
+        keep: Keep | str | None = None,
+        by: str | None = None,
+        sh: str = "all",
+        clean: bool = False,
+        repair: RepairBudget = NO_REPAIR,
+    ) -> CompactRequest:
+        """A request from options that may be missing.
+
+        Args:
+            refiner: None for none.
+            keep: None is the setting that the refiner was trained with; without a refiner, :data:`COMPACT_KEEP`.
+            by: None is the method that the refiner was trained with; without a refiner, merging.
+            sh: as of :class:`PruneRequest`.
+            clean: as of :class:`PruneRequest`.
+            repair: how long to repair; by default not at all.
+
+        Raises:
+            BudgetError, PointSplatError: as :class:`PruneRequest`.
+        """
+        usual_keep, usual_by, weight = COMPACT_KEEP, "merge", None
+        if refiner is not None:
+            usual_keep, usual_by, weight = refiner.settings.keep, refiner.settings.by, refiner.settings.opacity_weight
+        by = usual_by if by is None else by
+        weight = weight if method_named(by).weighs_opacity else None
+        return cls(PruneRequest(usual_keep if keep is None else keep, by, sh, weight, clean), refiner, repair)
+
+    @property
+    def device(self) -> torch.device:
+        """The device that renders: the refiner's, or the default one."""
+        return default_device() if self.refiner is None else self.refiner.device
+
+    def check_sh_degree(self, dense: Gaussians) -> None:
+        """Refuse a scene whose SH degree exceeds the refiner's, before the long computations.
+
+        Raises:
+            SceneError: if the degree that is left after pruning is known to exceed it.
+        """
+        if self.refiner is None:
+            return
+        sh, limit = self.prune.sh, self.refiner.network.config.sh_degree
+        if dense.sh_degree > limit and (sh == "all" or (sh.isdigit() and int(sh) > limit)):
+            raise SceneError(
+                f"the scene has SH degree {dense.sh_degree}; the refiner {self.refiner.source} was built for at most "
+                f"{limit}; cut it with --sh {limit}"
+            )
