@@ -161,7 +161,7 @@ def bottom_of_parabola(at_zero: float, at_half: float, at_one: float) -> float:
     """
     if not all(map(math.isfinite, (at_zero, at_half, at_one))):
         return math.nan
-    return top_of_parabola((0.0, 0.5, 1.0), [-at_zero, -at_half, -at_one], beyond=0.0)
+    return top_of_parabola((0.0, 0.5, 1.0), [-at_zero, -at_half, -at_one], 0.0)
 
 
 def helps(before: Closeness, after: Closeness) -> bool:

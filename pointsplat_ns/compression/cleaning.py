@@ -1,10 +1,10 @@
 """Finds the Gaussians of a scene that no picture needs, so that they take nothing of a budget.
 
-Two rules. A Gaussian that cannot be drawn goes: a value is NaN or infinite, or it is fainter than the rasterizer draws.
-And one that is seen from nowhere goes: cameras stand at places in free space and look in all directions, and it gets no
-blend weight (opacity on a pixel times the transmittance in front of it) on any pixel of any image. So a large
-background that is seen stays, and so does a lamp that hangs in the air. docs/cleaning.md says when
-it pays.
+Two rules remove a Gaussian. The first: it cannot be drawn, because a value is NaN or infinite, or because it is fainter
+than the rasterizer draws. The second: it is seen from nowhere. Cameras stand at places in free space and look in all
+directions; a Gaussian is unseen if it has no blend weight (its opacity at a pixel times the transmittance in front of
+it) on any pixel of any image. So a large background that is visible stays, and so does a lamp that hangs in the air.
+docs/cleaning.md says when it pays.
 """
 
 from __future__ import annotations
@@ -19,25 +19,32 @@ from pointsplat_ns.compression.closeness import DenseReference, views_text
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
-from pointsplat_ns.looking.content import content_box, content_diagonal, in_units
+from pointsplat_ns.looking.content import content_size, in_units
+from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.views import Views
 
-PLACES = 16
-"""Number of places that are looked around from. More places remove less and take longer."""
 
-SIDE = 32
-"""Pixels across each of the six images of a place. Time hardly depends on it, and a coarse image shows more of what is
-small: no Gaussian is drawn thinner than a pixel."""
+@dataclass(frozen=True)
+class CleaningSettings:
+    """Where cleaning looks from."""
 
-CHECKED_VIEWS = 4
-"""Maximum number of views in which renders are compared with the dense scene's."""
+    places: int = 16
+    """Number of places that are looked around from. More places remove less and take longer."""
+    side: int = 32
+    """Pixels across each of the six images of a place. Time hardly depends on it. A coarse image shows more small
+    Gaussians, because none is drawn thinner than a pixel."""
+    seed: int = 17
+    """Seed of the places. Views to compare renders in are sampled with another seed."""
+    checked_views: int = 4
+    """Maximum number of views in which renders are compared with the dense scene's."""
 
-_SEED = 17
-"""Of the places. Views to compare renders in are sampled with another seed."""
+
+SETTINGS = CleaningSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,50 +99,28 @@ def find_junk(scene: Gaussians, progress: Progress = silent) -> Junk:
     order = torch.where(usable, scene.alphas, -1.0).sort(stable=True).indices
     undrawable = order[~drawable[order]]
     drawn = drawable.nonzero()[:, 0]
-    seen = ~drawable  # or of no account here
+    seen = ~drawable  # undrawable Gaussians must not count as unseen too
     places = 0
     if len(drawn):
-        part = _normalised(scene[drawn])
+        part = scene[drawn]
+        part = in_units(part, *content_size(part))  # so that the scene's own unit of length does not matter
         try:
-            cameras = _places(part)
+            around = _views_all_around(part)
         except DataError:
             return Junk(undrawable.cpu(), drawn[:0].cpu(), 0)
-        weights = blend_weights(part, cameras, progress)
-        places = len(cameras)
-        # An all black set of images says nothing about the scene.
-        seen[drawn] = (weights > 0) | ~(weights > 0).any()
+        shown = _shown(part, around, progress)
+        places = len(around) // 6
+        seen[drawn] = shown | ~shown.any()  # images that show nothing say nothing about the scene
     return Junk(undrawable.cpu(), order[~seen[order]].cpu(), places)
 
 
-def blend_weights(scene: Gaussians, cameras: Tensor, progress: Progress = silent) -> Tensor:
-    """Blend weight of every Gaussian: opacity times transmittance, summed over the pixels of six images a place.
-
-    It is the gradient of the sum of all pixels by a Gaussian's grey value.
-
-    Args:
-        scene: N Gaussians.
-        cameras: (P, 3) positions.
-        progress: called with the name of the task and the share of it that is done, in [0, 1].
-
-    Returns:
-        (N,) float64, pixels.
-    """
-    half = SIDE / 2  # a field of view of 90 degrees
-    K = torch.tensor([[half, 0.0, half], [0.0, half, half], [0.0, 0.0, 1.0]], device=scene.device)
-    means, quats, stds, alphas = (value.detach() for value in (scene.means, scene.quats, scene.stds, scene.alphas))
-    grey = torch.ones(len(scene), 1, dtype=scene.dtype, device=scene.device, requires_grad=True)
-    total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
-    rotations = _six_directions().to(cameras)
-    for done, position in enumerate(cameras):
-        for rotation in rotations:
-            viewmat = torch.eye(4).to(cameras)
-            viewmat[:3, :3], viewmat[:3, 3] = rotation, -(rotation @ position)
-            with torch.enable_grad():
-                image, _, _ = rasterization(means, quats, stds, alphas, grey, viewmat[None], K[None], SIDE, SIDE)
-                if image.requires_grad:  # not where nothing is in front of the camera
-                    total += torch.autograd.grad(image.sum(), grey)[0][:, 0].double()
-        progress("looking for what cannot be seen", (done + 1) / len(cameras))
-    return total
+def _shown(scene: Gaussians, views: Views, progress: Progress) -> Tensor:
+    """Whether each Gaussian (N,) has a blend weight on any pixel of any view."""
+    shown = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
+    for done, pixels in enumerate(each_view(list(views), len(scene), lambda view: pixels_of(scene, view))):
+        shown |= pixels > 0
+        progress("looking for what cannot be seen", (done + 1) / len(views))
+    return shown
 
 
 def clean_scene(dense: Gaussians, at_least: int, views: ViewSource, progress: Progress = silent) -> Cleaning:
@@ -174,7 +159,7 @@ def clean_scene(dense: Gaussians, at_least: int, views: ViewSource, progress: Pr
 def _reference(dense: Gaussians, views: ViewSource) -> DenseReference | None:
     """Renders of the dense scene; None if there are no views."""
     try:
-        return DenseReference(dense, views.scored(CHECKED_VIEWS))
+        return DenseReference(dense, views.scored(SETTINGS.checked_views))
     except DataError:
         return None
 
@@ -188,7 +173,7 @@ def _closeness(reference: DenseReference, scene: Gaussians) -> str:
 
 
 def _first(junk: Junk, count: int) -> Junk:
-    """The first ``count`` of the junk: what cannot be drawn, then the least seen."""
+    """The first ``count`` of the junk: undrawable Gaussians, then unseen ones, the faintest first."""
     undrawable = junk.undrawable[:count]
     return Junk(undrawable, junk.unseen[: count - len(undrawable)], junk.places)
 
@@ -202,16 +187,22 @@ def _without(scene: Gaussians, indices: Tensor) -> Gaussians:
     return scene[kept]
 
 
-def _normalised(scene: Gaussians) -> Gaussians:
-    """The scene in units of its content, so that its own unit of length does not matter."""
-    low, high = content_box(scene)
-    return in_units(scene, 0.5 * (low + high), content_diagonal(scene, low, high))
+def _views_all_around(scene: Gaussians) -> Views:
+    """Views in all six directions from places all over free space; six after one another for each place.
 
-
-def _places(scene: Gaussians) -> Tensor:
-    """Positions (P, 3) in free space, float64; all over it, wherever photos were taken, which SH may tell."""
-    silent = scene.replace(features_rest=scene.features_rest[:, :0])
-    return invert_rigid(sample_views(silent, PLACES, seed=_SEED).viewmats)[:, :3, 3]
+    Raises:
+        DataError: if there is no free space.
+    """
+    without_sh = scene.replace(features_rest=scene.features_rest[:, :0])  # SH may tell where photos were taken
+    places = invert_rigid(sample_views(without_sh, SETTINGS.places, seed=SETTINGS.seed).viewmats)[:, :3, 3]
+    rotations = _six_directions().to(places)
+    viewmats = torch.eye(4).to(places).repeat(len(places), 6, 1, 1)
+    viewmats[..., :3, :3] = rotations
+    viewmats[..., :3, 3] = -torch.einsum("dij,pj->pdi", rotations, places)
+    half = SETTINGS.side / 2  # a field of view of 90 degrees
+    K = torch.tensor([[half, 0.0, half], [0.0, half, half], [0.0, 0.0, 1.0]])
+    viewmats = viewmats.flatten(0, 1)
+    return Views(viewmats, K.repeat(len(viewmats), 1, 1), SETTINGS.side, SETTINGS.side, torch.zeros(3))
 
 
 def _six_directions() -> Tensor:

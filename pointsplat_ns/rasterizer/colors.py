@@ -6,8 +6,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pointsplat_ns.gaussians import SH_C0
 from pointsplat_ns.rasterizer.compiled.colors import CompiledColor, can_color
-from pointsplat_ns.rasterizer.spherical_harmonics import C0, Color, check_degree, offset
+from pointsplat_ns.rasterizer.spherical_harmonics import Color, check_degree, offset
 
 
 def sh_to_color(
@@ -45,5 +46,5 @@ def sh_to_color(
         # a constant has no direction
         return CompiledColor.apply(directions if degree else directions.detach(), first, rest, ids, degree)
     if degree == 0:
-        return offset(C0 * (first[..., 0, :] if rest is None else first).index_select(0, ids)).clamp_min(0.0)
+        return offset(SH_C0 * (first[..., 0, :] if rest is None else first).index_select(0, ids)).clamp_min(0.0)
     return Color.apply(directions, first if rest is None else torch.cat([first[:, None], rest], 1), ids, degree)

@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from pointsplat_ns.gaussians import SH_C0
 from pointsplat_ns.geometry.quaternions import SHORTEST
 from pointsplat_ns.rasterizer.precision import full_precision
 
 # Normalisation constants of the real spherical harmonics (Sloan, "Efficient Spherical Harmonic
-# Evaluation", 2013), with the signs that 3DGS files use.
-C0 = 0.28209479177387814
+# Evaluation", 2013), with the signs that 3DGS files use. That of degree 0 is SH_C0.
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
@@ -25,7 +25,7 @@ def check_degree(degree: int) -> None:
 
 def _basis_rows(unit: Tensor, degree: int) -> list[Tensor]:
     x, y, z = unit
-    rows = [torch.full_like(x, C0)]
+    rows = [torch.full_like(x, SH_C0)]
     if degree >= 1:
         rows += [-C1 * y, C1 * z, -C1 * x]
     if degree >= 2:

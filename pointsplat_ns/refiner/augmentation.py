@@ -12,9 +12,9 @@ from functools import cached_property, lru_cache
 import torch
 from torch import Tensor
 
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.gaussians import SH_C0, Gaussians
 from pointsplat_ns.geometry.quaternions import rotation_matrices, zero_as_identity
-from pointsplat_ns.rasterizer.spherical_harmonics import C0, sh_basis
+from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +52,10 @@ class Transform:
         )
 
     def _color(self, scene: Gaussians) -> tuple[Tensor, Tensor]:
-        """Factors on SH coefficients, and the offset added to the constant ones. Colours are 0.5 + C0 dc, so a factor
-        on colours changes the 0.5, too."""
+        """Factors on SH coefficients, and the offset added to the constant ones. Colours are 0.5 + SH_C0 dc, so a
+        factor on colours changes the 0.5, too."""
         gains = self.gains.to(scene.means)
-        return gains, 0.5 * (gains - 1.0) / C0
+        return gains, 0.5 * (gains - 1.0) / SH_C0
 
     def _moved(self, scene: Gaussians, matrix: Tensor, quat: Tensor) -> Gaussians:
         """The scene with positions, rotations and SH bands rotated. A reflection through the origin leaves covariances,

@@ -13,9 +13,10 @@ import pointsplat_ns as ps
 from making import box_room, same_bits
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression import cleaning
-from pointsplat_ns.compression.cleaning import Cleaning, blend_weights, clean_scene, find_junk
+from pointsplat_ns.compression.cleaning import Cleaning, CleaningSettings, clean_scene, find_junk
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, write_ply
@@ -25,14 +26,13 @@ from pointsplat_ns.pruning import WithinPsnr, resolve_keep
 from pointsplat_ns.views import Views
 
 ROOM, PLANTED = 2500, 12
-SHIPPED_PLACES = cleaning.PLACES
 
 
 @pytest.fixture(scope="module", autouse=True)
 def few_places() -> Iterator[None]:
     """Four places instead of sixteen, in a quarter of the time, for tests of what does not depend on their number."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cleaning, "PLACES", 4)
+        patch.setattr(cleaning, "SETTINGS", CleaningSettings(places=4))
         yield
 
 
@@ -97,14 +97,14 @@ def with_junk(room: Gaussians) -> Gaussians:
 def test_nothing_of_a_clean_room_is_touched():
     thin = box_room(0)  # every Gaussian of its walls is seen
     assert junk_of(thin) == ([], [])
-    result = prune_scene(thin, 0.4, "opacity", clean=True)
-    assert same_bits(result.scene, prune_scene(thin, 0.4, "opacity").scene)
+    result = prune_scene(thin, PruneRequest(0.4, "opacity", clean=True))
+    assert same_bits(result.scene, prune_scene(thin, PruneRequest(0.4, "opacity")).scene)
     assert result.notes == ("clean: nothing removed",)
 
 
 @pytest.mark.parametrize("kind", JUNK)
 def test_what_is_behind_walls_goes_and_no_view_changes(kind, room, views, monkeypatch):
-    monkeypatch.setattr(cleaning, "PLACES", SHIPPED_PLACES)
+    monkeypatch.setattr(cleaning, "SETTINGS", CleaningSettings())
     scene = Gaussians.cat([room, JUNK[kind]])
     assert junk_of(scene) == ([], list(range(ROOM, ROOM + PLANTED)))
     assert DenseReference(scene, views).psnr(room)[0] == math.inf  # views that chose nothing
@@ -133,16 +133,6 @@ def test_what_cannot_be_drawn_goes_the_meaningless_first(room):
     assert junk.undrawable.tolist() == [2, 1, 0]
 
 
-def test_a_weight_is_opacity_times_transmittance_over_all_pixels():
-    """Two discs wider than an image, one behind the other: the first takes its opacity of every pixel of its face."""
-    discs = blobs(torch.tensor([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), torch.tensor([1e-4, 50.0, 50.0]).log(), 0.0)
-    one = blend_weights(discs, torch.zeros(1, 3, dtype=torch.float64))
-    half_space = blend_weights(discs[1], torch.zeros(1, 3, dtype=torch.float64))
-    assert one[0] > one[1] > 0
-    # Transmittance in front of the second is 1/2 where both are flat and wide; at the rims they differ a little.
-    torch.testing.assert_close(one[1], 0.5 * half_space[0], rtol=0.02, atol=0.0)
-
-
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
 def test_the_unit_of_length_does_not_matter(factor, room):
     scene = with_junk(room)
@@ -169,17 +159,19 @@ def test_where_there_is_nothing_to_compare_with_nothing_goes(scene):
     assert junk_of(scene) == ([], [])
 
 
-def test_of_giants_without_end_those_that_show_stay():
-    undrawable, unseen = junk_of(box_room(0, 30).replace(scales=torch.full((30, 3), 80.0)))
-    assert undrawable == [] and len(unseen) < 30
-
-
-@pytest.mark.parametrize("place", [0.0, 1e30])
-def test_of_identical_ones_those_that_show_stay(place):
-    """The first of opacity 0.98 let 2 % through each; when a ten-thousandth is left the others are not drawn."""
-    stack = box_room(0, 30).replace(means=torch.full((30, 3), place), scales=torch.full((30, 3), -1.0))
-    undrawable, unseen = junk_of(stack)
-    assert undrawable == [] and len(unseen) <= 28
+@pytest.mark.parametrize(
+    ("scene", "most"),
+    [
+        (box_room(0, 30).replace(scales=torch.full((30, 3), 80.0)), 29),
+        # The first of opacity 0.98 let 2 % through each; when a ten-thousandth is left the others are not drawn.
+        (box_room(0, 30).replace(means=torch.zeros(30, 3), scales=torch.full((30, 3), -1.0)), 28),
+        (box_room(0, 30).replace(means=torch.full((30, 3), 1e30), scales=torch.full((30, 3), -1.0)), 28),
+    ],
+    ids=["giants without end", "in one place", "in one place far away"],
+)
+def test_of_alike_ones_those_that_show_stay(scene, most):
+    undrawable, unseen = junk_of(scene)
+    assert undrawable == [] and len(unseen) <= most
 
 
 def test_a_scene_of_which_nothing_can_be_drawn_is_all_junk():
@@ -198,7 +190,7 @@ def test_the_same_scene_gives_the_same_junk(room):
 @pytest.mark.parametrize("keep", [1, 0.3, 0.999, 1.0])
 def test_keep_refers_to_the_scene_as_read_and_is_exact(by, keep, room, views):
     scene = with_junk(room)[:-2] if by == "merge" else with_junk(room)
-    result = prune_scene(scene, keep, by, views=ViewSource(scene, given=views), clean=True)
+    result = prune_scene(scene, PruneRequest(keep, by, clean=True), ViewSource(scene, given=views))
     assert len(result.scene) == resolve_keep(len(scene), keep)
     if keep == 0.3:
         assert int((result.scene.means[:, 0].abs() > 3).sum()) == 0
@@ -207,7 +199,7 @@ def test_keep_refers_to_the_scene_as_read_and_is_exact(by, keep, room, views):
 def test_a_quality_that_takes_junk_gets_it_back(room, views):
     scene = Gaussians.cat([room, JUNK["floaters"]])
     source = ViewSource(scene, given=views)
-    easy = prune_scene(scene, WithinPsnr(12.0), "coverage", views=source, clean=True)
+    easy = prune_scene(scene, PruneRequest(WithinPsnr(12.0), "coverage", clean=True), source)
     assert len(easy.scene) < ROOM and int((easy.scene.means[:, 0].abs() > 3).sum()) == 0
     cleaning_of = clean_scene(scene, 1, source)
     for count in (len(scene), len(scene) - 1, len(scene) - 5):

@@ -10,17 +10,28 @@ import torch
 
 import pointsplat_ns.compression.compact as compact_module
 from making import ball, same
+from pointsplat_ns.compression import acceptance
+from pointsplat_ns.compression.acceptance import (
+    ACCEPTANCE,
+    AcceptanceSettings,
+    at_strength,
+    bottom_of_parabola,
+    closer_in,
+    helps,
+)
 from pointsplat_ns.compression.closeness import Closeness, DenseReference
-from pointsplat_ns.compression.compact import MIN_GAIN, Compacted, at_strength, bottom_of_parabola, compact_scene, helps
+from pointsplat_ns.compression.compact import Compacted, compact_scene
 from pointsplat_ns.compression.prune import prune_scene
-from pointsplat_ns.compression.repair import RepairBudget, Repaired
+from pointsplat_ns.compression.repair import Repaired
+from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, RepairBudget
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
-from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
+from pointsplat_ns.errors import BudgetError, DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import PruneSettings, WithinPsnr, prune
 from pointsplat_ns.refiner import Refiner, RefinerConfig
+from pointsplat_ns.system.progress import silent
 from pointsplat_ns.views import Views
 
 TINY = {"enc_channels": (8, 8), "enc_depths": (1, 1), "enc_heads": (1, 1), "strides": (2,), "patch": 64}
@@ -45,9 +56,25 @@ def trained(refiner: Refiner, keep: float | int = 0.5, by: str = "opacity", **op
     return TrainedRefiner(refiner, PruneSettings(keep, by, **options), Path("in memory"))
 
 
-def compacted(scene: Gaussians, refiner: TrainedRefiner, views: Views, *args, **options) -> Compacted:
+REPAIRED = RepairBudget("quick", 1.0)
+
+
+def compacted(
+    scene: Gaussians, refiner: TrainedRefiner | None, views: Views | ViewSource | None, progress=silent, **options
+) -> Compacted:
     """Compacted with renders compared in the given views."""
-    return compact_scene(scene, refiner, *args, **options, views=ViewSource(scene, given=views))
+    source = ViewSource(scene, given=views) if isinstance(views, Views) else views
+    return compact_scene(scene, CompactRequest.of(refiner, **options), source, progress)
+
+
+@pytest.fixture
+def repaired_to(monkeypatch):
+    """A function that makes every repair give one scene."""
+
+    def give(made: Gaussians, interrupted: bool = False) -> None:
+        monkeypatch.setattr(compact_module, "repair", lambda *_, **others: Repaired(made, 5, 0.5, interrupted))
+
+    return give
 
 
 class NoViews(ViewSource):
@@ -123,14 +150,12 @@ def test_a_refiner_that_goes_too_far_is_taken_part_of_the_way(scene, views):
 
 
 def test_what_brings_next_to_nothing_is_left_out(scene, views, monkeypatch):
-    for worth, accepted in ((MIN_GAIN, False), (0.001, True)):
-        monkeypatch.setattr(compact_module, "MIN_GAIN", worth)
-        result = compacted(scene, trained(tiny_refiner("scales", 0.002)), views)
-        assert result.accepted == accepted
-        assert result.before.psnr < result.after.psnr < result.before.psnr + MIN_GAIN
-    monkeypatch.undo()
-    result = compacted(scene, trained(tiny_refiner("scales", 0.002)), views)
+    refiner = trained(tiny_refiner("scales", 0.002))
+    result = compacted(scene, refiner, views)
+    assert not result.accepted and result.before.psnr < result.after.psnr < result.before.psnr + ACCEPTANCE.min_gain
     assert result.verdict.startswith("refinement left out, it brings less than 0.1 dB: ")
+    monkeypatch.setattr(acceptance, "ACCEPTANCE", AcceptanceSettings(min_gain=0.001))
+    assert compacted(scene, refiner, views).accepted
 
 
 def test_a_share_of_the_way_is_linear_in_what_is_stored_and_finite_where_the_start_is():
@@ -165,7 +190,7 @@ def test_an_untrained_refiner_changes_nothing_and_it_is_said(scene, views):
     result = compacted(scene, trained(tiny_refiner()), views)
     assert not result.accepted and "left out: it changes nothing" in result.verdict
     assert same(result.scene, result.refined)
-    whole = compacted(scene, trained(tiny_refiner("scales", 0.1)), views, 1.0)
+    whole = compacted(scene, trained(tiny_refiner("scales", 0.1)), views, keep=1.0)
     assert not whole.accepted and same(whole.scene, scene) and whole.before.psnr == math.inf
 
 
@@ -183,13 +208,13 @@ def test_what_is_not_finite_never_gets_out(scene, views):
 
     unsound = Unsound(refiner.config).eval()
     for source in (ViewSource(scene, given=views), NoViews(scene)):
-        result = compact_scene(scene, trained(unsound), views=source)
+        result = compacted(scene, trained(unsound), source)
         assert not result.accepted and same(result.scene, pruned) and result.after is None
         assert result.verdict == "refinement left out: 7 of 200 refined Gaussians are not finite"
 
 
 def test_without_a_place_to_look_from_refinement_is_left_out_and_the_reason_is_said(scene):
-    result = compact_scene(scene, trained(tiny_refiner("scales", 0.2)), views=NoViews(scene))
+    result = compacted(scene, trained(tiny_refiner("scales", 0.2)), NoViews(scene))
     assert not result.accepted and same(result.scene, prune(scene, 0.5, "opacity"))
     assert result.reference is None and result.views is None and result.psnr is None
     assert result.verdict == (
@@ -201,54 +226,46 @@ def test_without_a_place_to_look_from_refinement_is_left_out_and_the_reason_is_s
 def test_one_gaussian_is_compacted_and_none_are_refused(scene, short_search):
     one = scene[5:6].replace(opacities=torch.tensor([[4.0]]))
     for moved in (0.0, 0.3):  # nothing is closer to a scene than itself
-        result = compact_scene(one, trained(tiny_refiner("scales", moved), 1))
+        result = compacted(one, trained(tiny_refiner("scales", moved), 1), None)
         assert len(result.scene) == 1 and same(result.scene, one) and not result.accepted
         assert result.notes == ("poses sampled in free space",) and result.before.psnr == math.inf
     faint = one.replace(opacities=torch.tensor([[-4.0]]))  # no place sees a covered picture of it
-    result = compact_scene(faint, trained(tiny_refiner("scales", 0.3), 1))
+    result = compacted(faint, trained(tiny_refiner("scales", 0.3), 1), None)
     assert same(result.scene, faint) and "cannot be compared" in result.verdict and result.notes == ()
-    with pytest.raises(SceneError, match="can be drawn"):
-        compact_scene(scene[:0], trained(tiny_refiner()))
-    with pytest.raises(SceneError, match="can be drawn"):
-        compact_scene(scene.map(lambda value: value * math.nan), trained(tiny_refiner()))
-
-
-def test_what_is_asked_for_goes_before_what_the_refiner_was_trained_with(scene, views):
-    refiner = trained(tiny_refiner(), 0.25, "paper", opacity_weight=0.9)
-    result = compacted(scene, refiner, views)
-    assert same(result.pruned, prune(scene, 0.25, "paper", opacity_weight=0.9))
-    result = compacted(scene, refiner, views, 30, "merge", "0")
-    alone = prune_scene(scene, 30, "merge", "0", views=ViewSource(scene, views))
-    assert same(result.pruned, alone.scene) and result.scene.sh_degree == 0
-    with pytest.raises(BudgetError, match="keep is 401"):
-        compact_scene(scene, refiner, 401)
-
-
-@pytest.mark.parametrize("by", ["authors", "log-volume"])
-def test_the_opacity_weight_of_the_training_serves_every_method_that_weighs_opacity(scene, views, by):
-    refiner = trained(tiny_refiner(), 0.25, "paper", opacity_weight=0.9)
-    result = compacted(scene, refiner, views, by=by)
-    assert same(result.pruned, prune(scene, 0.25, by, opacity_weight=0.9))
+    for nothing in (scene[:0], scene.map(lambda value: value * math.nan)):
+        with pytest.raises(SceneError, match="can be drawn"):
+            compacted(nothing, trained(tiny_refiner()), None)
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "expected"),
     [
-        ({"keep": "half"}, "keep is 'half'"),
-        ({"by": "best"}, "no method is called 'best'"),
-        ({"sh": "9"}, "sh is '9'; expected all, auto or a degree"),
-        ({"keep": WithinPsnr(math.nan)}, "the wanted PSNR is nan"),
+        ({}, {}),
+        ({"keep": 30, "by": "merge", "sh": "0"}, {"keep": 30, "by": "merge", "sh": "0", "opacity_weight": None}),
+        ({"by": "authors"}, {"by": "authors"}),  # the weight of the training serves every method that weighs opacity
+        ({"by": "log-volume", "clean": True}, {"by": "log-volume", "clean": True}),
     ],
 )
-def test_options_that_fit_no_scene_are_refused_first(scene, options, message):
-    with pytest.raises(PointSplatError, match=message):
-        compact_scene(scene, trained(tiny_refiner(sh_degree=0)), **options, views=NoViews(scene))
+def test_options_go_before_what_the_refiner_was_trained_with(options, expected):
+    refiner = trained(tiny_refiner(), 0.25, "paper", opacity_weight=0.9)
+    trained_with = {"keep": 0.25, "by": "paper", "opacity_weight": 0.9}
+    assert CompactRequest.of(refiner, **options).prune == PruneRequest(**{**trained_with, **expected})
+
+
+def test_the_scene_is_pruned_as_the_request_says(scene, views):
+    refiner = trained(tiny_refiner(), 0.25, "paper", opacity_weight=0.9)
+    assert same(compacted(scene, refiner, views).pruned, prune(scene, 0.25, "paper", opacity_weight=0.9))
+    alone = prune_scene(scene, PruneRequest(30, sh="0"), ViewSource(scene, views))
+    result = compacted(scene, refiner, views, keep=30, by="merge", sh="0")
+    assert same(result.pruned, alone.scene) and result.scene.sh_degree == 0
+    with pytest.raises(BudgetError, match="keep is 401"):
+        compacted(scene, refiner, views, keep=401)
 
 
 def test_a_wanted_psnr_is_met_before_refinement_so_in_any_case(scene, views):
     for moved in (2.0, -0.05):
         refiner = trained(tiny_refiner("features_dc", moved))
-        result = compacted(scene, refiner, views, WithinPsnr(24.0), "coverage")
+        result = compacted(scene, refiner, views, keep=WithinPsnr(24.0), by="coverage")
         assert result.before.psnr >= 24 and DenseReference(scene, views).psnr(result.scene)[0] >= result.before.psnr
         assert any("renders reach" in note for note in result.notes)
 
@@ -272,35 +289,33 @@ def test_views_smaller_than_the_window_of_ssim_are_compared_by_psnr_alone(scene)
 
 def test_progress_names_what_is_done_and_never_goes_back(scene, views):
     steps = []
-    compacted(
-        scene,
-        trained(tiny_refiner("scales", 0.2), by="merge"),
-        views,
-        progress=lambda what, share: steps.append((what, share)),
-    )
+    refiner = trained(tiny_refiner("scales", 0.2), by="merge")
+    compacted(scene, refiner, views, lambda what, share: steps.append((what, share)))
     assert list(dict.fromkeys(what for what, _ in steps)) == ["by merge", "comparing renders", "refining"]
     shares = [share for what, share in steps if what == "comparing renders"]
     assert shares == sorted(shares) and shares[-1] == 1 and all(0 <= share <= 1 for _, share in steps)
 
 
-def test_a_repair_that_helps_is_kept_and_one_that_harms_is_left_out(scene, views, monkeypatch):
-    """Also one that is not finite."""
-    refiner, budget = trained(tiny_refiner()), RepairBudget("quick", 1.0)
-    pruned, reference = prune(scene, 0.5, "opacity"), DenseReference(scene, views)
-    larger = pruned.replace(scales=pruned.scales + 0.1)
-    spoiled = pruned.replace(features_dc=pruned.features_dc * math.nan)
-    far = pruned.replace(features_dc=pruned.features_dc - 2.0)
-    for made, kept in ((larger, True), (far, False), (spoiled, False)):
-        monkeypatch.setattr(
-            compact_module, "repair", lambda *_, made=made, kept=kept, **others: Repaired(made, 5, 0.5, not kept)
-        )
-        result = compacted(scene, refiner, views, budget=budget)
-        assert result.repair_accepted == kept
-        assert same(result.scene, made if kept else pruned)
-        assert result.psnr == reference.psnr(result.scene)[0] and result.psnr >= result.before.psnr
-        line = result.verdict.splitlines()[1]
-        assert line.startswith("repair, 5 steps in 0.5 s: " if kept else "repair left out, ")
-        assert ("interrupted" in line) == (not kept)
+@pytest.mark.parametrize(
+    ("change", "kept"),
+    [
+        (lambda pruned: pruned.replace(scales=pruned.scales + 0.1), True),
+        (lambda pruned: pruned.replace(features_dc=pruned.features_dc - 2.0), False),
+        (lambda pruned: pruned.replace(features_dc=pruned.features_dc * math.nan), False),
+    ],
+    ids=["better", "worse", "not finite"],
+)
+def test_a_repair_that_helps_is_kept_and_one_that_harms_is_left_out(change, kept, scene, views, repaired_to):
+    pruned = prune(scene, 0.5, "opacity")
+    made = change(pruned)
+    repaired_to(made, interrupted=not kept)
+    result = compacted(scene, trained(tiny_refiner()), views, repair=REPAIRED)
+    assert result.repair_accepted == kept
+    assert same(result.scene, made if kept else pruned)
+    assert result.psnr == DenseReference(scene, views).psnr(result.scene)[0] and result.psnr >= result.before.psnr
+    line = result.verdict.splitlines()[1]
+    assert line.startswith("repair, 5 steps in 0.5 s: " if kept else "repair left out, ")
+    assert ("interrupted" in line) == (not kept)
 
 
 def test_a_repair_knows_how_close_the_scene_is_where_there_is_anything(scene, views, monkeypatch):
@@ -311,19 +326,19 @@ def test_a_repair_knows_how_close_the_scene_is_where_there_is_anything(scene, vi
         return Repaired(scene, 5, 0.5, False)
 
     monkeypatch.setattr(compact_module, "repair", repair)
-    result = compacted(scene, trained(tiny_refiner()), views, budget=RepairBudget("quick", 1.0))
+    result = compacted(scene, trained(tiny_refiner()), views, repair=REPAIRED)
     assert result.reference.covered < 0.95
     assert told == [pytest.approx(result.before.psnr + 10 * math.log10(result.reference.covered))]
 
 
-def test_a_repair_that_goes_too_far_is_kept_in_part(scene, views, monkeypatch):
-    refiner, reference = trained(tiny_refiner()), DenseReference(scene, views)
-    pruned = prune(scene, 0.5, "opacity")
+def test_a_repair_that_goes_too_far_is_kept_in_part(scene, views, repaired_to):
+    pruned, reference = prune(scene, 0.5, "opacity"), DenseReference(scene, views)
     made = pruned.replace(scales=pruned.scales + 0.6)
-    monkeypatch.setattr(compact_module, "repair", lambda *_, **others: Repaired(made, 5, 0.5, False))
-    result = compacted(scene, refiner, views, budget=RepairBudget("quick", 1.0))
+    repaired_to(made)
+    result = compacted(scene, trained(tiny_refiner()), views, repair=REPAIRED)
     assert not helps(result.before, reference.closeness(made))
-    assert result.repair_accepted and result.psnr == reference.psnr(result.scene)[0] > result.before.psnr + MIN_GAIN
+    gained = reference.psnr(result.scene)[0] - result.before.psnr
+    assert result.repair_accepted and result.psnr == reference.psnr(result.scene)[0] and gained > ACCEPTANCE.min_gain
     share = (result.scene.scales - pruned.scales).mean() / 0.6
     assert 0 < share < 1 and torch.equal(result.scene.means, pruned.means)
     assert f"repair at {share:.0%} of its strength, 5 steps in 0.5 s: " in result.verdict
@@ -331,46 +346,43 @@ def test_a_repair_that_goes_too_far_is_kept_in_part(scene, views, monkeypatch):
 
 def test_what_cannot_be_compared_or_is_as_good_as_can_be_is_not_repaired(scene, views, monkeypatch):
     monkeypatch.setattr(compact_module, "repair", None)  # a call of it would fail
-    budget = RepairBudget("quick", 1.0)
-    blind = compact_scene(scene, trained(tiny_refiner()), views=NoViews(scene), budget=budget)
-    whole = compacted(scene, trained(tiny_refiner()), views, 1.0, budget=budget)
+    blind = compacted(scene, trained(tiny_refiner()), NoViews(scene), repair=REPAIRED)
+    whole = compacted(scene, trained(tiny_refiner()), views, keep=1.0, repair=REPAIRED)
     assert blind.repaired is None and whole.repaired is None and same(whole.scene, scene)
 
 
-def test_what_most_views_pay_for_is_left_out(scene, views, monkeypatch):
+def test_what_most_views_pay_for_is_left_out(scene, views, monkeypatch, repaired_to):
     """Over all pixels it is a gain."""
     pruned = prune(scene, 0.5, "opacity")
-    made = pruned.replace(scales=pruned.scales + 0.1)
+    repaired_to(pruned.replace(scales=pruned.scales + 0.1))
 
     def closeness(self, scene, progress=None):
         return Closeness((0.9, 0.2, 0.2) if same(scene, pruned) else (0.1, 0.21, 0.21), None)
 
     monkeypatch.setattr(DenseReference, "closeness", closeness)
-    monkeypatch.setattr(compact_module, "repair", lambda *_, **others: Repaired(made, 5, 0.5, False))
-    result = compacted(scene, trained(tiny_refiner("scales", 0.1)), views, budget=RepairBudget("quick", 1.0))
+    result = compacted(scene, trained(tiny_refiner("scales", 0.1)), views, repair=REPAIRED)
     assert same(result.scene, pruned) and result.after_repair.psnr > result.before.psnr + 3
+    assert closer_in(result.before, result.after) == 1
     assert result.verdict.startswith("refinement left out, it is farther in most views: ")
     assert "repair left out, it is farther in most views (5 steps in 0.5 s)" in result.verdict
 
 
-def test_a_repair_that_harms_pictures_of_another_size_is_left_out(scene, monkeypatch):
+def test_a_repair_that_harms_pictures_of_another_size_is_left_out(scene, monkeypatch, repaired_to):
     """Thinner Gaussians may be right in pictures of a middle size, and wrong in large ones."""
     large = sample_views(scene, 2, 640, 480)
     pruned = prune(scene, 0.5, "opacity")
-    better = pruned.replace(scales=pruned.scales + 0.1)
-    monkeypatch.setattr(compact_module, "repair", lambda *_, **others: Repaired(better, 5, 0.5, False))
-    budget = RepairBudget("quick", 1.0)
-    refiner = trained(tiny_refiner())
-    assert compacted(scene, refiner, large, budget=budget).repair_accepted
+    repaired_to(pruned.replace(scales=pruned.scales + 0.1))
+    options = {"by": "opacity", "keep": 0.5, "repair": REPAIRED}
+    assert compacted(scene, None, large, **options).repair_accepted
     psnrs = iter([[30.0, 30.0, 30.0], *([[31.0, 31.0, 29.9]] * 3)])
-    monkeypatch.setattr(compact_module.Comparison, "psnrs", lambda self, scene: next(psnrs, [31.0, 31.0, 29.9]))
-    monkeypatch.setattr(compact_module, "helps", lambda before, after: after.psnr > before.psnr)
-    left = compacted(scene, None, large, budget=budget, by="opacity", keep=0.5)
+    monkeypatch.setattr(acceptance.Comparison, "psnrs", lambda self, scene: next(psnrs, [31.0, 31.0, 29.9]))
+    left = compacted(scene, None, large, **options)
     assert not left.repair_accepted and same(left.scene, left.pruned)
-    assert left.verdict.startswith("repair left out")
+    assert left.verdict.startswith("repair left out, it harms pictures of another size (5 steps in 0.5 s): ")
 
 
 def test_without_a_refiner_the_scene_is_only_pruned_and_compared(scene, views):
-    result = compact_scene(scene, views=ViewSource(scene, given=views))
+    result = compacted(scene, None, views)
     assert same(result.scene, result.pruned) and result.after is None and len(result.scene) == len(scene) // 10
     assert result.verdict.startswith(f"not repaired: {result.psnr:.2f} dB")
+    assert compacted(scene, None, NoViews(scene)).verdict.startswith("not refined or repaired: it cannot be compared")

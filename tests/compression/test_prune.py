@@ -11,12 +11,14 @@ import torch
 from making import ball, same
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.distributions import opacity_quantiles, plot_distributions, size_quantiles
-from pointsplat_ns.compression.prune import SH_CHOICES, Pruned, check_options, prune_scene
+from pointsplat_ns.compression.prune import Pruned, prune_scene
+from pointsplat_ns.compression.requests import SH_CHOICES, PruneRequest
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import METHODS, Keep, Megabytes, WithinPsnr, cut_sh, ply_bytes, prune, select
+from pointsplat_ns.system.progress import silent
 from pointsplat_ns.views import Views
 
 
@@ -30,9 +32,12 @@ def views(scene) -> Views:
     return sample_views(scene, 3, 48, 36)
 
 
-def pruned(scene: Gaussians, views: Views, keep: Keep | str, by: str, **options) -> Pruned:
+def pruned(
+    scene: Gaussians, views: Views | ViewSource | None, keep: Keep | str, by: str = "merge", progress=silent, **options
+) -> Pruned:
     """Pruned with renders compared in the given views."""
-    return prune_scene(scene, keep, by, **options, views=ViewSource(scene, given=views))
+    source = ViewSource(scene, given=views) if isinstance(views, Views) else views
+    return prune_scene(scene, PruneRequest(keep, by, **options), source, progress)
 
 
 class Refusing(ViewSource):
@@ -43,7 +48,7 @@ class Refusing(ViewSource):
 
 
 def test_no_views_are_asked_for_where_none_are_needed(scene):
-    result = prune_scene(scene, 0.25, "coverage", sh="0", views=Refusing(scene))
+    result = pruned(scene, Refusing(scene), 0.25, "coverage", sh="0")
     assert same(result.scene, cut_sh(prune(scene, 0.25, "coverage"), 0))
     assert result.notes == ("SH degree 1 cut to 0: 100 % of the directional energy lost",)
 
@@ -64,7 +69,7 @@ def test_a_score_that_looks_at_the_scene_is_computed_once_and_chooses(by, scene,
 
 
 def test_a_size_counts_the_bands_that_are_left(scene):
-    result = prune_scene(scene, Megabytes(0.01), "opacity", sh="0")
+    result = pruned(scene, None, Megabytes(0.01), "opacity", sh="0")
     assert ply_bytes(len(result.scene), 0) <= 10_000 < ply_bytes(len(result.scene) + 1, 0)
 
 
@@ -98,23 +103,16 @@ def test_auto_sh_keeps_bands_that_are_seen_and_drops_those_that_are_not(scene, v
 
 
 def test_fine_tuning_follows_where_it_is_asked_for(scene, views):
-    plain = prune_scene(scene, 0.3, "coverage").scene
-    tuned = pruned(scene, views, 0.3, "coverage", fine_tune_steps=10).scene
+    plain = pruned(scene, None, 0.3, "coverage").scene
+    tuned = pruned(scene, views, 0.3, "coverage", fine_tune=10).scene
     reference = DenseReference(scene, views)
     assert len(tuned) == len(plain) and reference.psnr(tuned)[0] > reference.psnr(plain)[0]
 
 
 def test_progress_names_what_is_done(scene, views):
     steps = []
-    pruned(
-        scene,
-        views,
-        WithinPsnr(20.0),
-        "lightgaussian",
-        sh="auto",
-        fine_tune_steps=2,
-        progress=lambda what, share: steps.append((what, share)),
-    )
+    report = lambda what, share: steps.append((what, share))  # noqa: E731
+    pruned(scene, views, WithinPsnr(20.0), "lightgaussian", report, sh="auto", fine_tune=2)
     assert all(0 <= share <= 1 for _, share in steps)
     assert list(dict.fromkeys(what for what, _ in steps)) == [
         "comparing SH degrees",
@@ -128,12 +126,12 @@ def test_progress_names_what_is_done(scene, views):
 @pytest.mark.parametrize("keep", [0, 0.0, 1.5, math.nan, 401, -1, Megabytes(1e-6), WithinPsnr(math.nan)])
 def test_what_cannot_be_made_is_refused_by_every_method_before_it_looks(by, keep, scene):
     with pytest.raises(BudgetError):
-        prune_scene(scene, keep, by, views=Refusing(scene))
+        pruned(scene, Refusing(scene), keep, by)
 
 
 def test_what_is_no_scene_is_refused(scene):
     with pytest.raises(SceneError, match="can be drawn"):
-        prune_scene(scene.map(lambda value: value * math.nan), 0.5, "coverage")
+        pruned(scene.map(lambda value: value * math.nan), None, 0.5, "coverage")
 
 
 @pytest.mark.parametrize(
@@ -143,24 +141,24 @@ def test_what_is_no_scene_is_refused(scene):
         ({"sh": "4"}, "sh is '4'; expected all, auto or a degree from 0 to 3"),
         ({"keep": "half"}, "keep is 'half'"),
         ({"keep": WithinPsnr(-1.0)}, "the wanted PSNR is -1.0 dB"),
-        ({"fine_tune_steps": -1}, "-1 steps of fine-tuning; expected 0 for none, or more"),
+        ({"fine_tune": -1}, "-1 steps of fine-tuning; expected 0 for none, or more"),
         ({"by": "merge", "opacity_weight": 0.5}, "opacity weight 0.5: merge does not weigh opacity"),
     ],
 )
 def test_options_that_fit_no_scene_are_refused_without_one(options, message):
     with pytest.raises(PointSplatError, match=message):
-        check_options(**{"keep": 0.5, "by": "paper", **options})
+        PruneRequest(**{"keep": 0.5, "by": "paper", **options})
 
 
 @pytest.mark.parametrize("by", sorted(name for name, method in METHODS.items() if not method.weighs_opacity))
-def test_an_opacity_weight_is_refused_by_every_method_that_has_none(by, scene):
+def test_an_opacity_weight_is_refused_by_every_method_that_has_none(by):
     with pytest.raises(PointSplatError, match="choose one of paper, authors, log-volume"):
-        prune_scene(scene, 0.5, by, opacity_weight=0.5, views=Refusing(scene))
+        PruneRequest(0.5, by, opacity_weight=0.5)
 
 
 @pytest.mark.parametrize("sh", SH_CHOICES)
-def test_every_choice_of_bands_may_be_asked_for(sh):
-    assert check_options("10%", "merge", sh) == 0.1
+def test_every_choice_of_bands_may_be_asked_for_and_text_is_parsed(sh):
+    assert PruneRequest("10%", sh=sh).budget == 0.1
 
 
 def test_distributions_are_numbers_and_a_picture(scene, tmp_path):
@@ -174,9 +172,9 @@ def test_distributions_are_numbers_and_a_picture(scene, tmp_path):
 
 
 def test_what_merging_chose_for_the_scene_is_noted(scene):
-    assert [note for note in prune_scene(scene, 30).notes if note.startswith("merged: optical depth")]
+    assert [note for note in pruned(scene, None, 30).notes if note.startswith("merged: optical depth")]
 
 
 def test_merging_looks_from_the_views_that_are_given_and_from_no_others(scene, views):
-    given = prune_scene(scene, 30, views=ViewSource(scene, given=views)).scene
+    given = pruned(scene, views, 30).scene
     assert same(given, prune(scene, 30, views=views)) and not same(given, prune(scene, 30))

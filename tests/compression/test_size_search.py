@@ -4,6 +4,7 @@ import pytest
 
 from making import cloud
 from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.compression.size_search import CLOSE, largest_within
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.io.formats import Format, format_to_write
@@ -43,7 +44,7 @@ def test_a_size_that_jumps_ends_the_search_with_what_fits():
 @pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply", ".splat", ".glb", ".ply"])
 def test_prune_counts_bytes_of_the_format_that_is_named(tmp_path, suffix):
     scene = cloud(2000)
-    small = prune_scene(scene, f"0.02MB{suffix}", "opacity").scene
+    small = prune_scene(scene, PruneRequest(f"0.02MB{suffix}", "opacity")).scene
     path = tmp_path / f"a{suffix}"
     format_to_write(path).write(small, path, lambda what, share: None)
     assert path.stat().st_size <= 20_000
