@@ -10,13 +10,12 @@ import pytest
 import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
-import pointsplat_ns.compression.compact as compact_module
 from html_parts import parts_of
 from making import ball, same
 from pointsplat_ns import api
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression import trained_refiner
-from pointsplat_ns.compression.repair import STEPS
+from pointsplat_ns.compression import acceptance, trained_refiner
+from pointsplat_ns.compression.requests import STEPS
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.looking.sampling import sample_views
@@ -144,7 +143,7 @@ def test_an_auto_budget_is_met_with_or_without_refinement(ply, helps, tmp_path, 
 def test_a_run_is_compared_from_the_poses_of_its_dataset_and_as_it_was_drawn(helps, trained_walls, tmp_path, capsys):
     (source,) = (trained_walls / "wall-b" / "splatfacto-cpu").iterdir()
     seen = []
-    dense_reference = compact_module.DenseReference
+    dense_reference = acceptance.DenseReference
 
     class Watched(dense_reference):
         def __init__(self, dense, views):
@@ -152,7 +151,7 @@ def test_a_run_is_compared_from_the_poses_of_its_dataset_and_as_it_was_drawn(hel
             super().__init__(dense, views)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compact_module, "DenseReference", Watched)
+        patch.setattr(acceptance, "DenseReference", Watched)
         run("compact", source, "--refiner", helps, "-o", tmp_path / "small.ply")
     assert "poses of the dataset" in capsys.readouterr().out
     assert seen == [("antialiased", [1.0, 1.0, 1.0], 64)]
@@ -197,8 +196,7 @@ def test_where_nothing_can_be_compared_that_is_said_and_no_picture_is_drawn(help
 def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
     ply, helps, trained_walls, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(api, "prune_scene", None)  # a call of it would be no error of ours
-    monkeypatch.setattr(compact_module, "prune_scene", None)
+    monkeypatch.setattr("pointsplat_ns.compression.compact.prune_scene", None)  # a call of it would be no error of ours
     output = tmp_path / "small.ply"
     (splatfacto,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
     said = refusal(capsys, output, ply, "--refiner", splatfacto)
@@ -257,7 +255,7 @@ def test_a_scene_is_repaired_as_long_as_asked_and_what_it_brought_and_cost_is_sa
 ):
     """By an effort, of which the number of steps is known. The scene is so small that few views gain."""
     monkeypatch.setitem(STEPS, "quick", 25)
-    monkeypatch.setattr(compact_module, "_closer_in", lambda before, after: len(before.errors))
+    monkeypatch.setattr(acceptance, "closer_in", lambda before, after: len(before.errors))
     write_ply(room(400), tmp_path / "room.ply")
     options = ("--refiner", helps, "--keep", "40", "--by", "merge", "--effort", "quick", "-o", tmp_path / "small.ply")
     run("compact", tmp_path / "room.ply", *options, "--picture", tmp_path / "shown.png")
@@ -267,7 +265,7 @@ def test_a_scene_is_repaired_as_long_as_asked_and_what_it_brought_and_cost_is_sa
         said,
     )
     assert found is not None, said
-    assert float(found[2]) >= float(found[1]) + compact_module.MIN_GAIN
+    assert float(found[2]) >= float(found[1]) + acceptance.ACCEPTANCE.min_gain
     assert re.search(r"kept( and refined)? and repaired 40 of 400", said)
     assert "repaired, side by side" in said
     assert len(read_ply(tmp_path / "small.ply")) == 40

@@ -7,9 +7,8 @@ import math
 import pytest
 import torch
 
-from pointsplat_ns.compression import feedback as feedback_module
-from pointsplat_ns.compression.feedback import BETAS, DAMPING, Feedback
-from pointsplat_ns.compression.optimiser import seen_rms
+from pointsplat_ns.compression.feedback import REPAIR, Feedback
+from pointsplat_ns.compression.optimiser import Adam, AdamSettings, seen_rms
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.refiner.feedback import FEATURES, PARAMETERS, FeedbackRefiner
@@ -32,16 +31,21 @@ def gradients(scene: Gaussians, seed: int, size: float = 1.0) -> dict[str, torch
     return values
 
 
-def test_steps_that_are_not_learned_are_those_of_adam(scene):
-    feedback = Feedback(scene, 1000)
+@pytest.mark.parametrize("settings", [REPAIR.adam, AdamSettings()], ids=["repairs", "fine-tuning"])
+def test_steps_that_are_not_learned_are_those_of_adam(scene, settings):
+    feedback = Adam(scene, settings)
     values = {name: value.clone() for name, value in scene.items()}
     first = gradients(scene, 0)
     groups = [
-        {"params": [values[name]], "lr": feedback.rates[name], "eps": DAMPING * seen_rms(first[name])}
+        {
+            "params": [values[name]],
+            "lr": feedback.rates[name],
+            "eps": max(settings.damping * seen_rms(first[name]), 1e-15),
+        }
         for name in PARAMETERS
         if values[name].numel()
     ]
-    adam = torch.optim.Adam(groups, betas=BETAS)
+    adam = torch.optim.Adam(groups, betas=settings.betas)
     moved = {name: value.clone() for name, value in scene.items()}
     for seed in range(4):
         given = gradients(scene, seed)
@@ -173,11 +177,18 @@ def test_features_and_steps_are_right_at_the_extremes(scene, size, degree):
             torch.testing.assert_close(found[0][1][name].double(), found[1][1][name], rtol=1e-4, atol=1e-6)
 
 
-def test_what_is_seen_for_the_first_time_later_is_damped_as_it_is_then(scene, monkeypatch):
+def test_damping_is_that_of_the_first_step_that_sees_anything(scene):
     feedback = Feedback(scene, 1000)
-    feedback.observe({name: torch.zeros_like(value) for name, value in scene.items()})
+    nothing = {name: torch.zeros_like(value) for name, value in scene.items()}
+    given = [nothing, gradients(scene, 0), gradients(scene, 1, 1e-3)]
+    feedback.observe(given[0])
     assert all(not bool(value.any()) for value in feedback.moves(1.0).values())
-    feedback.observe(gradients(scene, 0))
-    monkeypatch.setattr(feedback_module, "DAMPING", 1e9)
-    feedback.observe(gradients(scene, 1))
-    assert float(feedback.moves(1.0)["means"].abs().max()) > 0.01 * feedback.rates["means"]
+    for each in given[1:]:
+        feedback.observe(each)
+    (beta, square_beta), damping = REPAIR.adam.betas, REPAIR.adam.damping
+    for name in ("means", "opacities", "features_dc"):
+        mean = sum((1 - beta) * beta ** (2 - i) * each[name] for i, each in enumerate(given)) / (1 - beta**3)
+        square = sum((1 - square_beta) * square_beta ** (2 - i) * each[name] ** 2 for i, each in enumerate(given))
+        root = (square / (1 - square_beta**3)).sqrt()
+        expected = -feedback.rates[name] * mean / (root + damping * seen_rms(given[1][name]))
+        torch.testing.assert_close(feedback.moves(1.0)[name], expected, rtol=1e-4, atol=1e-8)

@@ -10,13 +10,13 @@ import pytest
 
 import pointsplat_ns as ps
 from making import box_room, same_bits
-from pointsplat_ns import api, folders
+from pointsplat_ns import folders
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression import repair
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
-from pointsplat_ns.tradeoff import finding, judging
+from pointsplat_ns.tradeoff import finding, judging, settings
 from pointsplat_ns.tradeoff.finding import find_scene
 from pointsplat_ns.tradeoff.measuring import Measurer
 from pointsplat_ns.tradeoff.targets import Targets
@@ -26,7 +26,7 @@ from pointsplat_ns.tradeoff.targets import Targets
 def quick(room_views, no_lpips, monkeypatch):
     """Three small views of any scene, no repairs, which take long, and times as counts are."""
     monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, **options: room_views[:count])
-    for module in (api, folders):
+    for module in (settings, folders):
         monkeypatch.setattr(module, "repairs_of", lambda effort: ("none",))
     monkeypatch.setattr(judging, "_timed", lambda scene, view, drawn: 1e-5 * len(scene))
 
@@ -60,7 +60,7 @@ def test_the_file_that_is_written_fits_and_leaves_little_unused(dense, tmp_path,
 
 
 def test_it_is_the_scene_that_a_sweep_finds(room, tmp_path, plain_page, plain_plots, monkeypatch):
-    monkeypatch.setattr(api, "repairs_of", lambda effort: ("none", effort))
+    monkeypatch.setattr(settings, "repairs_of", lambda effort: ("none", effort))
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     targets = {"target_mb": 0.01}
     sweep = ps.measure_tradeoff(room, tmp_path, **targets)
