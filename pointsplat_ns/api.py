@@ -1,6 +1,6 @@
-"""The public functions that put the parts together. ``import pointsplat_ns as ps`` gives them all.
+"""The public functions on whole scenes; ``import pointsplat_ns as ps`` gives them all.
 
-The command line is a thin layer over these: what it can do, one call here can do.
+Each command of the command line does what one of these functions does.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def load(path: str | Path, scene: str | None = None) -> Gaussians:
 
 
 def example_room() -> Gaussians:
-    """A small scene to try things on: a built-in room that the refiner that ships was not trained on.
+    """A small built-in scene: a room that the shipped refiner was not trained on.
 
     Returns:
         The scene, float32 on the CPU, in metres with z up.
@@ -102,38 +102,38 @@ def prune(
     resolution: tuple[int, int] | str | None = None,
     progress: bool | Progress = False,
 ) -> Gaussians:
-    """Make a scene smaller: merge neighbours, or keep the Gaussians that matter, from the scene alone.
+    """Make a scene smaller: merge neighbours, or keep the most important Gaussians. No photos are needed.
 
-    What was found on the way (SH bands dropped, PSNR reached, where views came from) is logged at level INFO.
+    Findings (SH bands dropped, PSNR reached, the origin of views) are logged at level INFO.
 
     Args:
         scene: N Gaussians, or where to read them: a PLY, a checkpoint, or a Splatfacto run.
-        keep: how much: a ratio (0.3, "30%"), a count (50000), the size of a PLY ("12MB") or of a file of another format
-            ("12MB.spz"), or "auto:35", the smallest scene whose renders reach 35 dB PSNR against those of the given one
-            ("auto" alone means 35). For .spz and .sog the count is found by trying.
+        keep: size of the result: a ratio (0.3, "30%"), a count (50000), the size of a PLY ("12MB") or of a file of
+            another format ("12MB.spz"), or "auto:35", the smallest scene whose renders reach 35 dB PSNR against those
+            of the given one ("auto" alone means 35). For .spz and .sog the count is searched for.
         by: the method. "merge" replaces neighbours by one Gaussian each; the others keep Gaussians bit for bit:
             "coverage", "paper" (eq. 3), "authors", "opacity", "volume", "log-volume", "area", "random", and
-            "lightgaussian" and "pup", which look at the scene from ``views``.
-        sh: SH bands to keep: "all", up to a degree ("0" to "3"), or "auto", those without which renders stay within
+            "lightgaussian" and "pup", which score Gaussians in ``views``.
+        sh: SH bands to keep: "all", up to a degree ("0" to "3"), or "auto", the lowest degree whose renders reach
             40 dB.
         opacity_weight: lambda of "paper", "authors" and "log-volume", in [0, 1]; by default the paper's 0.3.
-        clean: first remove what cannot be drawn and what is seen from nowhere; ``keep`` refers to the scene as given.
-        fine_tune: steps of optimising what was kept against the given scene's own renders.
-        views: where to look from, if anything has to be rendered: views, the run whose dataset has the poses, or a file
+        clean: first remove Gaussians that cannot be drawn or seen; ``keep`` refers to the scene as given.
+        fine_tune: number of steps of optimising the result against renders of the given scene.
+        views: cameras, if anything has to be rendered: views, the run whose dataset has the poses, or a file
             of cameras (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model). By
             default those of the run that ``scene`` names, or poses sampled in free space.
-        resolution: width and height of the pictures that people look at, pixels: (1920, 1080) or "1920x1080". What is
-            decided by rendering is decided at this size. By default that of the photos or of given views, else
+        resolution: width and height of the pictures that people look at, pixels: (1920, 1080) or "1920x1080".
+            Decisions by rendering are made at this size. By default the size of the photos or of given views, else
             1920 x 1080.
-        progress: True shows a bar; a function is called with what is being done and the share done of it.
+        progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
     Returns:
-        Exactly as many Gaussians as ``keep`` means, on the device of the given ones.
+        Exactly as many Gaussians as ``keep`` asks for, on the device of the given scene.
 
     Raises:
         BudgetError: if no such scene can be made.
         SceneError: if no Gaussian can be drawn, or the file is not usable.
-        DataError: if views are needed and cannot be had, or most of those of a file see nothing of the scene.
+        DataError: if views are needed and there are none, or most cameras of a file see nothing of the scene.
         PointSplatError: if there is no such method, or an option does not fit it.
 
     Example:
@@ -148,17 +148,16 @@ def prune(
 
 
 def refine(scene: Gaussians, refiner: TrainedRefiner | None = None) -> Gaussians:
-    """Repair a pruned scene by one forward pass of a trained network.
+    """Refine a pruned scene by one forward pass of a trained network.
 
-    The network was trained on scenes pruned as ``refiner.settings`` says, and knows no other kind; :func:`compact`
-    checks whether it helps.
+    The network was trained on scenes pruned with ``refiner.settings``. :func:`compact` checks whether it helps.
 
     Args:
         scene: K Gaussians.
         refiner: from :func:`load_refiner`; by default the one that ships.
 
     Returns:
-        K Gaussians on the device of the given ones.
+        K Gaussians on the device of the given scene.
 
     Raises:
         SceneError: if the SH degree exceeds the network's.
@@ -192,43 +191,43 @@ def compact(
 ) -> Compacted:
     """Make a scene smaller, repair it, and check by rendering how far that helps.
 
-    Learned steps bring the smaller scene closer to the given scene's own renders, no photos, for as long as ``effort``
-    or ``seconds`` says. A trained refiner, if one is given, comes before them. What does not bring renders closer in
-    pictures of every size is left out.
+    A trained refiner, if one is given, refines the smaller scene. Learned steps then bring it closer to renders of the
+    given scene, for as long as ``effort`` or ``seconds`` says. No photos are needed. A refinement or repair that harms
+    pictures of any size is left out.
 
-    With targets, count, SH degree and whether to repair are decided by what the scene needs: the smallest file that has
-    ``target_db`` and is within the limits of time and size; among limits alone, the best within them.
+    With targets, a search chooses count, SH degree and repair: the smallest file that reaches ``target_db`` within the
+    limits of time and size; without ``target_db``, the best scene within the limits.
 
     Args:
         scene: N Gaussians, or where to read them: a PLY, a checkpoint, or a Splatfacto run.
-        keep: how much, as for :func:`prune`; an "auto" PSNR is met before repairs. By default what the refiner was
-            trained with, and a tenth without one.
+        keep: size of the result, as for :func:`prune`; an "auto" PSNR is reached before repairs. By default the setting
+            that the refiner was trained with, and a tenth without a refiner.
         refiner: from :func:`load_refiner`; by default none.
         by: the method, as for :func:`prune`; by default the one that the refiner was trained with, and "merge" without
             one.
         sh: SH bands to keep, as for :func:`prune`.
         clean: as for :func:`prune`.
         effort: "instant" takes no steps; "quick" and "thorough" take 48 and 400.
-        seconds: repair for so long, instead; Ctrl-C ends it earlier, and what has been reached is kept.
-        target_db: least PSNR against the given scene's renders, dB, mean over views; those of held-out photos where the
-            run's are found.
+        seconds: duration of the repair, in place of ``effort``; Ctrl-C ends it earlier and keeps the scene so far.
+        target_db: least PSNR against the given scene's renders, dB, mean over views; views of held-out photos if the
+            run has any.
         target_ms: longest time of a frame, milliseconds, drawn by this package in these views.
         target_mb: largest file, in units of 10^6 bytes.
-        target_format: of the file whose size counts, as the end of its name: ".ply", ".spz", ".sog", ...
-        views: where renders are compared, as for :func:`prune`; at most 12 are taken. If there are more than twice as
-            many, the scene is repaired from the others, else on views sampled in free space.
+        target_format: format of the file whose size counts: ".ply", ".spz", ".sog", ...
+        views: cameras that renders are compared in, as for :func:`prune`; at most 12 are used. If there are more than
+            twice as many, the others are used for the repair; else views are sampled in free space.
         resolution: as for :func:`prune`.
-        progress: True shows a bar; a function is called with what is being done and the share done of it.
+        progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
     Returns:
         ``.scene``, ``.accepted`` (whether the refiner is in it), ``.psnr`` (dB against the given scene's renders),
-        ``.seconds``, ``.verdict`` (all of that in a line), and more: see :class:`Compacted`. ``.target`` says what was
-        found for targets, and what the next cheaper scene would have missed.
+        ``.seconds``, ``.verdict`` (gains in words), and more: see :class:`Compacted`. ``.target`` says which scene
+        meets the targets, and which target the next cheaper scene misses.
 
     Raises:
-        BudgetError: if no such scene can be made; of targets, the text says what can.
+        BudgetError: if no such scene can be made; for targets, the text says what is reachable.
         SceneError: if no Gaussian can be drawn, the file is not usable, or the SH degree exceeds the refiner's.
-        DataError: if the budget or ``sh`` needs views and none can be had.
+        DataError: if the budget or ``sh`` needs views and there are none.
         PointSplatError: if there is no such method or effort, or the time is negative.
 
     Example:
@@ -262,16 +261,16 @@ def lod(
 
     Args:
         scene: N Gaussians, or where to read them: a PLY, a checkpoint, or a Splatfacto run.
-        levels: how much each level keeps, as for :func:`prune` but for "auto"; in any order.
+        levels: sizes of the levels, as ``keep`` of :func:`prune` except "auto"; in any order.
         sh: SH bands of every level, as for :func:`prune`.
-        views: where renders are compared, as for :func:`prune`; at most 12 are taken.
+        views: cameras that renders are compared in, as for :func:`prune`; at most 12 are used.
         resolution: as for :func:`prune`.
         folder: where to write each level as soon as it is there, a manifest and a picture; see :meth:`Levels.save`.
         force: overwrite existing files in ``folder``.
-        progress: True shows a bar; a function is called with what is being done and the share done of it.
+        progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
     Returns:
-        The levels, the finest first, with exactly as many Gaussians as asked for; their errors, and the parents of
+        The levels, the finest first, with exactly the numbers of Gaussians asked for; their errors, and the parent of
         each Gaussian: see :class:`Levels`.
 
     Raises:
@@ -314,7 +313,7 @@ def plot_views(
         resolution: as for :func:`prune`.
 
     Returns:
-        Text: where the views come from, what is taken to be up, and what share of the visible content they show.
+        Text: the origin of the views, the estimated up direction, and the share of visible content in the views.
 
     Raises:
         SceneError: if the scene is not usable, or the file cannot be written.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import logging
 import os
@@ -15,6 +16,26 @@ from contextlib import contextmanager
 from typing import Any
 
 ABOUT = "Makes trained 3D Gaussian Splatting scenes smaller, and looks at them. `--version` prints the version."
+
+
+COMMANDS = (
+    *(
+        "prune",
+        "compact",
+        "lod",
+        "tradeoff",
+        "tables",
+        "convert",
+        "info",
+        "view",
+        "render",
+        "export",
+        "report",
+        "rooms",
+    ),
+    *("make-refiner", "make-feedback", "demo"),
+)
+"""The commands. Each is a function of the module of its name, which is only imported when it runs."""
 
 
 class _PrintHandler(logging.Handler):
@@ -79,6 +100,22 @@ def _is_lack_of_memory(error: RuntimeError) -> bool:
     return isinstance(error, torch.cuda.OutOfMemoryError) or "can't allocate memory" in str(error)
 
 
+def _command(name: str) -> Callable[..., None]:
+    """The function of a command, in the module of the same name."""
+    name = name.replace("-", "_")
+    return getattr(importlib.import_module(f"{__package__}.{name}"), name)
+
+
+def _all(args: list[str]) -> dict[str, Callable[..., None]]:
+    """All commands, for help on the program, for completion in shells, and where no command is named."""
+    commands = {name: _command(name) for name in COMMANDS}
+    if args in (["-h"], ["--help"]):
+        return _redescribed(commands, _first_sentence)
+    if args and args[0].startswith("--tyro-"):
+        return _redescribed(commands, _options_in_lines)
+    return commands
+
+
 def _redescribed(
     commands: dict[str, Callable[..., None]], describe: Callable[[str], str]
 ) -> dict[str, Callable[..., None]]:
@@ -115,55 +152,21 @@ def main(args: list[str] | None = None) -> None:
     import tyro
 
     from pointsplat_ns import __version__
-    from pointsplat_ns.cli.compact import compact
-    from pointsplat_ns.cli.convert import convert
-    from pointsplat_ns.cli.demo import demo
-    from pointsplat_ns.cli.export import export
     from pointsplat_ns.cli.help import after_help
-    from pointsplat_ns.cli.info import info
-    from pointsplat_ns.cli.lod import lod
-    from pointsplat_ns.cli.make_feedback import make_feedback
-    from pointsplat_ns.cli.make_refiner import make_refiner
     from pointsplat_ns.cli.printing import only_json
-    from pointsplat_ns.cli.prune import prune
-    from pointsplat_ns.cli.render import render
-    from pointsplat_ns.cli.report import report
-    from pointsplat_ns.cli.rooms import rooms
-    from pointsplat_ns.cli.tables import tables
-    from pointsplat_ns.cli.tradeoff import tradeoff
-    from pointsplat_ns.cli.view import view
     from pointsplat_ns.errors import PointSplatError
     from pointsplat_ns.system.memory import keep_freed_memory
 
     keep_freed_memory()
-    commands: dict[str, Callable[..., None]] = {
-        "prune": prune,
-        "compact": compact,
-        "lod": lod,
-        "tradeoff": tradeoff,
-        "tables": tables,
-        "convert": convert,
-        "info": info,
-        "view": view,
-        "render": render,
-        "export": export,
-        "report": report,
-        "rooms": rooms,
-        "make-refiner": make_refiner,
-        "make-feedback": make_feedback,
-        "demo": demo,
-    }
     args = sys.argv[1:] if args is None else args
-    if args in (["-h"], ["--help"]):
-        commands = _redescribed(commands, _first_sentence)
-    elif args and args[0].startswith("--tyro-"):
-        commands = _redescribed(commands, _options_in_lines)
     try:
         with _log_printed(), _ended_by_signals(), only_json(args):
             if args == ["--version"]:
                 print(f"pointsplat-ns {__version__}")
+            elif args and args[0] in COMMANDS:
+                tyro.cli(_command(args[0]), prog=f"pointsplat {args[0]}", args=args[1:])
             else:
-                tyro.extras.subcommand_cli_from_dict(commands, prog="pointsplat", description=ABOUT, args=args)
+                tyro.extras.subcommand_cli_from_dict(_all(args), prog="pointsplat", description=ABOUT, args=args)
             sys.stdout.flush()  # so that a full disk or a closed pipe is noticed here
     except PointSplatError as error:
         print(f"error: {error}", file=sys.stderr)

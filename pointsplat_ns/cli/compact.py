@@ -57,40 +57,40 @@ def compact(
 ) -> None:
     """Make any scene smaller and repair it, or all scenes of a folder. No photos are needed.
 
-    Learned steps bring the smaller scene closer to the dense scene's renders. Renders are then compared with the dense
-    scene's in other views, and what does not help in pictures of every size is left out. Views are those of --poses,
-    else the poses of the run's dataset if it is found, else sampled in free space.
+    Learned steps bring the smaller scene closer to renders of the dense scene. Both are then compared in other views,
+    and a repair that harms pictures of any size is left out. Views are those of --poses, else those of the run's
+    dataset; if there are none, they are sampled in free space.
 
-    A folder that holds config.yml is a run: one scene. Any other folder is a folder of scenes: all files with Gaussians
-    below it, and the newest Splatfacto run of each experiment. What is finished is left alone, so that the same command
-    goes on after an interruption; it may also be started several times, or on several machines that share the folder.
+    A folder with config.yml is a run: one scene. Any other folder is a folder of scenes: all files with Gaussians below
+    it, and the newest Splatfacto run of each experiment. Finished scenes are skipped, so the same command continues
+    after an interruption. It may also run several times at once, or on several machines that share the folder.
 
     Args:
         scene: a file of any format, a Splatfacto checkpoint, a run (its folder or config.yml), or a folder of scenes.
         output: the file to write, of any format as for prune; by default beside the scene: room_compact.ply for
             room.ply, compact.ply in the folder of a run. For a folder of scenes, another folder; by default
             rooms_compact beside rooms.
-        keep: how much, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before repairs. By default
-            what the refiner was trained with; without one 0.1.
+        keep: size of the result, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before repairs. By
+            default the setting that the refiner was trained with; without one 0.1.
         refiner: a trained network that refines the scene before the steps: a pointsplat run (its folder or config.yml),
             a .safetensors file, or shipped, the one that ships; by default none. --using is the same.
         by: the method of prune; by default the one that the refiner was trained with; without one merge.
         sh: SH bands to keep, as for prune: all, up to a degree, or auto.
-        clean: as for prune: first remove what cannot be drawn and what is seen from nowhere.
+        clean: as for prune: first remove Gaussians that cannot be drawn or seen.
         effort: how long to repair then: not at all (instant), 48 steps (quick, about as long as merging takes), or 400.
-        seconds: repair for so many seconds, instead of a fixed effort. Ctrl-C ends it earlier and loses nothing.
-        target_db: find the smallest file of at least this PSNR against the dense scene's renders, in place of --keep
-            and --sh: count, SH degree and whether to repair are decided by what the scene needs.
-        target_ms: and of at most so many milliseconds a frame. Without --target-db, find the best within the limits.
-        target_mb: and of at most so many megabytes, in the format of the output.
-        poses: a file of cameras to look from: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
+        seconds: duration of the repair, in place of --effort. Ctrl-C ends it earlier and keeps the scene so far.
+        target_db: search for the smallest file of at least this PSNR against renders of the dense scene. The search
+            chooses count, SH degree and repair, in place of --keep and --sh.
+        target_ms: longest time of a frame, milliseconds. Without --target-db, search for the best within the limits.
+        target_mb: largest file, megabytes, in the format of the output.
+        poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
             COLMAP model; for one scene.
-        resolution: size of the pictures that people look at, in pixels; what is decided by rendering is decided at this
-            size. By default that of the photos where there are any, else 1920x1080.
+        resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
+            default the size of the photos, if there are any, else 1920x1080.
         picture: a .png file for images of some views: dense, before and after the repair, side by side.
         html: an .html file that opens offline in a browser, to fly through the scene before and after, with a wipe
             between them.
-        html_limit: size of that file, at most, in MB. Where both scenes take more, the dense one is left out.
+        html_limit: largest size of that file, MB. If both scenes take more, the dense one is left out.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
         jobs: of a folder: number of processes that share its scenes and the cores; by default 1.

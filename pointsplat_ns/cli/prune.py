@@ -37,29 +37,29 @@ def prune(
     threads: int | None = None,
     json_output: Json = False,
 ) -> None:
-    """Make a scene smaller: keep the Gaussians that matter, or merge them, from the scene alone.
+    """Make a scene smaller: merge neighbours, or keep the most important Gaussians. No photos are needed.
 
-    If something has to be rendered, the poses are those of --poses, else those of the run's dataset if it is found; for
-    a file they are sampled in free space.
+    If anything has to be rendered, cameras are those of --poses, else those of the run's dataset; if there are none,
+    they are sampled in free space.
 
     Args:
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
         output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog, .splat or .glb. By
             default beside the scene: room_pruned.ply for room.ply, pruned.ply in the folder of a run.
-        keep: how much: a ratio (0.3), a percentage (30%), a count (50000), the size of the file (12MB; for .spz and
-            .sog it is found by trying, which takes two or three times as long), or auto:35, the
-            smallest scene whose renders reach 35 dB PSNR against those of the dense scene (auto alone means 35).
+        keep: size of the result: a ratio (0.3), a percentage (30%), a count (50000), the size of the file (12MB; for
+            .spz and .sog the count is searched for, which takes two or three times as long), or auto:35, the smallest
+            scene whose renders reach 35 dB PSNR against those of the dense scene (auto alone means 35).
         by: merge replaces neighbours by one Gaussian each and is by far the best; every other method keeps Gaussians as
             they are: coverage (empties no region), paper (eq. 3), authors (the formula of its released code), opacity,
             volume, log-volume, area, random; lightgaussian and pup score by views of the scene.
         opacity_weight: lambda of paper, authors and log-volume: the weight of opacity; by default the paper's 0.3.
-        sh: SH bands to keep: all, up to a degree, or auto, those without which renders stay within 40 dB.
-        clean: first remove what cannot be drawn and what is seen from nowhere; --keep refers to the scene as read.
-        fine_tune: steps of optimising the result against the dense scene's own renders.
-        poses: a file of cameras to look from: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
+        sh: SH bands to keep: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
+        clean: first remove Gaussians that cannot be drawn or seen; --keep refers to the scene as read.
+        fine_tune: number of steps of optimising the result against renders of the dense scene.
+        poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
             COLMAP model. They must be of this scene.
-        resolution: size of the pictures that people look at, in pixels; what is decided by rendering is decided at this
-            size. By default that of the photos where there are any, else 1920x1080.
+        resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
+            default the size of the photos, if there are any, else 1920x1080.
         plot: a .png file for a plot of the distributions of opacity and volume, before and after.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.

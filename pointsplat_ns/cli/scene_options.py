@@ -102,7 +102,7 @@ def _check_free(path: Path, force: bool) -> None:
 
 
 def check_poses(poses: Path | None) -> None:
-    """Check that a path can hold cameras, before it is taken for where views come from.
+    """Check that a path can hold cameras.
 
     Args:
         poses: the file or folder; None for none.
@@ -130,7 +130,7 @@ def in_format_of(keep: str, output: Path) -> str:
 
 
 def warn_if_larger(keep: str | None, output: Path) -> None:
-    """Say so if a file is larger than a budget allows, as what is changed after pruning may compress less well."""
+    """Warn if a file is larger than its budget: a scene changed after pruning may compress less well."""
     from pointsplat_ns.io.files import logger
     from pointsplat_ns.pruning import Megabytes, parse_keep
 

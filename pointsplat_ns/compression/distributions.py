@@ -12,8 +12,6 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.pruning.scores import log_volume
 
-QUANTILES = (0.1, 0.5, 0.9)
-
 
 def size_quantiles(scene: Gaussians) -> list[float]:
     """The 10, 50 and 90 % quantiles of the largest standard deviation, scene units; NaN for an empty scene."""
@@ -26,14 +24,16 @@ def opacity_quantiles(scene: Gaussians) -> list[float]:
 
 
 def _quantiles(values: Tensor) -> list[float]:
+    """The 10, 50 and 90 % quantiles of the finite values."""
+    shares = (0.1, 0.5, 0.9)
     ranked = values.detach().double()[values.isfinite()].sort().values
     if len(ranked) == 0:
-        return [math.nan] * len(QUANTILES)
-    return [float(ranked[round(q * (len(ranked) - 1))]) for q in QUANTILES]
+        return [math.nan] * len(shares)
+    return [float(ranked[round(q * (len(ranked) - 1))]) for q in shares]
 
 
 def plot_distributions(scenes: dict[str, Gaussians], path: Path | str) -> None:
-    """Plot the distributions of opacity (left) and of the logarithm of the volume (right), as the paper's Figure 4.
+    """Plot the distributions of opacity (left) and log-volume (right), as in Figure 4 of the paper.
 
     Args:
         scenes: name in the legend, such as "before" and "after" -> scene.

@@ -20,7 +20,7 @@ from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import spread_indices
 
-_SHEET, _SHEET_SIDE = (4, 4), 320
+_SHEET_COLUMNS, _SHEET_SIDE = 4, 320
 """Rows and columns of a sheet of views, and longer side of its pictures, pixels."""
 
 SHOWN_VIEWS = 3
@@ -29,7 +29,7 @@ SHOWN_VIEWS = 3
 
 @torch.no_grad()
 def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> str:
-    """Draw some of the views compared: dense, before and after each repair, side by side.
+    """Draw some of the compared views: the dense scene, and the scene after each stage, side by side.
 
     Args:
         dense: the scene that was compacted.
@@ -37,7 +37,7 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> st
         path: the PNG file to write.
 
     Returns:
-        A line of text that says what the image shows, or why there is none.
+        A line of text: the columns of the image, or why there is none.
 
     Raises:
         SceneError: if the file cannot be written.
@@ -79,7 +79,7 @@ def _title(name: str, scene: Gaussians, close: Closeness | None) -> str:
 
 @torch.no_grad()
 def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
-    """Draw what the views show that decisions about a scene are made in.
+    """Draw the views that decisions about a scene are made in.
 
     Args:
         dense: N Gaussians on the CPU.
@@ -87,16 +87,16 @@ def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
         path: the PNG file to write.
 
     Returns:
-        Text: where the views come from, what is taken to be up, and what share of the visible content they show.
+        Text: where the views come from, the estimated up direction, and the share of visible content in the views.
 
     Raises:
         DataError: if there are no views.
         SceneError: if the file cannot be written.
     """
     views = source.views(MERGED_FROM)
-    pictures = [render(dense, view) for view in views.spread(_SHEET[0] * _SHEET[1]).resized(_SHEET_SIDE)]
+    pictures = [render(dense, view) for view in views.spread(_SHEET_COLUMNS**2).resized(_SHEET_SIDE)]
     share = coverage(dense, views)
-    columns = _SHEET[1]
+    columns = _SHEET_COLUMNS
     rows = [pictures[first : first + columns] for first in range(0, len(pictures), columns)]
     rows[-1] += [torch.ones_like(pictures[0])] * (columns - len(rows[-1]))
     side_by_side(rows, [""] * columns, path)

@@ -1,4 +1,4 @@
-"""Turning, scaling and moving scenes: which way is up, how long a unit is, and the frame of a run's data."""
+"""Turns, scales and moves scenes: to another up direction, another unit, or the frame of a run's data."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ from pointsplat_ns.looking.sampling import estimated_up
 from pointsplat_ns.refiner.augmentation import Transform
 
 _AXES = {"x": 0, "y": 1, "z": 2}
-_ORTHOGONAL = 1e-4
-"""Transforms are saved with about 7 digits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +29,11 @@ class Similarity:
     offset: Tensor  # [3] float64
 
     def inverse(self) -> Similarity:
-        """What undoes it."""
+        """The similarity that undoes this one."""
         return Similarity(self.matrix.T, 1 / self.scale, -(self.matrix.T @ self.offset) / self.scale)
 
     def apply(self, scene: Gaussians) -> Gaussians:
-        """The scene in its new place, its SH turned with it. Mirroring a scene mirrors what its SH show."""
+        """The scene after the transform. Its SH are turned too; a mirrored scene has mirrored SH."""
         mirrored = bool(torch.linalg.det(self.matrix) < 0)
         quat = quaternions_of(-self.matrix if mirrored else self.matrix)
         turn = Transform(quat, mirrored, torch.ones(3, dtype=torch.float64), torch.arange(3))
@@ -48,23 +46,23 @@ class Similarity:
 def place(
     scene: Gaussians, up: str | None = None, scale: float = 1.0, original_frame: str | Path | None = None
 ) -> Gaussians:
-    """Turn and scale a scene, and bring it back to the frame of the data that it was trained on.
+    """Turn and scale a scene, or move it back to the frame of the data that it was trained on.
 
-    nerfstudio turns, centres and scales the poses of a dataset before it trains. ``original_frame`` undoes that, so
-    that the scene fits the poses, meshes and measurements of the data. That comes first, then ``up``, then ``scale``.
+    nerfstudio turns, centres and scales the poses of a dataset before training. ``original_frame`` undoes this, so
+    that the scene fits the poses, meshes and measurements of the data. It comes first, then ``up``, then ``scale``.
 
     Args:
         scene: N Gaussians.
-        up: "z" turns the scene, about the origin, so that up is the z axis; also "x", "y", "-x", "-y" and "-z". Which
-            way is up in the given scene is estimated, or said: "-y:z" if it is the -y axis.
+        up: "z" turns the scene about the origin so that up is the z axis; also "x", "y", "-x", "-y" and "-z". The up
+            direction of the given scene is estimated, unless it is named: "-y:z" turns -y to z.
         scale: factor on positions and sizes, above 0.
-        original_frame: the Splatfacto run that the scene is of (its folder, ``config.yml`` or checkpoint).
+        original_frame: the Splatfacto run of the scene (its folder, ``config.yml`` or checkpoint).
 
     Returns:
         N Gaussians on the same device.
 
     Raises:
-        PointSplatError: if ``up`` or ``scale`` means nothing.
+        PointSplatError: if ``up`` is no axis, or ``scale`` is not above 0.
         DataError: if up is to be estimated, and nothing of the scene is visible.
         SceneError: if ``original_frame`` is no run.
 
@@ -97,7 +95,7 @@ def _frame_at(path: str | Path) -> Similarity:
 
 
 def frame_of(run: Run) -> Similarity:
-    """From the frame of a run's data to that of its scene.
+    """The similarity from the frame of a run's data to the frame of its scene.
 
     Raises:
         SceneError: if the run's transform is not a rotation with one scale.
@@ -105,14 +103,14 @@ def frame_of(run: Run) -> Similarity:
     linear = run.transform[:, :3].double()
     size = float(torch.linalg.det(linear).abs()) ** (1 / 3)
     matrix = linear / size if size > 0 else linear
-    if not size > 0 or float((matrix @ matrix.T - torch.eye(3)).abs().max()) > _ORTHOGONAL:
+    if not size > 0 or float((matrix @ matrix.T - torch.eye(3)).abs().max()) > 1e-4:  # saved with about 7 digits
         raise SceneError(f"{run.folder}: its transform is no rotation with one scale; expected what nerfstudio saves")
     u, _, v = torch.linalg.svd(matrix)
     return Similarity(u @ v, size * run.scale, run.transform[:, 3].double() * run.scale)
 
 
 def _directions(up: str) -> tuple[Tensor | None, Tensor]:
-    """What is up now, None if that is to be estimated, and what shall be up."""
+    """The up direction of the scene, None if it is to be estimated, and the wanted one."""
     match = re.fullmatch(r"(?:([+-]?[xyz]):)?([+-]?[xyz])", up.strip().lower())
     if not match:
         raise PointSplatError(f"up is {up!r}; expected an axis such as z or -y, or two such as -y:z (from -y to z)")
@@ -137,7 +135,7 @@ def _axis(text: str) -> Tensor:
 
 
 def _turn(start: Tensor, end: Tensor) -> Tensor:
-    """The smallest rotation (3, 3) that turns one direction to another; one of many if they are opposite."""
+    """The smallest rotation (3, 3) from one direction to another; any of the smallest if they are opposite."""
     cosine = float(start @ end)
     if cosine < -1 + 1e-12:
         side = torch.linalg.cross(start, torch.eye(3, dtype=torch.float64)[int(start.abs().argmin())])

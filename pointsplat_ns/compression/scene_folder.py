@@ -1,4 +1,4 @@
-"""Every scene of a folder: which ones, in which shard, by how many processes, and a table of what became of them."""
+"""Works on every scene of a folder, in shards and in several processes, and writes a table of the results."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TABLE_NAME, LOCK_NAME = "scenes.csv", ".scenes.lock"
 FORMAT = "pointsplat-scenes"
 
 _SLOW_IMPORTS = ("pointsplat_ns.folders", "kornia.metrics", "plyfile", "safetensors.torch", "scipy.spatial")
-"""What the processes import, most of it only when it is first needed."""
+"""Slow imports that the processes share: they are made once, before processes are forked."""
 
 
 @dataclass(frozen=True)
@@ -80,19 +80,18 @@ WHOLE = Shard(1, 1)
 
 @dataclass(frozen=True)
 class Command:
-    """What is done to every scene.
-
-    Pickled for other processes, so ``make`` has to be a function of a module, or a partial of one.
+    """The work on every scene. It is pickled for other processes, so ``make`` has to be a function of a module, or a
+    partial of one.
     """
 
     name: str
     make: Callable[[Path], Made]
     options: Options
-    """All that ``make`` depends on beside the scene."""
+    """All options that ``make`` depends on."""
 
     @property
     def description(self) -> dict[str, object]:
-        """What the folder of the results says of them."""
+        """The content of the file that describes the results in their folder."""
         return {"format": FORMAT, "command": self.name, "options": dict(self.options)}
 
 
@@ -105,22 +104,22 @@ def settle_folder(
     force: bool = False,
     progress: Progress = silent,
 ) -> list[SceneResult]:
-    """Do something to every scene of a folder, and write the results to another.
+    """Apply a command to every scene of a folder, and write the results to another folder.
 
-    Results that are finished are left alone, so that an interrupted call is taken up by the next one. Several
-    processes may work on the same folders at the same time: each scene is claimed by one of them.
+    Finished results are kept, so the next call continues an interrupted one. Several processes may work on the same
+    folders at the same time; each scene is claimed by one of them.
 
     Args:
         folder: searched by :func:`~pointsplat_ns.io.discovery.find_scenes`.
         output: folder for ``NAME.ply`` and its record ``NAME.ply.json``, and the table ``scenes.csv``.
-        command: what is done.
+        command: the work.
         jobs: number of processes; 1 works in this one.
         shard: the part of the scenes that is worked on here.
         force: overwrite files that this function did not write, or wrote with other options.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
 
     Returns:
-        What became of each scene of the shard, in the order of their names.
+        The results of the shard's scenes, in the order of their names.
 
     Raises:
         DataError: if ``jobs`` is not positive.
@@ -167,7 +166,7 @@ def _settled(
 
 
 def _given_up(task: SceneTask, how: str) -> SceneResult:
-    """The result of a scene at which process after process was killed."""
+    """The result of a scene whose processes were killed again and again."""
     _clear(task)
     failed = task.result("failed", error=f"every process that worked on it ended early; the last {how}")
     note_failure(task, failed)
@@ -175,14 +174,14 @@ def _given_up(task: SceneTask, how: str) -> SceneResult:
 
 
 def _clear(task: SceneTask) -> None:
-    """Remove what a killed process left, unless another one is at work on the scene by now."""
+    """Remove the partial files of a killed process, unless another process works on the scene."""
     with claim(task.lock) as claimed:
         if claimed:
             remove_unfinished(task)
 
 
 def _check_and_describe(output: Path, command: Command, force: bool) -> None:
-    """Write down what the results are. If others are there, refuse to mix them.
+    """Write the description of the results. Refuse a folder with results of another command or other options.
 
     Raises:
         SceneError: if the output is no folder, or holds results of another command or other options.
@@ -206,7 +205,7 @@ def _check_and_describe(output: Path, command: Command, force: bool) -> None:
 
 
 def _description(path: Path) -> dict | None:
-    """What a folder says of its results; None if it has none."""
+    """The description of the results in a folder; None if there is none."""
     try:
         known = json.loads(path.read_text("utf-8"))
     except FileNotFoundError:
@@ -227,8 +226,8 @@ def _differences(known: Mapping, wanted: Mapping) -> str:
 
 
 def _write_table(output: Path, everything: Sequence[SceneTask], results: Mapping[str, SceneResult]) -> None:
-    """Write the table of all scenes, those of other shards as their records tell."""
-    with claim(output / LOCK_NAME, wait=True):  # who writes last has read all records
+    """Write the table of all scenes. Scenes of other shards are taken from their records."""
+    with claim(output / LOCK_NAME, wait=True):  # so the last process to write has read all records
         rows = [results.get(task.name) or known_result(task) for task in everything]
         with replacing(output / TABLE_NAME) as part, part.open("w", encoding="utf-8", newline="") as stream:
             writer = csv.DictWriter(stream, [field.name for field in dataclasses.fields(SceneResult)])

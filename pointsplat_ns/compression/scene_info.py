@@ -1,4 +1,4 @@
-"""What is in a scene: counts, SH, opacities, sizes, bounds, rows that look wrong, and what files of it would weigh."""
+"""Figures of a scene: counts, SH, opacities, sizes, bounds, suspicious rows, and sizes of files."""
 
 from __future__ import annotations
 
@@ -22,18 +22,16 @@ from pointsplat_ns.pruning.sh_bands import band_energies
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.progress import silent
 
-SHARES = (1.0, 0.5, 0.3, 0.1, 0.03)
+_SHARES = (1.0, 0.5, 0.3, 0.1, 0.03)
 """Shares of the Gaussians for which sizes of files are given."""
 
-SAMPLED = 20_000
-"""Gaussians, at most, that are encoded to estimate the size of a compressed file."""
-
-OPACITY_BINS = 10
+_SAMPLED = 20_000
+"""Largest number of Gaussians that are encoded to estimate the size of a compressed file."""
 
 
 @dataclass(frozen=True)
 class SceneInfo:
-    """What :func:`pointsplat_ns.info` finds.
+    """The result of :func:`pointsplat_ns.info`.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -45,7 +43,7 @@ class SceneInfo:
     gaussians: int
     sh_degree: int
     sh_energies: list[float]
-    """Mean square of what each band from degree 1 on adds to the colours."""
+    """Mean square of the contribution of each band to the colours, from degree 1 on."""
     opacities: list[int]
     """Gaussians by opacity, in ten bins from 0 to 1."""
     sizes: dict[str, int]
@@ -53,24 +51,24 @@ class SceneInfo:
     bounds: list[list[float]]
     """Lowest and highest corner of all positions."""
     content: list[list[float]]
-    """The same of the middle 96 % along each axis."""
+    """Corners of the middle 96 % of positions along each axis."""
     suspicious: dict[str, int]
-    """Rows that look wrong, by what is wrong with them; those without any are left out."""
+    """Number of rows by kind of defect; kinds without rows are left out."""
     file_bytes: dict[str, dict[str, int]]
     """Bytes of a file by format and share of the Gaussians that is kept. Those of ``.spz`` are an estimate, and left
     out where the scene is too large for it."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The same as numbers, lists and dictionaries that JSON can hold."""
+        """The figures as numbers, lists and dictionaries that JSON can hold."""
         return dataclasses.asdict(self)
 
 
 def info(scene: Gaussians | str | Path) -> SceneInfo:
-    """Look at a scene.
+    """Measure a scene.
 
     Args:
-        scene: N Gaussians, or where to read them. Of a file, Gaussians that cannot be drawn are counted as well, which
-            are dropped where a scene is read otherwise.
+        scene: N Gaussians, or where to read them. Undrawable Gaussians of a file are counted too; other functions drop
+            them when they read it.
 
     Raises:
         SceneError: if the file is not usable.
@@ -91,7 +89,7 @@ def info(scene: Gaussians | str | Path) -> SceneInfo:
         gaussians=len(scene),
         sh_degree=scene.sh_degree,
         sh_energies=band_energies(scene),
-        opacities=torch.histc(good.alphas, OPACITY_BINS, 0.0, 1.0).long().tolist(),
+        opacities=torch.histc(good.alphas, 10, 0.0, 1.0).long().tolist(),
         sizes=_by_powers_of_ten(good.scales.amax(dim=1)) if len(good) else {},
         bounds=_corners(good.means, 0.0),
         content=_corners(good.means, 0.02),
@@ -124,7 +122,7 @@ def _by_powers_of_ten(log_sizes: Tensor) -> dict[str, int]:
 
 
 def _corners(means: Tensor, outside: float) -> list[list[float]]:
-    """Corners of the box of all but a share of the positions at either end of each axis."""
+    """Corners of the box of the positions, without a share of them at either end of each axis."""
     if not len(means):
         return []
     ranked = means.sort(dim=0).values
@@ -133,13 +131,13 @@ def _corners(means: Tensor, outside: float) -> list[list[float]]:
 
 
 def _sizes(kind: Format, scene: Gaussians) -> dict[str, int]:
-    """Bytes of a file by share, in SPZ in proportion to that of a sample; empty of formats that tell nothing."""
-    counts = {f"{share:.0%}": int(share * len(scene) + 0.5) for share in SHARES}
+    """Bytes of a file by share. SPZ is estimated from a sample; empty for formats whose size cannot be told."""
+    counts = {f"{share:.0%}": int(share * len(scene) + 0.5) for share in _SHARES}
     if kind.bytes_of is not None:
         return {text: kind.bytes_of(count, scene.sh_degree) for text, count in counts.items()}
     if kind.suffix != ".spz" or kind.encode is None:  # the palette of SOG does not grow with the scene
         return {}
-    sample = scene[:: max(-(-len(scene) // SAMPLED), 1)]
+    sample = scene[:: max(-(-len(scene) // _SAMPLED), 1)]
     try:
         each = len(kind.encode(sample, silent)) / max(len(sample), 1)
     except SceneError:  # positions beyond what 24 bits hold

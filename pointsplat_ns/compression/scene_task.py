@@ -1,7 +1,7 @@
-"""One of many scenes: who works on it, whether it is finished, and what is written beside the result.
+"""One of many scenes: the lock of the process that works on it, its result, and the record beside the result.
 
-Beside a result ``room.ply`` lies its record ``room.ply.json``. A result is finished if its record has the hash of what
-was read, of the options and of the result itself.
+The record of a result ``room.ply`` is ``room.ply.json``. A result is finished if its record has the hashes of the input
+file, of the options and of the result itself.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from pointsplat_ns.system.claims import claim
 Status = Literal["done", "done before", "failed", "open"]
 
 Options = Mapping[str, str | float | bool | None]
-"""What a result depends on beside the scene."""
+"""The options that a result depends on."""
 
 
 @dataclass(frozen=True)
 class SceneResult:
-    """What became of one of many scenes.
+    """The result of one of many scenes.
 
     Example:
         >>> import tempfile
@@ -47,7 +47,7 @@ class SceneResult:
     """
 
     name: str
-    """Where the scene lies below its folder, without a suffix."""
+    """Path of the scene below its folder, without a suffix."""
     source: str
     """Path of the file or run that was read."""
     output: str
@@ -65,16 +65,18 @@ class SceneResult:
     seconds: float | None = None
     """Duration."""
     error: str = ""
-    """What failed, in one line."""
+    """The error in one line; empty if there was none."""
 
 
 @dataclass(frozen=True)
 class Made:
-    """What a scene was made into."""
+    """A smaller scene, and figures for the table."""
 
     scene: Gaussians
     before: int
+    """Gaussians of the dense scene."""
     psnr: float | None
+    """PSNR against the dense scene's renders, dB; None if nothing was compared."""
 
 
 @dataclass(frozen=True)
@@ -91,28 +93,28 @@ class SceneTask:
 
     @property
     def record(self) -> Path:
-        """The file that says what the result was made of."""
+        """The file with the figures and hashes of the result."""
         return self.output.with_name(f"{self.output.name}.json")
 
     @property
     def lock(self) -> Path:
-        """The file whose lock is held by who works on the scene."""
+        """The file that a process locks while it works on the scene."""
         return self.output.with_name(f".{self.output.name}.lock")
 
 
 def settle(task: SceneTask, make: Callable[[Path], Made], options: Options, force: bool = False) -> SceneResult | None:
-    """Make a scene's result, unless it is finished or another process is at work on it.
+    """Make the result of a scene, unless it is finished or another process works on it.
 
-    Whatever fails becomes a result with the status ``failed``. Nothing of it is left but its record.
+    An error gives a result with the status ``failed``. It leaves no file but its record.
 
     Args:
         task: the scene.
-        make: makes the result from what the task names.
-        options: all that ``make`` depends on beside the scene.
+        make: from the path of the scene to the smaller scene.
+        options: all options that ``make`` depends on.
         force: overwrite a result that this function did not write, or that was changed since.
 
     Returns:
-        What became of it; None if another process is at work on it.
+        The result; None if another process works on the scene.
     """
     start = time.perf_counter()
     try:
@@ -125,7 +127,7 @@ def settle(task: SceneTask, make: Callable[[Path], Made], options: Options, forc
             if result is None:
                 _check_overwriting(task, force)
                 result = _write(task, make(task.source), key, options, start)
-            task.lock.unlink(missing_ok=True)  # whoever gets its lock now sees that the scene is finished
+            task.lock.unlink(missing_ok=True)  # a process that gets the lock now finds the scene finished
             return result
     except Exception as error:  # one scene must not stop the others
         kind = "" if isinstance(error, (PointSplatError, OSError)) else f"{type(error).__name__}: "
@@ -137,7 +139,7 @@ def settle(task: SceneTask, make: Callable[[Path], Made], options: Options, forc
 
 
 def remove_unfinished(task: SceneTask) -> None:
-    """Remove what a process that was killed left of a result. To be called by who holds the task's lock."""
+    """Remove the partial files of a killed process. The caller must hold the task's lock."""
     # As :func:`~pointsplat_ns.io.files.replacing` names them; a result is written within one call by another.
     pattern = re.compile(rf"\.{{1,2}}{re.escape(task.output.name)}(\.json)?(\.\d+(-[0-9a-f]+)?\.part){{1,2}}")
     with os.scandir(task.output.parent) as entries:
@@ -147,14 +149,14 @@ def remove_unfinished(task: SceneTask) -> None:
 
 
 def note_failure(task: SceneTask, failed: SceneResult) -> None:
-    """Write the record of a scene that failed, for the tables of other processes. An earlier result keeps its own."""
+    """Write the record of a failed scene, for the tables of other processes. An earlier result keeps its record."""
     with suppress(SceneError):  # the folder may be what failed
         if not task.output.exists():
             _write_record(task, failed, {})
 
 
 def known_result(task: SceneTask) -> SceneResult:
-    """What a scene's record says became of it; nothing is checked against files."""
+    """The result in a scene's record; it is not checked against files."""
     record = _read_record(task)
     if record is None:
         return task.result("open")
@@ -164,7 +166,7 @@ def known_result(task: SceneTask) -> SceneResult:
 
 
 def _key(task: SceneTask, options: Options) -> str:
-    """Hash of what a result depends on."""
+    """Hash of the input file and the options."""
     text = json.dumps([source_file(task.source).sha256, dict(options)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -178,12 +180,12 @@ def _finished(task: SceneTask, key: str) -> SceneResult | None:
 
 
 def _as_written(task: SceneTask, record: Mapping[str, Any]) -> bool:
-    """Whether a result is there and was not changed since."""
+    """Whether a result exists and was not changed since it was written."""
     return task.output.is_file() and content_hash(task.output) == record.get("sha256")
 
 
 def _check_overwriting(task: SceneTask, force: bool) -> None:
-    """Refuse to replace anything but a result of this module whose scene has changed."""
+    """Refuse to replace a file, unless it is an unchanged result of this module."""
     if force or not os.path.lexists(task.output):
         return
     record = _read_record(task)
@@ -195,7 +197,7 @@ def _check_overwriting(task: SceneTask, force: bool) -> None:
 
 
 def _write(task: SceneTask, made: Made, key: str, options: Options, start: float) -> SceneResult:
-    """Write a result and its record. Killed in between, it leaves the record alone: the scene is not finished."""
+    """Write a result and its record. A process killed in between leaves the record alone: the scene is unfinished."""
     with replacing(task.output) as part:
         write_ply(made.scene, part)
         done = task.result(
@@ -225,7 +227,7 @@ _FACTS = {"before": int, "after": int, "megabytes": float, "psnr": float, "secon
 
 
 def _read_record(task: SceneTask) -> dict[str, Any] | None:
-    """The content of a scene's record; None if there is none or it is none."""
+    """The content of a scene's record; None if it is missing or damaged."""
     try:
         record = json.loads(task.record.read_text("utf-8"))
     except (OSError, ValueError, RecursionError):
