@@ -30,7 +30,8 @@ from torch import Tensor
 import pointsplat_ns as ps
 from pointsplat_ns.compression.optimiser import extent
 from pointsplat_ns.compression.prune import prune_scene
-from pointsplat_ns.compression.repair import RepairBudget, repair, share_of_rates
+from pointsplat_ns.compression.repair import repair, share_of_rates
+from pointsplat_ns.compression.requests import PruneRequest, RepairBudget
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
@@ -225,7 +226,7 @@ def main(
         with torch.no_grad():
             renders = [ps.render(dense, view) for view in judging]
         source = ViewSource(dense, run=path, dataset_views=dataset_views)
-        merged = prune_scene(dense, keep, "merge", views=source).scene
+        merged = prune_scene(dense, PruneRequest(keep), source).scene
         source.compared()
 
         def show(what: str, took: float, scene: Gaussians, path=path, judging=judging, renders=renders) -> None:

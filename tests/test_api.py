@@ -288,6 +288,7 @@ def saved(scene: ps.Gaussians, folder: Path) -> bytes:
         ),
         (("--keep", "0.01MB", "--sh", "auto"), {"keep": "0.01MB", "sh": "auto"}),
         (("--keep", "auto:20", "--by", "coverage"), {"keep": "auto:20", "by": "coverage"}),
+        (("--keep", "50%", "--by", "volume", "--clean"), {"keep": "50%", "by": "volume", "clean": True}),
         (("--keep", "20%", "--by", "area", "--fine-tune", "2"), {"keep": 0.2, "by": "area", "fine_tune": 2}),
     ],
 )

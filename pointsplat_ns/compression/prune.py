@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.compression.requests import PruneRequest
+from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
@@ -62,6 +63,8 @@ def prune_scene(
         SceneError: if no Gaussian of the scene can be drawn.
         DataError: if views are needed and there are none.
     """
+    if len(dense) == 0:
+        raise BudgetError(f"keep is {request.keep} but the scene holds no Gaussians; expected at least one")
     need_usable(dense)
     views = views or ViewSource(dense)
     notes: list[str] = []

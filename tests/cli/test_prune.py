@@ -139,29 +139,12 @@ def test_an_output_that_cannot_be_written_is_refused(ply, tmp_path, capsys):
     assert "cannot be written" in refusal(capsys, ply / "below_a_file.ply", "prune", ply)
 
 
-@pytest.mark.parametrize("command", ["prune", "compact"])
-def test_a_method_that_there_is_not_is_refused_with_the_list_of_those_there_are(command, ply, tmp_path, capsys):
-    said = refusal(capsys, tmp_path / "out.ply", command, ply, "--by", "best")
-    assert f"no method is called 'best'; expected one of {', '.join(METHODS)}" in said
-
-
 def test_the_help_names_every_method(capsys):
     with pytest.raises(SystemExit) as caught:
         run("prune", "--help")
     words = re.findall(r"[\w-]+", capsys.readouterr().out)
     assert caught.value.code == 0
     assert set(METHODS) - set(words) == set()
-
-
-@pytest.mark.parametrize("by", sorted(n for n, method in METHODS.items() if method.score and not method.needs_views))
-def test_prune_by_a_score_keeps_gaussians_bit_for_bit(by, ply, tmp_path):
-    run("prune", ply, "--keep", "0.3", "--by", by, "-o", tmp_path / "out.ply")
-    assert same(read_ply(tmp_path / "out.ply"), prune(read_ply(ply), 0.3, by))
-
-
-def test_prune_merges_if_not_told_otherwise(ply, tmp_path):
-    run("prune", ply, "--keep", "0.3", "-o", tmp_path / "out.ply")
-    assert same(read_ply(tmp_path / "out.ply"), prune(read_ply(ply), 0.3, "merge"))
 
 
 @pytest.mark.parametrize("by", ["lightgaussian", "pup"])
@@ -203,29 +186,18 @@ def test_prune_draws_the_distributions_when_it_is_asked_to(ply, tmp_path):
     assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_prune_refuses_options_that_cannot_be_met_before_it_starts(ply, tmp_path, capsys):
-    output = tmp_path / "out.ply"
-    assert "ends in .png" in refusal(capsys, output, "prune", ply, "--plot", tmp_path / "out.jpg")
-    assert "-1 steps of fine-tuning" in refusal(capsys, output, "prune", ply, "--fine-tune", "-1")
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--by", "best"), "no method is called 'best'"),
+        (("--by", "best"), f"no method is called 'best'; expected one of {', '.join(METHODS)}"),
         (("--by", "merge", "--opacity-weight", "0.5"), "opacity weight 0.5: merge does not weigh opacity"),
         (("--keep", "half"), "keep is 'half'"),
         (("--fine-tune", "-1"), "-1 steps of fine-tuning"),
+        (("--plot", "out.jpg"), "ends in .png"),
     ],
 )
 def test_options_that_fit_no_scene_are_refused_before_one_is_read(options, message, tmp_path, capsys):
     assert message in refusal(capsys, tmp_path / "out.ply", "prune", tmp_path / "not_there.ply", *options)
-
-
-@pytest.mark.parametrize("by", sorted(name for name, method in METHODS.items() if not method.weighs_opacity))
-def test_an_opacity_weight_that_would_do_nothing_is_refused(by, ply, tmp_path, capsys):
-    said = refusal(capsys, tmp_path / "out.ply", "prune", ply, "--by", by, "--opacity-weight", "0.5")
-    assert f"{by} does not weigh opacity" in said and "paper, authors, log-volume" in said
 
 
 def test_a_ply_is_written_beside_the_scene_where_no_name_is_given_and_it_is_said(ply, capsys):
@@ -275,12 +247,6 @@ def test_the_scene_itself_is_not_overwritten_either(ply, tmp_path, capsys):
     assert "exists already" in refusal(capsys, ply, "prune", ply)
     assert "exists already" in refusal(capsys, ply, "export", ply)
     assert ply.read_bytes() == before
-
-
-def test_a_plot_that_exists_is_only_overwritten_by_force(ply, tmp_path, capsys):
-    (tmp_path / "plot.png").write_text("precious")
-    said = refusal(capsys, tmp_path / "out.ply", "prune", ply, "--plot", tmp_path / "plot.png")
-    assert "plot.png: exists already" in said and "--force" in said
 
 
 def test_a_dry_run_is_not_stopped_by_what_it_would_overwrite(ply, capsys):

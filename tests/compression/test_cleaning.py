@@ -11,7 +11,6 @@ import torch
 
 import pointsplat_ns as ps
 from making import box_room, same_bits
-from pointsplat_ns.cli import main
 from pointsplat_ns.compression import cleaning
 from pointsplat_ns.compression.cleaning import Cleaning, CleaningSettings, clean_scene, find_junk
 from pointsplat_ns.compression.closeness import DenseReference
@@ -19,7 +18,6 @@ from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import read_ply, write_ply
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import WithinPsnr, resolve_keep
@@ -249,19 +247,6 @@ def test_without_a_free_place_or_views_only_the_undrawable_go(monkeypatch):
     (first, second) = clean_scene(scene, 1, ViewSource(scene)).notes
     assert first == f"clean: 2 of {len(scene)} removed that cannot be drawn"
     assert second.endswith("(no free place to look from was found)")
-
-
-def test_command_line_and_function_agree(room, tmp_path, capsys):
-    path = tmp_path / "room.ply"
-    write_ply(with_junk(room)[: ROOM + PLANTED], path)
-    main(["prune", str(path), "--clean", "--by", "volume", "--keep", "50%", "-o", str(tmp_path / "small.ply")])
-    assert same_bits(read_ply(tmp_path / "small.ply"), ps.prune(path, "50%", "volume", clean=True))
-    before = sorted(tmp_path.iterdir())
-    capsys.readouterr()
-    main(["prune", str(path), "--clean", "--by", "volume", "--dry-run"])
-    assert sorted(tmp_path.iterdir()) == before
-    said = capsys.readouterr()
-    assert "removed that are seen from nowhere" in " ".join((said.out + said.err).split())
 
 
 def test_compact_cleans_if_asked(room, views):
