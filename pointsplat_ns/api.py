@@ -17,12 +17,7 @@ from pointsplat_ns.compression.level_folder import check_folder
 from pointsplat_ns.compression.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
 from pointsplat_ns.compression.pictures import plot_views as draw_views
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
-from pointsplat_ns.compression.trained_refiner import (
-    TrainedRefiner,
-    load_refiner,
-    open_refiner_run,
-    scenes_of_run,
-)
+from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, open_refiner_run, scenes_of_run
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write

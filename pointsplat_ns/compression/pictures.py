@@ -56,17 +56,14 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> st
         return f"{path}: not drawn, as there is no view to draw"
     views, renders = result.reference.views, result.reference.renders
     shown = spread_indices(len(views), SHOWN_VIEWS)
-    names, scenes = ["dense", "pruned"], [result.pruned]
-    titles = [_title("dense", dense, None), _title("pruned", result.pruned, result.before)]
-    if result.after is not None:
-        share = "" if result.strength == 1 else f" at {result.strength:.0%}"
-        names.append(f"refined{share}" if result.accepted else "refined (left out)")
-        titles.append(_title(names[-1], result.refined, result.after))
-        scenes.append(result.refined)
-    if result.repaired is not None:
-        names.append("repaired" if result.repair_accepted else "repaired (left out)")
-        titles.append(_title(names[-1], result.repaired.scene, result.after_repair))
-        scenes.append(result.repaired.scene)
+    names, titles, scenes = ["dense"], [_title("dense", dense, None)], []
+    for stage in result.stages:
+        if stage.after is not None:
+            name = {"prune": "pruned", "refine": "refined", "repair": "repaired"}[stage.name]
+            share = f" at {stage.strength:.0%}" if stage.name == "refine" and stage.strength != 1 else ""
+            names.append(name + (share if stage.accepted else " (left out)"))
+            titles.append(_title(names[-1], stage.scene, stage.after))
+            scenes.append(stage.scene)
     rows = [[renders[i].cpu(), *(render(scene, views[i]).cpu() for scene in scenes)] for i in shown]
     side_by_side(rows, titles, path)
     return f"{path}: {', '.join(names)}, side by side"
