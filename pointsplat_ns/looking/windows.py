@@ -63,6 +63,11 @@ def parse_resolution(text: str | tuple[int, int] | None) -> tuple[int, int] | No
     return int(parts[0]), int(parts[1])
 
 
+def size_text(resolution: tuple[int, int]) -> str:
+    """A width and height as :func:`parse_resolution` reads them."""
+    return "x".join(map(str, resolution))
+
+
 def sides_of(width: int, height: int) -> tuple[int, ...]:
     """Longer sides of the pictures that windows are taken from, pixels: :data:`WINDOW`, the whole size, and their
     geometric mean. The whole size alone if it is no larger than a window.

@@ -44,7 +44,7 @@ def find_scene(
     """
     start = time.perf_counter()
     options = Options(methods=(by,), repairs=repairs)
-    measurer = Measurer(subject, options.views, options.side, progress, timed=targets.ms is not None)
+    measurer = Measurer(subject, options.views, progress, timed=targets.ms is not None)
 
     def measure(setting: Setting) -> Point:
         number = 1 + len(search.tried)

@@ -16,6 +16,7 @@ from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.looking.windows import middle_sized
 from pointsplat_ns.pruning import cut_sh, need_usable
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.tradeoff.judging import Judge, Judged, LookedAt
@@ -49,6 +50,8 @@ class Subject:
     """Of the format that smaller scenes are written in."""
     poses: Path | None = None
     """The file of cameras that it is looked at from, as commands name it; None if there is none."""
+    resolution: tuple[int, int] | None = None
+    """Width and height of pictures, pixels, if they were asked for; ``new_views`` has them too."""
 
 
 class Measurer:
@@ -57,7 +60,6 @@ class Measurer:
     Args:
         subject: the scene.
         views: largest number of views.
-        side: largest side of their images, pixels.
         progress: called with what is being waited for.
         folder: for pictures; None for none.
         timed: whether to time frames. If not, times are NaN, and others may measure meanwhile.
@@ -71,7 +73,6 @@ class Measurer:
         self,
         subject: Subject,
         views: int,
-        side: int,
         progress: Progress,
         folder: Path | None = None,
         timed: bool = True,
@@ -82,11 +83,11 @@ class Measurer:
         """Time of a frame of the dense scene that others are given in proportion to; None before it was measured. What
         was measured earlier goes here before anything is judged."""
         self.notes: dict[str, None] = {}
-        self.naming = Naming(subject.path, subject.name, len(self.dense), self.dense.sh_degree, subject.poses)
+        self.naming = Naming(subject.path, subject.name, len(self.dense), self.dense.sh_degree, subject.poses, subject.resolution)
         self._kept: dict[Setting, Made] = {}
         self._progress = progress
         progress("looking for views", 0.0)
-        self.looked_at = self._look(views).resized(side)
+        self.looked_at = self._look(views)
 
     def note(self, text: str) -> None:
         """Keep a line of text for the reader; once, and not if it is empty."""
@@ -99,7 +100,9 @@ class Measurer:
         if self.subject.held_out is not None:
             try:
                 views, photos = self.subject.held_out(count)
-                return LookedAt(views, photos, "held-out photos of the dataset")
+                whole = views if self.subject.resolution is None else views.resized(max(self.subject.resolution))
+                side = max(middle_sized(whole).width, middle_sized(whole).height)
+                return LookedAt(views, photos, "held-out photos of the dataset").resized(side)
             except (SceneError, DataError) as error:
                 self.note(f"there are no held-out photos: {error}")
         return LookedAt.compared(self.subject.new_views(), count)

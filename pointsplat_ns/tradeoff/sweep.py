@@ -12,6 +12,8 @@ from pathlib import Path
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.view_source import COMPARED_VIEWS
+from pointsplat_ns.looking.windows import size_text
 from pointsplat_ns.pages.flight import Stage
 from pointsplat_ns.pruning import method_named
 from pointsplat_ns.system.progress import Progress
@@ -43,10 +45,8 @@ class Options:
     """Loss, dB, that the recommended point may have."""
     methods: tuple[str, ...] = ("merge",)
     repairs: tuple[str, ...] = ("none", "quick")
-    views: int = 10
+    views: int = COMPARED_VIEWS
     """Largest number of views."""
-    side: int = 640
-    """Largest side of their images, pixels."""
     drawn: tuple[str, ...] = DRAWN
     """Ways to draw frames; of the other ways than the exact one, few scenes are measured."""
 
@@ -55,8 +55,8 @@ class Options:
             raise PointSplatError(f"{self.points} points; expected at least 2, of which one is the dense scene")
         if not 0 < self.within < math.inf:
             raise PointSplatError(f"a loss of {self.within:g} dB; expected a positive number, such as 0.5")
-        if self.views < 1 or self.side < 1:
-            raise PointSplatError(f"{self.views} views of {self.side} pixels; expected at least one view and pixel")
+        if self.views < 1:
+            raise PointSplatError(f"{self.views} views; expected at least one")
         if not self.methods:
             raise PointSplatError("no method is named; expected at least one, such as merge")
         for method in self.methods:
@@ -117,7 +117,7 @@ class Sweep:
     def __init__(self, subject: Subject, folder: Path, options: Options, progress: Progress):
         self.subject, self.folder, self.options, self.progress = subject, folder, options, progress
         self.dense = subject.dense
-        self.measurer = Measurer(subject, options.views, options.side, progress, folder)
+        self.measurer = Measurer(subject, options.views, progress, folder)
         self.plan = options.plan(self.dense)
         self.machine = machine_text(self.dense.device)
         views = self.measurer.looked_at.views
@@ -129,6 +129,8 @@ class Sweep:
             "width": views.width,
             "height": views.height,
         }
+        if subject.resolution is not None:
+            identity["resolution"] = size_text(subject.resolution)
         if subject.poses is not None:
             identity["poses"] = _digest(views)
         self.journal = Journal(folder, identity)

@@ -49,6 +49,11 @@ def test_a_command_makes_the_scene_that_was_measured(setting, room, room_views, 
     assert Path(f"room_{naming.key(setting.scene)}.ply").stat().st_size == setting.bytes
 
 
+def test_a_command_names_the_resolution_that_was_asked_for():
+    naming = Naming(Path("room.ply"), "room", 400, 1, resolution=(96, 54))
+    assert "--resolution 96x54" in naming.command(Setting(40, 1)) and "96" not in naming.key(Setting(40, 1))
+
+
 def test_keys_differ_and_fit_into_names_of_files():
     naming = Naming(Path("room.ply"), "room", 100_000, 3)
     repairs = [Setting(10_000, 3, repair) for repair in REPAIRS]

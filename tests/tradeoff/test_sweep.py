@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -148,6 +149,15 @@ def test_held_out_photos_are_what_scenes_are_judged_by(new_sweep, tmp_path, room
     assert "held-out photos" in result.why
 
 
+@pytest.mark.parametrize("resolution, side", [(None, 506), ((640, 480), 453), ((48, 36), 48)])
+def test_held_out_photos_are_judged_at_the_middle_size_of_the_resolution(room, room_views, no_lpips, resolution, side):
+    dense, large = ps.load(room), replace(room_views[:1], width=800, height=600)
+    photos = [torch.zeros(large.height, large.width, 3)]
+    subject = measuring.Subject(dense, room, "room", "", list, lambda count: (large, photos), resolution=resolution)
+    looked_at = measuring.Measurer(subject, 1, lambda what, share: None).looked_at
+    assert looked_at.views.width == side and looked_at.photos[0].shape == (looked_at.views.height, side, 3)
+
+
 def test_where_photos_cannot_be_had_it_says_why_and_goes_on_without(new_sweep, tmp_path):
     def gone(count):
         raise DataError("photo_3.jpg: no such file")
@@ -234,7 +244,6 @@ def test_points_are_listed_by_size_the_dense_scene_first(new_sweep, tmp_path):
         ({"within": 0.0}, "a loss of 0 dB"),
         ({"within": math.nan}, "a loss of nan dB"),
         ({"views": 0}, "0 views"),
-        ({"side": 0}, "of 0 pixels"),
         ({"methods": ()}, "no method is named"),
         ({"methods": ("magic",)}, "no method is called 'magic'"),
         ({"repairs": ("magic",)}, "repairs are magic"),
