@@ -265,7 +265,8 @@ def compact(
             result = compact_scene(dense, refiner, keep, by, sh, source, report, clean, budget)
         else:
             given = views if isinstance(views, Views) else source.given
-            subject = subject_of(dense, _run_of(scene, views), given, refiner, target_format, parse_resolution(resolution))
+            size = parse_resolution(resolution)
+            subject = subject_of(dense, _run_of(scene, views), given, refiner, target_format, size)
             result = find_scene(subject, targets, method, repairs_of(effort), report)
     _log((*result.target.splitlines(), *result.verdict.splitlines(), *result.notes))
     return result

@@ -70,7 +70,8 @@ def tradeoff(
     with fixed_threads(threads):
         found = ps.measure_tradeoff(
             scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, poses=poses,
-            resolution=resolution, drawn=drawn, target_db=target_db, target_ms=target_ms, target_mb=target_mb, force=force, progress=True,
+            resolution=resolution, drawn=drawn, target_db=target_db, target_ms=target_ms, target_mb=target_mb,
+            force=force, progress=True,
         )  # fmt: skip
     if json_output:
         print_json({"output": folder, **json.loads((folder / JSON).read_text("utf-8"))})

@@ -11,10 +11,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from pointsplat_ns.compression.budget_search import SH_PSNR, needed_sh_degree, smallest_within
+from pointsplat_ns.compression.budget_search import SH_PSNR, largest_within, needed_sh_degree, smallest_within
 from pointsplat_ns.compression.cleaning import Cleaning, clean_scene
 from pointsplat_ns.compression.fine_tune import fine_tune
-from pointsplat_ns.compression.size_search import largest_within
 from pointsplat_ns.errors import BudgetError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write

@@ -84,9 +84,8 @@ def measure_tradeoff(
         >>> import pointsplat_ns as ps
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     ps.save(ps.example_room()[::200][:300], f"{folder}/room.ply")
-        ...     found = ps.measure_tradeoff(
-        ...         f"{folder}/room.ply", f"{folder}/trade", target_mb=0.01, repairs=("none",), views=2, resolution="64x48"
-        ...     )
+        ...     options = {"repairs": ("none",), "views": 2, "resolution": "64x48"}
+        ...     found = ps.measure_tradeoff(f"{folder}/room.ply", f"{folder}/trade", target_mb=0.01, **options)
         >>> found.point(found.recommended).bytes <= 10_000
         True
     """

@@ -83,7 +83,9 @@ class Measurer:
         """Time of a frame of the dense scene that others are given in proportion to; None before it was measured. What
         was measured earlier goes here before anything is judged."""
         self.notes: dict[str, None] = {}
-        self.naming = Naming(subject.path, subject.name, len(self.dense), self.dense.sh_degree, subject.poses, subject.resolution)
+        self.naming = Naming(
+            subject.path, subject.name, len(self.dense), self.dense.sh_degree, subject.poses, subject.resolution
+        )
         self._kept: dict[Setting, Made] = {}
         self._progress = progress
         progress("looking for views", 0.0)
