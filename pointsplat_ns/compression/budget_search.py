@@ -22,7 +22,7 @@ SH_PSNR = 40.0
 size lowers the PSNR of an ``auto`` budget of 35 dB by 1.2 dB."""
 
 FIRST_SHARE, USUAL_SLOPE = 0.3, 6.0
-"""Share of the Gaussians that is tried first for a quality, and dB that merged scenes gain for each e-fold of the count."""
+"""Share of the Gaussians that is tried first for a quality; gain of merged scenes for each e-fold of the count, dB."""
 
 QUALITY = SearchSettings(tolerance=0.1)
 """For PSNR in dB: 0.1 dB above what is asked for is near enough."""
@@ -137,7 +137,8 @@ def largest_within(
     find_count(measure, math.log(limit), at_least=False, first=n, most=n, slope=1.0, settings=FILE_SIZE)
     if best is None:
         raise BudgetError(
-            f"keep is {limit / 1e6:g}MB{kind.suffix}, too small for one Gaussian; expected at least {tried[1] / 1e6:g}MB"
+            f"keep is {limit / 1e6:g}MB{kind.suffix}, too small for one Gaussian; expected at least "
+            f"{tried[1] / 1e6:g}MB"
         )
     return best
 

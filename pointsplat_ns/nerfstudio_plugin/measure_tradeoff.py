@@ -54,7 +54,7 @@ def measure_tradeoff(
         folder: where points, pictures, tables, plots, the page and the found scene go.
         points: largest number of scenes of a sweep, the dense one among them.
         within: the recommended point is the fastest that loses at most so much, dB: against photos, or as much as is
-            expected of its renders (:mod:`~pointsplat_ns.tradeoff.loss`).
+            expected of its renders (:mod:`~pointsplat_ns.tradeoff.front`).
         by: methods, as for :func:`pointsplat_ns.prune`; the first one is walked, others are measured at three budgets.
         repairs: some of "none", "refiner", "quick" and "thorough", the efforts of :func:`pointsplat_ns.compact`.
         views: largest number of views; without photos at most 12.

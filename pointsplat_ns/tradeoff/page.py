@@ -27,9 +27,9 @@ from pointsplat_ns.tradeoff.front import (
     fastest_first,
     fastest_within,
     pareto_front,
+    psnr_within,
     quality_of,
 )
-from pointsplat_ns.tradeoff.loss import psnr_within
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, picture_path, speed_of
 
 MAX_BYTES = 10_000_000

@@ -1,4 +1,4 @@
-"""A way of making a scene smaller, by the numbers: what is to be measured, what it is called, and its command."""
+"""Settings: the ways of making a scene smaller that are measured, their names, and their commands."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def check_repairs(repairs: tuple[str, ...]) -> tuple[Repair, ...]:
     """Repairs, each once, in the order of :data:`REPAIRS`.
 
     Raises:
-        PointSplatError: if there is none, or no such one.
+        PointSplatError: if none is given, or one is unknown.
     """
     unknown = [repair for repair in repairs if repair not in REPAIRS]
     if unknown or not repairs:
@@ -164,7 +164,7 @@ def check_drawn(drawn: tuple[str, ...]) -> tuple[Drawn, ...]:
     """Ways to draw, each once, in the order of :data:`DRAWN`.
 
     Raises:
-        PointSplatError: if there is no such one.
+        PointSplatError: if one is unknown.
     """
     unknown = [way for way in drawn if way not in DRAWN]
     if unknown:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from pointsplat_ns.tradeoff.loss import PHOTO_PSNR, expected_loss, loss_of, psnr_within, recommend
+from pointsplat_ns.tradeoff.front import PHOTO_PSNR, expected_loss, loss_of, psnr_within, recommend
 from pointsplat_ns.tradeoff.settings import DENSE, Setting
 from trades import point
 

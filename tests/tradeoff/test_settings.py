@@ -14,7 +14,7 @@ from pointsplat_ns.compression import repair
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.tradeoff.making import make
+from pointsplat_ns.tradeoff.measuring import make
 from pointsplat_ns.tradeoff.settings import REPAIRS, Naming, Setting, check_repairs, setting_of
 from trades import point
 

@@ -15,10 +15,9 @@ from making import same_bits
 from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.tradeoff import judging, making, measuring, sweep
+from pointsplat_ns.tradeoff import judging, measuring, sweep
 from pointsplat_ns.tradeoff.journal import POINTS
 from pointsplat_ns.tradeoff.outputs import OUTPUTS, PAGE, PLOTS, TABLE
-from pointsplat_ns.tradeoff.plots import AXES
 from pointsplat_ns.tradeoff.points import picture_path
 from pointsplat_ns.tradeoff.settings import Setting
 from pointsplat_ns.tradeoff.sweep import Options, check_folder
@@ -40,7 +39,7 @@ def test_a_sweep_leaves_tables_plots_pictures_and_a_page(new_sweep, tmp_path, pl
     content = json.loads((tmp_path / "tradeoff.json").read_text())
     assert content["points"][0]["against_dense"]["psnr"] is None, "infinite"
     assert content["recommended"] == result.recommended
-    assert [(tmp_path / name).read_text() for name in PLOTS.values()] == [*AXES]
+    assert [(tmp_path / name).read_text() for name in PLOTS.values()] == [*PLOTS]
     for shown in result.points:
         assert all(picture_path(tmp_path, view, shown.key).is_file() for view in range(3))
     assert names(tmp_path / "scenes") == ["10pct_sh1.json", "dense.json"]
@@ -52,7 +51,7 @@ def test_the_first_useful_results_are_there_after_the_first_smaller_scene(new_sw
     running.measure_dense()
     assert plain_page == []
     running.measure(Setting(40, 1))
-    assert plain_page == [tmp_path] and (tmp_path / PLOTS["count"]).is_file()
+    assert plain_page == [tmp_path] and (tmp_path / PLOTS["gaussians"]).is_file()
 
 
 def test_points_have_exact_counts_sizes_and_commands(new_sweep, tmp_path, room):
@@ -89,7 +88,7 @@ def test_a_scene_that_is_needed_again_is_made_again_the_same(new_sweep, tmp_path
 
 @pytest.mark.parametrize("after", [1, 2])
 def test_an_interruption_leaves_what_was_measured_and_the_next_call_goes_on(new_sweep, tmp_path, monkeypatch, after):
-    made, make = [], making.make
+    made, make = [], measuring.make
 
     def interrupted(dense, setting, *args):
         if len(made) == after:
@@ -177,7 +176,7 @@ def test_a_busy_machine_is_said_to_be_one(new_sweep, tmp_path, monkeypatch, othe
 
 
 def test_scenes_drawn_otherwise_come_on_top_and_are_not_made_again(new_sweep, tmp_path, monkeypatch):
-    made, make = [], making.make
+    made, make = [], measuring.make
     monkeypatch.setattr(measuring, "make", lambda *args: (made.append(args[1]), make(*args))[1])
     options = {"points": 3, "repairs": ("none",), "drawn": ("exact", "half")}
     first = new_sweep(tmp_path, **options).run().points
