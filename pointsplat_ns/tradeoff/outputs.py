@@ -114,8 +114,8 @@ def _draw(axis: Axes, sweep: Tradeoff, cost: Cost, reference: Reference) -> None
         if cost == "frame_ms":
             low, high = [p.frame_ms_low for p in members], [p.frame_ms_high for p in members]
             axis.hlines(at(members)[1], low, high, drawn[0].get_color(), linewidth=0.8, alpha=0.6)
-    for point, *place in zip(front, *at(front), strict=True):
-        axis.annotate(f"{100 * point.share:.3g} %", place, (4, -9), textcoords="offset points", fontsize=7)
+    for point, x, y in zip(front, *at(front), strict=True):
+        axis.annotate(f"{100 * point.share:.3g} %", (x, y), (4, -9), textcoords="offset points", fontsize=7)
     [dense_cost], [dense_psnr] = at([dense])
     if reference == "photos":
         axis.plot(dense_cost, dense_psnr, "*", color="black", label=DENSE, markersize=9)
