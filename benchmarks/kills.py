@@ -80,7 +80,7 @@ COMMANDS = (
     Command("lod", pointsplat("lod", "scene.ply", "--levels", "50%", "20%", "-o", "OUT/lod")),
     Command(
         "tradeoff",
-        pointsplat("tradeoff", "scene.ply", "-o", "OUT", "--points", "3", "--views", "2", "--side", "48",
+        pointsplat("tradeoff", "scene.ply", "-o", "OUT", "--points", "3", "--views", "2", "--resolution", "48x36",
                    "--drawn", "exact", "--repairs", "none"),
     ),
     Command(

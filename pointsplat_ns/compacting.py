@@ -101,7 +101,9 @@ def compact_source(
             from pointsplat_ns.tradeoff.settings import repairs_of
 
             given = views if isinstance(views, Views) else source.given
-            subject = subject_of(dense, run_of(scene, views), given, request.refiner, goal.suffix)
+            subject = subject_of(
+                dense, run_of(scene, views), given, request.refiner, goal.suffix, parse_resolution(resolution)
+            )
             result = find_scene(subject, goal.targets, request.prune.by, repairs_of(goal.effort), report)
     log((*result.target.splitlines(), *result.verdict.splitlines(), *result.notes))
     return dense, result

@@ -14,7 +14,7 @@ from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.looking.windows import parse_resolution
+from pointsplat_ns.looking.windows import parse_resolution, size_text
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
 from pointsplat_ns.pruning import Keep
@@ -110,11 +110,11 @@ def compact_folder(
         "clean": clean,
         "effort": effort if seconds is None else None,
         "seconds": seconds,
-        "resolution": None if size is None else "x".join(map(str, size)),
+        "resolution": None if size is None else size_text(size),
     }
     if targets is not None:
         options = {**options, "keep": None, "target_db": target_db, "target_ms": target_ms, "target_mb": target_mb}
-        make = functools.partial(_found, refiner, device, targets, request.prune.by, repairs_of(effort))
+        make = functools.partial(_found, refiner, device, targets, request.prune.by, repairs_of(effort), size)
     else:
         make = functools.partial(_compacted, refiner, device, replace(request, refiner=None), size)
     with progress_bar(progress if rank == 0 else False) as report:
@@ -144,11 +144,17 @@ def _compacted(
 
 
 def _found(
-    refiner: str | Path | None, device: str, targets: Targets, by: str, repairs: tuple[Repair, ...], path: Path
+    refiner: str | Path | None,
+    device: str,
+    targets: Targets,
+    by: str,
+    repairs: tuple[Repair, ...],
+    resolution: tuple[int, int] | None,
+    path: Path,
 ) -> Made:
     """The cheapest of a scene of a folder that meets targets."""
     dense = read_scene(path)
-    subject = subject_of(dense, path, refiner=_refiner_on(refiner, device))
+    subject = subject_of(dense, path, refiner=_refiner_on(refiner, device), resolution=resolution)
     result = find_scene(subject, targets, by, repairs, silent)
     if result.interrupted:
         raise KeyboardInterrupt  # which is meant for all scenes, not for the search of this one

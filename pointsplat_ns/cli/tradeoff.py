@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING, Literal
 
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Output, Poses, Scene, check_poses, output_beside
+from pointsplat_ns.cli.scene_options import Output, Poses, Resolution, Scene, check_poses, output_beside
 
 if TYPE_CHECKING:
     from pointsplat_ns.tradeoff.points import Quality, Tradeoff
@@ -19,9 +19,9 @@ def tradeoff(
     within: float = 0.5,
     by: tuple[str, ...] = ("merge",),
     repairs: tuple[Literal["none", "refiner", "quick", "thorough"], ...] = ("none", "quick"),
-    views: int = 10,
-    side: int = 640,
+    views: int = 12,
     poses: Poses = None,
+    resolution: Resolution = None,
     drawn: tuple[Literal["exact", "fast", "half"], ...] = ("exact", "fast", "half"),
     target_db: float | None = None,
     target_ms: float | None = None,
@@ -47,9 +47,10 @@ def tradeoff(
         by: methods of prune; the first one is walked, others are measured at three budgets.
         repairs: what may repair: nothing, the refiner alone, or compact's efforts quick and thorough.
         views: largest number of views; without photos at most 12.
-        side: largest side of their images, pixels; photos are reduced.
         poses: a file of cameras to look from: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
             COLMAP model; no photos are used then.
+        resolution: size of the pictures that people look at, in pixels; scenes are made for it, and judged and timed in
+            the pictures that compact compares in. By default that of the photos where there are any, else 1920x1080.
         drawn: how frames may be drawn: exact, of all scenes; fast and half (so, and at half the resolution) of a few.
         target_db: find the smallest scene of at least this PSNR against the dense scene's renders.
         target_ms: and of at most so many milliseconds a frame. Without --target-db, find the best within the limits.
@@ -68,8 +69,9 @@ def tradeoff(
     folder = output or output_beside(scene, "tradeoff").with_suffix("")
     with fixed_threads(threads):
         found = ps.measure_tradeoff(
-            scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, side=side, poses=poses,
-            drawn=drawn, target_db=target_db, target_ms=target_ms, target_mb=target_mb, force=force, progress=True,
+            scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, poses=poses,
+            resolution=resolution, drawn=drawn, target_db=target_db, target_ms=target_ms, target_mb=target_mb,
+            force=force, progress=True,
         )  # fmt: skip
     if json_output:
         print_json({"output": folder, **json.loads((folder / JSON).read_text("utf-8"))})

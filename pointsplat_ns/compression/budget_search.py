@@ -1,36 +1,58 @@
-"""The smallest scene whose renders stay close enough to the dense scene's own. No photos are needed."""
+"""Budgets that only trying can meet: a quality of renders, which needs no photos, and a size of a compressed file."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+
+import torch
 
 from pointsplat_ns.compression.closeness import DenseReference
+from pointsplat_ns.compression.count_search import SearchSettings, find_count
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.formats import Format
 from pointsplat_ns.pruning.sh_bands import cut_sh
+from pointsplat_ns.system.progress import silent
 from pointsplat_ns.views import Views
 
 SH_PSNR = 40.0
 """PSNR in dB that renders without some SH bands must reach against renders with all bands. An independent error of this
 size lowers the PSNR of an ``auto`` budget of 35 dB by 1.2 dB."""
 
-PRECISION = 1.05
-"""The search stops when the count is at most this factor above a count that failed."""
+FIRST_SHARE, USUAL_SLOPE = 0.3, 6.0
+"""Share of the Gaussians that is tried first for a quality; gain of merged scenes for each e-fold of the count, dB."""
+
+QUALITY = SearchSettings(tolerance=0.1)
+"""For PSNR in dB: 0.1 dB above what is asked for is near enough."""
+
+FILE_SIZE = SearchSettings(tolerance=-math.log(0.95), tries=3)
+"""For logarithms of file sizes: a file of at least 95 % of the limit is large enough, and each try makes a scene."""
 
 
 @dataclass(frozen=True, eq=False)
-class FoundBudget:
-    """The result of the search."""
+class FoundQuality:
+    """A scene whose renders are close enough."""
 
     scene: Gaussians
     psnr: float
     """PSNR of ``scene`` over all pixels of all views, dB; inf if nothing differs."""
     worst: float
     """PSNR of the worst view, dB."""
-    tried: dict[int, float] = field(default_factory=dict)
+    tried: dict[int, float]
     """PSNR in dB by count, for every count tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundSize:
+    """A scene whose file is small enough."""
+
+    scene: Gaussians
+    size: int
+    """Bytes of its file."""
+    tried: dict[int, int]
+    """Bytes by count, for every count tried."""
 
 
 def smallest_within(
@@ -39,13 +61,11 @@ def smallest_within(
     views: Views,
     psnr: float,
     progress: Callable[[float], None] | None = None,
-) -> FoundBudget:
+) -> FoundQuality:
     """Search for the smallest scene of a method whose renders reach ``psnr`` against those of the dense scene.
 
-    The PSNR is that of the mean squared error over all pixels of all views, so bad views count more. The count is
-    searched for between 1 and N. With one count that fails and one that suffices, the next one is found by linear
-    interpolation of the PSNR over the logarithm of the count, which is nearly a straight line in practice. The result
-    has been rendered and reaches ``psnr``. If quality does not always rise with the count, a smaller one may exist.
+    The PSNR is that of the mean squared error over all pixels of all views, so bad views count more. The result has
+    been rendered and reaches ``psnr``. If quality does not always rise with the count, a smaller one may exist.
 
     Args:
         dense: N Gaussians.
@@ -61,48 +81,73 @@ def smallest_within(
         raise BudgetError(f"the wanted PSNR is {psnr} dB; expected a positive number, such as 35")
     if len(views) == 0:
         raise BudgetError("no view to compare renders from; expected at least one pose")
-    n = len(dense)
-    reference = DenseReference(dense, views)
+    n, reference = len(dense), DenseReference(dense, views)
     tried: dict[int, float] = {}
+    best: FoundQuality | None = None
 
-    def attempt(count: int) -> FoundBudget:
+    def measure(count: int) -> float:
+        nonlocal best
         scene = make(count)
-        overall, worst = reference.psnr(scene)
-        tried[count] = overall
-        return FoundBudget(scene, overall, worst, tried)
-
-    low, high = 0, n  # low fails, high is good enough or not yet tried
-    best: FoundBudget | None = None
-    guess = max(1, round(0.3 * n))
-    widest = math.log(max(n, 2))
-    while True:
-        trial = attempt(guess)
-        if trial.psnr >= psnr:
-            high, best = guess, trial
-        else:
-            low = guess
+        tried[count], worst = reference.psnr(scene)
+        if tried[count] >= psnr:
+            best = FoundQuality(scene, tried[count], worst, tried)
         if progress is not None:
-            progress(1 - max(0.0, math.log(high / max(low, 1)) - math.log(PRECISION)) / widest)
-        if low == n:
-            raise BudgetError(f"all {n} Gaussians reach {trial.psnr:.1f} dB, not {psnr:g} dB; ask for less")
-        if best is None:
-            guess = min(n, 2 * guess)
-        elif high <= max(low, 0) * PRECISION or high - low <= 1:
-            return best
-        else:
-            guess = _next_guess(low, high, tried, psnr)
+            progress(len(tried) / (len(tried) + 2))
+        return tried[count]
+
+    first = max(1, round(FIRST_SHARE * n))
+    find_count(measure, psnr, at_least=True, first=first, most=n, slope=USUAL_SLOPE, settings=QUALITY)
+    if best is None:
+        raise BudgetError(f"all {n} Gaussians reach {tried[n]:.1f} dB, not {psnr:g} dB; ask for less")
+    return best
 
 
-def _next_guess(low: int, high: int, tried: dict[int, float], psnr: float) -> int:
-    """A count strictly between ``low``, which fails, and ``high``, which does not."""
-    below, above = math.log(max(low, 0.5)), math.log(high)
-    share = 0.5
-    if low in tried and math.isfinite(tried[high]) and math.isfinite(tried[low]):
-        share = (psnr - tried[low]) / (tried[high] - tried[low])
-        share = min(0.85, max(0.15, share + 0.03))  # a little more, so that the last try is likely to suffice
-    elif low == 0:
-        share = 1 - math.log(4) / max(above - below, math.log(4))  # a quarter of the count that suffices
-    return min(high - 1, max(low + 1, round(math.exp(below + share * (above - below)))))
+def largest_within(
+    full: Gaussians,
+    make: Callable[[int], Gaussians],
+    kind: Format,
+    limit: int,
+    progress: Callable[[float], None],
+) -> FoundSize:
+    """Search for a scene whose file has at most ``limit`` bytes, and not much less.
+
+    Args:
+        full: N Gaussians; if all fit, they are kept.
+        make: from a count K to a scene of K Gaussians.
+        kind: a format whose size depends on the scene.
+        limit: bytes.
+        progress: called with the share done, in [0, 1].
+
+    Raises:
+        BudgetError: if not even one Gaussian fits.
+    """
+    n = len(full)
+    tried: dict[int, int] = {}
+    best: FoundSize | None = None
+
+    def measure(count: int) -> float:
+        nonlocal best
+        scene = full if count == n else make(count)
+        tried[count] = _size(scene, kind)
+        if tried[count] <= limit:
+            best = FoundSize(scene, tried[count], tried)
+        progress(len(tried) / (len(tried) + 2))
+        return math.log(tried[count])
+
+    find_count(measure, math.log(limit), at_least=False, first=n, most=n, slope=1.0, settings=FILE_SIZE)
+    if best is None:
+        raise BudgetError(
+            f"keep is {limit / 1e6:g}MB{kind.suffix}, too small for one Gaussian; expected at least "
+            f"{tried[1] / 1e6:g}MB"
+        )
+    return best
+
+
+def _size(scene: Gaussians, kind: Format) -> int:
+    """Bytes of a scene's file, which leaves out what cannot be drawn."""
+    assert kind.encode is not None
+    scene = scene.detach().to("cpu", torch.float32)
+    return len(kind.encode(scene[scene.usable()], silent))
 
 
 def needed_sh_degree(dense: Gaussians, views: Views, psnr: float = SH_PSNR) -> tuple[int, float]:

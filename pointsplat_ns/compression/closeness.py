@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.windows import covered_share, mean_square
 from pointsplat_ns.metrics import SSIM_WINDOW, ssim
 from pointsplat_ns.rasterizer import render, render_with_alpha
 from pointsplat_ns.views import Views
@@ -60,13 +61,14 @@ class DenseReference:
         self.views = views
         drawn = [render_with_alpha(dense, view) for view in views]
         self.renders: list[Tensor] = [image for image, _ in drawn]
-        self.covered = sum(float(alpha.double().mean()) for _, alpha in drawn) / len(drawn)
+        self.covered = covered_share([alpha for _, alpha in drawn])
         """Share of all pixels that the dense scene covers, in [0, 1]."""
 
     @torch.no_grad()
     def errors(self, scene: Gaussians) -> list[float]:
         """Mean squared error of each view."""
-        return [_error(render(scene, view), target) for view, target in zip(self.views, self.renders, strict=True)]
+        pairs = zip(self.views, self.renders, strict=True)
+        return [mean_square(render(scene, view).double() - target.double()) for view, target in pairs]
 
     @torch.no_grad()
     def closeness(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> Closeness:
@@ -75,7 +77,7 @@ class DenseReference:
         errors, similarities = [], []
         for index, target in enumerate(self.renders):
             image = render(scene, self.views[index])
-            errors.append(_error(image, target))
+            errors.append(mean_square(image.double() - target.double()))
             if large_enough:
                 similarities.append(float(ssim(image, target)))
             if progress is not None:
@@ -92,11 +94,6 @@ class DenseReference:
         """PSNR over all pixels of all views, and of the worst view, dB."""
         close = Closeness(tuple(self.errors(scene)), None)
         return close.psnr, close.worst
-
-
-def _error(image: Tensor, target: Tensor) -> float:
-    """Mean squared error, float64."""
-    return float((image.double() - target.double()).square().mean())
 
 
 def _psnr(mse: float) -> float:

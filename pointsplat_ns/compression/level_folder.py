@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import content_hash, write_ply
 from pointsplat_ns.io.files import replacing, write_json
-from pointsplat_ns.looking.content import content_box
-from pointsplat_ns.rasterizer import render
-
-if TYPE_CHECKING:
-    from pointsplat_ns.compression.levels import Level, Levels
 
 FORMAT, VERSION = "pointsplat-lod", 1
 """Name and version of the manifest's format. The version rises when a reader of the old one would go wrong."""
@@ -29,8 +24,8 @@ MANIFEST, PICTURE = "lod.json", "lod.png"
 MAX_BYTES = 1 << 24
 """A manifest has about 1 kB a level."""
 
-_COLUMNS = 3
-"""Images side by side in the picture."""
+_COLUMNS, _INCHES = 3, 5.0
+"""Images side by side in the picture, and the width of each, inches."""
 
 
 def file_names(index: int) -> tuple[str, str]:
@@ -106,129 +101,47 @@ class LevelFolder:
             np.save(stream, parents.cpu().numpy())
         self._written.append({**self._facts(scene_name), "parents": self._facts(parents_name)})
 
-    def write_manifest(self, levels: Levels, complete: bool = True) -> None:
-        """Write the manifest of the levels that were written and measured so far.
+    def write_manifest(self, about: dict[str, Any], levels: Sequence[dict[str, Any]], complete: bool = True) -> None:
+        """Write the manifest of the levels that were written so far.
+
+        Args:
+            about: facts of all levels together.
+            levels: facts of each level that was written.
+            complete: whether these are all.
 
         Raises:
             SceneError: if it cannot be written.
         """
-        content = {
-            "format": FORMAT,
-            "version": VERSION,
-            "complete": complete,
-            "source": _source(levels),
-            "bounds": _bounds(levels.dense),
-            "views": _views(levels),
-            "levels": [
-                {**files, **_level(level, len(levels.dense))}
-                for files, level in zip(self._written, levels, strict=True)
-            ],
-        }
-        write_json(content, self.folder / MANIFEST)
+        rows = [{**files, **facts} for files, facts in zip(self._written, levels, strict=True)]
+        head = {"format": FORMAT, "version": VERSION, "complete": complete}
+        write_json({**head, **about, "levels": rows}, self.folder / MANIFEST)
 
-    def write_picture(self, levels: Levels) -> None:
-        """Draw one view of the dense scene and of every level, if there is a view.
+    def write_picture(self, images: Sequence[Tensor], captions: Sequence[str]) -> None:
+        """Draw images (H, W, 3) of one size with a caption below each; nothing if there is none.
 
         Raises:
             SceneError: if it cannot be written.
         """
-        if levels.reference is not None:
-            _draw(levels, self.folder / PICTURE)
+        from matplotlib.figure import Figure
+
+        if not images:
+            return
+        columns = min(_COLUMNS, len(images))
+        rows = math.ceil(len(images) / columns)
+        height, width = images[0].shape[:2]
+        size = (_INCHES * columns, rows * (_INCHES * height / width + 0.4))
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.subplots(rows, columns, squeeze=False).ravel()
+        for axis in axes[len(images) :]:
+            axis.set_axis_off()
+        for axis, image, caption in zip(axes, images, captions, strict=False):
+            axis.imshow(image.cpu().clamp(0, 1).numpy())
+            axis.set_xticks([])
+            axis.set_yticks([])
+            axis.set_xlabel(caption, fontsize=12)
+        with replacing(self.folder / PICTURE) as part:
+            figure.savefig(part, dpi=100, format="png")
 
     def _facts(self, name: str) -> dict[str, Any]:
         path = self.folder / name
         return {"file": name, "bytes": path.stat().st_size, "sha256": content_hash(path)}
-
-
-def _source(levels: Levels) -> dict[str, Any]:
-    file = levels.source
-    return {
-        "file": file and file.name,
-        "bytes": file and file.bytes,
-        "sha256": file and file.sha256,
-        "count": len(levels.dense),
-        "sh_degree": levels.dense.sh_degree,
-        "psnr_farther": _farther(levels.farther) if levels.reference is not None else None,
-    }
-
-
-def _bounds(dense: Gaussians) -> dict[str, Any]:
-    """Boxes about the centres of all Gaussians, and about 90 % of the opacity along each axis."""
-    boxes = {"all": (dense.means.amin(dim=0), dense.means.amax(dim=0))}
-    if bool((dense.alphas > 0).any()):
-        boxes["content"] = content_box(dense)
-    return {name: {"min": low.tolist(), "max": high.tolist()} for name, (low, high) in boxes.items()}
-
-
-def _views(levels: Levels) -> dict[str, Any] | None:
-    if levels.reference is None:
-        return None
-    views = levels.reference.views
-    focal = float(views.Ks[:, 1, 1].median())
-    return {
-        "count": len(views),
-        "origin": levels.origin,
-        "width": views.width,
-        "height": views.height,
-        "focal": focal,
-        "distance": levels.distance,
-        "pixel_size": levels.distance and levels.distance / focal,
-    }
-
-
-def _level(level: Level, whole: int) -> dict[str, Any]:
-    errors = level.errors
-    return {
-        "count": len(level.scene),
-        "share": len(level.scene) / whole,
-        "sh_degree": level.scene.sh_degree,
-        "dropped": level.dropped,
-        "median_size": level.median_size,
-        "displacement": {
-            "rms": level.displacement.rms,
-            "median": level.displacement.median,
-            "p95": level.displacement.p95,
-        },
-        "mse": errors and errors.near.error,
-        "psnr": errors and errors.near.psnr,
-        "worst_psnr": errors and errors.near.worst,
-        "ssim": errors and errors.near.ssim,
-        "psnr_farther": errors and _farther(errors.farther),
-    }
-
-
-def _farther(psnrs: dict[int, float]) -> list[dict[str, Any]]:
-    return [{"times": times, "psnr": psnr} for times, psnr in psnrs.items()]
-
-
-@torch.no_grad()
-def _draw(levels: Levels, path: Path) -> None:
-    """The view whose error at the coarsest level is the median: the dense scene, then every level."""
-    from matplotlib.figure import Figure
-
-    assert levels.reference is not None
-    views, renders = levels.reference.views, levels.reference.renders
-    last = levels[-1].errors
-    assert last is not None
-    shown = int(np.argsort(last.near.errors, kind="stable")[(len(views) - 1) // 2])
-    images = [renders[shown]]
-    captions = [f"dense: {len(levels.dense):,} Gaussians"]
-    for index, level in enumerate(levels):
-        assert level.errors is not None
-        images.append(render(level.scene, views[shown]))
-        share = 100 * len(level.scene) / len(levels.dense)
-        captions.append(f"level {index}: {len(level.scene):,} ({share:.3g} %), {level.errors.view_psnr(shown):.1f} dB")
-    columns = min(_COLUMNS, len(images))
-    rows = math.ceil(len(images) / columns)
-    width = 5.0  # of an image, inches
-    figure = Figure(figsize=(width * columns, rows * (width * views.height / views.width + 0.4)), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axis in axes[len(images) :]:
-        axis.set_axis_off()
-    for axis, image, caption in zip(axes, images, captions, strict=False):
-        axis.imshow(image.cpu().clamp(0, 1).numpy())
-        axis.set_xticks([])
-        axis.set_yticks([])
-        axis.set_xlabel(caption, fontsize=12)
-    with replacing(path) as part:
-        figure.savefig(part, dpi=100, format="png")

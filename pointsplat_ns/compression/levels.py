@@ -6,12 +6,15 @@ coarser level, its parent.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,9 +35,11 @@ from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable
 from pointsplat_ns.io.source import SourceFile
+from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, found_by_trying, need_usable, parse_keep, resolve_keep
 from pointsplat_ns.pruning.merging import merge_levels
+from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.progress import Progress, silent
 
 DEFAULT_LEVELS = ("50%", "25%", "10%", "3%")
@@ -57,6 +62,23 @@ class Level:
     """Errors of its renders against the dense scene's; None if there is no view."""
     seconds: float
     """Duration of merging from the level before."""
+
+    def facts(self, whole: int) -> dict[str, Any]:
+        """What the manifest says of the level; ``whole`` is the number of Gaussians of the dense scene."""
+        errors, near = self.errors, self.errors and self.errors.near
+        return {
+            "count": len(self.scene),
+            "share": len(self.scene) / whole,
+            "sh_degree": self.scene.sh_degree,
+            "dropped": self.dropped,
+            "median_size": self.median_size,
+            "displacement": dataclasses.asdict(self.displacement),
+            "mse": near and near.error,
+            "psnr": near and near.psnr,
+            "worst_psnr": near and near.worst,
+            "ssim": near and near.ssim,
+            "psnr_farther": errors and _farther(errors.farther),
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,8 +152,63 @@ class Levels:
         out = LevelFolder(folder, len(self), force)
         for level in self:
             out.write_level(level.scene, level.parents)
-        out.write_picture(self)
-        out.write_manifest(self)
+        self._finish(out)
+
+    def _finish(self, out: LevelFolder) -> None:
+        """Write the picture and the manifest of levels that were written."""
+        out.write_picture(*self._picture())
+        out.write_manifest(*self._manifest())
+
+    def _manifest(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+        """What the manifest says of all levels together, and of each."""
+        dense, file, views = self.dense, self.source, None
+        boxes = {"all": (dense.means.amin(dim=0), dense.means.amax(dim=0))}
+        if bool((dense.alphas > 0).any()):
+            boxes["content"] = content_box(dense)
+        if self.reference is not None:
+            of = self.reference.views
+            focal = float(of.Ks[:, 1, 1].median())
+            views = {
+                "count": len(of),
+                "origin": self.origin,
+                "width": of.width,
+                "height": of.height,
+                "focal": focal,
+                "distance": self.distance,
+                "pixel_size": self.distance and self.distance / focal,
+            }
+        source = {
+            "file": file and file.name,
+            "bytes": file and file.bytes,
+            "sha256": file and file.sha256,
+            "count": len(dense),
+            "sh_degree": dense.sh_degree,
+            "psnr_farther": _farther(self.farther) if self.reference is not None else None,
+        }
+        bounds = {name: {"min": low.tolist(), "max": high.tolist()} for name, (low, high) in boxes.items()}
+        return {"source": source, "bounds": bounds, "views": views}, [level.facts(len(dense)) for level in self]
+
+    @torch.no_grad()
+    def _picture(self) -> tuple[list[Tensor], list[str]]:
+        """Images of the dense scene and of every level, and captions: of the view whose error at the coarsest level is
+        the median; none if there is no view."""
+        if self.reference is None:
+            return [], []
+        views, last = self.reference.views, self[-1].errors
+        assert last is not None
+        shown = int(np.argsort(last.near.errors, kind="stable")[(len(views) - 1) // 2])
+        images, captions = [self.reference.renders[shown]], [f"dense: {len(self.dense):,} Gaussians"]
+        for index, level in enumerate(self):
+            assert level.errors is not None
+            images.append(render(level.scene, views[shown]))
+            share = f"{100 * len(level.scene) / len(self.dense):.3g} %"
+            psnr = level.errors.view_psnr(shown)
+            captions.append(f"level {index}: {len(level.scene):,} ({share}), {psnr:.1f} dB")
+        return images, captions
+
+
+def _farther(psnrs: dict[int, float]) -> list[dict[str, Any]]:
+    return [{"times": times, "psnr": psnr} for times, psnr in psnrs.items()]
 
 
 def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
@@ -263,13 +340,12 @@ def make_levels(
             )
         )
         if out is not None:
-            out.write_manifest(so_far(), complete=False)
+            out.write_manifest(*so_far()._manifest(), complete=False)
         before = merged.assignment
         start = time.perf_counter()
     result = so_far()
     if out is not None:
-        out.write_picture(result)
-        out.write_manifest(result)
+        result._finish(out)
     return result
 
 

@@ -177,7 +177,7 @@ def _search(
             f"{len(compared)} views; {len(reached.tried)} counts tried"
         )
         return reached.scene
-    from pointsplat_ns.compression.size_search import largest_within
+    from pointsplat_ns.compression.budget_search import largest_within
 
     assert isinstance(budget, Megabytes)
     kind = format_to_write(budget.suffix)

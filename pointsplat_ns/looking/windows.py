@@ -63,6 +63,11 @@ def parse_resolution(text: str | tuple[int, int] | None) -> tuple[int, int] | No
     return int(parts[0]), int(parts[1])
 
 
+def size_text(resolution: tuple[int, int]) -> str:
+    """A width and height as :func:`parse_resolution` reads them."""
+    return "x".join(map(str, resolution))
+
+
 def sides_of(width: int, height: int) -> tuple[int, ...]:
     """Longer sides of the pictures that windows are taken from, pixels: :data:`WINDOW`, the whole size, and their
     geometric mean. The whole size alone if it is no larger than a window.
@@ -157,7 +162,7 @@ class WindowRenders:
         self._other = (1 - 2 * views.background).to(dense.means)  # from a background to its opposite
         per_side = len(views)
         self.covered = [
-            sum(float(alpha.double().mean()) for _, alpha in self.renders[i * per_side : (i + 1) * per_side]) / per_side
+            covered_share([alpha for _, alpha in self.renders[i * per_side : (i + 1) * per_side]])
             for i in range(len(self.windows.sides))
         ]
         """Share of the pixels that the dense scene covers, for each side, in [0, 1]."""
@@ -170,7 +175,7 @@ class WindowRenders:
         for (image, alpha), (target, covered) in zip(pictures, self.renders, strict=True):
             apart = image.double() - target.double()
             over_other = apart - (alpha - covered).double() * self._other
-            errors.append(0.5 * float(apart.square().mean() + over_other.square().mean()))
+            errors.append(0.5 * (mean_square(apart) + mean_square(over_other)))
         count = len(self.windows.views[0])
         return [errors[i : i + count] for i in range(0, len(errors), count)]
 
@@ -185,6 +190,16 @@ class WindowRenders:
         """Mean of :meth:`psnrs` over the sides, dB."""
         found = self.psnrs(scene)
         return sum(found) / len(found)
+
+
+def mean_square(differences: Tensor) -> float:
+    """Mean squared error, float64, of the differences between two pictures."""
+    return float(differences.double().square().mean())
+
+
+def covered_share(alphas: Sequence[Tensor]) -> float:
+    """Share of the pixels of pictures of one size that a scene covers, in [0, 1], by their alphas (H, W, 1)."""
+    return sum(float(alpha.double().mean()) for alpha in alphas) / len(alphas)
 
 
 def psnr_of(error: float, covered: float = 1.0) -> float:

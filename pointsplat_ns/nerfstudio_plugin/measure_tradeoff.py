@@ -13,7 +13,8 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, name_of
 from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.io.source import source_file
-from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
+from pointsplat_ns.looking.windows import parse_resolution
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.tradeoff.measuring import Subject
@@ -31,9 +32,9 @@ def measure_tradeoff(
     within: float = 0.5,
     by: tuple[str, ...] = ("merge",),
     repairs: tuple[str, ...] = ("none", "quick"),
-    views: int = 10,
-    side: int = 640,
+    views: int = COMPARED_VIEWS,
     poses: str | Path | None = None,
+    resolution: tuple[int, int] | str | None = None,
     drawn: tuple[str, ...] = ("exact", "fast", "half"),
     target_db: float | None = None,
     target_ms: float | None = None,
@@ -53,12 +54,13 @@ def measure_tradeoff(
         folder: where points, pictures, tables, plots, the page and the found scene go.
         points: largest number of scenes of a sweep, the dense one among them.
         within: the recommended point is the fastest that loses at most so much, dB: against photos, or as much as is
-            expected of its renders (:mod:`~pointsplat_ns.tradeoff.loss`).
+            expected of its renders (:mod:`~pointsplat_ns.tradeoff.front`).
         by: methods, as for :func:`pointsplat_ns.prune`; the first one is walked, others are measured at three budgets.
         repairs: some of "none", "refiner", "quick" and "thorough", the efforts of :func:`pointsplat_ns.compact`.
         views: largest number of views; without photos at most 12.
-        side: largest side of their images, pixels; photos are reduced.
         poses: a file of cameras to look from, as ``views`` of :func:`pointsplat_ns.prune`; no photos are used then.
+        resolution: as for :func:`pointsplat_ns.prune`. Scenes are judged and timed in the pictures that
+            :func:`pointsplat_ns.compact` compares in, of 784 x 441 pixels for 1920 x 1080; photos are reduced to them.
         drawn: how frames may be drawn: "exact", of all scenes; "fast" and "half" (so, and at half the resolution), of a
             few where that may pay. A search for targets draws exactly.
         target_db: least PSNR against the dense scene's renders, dB, mean over views.
@@ -82,18 +84,17 @@ def measure_tradeoff(
         >>> import pointsplat_ns as ps
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     ps.save(ps.example_room()[::200][:300], f"{folder}/room.ply")
-        ...     found = ps.measure_tradeoff(
-        ...         f"{folder}/room.ply", f"{folder}/trade", target_mb=0.01, repairs=("none",), views=2, side=64
-        ...     )
+        ...     options = {"repairs": ("none",), "views": 2, "resolution": "64x48"}
+        ...     found = ps.measure_tradeoff(f"{folder}/room.ply", f"{folder}/trade", target_mb=0.01, **options)
         >>> found.point(found.recommended).bytes <= 10_000
         True
     """
-    options = Options(points, within, tuple(by), tuple(repairs), views, side, tuple(drawn))
-    targets = targets_of(target_db, target_ms, target_mb)
+    options = Options(points, within, tuple(by), tuple(repairs), views, tuple(drawn))
+    targets, size = targets_of(target_db, target_ms, target_mb), parse_resolution(resolution)
     path, folder = Path(scene), Path(folder)
     dense, given = (read_scene(path), None) if poses is None else read_posed(path, poses)
     check_folder(folder, force)
-    subject = subject_of(dense, path, given)
+    subject = subject_of(dense, path, given, resolution=size)
     file = None if poses is None else Path(poses)
     subject = replace(subject, name=name_of(path), sha256=source_file(path).sha256, poses=file)
     with progress_bar(progress) as report:
@@ -121,6 +122,7 @@ def subject_of(
     views: Views | None = None,
     refiner: TrainedRefiner | None = None,
     suffix: str = ".ply",
+    resolution: tuple[int, int] | None = None,
 ) -> Subject:
     """A scene to be measured, with the views that its commands have and its held-out photos.
 
@@ -130,6 +132,7 @@ def subject_of(
         views: given ones, in place of any others; there are no photos of them.
         refiner: what repairs begin with; by default nothing, and the one that ships where it repairs alone.
         suffix: of the format that smaller scenes are written in.
+        resolution: width and height of pictures, pixels, as for :class:`~pointsplat_ns.looking.view_source.ViewSource`.
     """
     has_photos = path is not None and views is None and may_be_run(path)
     return Subject(
@@ -137,8 +140,9 @@ def subject_of(
         path=path or Path("scene.ply"),
         name="scene",
         sha256="",
-        new_views=lambda: ViewSource(dense, given=views, run=path, dataset_views=dataset_views),
+        new_views=lambda: ViewSource(dense, given=views, run=path, dataset_views=dataset_views, resolution=resolution),
         held_out=functools.partial(dataset_photos, path, "test") if path is not None and has_photos else None,
         refiner=refiner,
         suffix=suffix,
+        resolution=resolution,
     )

@@ -18,7 +18,7 @@ from pointsplat_ns.tables.refiners import Refiners, Weights
 from pointsplat_ns.tables.scene import Opened, TableOptions
 from pointsplat_ns.tables.splat_transform import SplatTransform
 from pointsplat_ns.tables.ways import SEED, Network, Way
-from pointsplat_ns.tradeoff.making import Made, make
+from pointsplat_ns.tradeoff.measuring import Made, make
 from pointsplat_ns.tradeoff.settings import DENSE, EFFORTS, Setting
 
 LONGEST = 7200.0

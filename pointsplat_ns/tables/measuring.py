@@ -26,8 +26,7 @@ from pointsplat_ns.tables.scene import Opened, TableScene
 from pointsplat_ns.tables.ways import SEED, Way, all_cells, cell_key
 from pointsplat_ns.tradeoff.judging import Judge, Judged
 from pointsplat_ns.tradeoff.machine import machine_text, one_at_a_time
-from pointsplat_ns.tradeoff.making import Made
-from pointsplat_ns.tradeoff.measuring import point_of
+from pointsplat_ns.tradeoff.measuring import Made, point_of
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import DENSE
 

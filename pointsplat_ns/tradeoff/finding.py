@@ -1,4 +1,4 @@
-"""Finds the cheapest scene that meets targets, without a folder of measurements: what ``compact --target-db`` does."""
+"""Finds the cheapest scene that meets targets, without a folder of measurements: ``compact --target-db``."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from dataclasses import replace
 
 from pointsplat_ns.compression.compact import Compacted, as_compacted
 from pointsplat_ns.io.formats import format_to_write
+from pointsplat_ns.looking.view_source import COMPARED_VIEWS
 from pointsplat_ns.pruning import cut_sh
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.machine import busy_note
-from pointsplat_ns.tradeoff.making import through_file
-from pointsplat_ns.tradeoff.measuring import Measurer, Subject
+from pointsplat_ns.tradeoff.measuring import Measurer, Subject, through_file
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import Repair, Setting
-from pointsplat_ns.tradeoff.sweep import Options
 from pointsplat_ns.tradeoff.targets import Search, Targets
+from pointsplat_ns.tradeoff.walk import Plan
 
 
 def find_scene(
@@ -25,15 +25,15 @@ def find_scene(
 ) -> Compacted:
     """Find the cheapest scene that meets targets, as :class:`~pointsplat_ns.tradeoff.targets.Search` does.
 
-    Scenes are judged in the views of :class:`~pointsplat_ns.tradeoff.sweep.Options`, so that the scene is the one that
-    a sweep finds for the same targets; as they are read from files of the subject's format. Frames are timed only if
-    there is a target for it. Where Ctrl-C ends the search, the cheapest of what it has found is given.
+    Scenes are judged in the views of :func:`~pointsplat_ns.tradeoff.measuring.views_to_judge`, as they are read from
+    files of the subject's format. Frames are timed only if there is a target for it. Where Ctrl-C ends the search, the
+    cheapest scene found so far is given.
 
     Args:
         subject: the scene.
         targets: what to meet.
         by: the method of pruning.
-        repairs: what may repair.
+        repairs: repairs that may be tried.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
 
     Raises:
@@ -43,8 +43,8 @@ def find_scene(
         KeyboardInterrupt: if it is interrupted before a scene meets all targets.
     """
     start = time.perf_counter()
-    options = Options(methods=(by,), repairs=repairs)
-    measurer = Measurer(subject, options.views, options.side, progress, timed=targets.ms is not None)
+    dense, timed = subject.dense, targets.ms is not None
+    measurer = Measurer(subject, COMPARED_VIEWS, progress, timed=timed)
 
     def measure(setting: Setting) -> Point:
         number = 1 + len(search.tried)
@@ -52,10 +52,11 @@ def find_scene(
 
     kind = format_to_write(subject.suffix)
     size = kind.bytes_of or _estimated(subject)
-    search = Search(targets, options.plan(subject.dense), measure, measurer.cut_psnr, size, exact=kind.suffix == ".ply")
+    plan = Plan(len(dense), dense.sh_degree, (by,), repairs)
+    search = Search(targets, plan, measure, measurer.cut_psnr, size, exact=kind.suffix == ".ply")
     interrupted = False
     try:
-        if targets.ms is not None:
+        if timed:
             measurer.measure_dense(lambda what, share: progress("timing the dense scene", share))
         found = search.run()
     except KeyboardInterrupt:
@@ -63,12 +64,10 @@ def find_scene(
         if so_far is None:
             raise
         found = so_far
-    if targets.ms is not None:
+    if timed:
         measurer.note(busy_note([p.others_cores for p in search.tried.values() if p.others_cores is not None]))
     made = measurer.made(found.setting, progress)
-    compacted = made.compacted
-    if compacted is None:
-        compacted = as_compacted(subject.dense, made.scene, subject.new_views(), made.notes)
+    compacted = made.compacted or as_compacted(dense, made.scene, subject.new_views(), made.notes)
     notes = tuple(dict.fromkeys((*measurer.notes, *compacted.notes)))
     seconds = time.perf_counter() - start
     return replace(compacted, target=found.why, interrupted=interrupted, notes=notes, seconds=seconds)

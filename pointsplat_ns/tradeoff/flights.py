@@ -1,4 +1,4 @@
-"""Scenes of a sweep, kept as its page shows them to fly through."""
+"""Scenes of a sweep, kept for its page to fly through."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from pointsplat_ns.pages.flight import Stage
 from pointsplat_ns.pruning import ply_bytes
 
 MAX_BYTES = 4_000_000
-"""Of the page, at most, for scenes to fly through; the rest is for its pictures."""
+"""Largest size of a page's scenes; the rest of the page is for its pictures."""
 
 _RATIO = 20
-"""A PLY of so many times the bytes that there are is not tried: in a page, scenes have a tenth of its bytes or more."""
+"""A PLY of more than so many times that size is not tried: in a page, scenes have a tenth of its bytes or more."""
 
 _KEYS = {"scenes", "views", "up", "near", "background", "antialiased", "drag"}
 
@@ -44,35 +44,31 @@ def keep_flight(stage: Stage, scene: Gaussians, name: str, path: Path) -> bool:
     return True
 
 
-def read_flight(path: Path) -> dict[str, Any] | None:
-    """What :func:`keep_flight` wrote; None if there is nothing like it, as of scenes that were too large."""
+def read_flight_beside(path: Path, dense: Path) -> dict[str, Any] | None:
+    """A scene that :func:`keep_flight` wrote, with the dense scene on the left if both fit; None if it was too large,
+    or the file holds something else.
+
+    Args:
+        path: of the scene.
+        dense: of the dense scene, which may be the same.
+    """
+    flight = _read(path)
+    beside = _read(dense) if dense != path else None
+    if flight is None or beside is None:
+        return flight
+    scenes = [*beside["scenes"], *flight["scenes"]]
+    return {**flight, "scenes": scenes} if sum(len(scene["spz"]) for scene in scenes) <= MAX_BYTES else flight
+
+
+def _read(path: Path) -> dict[str, Any] | None:
     try:
         if path.stat().st_size > MAX_BYTES:
             return None
         flight = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    return flight if _is_flight(flight) else None
-
-
-def _is_flight(content: Any) -> bool:
-    scenes = content["scenes"] if isinstance(content, dict) and content.keys() == _KEYS else None
-    if not isinstance(scenes, list) or not scenes:
-        return False
-    return all(isinstance(scene, dict) and isinstance(scene.get("spz"), str) for scene in scenes)
-
-
-def read_flight_beside(path: Path, dense: Path) -> dict[str, Any] | None:
-    """What :func:`keep_flight` wrote of a scene, with the dense scene on the left if both fit; None as for
-    :func:`read_flight`.
-
-    Args:
-        path: of the scene.
-        dense: of the dense scene, which may be the same.
-    """
-    flight = read_flight(path)
-    beside = read_flight(dense) if dense != path else None
-    if flight is None or beside is None:
-        return flight
-    scenes = [*beside["scenes"], *flight["scenes"]]
-    return {**flight, "scenes": scenes} if sum(len(scene["spz"]) for scene in scenes) <= MAX_BYTES else flight
+    scenes = flight["scenes"] if isinstance(flight, dict) and flight.keys() == _KEYS else None
+    known = (
+        isinstance(scenes, list) and scenes and all(isinstance(s, dict) and type(s.get("spz")) is str for s in scenes)
+    )
+    return flight if known else None

@@ -1,4 +1,9 @@
-"""Which of the measured points are worth having: the Pareto front, and the fastest that is good enough."""
+"""The points worth having: the Pareto front, the loss of each point in dB, and the fastest within a loss.
+
+Where there are photos, the loss is measured: the PSNR of the dense scene against them less that of the smaller one.
+Where there are none, it is estimated: a trained scene is typically :data:`PHOTO_PSNR` away from its photos, the change
+of a smaller scene is independent of that error, and such squared errors add up.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +11,7 @@ import math
 from collections.abc import Sequence
 from typing import Literal
 
-from pointsplat_ns.tradeoff.points import Point, Quality
+from pointsplat_ns.tradeoff.points import Point, Quality, speed_of
 
 Reference = Literal["renders", "photos"]
 """What a point was compared with: renders of the dense scene, or held-out photos."""
@@ -16,6 +21,10 @@ Cost = Literal["frame_ms", "gaussians", "bytes"]
 REFERENCES: tuple[Reference, ...] = ("renders", "photos")
 METRICS: tuple[Metric, ...] = ("psnr", "ssim", "lpips")
 COSTS: tuple[Cost, ...] = ("frame_ms", "gaussians", "bytes")
+
+PHOTO_PSNR = 27.0
+"""PSNR in dB of a trained scene against held-out photos, where it is not known: about that of 3DGS on the captures of
+papers."""
 
 
 def quality_of(point: Point, reference: Reference, metric: Metric) -> float | None:
@@ -46,30 +55,21 @@ def fastest_first(points: Sequence[Point], trusted: bool = True) -> list[Point]:
 
     Args:
         points: any points.
-        trusted: whether times mean anything. If not, they go by their Gaussians, as these are what drawing takes time
-            for.
+        trusted: whether times can be trusted. If not, the number of Gaussians counts in their place.
     """
     return sorted(points, key=lambda point: (point.frame_ms if trusted else 0.0, point.gaussians, point.bytes))
 
 
 def fastest_within(points: Sequence[Point], db: float, trusted: bool = True) -> Point | None:
     """The fastest point whose PSNR against photos is at most ``db`` below that of the first point, the dense scene;
-    ``trusted`` as for :func:`fastest_first`.
-
-    Returns:
-        The point; None where there are no photos.
-    """
+    None where there are no photos. ``trusted`` as for :func:`fastest_first`."""
     dense = quality_of(points[0], "photos", "psnr")
     return None if dense is None else _fastest(points, "photos", dense - db, trusted)
 
 
 def fastest_above(points: Sequence[Point], db: float, trusted: bool = True) -> Point | None:
-    """The fastest point that has at least ``db`` of PSNR against the dense scene's own renders; ``trusted`` as for
-    :func:`fastest_first`.
-
-    Returns:
-        The point; None only if there is none, as the dense scene itself has an infinite PSNR.
-    """
+    """The fastest point of at least ``db`` PSNR against the dense scene's renders; None only if there is none, as the
+    dense scene itself has an infinite PSNR. ``trusted`` as for :func:`fastest_first`."""
     return _fastest(points, "renders", db, trusted)
 
 
@@ -80,3 +80,56 @@ def _fastest(points: Sequence[Point], reference: Reference, least: float, truste
         if quality is not None and quality >= least - 1e-9:
             return point
     return None
+
+
+def expected_loss(psnr: float) -> float:
+    """The loss against photos, dB, of a scene whose renders have a PSNR (dB) against the dense scene's.
+
+    Example:
+        >>> expected_loss(float("inf")), round(expected_loss(27.0), 2), round(expected_loss(36.14), 2)
+        (0.0, 3.01, 0.5)
+    """
+    return 10 * math.log10(1 + 10 ** ((PHOTO_PSNR - psnr) / 10))
+
+
+def psnr_within(loss: float) -> float:
+    """The PSNR against the dense scene's renders, dB, at which a loss (dB, above 0) is expected.
+
+    Example:
+        >>> round(psnr_within(0.5), 1), round(psnr_within(1.0), 1)
+        (36.1, 32.9)
+    """
+    return PHOTO_PSNR - 10 * math.log10(10 ** (loss / 10) - 1)
+
+
+def loss_of(point: Point, dense: Point) -> float:
+    """The loss of a point, dB: measured against photos, or else expected."""
+    if point.against_photos is not None and dense.against_photos is not None:
+        return dense.against_photos.psnr - point.against_photos.psnr
+    return expected_loss(point.against_dense.psnr)
+
+
+def recommend(points: Sequence[Point], within: float, trusted: bool = True) -> tuple[Point, str]:
+    """The fastest point within a loss, and a line of text that says so.
+
+    Args:
+        points: the dense scene, then others.
+        within: the largest loss, dB.
+        trusted: as for :func:`fastest_first`.
+    """
+    dense = points[0]
+    best = fastest_within(points, within, trusted) or fastest_above(points, psnr_within(within), trusted) or dense
+    if dense.against_photos is not None:
+        limit = f"within {within:g} dB of the dense scene's {dense.against_photos.psnr:.1f} dB against held-out photos"
+    else:
+        limit = (
+            f"of at least {psnr_within(within):.1f} dB against the dense scene's renders, which costs {within:g} dB "
+            f"against photos that it meets with {PHOTO_PSNR:g} dB"
+        )
+    what = "fastest point" if trusted else "point with the fewest Gaussians"
+    if best is dense:
+        return dense, f"the {what} {limit} is the dense scene itself"
+    figures = f"{best.gaussians:,} Gaussians, {best.bytes / 1e6:.2f} MB"
+    if trusted:
+        figures += f", {speed_of(best, dense)}: {best.frame_ms:.3g} ms a frame in place of {dense.frame_ms:.3g}"
+    return best, f"the {what} {limit}: {best.label}, {figures}"

@@ -1,4 +1,4 @@
-"""Journals: everything measured is written as soon as it is, so that an interrupted command goes on where it was.
+"""Journals: every record is written as soon as it is measured, so that an interrupted command goes on where it was.
 
 ``points.json`` is that of a sweep; :mod:`pointsplat_ns.tables` keeps its cells in files of the same shape.
 """
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 Identity = Mapping[str, str | int]
-"""What all records of a journal have in common; texts and whole numbers by name."""
+"""Values that all records of a journal have in common, by name."""
 
 T = TypeVar("T")
 
@@ -37,9 +37,9 @@ class Form:
     name: str
     version: int
     records: str
-    """Name of the list of records: what they are, in the plural."""
+    """Name of the list of records, in the plural."""
     of: str
-    """What they are of, in the singular."""
+    """Name of the whole, in the singular."""
 
     def write(self, path: Path, identity: Identity, records: Sequence[DataclassInstance]) -> None:
         """Write all records.
@@ -82,7 +82,7 @@ class Form:
         Args:
             path: the file, for the error.
             of: its identity.
-            identity: what it must have in common with it.
+            identity: the values that it must have in common with it.
 
         Raises:
             SceneError: if they differ.
@@ -106,18 +106,21 @@ class Journal:
 
     Args:
         folder: of the sweep.
-        identity: what all points have in common; texts and whole numbers by name.
+        identity: values that all points have in common.
 
     Raises:
         SceneError: if the folder holds points of something else, or a file of points that cannot be read.
     """
 
-    def __init__(self, folder: Path, identity: Mapping[str, str | int]):
+    def __init__(self, folder: Path, identity: Identity):
         self.path, self._identity = folder / POINTS, dict(identity)
         self.dense: Point | None = None
         self.points: dict[Setting, Point] = {}
         if self.path.exists():
-            self._read()
+            of, points = POINTS_FORM.read(self.path, _point_of_sweep)
+            POINTS_FORM.check(self.path, of, self._identity)
+            for point in points:
+                self._take(point)
 
     def add(self, point: Point) -> None:
         """Take a point in, and write all of them.
@@ -134,12 +137,6 @@ class Journal:
             self.dense = point
         else:
             self.points[setting_of(point)] = point
-
-    def _read(self) -> None:
-        of, points = POINTS_FORM.read(self.path, _point_of_sweep)
-        POINTS_FORM.check(self.path, of, self._identity)
-        for point in points:
-            self._take(point)
 
 
 def _point_of_sweep(values: dict[str, Any]) -> Point:
@@ -170,7 +167,7 @@ def _quality(values: dict[str, Any] | None) -> Quality | None:
 
 
 def check_types(of: DataclassInstance) -> None:
-    """Check that the values of a record have the types that its fields say.
+    """Check that the values of a record have the types of its fields.
 
     Raises:
         ValueError: if one has not.

@@ -1,7 +1,7 @@
-"""Judges scenes: against the dense scene's renders and photos, and by the time that a frame takes.
+"""Judges scenes: against the dense scene's renders and photos, and by the time of a frame.
 
 On a shared machine a frame may take twice as long in one minute as in the next. So each frame is timed beside one of
-the dense scene in the same view: what slows one down slows down the other, and the ratio of their times stays.
+the dense scene in the same view: both slow down alike, and the ratio of their times stays.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class LookedAt:
     """The views that scenes are judged in."""
 
     views: Views
-    photos: list[Tensor] | None  # [H, W, 3] in [0, 1], what the views show; None where there are none
+    photos: list[Tensor] | None  # [H, W, 3] in [0, 1], the photo of each view; None where there are none
     origin: str
     """Text: where the views came from."""
 
@@ -71,16 +71,16 @@ class LookedAt:
 
 @dataclass(frozen=True)
 class Judged:
-    """What a scene is worth; each is a field of :class:`~pointsplat_ns.tradeoff.points.Point`, see
-    :func:`~pointsplat_ns.tradeoff.measuring.point_of`."""
+    """Figures of a scene; each is a field of :class:`~pointsplat_ns.tradeoff.points.Point`. Times are NaN where nothing
+    was timed."""
 
     against_dense: Quality
     against_photos: Quality | None
-    frame_ms: float
-    frame_ms_low: float
-    frame_ms_high: float
-    clock_ms: float
-    others_cores: float
+    frame_ms: float = math.nan
+    frame_ms_low: float = math.nan
+    frame_ms_high: float = math.nan
+    clock_ms: float = math.nan
+    others_cores: float = math.nan
 
 
 class Judge:
@@ -121,29 +121,22 @@ class Judge:
         """Render a scene, write pictures of it, and time it.
 
         Args:
-            scene: what is judged.
+            scene: the scene to judge.
             key: of its point.
             progress: called with the share done, in [0, 1].
-            timed: whether to time it. If not, times are NaN.
+            timed: whether to time it.
             drawn: how its frames are drawn; those of the dense scene always are drawn exactly.
         """
-        against_dense: list[Quality] = []
-        against_photos: list[Quality] = []
-        pictures = []
+        images = []
         passes = 1 + 2 * ROUNDS * timed
-        for i, view in enumerate(self.views):
-            image = draw(scene, view, drawn)
-            against_dense.append(self._quality(image, self.renders[i]))
-            if self.photos is not None:
-                against_photos.append(self._quality(image, self.photos[i].to(image)))
-            if i in self.shown:
-                pictures.append(image)
-            progress((i + 1) / (passes * len(self.views)))
-        self._write(pictures, key)
-        photos = _mean(against_photos) if against_photos else None
-        times = self._time(scene, drawn) if timed else _UNTIMED
+        for view in self.views:
+            images.append(draw(scene, view, drawn))
+            progress(len(images) / (passes * len(self.views)))
+        self._write([images[i] for i in self.shown], key)
+        photos = None if self.photos is None else self._quality(images, self.photos)
+        times = self._time(scene, drawn) if timed else {}
         progress(1.0)
-        return Judged(_mean(against_dense), photos, **times)
+        return Judged(self._quality(images, self.renders), photos, **times)
 
     def _time(self, scene: Gaussians, drawn: Drawn) -> dict[str, float]:
         """The times of :class:`Judged`: those of the dense scene's reference times the ratio that was measured now."""
@@ -161,13 +154,8 @@ class Judge:
         shares = np.median(rounds[..., 1] / rounds[..., 0], axis=0)  # of each view
         low, middle, high = (float(value) for value in np.quantile(shares, (0.25, 0.5, 0.75)))
         unit = self.dense_ms / (middle if scene is self.dense else 1.0)  # the dense scene is as fast as itself
-        return {
-            "frame_ms": middle * unit,
-            "frame_ms_low": low * unit,
-            "frame_ms_high": high * unit,
-            "clock_ms": clock_ms,
-            "others_cores": others.cores(),
-        }
+        times = {"frame_ms": middle * unit, "frame_ms_low": low * unit, "frame_ms_high": high * unit}
+        return {**times, "clock_ms": clock_ms, "others_cores": others.cores()}
 
     @torch.no_grad()
     def psnr(self, scene: Gaussians) -> float:
@@ -182,18 +170,19 @@ class Judge:
             return []
         return [picture_path(self.folder, number, key) for number in range(len(self.shown))]
 
-    def _quality(self, image: Tensor, target: Tensor) -> Quality:
-        lpips = None if self.lpips is None else float(self.lpips(image, target))
-        return Quality(finite_psnr(image, target), float(ssim(image, target)), lpips)
+    def _quality(self, images: list[Tensor], targets: list[Tensor]) -> Quality:
+        """Means over the views."""
+        pairs = [(image, target.to(image)) for image, target in zip(images, targets, strict=True)]
+        return Quality(
+            fmean(finite_psnr(*pair) for pair in pairs),
+            fmean(float(ssim(*pair)) for pair in pairs),
+            None if self.lpips is None else fmean(float(self.lpips(*pair)) for pair in pairs),
+        )
 
     def _write(self, images: list[Tensor], key: str) -> None:
-        if self.folder is None:
-            return
-        for path, image in zip(self.pictures(key), images, strict=True):
-            write_picture(image, path)
-
-
-_UNTIMED = dict.fromkeys(("frame_ms", "frame_ms_low", "frame_ms_high", "clock_ms", "others_cores"), math.nan)
+        if self.folder is not None:
+            for path, image in zip(self.pictures(key), images, strict=True):
+                write_picture(image, path)
 
 
 def _timed(scene: Gaussians, view: View, drawn: Drawn) -> float:
@@ -206,7 +195,7 @@ def _timed(scene: Gaussians, view: View, drawn: Drawn) -> float:
 
 
 def _wait_for(device: torch.device) -> None:
-    """Until a GPU has done what it was given."""
+    """Until a GPU is done."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
@@ -216,15 +205,8 @@ def _lpips(image: Tensor) -> tuple[Lpips | None, str]:
     try:
         lpips = load_lpips("alex", download=False).to(image.device)
         lpips(image, image)
-    except LpipsUnavailable:  # of which the reason names folders, and the page is there to be sent
+    except LpipsUnavailable:  # whose text names folders; the page is for other people
         return None, "LPIPS is missing: its weights are not at hand; see docs/training.md on POINTSPLAT_LPIPS_WEIGHTS"
     except ImageError as error:  # an image too small for the network
         return None, f"LPIPS is missing: {error}"
     return lpips, ""
-
-
-def _mean(values: list[Quality]) -> Quality:
-    lpips = [value.lpips for value in values if value.lpips is not None]
-    return Quality(
-        fmean(value.psnr for value in values), fmean(value.ssim for value in values), fmean(lpips) if lpips else None
-    )

@@ -1,4 +1,4 @@
-"""The machine that times are measured on: what it is, that one measurement runs at a time, and whether it is busy."""
+"""The machine that times are measured on: its name, a lock for one measurement at a time, and whether it is busy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pointsplat_ns.system.cores import cores
 from pointsplat_ns.system.progress import Progress
 
 LOCK = "pointsplat-measuring.lock"
-"""Name of the file, in the folder for temporary files, that whoever measures holds locked."""
+"""Name of the lock's file, in the folder for temporary files."""
 
 TURN = 0.2
 """Seconds after a measurement in which others that wait for the lock can take it; they look every 0.05."""
@@ -46,7 +46,7 @@ def one_at_a_time(progress: Progress) -> Iterator[bool]:
     """Hold the lock of measurements on this machine while the context is open; wait for others that hold it.
 
     Args:
-        progress: called with what is being waited for.
+        progress: called with the name of what is waited for.
 
     Yields:
         Whether it could be had: its file may belong to another user.
@@ -70,7 +70,7 @@ def one_at_a_time(progress: Progress) -> Iterator[bool]:
 
 
 class OtherPrograms:
-    """Counts how many cores other programs keep busy from here on."""
+    """Mean number of cores that other programs keep busy from here on."""
 
     def __init__(self) -> None:
         self._before = self._read()
@@ -98,7 +98,7 @@ def is_busy(others: float) -> bool:
 
 
 def busy_note(others: Sequence[float]) -> str:
-    """A line of text if other programs were in the way of measurements; else empty.
+    """A line of text if other programs disturbed measurements; else empty.
 
     Args:
         others: cores that other programs kept busy in each of them.

@@ -1,8 +1,10 @@
-"""Measures points of a scene's trade: makes a scene, judges it and times it, while no other measurement runs."""
+"""Makes the scene of a setting as its command does, judges it and times it, while no other measurement runs."""
 
 from __future__ import annotations
 
 import math
+import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -12,17 +14,23 @@ from typing import Any
 
 from torch import Tensor
 
-from pointsplat_ns.compression.trained_refiner import TrainedRefiner
+from pointsplat_ns.compression.compact import Compacted, compact_scene
+from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, RepairBudget
+from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.formats import format_to_write
+from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.pruning import cut_sh, need_usable
+from pointsplat_ns.looking.windows import middle_sized
+from pointsplat_ns.pruning import cut_sh, need_usable, ply_bytes
+from pointsplat_ns.system.memory import PeakMemory
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.tradeoff.judging import Judge, Judged, LookedAt
 from pointsplat_ns.tradeoff.machine import one_at_a_time
-from pointsplat_ns.tradeoff.making import Made, make, through_file
 from pointsplat_ns.tradeoff.points import Point
-from pointsplat_ns.tradeoff.settings import DENSE, Naming, Setting
+from pointsplat_ns.tradeoff.settings import DENSE, EFFORTS, Naming, Setting
 from pointsplat_ns.views import Views
 
 HeldOut = Callable[[int], tuple[Views, list[Tensor]]]
@@ -31,7 +39,7 @@ HeldOut = Callable[[int], tuple[Views, list[Tensor]]]
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """The scene in hand."""
+    """The scene to be measured."""
 
     dense: Gaussians
     path: Path
@@ -44,11 +52,107 @@ class Subject:
     held_out: HeldOut | None = None
     """Its held-out photos; None if it cannot have any."""
     refiner: TrainedRefiner | None = None
-    """What repairs begin with; None for nothing, and for the one that ships where it repairs alone."""
+    """The network that repairs begin with; by default none, and the one that ships where it repairs alone."""
     suffix: str = ".ply"
     """Of the format that smaller scenes are written in."""
     poses: Path | None = None
     """The file of cameras that it is looked at from, as commands name it; None if there is none."""
+    resolution: tuple[int, int] | None = None
+    """Width and height of pictures, pixels, if they were asked for; ``new_views`` has them too."""
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A smaller scene, and the cost of making it."""
+
+    scene: Gaussians
+    seconds: float
+    peak_bytes: int | None
+    """Peak memory of this process meanwhile."""
+    notes: tuple[str, ...] = ()
+    """Lines of text, as of :class:`~pointsplat_ns.compression.prune.Pruned`."""
+    compacted: Compacted | None = None
+    """The whole result of a scene that was repaired; None of others."""
+
+
+def make(
+    dense: Gaussians,
+    setting: Setting,
+    new_views: Callable[[], ViewSource],
+    progress: Progress,
+    refiner: TrainedRefiner | None = None,
+) -> Made:
+    """Make the scene of a setting.
+
+    Args:
+        dense: N Gaussians.
+        setting: how.
+        new_views: called once for each scene, so that time and result are those of the command.
+        progress: called with the name of the current task and the share of it that is done, in [0, 1].
+        refiner: as for :class:`Subject`.
+
+    Raises:
+        KeyboardInterrupt: also where a repair would keep its result so far.
+    """
+    peak, start = PeakMemory(), time.perf_counter()
+    sh = str(setting.sh_degree) if setting.sh_degree < dense.sh_degree else "all"
+    compacted = None
+    if setting.repair == "none":
+        pruned = prune_scene(dense, PruneRequest(setting.count, setting.by, sh), new_views(), progress)
+        scene, notes = pruned.scene, pruned.notes
+    else:
+        if setting.repair == "refiner":
+            refiner = refiner or load_refiner()
+        budget = RepairBudget(EFFORTS[setting.repair])
+        request = CompactRequest.of(refiner, setting.count, setting.by, sh, repair=budget)
+        compacted = compact_scene(dense, request, new_views(), progress)
+        if compacted.repaired is not None and compacted.repaired.interrupted:
+            raise KeyboardInterrupt
+        scene, notes = compacted.scene, compacted.notes
+    return Made(scene.to(dense.device), time.perf_counter() - start, peak.bytes(), notes, compacted)
+
+
+def through_file(scene: Gaussians, suffix: str) -> tuple[int, Gaussians]:
+    """The size of a scene's file, bytes, and the scene as it is read from it: to the bit from a PLY, with fewer bits
+    from others.
+
+    Args:
+        scene: N Gaussians.
+        suffix: of the format's files, such as ``.spz``. Of formats that are only written, as ``.glb``, the scene is
+            given back as it is.
+    """
+    kind = format_to_write(suffix)
+    if kind.suffix == ".ply":
+        return ply_bytes(len(scene), scene.sh_degree), scene
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"scene{suffix}"
+        save(scene, path)
+        return path.stat().st_size, scene if kind.read is None else read_scene(path).to(scene.device)
+
+
+def views_to_judge(subject: Subject, count: int) -> tuple[LookedAt, str]:
+    """The views to judge scenes in, and a note; both of the size that ``compact`` compares in.
+
+    They are those of held-out photos, or else those that ``compact`` compares in, which no repair is optimised on.
+
+    Args:
+        subject: the scene.
+        count: largest number of views.
+
+    Raises:
+        DataError: if there is no view.
+    """
+    note = ""
+    if subject.held_out is not None:
+        try:
+            views, photos = subject.held_out(count)
+            whole = views if subject.resolution is None else views.resized(max(subject.resolution))
+            middle = middle_sized(whole)
+            photographed = LookedAt(views, photos, "held-out photos of the dataset")
+            return photographed.resized(max(middle.width, middle.height)), ""
+        except (SceneError, DataError) as error:
+            note = f"there are no held-out photos: {error}"
+    return LookedAt.compared(subject.new_views(), count), note
 
 
 class Measurer:
@@ -57,8 +161,7 @@ class Measurer:
     Args:
         subject: the scene.
         views: largest number of views.
-        side: largest side of their images, pixels.
-        progress: called with what is being waited for.
+        progress: called with the name of what is waited for.
         folder: for pictures; None for none.
         timed: whether to time frames. If not, times are NaN, and others may measure meanwhile.
 
@@ -68,45 +171,30 @@ class Measurer:
     """
 
     def __init__(
-        self,
-        subject: Subject,
-        views: int,
-        side: int,
-        progress: Progress,
-        folder: Path | None = None,
-        timed: bool = True,
+        self, subject: Subject, views: int, progress: Progress, folder: Path | None = None, timed: bool = True
     ):
         need_usable(subject.dense)
         self.subject, self.dense, self.folder, self.timed = subject, subject.dense, folder, timed
         self.dense_ms: float | None = None
-        """Time of a frame of the dense scene that others are given in proportion to; None before it was measured. What
-        was measured earlier goes here before anything is judged."""
+        """Time of a frame of the dense scene, if it was measured earlier; set before anything is judged."""
         self.notes: dict[str, None] = {}
-        self.naming = Naming(subject.path, subject.name, len(self.dense), self.dense.sh_degree, subject.poses)
+        self.naming = Naming(
+            *(subject.path, subject.name, len(self.dense), self.dense.sh_degree, subject.poses, subject.resolution)
+        )
         self._kept: dict[Setting, Made] = {}
         self._progress = progress
         progress("looking for views", 0.0)
-        self.looked_at = self._look(views).resized(side)
+        self.looked_at, note = views_to_judge(subject, views)
+        self.note(note)
 
     def note(self, text: str) -> None:
         """Keep a line of text for the reader; once, and not if it is empty."""
         if text:
             self.notes[text] = None
 
-    def _look(self, count: int) -> LookedAt:
-        """The views to judge in: those of held-out photos, or else those that ``compact`` compares in, on which no
-        repair is optimised."""
-        if self.subject.held_out is not None:
-            try:
-                views, photos = self.subject.held_out(count)
-                return LookedAt(views, photos, "held-out photos of the dataset")
-            except (SceneError, DataError) as error:
-                self.note(f"there are no held-out photos: {error}")
-        return LookedAt.compared(self.subject.new_views(), count)
-
     @cached_property
     def judge(self) -> Judge:
-        """What judges."""
+        """The judge of all scenes."""
         judge = Judge(self.dense, self.looked_at, self.folder, self.dense_ms)
         self.note(judge.no_lpips)
         return judge
@@ -139,8 +227,7 @@ class Measurer:
         the dense scene has."""
         setting = setting.scene
         if setting not in self._kept:
-            made = make(self.dense, setting, self.subject.new_views, show, self.subject.refiner)
-            self._kept[setting] = made
+            self._kept[setting] = make(self.dense, setting, self.subject.new_views, show, self.subject.refiner)
             while len(self._kept) > 1 and sum(len(kept.scene) for kept in self._kept.values()) > len(self.dense):
                 self._kept.pop(next(iter(self._kept)))
         return self._kept[setting]
@@ -159,26 +246,14 @@ class Measurer:
         size, scene = through_file(made.scene, self.subject.suffix)
         judged = self.judge.judge(scene, key, lambda share: show("", share), self.timed, setting.drawn)
         return point_of(
-            made,
-            judged,
-            key=key,
-            label=label,
-            command=command,
-            by=setting.by,
-            share=setting.count / len(self.dense),
-            repair=setting.repair,
-            bytes=size,
-            drawn=setting.drawn,
-        )
+            made, judged, key=key, label=label, command=command, by=setting.by, share=setting.count / len(self.dense),
+            repair=setting.repair, bytes=size, drawn=setting.drawn,
+        )  # fmt: skip
 
 
 def point_of(made: Made, judged: Judged, **named: Any) -> Point:
     """The point of a scene that was made and judged; ``named`` are the other fields of :class:`Point`."""
     return Point(
-        gaussians=len(made.scene),
-        sh_degree=made.scene.sh_degree,
-        seconds=made.seconds,
-        peak_bytes=made.peak_bytes,
-        **vars(judged),
-        **named,
-    )
+        gaussians=len(made.scene), sh_degree=made.scene.sh_degree, seconds=made.seconds, peak_bytes=made.peak_bytes,
+        **vars(judged), **named,
+    )  # fmt: skip

@@ -1,21 +1,33 @@
-"""What a sweep writes of its points: tables, plots and the page."""
+"""The files that a sweep writes of its points: table, JSON, plots and the page."""
 
 from __future__ import annotations
 
 import csv
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pointsplat_ns.io.files import replacing, write_json
 from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.tradeoff.plots import plot
+from pointsplat_ns.tradeoff.front import Cost, Reference, pareto_front, quality_of
 from pointsplat_ns.tradeoff.points import Point, Quality, Tradeoff, speed_of
+from pointsplat_ns.tradeoff.settings import DENSE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 TABLE, JSON, PAGE = "tradeoff.csv", "tradeoff.json", "tradeoff.html"
-PLOTS = {"ms": "tradeoff_ms.png", "mb": "tradeoff_mb.png", "count": "tradeoff_count.png"}
-"""Names of the plots by what quality is plotted against."""
+PLOTS: dict[Cost, str] = {
+    "frame_ms": "tradeoff_ms.png",
+    "bytes": "tradeoff_mb.png",
+    "gaussians": "tradeoff_count.png",
+}
+"""Names of the plots by the cost that quality is plotted against."""
 
 OUTPUTS = (TABLE, JSON, PAGE, *PLOTS.values())
+
+_AXES = {"frame_ms": "milliseconds a frame", "bytes": "size of the file, MB", "gaussians": "Gaussians"}
+_MARKERS = {"none": "o", "refiner": "v", "quick": "s", "thorough": "D"}
 
 
 def write_outputs(sweep: Tradeoff, folder: Path, progress: Progress = silent) -> None:
@@ -34,18 +46,14 @@ def write_outputs(sweep: Tradeoff, folder: Path, progress: Progress = silent) ->
     dense = sweep.points[0]
     points = [{**dataclasses.asdict(point), "speed": speed_of(point, dense)._asdict()} for point in sweep.points]
     write_json({**dataclasses.asdict(sweep), "points": points}, folder / JSON)
-    _write_table(sweep, folder / TABLE)
-    for against, name in PLOTS.items():
-        plot(sweep, against, folder / name)
-    write_page(sweep, folder, folder / PAGE, progress)
-
-
-def _write_table(sweep: Tradeoff, path: Path) -> None:
-    rows = [_row(point, sweep.points[0]) for point in sweep.points]
-    with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as stream:
+    rows = [_row(point, dense) for point in sweep.points]
+    with replacing(folder / TABLE) as part, part.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
+    for cost, name in PLOTS.items():
+        plot(sweep, cost, folder / name)
+    write_page(sweep, folder, folder / PAGE, progress)
 
 
 def _row(point: Point, dense: Point) -> dict[str, object]:
@@ -59,3 +67,83 @@ def _row(point: Point, dense: Point) -> dict[str, object]:
         else:
             row[field.name] = value
     return row | {f"speed_{name}": value for name, value in speed_of(point, dense)._asdict().items()}
+
+
+def plot(sweep: Tradeoff, cost: Cost, path: Path) -> None:
+    """Draw the PSNR of all points, against the dense scene's renders and, if there are any, photos.
+
+    Args:
+        sweep: what was measured.
+        cost: the horizontal axis.
+        path: the PNG file to write.
+
+    Raises:
+        SceneError: if it cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    panels: dict[Reference, str] = {"renders": "against the dense scene's renders"}
+    if sweep.points[0].against_photos is not None:
+        panels = {"photos": "against held-out photos", **panels}
+    figure = Figure(figsize=(6.4 * len(panels), 4.8), layout="constrained")
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axis, (reference, title) in zip(axes, panels.items(), strict=True):
+        _draw(axis, sweep, cost, reference)
+        axis.set_title(title, fontsize=10)
+    figure.suptitle(f"{sweep.scene}, {sweep.width} x {sweep.height} pixels\n{sweep.machine}", fontsize=9)
+    with replacing(path) as part:
+        figure.savefig(part, dpi=150, format="png")
+
+
+def _draw(axis: Axes, sweep: Tradeoff, cost: Cost, reference: Reference) -> None:
+    """One panel: a marker for each point, a line along the front, the dense scene, and the recommended point."""
+    dense, *others = sweep.points
+    others = [point for point in others if quality_of(point, reference, "psnr") is not None]
+
+    def at(points: list[Point]) -> tuple[list[float], list[float]]:
+        costs = [getattr(point, cost) / (1e6 if cost == "bytes" else 1) for point in points]
+        return costs, [quality_of(point, reference, "psnr") or 0.0 for point in points]
+
+    front = pareto_front(others, cost, reference, "psnr")
+    axis.plot(*at(front), color="0.6", linewidth=1, zorder=1)
+    groups: dict[str, list[Point]] = {}
+    for point in others:
+        groups.setdefault(_group(point, dense), []).append(point)
+    for name, members in groups.items():
+        drawn = axis.plot(*at(members), _MARKERS[members[0].repair], label=name, markersize=5)
+        if cost == "frame_ms":
+            low, high = [p.frame_ms_low for p in members], [p.frame_ms_high for p in members]
+            axis.hlines(at(members)[1], low, high, drawn[0].get_color(), linewidth=0.8, alpha=0.6)
+    for point, x, y in zip(front, *at(front), strict=True):
+        axis.annotate(f"{100 * point.share:.3g} %", (x, y), (4, -9), textcoords="offset points", fontsize=7)
+    [dense_cost], [dense_psnr] = at([dense])
+    if reference == "photos":
+        axis.plot(dense_cost, dense_psnr, "*", color="black", label=DENSE, markersize=9)
+        axis.axhline(dense_psnr, color="0.8", linewidth=0.8, zorder=0)
+    else:
+        axis.axvline(dense_cost, color="0.8", linewidth=0.8, zorder=0, label=DENSE)
+    best = at([point for point in others if point.key == sweep.recommended])
+    if best[0]:
+        axis.plot(*best, "o", fillstyle="none", color="crimson", markersize=13, label="recommended")
+    _plain_logarithmic(axis)
+    axis.set_xlabel(_AXES[cost] + (", median and quartiles over views" if cost == "frame_ms" else ""))
+    axis.set_ylabel("PSNR, dB")
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8, loc="lower right")  # where a front that rises leaves room
+
+
+def _plain_logarithmic(axis: Axes) -> None:
+    """A logarithmic axis with few numbers, not written as powers."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_xscale("log")
+    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _group(point: Point, dense: Point) -> str:
+    """Name of the points of one marker and colour."""
+    words = [point.by] + ([] if point.repair == "none" else [point.repair])
+    words += [] if point.drawn == "exact" else [f"drawn {point.drawn}"]
+    return ", ".join(words + ([] if point.sh_degree == dense.sh_degree else [f"SH degree {point.sh_degree}"]))

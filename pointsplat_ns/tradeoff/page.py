@@ -5,8 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from itertools import count
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -27,19 +26,21 @@ from pointsplat_ns.tradeoff.front import (
     fastest_first,
     fastest_within,
     pareto_front,
+    psnr_within,
     quality_of,
 )
-from pointsplat_ns.tradeoff.loss import psnr_within
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, picture_path, speed_of
 
 MAX_BYTES = 10_000_000
-"""Size of the page, at most: what goes through mail and opens at once."""
+"""Largest size of the page: it goes through mail and opens at once."""
 
 WITHIN_DB = 0.5
 """PSNR in dB to lose against photos, as the page asks at first."""
 
 ABOVE_DB = round(psnr_within(WITHIN_DB), 1)
 """The same where there are no photos: PSNR to have against renders of the dense scene."""
+
+Picture = Callable[[], np.ndarray]
 
 
 def write_page(sweep: Tradeoff, folder: Path, output: Path, progress: bool | Progress = False) -> Path:
@@ -68,79 +69,70 @@ def write_page(sweep: Tradeoff, folder: Path, output: Path, progress: bool | Pro
     """
     if not sweep.points:
         raise DataError(f"{folder}: nothing was measured; expected the dense scene and at least one smaller one")
-    pictures = _Pictures.of(sweep, folder)
+    views = _pictures(sweep, folder)
+    sources = [picture for view in views for picture in view.values()]
     dense, recommended = sweep.points[0].key, sweep.recommended
     flight = read_flight_beside(flight_path(folder, recommended), flight_path(folder, dense))
-    values, data = _values(sweep, len(pictures.names)), {**_data(sweep), "flight": flight}
+    values, data = _values(sweep, len(views)), {**_data(sweep), "flight": flight}
     scripts = ("chart.js", *(SCRIPTS if flight else ()), "tradeoff.js")
 
     def filled(uris: list[str], compressed: str) -> str:
-        shown = {**data, "pictures": pictures.placed(uris)}
+        left = iter(uris)
+        pictures = [{name: next(left) for name in view} for view in views]
         return page(
-            "tradeoff.html", scripts, with_workers=flight is not None, **values, flight=flight, data=shown,
-            compressed=compressed,
+            "tradeoff.html", scripts, with_workers=flight is not None, **values, flight=flight,
+            data={**data, "pictures": pictures}, compressed=compressed,
         )  # fmt: skip
 
-    empty = filled([""] * len(pictures.sources), " " * 100)  # of how pictures were compressed is said in fewer letters
-    text = filled(*fit(pictures.sources, MAX_BYTES - len(empty.encode("utf-8")), progress))
+    empty = filled([""] * len(sources), " " * 100)  # the note on how pictures were compressed is shorter
+    text = filled(*fit(sources, MAX_BYTES - len(empty.encode("utf-8")), progress))
     with replacing(output) as part:
         part.write_text(text, encoding="utf-8")
     return output
 
 
-@dataclass
-class _Pictures:
-    """What pictures the page shows, and where they belong."""
+def _pictures(sweep: Tradeoff, folder: Path) -> list[dict[str, Picture]]:
+    """For each view, functions that read or compute its pictures, by name: a point's key, ``photo``, or ``renders:KEY``
+    and ``photos:KEY`` for the error map of a point.
 
-    sources: list[Callable[[], np.ndarray]] = field(default_factory=list)
-    """One function for each picture that reads or computes it."""
-    names: list[dict[str, int]] = field(default_factory=list)
-    """For each view, the index of each of its pictures by name: a point's key, ``photo``, or ``renders:KEY`` and
-    ``photos:KEY`` for the error map of a point."""
+    Error maps are computed from the PNG files: what compression for the page changes must not show as error.
+    """
+    dense = sweep.points[0].key
+    views: list[dict[str, Picture]] = []
 
-    @classmethod
-    def of(cls, sweep: Tradeoff, folder: Path) -> _Pictures:
-        """All pictures of a sweep. Error maps are computed from the PNG files: what compression for the page changes
-        must not show as error."""
-        read = functools.partial(read_png, width=sweep.width, height=sweep.height)
-        dense = sweep.points[0].key
-        pictures = cls()
-        for view in count():
-            if not picture_path(folder, view, dense).exists():
-                break
-            names: dict[str, int] = {}
-            photo = picture_path(folder, view, "photo")
-            if photo.exists():
-                names["photo"] = pictures._add(read, photo)
-            for point in sweep.points:
-                path = picture_path(folder, view, point.key)
-                names[point.key] = pictures._add(read, path)
-                references = {"renders": picture_path(folder, view, dense)} if point.key != dense else {}
-                references |= {"photos": photo} if photo.exists() else {}
-                for reference, other in references.items():
-                    names[f"{reference}:{point.key}"] = pictures._add(_read_difference, read, path, other)
-            pictures.names.append(names)
-        if not pictures.names:
-            raise DataError(f"{picture_path(folder, 0, dense)}: no such file; expected pictures of at least one view")
-        return pictures
+    def read(path: Path) -> np.ndarray:
+        return read_png(path, width=sweep.width, height=sweep.height)
 
-    def _add(self, source: Callable[..., np.ndarray], *args: Any) -> int:
-        self.sources.append(functools.partial(source, *args))
-        return len(self.sources) - 1
+    def difference(path: Path, reference: Path) -> np.ndarray:
+        return error_map(read(path), read(reference))
 
-    def placed(self, uris: list[str]) -> list[dict[str, str]]:
-        """For each view, the URI of each of its pictures by name."""
-        return [{name: uris[index] for name, index in view.items()} for view in self.names]
-
-
-def _read_difference(read: Callable[[Path], np.ndarray], picture: Path, reference: Path) -> np.ndarray:
-    return error_map(read(picture), read(reference))
+    for view in takewhile(lambda view: picture_path(folder, view, dense).exists(), count()):
+        photo = picture_path(folder, view, "photo")
+        has_photo = photo.exists()
+        pictures: dict[str, Picture] = {"photo": functools.partial(read, photo)} if has_photo else {}
+        for point in sweep.points:
+            path = picture_path(folder, view, point.key)
+            pictures[point.key] = functools.partial(read, path)
+            if point.key != dense:
+                pictures[f"renders:{point.key}"] = functools.partial(
+                    difference, path, picture_path(folder, view, dense)
+                )
+            if has_photo:
+                pictures[f"photos:{point.key}"] = functools.partial(difference, path, photo)
+        views.append(pictures)
+    if not views:
+        raise DataError(f"{picture_path(folder, 0, dense)}: no such file; expected pictures of at least one view")
+    return views
 
 
 def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
     """What the template shows without the help of a script."""
     has_photos = quality_of(sweep.points[0], "photos", "psnr") is not None
     has_lpips = any(quality_of(point, "renders", "lpips") is not None for point in sweep.points)
+    rows = [{"key": point.key, "label": point.label, "cells": _cells(point, sweep.points[0])} for point in sweep.points]
+    shown = [name for name in _TITLES if (has_photos or "photos" not in name) and (has_lpips or "lpips" not in name)]
+    if all(point.peak_bytes is None for point in sweep.points):
+        shown.remove("peak_bytes")
     return {
         "sweep": sweep,
         "views": views,
@@ -149,8 +141,8 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
         "recommended": fastest_within(sweep.points, WITHIN_DB, sweep.times_trusted)
         or fastest_above(sweep.points, ABOVE_DB, sweep.times_trusted)
         or sweep.points[0],
-        "rows": [_row(point, sweep.points[0]) for point in sweep.points],
-        "columns": _columns(has_photos, has_lpips, any(point.peak_bytes is not None for point in sweep.points)),
+        "rows": rows,
+        "columns": [(name, _TITLES[name]) for name in shown],
         "amplified": AMPLIFIED,
         "full_level": math.ceil(255 / AMPLIFIED),
         "within_db": WITHIN_DB,
@@ -161,6 +153,14 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
 
 def _data(sweep: Tradeoff) -> dict[str, Any]:
     """What the scripts read, but for the pictures. An infinite number is the text "Infinity"."""
+
+    def qualities(point: Point, reference: Any) -> dict[str, float | str | None]:
+        values = {metric: quality_of(point, reference, metric) for metric in METRICS}
+        return {metric: "Infinity" if value == math.inf else value for metric, value in values.items()}
+
+    def fronts(reference: Any, metric: Any) -> dict[str, list[str]]:
+        return {cost: [p.key for p in pareto_front(sweep.points, cost, reference, metric)] for cost in COSTS}
+
     return {
         "points": [
             {
@@ -171,63 +171,51 @@ def _data(sweep: Tradeoff) -> dict[str, Any]:
                 "low": point.frame_ms_low,
                 "high": point.frame_ms_high,
                 **{cost: getattr(point, cost) for cost in COSTS},
-                **{
-                    reference: {metric: _finite(quality_of(point, reference, metric)) for metric in METRICS}
-                    for reference in REFERENCES
-                },
+                **{reference: qualities(point, reference) for reference in REFERENCES},
             }
             for point in sweep.points
         ],
-        "fronts": {
-            reference: {
-                metric: {cost: [p.key for p in pareto_front(sweep.points, cost, reference, metric)] for cost in COSTS}
-                for metric in METRICS
-            }
-            for reference in REFERENCES
-        },
+        "fronts": {ref: {metric: fronts(ref, metric) for metric in METRICS} for ref in REFERENCES},
         "fastest": [point.key for point in fastest_first(sweep.points, sweep.times_trusted)],
     }
 
 
 def _group(point: Point) -> str:
-    """What points of one colour have in common."""
+    """Name of the points of one colour."""
     if point.by == "dense":
         return "the dense scene"
     group = f"{point.by}, " + ("not repaired" if point.repair == "none" else f"repaired ({point.repair})")
     return group if point.drawn == "exact" else f"{group}, drawn {point.drawn}"
 
 
-def _finite(value: float | None) -> float | str | None:
-    return "Infinity" if value == math.inf else value
+_TITLES = {
+    "share": "kept",
+    "gaussians": "Gaussians",
+    "sh_degree": "SH",
+    "bytes": "MB",
+    "speed": "times as fast",
+    "frame_ms": "ms a frame",
+    **{
+        f"{reference}_{metric}": f"{title}, {reference}"
+        for reference in REFERENCES
+        for metric, title in zip(METRICS, ("PSNR dB", "SSIM", "LPIPS"), strict=True)
+    },
+    "seconds": "made in, s",
+    "peak_bytes": "peak memory, GB",
+}
+"""Titles of the table's columns, by name."""
 
 
-def _columns(has_photos: bool, has_lpips: bool, has_peak: bool) -> list[tuple[str, str]]:
-    """Names in :func:`_row` and titles of the table's columns."""
-    columns = [
-        ("share", "kept"),
-        ("gaussians", "Gaussians"),
-        ("sh_degree", "SH"),
-        ("bytes", "MB"),
-        ("speed", "times as fast"),
-        ("frame_ms", "ms a frame"),
-    ]
-    for reference, title in zip(REFERENCES[: 1 + has_photos], ("renders", "photos"), strict=False):
-        names = (("psnr", "PSNR dB"), ("ssim", "SSIM"), ("lpips", "LPIPS"))[: 2 + has_lpips]
-        columns += [(f"{reference}_{metric}", f"{name}, {title}") for metric, name in names]
-    columns.append(("seconds", "made in, s"))
-    return columns + ([("peak_bytes", "peak memory, GB")] if has_peak else [])
-
-
-def _row(point: Point, dense: Point) -> dict[str, Any]:
+def _cells(point: Point, dense: Point) -> dict[str, tuple[float | None, str]]:
     """A point for the table: by column, a number to sort by (None: unknown) and its text."""
-    speed = speed_of(point, dense)
+    speed, ms = speed_of(point, dense), point.frame_ms
     cells: dict[str, tuple[float | None, str]] = {
         "share": (point.share, f"{100 * point.share:.3g} %"),
         "gaussians": (point.gaussians, f"{point.gaussians:,}"),
         "sh_degree": (point.sh_degree, str(point.sh_degree)),
         "bytes": (point.bytes, f"{point.bytes / 1e6:.2f}"),
         "speed": (speed.median, f"{speed.median:.2f} ({speed.low:.2f}–{speed.high:.2f})"),
-        "frame_ms": (point.frame_ms, _time(point.frame_ms)),
+        "frame_ms": (ms, f"{ms:,.0f}" if ms >= 100 else f"{ms:.1f}"),
         "seconds": (point.seconds, f"{point.seconds:.1f}"),
         "peak_bytes": (point.peak_bytes, "–" if point.peak_bytes is None else f"{point.peak_bytes / 1e9:.2f}"),
     }
@@ -236,8 +224,4 @@ def _row(point: Point, dense: Point) -> dict[str, Any]:
             value = quality_of(point, reference, metric)
             text = "–" if value is None else "identical" if value == math.inf else f"{value:.{digits}f}"
             cells[f"{reference}_{metric}"] = (value, text)
-    return {"key": point.key, "label": point.label, "cells": cells}
-
-
-def _time(ms: float) -> str:
-    return f"{ms:,.0f}" if ms >= 100 else f"{ms:.1f}"
+    return cells

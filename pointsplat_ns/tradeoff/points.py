@@ -90,7 +90,7 @@ class Tradeoff:
         >>> import pointsplat_ns as ps
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     ps.save(ps.example_room()[::200][:300], f"{folder}/room.ply")
-        ...     options = {"points": 2, "views": 2, "side": 64, "drawn": ("exact",)}
+        ...     options = {"points": 2, "views": 2, "resolution": "64x48", "drawn": ("exact",)}
         ...     found = ps.measure_tradeoff(f"{folder}/room.ply", f"{folder}/trade", **options)
         >>> [point.key for point in found.points], found.point("10pct_sh1").gaussians
         (['dense', '10pct_sh1'], 30)

@@ -1,4 +1,4 @@
-"""A way of making a scene smaller, by the numbers: what is to be measured, what it is called, and its command."""
+"""Settings: the ways of making a scene smaller that are measured, their names, and their commands."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pointsplat_ns.compression.repair import Effort
 from pointsplat_ns.compression.trained_refiner import SHIPPED
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.windows import size_text
 from pointsplat_ns.pruning import method_named, ply_bytes
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.tradeoff.points import Point
@@ -107,6 +108,8 @@ class Naming:
     """And their SH degree."""
     poses: Path | None = None
     """The file of cameras that the scene is looked at from, as commands name it."""
+    resolution: tuple[int, int] | None = None
+    """Width and height of pictures, pixels, if they were asked for."""
 
     def key(self, setting: Setting) -> str:
         """A short name that can be part of a file's name."""
@@ -132,6 +135,8 @@ class Naming:
         words = ["pointsplat", program, str(self.path), "--keep", str(setting.count)]
         if self.poses is not None:
             words += ["--poses", str(self.poses)]
+        if self.resolution is not None:
+            words += ["--resolution", size_text(self.resolution)]
         if program == "compact" or setting.by != "merge":
             words += ["--by", setting.by]
         if setting.sh_degree != self.sh_degree:
@@ -147,7 +152,7 @@ def check_repairs(repairs: tuple[str, ...]) -> tuple[Repair, ...]:
     """Repairs, each once, in the order of :data:`REPAIRS`.
 
     Raises:
-        PointSplatError: if there is none, or no such one.
+        PointSplatError: if none is given, or one is unknown.
     """
     unknown = [repair for repair in repairs if repair not in REPAIRS]
     if unknown or not repairs:
@@ -159,7 +164,7 @@ def check_drawn(drawn: tuple[str, ...]) -> tuple[Drawn, ...]:
     """Ways to draw, each once, in the order of :data:`DRAWN`.
 
     Raises:
-        PointSplatError: if there is no such one.
+        PointSplatError: if one is unknown.
     """
     unknown = [way for way in drawn if way not in DRAWN]
     if unknown:

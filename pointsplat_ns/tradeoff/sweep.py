@@ -1,4 +1,4 @@
-"""Measures points of a scene's trade, one after the other, and keeps what was measured whatever happens."""
+"""Measures points of a scene's trade, one after the other, and keeps each as soon as it is measured."""
 
 from __future__ import annotations
 
@@ -12,26 +12,27 @@ from pathlib import Path
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.view_source import COMPARED_VIEWS
+from pointsplat_ns.looking.windows import size_text
 from pointsplat_ns.pages.flight import Stage
 from pointsplat_ns.pruning import method_named
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.flights import keep_flight
+from pointsplat_ns.tradeoff.front import recommend
 from pointsplat_ns.tradeoff.journal import POINTS, Journal
-from pointsplat_ns.tradeoff.loss import recommend
 from pointsplat_ns.tradeoff.machine import busy_note, machine_text
 from pointsplat_ns.tradeoff.measuring import Measurer, Subject
 from pointsplat_ns.tradeoff.outputs import OUTPUTS, write_outputs
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, speed_of
-from pointsplat_ns.tradeoff.settings import DENSE, DRAWN, REPAIRS, Drawn, Setting, check_drawn, check_repairs
-from pointsplat_ns.tradeoff.walk import MOST_DRAWINGS, Plan, drawings, walk
-from pointsplat_ns.views import Views
+from pointsplat_ns.tradeoff.settings import DENSE, DRAWN, REPAIRS, Setting, check_drawn, check_repairs
+from pointsplat_ns.tradeoff.walk import MOST_DRAWINGS, Enough, Plan, drawings, walk
 
 logger = logging.getLogger("pointsplat_ns")
 
 
 @dataclass(frozen=True)
 class Options:
-    """What to measure, and in which views.
+    """What to measure, and in how many views.
 
     Raises:
         PointSplatError: if one means nothing.
@@ -43,10 +44,8 @@ class Options:
     """Loss, dB, that the recommended point may have."""
     methods: tuple[str, ...] = ("merge",)
     repairs: tuple[str, ...] = ("none", "quick")
-    views: int = 10
+    views: int = COMPARED_VIEWS
     """Largest number of views."""
-    side: int = 640
-    """Largest side of their images, pixels."""
     drawn: tuple[str, ...] = DRAWN
     """Ways to draw frames; of the other ways than the exact one, few scenes are measured."""
 
@@ -55,8 +54,8 @@ class Options:
             raise PointSplatError(f"{self.points} points; expected at least 2, of which one is the dense scene")
         if not 0 < self.within < math.inf:
             raise PointSplatError(f"a loss of {self.within:g} dB; expected a positive number, such as 0.5")
-        if self.views < 1 or self.side < 1:
-            raise PointSplatError(f"{self.views} views of {self.side} pixels; expected at least one view and pixel")
+        if self.views < 1:
+            raise PointSplatError(f"{self.views} views; expected at least one")
         if not self.methods:
             raise PointSplatError("no method is named; expected at least one, such as merge")
         for method in self.methods:
@@ -64,15 +63,11 @@ class Options:
         check_repairs(self.repairs)
         check_drawn(self.drawn)
 
-    @property
-    def drawings(self) -> tuple[Drawn, ...]:
-        """``drawn`` without the exact way, in which all is measured."""
-        return tuple(way for way in check_drawn(self.drawn) if way != "exact")
-
     def plan(self, dense: Gaussians) -> Plan:
-        """What may be tried of a scene."""
+        """What may be tried of a scene. Everything is drawn exactly; ``drawn`` are the other ways."""
         methods = tuple(dict.fromkeys(self.methods))
-        return Plan(len(dense), dense.sh_degree, methods, check_repairs(self.repairs), self.within, self.drawings)
+        drawn = tuple(way for way in check_drawn(self.drawn) if way != "exact")
+        return Plan(len(dense), dense.sh_degree, methods, check_repairs(self.repairs), self.within, drawn)
 
 
 def check_folder(folder: Path, force: bool) -> None:
@@ -95,11 +90,6 @@ def check_folder(folder: Path, force: bool) -> None:
             )
 
 
-def _digest(views: Views) -> str:
-    """A text that tells cameras apart."""
-    return hashlib.sha256(views.viewmats.numpy().tobytes() + views.Ks.numpy().tobytes()).hexdigest()[:16]
-
-
 class Sweep:
     """Measures settings of a scene.
 
@@ -116,27 +106,31 @@ class Sweep:
 
     def __init__(self, subject: Subject, folder: Path, options: Options, progress: Progress):
         self.subject, self.folder, self.options, self.progress = subject, folder, options, progress
-        self.dense = subject.dense
-        self.measurer = Measurer(subject, options.views, options.side, progress, folder)
-        self.plan = options.plan(self.dense)
-        self.machine = machine_text(self.dense.device)
-        views = self.measurer.looked_at.views
-        identity: dict[str, str | int] = {
-            "scene": subject.sha256,
-            "machine": self.machine,
-            "views": self.measurer.looked_at.origin,
-            "number of views": len(views),
-            "width": views.width,
-            "height": views.height,
-        }
-        if subject.poses is not None:
-            identity["poses"] = _digest(views)
-        self.journal = Journal(folder, identity)
+        self.measurer = Measurer(subject, options.views, progress, folder)
+        self.plan = options.plan(subject.dense)
+        self.most = options.points + (MOST_DRAWINGS if self.plan.drawn else 0)
+        self.machine = machine_text(subject.dense.device)
+        self.journal = Journal(folder, self._identity())
         if self.journal.dense is not None:
             self.measurer.dense_ms = self.journal.dense.frame_ms
         self._forget_those_without_pictures()
         self._seconds: list[float] = []
-        self._shown = False
+
+    def _identity(self) -> dict[str, str | int]:
+        """Values that points must have in common to be compared."""
+        subject, looked_at = self.subject, self.measurer.looked_at
+        views = looked_at.views
+        cameras = hashlib.sha256(views.viewmats.numpy().tobytes() + views.Ks.numpy().tobytes()).hexdigest()[:16]
+        return {
+            "scene": subject.sha256,
+            "machine": self.machine,
+            "views": looked_at.origin,
+            "number of views": len(views),
+            "width": views.width,
+            "height": views.height,
+            "resolution": "" if subject.resolution is None else size_text(subject.resolution),
+            **({} if subject.poses is None else {"poses": cameras}),
+        }
 
     def run(self) -> Tradeoff:
         """Walk the front.
@@ -144,17 +138,17 @@ class Sweep:
         Raises:
             KeyboardInterrupt, SystemExit: of Ctrl-C or another signal, after results of what was measured were written.
         """
-        most = self.options.points + (MOST_DRAWINGS if self.options.drawings else 0)
-        dense, points = self.measure_dense(most), self.journal.points
+        dense, points = self.measure_dense(self.most), self.journal.points
+
+        def measure(setting: Setting) -> Point:
+            exact = sum(measured.drawn == "exact" for measured in points)
+            if setting not in points and setting.drawn == "exact" and 1 + exact >= self.options.points:
+                raise Enough
+            return self.measure(setting, self.most)
+
         try:
-            for setting in walk(self.plan, points, dense, self.measurer.cut_psnr):
-                if setting in points:
-                    continue
-                if 1 + sum(measured.drawn == "exact" for measured in points) >= self.options.points:
-                    break
-                self.measure(setting, most)
-            for setting in drawings(self.plan, points, dense):
-                self.measure(setting, most)
+            walk(self.plan, measure, dense, self.measurer.cut_psnr)
+            drawings(self.plan, dict(points), dense, measure)
             self.progress("measuring", 1.0)
         except (KeyboardInterrupt, SystemExit):
             self.finish_early()
@@ -166,8 +160,7 @@ class Sweep:
         if self.journal.dense is None:
             start = time.perf_counter()
             point = self.measurer.measure_dense(self._shower(0, of))
-            self._keep_flight(self.measurer.dense, DENSE, DENSE)
-            self._take(point, time.perf_counter() - start, of)
+            self._take(point, self.subject.dense, time.perf_counter() - start, of)
         assert self.journal.dense is not None
         return self.journal.dense
 
@@ -176,40 +169,33 @@ class Sweep:
 
         Args:
             setting: what to measure.
-            of: at most how many points there will be; None if that is not known.
+            of: largest number of points that there will be; None if that is not known.
         """
         if setting not in self.journal.points:
             start = time.perf_counter()
             point = self.measurer.measure(setting, self._shower(1 + len(self.journal.points), of))
-            self._keep_flight(self.scene(setting), point.key, point.label)
-            self._take(point, time.perf_counter() - start, of)
-            if not self._shown:  # the first useful picture, early
-                self._shown = True
+            self._take(point, self.scene(setting), time.perf_counter() - start, of)
+            if not (self.folder / OUTPUTS[0]).exists():  # the first useful results, early
                 write_outputs(self.result(), self.folder)
         return self.journal.points[setting]
-
-    def _keep_flight(self, scene: Gaussians, key: str, label: str) -> None:
-        """Keep a scene for the page, to fly through."""
-        if self._stage is not None:
-            keep_flight(self._stage, scene, label, flight_path(self.folder, key))
 
     @cached_property
     def _stage(self) -> Stage | None:
         """Where flights through scenes begin; None if nothing of the dense one is visible."""
         try:
-            return Stage.of(self.measurer.dense, self.measurer.looked_at.views)
+            return Stage.of(self.subject.dense, self.measurer.looked_at.views)
         except DataError:
             return None
 
     def scene(self, setting: Setting) -> Gaussians:
-        """The scene of a setting, made anew unless it was the last one made."""
+        """The scene of a setting, made anew unless it is one of the last."""
         return self.measurer.made(setting, self.progress).scene
 
     def result(self, recommended: Point | None = None, why: str = "") -> Tradeoff:
-        """What was measured so far, the dense scene first and the others by their size.
+        """All points so far, the dense scene first and the others by their size.
 
         Args:
-            recommended: a point; by default see :func:`~pointsplat_ns.tradeoff.loss.recommend`.
+            recommended: a point; by default see :func:`~pointsplat_ns.tradeoff.front.recommend`.
             why: a line of text on it.
         """
         dense = self.journal.dense
@@ -222,13 +208,13 @@ class Sweep:
         busy = busy_note([p.others_cores for p in points if p.others_cores is not None])
         if recommended is None:
             recommended, why = recommend(points, self.options.within, trusted=not busy)
-        views = self.measurer.looked_at.views
+        looked_at = self.measurer.looked_at
         return Tradeoff(
             scene=self.subject.name,
             machine=self.machine,
-            views_origin=self.measurer.looked_at.origin,
-            width=views.width,
-            height=views.height,
+            views_origin=looked_at.origin,
+            width=looked_at.views.width,
+            height=looked_at.views.height,
             points=points,
             notes=(*([busy] if busy else []), *self.measurer.notes),
             times_trusted=not busy,
@@ -276,16 +262,17 @@ class Sweep:
 
         return show
 
-    def _take(self, point: Point, seconds: float, of: int | None) -> None:
-        """Keep a point, and say what it is and how long the rest may take."""
+    def _take(self, point: Point, scene: Gaussians, seconds: float, of: int | None) -> None:
+        """Keep a point, its scene for the page, and log its figures and the time left."""
+        if self._stage is not None:
+            keep_flight(self._stage, scene, point.label, flight_path(self.folder, point.key))
         self.journal.add(point)
         self._seconds.append(seconds)
-        done = 1 + len(self.journal.points)
-        quality = [f"{point.against_dense.psnr:.1f} dB against the dense scene"] if point.by != DENSE else []
-        quality += [f"{point.against_photos.psnr:.2f} dB against photos"] if point.against_photos is not None else []
-        dense = self.journal.dense
-        quality += [str(speed_of(point, dense))] if dense is not None and point is not dense else []
-        figures = [*quality, f"{point.frame_ms:.3g} ms a frame", f"{point.bytes / 1e6:.2f} MB"]
+        done, dense = 1 + len(self.journal.points), self.journal.dense
+        figures = [] if point.by == DENSE else [f"{point.against_dense.psnr:.1f} dB against the dense scene"]
+        figures += [f"{point.against_photos.psnr:.2f} dB against photos"] if point.against_photos is not None else []
+        figures += [str(speed_of(point, dense))] if dense is not None and point is not dense else []
+        figures += [f"{point.frame_ms:.3g} ms a frame", f"{point.bytes / 1e6:.2f} MB"]
         left = ""
         if of is not None and done < of:
             minutes = (of - done) * sum(self._seconds) / len(self._seconds) / 60

@@ -1,14 +1,12 @@
-"""The cheapest scene that meets targets, found by search: how many Gaussians, which SH degree, and whether to repair.
+"""The cheapest scene that meets targets: how many Gaussians, which SH degree, and whether to repair.
 
-With a quality to reach, the cheapest is the smallest file that reaches it. Each way (an SH degree and a repair) has its
-smallest count that does; quality rises with the logarithm of the count nearly in a straight line, so a few tries find
-it to within :data:`PRECISION`. A way whose largest count that would still be cheaper falls short is given up after one
-try. Limits of time and size are then checked on what was found: more Gaussians would only be slower and larger.
+A *way* is an SH degree and a repair. With a quality to reach, the cheapest scene is the smallest file that reaches it:
+of each way the smallest count is searched for, and ways whose files would be larger than one already found are left.
+Limits of time and size are then checked. With limits only, it is the best quality within them: of each way the largest
+count within the limits.
 
-With limits only, the cheapest would be one Gaussian; what is found is the best quality within them.
-
-Sizes are those of the files of the format that is asked for. Where only writing a scene tells its size, counts are
-guessed from the dense scene's file, and corrected by what the files of scenes weigh.
+Sizes are those of files of the format asked for. Where only writing a scene tells its size, counts are first estimated
+from the dense scene's file.
 """
 
 from __future__ import annotations
@@ -18,17 +16,16 @@ from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from pointsplat_ns.compression.budget_search import FILE_SIZE, FIRST_SHARE
+from pointsplat_ns.compression.count_search import SearchSettings, find_count
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.pruning import ply_bytes, resolve_keep
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import Setting
 from pointsplat_ns.tradeoff.walk import Plan
 
-PRECISION = 1.1
-"""The search of a way ends when a count that meets the targets is at most this factor from one that does not."""
-
-SIZE_CLOSE, SIZE_TRIES = 0.95, 3
-"""A file whose size only writing tells is large enough at this share of the limit; and so many counts are tried."""
+SEARCH = SearchSettings(precision=1.1)
+"""For qualities and times: each try makes, repairs and renders a scene."""
 
 FEWEST = 1e-3
 """Share of the Gaussians below which no scene is tried for a limit of time: almost nothing is left to be drawn."""
@@ -58,7 +55,7 @@ class Targets:
             raise BudgetError(f"no target is given; expected one of {', '.join(given)}")
 
     def missed(self, point: Point) -> list[str]:
-        """What of the targets a point does not meet, in words; empty if it meets all."""
+        """The targets that a point does not meet, in words; empty if it meets all."""
         words = []
         if self.db is not None and point.against_dense.psnr < self.db:
             words.append(f"{point.against_dense.psnr:.2f} dB where {self.db:g} are wanted")
@@ -81,13 +78,8 @@ def targets_of(
     """Targets of which any may be missing; None if all are.
 
     Args:
-        db: least PSNR, dB; see :class:`Targets`.
-        ms: longest time of a frame, milliseconds.
-        mb: largest file, in units of 10^6 bytes.
-        keep: this and the others are options of ``compact`` that say what the search decides.
-        sh: as above.
-        clean: as above.
-        seconds: as above.
+        db, ms, mb: see :class:`Targets`.
+        keep, sh, clean, seconds: options of ``compact`` that say what the search decides.
 
     Raises:
         BudgetError: if a target means nothing, or such an option was given beside one.
@@ -106,12 +98,12 @@ def targets_of(
 
 @dataclass(frozen=True)
 class Found:
-    """What the search found."""
+    """The result of the search."""
 
     setting: Setting
     point: Point
     why: str
-    """One line of text: what it meets at what cost, and what the next one tried would have missed."""
+    """One line of text: the figures of the scene, and the targets that the next one tried would have missed."""
 
 
 class Search:
@@ -119,10 +111,10 @@ class Search:
 
     Args:
         targets: what to meet.
-        plan: what may be tried; only the first method is.
+        plan: what may be tried; of the methods only the first.
         measure: from a setting to its point; the same each time.
         cut_psnr: as for :func:`~pointsplat_ns.tradeoff.walk.walk`.
-        size: of a file, bytes, by count and SH degree; an estimate where only writing a scene tells it. By default that
+        size: bytes of a file by count and SH degree; an estimate where only writing a scene tells it. By default those
             of a PLY.
         exact: whether files give scenes back as they are, as a PLY does.
     """
@@ -137,10 +129,11 @@ class Search:
         exact: bool = True,
     ):
         self.targets, self.plan = targets, plan
-        self._size, self._exact = size, exact
         self.tried: dict[Setting, Point] = {}
-        self._measure, self._cut_psnr = measure, cut_psnr
-        self._slope: float | None = None  # dB for each e-fold of the count, as seen in the way before
+        self._measure, self._cut_psnr, self._size, self._exact = measure, cut_psnr, size, exact
+        self._ends: list[Setting] = []  # the result of each way
+        self._best: Setting | None = None
+        self._slope: float | None = None  # dB for each e-fold of the count, of the way before
 
     def run(self) -> Found:
         """Search.
@@ -148,99 +141,71 @@ class Search:
         Raises:
             BudgetError: if no scene meets all targets; the text says which one is the obstacle, and what is reachable.
         """
-        return self._smallest() if self.targets.db is not None else self._best()
+        plan, by = self.plan, self.plan.methods[0]
+        for repair in plan.repairs:
+            self._try(Setting(plan.count, plan.sh_degree, repair, by))
+        repair = plan.repairs[0] if self._best is None else self._best.repair
+        for degree in reversed(range(plan.sh_degree)):
+            if self._cut_psnr(degree) <= self._wanted:
+                break
+            self._try(Setting(plan.count, degree, repair, by))
+        if self._best is None:
+            raise BudgetError(self._obstacle())
+        return self._found(self._best)
 
     def so_far(self) -> Found | None:
         """The cheapest of what was tried that meets all targets, if the search was interrupted; None if none does."""
-        meeting = {s: point for s, point in self.tried.items() if not self.targets.missed(point)}
+        meeting = [setting for setting, point in self.tried.items() if not self.targets.missed(point)]
         if not meeting:
             return None
-        if self.targets.db is not None:
-            best = min(meeting, key=lambda setting: meeting[setting].bytes)
-        else:
-            best = max(meeting, key=lambda setting: meeting[setting].against_dense.psnr)
-        found = self._found(best)
+        found = self._found(min(meeting, key=self._cost))
         return replace(found, why=f"{found.why}; the search was interrupted, and might have found a better one")
+
+    @property
+    def _wanted(self) -> float:
+        """PSNR, dB, that the dense scene must keep without some SH bands for an SH degree to be tried."""
+        if self.targets.db is not None:
+            return self.targets.db
+        return -math.inf if self._best is None else self._point(self._best).against_dense.psnr
+
+    def _cost(self, setting: Setting) -> float:
+        """What is to be small: the file, or if no quality is wanted, the lack of it."""
+        point = self._point(setting)
+        return -point.against_dense.psnr if self.targets.db is None else point.bytes
+
+    def _try(self, way: Setting) -> None:
+        """Search in a way, and keep the result if it is the best."""
+        end = self._within(way) if self.targets.db is None else self._reaching(way, self.targets.db)
+        if end is None:
+            return
+        self._ends.append(end)
+        meets = not self.targets.missed(self._point(end))
+        if meets and (self._best is None or self._cost(end) < self._cost(self._best)):
+            self._best = end
 
     def _point(self, setting: Setting) -> Point:
         if setting not in self.tried:
             self.tried[setting] = self._measure(setting)
         return self.tried[setting]
 
-    def _way(self, degree: int, repair: int = 0) -> Setting:
-        return Setting(self.plan.count, degree, self.plan.repairs[repair], self.plan.methods[0])
+    def _reaching(self, way: Setting, wanted: float) -> Setting | None:
+        """The setting of a way with the fewest Gaussians that reaches a PSNR, if its file is smaller than that of the
+        best so far; else None."""
+        whole = Setting(self.plan.count, self.plan.sh_degree, by=way.by)
 
-    def _smallest(self) -> Found:
-        """The smallest file that reaches the wanted quality."""
-        wanted = self.targets.db
-        assert wanted is not None
-        ends: list[Setting] = []  # the smallest that reaches it, of each way
-        best: Setting | None = None
-        size = math.inf  # of its file
-        repair = self.plan.repairs[0]
+        def psnr(count: int) -> float:
+            setting = replace(way, count=count)
+            return math.inf if self._exact and setting == whole else self._point(setting).against_dense.psnr
 
-        def attempt(way: Setting) -> bool:
-            nonlocal best, size
-            end = self._reaching(way, wanted, self._most(way, math.inf if best is None else size))
-            if end is None:
-                return False
-            ends.append(end)
-            point = self._point(end)
-            if self.targets.missed(point) or point.bytes >= size:
-                return False
-            best, size = end, point.bytes
-            return True
-
-        for index, name in enumerate(self.plan.repairs):
-            if attempt(self._way(self.plan.sh_degree, index)):
-                repair = name
-        for degree in reversed(range(self.plan.sh_degree)):
-            if self._cut_psnr(degree) <= wanted:
-                break
-            attempt(replace(self._way(degree), repair=repair))
-        if best is None:
-            raise BudgetError(self._obstacle(ends))
-        return self._found(best)
-
-    def _reaching(self, way: Setting, wanted: float, most: int) -> Setting | None:
-        """The setting of a way with the fewest Gaussians, at most ``most``, that reaches a PSNR; None if none does."""
-
-        def margin(count: int) -> float:
-            if (
-                self._exact
-                and count == self.plan.count
-                and way.repair == "none"
-                and way.sh_degree == self.plan.sh_degree
-            ):
-                return math.inf  # the dense scene itself
-            return self._point(replace(way, count=count)).against_dense.psnr - wanted
-
+        most = self.plan.count if self._best is None else self._most(way, self._point(self._best).bytes)
         if most < 1:
             return None
-        first = most if most < self.plan.count else resolve_keep(self.plan.count, 0.3)
-        high, low = first, 0
-        while margin(high) < 0:
-            if high >= most:
-                return None
-            low, high = high, min(most, 2 * high)
-        _, fewest, self._slope = _crossing(low, high, margin, self._slope)
-        return replace(way, count=fewest)
-
-    def _best(self) -> Found:
-        """The best quality within the limits."""
-        best: Setting | None = None
-        repair = self.plan.repairs[0]
-        for index, name in enumerate(self.plan.repairs):
-            end = self._within(self._way(self.plan.sh_degree, index))
-            if best is None or self._psnr(end) > self._psnr(best):
-                best, repair = end, name
-        assert best is not None
-        for degree in reversed(range(self.plan.sh_degree)):
-            if self._cut_psnr(degree) <= self._psnr(best):
-                break
-            end = self._within(replace(self._way(degree), repair=repair))
-            best = end if self._psnr(end) > self._psnr(best) else best
-        return self._found(best)
+        first = most if most < self.plan.count else resolve_keep(self.plan.count, FIRST_SHARE)
+        found = find_count(psnr, wanted, at_least=True, first=first, most=most, slope=self._slope, settings=SEARCH)
+        if found.count is None:
+            return None
+        self._slope = found.slope
+        return replace(way, count=found.count)
 
     def _within(self, way: Setting) -> Setting:
         """The setting of a way with the most Gaussians that is within the limits of time and size.
@@ -248,93 +213,70 @@ class Search:
         Raises:
             BudgetError: if none is.
         """
-        n, limit = self.plan.count, self.targets.ms
-        high = n if self.targets.mb is None else self._fitting(way, math.floor(1e6 * self.targets.mb))
+        count, limit = self._fitting(way), self.targets.ms
         if limit is None:
-            return replace(way, count=high)
+            return replace(way, count=count)
+        least = min(count, max(1, round(FEWEST * self.plan.count)))
+        found = find_count(
+            lambda count: math.log(self._point(replace(way, count=count)).frame_ms), math.log(limit), at_least=False,
+            first=count, most=count, least=least, slope=1.0, settings=SEARCH,
+        )  # fmt: skip
+        if found.count is None:
+            point = self._point(replace(way, count=least))
+            raise BudgetError(
+                f"no scene meets --target-ms {limit:g}: {point.gaussians:,} Gaussians still take {point.frame_ms:.3g} "
+                "ms a frame at this size of the image"
+            )
+        return replace(way, count=found.count)
 
-        def margin(count: int) -> float:
-            return self._point(replace(way, count=count)).frame_ms / limit - 1  # above 0 where it is too slow
-
-        if margin(high) <= 0:
-            return replace(way, count=high)
-        low = max(1, round(high / 4))
-        while margin(low) > 0:
-            if low <= FEWEST * n or low == 1:
-                point = self._point(replace(way, count=low))
-                raise BudgetError(
-                    f"no scene meets --target-ms {limit:g}: {point.gaussians:,} Gaussians still take "
-                    f"{point.frame_ms:.3g} ms a frame at this size of the image"
-                )
-            high, low = low, max(1, round(low / 4))
-        return replace(way, count=_crossing(low, high, margin)[0])
-
-    def _most(self, way: Setting, size: float) -> int:
-        """The most Gaussians of a way whose file should be smaller than ``size`` bytes; 0 if none is."""
-        if size == math.inf:
-            return self.plan.count
-        counts = range(1, self.plan.count + 1)
-        return bisect_left(counts, size, key=lambda count: self._size(count, way.sh_degree))
-
-    def _fitting(self, way: Setting, limit: int) -> int:
-        """The most Gaussians of a way whose file has at most ``limit`` bytes, nearly.
+    def _fitting(self, way: Setting) -> int:
+        """The most Gaussians of a way whose file is within the limit of size, nearly.
 
         Raises:
             BudgetError: if not even one fits.
         """
-        fits, tries, count = 0, 0, self._most(way, limit + 1)
-        while count > fits:
-            tries += 1
-            expected = self._size(count, way.sh_degree)
-            size = self._point(replace(way, count=count)).bytes
-            if size <= limit:
-                fits = count
-                if size == expected or size >= SIZE_CLOSE * limit or count == self.plan.count:
-                    return fits
-            if fits and tries >= SIZE_TRIES:
-                return fits
-            closer = self._most(way, 0.99 * limit * expected / size)
-            count = closer if size <= limit else min(closer, count - 1)
-        if not fits:
+        if self.targets.mb is None:
+            return self.plan.count
+        limit = math.floor(1e6 * self.targets.mb)
+        found = find_count(
+            lambda count: math.log(self._point(replace(way, count=count)).bytes), math.log(max(limit, 1)),
+            at_least=False, first=self._most(way, limit + 1), most=self.plan.count, slope=1.0, settings=FILE_SIZE,
+        )  # fmt: skip
+        if found.count is None:
             raise BudgetError(
                 f"--target-mb is {limit / 1e6:g}, too small for one Gaussian of SH degree {way.sh_degree}; expected at "
                 f"least {self._size(1, way.sh_degree) / 1e6:g}"
             )
-        return fits
+        return found.count
 
-    def _psnr(self, setting: Setting) -> float:
-        return self._point(setting).against_dense.psnr
+    def _most(self, way: Setting, size: int) -> int:
+        """The most Gaussians of a way whose file should be smaller than ``size`` bytes; 0 if none is."""
+        counts = range(1, self.plan.count + 1)
+        return bisect_left(counts, size, key=lambda count: self._size(count, way.sh_degree))
 
     def _found(self, setting: Setting) -> Found:
         point = self._point(setting)
         time = "" if math.isnan(point.frame_ms) else f"{point.frame_ms:.3g} ms a frame, "
-        figures = (
-            f"{point.against_dense.psnr:.2f} dB against the dense scene's renders, {time}{point.bytes / 1e6:.2f} MB, "
-            f"{point.gaussians:,} Gaussians"
+        why = (
+            f"{point.label}: {point.against_dense.psnr:.2f} dB against the dense scene's renders, {time}"
+            f"{point.bytes / 1e6:.2f} MB, {point.gaussians:,} Gaussians; {len(self.tried)} scenes tried"
         )
-        why = f"{point.label}: {figures}; {len(self.tried)} scenes tried"
-        failed = [other for other in self.tried.values() if self.targets.missed(other)]
-        if self.targets.db is not None:
-            cheaper = [other for other in failed if other.bytes < point.bytes]
-            if cheaper:
-                other = max(cheaper, key=lambda p: (p.bytes, p.against_dense.psnr))
-                why += f"; the next cheaper, {other.label}, has {', '.join(self.targets.missed(other))}"
-        else:
-            better = [other for other in failed if other.against_dense.psnr > point.against_dense.psnr]
-            if better:
-                other = min(better, key=lambda p: p.against_dense.psnr)
-                why += f"; the next better, {other.label}, has {', '.join(self.targets.missed(other))}"
+        cheaper = [s for s, p in self.tried.items() if self.targets.missed(p) and self._cost(s) < self._cost(setting)]
+        if cheaper:
+            other = self.tried[max(cheaper, key=lambda s: (self._cost(s), self.tried[s].against_dense.psnr))]
+            word = "better" if self.targets.db is None else "cheaper"
+            why += f"; the next {word}, {other.label}, has {', '.join(self.targets.missed(other))}"
         return Found(setting, point, why)
 
-    def _obstacle(self, ends: list[Setting]) -> str:
-        """Why no scene meets all targets, given the smallest of each way that reach the wanted quality."""
-        if not ends:
+    def _obstacle(self) -> str:
+        """Why no scene meets all targets."""
+        if not self._ends:
             best = max(self.tried.values(), key=lambda point: point.against_dense.psnr)
             return (
                 f"no scene reaches --target-db {self.targets.db:g} in this format: the best tried has "
                 f"{best.against_dense.psnr:.2f} dB ({best.label})"
             )
-        points = [self._point(end) for end in ends]
+        points = [self._point(end) for end in self._ends]
         size, ms = min(p.bytes for p in points) / 1e6, min(p.frame_ms for p in points)
         obstacles = []
         if self.targets.mb is not None and size > self.targets.mb:
@@ -348,55 +290,3 @@ class Search:
             f"no scene meets all targets: what reaches {self.targets.db:g} dB {obstacle}; the best within the limits "
             f"has {within.against_dense.psnr:.2f} dB ({within.label}), so ask for less than that"
         )
-
-
-def _crossing(
-    low: int, high: int, margin: Callable[[int], float], slope: float | None = None
-) -> tuple[int, int, float | None]:
-    """Neighbouring counts, within :data:`PRECISION`, between which a margin rises through 0: below at the first (which
-    may be 0, that holds nothing), not below at the second. For a limit, the first is the largest that is within it.
-
-    Args:
-        low: a count at which it is below; 0 if none is known.
-        high: a count at which it is not.
-        margin: of a count.
-        slope: how much a margin of this kind was seen to rise while counts rise e-fold.
-
-    Returns:
-        The two, and the slope seen last.
-    """
-    enough = [(high, margin(high))]  # counts and margins that are not below 0, descending
-    while high > max(low, 1) * PRECISION and high - low > 1:
-        if len(enough) > 1 and low == 0:
-            slope = _slope(enough[-1], enough[-2])
-        guess = _beyond(*enough[-1], slope) if low == 0 else _between((low, margin(low)), enough[-1])
-        middle = min(high - 1, max(low + 1, round(guess)))
-        value = margin(middle)
-        if value < 0:
-            low = middle
-        else:
-            high = middle
-            enough.append((middle, value))
-    return low, high, _slope((low, margin(low)), enough[-1]) if low else slope
-
-
-def _slope(fewer: tuple[int, float], more: tuple[int, float]) -> float | None:
-    """How much a margin rises from one count to another for each e-fold; None if it does not, or has no bound."""
-    slope = (more[1] - fewer[1]) / math.log(more[0] / fewer[0])
-    return slope if 0 < slope < math.inf else None
-
-
-def _between(below: tuple[int, float], above: tuple[int, float]) -> float:
-    """The count between two at which the margin is 0, if it is a straight line over the logarithm of the count, and a
-    little more, so that it is likely to be enough; away from both ends, so that each try narrows the gap."""
-    (fewer, lack), (more, spare) = below, above
-    share = 0.05 - lack / (spare - lack) if math.isfinite(spare - lack) else 0.5
-    return fewer * (more / fewer) ** min(0.85, max(0.15, share))
-
-
-def _beyond(count: int, spare: float, slope: float | None) -> float:
-    """A count below one that has a margin to spare: a little below where a straight line of this slope has none; a
-    quarter where the slope is not known."""
-    if slope is None or not math.isfinite(spare):
-        return count / 4
-    return max(count / 16, 0.95 * count * math.exp(-spare / slope))

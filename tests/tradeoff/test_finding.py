@@ -15,6 +15,7 @@ from pointsplat_ns.cli import main
 from pointsplat_ns.compression import repair
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.looking import view_source
+from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
 from pointsplat_ns.tradeoff import finding, judging, settings
 from pointsplat_ns.tradeoff.finding import find_scene
@@ -68,6 +69,37 @@ def test_it_is_the_scene_that_a_sweep_finds(room, tmp_path, plain_page, plain_pl
     found = ps.compact(room, **targets)
     assert same_bits(found.scene, ps.load(written))
     assert found.target.split(":")[0] == sweep.why.split(":")[0]
+
+
+@pytest.mark.parametrize("resolution", [None, "96x54"])
+@pytest.mark.parametrize("search", ["compact", "compact_folder", "measure_tradeoff"])
+def test_scenes_are_judged_in_the_views_that_compact_compares_in(
+    room, tmp_path, plain_page, plain_plots, monkeypatch, resolution, search
+):
+    def few(scene, photos, count, width, height, **seed):
+        return sample_views(scene, min(count, 3), width, height)
+
+    monkeypatch.setattr(view_source, "views_about", few)
+    monkeypatch.setattr(view_source, "RESOLUTION", (512, 384))  # which decisions are made at, if nothing is asked for
+    wanted = ps.compact(room, 0.5, by="opacity", effort="instant", resolution=resolution).views
+    judged, begin = [], judging.Judge.__init__
+
+    def watched(self, dense, looked_at, *others):
+        judged.append(looked_at.views)
+        begin(self, dense, looked_at, *others)
+
+    monkeypatch.setattr(judging.Judge, "__init__", watched)
+    options = {"resolution": resolution, "target_mb": 0.01, "by": "opacity"}
+    if search == "measure_tradeoff":
+        ps.measure_tradeoff(room, tmp_path / "found", **{**options, "by": ("opacity",)}, repairs=("none",))
+    else:
+        ps.save(ps.load(room), tmp_path / "rooms" / "room.ply")
+        of = room if search == "compact" else tmp_path / "rooms"
+        getattr(ps, search)(of, **options)
+    [views] = judged
+    assert (views.width, views.height) == (wanted.width, wanted.height)
+    assert views.viewmats.equal(wanted.viewmats) and views.Ks.equal(wanted.Ks)
+    assert max(views.width, views.height) == (405 if resolution is None else 96)
 
 
 def test_only_a_target_of_time_has_frames_timed(dense, monkeypatch):

@@ -29,8 +29,14 @@ def photos(dense, room_views):
     return [(image + 0.1).clamp(0, 1) for image in render(dense, room_views)]
 
 
-def judged(judge: Judge, scene, key="some"):
-    return judge.judge(scene, key, lambda share: None)
+def judged(judge: Judge, scene, key="some", **options):
+    return judge.judge(scene, key, lambda share: None, **options)
+
+
+@pytest.fixture()
+def judge(dense, room_views, no_lpips):
+    """A judge of the room without photos."""
+    return Judge(dense, LookedAt(room_views, None, ""))
 
 
 def test_figures_are_means_over_views(dense, room_views, photos, tmp_path, no_lpips):
@@ -41,18 +47,12 @@ def test_figures_are_means_over_views(dense, room_views, photos, tmp_path, no_lp
     assert got.against_dense.ssim == pytest.approx(fmean(ps.ssim(renders, wanted).tolist()), abs=1e-5)
     assert got.against_photos.psnr == pytest.approx(fmean(ps.psnr(renders, torch.stack(photos)).tolist()), abs=1e-4)
     assert got.against_dense.lpips is got.against_photos.lpips is None
+    again = judged(Judge(dense, LookedAt(room_views, photos, ""), tmp_path), small)
+    assert (again.against_dense, again.against_photos) == (got.against_dense, got.against_photos), "to the bit"
 
 
-def test_judging_again_gives_the_same_figures_to_the_bit(dense, room_views, photos, tmp_path, no_lpips):
-    small = ps.prune(dense, 200)
-    first, second = (
-        judged(Judge(dense, LookedAt(room_views, photos, ""), tmp_path), small) for _ in range(2)
-    )  # fmt: skip
-    assert (first.against_dense, first.against_photos) == (second.against_dense, second.against_photos)
-
-
-def test_equal_pictures_do_not_make_means_infinite(dense, room_views, tmp_path, no_lpips):
-    assert judged(Judge(dense, LookedAt(room_views, None, ""), tmp_path), dense).against_dense.psnr == MOST_PSNR
+def test_equal_pictures_do_not_make_means_infinite(dense, judge):
+    assert judged(judge, dense).against_dense.psnr == MOST_PSNR
 
 
 @pytest.fixture()
@@ -73,28 +73,26 @@ def clock(dense, room_views, monkeypatch):
     return slow, drawn
 
 
-def test_times_are_the_dense_scenes_times_the_median_share_between_its_quartiles(dense, room_views, no_lpips, clock):
-    judge = Judge(dense, LookedAt(room_views, None, ""), None)
+def test_times_are_the_dense_scenes_times_the_median_share_between_its_quartiles(dense, judge, clock):
     got = judged(judge, ps.prune(dense, 200, by="opacity"))
     assert judge.dense_ms == pytest.approx(20.0)
     assert (got.frame_ms_low, got.frame_ms, got.frame_ms_high) == pytest.approx((4.5, 5.0, 7.5))
     assert got.clock_ms == pytest.approx(5.0)
 
 
-def test_a_machine_that_slows_down_changes_what_the_clock_says_and_not_the_times(dense, room_views, no_lpips, clock):
+def test_a_machine_that_slows_down_changes_what_the_clock_says_and_not_the_times(dense, judge, clock):
     small, (slow, _) = ps.prune(dense, 200, by="opacity"), clock
-    judge = Judge(dense, LookedAt(room_views, None, ""), None)
     before = judged(judge, small)
     slow[:] = [2.0, 1.5, 7.0]
     after = judged(judge, small)
     assert after.clock_ms == pytest.approx(1.5 * before.clock_ms)
-    for name in ("frame_ms", "frame_ms_low", "frame_ms_high"):
-        assert getattr(after, name) == pytest.approx(getattr(before, name))
+    assert (after.frame_ms, after.frame_ms_low, after.frame_ms_high) == pytest.approx(
+        (before.frame_ms, before.frame_ms_low, before.frame_ms_high)
+    )
 
 
-def test_each_frame_is_timed_right_after_the_same_one_of_the_dense_scene(dense, room_views, no_lpips, clock):
-    judge = Judge(dense, LookedAt(room_views, None, ""), None)
-    judge.judge(dense[:300], "some", lambda share: None, drawn="fast")
+def test_each_frame_is_timed_right_after_the_same_one_of_the_dense_scene(dense, room_views, judge, clock):
+    judged(judge, dense[:300], drawn="fast")
     views, pair = range(len(room_views)), ((True, "exact"), (False, "fast"))
     assert clock[1] == [(*scene, view) for _ in range(judging.ROUNDS) for view in views for scene in pair]
 
@@ -104,25 +102,23 @@ def test_a_reference_that_was_measured_before_is_kept(dense, room_views, no_lpip
     assert got.frame_ms == pytest.approx(25.0) and got.clock_ms == pytest.approx(5.0)
 
 
-def test_the_dense_scene_is_as_fast_as_itself(dense, room_views, no_lpips, monkeypatch):
+def test_the_dense_scene_is_as_fast_as_itself(dense, judge, monkeypatch):
     seconds = iter(range(1, 1000))
     monkeypatch.setattr(judging, "_timed", lambda *args: float(next(seconds)))
-    judge = Judge(dense, LookedAt(room_views, None, ""), None)
     got = judged(judge, dense)
     assert got.frame_ms == judge.dense_ms and got.frame_ms_low < got.frame_ms < got.frame_ms_high
 
 
 @pytest.mark.parametrize("drawn, options", [("fast", ("fast", 1)), ("half", ("fast", 2))])
-def test_other_ways_to_draw_are_judged_by_what_is_seen(dense, room_views, no_lpips, drawn, options):
-    judge = Judge(dense, LookedAt(room_views, None, ""), None)
-    got = judge.judge(dense, "some", lambda share: None, timed=False, drawn=drawn).against_dense
+def test_other_ways_to_draw_are_judged_by_what_is_seen(dense, room_views, judge, drawn, options):
+    got = judged(judge, dense, timed=False, drawn=drawn).against_dense
     wanted = ps.psnr(render(dense, room_views, *options), render(dense, room_views))
     assert got.psnr == pytest.approx(fmean(wanted.tolist()), abs=1e-4) and got.psnr < 60
 
 
-def test_what_is_not_timed_has_no_times(dense, room_views, no_lpips, monkeypatch):
+def test_what_is_not_timed_has_no_times(dense, judge, monkeypatch):
     monkeypatch.setattr(judging, "_timed", lambda *args: pytest.fail("timed"))
-    got = Judge(dense, LookedAt(room_views, None, ""), None).judge(dense, "some", lambda share: None, timed=False)
+    got = judged(judge, dense, timed=False)
     assert math.isnan(got.frame_ms) and math.isnan(got.clock_ms)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import threading
 
+import pytest
 import torch
 from filelock import FileLock
 
@@ -49,12 +50,9 @@ def test_whoever_waits_gets_the_next_turn():
 
 def test_the_lock_is_given_back_after_an_error():
     for _ in range(2):
-        try:
-            with one_at_a_time(lambda what, share: None) as alone:
-                assert alone
-                raise RuntimeError
-        except RuntimeError:
-            pass
+        with pytest.raises(RuntimeError), one_at_a_time(lambda what, share: None) as alone:
+            assert alone
+            raise RuntimeError
 
 
 def test_a_lock_that_belongs_to_another_user_is_not_waited_for(monkeypatch):

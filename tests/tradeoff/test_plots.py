@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from matplotlib.image import imread
 
-from pointsplat_ns.tradeoff.plots import AXES, plot
+from pointsplat_ns.tradeoff.outputs import PLOTS, plot
 from pointsplat_ns.tradeoff.points import Tradeoff
 from pointsplat_ns.tradeoff.settings import DENSE, REPAIRS, Setting
 from trades import point
@@ -22,7 +22,7 @@ def sweep(photos: float | None, repairs=REPAIRS) -> Tradeoff:
     return Tradeoff("room", "a machine", "given views", 64, 48, tuple(points), recommended=points[-1].key)
 
 
-@pytest.mark.parametrize("against", AXES)
+@pytest.mark.parametrize("against", PLOTS)
 @pytest.mark.parametrize("photos, wide", [(28.0, True), (None, False)])
 def test_there_is_a_panel_for_renders_and_one_for_photos_where_there_are_any(against, photos, wide, tmp_path):
     plot(sweep(photos), against, tmp_path / "plot.png")
@@ -32,11 +32,11 @@ def test_there_is_a_panel_for_renders_and_one_for_photos_where_there_are_any(aga
 
 def test_what_is_recommended_shows(tmp_path):
     shown = sweep(None, ("none",))
-    plot(shown, "ms", tmp_path / "with.png")
-    plot(replace(shown, recommended="dense"), "ms", tmp_path / "without.png")
+    plot(shown, "frame_ms", tmp_path / "with.png")
+    plot(replace(shown, recommended="dense"), "frame_ms", tmp_path / "without.png")
     assert (imread(tmp_path / "with.png") != imread(tmp_path / "without.png")).any()
 
 
 def test_a_sweep_that_has_only_begun_can_be_drawn(tmp_path):
-    plot(sweep(28.0, ()), "mb", tmp_path / "plot.png")
+    plot(sweep(28.0, ()), "bytes", tmp_path / "plot.png")
     assert (tmp_path / "plot.png").stat().st_size > 1000

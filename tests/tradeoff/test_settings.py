@@ -14,7 +14,7 @@ from pointsplat_ns.compression import repair
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.tradeoff.making import make
+from pointsplat_ns.tradeoff.measuring import make
 from pointsplat_ns.tradeoff.settings import REPAIRS, Naming, Setting, check_repairs, setting_of
 from trades import point
 
@@ -47,6 +47,11 @@ def test_a_command_makes_the_scene_that_was_measured(setting, room, room_views, 
     main(words)
     assert same_bits(ps.load(f"room_{naming.key(setting.scene)}.ply"), made.scene)
     assert Path(f"room_{naming.key(setting.scene)}.ply").stat().st_size == setting.bytes
+
+
+def test_a_command_names_the_resolution_that_was_asked_for():
+    naming = Naming(Path("room.ply"), "room", 400, 1, resolution=(96, 54))
+    assert "--resolution 96x54" in naming.command(Setting(40, 1)) and "96" not in naming.key(Setting(40, 1))
 
 
 def test_keys_differ_and_fit_into_names_of_files():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,10 +15,9 @@ from making import same_bits
 from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.tradeoff import judging, making, measuring, sweep
+from pointsplat_ns.tradeoff import judging, measuring, sweep
 from pointsplat_ns.tradeoff.journal import POINTS
 from pointsplat_ns.tradeoff.outputs import OUTPUTS, PAGE, PLOTS, TABLE
-from pointsplat_ns.tradeoff.plots import AXES
 from pointsplat_ns.tradeoff.points import picture_path
 from pointsplat_ns.tradeoff.settings import Setting
 from pointsplat_ns.tradeoff.sweep import Options, check_folder
@@ -39,7 +39,7 @@ def test_a_sweep_leaves_tables_plots_pictures_and_a_page(new_sweep, tmp_path, pl
     content = json.loads((tmp_path / "tradeoff.json").read_text())
     assert content["points"][0]["against_dense"]["psnr"] is None, "infinite"
     assert content["recommended"] == result.recommended
-    assert [(tmp_path / name).read_text() for name in PLOTS.values()] == [*AXES]
+    assert [(tmp_path / name).read_text() for name in PLOTS.values()] == [*PLOTS]
     for shown in result.points:
         assert all(picture_path(tmp_path, view, shown.key).is_file() for view in range(3))
     assert names(tmp_path / "scenes") == ["10pct_sh1.json", "dense.json"]
@@ -51,7 +51,7 @@ def test_the_first_useful_results_are_there_after_the_first_smaller_scene(new_sw
     running.measure_dense()
     assert plain_page == []
     running.measure(Setting(40, 1))
-    assert plain_page == [tmp_path] and (tmp_path / PLOTS["count"]).is_file()
+    assert plain_page == [tmp_path] and (tmp_path / PLOTS["gaussians"]).is_file()
 
 
 def test_points_have_exact_counts_sizes_and_commands(new_sweep, tmp_path, room):
@@ -88,7 +88,7 @@ def test_a_scene_that_is_needed_again_is_made_again_the_same(new_sweep, tmp_path
 
 @pytest.mark.parametrize("after", [1, 2])
 def test_an_interruption_leaves_what_was_measured_and_the_next_call_goes_on(new_sweep, tmp_path, monkeypatch, after):
-    made, make = [], making.make
+    made, make = [], measuring.make
 
     def interrupted(dense, setting, *args):
         if len(made) == after:
@@ -148,6 +148,15 @@ def test_held_out_photos_are_what_scenes_are_judged_by(new_sweep, tmp_path, room
     assert "held-out photos" in result.why
 
 
+@pytest.mark.parametrize("resolution, side", [(None, 506), ((640, 480), 453), ((48, 36), 48)])
+def test_held_out_photos_are_judged_at_the_middle_size_of_the_resolution(room, room_views, no_lpips, resolution, side):
+    dense, large = ps.load(room), replace(room_views[:1], width=800, height=600)
+    photos = [torch.zeros(large.height, large.width, 3)]
+    subject = measuring.Subject(dense, room, "room", "", list, lambda count: (large, photos), resolution=resolution)
+    looked_at = measuring.Measurer(subject, 1, lambda what, share: None).looked_at
+    assert looked_at.views.width == side and looked_at.photos[0].shape == (looked_at.views.height, side, 3)
+
+
 def test_where_photos_cannot_be_had_it_says_why_and_goes_on_without(new_sweep, tmp_path):
     def gone(count):
         raise DataError("photo_3.jpg: no such file")
@@ -167,7 +176,7 @@ def test_a_busy_machine_is_said_to_be_one(new_sweep, tmp_path, monkeypatch, othe
 
 
 def test_scenes_drawn_otherwise_come_on_top_and_are_not_made_again(new_sweep, tmp_path, monkeypatch):
-    made, make = [], making.make
+    made, make = [], measuring.make
     monkeypatch.setattr(measuring, "make", lambda *args: (made.append(args[1]), make(*args))[1])
     options = {"points": 3, "repairs": ("none",), "drawn": ("exact", "half")}
     first = new_sweep(tmp_path, **options).run().points
@@ -234,7 +243,6 @@ def test_points_are_listed_by_size_the_dense_scene_first(new_sweep, tmp_path):
         ({"within": 0.0}, "a loss of 0 dB"),
         ({"within": math.nan}, "a loss of nan dB"),
         ({"views": 0}, "0 views"),
-        ({"side": 0}, "of 0 pixels"),
         ({"methods": ()}, "no method is named"),
         ({"methods": ("magic",)}, "no method is called 'magic'"),
         ({"repairs": ("magic",)}, "repairs are magic"),

@@ -210,9 +210,9 @@ def test_scenes_that_take_too_much_of_a_page_are_not_kept(tmp_path, monkeypatch)
     monkeypatch.setattr(flights, "MAX_BYTES", 60_000)
     assert not flights.keep_flight(stage, room, "room", path) and not path.parent.exists()
     monkeypatch.setattr(flights, "MAX_BYTES", 120_000)
-    assert flights.keep_flight(stage, room, "room", path) and flights.read_flight(path)["drag"] == "look"
+    assert flights.keep_flight(stage, room, "room", path) and flights.read_flight_beside(path, path)["drag"] == "look"
     monkeypatch.setattr(flights, "MAX_BYTES", 60_000)
-    assert flights.read_flight(path) is None
+    assert flights.read_flight_beside(path, path) is None
 
 
 def test_the_limit_is_ten_megabytes():
