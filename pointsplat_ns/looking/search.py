@@ -85,6 +85,10 @@ _COMPARED = 4096
 _FAR = 4.0
 """Distance, units, from which on a surface counts less, as it is then small in the image."""
 
+_SHARP = 0.015
+"""Standard deviation, radians, that a Gaussian subtends in a view that shows it half as well as from afar: photos are
+taken from where most is smaller. In compact scenes of seven captures and splats it gains 0.2 dB."""
+
 _NOVEL = 0.1
 """Once a point has been shown this well (1 is in the middle of a picture and near), it counts half."""
 
@@ -152,14 +156,25 @@ class Search:
         """Views (V, 4, 4) of some places, the place (V,) of each, and how much they show of each point (V, P)."""
         if self.photos is not None:
             return self._like_photos(*self.photos)
-        places = self._inside() if self.inside else self._outside()
+        within = self._views_from(self._inside(), True)
+        if self.inside:
+            return within
+        # Parts of what is no room as a whole may be enclosed, such as the rooms of a flat without its walls.
+        about = self._views_from(self._outside(), False)
+        viewmats, owner, gains = (torch.cat(both) for both in zip(about, within, strict=True))
+        owner[len(about[1]) :] += PLACES
+        return viewmats, owner, gains
+
+    def _views_from(self, places: Tensor, inside: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """As :meth:`_candidates`, from the free ones of ``places`` (P, 3); if ``inside``, from the enclosed ones, all
+        round, else towards the content."""
         places = places[self.surface.clearance(places) > TOO_NEAR][:PLACES]
         seen, around = self.surface.seen_from(places)
-        if self.inside:
+        if inside:
             places, seen = places[around >= ENCLOSED], seen[around >= ENCLOSED]
-        owner = torch.arange(len(places)).repeat_interleave(_TURNS[self.inside])
+        owner = torch.arange(len(places)).repeat_interleave(_TURNS[inside])
         eyes = places[owner]
-        targets = self._ahead(eyes) if self.inside else self._at_content(seen[owner])
+        targets = self._ahead(eyes) if inside else self._at_content(seen[owner])
         viewmats = look_at(eyes, targets, self.box.up)
         return viewmats, owner, self._shown(viewmats, seen[:, :_COMPARED][owner])
 
@@ -232,7 +247,9 @@ class Search:
         edge = edge / max(self.width, self.height)
         aside = torch.maximum(x.abs() / edge[0], y.abs() / edge[1]) / z.clamp_min(1e-6)
         inside = seen & (z > 0) & (aside < 1)
-        return inside * (1 - 0.5 * aside.square().clamp_max(1)) / (1 + (z / _FAR).square())
+        subtended = self.surface.widths[:_COMPARED] / z.clamp_min(1e-6)
+        sharp = 1 / (1 + (subtended / _SHARP).square())
+        return inside * sharp * (1 - 0.5 * aside.square().clamp_max(1)) / (1 + (z / _FAR).square())
 
     def _is_free(self, viewmat: Tensor) -> bool:
         """Whether a view shows enough, and hardly any surface that is very near."""

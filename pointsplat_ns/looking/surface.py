@@ -46,6 +46,7 @@ class Surface:
     points: Tensor  # [M, 3] float64
     normals: Tensor  # [M, 3] float64 along the shortest axis of the Gaussian, of either sign
     flatness: Tensor  # [M] float64 in [0, 1]: 1 less the ratio of the shortest axis to the next
+    widths: Tensor  # [M] float32, geometric mean of the two larger standard deviations of its Gaussian, units
     shown: Tensor  # [M] float32, how much photos showed of it, see :func:`~pointsplat_ns.looking.traces.how_much_seen`
     sh: Tensor  # [M, K, 3] float32, SH coefficients of its Gaussian, without the constant, at a length of 1
 
@@ -81,7 +82,8 @@ class Surface:
         along = curve_keys(unit_cells(some.means)).argsort(stable=True)
         shown = torch.empty(POINTS)
         shown[along] = how_much_seen(some, along)
-        return Surface(points, axes[:, :, 0], flatness, shown, unit_sh(some.features_rest))
+        widths = (stds[:, 1] * stds[:, 2]).sqrt().float()
+        return Surface(points, axes[:, :, 0], flatness, widths, shown, unit_sh(some.features_rest))
 
     def clearance(self, places: Tensor) -> Tensor:
         """Distance (P,) from places (P, 3) to the nearest surface, units."""
