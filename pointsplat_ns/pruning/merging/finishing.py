@@ -1,8 +1,8 @@
-"""How a scene is finished: two numbers that suit all of its merged Gaussians, chosen by renders.
+"""How a scene is finished: one factor for the sizes of all merged Gaussians, chosen by renders.
 
-How opaque and how large a merged Gaussian must be to look like its members depends on how these overlap and on what is
-behind them, and differs between scenes. Both numbers are chosen by the PSNR against the dense scene in windows of
-several sizes of the picture (:mod:`~pointsplat_ns.looking.windows`).
+How large a merged Gaussian must be to look like its members depends on how these overlap and on what is behind them,
+and differs between scenes. The factor is chosen by the PSNR against the dense scene in windows of several sizes of the
+picture (:mod:`~pointsplat_ns.looking.windows`).
 """
 
 from __future__ import annotations
@@ -16,51 +16,36 @@ from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
 
 @dataclass(frozen=True)
 class Finish:
-    """The two numbers of a scene."""
+    """The change of the sizes of merged Gaussians."""
 
-    depth_exponent: float = DEFAULTS.default_depth_exponent
-    """The optical depth of a merged Gaussian is multiplied by its number of members to this power. Merging keeps the
-    mass but spreads it over a larger area, so that more of the background shows through."""
     size_change: float = 0.0
     """Added to the log-scales of merged Gaussians."""
     psnr: float | None = None
     """Mean PSNR in windows of all sizes against the dense scene's renders, dB; None if nothing was rendered."""
     psnr_before: float | None = None
-    """The same with a depth exponent and a size change of 0, dB."""
+    """The same with a size change of 0, dB."""
 
     @property
     def note(self) -> str:
-        """One line of text: the numbers, and their gain."""
-        numbers = f"optical depth x members^{self.depth_exponent:.2f}, sizes x {math.exp(self.size_change):.3f}"
+        """One line of text: the factor, and its gain."""
+        factor = f"merged: sizes x {math.exp(self.size_change):.3f}"
         if self.psnr is None or self.psnr_before is None:
-            return f"merged: {numbers}, by default"
-        return f"merged: {numbers}, chosen by renders: {self.psnr_before:.2f} -> {self.psnr:.2f} dB"
+            return f"{factor}, by default"
+        return f"{factor}, chosen by renders: {self.psnr_before:.2f} -> {self.psnr:.2f} dB"
 
 
-def best_finish(psnr_of: Callable[[Finish], float], settings: MergeSettings = DEFAULTS) -> Finish:
-    """The best finish of those tried: first the depth exponent, then the size, each at the top of the parabola through
-    three trials.
+def best_finish(psnr_of: Callable[[float], float], settings: MergeSettings = DEFAULTS) -> Finish:
+    """The best size change of those tried: three, and the top of the parabola through them.
 
     Args:
-        psnr_of: PSNR of the scene with a finish, dB.
+        psnr_of: PSNR of the scene with a size change, dB.
         settings: the trials.
     """
-    tried: dict[tuple[float, float], float] = {}
-
-    def attempt(exponent: float, size_change: float) -> float:
-        if (exponent, size_change) not in tried:
-            tried[exponent, size_change] = psnr_of(Finish(exponent, size_change))
-        return tried[exponent, size_change]
-
-    exponents, sizes = settings.depth_exponents, settings.size_changes
-    before = attempt(0.0, 0.0)
-    top = top_of_parabola(exponents, [attempt(value, 0.0) for value in exponents], settings.depth_exponent_margin)
-    # Outside of the trials the parabola is a guess, so sizes are tried with the nearest trial as well.
-    for exponent in dict.fromkeys((top, min(max(top, exponents[0]), exponents[-1]))):
-        psnrs = [attempt(exponent, size_change) for size_change in sizes]
-        attempt(exponent, top_of_parabola(sizes, psnrs, settings.size_change_margin))
-    found = max(tried, key=lambda key: tried[key])
-    return Finish(*found, psnr=tried[found], psnr_before=before)
+    tried = {change: psnr_of(change) for change in settings.size_changes}
+    top = top_of_parabola(settings.size_changes, list(tried.values()), settings.size_change_margin)
+    tried[top] = psnr_of(top)
+    best = max(tried, key=lambda change: tried[change])
+    return Finish(best, psnr=tried[best], psnr_before=tried.get(0.0))
 
 
 def top_of_parabola(at: tuple[float, float, float], values: list[float], margin: float) -> float:

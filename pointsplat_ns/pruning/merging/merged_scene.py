@@ -1,4 +1,4 @@
-"""The scene of groups: one Gaussian for each, with the numbers of a finish."""
+"""The scene of groups: one Gaussian for each."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.quaternions import quaternions_of
 from pointsplat_ns.pruning.merging.covariance import MIN_DIVISOR, unpack
-from pointsplat_ns.pruning.merging.finishing import Finish
 from pointsplat_ns.pruning.merging.groups import Groups
 from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.settings import MergeSettings
@@ -18,8 +17,9 @@ from pointsplat_ns.rasterizer.constants import ALPHA_MAX
 from pointsplat_ns.system.pieces import CHUNK
 
 
-def scene_maker(participants: Participants, groups: Groups, settings: MergeSettings) -> Callable[[Finish], Gaussians]:
-    """A function from a finish to the scene of K groups. A group of one member is that member to the bit."""
+def scene_maker(participants: Participants, groups: Groups, settings: MergeSettings) -> Callable[[float], Gaussians]:
+    """A function from a size change to the scene of K groups; the change is added to log-scales. A group of one member
+    is that member to the bit."""
     scene, counts = participants.scene, groups.counts.double()
     single = (counts == 1)[:, None]
     sh = _mean_sh(participants, groups, single[:, 0])
@@ -27,10 +27,11 @@ def scene_maker(participants: Participants, groups: Groups, settings: MergeSetti
     means = torch.where(single, scene.means[groups.first], groups.means.to(scene.dtype))
     quats = torch.where(single, scene.quats[groups.first], quats.to(scene.dtype))
 
-    def make(finish: Finish) -> Gaussians:
-        alphas = deepened(groups.alphas, counts, finish.depth_exponent, settings.max_opacity)
-        logits = torch.logit(alphas, 1e-7)[:, None].to(scene.dtype)
-        sizes = (log_scales + finish.size_change).to(scene.dtype)
+    alphas = deepened(groups.alphas, counts, settings.depth_exponent, settings.max_opacity)
+    logits = torch.logit(alphas, 1e-7)[:, None].to(scene.dtype)
+
+    def make(size_change: float) -> Gaussians:
+        sizes = (log_scales + size_change).to(scene.dtype)
         return Gaussians(
             means,
             torch.where(single, scene.scales[groups.first], sizes),

@@ -8,7 +8,7 @@ hard EM of a mixture of Gaussians whose data are Gaussians (Vasconcelos and Lipp
     fit = 1/2 (tr(S_g^-1 (S + (mu - mu_g)(mu - mu_g)^T)) + log det S_g) + |c - c_g|^2 / (2 contrast^2)
 
 The less, the better: the expected negative log-density of the group over the member, and the difference of colour. The
-mass of a member, by which the moments of a group are weighted, is opacity times root mean square area times visibility.
+mass of a member, by which the moments of a group are weighted, is opacity times root mean square area.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Moments:
     shares: Tensor  # [n] float64, of the members in the mass of their groups
 
 
-def regrouped(participants: Participants, groups: Groups, visibility: Tensor, settings: MergeSettings) -> Groups:
+def regrouped(participants: Participants, groups: Groups, settings: MergeSettings) -> Groups:
     """Groups whose members fit them better.
 
     The mass of a group may differ from the sum of its members' masses, because members overlap. The ratio of both is
@@ -55,11 +55,10 @@ def regrouped(participants: Participants, groups: Groups, visibility: Tensor, se
     Args:
         participants: n Gaussians.
         groups: K groups of them.
-        visibility: (n,) visibility factor of each, see :mod:`~pointsplat_ns.pruning.merging.visibility`.
         settings: ``regrouping_rounds`` and how members choose.
     """
     scene, members, group, count = participants.scene, participants.members, groups.group, len(groups)
-    masses = masses_of(scene, members).mul_(visibility)
+    masses = masses_of(scene, members)
     common = moments(scene, members, masses, group, count, settings)
     ratios = groups.alphas * rms_area(groups.cov) / common.mass.clamp_min(MIN_DIVISOR)
     for _ in range(settings.regrouping_rounds):

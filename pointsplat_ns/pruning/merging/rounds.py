@@ -34,7 +34,7 @@ from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
 from pointsplat_ns.pruning.merging.state import State, initial_state
 from pointsplat_ns.pruning.merging.tree import Tree
 from pointsplat_ns.pruning.merging.viewpoints import Viewpoints, sampled_viewpoints
-from pointsplat_ns.pruning.merging.weights import Weights, visibility_weights
+from pointsplat_ns.pruning.merging.visibility import visibility_weights
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import Views
 
@@ -68,8 +68,8 @@ def merge(
             ``k`` is N.
         k: number of Gaussians in the result; N returns the scene itself.
         progress: called with the share done, in [0, 1].
-        views: views in which the result should look the same, such as the poses of the scene's photos. Gaussians
-            outside of all of them are merged first. By default views are sampled from where photos were taken if the
+        views: views in which the result should look the same, such as the poses of the scene's photos. What none of
+            them shows is merged first. By default views are sampled from where photos were taken if the
             scene tells (:mod:`~pointsplat_ns.looking.traces`), else from free places in it, in all directions.
         resolution: width and height of sampled views, pixels.
         settings: the tuned numbers.
@@ -129,7 +129,7 @@ def _levels(
     n = len(scene)
     if n in counts:
         report(0.0 if len(counts) > 1 else 1.0)
-        yield Merged(scene, torch.arange(n, device=scene.device), Finish(settings.default_depth_exponent))
+        yield Merged(scene, torch.arange(n, device=scene.device), Finish())
         counts = counts[1:]
     if not counts:
         return
@@ -164,7 +164,6 @@ class Step:
 
     participants: Participants
     viewpoints: Viewpoints | None
-    weights: Weights
     state: State
     tree: Tree
     reference: WindowRenders | None
@@ -177,11 +176,11 @@ def first_step(
     """The step before the first round; ``views`` and ``resolution`` as for :func:`merge`."""
     viewpoints: Viewpoints | None = None
     if views is not None:
-        viewpoints = Viewpoints(views_in_units(views, participants.centre, participants.size), given=True)
+        viewpoints = Viewpoints(views_in_units(views, participants.centre, participants.size))
     elif len(participants) >= settings.min_count_rendered:
         viewpoints = sampled_viewpoints(participants.in_units(participants.scene), *resolution, settings)
     weights = visibility_weights(participants, viewpoints, settings)
-    state = initial_state(participants, weights.area, settings)
+    state = initial_state(participants, weights, settings)
     tree = Tree.of_single(len(participants))
 
     def dense() -> Gaussians:
@@ -189,7 +188,7 @@ def first_step(
         return participants.scene if whole else participants.scene[participants.members]
 
     reference = _reference(participants, viewpoints, len(state), dense, settings)
-    return Step(participants, viewpoints, weights, state, tree, reference)
+    return Step(participants, viewpoints, state, tree, reference)
 
 
 def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
@@ -204,10 +203,10 @@ def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
 
     def remaining() -> Gaussians:
         groups = merged_groups(participants, state, tree)
-        return scene_maker(participants, groups, settings)(Finish(settings.default_depth_exponent))
+        return scene_maker(participants, groups, settings)(0.0)
 
     reference = step.reference or _reference(participants, viewpoints, len(state), remaining, settings)
-    return Step(participants, viewpoints, step.weights, state, tree, reference)
+    return Step(participants, viewpoints, state, tree, reference)
 
 
 def finished(step: Step, regroup: bool, settings: MergeSettings) -> tuple[Groups, Gaussians, Finish]:
@@ -215,27 +214,19 @@ def finished(step: Step, regroup: bool, settings: MergeSettings) -> tuple[Groups
 
     Args:
         step: after the last round.
-        regroup: whether members may change groups. They do unless renders lose by it.
+        regroup: whether members may change groups.
         settings: of regrouping and finishing.
     """
     participants, reference = step.participants, step.reference
-    finish = Finish(settings.default_depth_exponent)
-    groups = merged_groups(participants, step.state, step.tree).in_order()
+    groups = merged_groups(participants, step.state, step.tree)
+    if regroup and groups.any_merged and settings.regrouping_rounds > 0:
+        groups = regrouped(participants, groups, settings)
+    groups = groups.in_order()
     make = scene_maker(participants, groups, settings)
-    if not groups.any_merged:
-        return groups, make(finish), finish
-
-    def psnr(make: Callable[[Finish], Gaussians], finish: Finish) -> float:
-        return 0.0 if reference is None else reference.psnr(participants.in_units(make(finish)))
-
-    if regroup and settings.regrouping_rounds > 0:
-        changed = regrouped(participants, groups, step.weights.visibility, settings).in_order()
-        make_changed = scene_maker(participants, changed, settings)
-        if psnr(make_changed, finish) >= psnr(make, finish):
-            groups, make = changed, make_changed
-    if reference is not None:
-        finish = best_finish(lambda trial: psnr(make, trial), settings)
-    return groups, make(finish), finish
+    finish = Finish()
+    if reference is not None and groups.any_merged:
+        finish = best_finish(lambda change: reference.psnr(participants.in_units(make(change))), settings)
+    return groups, make(finish.size_change), finish
 
 
 def _reference(

@@ -26,7 +26,7 @@ class MergeSettings:
     equal weights, without renders, in less time than sampling takes."""
 
     max_count_rendered: int = 2_000_000
-    """Largest number of Gaussians that are rendered as the reference of regrouping and finishing. A larger scene is
+    """Largest number of Gaussians that are rendered as the reference of finishing. A larger scene is
     rendered as soon as rounds have made it this small."""
 
     sampled_views: int = 48
@@ -39,74 +39,30 @@ class MergeSettings:
     find_photo_places: bool = True
     """Whether the scene is asked where its photos were taken, so that sampled views and weights start from there."""
 
-    min_distance: float = 0.1
-    """Distance that is added in quadrature to the distance of a Gaussian from a camera, as a share of the content's
-    diagonal. Without it (0), one camera that happens to be close would outweigh all others."""
+    # Visibility weights (visibility.py)
 
-    outside_weight: float = 1e-5
-    """Factor of the weight of a Gaussian in a given view whose picture it is outside of; 1 turns the rule off. A
-    Gaussian outside of all photos has never been trained. On such a scene (fox, 30 % kept) 0.02 gives 29.9 dB in
-    held-out views, 1e-3 30.6, 1e-5 30.9."""
+    visibility_views: int = 48
+    """Largest number of views in which covered pixels are counted. Over 16, 48 gain 0.2 to 0.7 dB in a lounge."""
 
-    picture_margin: float = 0.05
-    """Margin around a picture that still counts as inside of it, as a share of its width and height."""
-
-    # Traces of photos in the scene (weights.py, looking/traces.py). An exponent of 0 turns a rule off.
-
-    trace_exponent_given: float = 0.5
-    """Exponent of the trace factor where views are given. The visibility share tells a part of the same. On two
-    captures (second trainings, 50 to 3 % kept) 0.5 gains 0.0 to 0.6 dB over 1; on two others -0.2 to 0.2."""
-
-    trace_exponent_photos: float = 1.0
-    """Exponent of the trace factor where the scene tells where its photos were taken."""
-
-    trace_exponent_room: float = 0.25
-    """Exponent of the trace factor in a room that does not tell where its photos were taken. In held-out poses of three
-    rooms 0.25 gains 0.1 to 0.5 dB, in sampled views of another room it loses 0.1; larger exponents gain and lose
-    more."""
-
-    trace_exponent_object: float = 0.0
-    """The same for an object that is seen from outside; no exponent gains there."""
-
-    # Occlusion (visibility.py)
-
-    occlusion_views: int = 48
-    """Largest number of views in which covered pixels are counted. Over 16, 48 gain 0.2 to 0.7 dB in a lounge, with
-    its poses and without, and -0.2 to 0.4 in eight other scenes, for a second or two."""
-
-    occlusion_side: int = 112
+    visibility_side: int = 112
     """Longer side of the pictures in which covered pixels are counted, pixels."""
 
-    occlusion_max_count: int = 500_000
+    max_count_drawn: int = 500_000
     """Largest number of Gaussians that are drawn to count covered pixels; of more, every second (third, ...) is drawn,
     larger. In a lounge of 445,000, half or a quarter is as good as all (0.0 dB); in a bouquet of 117,000, a quarter
-    loses 0.4 of the 1.4 dB that counting gains at 10 %."""
+    loses 0.4 dB at 10 %."""
 
-    occlusion_neighbours: int = 17
-    """Number of Gaussians along the curve, an odd number, over which pixels are summed for the pair cost; 1 turns the
-    rule off. Of two Gaussians in the same place one hides the other, and it does not matter which."""
+    well_seen_quantile: float = 0.9
+    """Quantile of covered pixels per area that counts as seen well, in [0, 1]. Bounds are relative to it."""
 
-    unoccluded_quantile: float = 0.9
-    """Quantile of the shares of covered pixels that counts as not occluded, in [0, 1]. Expected pixels have no absolute
-    unit, so shares are relative to this one."""
-
-    min_share_neighbours: float = 1e-4
-    """Lower bound of the visibility share of a neighbourhood, before the exponent; 1 turns occlusion off in the pair
-    cost. It is above 0, because real cameras may stand elsewhere."""
-
-    min_share_single: float = 0.16
-    """Lower bound of the visibility share of a single Gaussian, before the exponent; 1 turns occlusion off in
-    regrouping. It is above 0, because other views may show the Gaussian. Of 0.25, 0.09 and 0.01, smaller bounds gain up
-    to 0.3 dB on objects and on two captures, and lose as much in two built-in rooms."""
-
-    occlusion_exponent: float = 0.5
-    """Exponent of visibility shares; 0 turns occlusion off. Together with the trace factor, 1 gains 1.1 dB on one
-    capture at 10 % and loses up to 0.3 on another; 0.5 gains on all three that it was tried on."""
+    min_visibility: float = 1e-4
+    """Lower bound of a weight, relative to a Gaussian that is seen well. It is above 0, because real cameras may stand
+    elsewhere. 1e-2 loses 2 dB in a capture with its poses (fox, 10 %)."""
 
     # Neighbours and pairs (rounds.py, matching.py)
 
-    neighbours: int = 8
-    """Number of nearest centres that a Gaussian may be merged with."""
+    neighbours: int = 6
+    """Number of nearest centres that a Gaussian may be merged with. 8 are 0.1 dB worse, 12 0.4."""
 
     round_share: float = 0.4
     """Largest share of the remaining Gaussians that one round merges away. Smaller shares are greedier and measured
@@ -169,17 +125,11 @@ class MergeSettings:
     # Finish (finishing.py)
 
     finish_views: int = 8
-    """Number of views whose windows are compared; 0 turns renders off, so that members always change groups and the
-    finish is the default one. Of 6, 12 and 24, 12 are as good as 24, and 6 lose up to 0.2 dB."""
+    """Number of views whose windows are compared; 0 turns the step off. 4 lose up to 0.2 dB."""
 
-    default_depth_exponent: float = 0.15
-    """Depth exponent of scenes that are not rendered, and of the comparison with regrouped ones."""
-
-    depth_exponents: tuple[float, float, float] = (0.0, 0.15, 0.3)
-    """Depth exponents that are tried by renders, ascending."""
-
-    depth_exponent_margin: float = 0.15
-    """How far outside of ``depth_exponents`` the chosen one may lie."""
+    depth_exponent: float = 0.15
+    """The optical depth of a merged Gaussian is multiplied by its number of members to this power: merging spreads its
+    mass over a larger area, so that more of the background shows through. Choosing it for each scene gains nothing."""
 
     size_changes: tuple[float, float, float] = (-0.1, 0.0, 0.05)
     """Changes of the log-scales of merged Gaussians that are tried by renders, ascending."""

@@ -1,72 +1,70 @@
-"""Visibility: the share of each Gaussian's expected pixels that pictures really show. The rest is occluded.
+"""Visibility weight of each Gaussian: the pixels that it covers per unit of its own area. Errors count by it.
 
-A Gaussian of opacity a and area A at distance r is expected to cover ``a A / r^2`` pixels, up to a common factor. The
-rasterizer tells how many it covers: the sum over pixels of its blend weight, alpha times transmittance. The ratio of
-both, relative to that of Gaussians that nothing occludes, is the visibility share.
+The error that counts is per solid angle, not per squared metre, and only where something is seen. So both distance and
+occlusion matter, and a render tells both: a Gaussian covers the sum over pixels of its blend weight, alpha times
+transmittance. Divided by its opacity and area, that is large near the cameras, small far away, and 0 behind a wall.
+
+Pictures are small. 3DGS rasterizers widen every projected Gaussian by 0.3 pixels, which would make Gaussians below the
+size of a pixel seem large. The antialiased rasterizer lowers their opacity by as much, so it counts right.
+
+Where the scene tells where its photos were taken, the weight is multiplied by how much photos showed of the place
+(:mod:`~pointsplat_ns.looking.traces`).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.content import some_of
 from pointsplat_ns.looking.each_view import each_view
-from pointsplat_ns.looking.traces import means_around
-from pointsplat_ns.pruning.merging.settings import MergeSettings
+from pointsplat_ns.looking.traces import how_much_seen
+from pointsplat_ns.pruning.merging.participants import Participants
+from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
+from pointsplat_ns.pruning.merging.viewpoints import Viewpoints
 from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.views import Views
 
 
-@dataclass(frozen=True, eq=False)
-class PixelCounts:
-    """Pixels of each Gaussian, over all views."""
-
-    covered: Tensor  # [n] float64, pixels
-    expected: Tensor  # [n] float64, as if nothing were occluded, up to a common factor
-
-    def neighbourhood_shares(self, settings: MergeSettings) -> Tensor:
-        """Visibility factor of the neighbourhood of each Gaussian along the curve, (n,) float32 in (0, 1]."""
-        covered, expected = (
-            means_around(pixels, settings.occlusion_neighbours) for pixels in (self.covered, self.expected)
-        )
-        return _visibility(covered, expected, settings.min_share_neighbours, settings)
-
-    def single_shares(self, settings: MergeSettings) -> Tensor:
-        """Visibility factor of each Gaussian by itself, (n,) float32 in (0, 1]."""
-        return _visibility(self.covered, self.expected, settings.min_share_single, settings)
+def visibility_weights(participants: Participants, viewpoints: Viewpoints | None, settings: MergeSettings) -> Tensor:
+    """Weights of the participants, (n,) float32, up to a common factor; 1 for all without viewpoints. In a large scene,
+    one of several participants along the curve is drawn for all of them."""
+    scene, members = participants.scene, participants.members
+    if viewpoints is None:
+        return torch.ones(len(members))
+    step = -(-len(members) // settings.max_count_drawn)
+    drawn, rows = (scene, members) if step == 1 else (some_of(scene, members, step), torch.arange(-(-len(members) // step)))
+    weights = covered_per_area(participants.in_units(drawn), rows, viewpoints.views, settings)
+    weights = weights.repeat_interleave(step)[: len(members)]
+    return weights * how_much_seen(scene, members) if viewpoints.photos_found else weights
 
 
-def count_pixels(
-    scene: Gaussians, members: Tensor, weights: Tensor, views: Views, settings: MergeSettings
-) -> PixelCounts:
-    """Count the pixels of some Gaussians in small pictures.
+def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: MergeSettings = DEFAULTS) -> Tensor:
+    """Covered pixels of some Gaussians over opacity times area, relative to one that is seen well.
 
     Args:
         scene: N Gaussians on the CPU.
-        members: (n,) indices, n at least 1, in an order in which neighbours are near each other.
-        weights: (n,) pixels of a unit of area at each member, up to a common factor; see
-            :mod:`~pointsplat_ns.pruning.merging.viewpoints`.
+        rows: (n,) indices, n at least 1.
         views: of the scene, in its own unit.
-        settings: ``occlusion_views`` and ``occlusion_side``.
+        settings: ``visibility_views``, ``visibility_side``, ``well_seen_quantile`` and ``min_visibility``.
+
+    Returns:
+        (n,) float32 in [``min_visibility``, 1 / ``min_visibility``]; 1 for all if no view shows enough to tell.
     """
     covered = torch.zeros(len(scene), dtype=torch.float64)
-    small = views.spread(settings.occlusion_views).resized(settings.occlusion_side)
+    small = views.spread(settings.visibility_views).resized(settings.visibility_side)
+    small = replace(small, rasterize_mode="antialiased")
     for pixels in each_view(list(small), len(scene), lambda view: pixels_of(scene, view)):
         covered += pixels
-    stds = scene.stds[members].double().sort(dim=1).values
-    expected = weights.double() * scene.alphas[members].double() * stds[:, 1] * stds[:, 2]
-    return PixelCounts(covered[members], expected.nan_to_num(0.0, 0.0, 0.0))
+    stds = scene.stds[rows].double().sort(dim=1).values
+    area = (scene.alphas[rows].double() * stds[:, 1] * stds[:, 2]).nan_to_num(0.0, 0.0, 0.0)
+    ratios = covered[rows] / area.clamp_min(torch.finfo(torch.float64).tiny)
+    well_seen = ratios.sort().values[int(settings.well_seen_quantile * (len(ratios) - 1))]
+    if not 0 < float(well_seen) < math.inf:
+        return torch.ones(len(ratios))
+    return (ratios / well_seen).clamp(settings.min_visibility, 1 / settings.min_visibility).float()
 
-
-def _visibility(covered: Tensor, expected: Tensor, minimum: float, settings: MergeSettings) -> Tensor:
-    """Shares of expected pixels that are covered, relative to those not occluded, to the power of
-    ``occlusion_exponent``; 1 for all if no view shows enough to tell."""
-    shares = covered / expected.clamp_min(torch.finfo(torch.float64).tiny)
-    unoccluded = shares.sort().values[int(settings.unoccluded_quantile * (len(shares) - 1))]
-    if not 0 < float(unoccluded) < math.inf:
-        return torch.ones(len(shares))
-    return (shares / unoccluded).clamp(minimum, 1.0).pow(settings.occlusion_exponent).float()
