@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -14,9 +15,8 @@ from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.io.camera_files import read_views, transforms_beside
 from pointsplat_ns.io.runs import CONFIG_NAME, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
-from pointsplat_ns.pruning.merging.viewpoints import in_picture
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
-from pointsplat_ns.views import Views
+from pointsplat_ns.views import View, Views
 
 LONGEST_SIDE = 1600
 """Maximum of the longer side of pictures, pixels. 3DGS training reduces photos to as much."""
@@ -97,13 +97,21 @@ def need_seen(scene: Gaussians, views: Views, poses: Path | str) -> None:
     away = (invert_rigid(checked.viewmats.double())[:, :3, 3] - 0.5 * (low + high)).norm(dim=1)
     across = checked.Ks[:, 0, 0].double() * (high - low).norm()  # pixels, at a distance of 1
     large = (across >= _SMALLEST * checked.width * away) | bool((low == high).all())
-    seeing = sum(bool(in_picture(means, view).any()) for view, shown in zip(checked, large, strict=True) if shown)
+    seeing = sum(bool(_in_picture(means, view).any()) for view, shown in zip(checked, large, strict=True) if shown)
     if 2 * seeing < len(checked):
         raise DataError(
             f"{poses}: {seeing} of {len(checked)} cameras see anything of the scene; expected at least half; poses and "
             "scene are probably in different frames: nerfstudio moves and scales scenes, and its run says how in "
             "dataparser_transforms.json; put that file beside the scene"
         )
+
+
+def _in_picture(means: Tensor, view: View) -> Tensor:
+    """Whether positions (N, 3) are in front of a camera and in its picture, (N,) bool."""
+    at = means @ view.viewmat[:3, :3].to(means).T + view.viewmat[:3, 3].to(means)
+    x, y, w = (at @ view.K.to(means).T).unbind(1)
+    # Multiplied by the depth, so that nothing is divided by it.
+    return (w > 0) & (x >= 0) & (x <= view.width * w) & (y >= 0) & (y <= view.height * w)
 
 
 def _transforms_of(scene: Path) -> Path | None:

@@ -6,13 +6,12 @@ import math
 
 import pytest
 import torch
-from upright_scenes import room
 
 from making import EYES, ball, normal_scene, photographed
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.looking.poses import look_at
-from pointsplat_ns.looking.sampling import is_room, sample_views, views_about
+from pointsplat_ns.looking.sampling import sample_views, views_about
 from pointsplat_ns.looking.traces import MOST_FACTOR, correlation, how_much_seen, log_norms, photo_places
 from pointsplat_ns.pruning.merging import merge
 from pointsplat_ns.rasterizer import render
@@ -213,26 +212,6 @@ def test_extremes_stay_within_bounds(dtype):
         seen = how_much_seen(scene.replace(features_rest=rest, scales=scales), torch.arange(2000))
         assert bool(seen.isfinite().all())
         assert float(seen.log().abs().max()) <= MOST_FACTOR + 1e-5
-
-
-def test_merging_keeps_more_where_photos_showed_more():
-    viewmats = look_at(torch.tensor([[50.0, 50.0, -400.0]]).double(), torch.full((1, 3), 50.0).double())
-    K = torch.tensor([[[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]]).double()
-    both = Views(viewmats, K, 64, 48, torch.zeros(3))
-    kept, even = (merge(halves(factor), 400, views=both).scene.means[:, 0] < 50 for factor in (10.0, 1.0))
-    assert int(kept.sum()) > 1.2 * int(even.sum())
-
-
-def test_merging_keeps_more_of_what_is_flat_in_a_room_that_tells_nothing_else():
-    walls = room()
-    left = walls.means[:, 0] < 0
-    flat, round_ = walls.scales.clone(), walls.scales.clone()
-    thinner = torch.where(left, math.log(0.005), math.log(0.05))[:, None]
-    half = torch.where(flat < math.log(0.05), thinner.expand_as(flat), flat)
-    even = torch.where(round_ < math.log(0.05), math.log(0.02), round_)
-    assert is_room(walls) and photo_places(walls.replace(scales=half)) is None
-    kept = [float((merge(walls.replace(scales=s), 500).scene.means[:, 0] < 0).float().mean()) for s in (half, even)]
-    assert kept[0] > kept[1] + 0.02
 
 
 def test_merging_keeps_more_where_sh_tell_that_photos_looked():

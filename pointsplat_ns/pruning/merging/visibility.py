@@ -37,8 +37,9 @@ def visibility_weights(participants: Participants, viewpoints: Viewpoints | None
     if viewpoints is None:
         return torch.ones(len(members))
     step = -(-len(members) // settings.max_count_drawn)
-    drawn, rows = (scene, members) if step == 1 else (some_of(scene, members, step), torch.arange(-(-len(members) // step)))
-    weights = covered_per_area(participants.in_units(drawn), rows, viewpoints.views, settings)
+    rows = members if step == 1 else torch.arange(-(-len(members) // step))
+    drawn = participants.in_units(scene if step == 1 else some_of(scene, members, step))
+    weights = covered_per_area(drawn, rows, viewpoints.views, settings)
     weights = weights.repeat_interleave(step)[: len(members)]
     return weights * how_much_seen(scene, members) if viewpoints.photos_found else weights
 
@@ -67,4 +68,3 @@ def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: Mer
     if not 0 < float(well_seen) < math.inf:
         return torch.ones(len(ratios))
     return (ratios / well_seen).clamp(settings.min_visibility, 1 / settings.min_visibility).float()
-

@@ -1,4 +1,4 @@
-"""The choice of two numbers by renders."""
+"""The choice of a size change by renders."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import math
 import pytest
 
 from making import ball
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.windows import WindowRenders
 from pointsplat_ns.pruning.merging.finishing import Finish, best_finish, top_of_parabola
+from pointsplat_ns.pruning.merging.settings import DEFAULTS
 
 
 @pytest.mark.parametrize(
@@ -38,44 +38,32 @@ def test_not_a_number_is_never_chosen():
     assert math.isfinite(top_of_parabola((0.0, 1.0, 2.0), [math.nan, 1.0, 2.0], 0.5))
 
 
-def faded(dense: Gaussians, opacity: float, size: float):
-    """A function from a finish to the scene as if one step too faint and too small."""
-
-    def make(finish: Finish) -> Gaussians:
-        return dense.replace(
-            opacities=dense.opacities + 20 * (finish.depth_exponent - opacity),
-            scales=dense.scales + finish.size_change - size,
-        )
-
-    return make
-
-
-@pytest.mark.parametrize(("opacity", "size"), [(0.1, -0.04), (0.25, 0.03), (0.0, 0.0)])
-def test_the_numbers_that_undo_a_known_change_are_found(opacity, size):
+@pytest.mark.parametrize("change", [-0.08, -0.04, 0.03, 0.0])
+def test_the_size_change_that_undoes_a_known_one_is_found(change):
     dense = ball(500)
-    reference, make = WindowRenders(dense, sample_views(dense, 3, width=96, height=72)), faded(dense, opacity, size)
-    found = best_finish(lambda finish: reference.psnr(make(finish)))
-    assert found.psnr >= found.psnr_before
-    assert reference.psnr(make(found)) == pytest.approx(found.psnr)
-    assert found.size_change == pytest.approx(size, abs=0.03) or found.psnr > found.psnr_before + 3
+    reference = WindowRenders(dense, sample_views(dense, 3, width=96, height=72))
 
-
-@pytest.mark.parametrize(("top", "exponents"), [(0.2, {0.2}), (-0.1, {-0.1, 0.0}), (0.4, {0.4, 0.3})])
-def test_sizes_are_tried_at_the_top_and_outside_of_the_trials_at_the_nearest_trial_as_well(top, exponents):
-    tried = []
-
-    def psnr_of(finish: Finish) -> float:
-        tried.append(finish)
-        return 30 - (finish.depth_exponent - top) ** 2 - finish.size_change**2
+    def psnr_of(trial: float) -> float:
+        return reference.psnr(dense.replace(scales=dense.scales + trial - change))
 
     found = best_finish(psnr_of)
-    assert {round(finish.depth_exponent, 9) for finish in tried if finish.size_change} == exponents
-    assert (found.depth_exponent, found.size_change) == pytest.approx((top, 0.0)) and found.psnr == pytest.approx(30)
-    assert len(tried) == len(set(tried)), "rendered twice"
+    assert found.psnr_before == psnr_of(0.0) <= found.psnr == psnr_of(found.size_change)
+    assert found.size_change == pytest.approx(change, abs=0.03)
+
+
+def test_the_top_of_the_trials_is_tried_too():
+    tried = []
+
+    def psnr_of(change: float) -> float:
+        tried.append(change)
+        return 30 - (change + 0.06) ** 2
+
+    found = best_finish(psnr_of)
+    assert found.size_change == pytest.approx(-0.06) and found.psnr == pytest.approx(30)
+    assert tried == [*DEFAULTS.size_changes, pytest.approx(-0.06)]
 
 
 def test_the_note_is_one_line():
-    assert Finish(0.2, math.log(0.95), 31.0, 30.0).note == (
-        "merged: optical depth x members^0.20, sizes x 0.950, chosen by renders: 30.00 -> 31.00 dB"
-    )
+    note = Finish(math.log(0.95), 31.0, 30.0).note
+    assert note == "merged: sizes x 0.950, chosen by renders: 30.00 -> 31.00 dB"
     assert Finish().note.endswith("by default")

@@ -1,0 +1,143 @@
+"""Visibility weights: covered pixels per area, by distance, occlusion and traces."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from making import ball, cloud, normal_scene, photographed
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.content import content_size, in_units, views_in_units
+from pointsplat_ns.looking.poses import look_at
+from pointsplat_ns.pruning.merging import DEFAULTS, merge, visibility
+from pointsplat_ns.pruning.merging.participants import Participants
+from pointsplat_ns.pruning.merging.viewpoints import Viewpoints, sampled_viewpoints
+from pointsplat_ns.pruning.merging.visibility import covered_per_area, visibility_weights
+from pointsplat_ns.views import Views
+
+
+def of_origin(*eyes: tuple[float, float, float], width: int = 64, height: int = 48) -> Views:
+    """Views of the origin."""
+    at = torch.tensor(eyes).double()
+    K = torch.tensor([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]]).double()
+    return Views(look_at(at, torch.zeros_like(at)), K.repeat(len(eyes), 1, 1), width, height, torch.zeros(3))
+
+
+def wall(z: float, rows: int = 32, size: float = 2.0) -> Gaussians:
+    """A wall of flat, opaque Gaussians that touch each other."""
+    line = torch.linspace(-1, 1, rows)
+    across = torch.cartesian_prod(line, line) * size / 2
+    scene = ball(len(across), 0)
+    return scene.replace(
+        means=torch.cat([across, torch.full((len(across), 1), z)], dim=1),
+        scales=torch.tensor([size / rows, size / rows, 0.01]).log().expand(len(across), 3),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(len(across), 4),
+        opacities=torch.full((len(across), 1), 4.0),
+    )
+
+
+def joined(*scenes: Gaussians) -> Gaussians:
+    return Gaussians(*(torch.cat(values) for values in zip(*(scene.tensors() for scene in scenes), strict=True)))
+
+
+def two_walls() -> Gaussians:
+    """Two walls, one behind the other, alike to the last digit in all else."""
+    return joined(wall(-0.5), wall(0.5))
+
+
+def weights_of(scene: Gaussians, views: Views) -> torch.Tensor:
+    return covered_per_area(scene, torch.arange(len(scene)), views)
+
+
+def aside(scene: Gaussians, x: float) -> Gaussians:
+    return scene.replace(means=scene.means + torch.tensor([x, 0.0, 0.0]))
+
+
+def test_weights_fall_with_the_square_of_the_distance():
+    near, far = weights_of(joined(aside(wall(0), -1.2), aside(wall(4), 1.2)), of_origin((0, 0, -4))).chunk(2)
+    assert float(near.median() / far.median()) == pytest.approx(4, rel=0.1)
+
+
+@pytest.mark.parametrize("rows", [16, 64, 256])
+def test_weights_hardly_depend_on_the_size_of_gaussians_even_below_a_pixel(rows):
+    """Of 256 in a row, each is 0.2 pixels large. Widened by 0.3 pixels, it would weigh ten times as much."""
+    coarse, fine = aside(wall(0, rows=16), -1.2), aside(wall(0, rows=rows), 1.2)
+    found = weights_of(joined(coarse, fine), of_origin((0, 0, -4)))
+    assert 0.5 < float(found[256:].median() / found[:256].median()) < 2
+
+
+def test_an_occluded_gaussian_has_a_small_weight():
+    front, back = weights_of(two_walls(), of_origin((0, 0, -4))).chunk(2)
+    assert front.dtype == torch.float32 and float(back.median()) < 0.1 * float(front.median())
+
+
+def test_a_gaussian_outside_of_all_pictures_has_the_smallest_weight():
+    scene = joined(wall(0.0), wall(0.0).replace(means=wall(0.0).means + torch.tensor([0, 0, -20.0])))
+    _, behind = weights_of(scene, of_origin((0, 0, -4))).chunk(2)
+    assert behind.tolist() == pytest.approx([DEFAULTS.min_visibility] * len(behind))
+
+
+def test_merging_keeps_visible_gaussians_rather_than_occluded_ones():
+    kept = merge(two_walls(), 600, views=of_origin((0, 0, -4), (1, 0, -4), (0, 1, -4))).scene
+    front = int((kept.means[:, 2] < 0).sum())
+    assert len(kept) == 600 and front > 1.5 * (600 - front)
+
+
+@pytest.mark.parametrize("max_count", [2048, 700, 3])  # of more, some are drawn for all
+def test_in_a_large_scene_some_gaussians_are_drawn_for_all(max_count):
+    scene = two_walls()
+    participants = Participants.of(scene, torch.arange(len(scene)))
+    viewpoints = Viewpoints(views_in_units(of_origin((0, 0, -4)), participants.centre, participants.size))
+    found = visibility_weights(participants, viewpoints, replace(DEFAULTS, max_count_drawn=max_count))
+    assert found.shape == (len(scene),)
+    front = scene.means[participants.members, 2] < 0
+    if max_count > 3:
+        assert float(found[front].mean()) > 1.5 * float(found[~front].mean())
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
+@pytest.mark.parametrize("case", ["normal", "wild scales", "transparent", "no view"])
+def test_weights_are_bounded_whatever_the_scene(dtype, case):
+    scene = Gaussians(*(value.to(dtype) for value in normal_scene(400, degree=0).tensors()))
+    if case == "wild scales":
+        wild = scene.scales.clone()
+        wild[:100], wild[100:200, 0], wild[200:300] = -math.inf, math.inf, torch.finfo(dtype).max
+        scene = scene.replace(scales=wild)
+    if case == "transparent":
+        scene = scene.replace(opacities=torch.full_like(scene.opacities, -math.inf))
+    views = of_origin((0, -6, 1))[[]] if case == "no view" else of_origin((0, -6, 1))
+    found = weights_of(scene, views)
+    least = DEFAULTS.min_visibility
+    assert found.shape == (400,) and bool(((found >= 0.999 * least) & (found <= 1.001 / least)).all())
+    if case in ("transparent", "no view"):  # nothing is known
+        assert found.tolist() == [1.0] * 400
+
+
+@pytest.mark.parametrize("found_photos", [True, False])
+def test_traces_count_where_the_scene_tells_of_its_photos(monkeypatch, found_photos):
+    monkeypatch.setattr(visibility, "covered_per_area", lambda scene, rows, views, settings: torch.full((30,), 0.5))
+    monkeypatch.setattr(visibility, "how_much_seen", lambda scene, members: torch.full((30,), 16.0))
+    viewpoints = Viewpoints(of_origin((0, -6, 1)), photos_found=found_photos)
+    found = visibility_weights(Participants.of(cloud(30), torch.arange(30)), viewpoints, DEFAULTS)
+    assert found.tolist() == [8.0 if found_photos else 0.5] * 30
+
+
+def test_without_viewpoints_all_weights_are_equal():
+    assert visibility_weights(Participants.of(cloud(30), torch.arange(30)), None, DEFAULTS).tolist() == [1.0] * 30
+
+
+def test_without_a_free_place_there_are_no_viewpoints():
+    fog = ball(200)
+    fog = fog.replace(opacities=torch.full((200, 1), -math.inf))
+    assert sampled_viewpoints(fog, 32, 24, DEFAULTS) is None
+
+
+def test_photo_places_are_found_unless_that_is_turned_off():
+    content = photographed()
+    content = in_units(content, *content_size(content))
+    settings = replace(DEFAULTS, sampled_views=2)
+    assert sampled_viewpoints(content, 32, 24, settings).photos_found
+    assert not sampled_viewpoints(content, 32, 24, replace(settings, find_photo_places=False)).photos_found
