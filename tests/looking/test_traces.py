@@ -11,7 +11,7 @@ from making import EYES, ball, normal_scene, photographed
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.looking.poses import look_at
-from pointsplat_ns.looking.sampling import sample_views, views_about
+from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.traces import MOST_FACTOR, correlation, how_much_seen, log_norms, photo_places
 from pointsplat_ns.pruning.merging import merge
 from pointsplat_ns.rasterizer import render
@@ -184,13 +184,11 @@ def test_without_sh_flatness_counts_squared():
 
 
 def test_views_of_a_scene_without_sh_are_sampled_where_sizes_tell():
-    scene = grown_from(torch.tensor([1.5, 0.0, 0.0]))
-    towards = []
-    for views in (sample_views(scene, 6, 64, 48), views_about(scene, None, 6, 64, 48)):
-        assert len(views) == 6
-        eyes = invert_rigid(views.viewmats[::2])[:, :3, 3]  # every other one is near where photos were taken
-        towards.append(float((eyes[:, 0] / eyes.norm(dim=1)).mean()))
-    assert towards[0] > 0.7 and towards[0] > towards[1] + 0.3
+    eye = torch.tensor([1.5, 0.0, 0.0])
+    views = sample_views(grown_from(eye), 6, 64, 48)
+    assert len(views) == 6
+    eyes = invert_rigid(views.viewmats[::2])[:, :3, 3]  # every other one is near where photos were taken
+    assert float((eyes[:, 0] / eyes.norm(dim=1)).mean()) > 0.7
 
 
 def test_all_is_seen_alike_if_nothing_tells():
