@@ -172,7 +172,7 @@ def test_distributions_are_numbers_and_a_picture(scene, tmp_path):
 
 
 def test_what_merging_chose_for_the_scene_is_noted(scene):
-    assert [note for note in pruned(scene, None, 30).notes if note.startswith("merged: optical depth")]
+    assert [note for note in pruned(scene, None, 30).notes if note.startswith("merged: sizes x")]
 
 
 def test_merging_looks_from_the_views_that_are_given_and_from_no_others(scene, views):
