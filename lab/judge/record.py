@@ -1,7 +1,7 @@
-"""The record of what benchmarks/judge.py measured: rows as JSON, tables as a page, and the table of the README.
+"""The record of what lab/judge/judge.py measured: rows as JSON, tables as a page, and the table of the README.
 
-    python benchmarks/judge_record.py judge.json judge_photos.json                            # takes new rows
-    python benchmarks/judge_record.py docs/record/judge.json docs/record/judge_photos.json    # writes the tables again
+    python -m lab.judge.record judge.json judge_photos.json                            # takes new rows
+    python -m lab.judge.record docs/record/judge.json docs/record/judge_photos.json    # writes the tables again
 
 Rows of camera paths go to ``judge.json``, rows of held-out photos to ``judge_photos.json``. Both are files that
 ``judge.py --resume`` takes up. A scene counts at a budget once prune, compact and a mode of splat-transform are there.
@@ -15,14 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from compaction_tables import Row, group_of, grouped, summary
-from judge_scenes import LPIPS_WIDTH, MEASURES, PHOTOS
-from judge_tables import AHEAD, all_leads, at_order, means
 
+from lab.common.printing import markdown
+from lab.common.results import Row, grouped
+from lab.common.scenes import group_of
+from lab.judge.scenes import LPIPS_WIDTH, MEASURES, PHOTOS
+from lab.judge.tables import AHEAD, all_leads, at_order, means, summary
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.tables.splat_transform import NAME
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 OURS = ("prune", "compact")
 """Our ways, as rows call them."""
@@ -40,8 +42,8 @@ START, END = "<!-- judge -->", "<!-- /judge -->"
 
 PAGE = """# What smaller scenes lose
 
-`benchmarks/judge_record.py` writes this page from [judge.json](judge.json) and [judge_photos.json](judge_photos.json),
-which `benchmarks/judge.py` measured. [benchmarks.md](../benchmarks.md#a-judge-that-is-not-the-defendant) says how.
+`lab/judge/record.py` writes this page from [judge.json](judge.json) and [judge_photos.json](judge_photos.json), which
+`lab/judge/judge.py` measured. [benchmarks.md](../benchmarks.md#a-judge-that-is-not-the-defendant) says how.
 
 - Splats are judged in at most {views} views of a camera path that was written by hand, at several widths.
 - Captures are judged in the poses of at most {views} held-out photos, at the size of the photos.
@@ -147,7 +149,7 @@ class Figures:
 
     def lead(self, method: str, at: int | str, column: str) -> dict[float, tuple[float, float, str]]:
         """By budget: mean lead of a way in dB, the least one, and the scene that has it."""
-        lines = list(summary(self.leads.get((method, at), []), column, together=True))
+        lines = list(summary(self.leads.get((method, at), []), column))
         if not lines:
             return {}
         (_, mean, _), (_, least, scenes) = lines[-2:]
@@ -199,7 +201,7 @@ SCENES = f"""No constant is chosen on scenes of the list "judged". Scenes of no 
 because a judged scene had shown the need; their constants come from scenes for tuning: repairs hold from nearer places
 (rock), merging holds before a white background (ethiopianHead), repairs take no views that large Gaussians fill
 (apt_kitchen_balcony).
-[benchmarks.md](../benchmarks.md#merging-beside-splat-transform) says where the scenes come from.
+[benchmarks.md](../benchmarks.md#scenes) says where the scenes come from.
 The network that sets the steps of `compact` was trained on {", ".join(LEARNED)}."""
 
 TIME = """CPU seconds and peak memory of one process, with starting, reading and writing: mean and largest over scenes.
@@ -213,7 +215,7 @@ def _scene_table(rows: list[Row], figures: Figures) -> str:
         kept = ", ".join(_share(keep) for keep in sorted(there, reverse=True)) or "none yet"
         where = "held-out photos" if at else "camera path"
         lines.append([scene, f"{same[0]['gaussians']:,}", where, group_of(scene) or "other", kept])
-    return table(["scene", "Gaussians", "views", "list", "budgets measured"], lines)
+    return markdown(["scene", "Gaussians", "views", "list", "budgets measured"], lines)
 
 
 def _mean_table(figures: Figures, at: int | str, column: str, digits: int) -> str:
@@ -224,7 +226,7 @@ def _mean_table(figures: Figures, at: int | str, column: str, digits: int) -> st
             if column in mean:
                 values = [f"{mean[name]:.{digits}f}" for name in (column, f"{column}_median", f"{column}_worst")]
                 lines.append([_share(keep), _way(way), *values, mean[f"{column}_worst_scene"], str(mean["scenes"])])
-    return table(["kept", "way", "mean", "median", "worst", "of", "scenes"], lines) if lines else ""
+    return markdown(["kept", "way", "mean", "median", "worst", "of", "scenes"], lines) if lines else ""
 
 
 def _lead_table(figures: Figures, at: int | str, column: str) -> str:
@@ -239,7 +241,7 @@ def _lead_table(figures: Figures, at: int | str, column: str) -> str:
             ]
             lines.append([_share(keep), *cells])
     heads = ["kept", f"`prune` over {NAME}", "worst", "`compact` over `prune`", "worst"]
-    return table(heads, lines) if lines else ""
+    return markdown(heads, lines) if lines else ""
 
 
 def _cost_table(figures: Figures) -> str:
@@ -253,7 +255,7 @@ def _cost_table(figures: Figures) -> str:
                     seconds = [f"{mean[f'cpu_seconds{end}']:.0f}" for end in ("", "_worst")]
                     memory = [f"{1e-9 * mean[f'peak_bytes{end}']:.2f}" for end in ("", "_worst")]
                     lines.append([name, _share(keep), _way(way), *seconds, *memory])
-    return table(["scenes", "kept", "way", "CPU s", "largest", "GB", "largest"], lines) if lines else ""
+    return markdown(["scenes", "kept", "way", "CPU s", "largest", "GB", "largest"], lines) if lines else ""
 
 
 def readme_table(rows: list[Row]) -> str:
@@ -271,7 +273,7 @@ def readme_table(rows: list[Row]) -> str:
     for method, what in (("prune", "worst lead of `prune`"), ("compact", "worst gain by `compact`")):
         worst = [figures.worst_lead(method, keep, figures.ats) for keep in figures.keeps]
         lines.append([what, *("-" if lead is None else f"{lead[0]:+.1f} ({lead[1]}, {lead[2]})" for lead in worst)])
-    return table(["kept", *map(_share, figures.keeps)], lines)
+    return markdown(["kept", *map(_share, figures.keeps)], lines)
 
 
 def put_between(text: str, new: str, path: Path) -> str:
@@ -284,12 +286,6 @@ def put_between(text: str, new: str, path: Path) -> str:
         raise SystemExit(f"{path}: expected {START} and then {END}, once each")
     before, rest = text.split(START)
     return f"{before}{START}\n\n{new}\n\n{END}{rest.split(END)[1]}"
-
-
-def table(heads: list[str], lines: list[list[str]]) -> str:
-    """A Markdown table."""
-    rows = ["| " + " | ".join(cells) + " |" for cells in (heads, *lines)]
-    return "\n".join([rows[0], "|" + "---|" * len(heads), *rows[1:]])
 
 
 def _count(scenes: str) -> str:

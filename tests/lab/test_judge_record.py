@@ -1,4 +1,4 @@
-"""benchmarks/judge_record.py: which rows count, what tables say of them, and what is written."""
+"""lab/judge/record.py: which rows count, what tables say of them, and what is written."""
 
 from __future__ import annotations
 
@@ -8,12 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from lab.judge import record
+
 A, B = "splat-transform 3.7.0 -d", "splat-transform 2.7.1"
-
-
-@pytest.fixture(scope="module")
-def record(benchmark):
-    return benchmark("judge_record")
 
 
 def row(scene: str, method: str, covered: float | None, at: int | str = 960, keep: float = 0.1, **more: object) -> dict:
@@ -37,7 +34,7 @@ def lines_of(text: str) -> list[list[str]]:
     return [line.strip("| ").split(" | ") for line in text.splitlines()]
 
 
-def test_a_scene_counts_at_a_budget_once_all_ways_are_there(record):
+def test_a_scene_counts_at_a_budget_once_all_ways_are_there():
     whole = scene("rock", 30.0, 31.0, 28.0, 29.0)
     half = scene("lounge", 30.0, 31.0, 28.0, 29.0)[:3]  # one mode of splat-transform is enough
     no_compact = [entry for entry in scene("diorama", 1.0, 2.0, 3.0, 4.0) if entry["method"] != "compact"]
@@ -46,14 +43,14 @@ def test_a_scene_counts_at_a_budget_once_all_ways_are_there(record):
     assert record.complete([*whole, *half, *no_compact, *failed]) == [*whole, *half]
 
 
-def test_the_best_mode_is_chosen_by_each_measure_and_costs_are_of_the_best_psnr(record):
+def test_the_best_mode_is_chosen_by_each_measure_and_costs_are_of_the_best_psnr():
     rows = [row("rock", A, 28.0, dense_lpips=0.1, cpu_seconds=5.0), row("rock", B, 29.0, dense_lpips=0.2)]
     [best] = record.best_peers([*rows, row("rock", "prune", 40.0)])
     assert (best["method"], best["covered_psnr"], best["dense_lpips"]) == ("splat-transform", 29.0, 0.1)
     assert best["cpu_seconds"] == 2.0 and best["photo_psnr"] is None
 
 
-def test_the_readme_has_means_of_three_ways_and_the_worst_lead_over_all_widths(record):
+def test_the_readme_has_means_of_three_ways_and_the_worst_lead_over_all_widths():
     rows = scene("rock", 30.0, 31.0, 28.0, 29.0) + scene("pc_playbot", 20.0, 24.0, 18.0, 16.0)
     rows += scene("rock", 30.0, 29.0, 31.5, 29.0, at=1920) + scene("rock", 40.0, 41.0, 38.0, 39.0, keep=0.5)
     rows += scene("lounge", 25.0, 26.0, 22.0, 23.0, at="photos")
@@ -68,7 +65,7 @@ def test_the_readme_has_means_of_three_ways_and_the_worst_lead_over_all_widths(r
     ]
 
 
-def test_the_page_has_means_leads_costs_and_failures(record):
+def test_the_page_has_means_leads_costs_and_failures():
     rows = scene("rock", 30.0, 31.0, 28.0, 29.0) + scene("pc_playbot", 20.0, 24.0, 18.0, 16.0)
     rows += scene("fox", 25.0, 26.0, 22.0, 23.0, at="photos", photo_psnr=21.0)
     rows.append(row("rock", A, 0.0, keep=0.03, failed="out of memory") | {"covered_psnr": None})
@@ -84,7 +81,7 @@ def test_the_page_has_means_leads_costs_and_failures(record):
     assert text.count("LPIPS against") == 2 and "PSNR against the photos" in text
 
 
-def test_rows_are_split_and_rounded_and_give_the_same_tables_again(record, tmp_path, capsys):
+def test_rows_are_split_and_rounded_and_give_the_same_tables_again(tmp_path, capsys):
     splats = write(tmp_path / "a.json", scene("rock", 30.12345, 31.0, 28.0, 29.0))
     photos = write(tmp_path / "b.json", scene("lounge", 25.0, 26.0, 22.0, 23.0, at="photos"))
     folder, readme = tmp_path / "record", tmp_path / "README.md"
@@ -101,7 +98,7 @@ def test_rows_are_split_and_rounded_and_give_the_same_tables_again(record, tmp_p
     assert (folder / "judge.md").read_text() == page and readme.read_text() == said
 
 
-def test_what_cannot_be_recorded_is_an_error_and_changes_nothing(record, tmp_path):
+def test_what_cannot_be_recorded_is_an_error_and_changes_nothing(tmp_path):
     whole = write(tmp_path / "a.json", scene("rock", 30.0, 31.0, 28.0, 29.0))
     readme = tmp_path / "README.md"
     readme.write_text("no marks")
@@ -120,7 +117,7 @@ def test_what_cannot_be_recorded_is_an_error_and_changes_nothing(record, tmp_pat
     assert not (tmp_path / "record").exists() and readme.read_text() == "no marks"
 
 
-def test_the_record_that_is_committed_is_small_and_its_tables_are_up_to_date(record):
+def test_the_record_that_is_committed_is_small_and_its_tables_are_up_to_date():
     folder = record.ROOT / "docs" / "record"
     files = [folder / "judge.json", folder / "judge_photos.json"]
     assert all(path.stat().st_size < 200_000 for path in files)

@@ -1,24 +1,33 @@
-"""Tables of benchmarks/judge.py: each scene; mean, median and worst over scenes; and who is ahead of whom."""
+"""Tables of the judge: each scene; mean, median and worst over scenes; and who is ahead of whom."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from statistics import fmean, median
 from typing import Any
 
-from compaction_tables import JUDGED, SHOWN, TUNING, Row, group_of, grouped, leads, number, summary, table_of_leads
-from judge_paths import path_of
-from judge_scenes import MEASURES, PHOTOS
-from processes import WAYS
 from rich.table import Table
 
+from lab.common.compare import METRICS
+from lab.common.printing import megabytes, number
+from lab.common.results import Row, grouped
+from lab.common.scenes import JUDGED, TUNING, group_of
+from lab.common.ways import WAYS
+from lab.judge.camera_paths import path_of
+from lab.judge.scenes import MEASURES, PHOTOS
 from pointsplat_ns.tables.splat_transform import NAME
 
 COSTS = ("seconds", "cpu_seconds", "peak_bytes")
 """What making a scene smaller took."""
 
-HEADS = {"covered_psnr": ("covered PSNR", number(2))} | {
-    name: SHOWN[name] for name in (*MEASURES, "count", *COSTS) if name in SHOWN
+HEADS: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "covered_psnr": ("covered PSNR", number(2)),
+    **{f"dense_{name}": (name.upper(), number(2 if name == "psnr" else 3)) for name in METRICS},
+    **{f"photo_{name}": (f"photo {name.upper()}", number(2 if name == "psnr" else 3)) for name in METRICS},
+    "count": ("splats", number(0)),
+    "seconds": ("s", number(1)),
+    "cpu_seconds": ("CPU s", number(1)),
+    "peak_bytes": ("MB", megabytes),
 }
 """Columns by what a row calls them: their heads, and how a value is written."""
 
@@ -27,6 +36,9 @@ AHEAD = {"covered_psnr": "against the dense scene's renders", "photo_psnr": "aga
 
 BEHIND = {"prune": None, "compact": ("prune",)}
 """Whose leads are told, and over whom; None: over all modes of splat-transform."""
+
+Line = tuple[str, dict[float, float], dict[float, str]]
+"""A line of a table of leads: its name, dB by budget, and what stands beside them."""
 
 
 def at_order(at: int | str) -> tuple[bool, int | str]:
@@ -68,13 +80,63 @@ def means(rows: list[Row]) -> list[Row]:
     return result
 
 
+def leads(rows: list[Row], method: str, rivals: tuple[str, ...] | None) -> list[Row]:
+    """How far a method is ahead, in dB, of the best of others at each scene and budget.
+
+    Args:
+        rows: of one width, one for each scene, budget and method.
+        method: whose lead it is.
+        rivals: the others, of which the best is chosen anew for each PSNR; None: all modes of splat-transform.
+
+    Returns:
+        A row for each scene and budget that has both.
+    """
+    result = []
+    for (scene, keep), same in grouped(rows, lambda row: (row["scene"], row["keep"])).items():
+        ours = [row for row in same if row["method"] == method]
+        peers = [row for row in same if (row["method"].startswith(NAME) if rivals is None else row["method"] in rivals)]
+        lead: Row = {"scene": scene, "keep": keep}
+        for column in AHEAD:
+            known = [row for row in peers if row[column] is not None]
+            if ours and ours[0][column] is not None and known:
+                best = max(known, key=lambda row: row[column])
+                lead |= {column: ours[0][column] - best[column], f"{column}_peer": best["method"]}
+        if len(lead) > 2:
+            result.append(lead)
+    return result
+
+
+def summary(found: list[Row], column: str) -> Iterator[Line]:
+    """Lines of a table of leads: those of each group of scenes, then its mean and its least lead with the scene that has
+    it; last, these of all scenes of several groups."""
+    groups = grouped(found, lambda lead: group_of(lead["scene"]))
+    for group, members in groups.items():
+        known = [lead for lead in members if column in lead]
+        for scene, same in grouped(known, lambda lead: lead["scene"]).items():
+            beside = {lead["keep"]: lead[f"{column}_peer"].removeprefix(NAME).strip() for lead in same}
+            yield scene, {lead["keep"]: lead[column] for lead in same}, beside
+        yield from _mean_and_worst(known, column, group)
+    if len(groups) > 1:
+        yield from _mean_and_worst([lead for lead in found if column in lead], column, "all")
+
+
+def _mean_and_worst(known: list[Row], column: str, name: str) -> Iterator[Line]:
+    """The last two lines of a group of scenes, in :func:`summary`; none if there is no lead."""
+    budgets = grouped(known, lambda lead: lead["keep"])
+    worst = {keep: min(same, key=lambda lead: lead[column]) for keep, same in budgets.items()}
+    if known:
+        yield f"{name} mean".strip(), {k: fmean(lead[column] for lead in same) for k, same in budgets.items()}, {}
+        least = {keep: lead[column] for keep, lead in worst.items()}
+        yield f"{name} worst".strip(), least, {keep: lead["scene"] for keep, lead in worst.items()}
+
+
 def all_leads(rows: list[Row]) -> list[Row]:
     """The leads of ``prune`` over the best mode of splat-transform, and of ``compact`` over ``prune``, in dB, for each
     scene, budget and width. The best mode is chosen anew for each of these and each PSNR."""
     found = []
     for at, same in grouped(rows, lambda row: row["at"]).items():
         for method, rivals in BEHIND.items():
-            found += [{"method": method, "at": at} | lead for lead in leads(same, method, tuple(AHEAD), rivals)]
+            found += [{"method": method, "at": at} | lead for lead in leads(same, method, rivals)]
     return found
 
 
@@ -92,7 +154,7 @@ def scene_table(rows: list[Row]) -> Table:
     for (at, keep), same in grouped(rows, lambda row: (row["at"], row["keep"])).items():
         for row in same:
             start = [str(at), f"{100 * keep:g} %"] if row is same[0] else ["", ""]
-            cells = ["-" if row.get(name) is None else HEADS[name][1](row[name]) for name in columns]
+            cells = [HEADS[name][1](row.get(name)) for name in columns]
             shown.add_row(*start, row["method"], *cells, end_section=row is same[-1])
     return shown
 
@@ -110,7 +172,7 @@ def mean_tables(rows: list[Row]) -> Iterator[Table]:
             for mean in members:
                 start = [group, f"{100 * keep:g} %"] if mean is members[0] else ["", ""]
                 cells = [_three(mean, column) for column in columns]
-                costs = [HEADS[name][1](mean[name]) if name in mean else "-" for name in ("seconds", "peak_bytes")]
+                costs = [HEADS[name][1](mean.get(name)) for name in ("seconds", "peak_bytes")]
                 worst = mean.get("covered_psnr_worst_scene", "-")
                 start += [mean["method"], str(mean["scenes"])]
                 shown.add_row(*start, *cells, worst, *costs, end_section=mean is members[-1])
@@ -124,10 +186,19 @@ def lead_tables(rows: list[Row]) -> Iterator[Table]:
         for at in sorted({at for found, at in by_kind if found == method}, key=at_order):
             for column, where in AHEAD.items():
                 over = f"the best mode of {NAME}" if rivals is None else " or ".join(rivals)
-                lines = list(summary(by_kind[method, at], column, together=True))
-                shown = table_of_leads(lines, f"{_at(at)}: {method} minus {over}, PSNR in dB {where}")
-                if shown is not None:
-                    yield shown
+                if lines := list(summary(by_kind[method, at], column)):
+                    yield _lead_table(lines, f"{_at(at)}: {method} minus {over}, PSNR in dB {where}")
+
+
+def _lead_table(lines: list[Line], title: str) -> Table:
+    shown = Table("scene", title=title)
+    keeps = sorted({keep for _, values, _ in lines for keep in values}, reverse=True)
+    for keep in keeps:
+        shown.add_column(f"{100 * keep:g} %")
+    for name, values, beside in lines:
+        cells = [f"{values[keep]:+.2f} {beside.get(keep, '')}".strip() if keep in values else "-" for keep in keeps]
+        shown.add_row(name, *cells, end_section=name.endswith("worst"))
+    return shown
 
 
 def scene_list() -> Table:

@@ -1,14 +1,30 @@
-"""The rows that a benchmark measures, in a file that is written anew after each scene and can be taken up again."""
+"""Results as JSON: whole files, and rows that are written after each scene and can be taken up again."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from compaction_tables import Row
-from options import write_whole
+from pointsplat_ns.io.files import replacing
+
+Row = dict[str, Any]
+
+
+def grouped(rows: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Row]]:
+    """Rows by a key, in the order that the keys come in."""
+    groups: dict[Any, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return groups
+
+
+def write_json(path: Path | None, content: Any) -> None:
+    """Write a JSON file whole or not at all; no path, no file."""
+    if path is not None:
+        with replacing(path) as part:
+            part.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
 
 
 class Results:
@@ -54,4 +70,4 @@ class Results:
     def put(self, name: str, rows: list[Row]) -> None:
         """Put rows of a scene in the place of those there are, and write."""
         self.rows = [row for row in self.rows if row["scene"] != name] + rows
-        write_whole(self.path, {"settings": self.settings, "rows": self.rows} | self.summarise(self.rows))
+        write_json(self.path, {"settings": self.settings, "rows": self.rows} | self.summarise(self.rows))

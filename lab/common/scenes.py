@@ -1,4 +1,4 @@
-"""What the benchmarks draw: a synthetic room of any number of Gaussians, and trained scenes with their own cameras."""
+"""Scenes to measure: which are for tuning and which judge, a synthetic room of any size, and trained scenes."""
 
 from __future__ import annotations
 
@@ -11,10 +11,34 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io import open_run, read_scene, scene_name
 
-SH_COEFFICIENTS = 16  # degree 3
+TUNING = (
+    *("apt_bathroom", "bouquet", "pc_flowers", "pc_statue_massa", "plant_pilea", "kettle_pod"),
+    *("pc_statue_angel", "pc_statue_narcissus", "kitchen", "fox", "final_3dgs", "vr_project", "room", "room5"),
+)
+"""Scenes that constants may be chosen on."""
+
+JUDGED = (
+    *("apt_kitchen_balcony", "cake_fraisier", "mujoco_tabletop", "pc_playbot", "rock", "pc_statue_angel_kneeling"),
+    *("pc_statue_angel_with_candlestick", "pc_statue_st_peter", "pc_statue_trumpet", "lounge", "diorama"),
+    *("ethiopianHead", "dataset_perso", "lego_dense"),
+)
+"""Scenes that no constant is chosen on: they were named before the first measurement. See docs/benchmarks.md."""
+
+SH_DEGREE = 3
 KEEP = 0.1
 """Share of a trained scene that its pruned case keeps: few, large and faint Gaussians."""
+
+
+def group_of(scene: str) -> str:
+    """ "tuning", "judged", or "" for any other scene."""
+    return "tuning" if scene in TUNING else "judged" if scene in JUDGED else ""
+
+
+def name_of(path: Path) -> str:
+    """The name of a scene in tables: that of a run, or of a PLY's file."""
+    return path.stem if path.suffix == ".ply" else scene_name(open_run(path))
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +62,8 @@ class Scene:
         return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
 
 
-def room(count: int, seed: int = 0) -> list[Tensor]:
-    """Means, quats, scales, opacities and SH (degree 3) on the six walls of a 6 x 3 x 6 room.
+def room(count: int, sh_degree: int = SH_DEGREE, seed: int = 0) -> Gaussians:
+    """A synthetic scene: Gaussians on the six walls of a 6 x 3 x 6 room.
 
     Scales shrink as the count grows, so that every count covers the walls equally often. The camera of
     :func:`room_scene` sees two in five: 200,000 Gaussians give about 80,000 visible ones.
@@ -53,7 +77,8 @@ def room(count: int, seed: int = 0) -> list[Tensor]:
     quats = torch.randn(count, 4, generator=g)
     scales = 0.6 * (108 / count) ** 0.5 * torch.exp(0.7 * torch.randn(count, 3, generator=g))
     opacities = 0.05 + 0.9 * torch.rand(count, generator=g)
-    return [means, quats, scales, opacities, 0.1 * torch.randn(count, SH_COEFFICIENTS, 3, generator=g)]
+    sh = 0.1 * torch.randn(count, (sh_degree + 1) ** 2, 3, generator=g)
+    return Gaussians(means, scales.log(), quats, opacities.logit()[:, None], sh[:, 0].clone(), sh[:, 1:].clone())
 
 
 def room_scene(count: int) -> Scene:
@@ -61,7 +86,13 @@ def room_scene(count: int) -> Scene:
     view = torch.eye(4)
     view[2, 3] = 2.0
     text = f"{count // 1_000_000}M" if count % 1_000_000 == 0 else f"{count / 1000:g}k"
-    return Scene(f"room {text}", "room", room(count), view, 0.6)
+    return Scene(f"room {text}", "room", activated(room(count)), view, 0.6)
+
+
+def activated(scene: Gaussians) -> list[Tensor]:
+    """The tensors of a :class:`Scene`, with zeros for SH bands that the scene lacks."""
+    sh = torch.nn.functional.pad(scene.sh, (0, 0, 0, (SH_DEGREE + 1) ** 2 - scene.sh.shape[1]))
+    return [t.contiguous() for t in (scene.means, scene.quats, scene.stds, scene.alphas, sh)]
 
 
 def trained_scenes(path: Path, views: Path | None, index: int | None) -> list[Scene]:
@@ -75,28 +106,16 @@ def trained_scenes(path: Path, views: Path | None, index: int | None) -> list[Sc
     Raises:
         SceneError: if the scene or its cameras cannot be read, or there is no such camera.
     """
-    from pointsplat_ns.io import open_run, read_scene, scene_name
     from pointsplat_ns.pruning import prune
 
     dense = read_scene(path)
-    if path.suffix.lower() == ".ply":
-        name, (viewmats, focal) = path.stem, _views_of(path, views)
-    else:
-        name, (viewmats, focal) = scene_name(open_run(path)), _cameras_of(path)
+    viewmats, focal = _views_of(path, views) if path.suffix.lower() == ".ply" else _cameras_of(path)
     index = len(viewmats) // 2 if index is None else index
     if not 0 <= index < len(viewmats):
         raise SceneError(f"{path}: view {index} asked for; expected 0 to {len(viewmats) - 1}")
     dense = dense[dense.usable() & dense.quats.any(1)]  # the yardstick knows no zero quaternions
-    variants = {"dense": dense, f"{KEEP:.0%}": prune(dense, KEEP, "paper")}
-    return [
-        Scene(f"{name} {kind}", f"{name} {kind}", _activated(scene), viewmats[index], focal)
-        for kind, scene in variants.items()
-    ]
-
-
-def _activated(scene: Gaussians) -> list[Tensor]:
-    sh = torch.nn.functional.pad(scene.sh, (0, 0, 0, SH_COEFFICIENTS - scene.sh.shape[1]))
-    return [t.contiguous() for t in (scene.means, scene.quats, scene.stds, scene.alphas, sh)]
+    scenes = {f"{name_of(path)} dense": dense, f"{name_of(path)} {KEEP:.0%}": prune(dense, KEEP, "paper")}
+    return [Scene(name, name, activated(scene), viewmats[index], focal) for name, scene in scenes.items()]
 
 
 def _views_of(path: Path, views: Path | None) -> tuple[Tensor, float]:

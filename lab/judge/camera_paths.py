@@ -1,6 +1,6 @@
 """Camera paths written by hand: what a visitor of a scene would look at.
 
-A path is a JSON file of the scene's name in ``benchmarks/paths``. Neither the package's sampler of views nor its
+A path is a JSON file of the scene's name in ``lab/judge/paths``. Neither the package's sampler of views nor its
 estimate of up had a part in them, so that they can judge what these lead to.
 """
 

@@ -1,11 +1,11 @@
 """A judge that is not the defendant: what scenes lose when they are made smaller, in views that were chosen by hand.
 
-    python benchmarks/judge.py --list                            # which scenes are for tuning, which judge
-    python benchmarks/judge.py --sheet sheets scenes/rock.ply    # what the views of a scene's path show
-    python benchmarks/judge.py scenes/rock.ply RUN --splat-transform v3/node_modules/.bin/splat-transform \\
+    python -m lab.judge.judge --list                            # which scenes are for tuning, which judge
+    python -m lab.judge.judge --sheet sheets scenes/rock.ply    # what the views of a scene's path show
+    python -m lab.judge.judge scenes/rock.ply RUN --splat-transform v3/node_modules/.bin/splat-transform \\
         --json judge.json --resume --again prune compact         # these two anew, all other rows as they are
 
-A PLY is looked at along the camera path of its name in ``benchmarks/paths``, at several widths; a Splatfacto run from
+A PLY is looked at along the camera path of its name in ``lab/judge/paths``, at several widths; a Splatfacto run from
 the poses of its held-out photos. Every way runs as a process of its own that reads the same PLY and writes one; its
 time and peak memory are those of that process. Smaller scenes are not kept.
 """
@@ -20,16 +20,14 @@ from typing import Annotated
 
 import torch
 import tyro
-from compaction_tables import Row
-from held_out import lpips_or_none
-from judge_paths import path_of, write_sheet
-from judge_scenes import MEASURES, JudgedScene, check, load, losses
-from judge_tables import COSTS, lead_tables, mean_tables, ordered, scene_list, scene_table, summaries
-from printing import console
-from processes import Way, count_of, pointsplat_way
-from results import Results
-from splat_transform import peers_of
 
+from lab.common.compare import lpips_or_none
+from lab.common.printing import console
+from lab.common.results import Results, Row
+from lab.common.ways import Way, count_of, programs_of
+from lab.judge.camera_paths import path_of, write_sheet
+from lab.judge.scenes import MEASURES, JudgedScene, check, load, losses
+from lab.judge.tables import COSTS, lead_tables, mean_tables, ordered, scene_list, scene_table, summaries
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_scene, write_ply
@@ -164,7 +162,7 @@ def main(
         raise SystemExit(f"--keep {' '.join(map(str, keep))}; expected shares above 0, at most 1")
     if views < 1 or not widths or min(widths) < LEAST_WIDTH:
         raise SystemExit(f"{views} views of widths {widths}; expected at least 1, and {LEAST_WIDTH} pixels")
-    programs = [*map(pointsplat_way, ways), *(peers_of(splat_transform)[0] if splat_transform else [])]
+    programs = programs_of(ways, splat_transform)
     labels = [program.label for program in programs]
     if unknown := {*again} - {*labels}:
         raise SystemExit(f"--again {', '.join(sorted(unknown))}; expected some of: {', '.join(labels)}")

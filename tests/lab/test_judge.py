@@ -1,4 +1,4 @@
-"""benchmarks/judge.py: the camera paths that ship, what is measured in their views, and rows that are kept."""
+"""lab/judge: the camera paths that ship, what is measured in their views, and rows that are kept."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ import pytest
 import torch
 from PIL import Image
 
-from making import BENCHMARKS, box_room
+from lab.judge import camera_paths, judge, scenes, tables
+from making import box_room
 from peers import peer
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.rasterizer import render, render_with_alpha
 
-PATHS = sorted((BENCHMARKS / "paths").glob("*.json"))
+PATHS = sorted(camera_paths.FOLDER.glob("*.json"))
 PATH = {
     "scene": "small",
     "about": "The walls of a room, from its middle.",
@@ -31,30 +32,10 @@ PATH = {
 }
 
 
-@pytest.fixture(scope="module")
-def judge(benchmark):
-    return benchmark("judge")
-
-
-@pytest.fixture(scope="module")
-def judge_paths(benchmark):
-    return benchmark("judge_paths")
-
-
-@pytest.fixture(scope="module")
-def judge_scenes(benchmark):
-    return benchmark("judge_scenes")
-
-
-@pytest.fixture(scope="module")
-def tables(benchmark):
-    return benchmark("judge_tables")
-
-
 @pytest.fixture()
-def folder(judge_paths, tmp_path, monkeypatch) -> Path:
+def folder(tmp_path, monkeypatch) -> Path:
     """A folder of camera paths in place of those that ship."""
-    monkeypatch.setattr(judge_paths, "FOLDER", tmp_path)
+    monkeypatch.setattr(camera_paths, "FOLDER", tmp_path)
     return tmp_path
 
 
@@ -72,14 +53,14 @@ def write_path(folder: Path, **changes: object) -> Path:
     return path
 
 
-def test_there_is_a_path_for_scenes_of_both_kinds(tables):
+def test_there_is_a_path_for_scenes_of_both_kinds():
     assert len(PATHS) >= 14
     assert {"tuning", "judged"} <= {tables.group_of(path.stem) for path in PATHS}
 
 
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
-def test_a_path_that_ships_has_sixteen_upright_views_from_different_places(judge_paths, path):
-    found, views = judge_paths.read_path(path), judge_paths.views_of(path, 320)
+def test_a_path_that_ships_has_sixteen_upright_views_from_different_places(path):
+    found, views = camera_paths.read_path(path), camera_paths.views_of(path, 320)
     assert len(views) == 16 and 60 <= found.field_of_view <= 70
     assert len({tuple(eye) for eye in torch.cat([found.eyes, found.ats], 1).tolist()}) == 16
     up = found.up / found.up.norm()
@@ -89,8 +70,8 @@ def test_a_path_that_ships_has_sixteen_upright_views_from_different_places(judge
 
 
 @pytest.mark.parametrize("width", [320, 960, 1920])
-def test_a_view_has_what_it_looks_at_in_its_middle_and_the_field_across_its_width(judge_paths, folder, width):
-    views = judge_paths.views_of(write_path(folder), width)
+def test_a_view_has_what_it_looks_at_in_its_middle_and_the_field_across_its_width(folder, width):
+    views = camera_paths.views_of(write_path(folder), width)
     assert (views.width, views.height) == (width, width * 9 // 16)
     assert views.background.tolist() == [0, 0, 0]
     distances = [math.dist(view["eye"], view["at"]) for view in PATH["views"]]
@@ -120,21 +101,21 @@ def test_a_view_has_what_it_looks_at_in_its_middle_and_the_field_across_its_widt
         ({"views": [{"eye": [1, 2, 3], "at": [1, 2, 3]}]}, "view 0 looks at its own eye"),
     ],
 )
-def test_a_path_that_means_nothing_is_an_error_with_the_reason(judge_paths, folder, changes, said):
+def test_a_path_that_means_nothing_is_an_error_with_the_reason(folder, changes, said):
     with pytest.raises(SystemExit, match=re.escape(said)):
-        judge_paths.views_of(write_path(folder, **changes), 320)
+        camera_paths.views_of(write_path(folder, **changes), 320)
 
 
 @pytest.mark.parametrize("text, said", [("", "cannot be read as JSON"), ("[]", "found list"), (None, "no such file")])
-def test_a_file_that_is_no_path_is_an_error(judge_paths, folder, text, said):
+def test_a_file_that_is_no_path_is_an_error(folder, text, said):
     path = folder / "small.json"
     if text is not None:
         path.write_text(text)
     with pytest.raises(SystemExit, match=said):
-        judge_paths.views_of(path, 320)
+        camera_paths.views_of(path, 320)
 
 
-def test_a_sheet_shows_all_views(judge, small, capsys):
+def test_a_sheet_shows_all_views(small, capsys):
     judge.main((small,), sheet=small.parent / "sheets")
     with Image.open(small.parent / "sheets" / "small.png") as sheet:
         assert sheet.size == (4 * 320, 180)
@@ -160,18 +141,18 @@ def together(a: Gaussians, b: Gaussians) -> Gaussians:
     return Gaussians(*(torch.cat(pair) for pair in zip(a.tensors(), b.tensors(), strict=True)))
 
 
-def scene_of(judge_scenes, judge_paths, dense: Gaussians, path: Path, width: int = 64):
-    looks = (judge_scenes.Look(width, judge_paths.views_of(path, width)),)
-    return judge_scenes.JudgedScene("small", dense, looks, "")
+def scene_of(dense: Gaussians, path: Path, width: int = 64):
+    looks = (scenes.Look(width, camera_paths.views_of(path, width)),)
+    return scenes.JudgedScene("small", dense, looks, "")
 
 
-def test_covered_psnr_counts_a_fault_beside_the_object_and_no_empty_background(judge_scenes, judge_paths, folder):
+def test_covered_psnr_counts_a_fault_beside_the_object_and_no_empty_background(folder):
     path = write_path(folder, views=[{"eye": [0, -2, 0], "at": [0, 0, 0]}])
     dense, other = ball(), ball(0.7)
     beside = ball()
     beside = beside.replace(means=torch.tensor([[0.9, 0.0, 0.0]]), scales=beside.scales - 1)
-    scene = scene_of(judge_scenes, judge_paths, dense, path)
-    found = [measures for _, _, measures in judge_scenes.losses(scene, [other, together(other, beside), dense], None)]
+    scene = scene_of(dense, path)
+    found = [measures for _, _, measures in scenes.losses(scene, [other, together(other, beside), dense], None)]
     view = scene.looks[0].views[0]
     image, alpha = render_with_alpha(dense, view)
     covered = float(alpha.mean())
@@ -184,28 +165,28 @@ def test_covered_psnr_counts_a_fault_beside_the_object_and_no_empty_background(j
     assert all(measures["photo_psnr"] is None and measures["dense_lpips"] is None for measures in found)
 
 
-def test_a_view_in_which_the_dense_scene_covers_nothing_counts_for_all_pixels_alone(judge_scenes, judge_paths, folder):
+def test_a_view_in_which_the_dense_scene_covers_nothing_counts_for_all_pixels_alone(folder):
     away = write_path(folder, views=[{"eye": [0, -2, 0], "at": [0, -4, 0]}])
-    scene = scene_of(judge_scenes, judge_paths, ball(), away)
-    [(_, _, found)] = judge_scenes.losses(scene, [ball(0.5)], None)
+    scene = scene_of(ball(), away)
+    [(_, _, found)] = scenes.losses(scene, [ball(0.5)], None)
     assert found["covered_psnr"] is None and found["dense_psnr"] == 100
 
 
-def test_lpips_is_left_out_of_wide_pictures(judge_scenes, judge_paths, small, monkeypatch):
-    monkeypatch.setattr(judge_scenes, "LPIPS_WIDTH", 32)
-    scene = judge_scenes.load(small, (32, 64), 1)
+def test_lpips_is_left_out_of_wide_pictures(small, monkeypatch):
+    monkeypatch.setattr(scenes, "LPIPS_WIDTH", 32)
+    scene = scenes.load(small, (32, 64), 1)
     sizes = []
 
     def lpips(image, target):
         sizes.append(image.shape)
         return torch.tensor(0.25)
 
-    found = {look.at: measures for _, look, measures in judge_scenes.losses(scene, [scene.dense], lpips)}
+    found = {look.at: measures for _, look, measures in scenes.losses(scene, [scene.dense], lpips)}
     assert found[32]["dense_lpips"] == 0.25 and found[64]["dense_lpips"] is None
     assert sizes == [(18, 32, 3)]
 
 
-def test_every_way_has_a_row_for_each_width(judge, small, tmp_path, capsys):
+def test_every_way_has_a_row_for_each_width(small, tmp_path, capsys):
     results = tmp_path / "rows.json"
     options = {"keep": (0.5,), "ways": ("prune",), "widths": (32, 64), "views": 2, "lpips": False}
     judge.main((small,), **options, splat_transform=(peer(tmp_path, "3.7.0"),), json_path=results)
@@ -225,7 +206,7 @@ def test_every_way_has_a_row_for_each_width(judge, small, tmp_path, capsys):
     assert {path.name for path in tmp_path.iterdir()} == {"small.ply", "small.json", "rows.json", "peer-3.7.0"}
 
 
-def test_rows_that_are_there_stay_and_what_is_asked_for_again_is_measured_anew(judge, small, tmp_path, capsys):
+def test_rows_that_are_there_stay_and_what_is_asked_for_again_is_measured_anew(small, tmp_path, capsys):
     results, first, second = tmp_path / "rows.json", peer(tmp_path, "3.7.0"), peer(tmp_path, "2.7.1")
     options = {"ways": (), "widths": (32,), "views": 2, "lpips": False, "json_path": results, "keep": (0.5,)}
 
@@ -278,7 +259,7 @@ case "$*" in *--version*) echo "splat-transform v2.0.0";; *) echo "out of memory
 """
 
 
-def test_a_way_that_fails_is_noted_and_measured_again(judge, small, tmp_path, capsys):
+def test_a_way_that_fails_is_noted_and_measured_again(small, tmp_path, capsys):
     results, broken = tmp_path / "rows.json", tmp_path / "broken"
     broken.write_text(FAILS)
     broken.chmod(0o755)
@@ -295,7 +276,7 @@ def test_a_way_that_fails_is_noted_and_measured_again(judge, small, tmp_path, ca
     assert [row["failed"] for row in rows] == ["", ""] and rows[1] == fine
 
 
-def test_a_run_is_judged_by_its_held_out_photos_in_their_size(judge, trained_walls, tmp_path, capsys):
+def test_a_run_is_judged_by_its_held_out_photos_in_their_size(trained_walls, tmp_path, capsys):
     results = tmp_path / "rows.json"
     [run] = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
     options = {"keep": (0.5,), "ways": (), "views": 2, "lpips": False, "json_path": results}
@@ -311,7 +292,7 @@ def row(scene: str, method: str, covered: float, at: int | str = 320, keep: floa
     return known | {"dense_psnr": covered + 5, "photo_psnr": None} | more
 
 
-def test_means_have_the_median_and_the_worst_with_its_scene(tables):
+def test_means_have_the_median_and_the_worst_with_its_scene():
     rows = [row("rock", "prune", 30.0, dense_lpips=0.1), row("pc_playbot", "prune", 20.0, dense_lpips=0.3)]
     rows += [row("lounge", "prune", 22.0), row("bouquet", "prune", 10.0), row("rock", "prune", 1.0, at=960)]
     judged, wide, tuning, everything, _ = tables.means(rows)
@@ -323,7 +304,7 @@ def test_means_have_the_median_and_the_worst_with_its_scene(tables):
     assert (everything["group"], everything["scenes"], everything["covered_psnr_worst_scene"]) == ("all", 4, "bouquet")
 
 
-def test_leads_are_of_prune_over_the_best_mode_and_of_compact_over_prune_at_each_width(tables):
+def test_leads_are_of_prune_over_the_best_mode_and_of_compact_over_prune_at_each_width():
     a, b = "splat-transform 3.7.0 -d", "splat-transform 2.7.1"
     rows = [row("rock", "prune", 30.0), row("rock", "compact", 33.0), row("rock", a, 28.0), row("rock", b, 29.0)]
     rows += [row("rock", "prune", 20.0, at=960), row("rock", a, 21.0, at=960), row("rock", b, 19.0, at=960)]
@@ -348,7 +329,7 @@ def test_leads_are_of_prune_over_the_best_mode_and_of_compact_over_prune_at_each
     assert (lines["all mean"], lines["all worst"]) == ("+3.00", "+1.00 rock")
 
 
-def test_the_table_of_means_tells_mean_median_and_worst_of_each_width_and_how_many_scenes(tables):
+def test_the_table_of_means_tells_mean_median_and_worst_of_each_width_and_how_many_scenes():
     rows = [row(scene, "prune", psnr, at=at) for at in (960, 320) for scene, psnr in (("rock", 30.0), ("lounge", 20.0))]
     narrow, wide = tables.mean_tables([*rows, row("diorama", "prune", 40.0)])
     assert (narrow.title.split(":")[0], wide.title.split(":")[0]) == ("320 pixels wide", "960 pixels wide")
@@ -357,7 +338,7 @@ def test_the_table_of_means_tells_mean_median_and_worst_of_each_width_and_how_ma
     assert (cells["covered PSNR"], cells["worst"]) == (["30.00 / 30.00 / 20.00"], ["lounge"])
 
 
-def test_the_list_names_the_kind_of_each_scene(judge, folder, capsys):
+def test_the_list_names_the_kind_of_each_scene(folder, capsys):
     write_path(folder).rename(folder / "rock.json")
     write_path(folder)
     judge.main(list_scenes=True)
@@ -366,7 +347,7 @@ def test_the_list_names_the_kind_of_each_scene(judge, folder, capsys):
     assert ["small", "other", "small.json"] in lines
 
 
-def test_what_cannot_be_judged_is_an_error_at_the_start(judge, small, tmp_path):
+def test_what_cannot_be_judged_is_an_error_at_the_start(small, tmp_path):
     with pytest.raises(SystemExit, match="no scene named"):
         judge.main()
     with pytest.raises(SystemExit, match="gone.ply: no such file or folder"):

@@ -11,10 +11,11 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from held_out import COLUMNS, metrics_of, name_of, photos_of
-from judge_paths import path_of, views_of
 from torch import Tensor
 
+from lab.common.compare import METRICS, metrics_of, photos_of
+from lab.common.scenes import name_of
+from lab.judge.camera_paths import path_of, views_of
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_scene
 from pointsplat_ns.metrics import finite_psnr
@@ -28,7 +29,7 @@ PHOTOS = "photos"
 LPIPS_WIDTH = 960
 """Width, pixels, above which LPIPS is not computed: it would take longer than all else."""
 
-MEASURES = ("covered_psnr", *(f"{against}_{column}" for against in ("dense", "photo") for column in COLUMNS))
+MEASURES = ("covered_psnr", *(f"{against}_{column}" for against in ("dense", "photo") for column in METRICS))
 """What is measured: PSNR of what the dense scene covers (:func:`covered_psnr`); then each metric over all pixels,
 against the dense scene's renders and against photos."""
 
