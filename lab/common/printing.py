@@ -20,11 +20,11 @@ WIDE = 240
 """Characters of a line where standard output is a file."""
 
 
-def start(program: Callable[..., Any] | type) -> Any:
-    """Run a function, or read a dataclass, with the arguments of the command line; input that cannot be used ends the
+def start(program: Callable[..., Any]) -> Any:
+    """Run a function with the arguments of the command line; input that cannot be used ends the
     program with one line."""
     try:
-        return tyro.cli(program)
+        return tyro.cli(program, config=(tyro.conf.OmitArgPrefixes,))
     except PointSplatError as error:
         sys.exit(f"error: {error}")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +26,9 @@ JUDGED = (
 """Scenes that no constant is chosen on: they were named before the first measurement. See docs/benchmarks.md."""
 
 SH_DEGREE = 3
+SAMPLED = 8
+"""Views sampled of a PLY, one of which is drawn."""
+
 KEEP = 0.1
 """Share of a trained scene that its pruned case keeps: few, large and faint Gaussians."""
 
@@ -95,44 +97,27 @@ def activated(scene: Gaussians) -> list[Tensor]:
     return [t.contiguous() for t in (scene.means, scene.quats, scene.stds, scene.alphas, sh)]
 
 
-def trained_scenes(path: Path, views: Path | None, index: int | None) -> list[Scene]:
+def trained_scenes(path: Path, index: int | None) -> list[Scene]:
     """A trained scene, dense and pruned to a tenth by the paper's score, at one of its cameras.
 
     Args:
-        path: a Splatfacto run (its folder or ``config.yml``), seen from its held-out cameras, or a PLY.
-        views: for a PLY: JSON with ``viewmats`` (4 x 4 world to camera, OpenCV axes) and ``focal`` in image widths.
+        path: a Splatfacto run (its folder or ``config.yml``), seen from its held-out cameras, or a PLY, seen from
+            sampled ones.
         index: which camera; the middle one if None.
 
     Raises:
         SceneError: if the scene or its cameras cannot be read, or there is no such camera.
     """
+    from pointsplat_ns.looking.sampling import sample_views
+    from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
     from pointsplat_ns.pruning import prune
 
     dense = read_scene(path)
-    viewmats, focal = _views_of(path, views) if path.suffix.lower() == ".ply" else _cameras_of(path)
-    index = len(viewmats) // 2 if index is None else index
-    if not 0 <= index < len(viewmats):
-        raise SceneError(f"{path}: view {index} asked for; expected 0 to {len(viewmats) - 1}")
+    views = sample_views(dense, SAMPLED) if path.suffix.lower() == ".ply" else dataset_views(path, "test")
+    index = len(views) // 2 if index is None else index
+    if not 0 <= index < len(views):
+        raise SceneError(f"{path}: view {index} asked for; expected 0 to {len(views) - 1}")
+    viewmat, focal = views.viewmats[index].float(), float(views.Ks[index, 0, 0] / views.width)
     dense = dense[dense.usable() & dense.quats.any(1)]  # the yardstick knows no zero quaternions
     scenes = {f"{name_of(path)} dense": dense, f"{name_of(path)} {KEEP:.0%}": prune(dense, KEEP, "paper")}
-    return [Scene(name, name, activated(scene), viewmats[index], focal) for name, scene in scenes.items()]
-
-
-def _views_of(path: Path, views: Path | None) -> tuple[Tensor, float]:
-    if views is None:
-        raise SceneError(f"{path}: a PLY has no cameras; name a file of view matrices with --views")
-    try:
-        content = json.loads(views.read_text("utf-8"))
-        viewmats, focal = torch.tensor(content["viewmats"], dtype=torch.float32), float(content["focal"])
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise SceneError(f"{views}: cannot be read ({error}); expected JSON with 'viewmats' and 'focal'") from error
-    if viewmats.dim() != 3 or viewmats.shape[1:] != (4, 4) or len(viewmats) == 0:
-        raise SceneError(f"{views}: viewmats have shape {tuple(viewmats.shape)}; expected (views, 4, 4)")
-    return viewmats, focal
-
-
-def _cameras_of(path: Path) -> tuple[Tensor, float]:
-    from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-
-    views = dataset_views(path, "test")
-    return views.viewmats.float(), float(views.Ks[0, 0, 0] / views.width)
+    return [Scene(name, name, activated(scene), viewmat, focal) for name, scene in scenes.items()]

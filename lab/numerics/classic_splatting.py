@@ -13,13 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.constants import (
-    ALPHA_MAX,
-    ALPHA_MIN,
-    EPS2D,
-    FRUSTUM_MARGIN,
-    TRANSMITTANCE_MIN,
-)
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, TRANSMITTANCE_MIN
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
 
@@ -96,8 +90,4 @@ def draw(
     basis = sh_basis(directions / directions.norm(dim=-1, keepdim=True), 3)
     colors = ((basis[:, None] @ sh)[:, 0] + 0.5).clamp_min(0)
     image, depth = weight.T @ colors, weight.T @ z
-    return (
-        image.view(height, width, 3),
-        weight.sum(0).view(height, width, 1),
-        depth.view(height, width, 1),
-    )
+    return tuple(values.view(height, width, -1) for values in (image, weight.sum(0), depth))

@@ -1,6 +1,6 @@
 """What Adam's step takes when its averages are below the smallest normal float32, as those of unseen Gaussians become.
 
-    OMP_NUM_THREADS=1 python benchmarks/small_numbers.py
+    OMP_NUM_THREADS=1 python -m lab.numerics.small_numbers
 
 A gradient comes once, and then none; the averages fall by a tenth a step.
 """
@@ -11,8 +11,8 @@ import contextlib
 import time
 
 import torch
-import tyro
 
+from lab.common.printing import start as start_program
 from pointsplat_ns.system.small_numbers import tiny_as_zero
 
 
@@ -38,4 +38,4 @@ def main(gaussians: int = 80_000, numbers: int = 45, steps: tuple[int, ...] = (1
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    start_program(main)

@@ -1,28 +1,32 @@
-"""How time and memory of making a scene smaller grow with its Gaussians, on synthetic scenes."""
+"""Time and memory of whole commands against the number of Gaussians: `prune`, `compact` and splat-transform.
+
+    python -m lab.speed.commands --gaussians 100000 300000 1000000 --json commands.json
+    python -m lab.speed.commands --ways compact --splat-transform v3/node_modules/.bin/splat-transform
+
+Synthetic scenes are made smaller to a tenth, from file to file, each in a process of its own: seconds, CPU seconds and
+peak memory are those of that process, with starting it. The slope of log time over log Gaussians is 1 where time is
+linear; "beyond the start" leaves out what a scene of 1,000 Gaussians takes.
+"""
 
 from __future__ import annotations
 
-import math
 import shutil
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import psutil
-import torch
 from rich.table import Table
 
-from pointsplat_ns.gaussians import Gaussians
+from lab.common.printing import console, megabytes, number, start, table
+from lab.common.results import Row, grouped, write_json
+from lab.common.scenes import KEEP, room
+from lab.common.timing import slope
+from lab.common.ways import Way, count_of, programs_of
 from pointsplat_ns.io import write_ply
-from pointsplat_ns.pruning import METHODS, ply_bytes
+from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.system.programs import ProgramFailed
 from pointsplat_ns.tables.splat_transform import Reducer
-
-Row = dict[str, Any]
-
-KEEP = 0.1
 
 START = 1000
 """Gaussians of the scene that shows what starting a program costs."""
@@ -31,22 +35,8 @@ HELD_BY_WRITING = 2.5
 """Memory that making and writing a scene takes, in sizes of its file: the tensors, one copy, the records."""
 
 
-def synthetic(n: int, seed: int = 0, sh_degree: int = 3) -> Gaussians:
-    """``n`` flat Gaussians on the walls of a room, of smooth colours and mixed sizes."""
-    g = torch.Generator().manual_seed(seed)
-    means = 2 * torch.rand(n, 3, generator=g) - 1
-    wall = torch.randint(0, 3, (n,), generator=g)
-    means[torch.arange(n), wall] = means[torch.arange(n), wall].sign() + 0.005 * torch.randn(n, generator=g)
-    scales = math.log(4 / math.sqrt(n)) + 0.6 * torch.randn(n, 3, generator=g)
-    scales[torch.arange(n), wall] -= 2.0
-    quats = torch.tensor([1.0, 0, 0, 0]) + 0.1 * torch.randn(n, 4, generator=g)
-    colours = torch.sin(3 * means) + 0.2 * torch.randn(n, 3, generator=g)
-    rest = torch.randn(n, (sh_degree + 1) ** 2 - 1, 3, generator=g).mul_(0.05)
-    return Gaussians(means, scales, quats, torch.randn(n, 1, generator=g), colours, rest)
-
-
-def scaling_rows(counts: tuple[int, ...], sh_degree: int, programs: list[Reducer]) -> Iterator[Row]:
-    """What each program takes for each size of scene, to a tenth, from file to file, the smallest first.
+def rows_of(counts: tuple[int, ...], sh_degree: int, programs: list[Reducer]) -> Iterator[Row]:
+    """What each program takes for each size of scene, the smallest first.
 
     A size that is expected to need more memory or disk than is free is left out; ``failed`` says so.
     """
@@ -58,7 +48,7 @@ def scaling_rows(counts: tuple[int, ...], sh_degree: int, programs: list[Reducer
             no_room = _more_than("disk", (1 + KEEP) * size, shutil.disk_usage(folder).free)
             no_room = no_room or _more_than("memory", HELD_BY_WRITING * size, psutil.virtual_memory().available)
             if not no_room:
-                write_ply(synthetic(n, sh_degree=sh_degree), source)
+                write_ply(room(n, sh_degree), source)
             for program in programs:
                 row: Row = {"method": program.label, "gaussians": n, "sh_degree": sh_degree, "file_bytes": size}
                 row |= {"count": None, "seconds": None, "cpu_seconds": None, "peak_bytes": None}
@@ -66,7 +56,7 @@ def scaling_rows(counts: tuple[int, ...], sh_degree: int, programs: list[Reducer
                 row["failed"] = no_room or _more_than("memory", expected, psutil.virtual_memory().available)
                 if not row["failed"]:
                     try:
-                        small, usage = program.reduce(source, max(1, round(KEEP * n)))
+                        small, usage = program.reduce(source, count_of(KEEP, n))
                         row |= {"count": len(small), **vars(usage)}
                         before[program.label] = row
                     except ProgramFailed as error:
@@ -83,97 +73,68 @@ def _more_than(what: str, needed: float, free: float) -> str:
     return f"about {needed / 1e9:.3g} GB of {what} needed, {free / 1e9:.3g} GB free" if needed > free else ""
 
 
-def slope(counts: list[int], seconds: list[float]) -> float | None:
-    """Least-squares slope of log time over log count: 1 where time is linear. Times that are not positive are left out;
-    None where fewer than two counts remain."""
-    points = [(math.log(n), math.log(s)) for n, s in zip(counts, seconds, strict=True) if n > 0 and s > 0]
-    if len({x for x, _ in points}) < 2:
-        return None
-    x, y = torch.tensor(points, dtype=torch.float64).unbind(1)
-    x, y = x - x.mean(), y - y.mean()
-    return float((x * y).sum() / (x * x).sum())
-
-
 def slopes(rows: list[Row]) -> list[Row]:
     """For each program, the slope of its seconds and CPU seconds, as they are and beyond those of the start."""
     result = []
-    for method in dict.fromkeys(row["method"] for row in rows):
-        done = [row for row in rows if row["method"] == method and row["seconds"] is not None]
-        start = next((row for row in done if row["gaussians"] == START), None)
+    for method, same in grouped(rows, lambda row: row["method"]).items():
+        done = [row for row in same if row["seconds"] is not None]
+        first = next((row for row in done if row["gaussians"] == START), None)
         sizes = [row for row in done if row["gaussians"] != START]
         found: Row = {"method": method}
         for name in ("seconds", "cpu_seconds"):
             counts, values = [row["gaussians"] for row in sizes], [row[name] for row in sizes]
             found[name] = slope(counts, values)
-            found[f"{name}_beyond_start"] = slope(counts, [v - start[name] for v in values]) if start else None
+            found[f"{name}_beyond_start"] = slope(counts, [v - first[name] for v in values]) if first else None
         result.append(found)
     return result
 
 
-def scaling_table(rows: list[Row]) -> Table:
-    """Time and memory by program and size, and how many times the seconds and the memory of our first program others
-    take."""
-    shown = Table(title=f"to {KEEP:.0%}, from file to file; kB a Gaussian: peak memory beyond the file's size")
-    for name in (
-        "Gaussians",
-        "method",
-        "s",
-        "CPU s",
-        "peak MB",
-        "kB a Gaussian",
-        "... beyond start",
-        "times s",
-        "times MB",
-    ):
-        shown.add_column(name, justify="left" if name == "method" else "right")
-    starts = {row["method"]: row for row in rows if row["gaussians"] == START and row["seconds"] is not None}
-    for n in dict.fromkeys(row["gaussians"] for row in rows):
-        same = [row for row in rows if row["gaussians"] == n]
+def tables(rows: list[Row]) -> Iterator[Table]:
+    """Time and memory by size and program, in times of the first program's too; then the slopes."""
+    lines = []
+    for n, same in grouped(rows, lambda row: row["gaussians"]).items():
         ours = same[0]
         for row in same:
-            name = f"{n:,}" if row is ours else ""
             if row["seconds"] is None:
-                shown.add_row(name, row["method"], row["failed"][:40], end_section=row is same[-1])
+                lines.append([f"{n:,}", row["method"], row["failed"][:40]])
                 continue
-            beyond = row["peak_bytes"] - row["file_bytes"]
-            start = starts.get(row["method"])
-            less = "-" if start is None or n == START else f"{(beyond - start['peak_bytes']) / n / 1e3:.2f}"
-            versus = [
-                "-" if row is ours or not ours[key] else f"{row[key] / ours[key]:.2f}"
-                for key in ("seconds", "peak_bytes")
-            ]
-            cells = [f"{row['seconds']:.1f}", f"{row['cpu_seconds']:.1f}", f"{row['peak_bytes'] / 1e6:,.0f}"]
-            each = "-" if n == START else f"{beyond / n / 1e3:.2f}"
-            shown.add_row(name, row["method"], *cells, each, less, *versus, end_section=row is same[-1])
-    return shown
+            times = [row[key] / ours[key] if ours[key] else None for key in ("seconds", "peak_bytes")]
+            beyond = number(2)((row["peak_bytes"] - row["file_bytes"]) / n / 1e3)
+            cells = [number(1)(row["seconds"]), number(1)(row["cpu_seconds"]), megabytes(row["peak_bytes"]), beyond]
+            lines.append([f"{n:,}", row["method"], *cells, *map(number(2), times)])
+    heads = ("Gaussians", "command", "s", "CPU s", "peak MB", "kB a Gaussian", "times s", "times MB")
+    title = f"to {KEEP:.0%}, from file to file; kB a Gaussian: peak memory beyond the file's size"
+    yield table(title, heads, lines, left=["command"])
+    names = {"seconds": "s", "seconds_beyond_start": "s beyond the start", "cpu_seconds": "CPU s"}
+    names["cpu_seconds_beyond_start"] = "CPU s beyond the start"
+    found = [[row["method"], *(number(2)(row[name]) for name in names)] for row in slopes(rows)]
+    yield table("slope of log time over log Gaussians (1: linear)", ("command", *names.values()), found)
 
 
-def slope_table(found: list[Row]) -> Table:
-    """The slopes of :func:`slopes`."""
-    shown = Table(title="slope of log time over log Gaussians (1: linear)")
-    names = {
-        "seconds": "s",
-        "seconds_beyond_start": "s beyond start",
-        "cpu_seconds": "CPU s",
-        "cpu_seconds_beyond_start": "CPU s beyond start",
-    }
-    for name in ("method", *names.values()):
-        shown.add_column(name, justify="left" if name == "method" else "right")
-    for row in found:
-        shown.add_row(row["method"], *("-" if row[name] is None else f"{row[name]:.2f}" for name in names))
-    return shown
+def main(
+    gaussians: tuple[int, ...] = (100_000, 300_000, 1_000_000),
+    ways: tuple[Way, ...] = ("prune",),
+    splat_transform: tuple[str, ...] = (),
+    sh_degree: int = 3,
+    json: Path | None = None,
+) -> None:
+    """Print what making synthetic scenes smaller takes.
+
+    Args:
+        gaussians: sizes of the scenes.
+        ways: prune, compact, and thorough: compact with that effort.
+        splat_transform: programs, of any versions, each of whose modes is measured too.
+        sh_degree: of the scenes.
+        json: write all rows there, after each.
+    """
+    rows: list[Row] = []
+    for row in rows_of(gaussians, sh_degree, programs_of(ways, splat_transform)):
+        rows.append(row)
+        took = row["failed"] or f"{row['seconds']:.1f} s, {megabytes(row['peak_bytes'])} MB"
+        print(f"{row['gaussians']:,} {row['method']}: {took}", flush=True)
+        write_json(json, {"rows": rows, "slopes": slopes(rows)})
+    console().print(*tables(rows))
 
 
-def print_score_times(n: int, sh_degree: int) -> None:
-    """Time of every score that needs no views, within this process, median of 5."""
-    scene = synthetic(n, sh_degree=sh_degree)
-    print(f"{n:,} Gaussians of SH degree {sh_degree} on {torch.get_num_threads()} threads")
-    for name, method in METHODS.items():
-        if method.needs_views or method.score is None:
-            continue
-        times = []
-        for _ in range(5):
-            start = time.perf_counter()
-            method.score(scene)
-            times.append(time.perf_counter() - start)
-        print(f"  {name:12s} {sorted(times)[2]:7.3f} s")
+if __name__ == "__main__":
+    start(main)

@@ -1,77 +1,63 @@
-"""Time, memory and work of the rasterizer, stage by stage, beside its peers, all in one run.
+"""Time, memory and errors of the rasterizer, stage by stage, beside a plain C++ rasterizer, all in one run.
 
-    python benchmarks/rasterizer.py                                # synthetic room; a few minutes
-    python benchmarks/rasterizer.py --scenes outputs/kitchen/...   # and a trained scene, dense and pruned to a tenth
-    python benchmarks/rasterizer.py --full --json out.json --plot out.png
+    python -m lab.speed.rasterizer                                # synthetic room; a few minutes
+    python -m lab.speed.rasterizer --scenes outputs/kitchen/...   # and a trained scene, dense and pruned to a tenth
+    python -m lab.speed.rasterizer --variants eager compiled balanced fast --json out.json
 
 Machines differ and are shared: compare figures of one run, by their ratios. On a busy machine `--cpu-time` counts the
-CPU seconds of one thread, ours and the C++ peer's.
+CPU seconds of one thread, ours and the C++ peer's. gsplat on a GPU is measured by cuda.py.
 """
 
 from __future__ import annotations
 
 import itertools
-import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
-from measure import BACKWARD_FMAS, FORWARD_FMAS, count_pairs, floor_costs, now, peak_extra_bytes, timed, use_cpu_time
-from options import Options, write_json
-from report import Result, console, plot, print_tables, summary
-from scenes import Scene, room_scene, trained_scenes
 from torch import Tensor
-from yardstick import CLASSIC_EXTENT, EXACT_EXTENT, TIGHT_EXTENT, Yardstick, load_yardstick
 
+from lab.common.printing import console, megabytes, number, start, table
+from lab.common.results import grouped, write_json
+from lab.common.scenes import Scene, room_scene, trained_scenes
+from lab.common.timing import now, peak_extra_bytes, slope, timed, use_cpu_time
+from lab.speed.yardstick import CLASSIC_EXTENT, EXACT_EXTENT, TIGHT_EXTENT, Yardstick, load_yardstick
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.rasterizer import binning, rasterization, rasterize_reference
+from pointsplat_ns.metrics import psnr
+from pointsplat_ns.rasterizer import binning, rasterization
 from pointsplat_ns.rasterizer.blending import blend
 from pointsplat_ns.rasterizer.colors import sh_to_color
 from pointsplat_ns.rasterizer.projection import Projected, project
 from pointsplat_ns.rasterizer.tiles import Footprints
 
-Draw = Callable[[list[Tensor], Tensor, Tensor, int, int], tuple[Tensor, Tensor]]
-
-
-def variant(**options: Any) -> Draw:
-    """The package with options: draws an image (H, W, 3) and alphas (H, W, 1)."""
-
-    def draw(scene: list[Tensor], viewmat: Tensor, K: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-        image, alphas, _ = rasterization(*scene, viewmat[None], K[None], width, height, sh_degree=3, **options)
-        return image[0], alphas[0]
-
-    return draw
-
-
-VARIANTS: dict[str, Draw] = {
-    "eager": variant(compiled=False),
-    "compiled": variant(compiled=True),
-    "balanced": variant(quality="balanced"),
-    "fast": variant(quality="fast"),
+VARIANTS: dict[str, dict[str, Any]] = {
+    "eager": {"compiled": False},
+    "compiled": {"compiled": True},
+    "balanced": {"quality": "balanced"},
+    "fast": {"quality": "fast"},
 }
-"""What is timed, by name; the first is the one that the others' errors and all ratios refer to."""
+"""What is timed, by name: options of ``rasterization``. Errors are against the image of "eager"."""
 
-PEERS = {"C++": (CLASSIC_EXTENT, False), "C++ boxes": (CLASSIC_EXTENT, True), "C++ tight": (TIGHT_EXTENT, True)}
-"""The C++ peer per pixel, which is the classic design; turned inside out, which is faster; and that with tight boxes
-(see yardstick.cpp): extent and whether by boxes."""
+PEERS = {"C++ classic": (CLASSIC_EXTENT, False), "C++ tight": (TIGHT_EXTENT, True)}
+"""The C++ peer of the classic design, pixel by pixel over squares of 3 sigma; and turned inside out, Gaussian by
+Gaussian over tight boxes, which is faster (see yardstick.cpp): extent and whether by boxes."""
+
+STAGES = ("projection", "colours", "binning", "blending", "blending backward", "projection backward")
 SIZES = ((160, 120), (640, 480), (1200, 680))
 COUNTS = (10_000, 60_000, 200_000, 300_000, 1_000_000)
-MAIN_SIZE, MAIN_COUNT, REFERENCE_COUNT = (640, 480), 200_000, 10_000
-KEPT_HITS_MAX = 4 * 10**8
-"""Needed pairs beyond which the C++ peer is left out: it keeps 8 bytes of each for its backward pass."""
+MAIN_SIZE, MAIN_COUNT = (640, 480), 200_000
+MOST_PAIRS = 4 * 10**8
+"""Pairs of Gaussian and pixel beyond which the C++ peer is left out: it keeps 8 bytes of each for its backward pass."""
 
 
 @dataclass
-class Args(Options):
-    """Time the rasterizer beside a C++ peer, a measured floor, the plain reference and gsplat."""
+class Args:
+    """Time the rasterizer beside a C++ peer."""
 
     scenes: tuple[Path, ...] = ()
-    """Trained scenes: Splatfacto runs (folder or config.yml), or PLY files together with --views."""
-    views: Path | None = None
-    """Cameras for PLY files: JSON with "viewmats" (4 x 4, world to camera, OpenCV) and "focal" in image widths."""
+    """Trained scenes: Splatfacto runs (folder or config.yml), seen from a held-out camera, or PLY files."""
     view: int | None = None
     """Which camera of a trained scene; its middle one by default."""
     gaussians: tuple[int, ...] | None = None
@@ -80,8 +66,6 @@ class Args(Options):
     """Image sizes such as 640x480, for every scene."""
     variants: tuple[str, ...] = ("eager",)
     """Which variants to time: eager, compiled, balanced, fast; the first is the base of all ratios."""
-    full: bool = False
-    """Every count of the room at every size."""
     repeats: int = 5
     """Rounds; medians are reported."""
     fastest: bool = False
@@ -90,6 +74,34 @@ class Args(Options):
     """Seconds a case may take before it is content with fewer rounds."""
     cpu_time: bool = False
     """Count CPU seconds of one thread in place of wall time: steadier still on a busy machine. Sets --threads 1."""
+    threads: int | None = None
+    """Threads of torch; its own choice by default. The C++ peer always has one."""
+    device: str = "cpu"
+    """Where our own code runs."""
+    json: Path | None = None
+    """Write all figures here, after each case."""
+
+
+@dataclass
+class Result:
+    """What was measured of one case: seconds and errors by name, bytes."""
+
+    scene: str
+    family: str
+    width: int
+    height: int
+    gaussians: int
+    visible: int
+    seconds: dict[str, float]
+    memory: dict[str, int | None]
+    errors: dict[str, float] = field(default_factory=dict)
+    pairs: int | None = None
+    """Pairs of Gaussian and pixel that are drawn, as the C++ peer counts them."""
+
+    def both(self, name: str) -> float | None:
+        """Seconds of forward and backward together, of a variant or a peer."""
+        ahead, back = self.seconds.get(f"{name} forward"), self.seconds.get(f"{name} backward")
+        return ahead + back if ahead is not None and back is not None else None
 
 
 class Case:
@@ -103,27 +115,26 @@ class Case:
         self.grad_image = torch.randn(height, width, 3, generator=g).to(device)
         self.grad_alphas = torch.randn(height, width, 1, generator=g).to(device)
 
-    def draw(self, variant: Draw) -> tuple[Tensor, Tensor]:
-        return variant(self.tensors, self.viewmat, self.K, self.width, self.height)
+    def draw(self, variant: str) -> tuple[Tensor, Tensor]:
+        """An image (H, W, 3) and alphas (H, W, 1)."""
+        camera = self.viewmat[None], self.K[None], self.width, self.height
+        image, alphas, _ = rasterization(*self.tensors, *camera, sh_degree=3, **VARIANTS[variant])
+        return image[0], alphas[0]
 
     def gradients(self, image: Tensor, alphas: Tensor) -> list[Tensor]:
         return list(torch.autograd.grad((image, alphas), self.tensors, (self.grad_image, self.grad_alphas)))
 
-    def time_variant(self, name: str, variant: Draw) -> dict[str, float]:
-        start = now()
+    def time_variant(self, name: str) -> dict[str, float]:
+        marks = [now()]
         with torch.no_grad():
-            self.draw(variant)
-        inference = now() - start
-        start = now()
-        drawn = self.draw(variant)
-        middle = now()
+            self.draw(name)
+        marks.append(now())
+        drawn = self.draw(name)
+        marks.append(now())
         self.gradients(*drawn)
-        return {f"{name} inference": inference, f"{name} forward": middle - start, f"{name} backward": now() - middle}
-
-    def count_pairs(self) -> dict[str, int]:
-        seen = project(*(t.detach() for t in self.tensors[:4]), self.viewmat, self.K, self.width, self.height)
-        footprints = self.footprints_of(seen)
-        return count_pairs(seen, footprints.tiles(footprints.whole), self.width, self.height)
+        marks.append(now())
+        names = ("inference", "forward", "backward")
+        return {f"{name} {what}": b - a for what, (a, b) in zip(names, itertools.pairwise(marks), strict=True)}
 
     def footprints_of(self, seen: Projected) -> Footprints:
         geometry = [t.detach() for t in (seen.means2d, seen.cov2d, seen.det, seen.opacities)]
@@ -143,7 +154,6 @@ class Case:
         marks.append(now())
         inputs = [seen.means2d, seen.cov2d, seen.det, seen.opacities, colors]
         leaves = [t.detach().requires_grad_() for t in inputs]
-        marks.append(now())
         footprints = self.footprints_of(seen)
         marks.append(now())
         drawn = blend(*leaves, footprints)
@@ -152,148 +162,91 @@ class Case:
         marks.append(now())
         torch.autograd.grad(inputs, self.tensors, grads)
         marks.append(now())
+        spans = dict(zip(STAGES, (b - a for a, b in itertools.pairwise(marks)), strict=True))
         footprints.tiles(footprints.whole)
-        marks.append(now())
-        names = (
-            "projection",
-            "colours",
-            "",
-            "binning",
-            "blending",
-            "blending backward",
-            "projection backward",
-            "lists",
-        )
-        spans = {n: after - before for n, (before, after) in zip(names, itertools.pairwise(marks), strict=True)}
-        lists = spans.pop("lists")
+        lists = now() - marks[-1]
         spans["binning"] += lists
         spans["blending"] = max(0.0, spans["blending"] - lists)
-        return {f"stage {name}": span for name, span in spans.items() if name}
+        return {f"stage {name}": span for name, span in spans.items()}
+
+    def visible(self) -> int:
+        with torch.no_grad():
+            seen = project(*self.tensors[:4], self.viewmat, self.K, self.width, self.height)
+        footprints = self.footprints_of(seen)
+        return int(torch.unique(footprints.tiles(footprints.whole).gaussians).numel())
 
     def time_yardstick(self, name: str, peer: Yardstick) -> dict[str, float]:
-        scene = [t.cpu() for t in self.scene.tensors]
-        grads = self.grad_image.cpu(), -self.grad_alphas.cpu()
-        start = now()
-        peer.forward(scene, self.scene.viewmat, self.K.cpu(), self.width, self.height, keep=True)
-        middle = now()
-        peer.backward(*grads)
-        end = now()
-        stages = {f"{name} stage {stage}": seconds for stage, seconds in peer.seconds.items()}
-        return {f"{name} forward": middle - start, f"{name} backward": end - middle, **stages}
+        marks = [now()]
+        peer.forward(self.scene.tensors, self.scene.viewmat, self.K.cpu(), self.width, self.height, keep=True)
+        marks.append(now())
+        peer.backward(self.grad_image.cpu(), -self.grad_alphas.cpu())
+        return {f"{name} forward": marks[1] - marks[0], f"{name} backward": now() - marks[1]}
 
-    def time_gsplat(self) -> dict[str, float]:
-        from gsplat import rasterization as gsplat_rasterization
-
-        tensors = [t.detach().cuda().requires_grad_() for t in self.tensors]
-        camera = self.viewmat.cuda()[None], self.K.cuda()[None]
-        grads = self.grad_image.cuda()[None], self.grad_alphas.cuda()[None]
-        start = now()
-        image, alphas, _ = gsplat_rasterization(*tensors, *camera, self.width, self.height, sh_degree=3)
-        middle = now()
-        torch.autograd.grad((image, alphas), tensors, grads)
-        return {"gsplat forward": middle - start, "gsplat backward": now() - middle}
-
-    def time_reference(self) -> float:
-        """Seconds of one image by the plain reference; its backward would keep every image-sized step."""
-        start = now()
-        with torch.no_grad():
-            tensors = [t.cpu() for t in self.tensors]
-            rasterize_reference(*tensors, self.viewmat.cpu(), self.K.cpu(), self.width, self.height, sh_degree=3)
-        return now() - start
-
-    def disagreement(self, variant: Draw, module: Any, needed: int) -> dict[str, float]:
-        """How far a variant is from the C++ peer drawing without the cut at three standard deviations: the largest
-        difference of the image, the share of values that differ, the largest relative difference of a gradient
-        (norms); and how far our count of needed pairs is from what the peer drew."""
-        peer = Yardstick(module, EXACT_EXTENT)
-        scene = [t.cpu() for t in self.scene.tensors]
-        image, _ = peer.forward(scene, self.scene.viewmat, self.K.cpu(), self.width, self.height, keep=True)
+    def disagreement(self, variant: str, peer: Yardstick) -> dict[str, float]:
+        """How far a variant is from the C++ peer without a cut at three standard deviations: the largest difference of
+        the image, the share of values that differ, the largest relative difference of a gradient (norms)."""
+        image, _ = peer.forward(
+            self.scene.tensors, self.scene.viewmat, self.K.cpu(), self.width, self.height, keep=True
+        )
         theirs = peer.backward(self.grad_image.cpu(), -self.grad_alphas.cpu())
         drawn = self.draw(variant)
         ours = self.gradients(*drawn)
-        pairs = zip(ours, theirs, strict=True)
         difference = (drawn[0].detach().cpu() - image).abs()
         return {
             "C++ image": float(difference.max()),
-            "C++ flipped": float((difference > 1e-4).float().mean()),
-            "C++ needed": abs(peer.counts["drawn"] / max(1, needed) - 1),
-            "C++ gradient": max(float((a.cpu() - b).norm() / b.norm().clamp_min(1e-20)) for a, b in pairs),
+            "C++ off by 1e-4": float((difference > 1e-4).float().mean()),
+            "C++ gradient": max(
+                float((a.cpu() - b).norm() / b.norm().clamp_min(1e-20)) for a, b in zip(ours, theirs, strict=True)
+            ),
         }
 
 
-def usable_gsplat() -> bool:
-    """Whether gsplat draws on this machine's GPU; its kernels may be compiled here, once."""
-    if not torch.cuda.is_available():
-        return False
-    try:
-        Case(room_scene(10), 16, 16, torch.device("cuda")).time_gsplat()
-    except Exception as error:  # no package, no compiler, a kernel that does not fit the GPU
-        console.print(f"no gsplat: {str(error).strip().splitlines()[0][:160] if str(error).strip() else type(error)}")
-        return False
-    return True
-
-
-def run_case(case: Case, args: Args, floor: dict[str, float], module: Any, with_gsplat: bool) -> Result:
+def run_case(case: Case, args: Args, module: Any) -> Result:
     """Everything that is measured of one case."""
-    variants = {name: VARIANTS[name] for name in args.variants}
-    base, draw_base = next(iter(variants.items()))
+    base, errors, pairs = args.variants[0], {}, None
     with torch.no_grad():
-        scene, size = [t.detach() for t in case.tensors], (case.width, case.height)
-        exact = VARIANTS["eager"](scene, case.viewmat, case.K, *size)[0]
-        pairs = case.count_pairs()
-        errors = {}
-        for name, variant in variants.items():
-            difference = (case.draw(variant)[0] - exact).abs()
-            errors |= {f"{name} max": float(difference.max()), f"{name} mean": float(difference.mean())}
-    del exact
-
+        exact = case.draw("eager")[0].clamp(0, 1)
+        for name in args.variants:
+            image = case.draw(name)[0].clamp(0, 1)
+            errors |= {f"{name} max": float((image - exact).abs().max()), f"{name} PSNR": float(psnr(image, exact))}
     functions: dict[str, Callable[[], dict[str, float]]] = {
-        name: lambda name=name, variant=variant: case.time_variant(name, variant) for name, variant in variants.items()
+        name: lambda name=name: case.time_variant(name) for name in args.variants
     }
     functions["stages"] = case.time_stages
-    with_peer = module is not None and pairs["needed"] <= KEPT_HITS_MAX
+    if module is not None:
+        peer = Yardstick(module, EXACT_EXTENT)
+        peer.forward(case.scene.tensors, case.scene.viewmat, case.K.cpu(), case.width, case.height, keep=False)
+        pairs = peer.counts["drawn"]
+    with_peer = pairs is not None and pairs <= MOST_PAIRS
     if with_peer:
-        for name, (extent, boxes) in PEERS.items():
-            peer = Yardstick(module, extent, boxes)
-            functions[name] = lambda name=name, peer=peer: case.time_yardstick(name, peer)
-    if with_gsplat:
-        functions["gsplat"] = case.time_gsplat
+        for name, options in PEERS.items():
+            functions[name] = lambda name=name, peer=Yardstick(module, *options): case.time_yardstick(name, peer)
     seconds = timed(functions, args.repeats, args.budget, args.fastest)
     functions.clear()  # the peers let go of what they kept
     if with_peer:
-        errors |= case.disagreement(draw_base, module, pairs["needed"])
-    if len(case.scene) <= REFERENCE_COUNT and case.width * case.height <= SIZES[0][0] * SIZES[0][1]:
-        seconds["reference inference"] = case.time_reference()
-    once = pairs["needed"] * (floor["exp"] + FORWARD_FMAS * floor["fma"])
-    seconds |= {"floor forward": once, "floor backward": pairs["needed"] * BACKWARD_FMAS * floor["fma"]}
+        errors |= case.disagreement(base, Yardstick(module, EXACT_EXTENT))
 
     def forward() -> None:
         with torch.no_grad():
-            case.draw(draw_base)
+            case.draw(base)
 
     memory = {
-        f"{base} inference": peak_extra_bytes(forward, case.device),
-        f"{base} training": peak_extra_bytes(lambda: case.gradients(*case.draw(draw_base)), case.device),
+        "inference": peak_extra_bytes(forward, case.device),
+        "training": peak_extra_bytes(lambda: case.gradients(*case.draw(base)), case.device),
     }
-    scene = case.scene
-    return Result(scene.name, scene.family, *size, len(scene), seconds, pairs, memory, errors)
+    scene, size = case.scene, (case.width, case.height)
+    return Result(scene.name, scene.family, *size, len(scene), case.visible(), seconds, memory, errors, pairs)
 
 
 def plan(args: Args) -> list[tuple[Scene, tuple[int, int]]]:
-    """The cases: all of them, those asked for, or a choice that shows every trend in a few minutes."""
+    """The cases: those asked for, or a choice that shows every trend in a few minutes."""
     chosen = [_size_of(text) for text in args.sizes] if args.sizes else None
-    every = args.full or chosen is not None or args.gaussians is not None
     cases = []
     for count in COUNTS if args.gaussians is None else filter(None, args.gaussians):
-        sizes = chosen or SIZES
-        if not every:
-            smallest = SIZES[:1] if count == REFERENCE_COUNT else ()
-            sizes = SIZES if count == MAIN_COUNT else (*smallest, MAIN_SIZE)
-        scene = room_scene(count)
-        cases += [(scene, size) for size in sizes]
+        few = chosen is None and args.gaussians is None and count != MAIN_COUNT
+        cases += [(room_scene(count), size) for size in ((MAIN_SIZE,) if few else chosen or SIZES)]
     for path in args.scenes:
-        for scene in trained_scenes(path, args.views, args.view):
-            cases += [(scene, size) for size in chosen or SIZES]
+        cases += [(scene, size) for scene in trained_scenes(path, args.view) for size in chosen or SIZES]
     return cases
 
 
@@ -302,6 +255,46 @@ def _size_of(text: str) -> tuple[int, int]:
     if len(parts) != 2 or not all(part.isdigit() and int(part) > 0 for part in parts):
         raise PointSplatError(f"size is {text!r}; expected WIDTHxHEIGHT such as 640x480")
     return int(parts[0]), int(parts[1])
+
+
+def print_tables(results: list[Result], variants: tuple[str, ...]) -> None:
+    """Everything that was measured; the first variant is what ratios refer to."""
+    base, ms, ratio = variants[0], number(1, 1e3), number(2)
+    timed_names = [*dict.fromkeys(name for r in results for name in r.seconds)]
+    used = [name for name in PEERS if any(r.both(name) for r in results)]
+
+    def show(title: str, columns: dict[str, Callable[[Result], str]]) -> None:
+        rows = [[r.scene, f"{r.width}x{r.height}", *(value(r) for value in columns.values())] for r in results]
+        console().print(table(title, ["case", "size", *columns], rows))
+
+    def over(a: float | None, b: float | None) -> str:
+        return ratio(a / b if a and b else None)
+
+    def error(name: str, value: float | None) -> str:
+        return "-" if value is None else f"{value:{'.1f' if name.endswith('PSNR') else '.1e'}}"
+
+    times = {name.removeprefix("stage "): lambda r, n=name: ms(r.seconds.get(n)) for name in timed_names}
+    show("Milliseconds", {"visible": lambda r: f"{r.visible:,}", **times})
+    show(
+        f"Seconds of forward and backward in those of {base} (above 1: slower); {base}'s peak memory, MB",
+        {
+            **{name: lambda r, n=name: over(r.both(n), r.both(base)) for name in (*variants[1:], *used)},
+            "drawn pairs, M": lambda r: number(1, 1e-6)(r.pairs),
+            **{f"memory, {name}": lambda r, n=name: megabytes(r.memory[n]) for name in results[0].memory},
+        },
+    )
+    show(
+        "Errors against the exact image (colour units, dB), and against the C++ peer",
+        {name: lambda r, n=name: error(n, r.errors.get(n)) for name in results[0].errors},
+    )
+    lines = []
+    for against, sizes in (("pixels", lambda r: r.width * r.height), ("drawn pairs", lambda r: r.pairs or 0)):
+        by = {"all": results} if against == "drawn pairs" else grouped(results, lambda r: r.scene)  # type: ignore[arg-type, return-value]
+        for name, rows in by.items():
+            found = slope([sizes(r) for r in rows], [r.both(base) for r in rows])
+            if found is not None:
+                lines.append([name, against, len(rows), ratio(found)])
+    console().print(table(f"Slopes of log time of {base}, both ways (1: linear)", ["", "over", "cases", "slope"], lines))
 
 
 def main(args: Args) -> None:
@@ -314,32 +307,25 @@ def main(args: Args) -> None:
         use_cpu_time()
     if args.threads:
         torch.set_num_threads(args.threads)
-    device = torch.device(args.device)
     cases = plan(args)
     if not cases:
         raise PointSplatError("nothing to draw; expected a count in --gaussians or a scene in --scenes")
-    with console.status("compiling the C++ peer (once)"):
-        module, reason = load_yardstick()
+    module, reason = load_yardstick()
     if module is None:
-        console.print(reason)
+        print(reason)
     elif args.cpu_time:
         module.use_cpu_time()
-    with_gsplat = usable_gsplat()
-    floor = floor_costs(device)
-    results = []
+    clock = "CPU" if args.cpu_time else "wall"
+    print(f"torch {torch.__version__} on {args.device}, {torch.get_num_threads()} threads (C++ peer: 1), {clock} time")
+    results: list[Result] = []
     for i, (scene, (width, height)) in enumerate(cases, 1):
-        with console.status(f"case {i} of {len(cases)}: {scene.name} at {width}x{height}"):
-            results.append(run_case(Case(scene, width, height, device), args, floor, module, with_gsplat))
-        settings = {"cpu_time": args.cpu_time, "fastest": args.fastest, "seconds_each": floor}
-        write_json(args, settings, [vars(result) for result in results])
-        console.print(f"{i}/{len(cases)} {summary(results[-1], args.variants[0])}")
-    print_tables(results, args.variants, floor, device, "CPU" if args.cpu_time else "wall")
-    if args.plot:
-        plot(results, args.variants[0], args.plot)
+        results.append(run_case(Case(scene, width, height, torch.device(args.device)), args, module))
+        settings = {"torch": torch.__version__, "threads": torch.get_num_threads(), "clock": clock}
+        write_json(args.json, settings | {"cases": [vars(result) for result in results]})
+        taken = number(1, 1e3)(results[-1].both(args.variants[0]))
+        print(f"{i}/{len(cases)} {scene.name} at {width}x{height}: {taken} ms, both ways", flush=True)
+    print_tables(results, args.variants)
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except PointSplatError as error:
-        sys.exit(str(error))
+    start(main)

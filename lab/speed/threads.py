@@ -1,7 +1,7 @@
 """What choosing the number of threads is worth beside other programs: seconds of a merge, and of a step of a repair and
 of a ``splatfacto-cpu`` training, on all threads, on one, and on as many as are chosen.
 
-    python benchmarks/threads.py --busy 0 1 2 --seconds 10
+    python -m lab.speed.threads --busy 0 1 2 --seconds 10
 
 Each is measured in a process of its own, with so many others that only compute, in turns.
 """
@@ -14,16 +14,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Literal
-
-import tyro
+from typing import Literal
 
 import pointsplat_ns as ps
+from lab.common.printing import start
 from pointsplat_ns.system.cores import cores
 
 Work = Literal["merge", "repair", "training"]
@@ -34,68 +32,51 @@ TITLES: dict[Work, str] = {
     "training": "training, s a step",
 }
 
+THREADS = ("all", "one", "chosen")
+
 WARM_UP = 2
 """Steps of a training that are not timed."""
 
 
-@dataclass
-class Options:
-    """What is measured."""
-
-    scene: Path | None = None
-    """What is merged and repaired; by default the scene that ships."""
-    data: Path | None = None
-    """What is trained on, in the Replica layout; by default a room that is made."""
-    works: tuple[Work, ...] = ("merge", "repair", "training")
-    busy: tuple[int, ...] = (0, 1, 2)
-    """Numbers of other processes."""
-    seconds: float = 10.0
-    """How long steps are taken."""
-    rounds: int = 3
-    """How often each is measured; the median is shown."""
-    measure: Annotated[Work | None, tyro.conf.arg(help="measure one in this process, and print its seconds")] = None
-
-
-def merging(options: Options) -> float:
+def merging(scene: Path | None, data: Path | None, seconds: float) -> float:
     """Seconds of a merge."""
-    scene = ps.example_room() if options.scene is None else ps.load(options.scene)
-    start = time.perf_counter()
-    ps.prune(scene, keep="10%")
-    return time.perf_counter() - start
+    dense = ps.example_room() if scene is None else ps.load(scene)
+    begin = time.perf_counter()
+    ps.prune(dense, keep="10%")
+    return time.perf_counter() - begin
 
 
-def repairing(options: Options) -> float:
+def repairing(scene: Path | None, data: Path | None, seconds: float) -> float:
     """Seconds of a step of a repair."""
     from pointsplat_ns.compression.repair import RepairBudget, repair
     from pointsplat_ns.looking.view_source import ViewSource
-    from pointsplat_ns.pruning import prune
 
-    scene = ps.example_room() if options.scene is None else ps.load(options.scene)
-    small, views = prune(scene, 0.1, "coverage"), ViewSource(scene)
+    dense = ps.example_room() if scene is None else ps.load(scene)
+    small, views = ps.prune(dense, 0.1, "coverage"), ViewSource(dense)
     next(views.others())  # sampling views is not a part of a step
-    done = repair(small, scene, views, RepairBudget(seconds=options.seconds))
+    done = repair(small, dense, views, RepairBudget(seconds=seconds))
     return done.seconds / done.steps
 
 
-def training(options: Options) -> float:
+def training(scene: Path | None, data: Path | None, seconds: float) -> float:
     """Seconds of a step of a training."""
     from nerfstudio.engine.callbacks import TrainingCallbackLocation as Location
 
     from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
     from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import splatfacto_cpu_config
 
-    assert options.data is not None
+    assert data is not None
     with tempfile.TemporaryDirectory() as folder:
         config = splatfacto_cpu_config()
         config.machine.device_type, config.output_dir, config.vis = "cpu", Path(folder), "tensorboard"
         config.early_look = False  # type: ignore[attr-defined]
         config.pipeline.datamanager.dataparser = ReplicaDataParserConfig()  # type: ignore[attr-defined]
-        config.pipeline.datamanager.data = config.data = options.data  # type: ignore[attr-defined]
+        config.pipeline.datamanager.data = config.data = data  # type: ignore[attr-defined]
         config.pipeline.model.num_downscales = 0  # type: ignore[attr-defined]
         config.set_timestamp()
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
-        start = time.perf_counter()
+        begin = time.perf_counter()
         for step in itertools.count():
             for where in (Location.BEFORE_TRAIN_ITERATION, Location.AFTER_TRAIN_ITERATION):
                 for callback in trainer.callbacks:
@@ -103,13 +84,17 @@ def training(options: Options) -> float:
                 if where is Location.BEFORE_TRAIN_ITERATION:
                     trainer.train_iteration(step)
             if step + 1 == WARM_UP:
-                start = time.perf_counter()
-            elif step + 1 > WARM_UP and (seconds := time.perf_counter() - start) > options.seconds:
-                return seconds / (step + 1 - WARM_UP)
+                begin = time.perf_counter()
+            elif step + 1 > WARM_UP and (spent := time.perf_counter() - begin) > seconds:
+                return spent / (step + 1 - WARM_UP)
     raise AssertionError("the loop ends by returning")
 
 
-MEASURES = {"merge": merging, "repair": repairing, "training": training}
+MEASURES: dict[Work, Callable[[Path | None, Path | None, float], float]] = {
+    "merge": merging,
+    "repair": repairing,
+    "training": training,
+}
 
 
 @contextmanager
@@ -124,31 +109,9 @@ def busy_machine(processes: int) -> Iterator[None]:
             process.wait()
 
 
-@dataclass
-class Row:
-    """Seconds of a work by the number of threads: "all", "one" or "chosen"."""
-
-    work: Work
-    busy: int
-    seconds: dict[str, list[float]] = field(default_factory=lambda: {"all": [], "one": [], "chosen": []})
-
-    def text(self) -> str:
-        values = {name: median(seconds) for name, seconds in self.seconds.items()}
-        ratios = (values["all"] / values["chosen"], values["one"] / values["chosen"])
-        cells = [
-            TITLES[self.work],
-            self.busy,
-            *(f"{value:.3g}" for value in values.values()),
-            *map("{:.2f}".format, ratios),
-        ]
-        return f"| {' | '.join(map(str, cells))} |"
-
-
-def measured_apart(work: Work, threads: str, options: Options) -> float:
+def measured_apart(work: Work, threads: str, options: list[str]) -> float:
     """What a process of its own measures."""
-    command = [sys.executable, __file__, "--measure", work, "--seconds", str(options.seconds)]
-    command += ["--scene", str(options.scene)] if options.scene else []
-    command += ["--data", str(options.data)] if options.data else []
+    command = [sys.executable, "-m", "lab.speed.threads", "--measure", work, *options]
     environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
     if threads != "chosen":
         environment["OMP_NUM_THREADS"] = str(cores() if threads == "all" else 1)
@@ -158,23 +121,46 @@ def measured_apart(work: Work, threads: str, options: Options) -> float:
     return float(done.stdout.split()[-1])
 
 
-def main(options: Options) -> None:
-    """Measure, and print a row as soon as it is complete."""
-    if options.measure is not None:
-        print(MEASURES[options.measure](options))
+def main(
+    scene: Path | None = None,
+    data: Path | None = None,
+    works: tuple[Work, ...] = ("merge", "repair", "training"),
+    busy: tuple[int, ...] = (0, 1, 2),
+    seconds: float = 10.0,
+    rounds: int = 3,
+    measure: Work | None = None,
+) -> None:
+    """Print a row for each work and number of other processes.
+
+    Args:
+        scene: what is merged and repaired; by default the scene that ships.
+        data: what is trained on, in the Replica layout; by default a room that is made.
+        works: what is measured.
+        busy: numbers of other processes.
+        seconds: how long steps are taken.
+        rounds: how often each is measured; the median is shown.
+        measure: measure one in this process, and print its seconds.
+    """
+    if measure is not None:
+        print(MEASURES[measure](scene, data, seconds))
         return
     with tempfile.TemporaryDirectory() as folder:
-        if options.data is None and "training" in options.works:
-            options.data = ps.write_room(Path(folder) / "room", 3, 20, progress=False)
+        if data is None and "training" in works:
+            data = ps.write_room(Path(folder) / "room", 3, 20, progress=False)
+        options = ["--seconds", str(seconds)]
+        for name, path in (("--scene", scene), ("--data", data)):
+            options += [name, str(path)] if path else []
         print(f"{cores()} cores; busy: other processes; {os.getloadavg()[0]:.1f} were running at the start\n")
         print("| | busy | all | one | chosen | all / chosen | one / chosen |\n|---|---|---|---|---|---|---|")
-        for work, busy in itertools.product(options.works, options.busy):
-            row = Row(work, busy)
-            for _, (name, seconds) in itertools.product(range(options.rounds), row.seconds.items()):
-                with busy_machine(busy):
-                    seconds.append(measured_apart(work, name, options))
-            print(row.text(), flush=True)
+        for work, processes in itertools.product(works, busy):
+            found: dict[str, list[float]] = {name: [] for name in THREADS}
+            for _, name in itertools.product(range(rounds), THREADS):
+                with busy_machine(processes):
+                    found[name].append(measured_apart(work, name, options))
+            every, one, chosen = (median(values) for values in found.values())
+            cells = [*(f"{value:.3g}" for value in (every, one, chosen)), f"{every / chosen:.2f}", f"{one / chosen:.2f}"]
+            print(f"| {TITLES[work]} | {processes} | {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    start(main)

@@ -1,7 +1,7 @@
 """Where a step of a training goes, and what its parts save beside those that nerfstudio configures.
 
-    python benchmarks/training.py outputs/kitchen/splatfacto-cpu/RUN --downscale 1 2
-    python benchmarks/training.py outputs/kitchen/splatfacto-cpu/RUN --refiner
+    python -m lab.speed.training outputs/kitchen/splatfacto-cpu/RUN --downscale 1 2
+    python -m lab.speed.training outputs/kitchen/splatfacto-cpu/RUN --refiner
 
 Steps of ``splatfacto-cpu`` go on from the end of a finished training whose photos are at hand, at its number of
 Gaussians. They alternate between ours, ours without compiled kernels, and one with nerfstudio's Adam and
@@ -12,7 +12,6 @@ is saved.
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -26,7 +25,7 @@ from pytorch_msssim import SSIM
 from torch.profiler import ProfilerActivity, profile
 
 import pointsplat_ns as ps
-from pointsplat_ns.errors import PointSplatError
+from lab.common.printing import start
 from pointsplat_ns.io import open_run
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import dataparser_of
@@ -43,10 +42,7 @@ DRAWING = {
 
 NETWORK = {
     "linear layers, both ways": ("aten::linear", "AddmmBackward0"),
-    "attention, both ways": (
-        "aten::scaled_dot_product_attention",
-        "ScaledDotProductFlashAttentionForCpuBackward0",
-    ),
+    "attention, both ways": ("aten::scaled_dot_product_attention", "ScaledDotProductFlashAttentionForCpuBackward0"),
     "sparse convolutions, both ways": ("_SubmanifoldConv", "_SubmanifoldConvBackward"),
 }
 """And those of a refiner."""
@@ -61,28 +57,6 @@ KINDS = {
 
 WARM_UP = 2
 """Steps that are not counted."""
-
-
-def steps(
-    run: tyro.conf.Positional[Path], downscale: tuple[int, ...] = (1,), count: int = 6, refiner: bool = False
-) -> None:
-    """Print a table for each size of the photos.
-
-    Args:
-        run: a finished training of ``splatfacto-cpu``.
-        downscale: photos are drawn at so many times fewer pixels a side.
-        count: number of steps counted of each kind.
-        refiner: steps of a refiner that is trained on this scene.
-    """
-    torch.set_num_threads(1)
-    with tempfile.TemporaryDirectory() as folder:
-        if refiner:
-            _refiners_table(_started(pointsplat_config(), run, Path(folder)), count)
-            return
-        trainer = _trainer(run, Path(folder))
-        for factor in downscale:
-            trainer.pipeline.model._get_downscale_factor = lambda factor=factor: factor
-            _table(trainer, count)
 
 
 def _trainer(run: Path, folder: Path) -> Any:
@@ -183,14 +157,27 @@ def _measured(
     return lines + [f"| {part} | {100 * share:.0f} % |" for part, share in shares.items()]
 
 
-def main() -> None:
-    """Run; input that cannot be used ends it with one line."""
-    try:
-        tyro.cli(steps)
-    except PointSplatError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(1)
+def main(
+    run: tyro.conf.Positional[Path], downscale: tuple[int, ...] = (1,), count: int = 6, refiner: bool = False
+) -> None:
+    """Print a table for each size of the photos.
+
+    Args:
+        run: a finished training of ``splatfacto-cpu``.
+        downscale: photos are drawn at so many times fewer pixels a side.
+        count: number of steps counted of each kind.
+        refiner: steps of a refiner that is trained on this scene.
+    """
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        if refiner:
+            _refiners_table(_started(pointsplat_config(), run, Path(folder)), count)
+            return
+        trainer = _trainer(run, Path(folder))
+        for factor in downscale:
+            trainer.pipeline.model._get_downscale_factor = lambda factor=factor: factor
+            _table(trainer, count)
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

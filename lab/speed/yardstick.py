@@ -10,7 +10,6 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer import constants
 
-STAGES = ("projection", "binning", "blending", "blending backward", "projection backward")
 CLASSIC_EXTENT = 3.0
 """Standard deviations around a mean that the classic design looks at."""
 TIGHT_EXTENT = 0.0
@@ -26,7 +25,7 @@ def load_yardstick():
         from torch.utils.cpp_extension import load
 
         source = Path(__file__).with_name("yardstick.cpp")
-        return load("pointsplat_yardstick", [str(source)], extra_cflags=["-O3", "-march=native"], verbose=False), ""
+        return load("pointsplat_yardstick", [str(source)], extra_cflags=["-O3", "-march=native"]), ""
     except Exception as error:  # whatever a missing or broken toolchain raises
         lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
         return None, f"no C++ peer, its figures are left out: {lines[0][:160]}"
@@ -34,14 +33,14 @@ def load_yardstick():
 
 @dataclass
 class Yardstick:
-    """Draws with the C++ peer. One scene and camera at a time; ``seconds`` is of the last call, by stage."""
+    """Draws with the C++ peer, one scene and camera at a time."""
 
     module: object
     extent: float = CLASSIC_EXTENT
     boxes: bool = False
     """Blend Gaussian by Gaussian over the pixels of its square or box, not pixel by pixel over its tile's list."""
-    seconds: dict[str, float] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
+    """Of the last call: Gaussians seen, tile pairs, and pairs of Gaussian and pixel looked at and drawn."""
 
     def __post_init__(self) -> None:
         c = constants
@@ -70,6 +69,5 @@ class Yardstick:
         return grads
 
     def _note(self) -> None:
-        self.seconds = dict(zip(STAGES, self._peer.seconds, strict=True))
         names = ("visible", "tile pairs", "looked at", "drawn")
         self.counts = dict(zip(names, self._peer.counts(), strict=True))

@@ -1,4 +1,4 @@
-"""The errors of float32 that benchmarks/stability.py measures, each against float64."""
+"""The errors of float32 that stability.py measures, each against float64."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import classic_splatting
 import torch
-from stability_cases import HEIGHT, WIDTH, Case, Sweep
 from torch import Tensor
 
 import pointsplat_ns as ps
+from lab.numerics import classic_splatting
+from lab.numerics.cases import HEIGHT, WIDTH, Case, Sweep
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.content import content_size
@@ -156,16 +156,19 @@ def _centre(case: Case) -> Tensor:
 def errors(got: Picture, wanted: Picture) -> tuple[dict[str, float], str]:
     """Relative errors of image and gradient, and the kind of parameter with the worst gradient."""
     off = (got.pixels - wanted.pixels).abs().amax((0, 1)) / wanted.pixels.abs().amax((0, 1)).clamp_min(1e-300)
-    least = LEAST_GRADIENT * max(float(grad.norm()) for grad in wanted.grads.values())
-    of_grads = {
-        name: _ratio(got.grads[name] - grad, max(float(grad.norm()), least)) for name, grad in wanted.grads.items()
+    error, worst = _worst(got.grads, wanted.grads)
+    return {"image": _finite(off.max()), "gradient": error}, worst
+
+
+def _worst(got: dict[str, Tensor], wanted: dict[str, Tensor]) -> tuple[float, str]:
+    """The largest error by name, relative to the norm of each tensor, and its name."""
+    least = LEAST_GRADIENT * max(float(value.norm()) for value in wanted.values())
+    found = {
+        name: _finite((got[name] - value).double().norm() / max(float(value.norm()), least, 1e-300))
+        for name, value in wanted.items()
     }
-    worst = max(of_grads, key=lambda name: of_grads[name])
-    return {"image": _finite(off.max()), "gradient": of_grads[worst]}, worst
-
-
-def _ratio(difference: Tensor, size: float) -> float:
-    return _finite(difference.double().norm() / max(size, 1e-300))
+    worst = max(found, key=lambda name: found[name])
+    return found[worst], worst
 
 
 def _finite(error: Tensor) -> float:
@@ -227,15 +230,8 @@ def refiners() -> tuple[Refiner, Refiner]:
 
 def _refiner(scene: Gaussians, truth: Gaussians) -> dict[str, tuple[float, str]]:
     single, double = (_residuals(network, part) for network, part in zip(refiners(), (scene, truth), strict=True))
-    result = {}
-    for quantity, got, wanted in zip(("residual", "gradient"), single, double, strict=True):
-        least = LEAST_GRADIENT * max(float(value.norm()) for value in wanted.values())
-        by_name = {
-            name: _ratio(got[name].double() - value, max(float(value.norm()), least)) for name, value in wanted.items()
-        }
-        worst = max(by_name, key=lambda name: by_name[name])
-        result[quantity] = (by_name[worst], worst)
-    return result
+    names = ("residual", "gradient")
+    return {name: _worst(got, wanted) for name, got, wanted in zip(names, single, double, strict=True)}
 
 
 def _residuals(network: Refiner, scene: Gaussians) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

@@ -1,4 +1,4 @@
-"""Small scenes for benchmarks/stability.py, each with one property driven over decades."""
+"""Small scenes for stability.py, each with one property driven over decades."""
 
 from __future__ import annotations
 
@@ -39,10 +39,9 @@ class Case:
     def rounded(self, dtype: torch.dtype) -> Case:
         """The same, as far as ``dtype`` holds it; the camera is never held to less than float32."""
         camera = torch.promote_types(dtype, torch.float32)
-        gaussians = (self.means, self.quats, self.scales, self.opacities, self.sh)
-        means, quats, scales, opacities, sh = (value.to(dtype).double() for value in gaussians)
-        view, K = (value.to(camera).double() for value in (self.viewmat, self.K))
-        return Case(means, quats, scales, opacities, sh, view, K, self.near, self.antialiased)
+        kinds = dict.fromkeys(("means", "quats", "scales", "opacities", "sh"), dtype)
+        kinds |= dict.fromkeys(("viewmat", "K"), camera)
+        return replace(self, **{name: getattr(self, name).to(kind).double() for name, kind in kinds.items()})
 
     def gaussians(self, dtype: torch.dtype) -> Gaussians:
         """The scene with logarithms and logits, rounded to ``dtype``."""
@@ -53,14 +52,8 @@ class Case:
         """This camera and others a little beside it."""
         viewmats = self.viewmat.repeat(count, 1, 1)
         viewmats[:, 0, 3] += 0.2 * self.means.std(0).max() * torch.arange(count)
-        return Views(
-            viewmats=viewmats,
-            Ks=self.K.repeat(count, 1, 1),
-            width=WIDTH,
-            height=HEIGHT,
-            background=torch.full((3,), 0.3),
-            near_plane=self.near,
-        )
+        grey = torch.full((3,), 0.3)
+        return Views(viewmats, self.K.repeat(count, 1, 1), WIDTH, HEIGHT, grey, near_plane=self.near)
 
 
 def usual(n: int = GAUSSIANS, seed: int = 0) -> Case:
@@ -105,8 +98,7 @@ def from_the_camera(distance: float) -> Case:
     """The usual scene that many times farther from its camera, whose focal length grows as much: the same picture."""
     case = usual()
     view, K = case.viewmat.clone(), case.K.clone()
-    # where DEPTH is now stays in the middle, and the size of a pixel there the same
-    view[2, 3] += DEPTH * (distance - 1)
+    view[2, 3] += DEPTH * (distance - 1)  # what is at DEPTH stays in the middle, and the size of a pixel there the same
     K[0, 0] *= distance
     K[1, 1] *= distance
     return replace(case, viewmat=view, K=K)
@@ -121,8 +113,7 @@ def of_opacity(odds: float) -> Case:
 def as_large_as(pixels: float) -> Case:
     """Blobs of that many pixels, faint, so that many are seen through one another."""
     case = usual()
-    scales = case.scales / case.scales.mean() * pixels * PIXEL
-    return replace(case, scales=scales, opacities=0.3 * case.opacities)
+    return replace(case, scales=case.scales / case.scales.mean() * pixels * PIXEL, opacities=0.3 * case.opacities)
 
 
 def needles(aspect: float) -> Case:
@@ -143,23 +134,15 @@ def discs(aspect: float) -> Case:
 
 def layers(count: float) -> Case:
     """As many Gaussians, the fainter the more there are, but for a twentieth."""
-    n = round(count)
-    case = usual(n)
-    faint = case.opacities * min(1.0, 30.0 / n) + 0.005
+    case = usual(round(count))
+    faint = case.opacities * min(1.0, 30.0 / count) + 0.005
     faint[::20] = case.opacities[::20]
     return replace(case, opacities=faint)
-
-
-def in_precision(epsilon: float) -> Case:
-    """The usual scene, whatever the precision that it is handed over in."""
-    return usual()
 
 
 _TYPES = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 PRECISIONS = {torch.finfo(dtype).eps: dtype for dtype in _TYPES}
 """Types by their relative rounding."""
-
-FLOAT32 = torch.finfo(torch.float32).eps
 
 
 @dataclass(frozen=True)
@@ -193,5 +176,8 @@ SWEEPS = (
     Sweep("needles", "length / width of needles 0.3 pixels wide", _decades(0, 7), needles),
     Sweep("discs", "width / thickness of discs 20 pixels wide", _decades(0, 8), discs),
     Sweep("count", "Gaussians", _decades(1, 3, 0.5), layers, 10.0),
-    Sweep("precision", "relative rounding of the type of the input", tuple(PRECISIONS), in_precision, FLOAT32, True),
-)
+    Sweep(
+        "precision", "relative rounding of the type of the input", tuple(PRECISIONS), lambda epsilon: usual(),
+        torch.finfo(torch.float32).eps, True,
+    ),
+)  # fmt: skip
