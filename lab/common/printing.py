@@ -11,8 +11,6 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from pointsplat_ns.errors import PointSplatError
-
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -21,8 +19,9 @@ WIDE = 240
 
 
 def start(program: Callable[..., Any]) -> Any:
-    """Run a function with the arguments of the command line; input that cannot be used ends the
-    program with one line."""
+    """Run a function with the arguments of the command line; input that cannot be used ends it with one line."""
+    from pointsplat_ns.errors import PointSplatError
+
     try:
         return tyro.cli(program, config=(tyro.conf.OmitArgPrefixes,))
     except PointSplatError as error:

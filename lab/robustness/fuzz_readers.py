@@ -350,5 +350,5 @@ READERS |= {
     "points": at("points.json", _use_points),
     "cells": at("room/cells.json", _use_cells, lambda folder: (folder / "room").mkdir()),
     "flight": at("a.json", _use_flight),
-    "levels": at("levels.json", _use_levels),
+    "levels": at("lod.json", _use_levels),
 }

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 import resource
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -101,7 +102,7 @@ def minimised(name: str, corpus: Path, output: Path) -> int:
     chosen.mkdir(parents=True, exist_ok=True)
     (output / "kept").mkdir(exist_ok=True)
     status, _ = _libfuzzer(name, output, ["-merge=1", str(chosen), str(corpus.resolve()), str(output / "kept")])
-    if status != 0:
+    if status != 0 or not any(chosen.iterdir()):
         raise SystemExit(f"{name} could not be merged; see {output / 'log.txt'}")
     for path in corpus.iterdir():
         if len(path.name) >= NAMED:
@@ -150,7 +151,8 @@ def child(name: str, found: Path, options: list[str]) -> None:
             one_input(path.read_bytes())
         taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (taken + HEADROOM, taken + HEADROOM))
-        atheris.Setup([sys.argv[0], *options], one_input)
+        again = shlex.join([sys.executable, "-m", "lab.robustness.fuzzing", "--child", name, str(found)])
+        atheris.Setup([again, *options], one_input)  # libFuzzer starts itself by a shell when it merges
         atheris.Fuzz()
 
 

@@ -5,37 +5,39 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
+from safetensors import safe_open
 
 import pointsplat_ns as ps
 from pointsplat_ns.io.formats import format_named
 from pointsplat_ns.io.inert_yaml import read_config
 
-_LOGS = ("events.out", "losses-")
-_TIMED = (".json", ".csv", ".html", ".md", ".tex", ".png")
+TIMED = (".json", ".csv", ".html", ".md", ".tex", ".png")
 """Kinds of files that say when something was made and how long it took, or show it."""
+
+LOGS = ("events.out", "losses-")
+"""Starts of the names of files that a training logs to, line by line."""
 
 
 def files_of(folder: Path) -> dict[str, Path]:
-    """The files below a folder by their relative names. What is hidden is unfinished, or a lock, and is left out; so is
-    what a training logs line by line."""
-    if not folder.is_dir():
-        return {}
-    files = {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*")) if path.is_file()}
+    """The files below a folder by their relative names, without logs. What is hidden is unfinished, or a lock, and is
+    left out."""
+    files = {path.relative_to(folder): path for path in sorted(folder.rglob("*")) if path.is_file()}
     return {
-        name: path
+        str(name): path
         for name, path in files.items()
-        if not any(part.startswith(".") for part in Path(name).parts)
-        and not path.name.startswith(("events.out", "losses-"))
+        if not any(part.startswith(".") for part in name.parts) and not name.name.startswith(LOGS)
     }
 
 
 def without_times(path: Path) -> bytes:
     """What has to be the same in two files; of those with times in them, their suffix."""
-    if path.suffix in _TIMED:
+    if path.suffix in TIMED:
         return path.suffix.encode()
     data = path.read_bytes()
     if path.suffix != ".safetensors":
@@ -44,58 +46,72 @@ def without_times(path: Path) -> bytes:
     return json.dumps(json.loads(data[8:end]), sort_keys=True).encode() + data[end:]  # its header has no fixed order
 
 
-def not_whole(folder: Path) -> list[tuple[Path, str]]:
+def differences(folder: Path, whole: Path) -> list[str]:
+    """How the files of a folder differ from those of an undisturbed command."""
+    found, expected = files_of(folder), files_of(whole)
+    faults = [f"lacks {name}" for name in sorted(expected.keys() - found.keys())]
+    faults += [f"has {name} as well" for name in sorted(found.keys() - expected.keys())]
+    both = sorted(expected.keys() & found.keys())
+    return faults + [
+        f"{name} has other bytes" for name in both if without_times(found[name]) != without_times(expected[name])
+    ]
+
+
+def not_whole(folder: Path) -> list[str]:
     """Files below a folder that are not what their names say, and why."""
     faults = []
     for path in files_of(folder).values():
         try:
-            _check(path)
+            if not _whole(path):
+                faults.append(f"{path.name} is not whole")
         except Exception as error:  # whatever a damaged file causes
-            faults.append((path, f"{type(error).__name__}: {error}"))
+            faults.append(f"{path.name} is not whole ({type(error).__name__}: {error})")
     return faults
 
 
-def _check(path: Path) -> None:
-    data = path.read_bytes()
+def _decoded(path: Path) -> bool:
+    with Image.open(path) as image:
+        image.load()
+    return True
+
+
+def _frames(path: Path) -> bool:
+    import av
+
+    with av.open(str(path)) as video:
+        return sum(1 for _ in video.decode(video=0)) > 0
+
+
+def _tensors(path: Path) -> bool:
+    with safe_open(path, framework="pt") as file:
+        return len(list(file.keys())) > 0
+
+
+def _same_length(path: Path) -> bool:
+    return len({len(row) for row in csv.reader(io.StringIO(path.read_text()))}) == 1
+
+
+CHECKS: dict[str, Callable[[Path], object]] = {
+    ".ckpt": lambda path: torch.load(path, weights_only=True),
+    ".glb": lambda path: path.stat().st_size == int.from_bytes(path.read_bytes()[8:12], "little"),
+    ".json": lambda path: json.loads(path.read_bytes()) is not None,
+    ".npy": lambda path: np.load(path) is not None,
+    ".csv": _same_length,
+    ".html": lambda path: path.read_bytes().rstrip().endswith(b"</html>"),
+    **dict.fromkeys((".png", ".jpg", ".webp"), _decoded),
+    ".yml": read_config,
+    ".mp4": _frames,
+    ".safetensors": _tensors,
+    **dict.fromkeys((".md", ".tex", ".txt"), lambda path: path.stat().st_size > 0),
+}
+"""What is true of a whole file, by its suffix."""
+
+
+def _whole(path: Path) -> bool:
     kind = format_named(path.name)
-    if path.suffix == ".ckpt":
-        torch.load(path, weights_only=True)
-    elif path.suffix == ".glb":
-        _need(len(data) == int.from_bytes(data[8:12], "little"), "of another length than it says")
-    elif kind is not None and kind.read is not None:
-        _need(len(ps.load(path)) > 0, "no Gaussians")
-    elif path.suffix == ".json":
-        json.loads(data)
-    elif path.suffix == ".npy":
-        np.load(path)
-    elif path.suffix == ".csv":
-        _need(len({len(row) for row in csv.reader(io.StringIO(data.decode()))}) == 1, "rows of several lengths")
-    elif path.suffix == ".html":
-        _need(data.rstrip().endswith(b"</html>"), "no end")
-    elif path.suffix in (".png", ".jpg", ".webp"):
-        from PIL import Image
-
-        with Image.open(path) as image:
-            image.load()
-    elif path.suffix == ".yml":
-        read_config(path)
-    elif path.suffix == ".mp4":
-        import av
-
-        with av.open(str(path)) as video:
-            _need(sum(1 for _ in video.decode(video=0)) > 0, "no frame")
-    elif path.suffix == ".safetensors":
-        from safetensors import safe_open
-
-        with safe_open(path, framework="pt") as file:
-            _need(len(list(file.keys())) > 0, "no tensor")
-    else:
-        _need(path.suffix in (".md", ".tex", ".txt") and len(data) > 0, "empty, or of a kind that is not known here")
-
-
-def _need(condition: bool, why: str) -> None:
-    if not condition:
-        raise ValueError(why)
+    if kind is not None and kind.read is not None and path.suffix not in (".ckpt", ".glb"):
+        return len(ps.load(path)) > 0
+    return bool(CHECKS[path.suffix](path))
 
 
 def losses_of(folder: Path) -> dict[int, str]:

@@ -1,6 +1,6 @@
 """Kills commands that write, with SIGKILL at random moments, and looks at what is left.
 
-    OMP_NUM_THREADS=1 python benchmarks/kills.py --kills 250
+    OMP_NUM_THREADS=1 python -m lab.robustness.kills --kills 250
 
 Each command works on a tiny scene, in a process forked from this one, which has imported everything. After a kill no
 file may have its final name that is not whole; what is unfinished has a hidden name. Then the same command is given
@@ -26,10 +26,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import tyro
-from kill_checks import files_of, losses_of, not_whole, training_left, without_times
-
 import pointsplat_ns as ps
+from lab.common.printing import start
+from lab.robustness.kill_checks import differences, files_of, losses_of, not_whole, training_left
 
 
 @dataclass
@@ -54,52 +53,49 @@ class Command:
     """Of its share of the kills; less for what takes long."""
 
 
-def pointsplat(*words: str) -> Callable[[Path], None]:
+def pointsplat(words: str) -> Callable[[Path], None]:
     """A ``pointsplat`` command; OUT stands for its folder."""
 
     def run(folder: Path) -> None:
         from pointsplat_ns.cli import main
 
-        main([word.replace("OUT", str(folder)) for word in words])
+        main([word.replace("OUT", str(folder)) for word in words.split()])
 
     return run
 
 
+COMPACT = "compact scene.ply -o OUT/small.ply --html OUT/small.html"
+TABLES = "--keeps 0.3 --views 2 --side 48 --scoring-views 2 --fine-tune 2 --only */merge/30% */random/30%"
+
 COMMANDS = (
-    Command("prune", pointsplat("prune", "scene.ply", "--keep", "30%", "-o", "OUT/small.ply")),
-    Command(
-        "compact",
-        pointsplat("compact", "scene.ply", "-o", "OUT/small.ply", "--html", "OUT/small.html"),
-        # Between its two files it leaves the first, which is not overwritten unless that is asked for.
-        pointsplat("compact", "scene.ply", "-o", "OUT/small.ply", "--html", "OUT/small.html", "--force"),
-    ),
-    Command("compact of a folder", pointsplat("compact", "scenes", "--effort", "instant", "-o", "OUT/small")),
-    Command("convert to SPZ", pointsplat("convert", "scene.ply", "OUT/a.spz")),
-    Command("convert to a SOG folder", pointsplat("convert", "scene.ply", "OUT/meta.json")),
-    Command("convert to glTF", pointsplat("convert", "scene.ply", "OUT/a.glb")),
-    Command("lod", pointsplat("lod", "scene.ply", "--levels", "50%", "20%", "-o", "OUT/lod")),
+    Command("prune", pointsplat("prune scene.ply --keep 30% -o OUT/small.ply")),
+    # Between its two files it leaves the first, which is not overwritten unless that is asked for.
+    Command("compact", pointsplat(COMPACT), pointsplat(f"{COMPACT} --force")),
+    Command("compact of a folder", pointsplat("compact scenes --effort instant -o OUT/small")),
+    Command("convert to SPZ", pointsplat("convert scene.ply OUT/a.spz")),
+    Command("convert to a SOG folder", pointsplat("convert scene.ply OUT/meta.json")),
+    Command("convert to glTF", pointsplat("convert scene.ply OUT/a.glb")),
+    Command("lod", pointsplat("lod scene.ply --levels 50% 20% -o OUT/lod")),
     Command(
         "tradeoff",
-        pointsplat("tradeoff", "scene.ply", "-o", "OUT", "--points", "3", "--views", "2", "--resolution", "48x36",
-                   "--drawn", "exact", "--repairs", "none"),
+        pointsplat("tradeoff scene.ply -o OUT --points 3 --views 2 --side 48 --drawn exact --repairs none"),
     ),
+    Command("tables", pointsplat(f"tables scene.ply -o OUT {TABLES}")),
+    Command("rooms", pointsplat("rooms -o OUT --seeds 0 1 --frames 3 --width 32 --height 24")),
+    Command("render", pointsplat("render scene.ply -o OUT/a.mp4 --width 32 --height 24 --seconds 1")),
+    Command("export", pointsplat("export run -o OUT/a.ply")),
+    Command("report", pointsplat("report evaluation.json --html OUT/a.html")),
     Command(
-        "tables",
-        pointsplat("tables", "scene.ply", "-o", "OUT", "--keeps", "0.3", "--views", "2", "--side", "48",
-                   "--scoring-views", "2", "--fine-tune", "2", "--only", "*/merge/30%", "*/random/30%"),
+        "make-feedback",
+        pointsplat("make-feedback scene.ply -o OUT/a.safetensors --keep 50% --updates 1 --at-once 1"),
+        weight=0.25,
     ),
-    Command("rooms", pointsplat("rooms", "-o", "OUT", "--seeds", "0", "1", "--frames", "3", "--width", "32",
-                                "--height", "24")),
-    Command("render", pointsplat("render", "scene.ply", "-o", "OUT/a.mp4", "--width", "32", "--height", "24",
-                                 "--seconds", "1")),
-    Command("export", pointsplat("export", "run", "-o", "OUT/a.ply")),
-    Command("report", pointsplat("report", "evaluation.json", "--html", "OUT/a.html")),
-    Command("make-feedback", pointsplat("make-feedback", "scene.ply", "-o", "OUT/a.safetensors", "--keep", "50%",
-                                        "--updates", "1", "--at-once", "1"), weight=0.25),
-)  # fmt: skip
+)
 
-SLOW_IMPORTS = ("av", "filelock", "kornia.metrics", "matplotlib.backends.backend_agg", "plyfile", "PIL.WebPImagePlugin",
-                "safetensors.torch", "scipy.spatial", "torchmetrics.image", "zstandard")  # fmt: skip
+SLOW_IMPORTS = (
+    *("av", "filelock", "kornia.metrics", "matplotlib.backends.backend_agg", "plyfile", "PIL.WebPImagePlugin"),
+    *("safetensors.torch", "scipy.spatial", "torchmetrics.image", "zstandard"),
+)
 """What commands import when they first need it; here it is shared by all that are forked."""
 
 STEPS, SAVED_EVERY = 24, 5
@@ -159,7 +155,7 @@ def main(
     possible = [*COMMANDS, TRAIN] if training else [c for c in COMMANDS if c.name != "export"]  # of a trained run
     chosen = [c for c in possible if not commands or c.name in commands]
     generator = random.Random(seed)
-    start = time.monotonic()
+    begin = time.monotonic()
     print("| Command | Seconds | Kills | Nothing there yet | Unfinished, hidden | Some files | All there | Faults |")
     print("|---|---|---|---|---|---|---|---|")
     done = 0
@@ -174,7 +170,7 @@ def main(
             print(f"| {' | '.join(row)} |", flush=True)
             for fault in found.faults:
                 print(f"  {command.name}: {fault}", flush=True)
-    print(f"{done} kills in {time.monotonic() - start:.0f} s")
+    print(f"{done} kills in {time.monotonic() - begin:.0f} s")
 
 
 def prepare(place: Path, training: bool) -> None:
@@ -220,9 +216,9 @@ def killed(command: Command, kills: int, generator: random.Random, place: Path, 
     whole = place / "whole"
     forked(command.run, whole)  # what is read for the first time takes longer
     shutil.rmtree(whole)
-    start = time.monotonic()
+    begin = time.monotonic()
     status = forked(command.run, whole)
-    outcomes = Outcomes(time.monotonic() - start)
+    outcomes = Outcomes(time.monotonic() - begin)
     if status != 0:
         outcomes.faults.append(f"ends with {status} undisturbed: {(place / 'said.txt').read_text()[-300:]}")
         return outcomes
@@ -231,7 +227,7 @@ def killed(command: Command, kills: int, generator: random.Random, place: Path, 
         folder = place / "killed"
         moment = generator.uniform(0, 1.05 * outcomes.seconds)
         forked(command.run, folder, moment)
-        faults = [f"{path.name} is not whole ({why})" for path, why in not_whole(folder)]
+        faults = not_whole(folder)
         left = files_of(folder)
         hidden = any(any(part.startswith(".") for part in path.parts) for path in folder.rglob("*"))
         finished = left.keys() == expected.keys() and command is not TRAIN
@@ -242,7 +238,7 @@ def killed(command: Command, kills: int, generator: random.Random, place: Path, 
             status = forked(command.again or command.run, folder)
             if status != 0:
                 faults.append(f"again ends with {status}: {(place / 'said.txt').read_text()[-300:]}")
-        faults += [f"{path.name} is not whole in the end ({why})" for path, why in not_whole(folder)]
+        faults += [f"{fault}, in the end" for fault in not_whole(folder)]
         if command is TRAIN:
             faults += [] if losses_of(folder) == losses_of(whole) else ["other losses than undisturbed"]
         else:
@@ -253,17 +249,6 @@ def killed(command: Command, kills: int, generator: random.Random, place: Path, 
         shutil.rmtree(folder, ignore_errors=True)
     shutil.rmtree(whole, ignore_errors=True)
     return outcomes
-
-
-def differences(folder: Path, whole: Path) -> list[str]:
-    """How the files of a folder differ from those of an undisturbed command."""
-    found, expected = files_of(folder), files_of(whole)
-    faults = [f"lacks {name}" for name in sorted(expected.keys() - found.keys())]
-    faults += [f"has {name} as well" for name in sorted(found.keys() - expected.keys())]
-    for name in sorted(expected.keys() & found.keys()):
-        if without_times(found[name]) != without_times(expected[name]):
-            faults.append(f"{name} has other bytes")
-    return faults
 
 
 def forked(run: Callable[[Path], None], folder: Path, seconds: float | None = None) -> int:
@@ -300,4 +285,4 @@ def forked(run: Callable[[Path], None], folder: Path, seconds: float | None = No
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    start(main)

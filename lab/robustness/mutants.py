@@ -1,12 +1,15 @@
 """Would the tests notice a fault? Faults are put into the code one by one, and the tests of its part are run.
 
-    OMP_NUM_THREADS=1 python benchmarks/mutants.py --seed 0 --output outputs/mutants.json
+    OMP_NUM_THREADS=1 python -m lab.robustness.mutants --seed 0 --output outputs/mutants.json
 
-So many faults of each part are drawn at random (:mod:`mutations`); the same seed draws the same. Each is tried in a
-process of its own, forked from one in which torch and pytest are loaded and nothing of this package: a fault costs
-seconds, and the files stay as they are. The examples of the module and the tests named after it come first, then the
-other tests of the part; the first failure ends it, if that test passes without the fault. What is done is in the
+So many faults of each part are drawn at random (:mod:`lab.robustness.mutations`); the same seed draws the same. Each is
+tried in a process of its own, forked from one in which torch and pytest are loaded and nothing of this package: a fault
+costs seconds, and the files stay as they are. The examples of the module and the tests named after it come first, then
+the other tests of the part; the first failure ends it, if that test passes without the fault. What is done is in the
 output, and not done again; ``--survivors`` tries what survived once more.
+
+mutmut leaves out decorated functions, such as all under ``@torch.no_grad()``; cosmic-ray changes the files and imports
+torch anew for each fault. So the faults and their trial are here.
 """
 
 from __future__ import annotations
@@ -29,23 +32,18 @@ from types import CodeType, ModuleType
 
 import pytest
 import tyro
-from mutations import Mutation, mutations
 
-ROOT = Path(__file__).parents[1]
+from lab.common.printing import markdown
+from lab.robustness.mutations import Mutation, mutations
+
+ROOT = Path(__file__).parents[2]
 
 LONGEST = 20
 """CPU seconds that a test may take, in no more than an hour: a fault that makes it longer is caught."""
 
 LOADED = (
-    "torch",
-    "scipy.spatial",
-    "hypothesis.strategies",
-    "_hypothesis_pytestplugin",
-    "kornia",
-    "torchmetrics",
-    "plyfile",
-    "cv2",
-    "yaml",
+    *("torch", "scipy.spatial", "hypothesis.strategies", "_hypothesis_pytestplugin", "kornia", "torchmetrics"),
+    *("plyfile", "cv2", "yaml"),
 )
 """Modules of others, loaded once for all; nerfstudio is one where it is installed."""
 
@@ -83,7 +81,10 @@ class Part:
         return [str(path) for path in first], [str(path) for path in dict.fromkeys(then) if path not in first]
 
 
+_SCORES = ("scores.py", "coverage.py", "view_scores.py")
 _SAME_RESULT = "tests/test_same_result.py"
+_REPAIR = tuple(f"tests/compression/test_{name}.py" for name in ("repair", "fine_tune", "compact", "feedback_training"))
+
 PARTS = {
     "rasterizer": Part(
         ("pointsplat_ns/rasterizer/*.py",),
@@ -92,28 +93,15 @@ PARTS = {
         left_out=("constants.py",),
     ),
     "scores": Part(
-        tuple(f"pointsplat_ns/pruning/{name}.py" for name in ("scores", "coverage", "view_scores")),
-        tuple(f"tests/pruning/test_{name}.py" for name in ("scores", "coverage", "view_scores")),
-        (
-            "tests/pruning/test_methods.py",
-            "tests/pruning/test_select.py",
-            _SAME_RESULT,
-            "tests/compression/test_prune.py",
-        ),
+        tuple(f"pointsplat_ns/pruning/{name}" for name in _SCORES),
+        tuple(f"tests/pruning/test_{name}" for name in _SCORES),
+        ("tests/pruning/test_methods.py", "tests/pruning/test_select.py", _SAME_RESULT, "tests/compression/test_prune.py"),
     ),
     "merge": Part(
-        ("pointsplat_ns/pruning/merging/*.py",),
-        tuple(
-            f"tests/pruning/merging/test_{name}.py"
-            for name in ("covariance", "matching", "pair_cost", "finishing", "regrouping", "weights")
-        ),
-        (
-            "tests/pruning/merging/test_merge.py",
-            "tests/pruning/test_methods.py",
-            _SAME_RESULT,
-            "tests/compression/test_threads_agree.py",
-        ),
-        left_out=("__init__.py", "settings.py"),
+        ("pointsplat_ns/pruning/*.py", "pointsplat_ns/merging/*.py"),
+        ("tests/*ing/test_covariance.py", "tests/*ing/test_matching.py"),
+        ("tests/pruning/test_*.py", "tests/*ing/test_merge*.py", _SAME_RESULT, "tests/compression/test_threads_agree.py"),
+        left_out=_SCORES,
     ),
     "refiner": Part(
         ("pointsplat_ns/refiner/*.py",),
@@ -123,14 +111,7 @@ PARTS = {
     "repair": Part(
         tuple(f"pointsplat_ns/compression/{name}.py" for name in ("repair", "feedback", "optimiser")),
         ("tests/compression/test_feedback.py", "tests/compression/test_optimiser.py"),
-        (
-            "tests/compression/test_repair.py",
-            "tests/compression/test_fine_tune.py",
-            "tests/refiner/test_feedback.py",
-            _SAME_RESULT,
-            "tests/compression/test_compact.py",
-            "tests/compression/test_feedback_training.py",
-        ),
+        (*_REPAIR, "tests/refiner/test_feedback.py", _SAME_RESULT),
     ),
 }
 
@@ -259,19 +240,6 @@ def drawn(part: Part, count: int, seed: int, root: Path) -> list[tuple[Path, Mut
     return [everything[i] for i in sorted(chosen)]
 
 
-def read(output: Path) -> list[Row]:
-    """What a former run wrote."""
-    return [Row(**row) for row in json.loads(output.read_text("utf-8"))] if output.exists() else []
-
-
-def write(output: Path, rows: Sequence[Row]) -> None:
-    """Write all rows, whole or not at all."""
-    output.parent.mkdir(parents=True, exist_ok=True)
-    part = output.with_name(output.name + ".partial")
-    part.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", "utf-8")
-    part.replace(output)
-
-
 def main(
     output: Path = Path("mutants.json"),
     seed: int = 0,
@@ -296,7 +264,9 @@ def main(
         importlib.import_module(name)
     if importlib.util.find_spec("nerfstudio"):
         importlib.import_module("nerfstudio.configs.external_methods")
-    rows = {(row.module, row.fault): row for row in read(output)}
+    done = [Row(**row) for row in json.loads(output.read_text("utf-8"))] if output.exists() else []
+    rows = {(row.module, row.fault): row for row in done}
+    output.parent.mkdir(parents=True, exist_ok=True)
     trial = Trial(root)
     for name in parts:
         for path, fault in drawn(PARTS[name], count, seed, root):
@@ -308,17 +278,18 @@ def main(
             runs = PARTS[name].tests_of(path, root)
             caught_by = trial.caught_by(path, source, runs[:1] if near else runs)
             rows[key] = Row(name, *key, caught_by, round(trial.spent - before, 1))
-            write(output, list(rows.values()))
+            part = output.with_name(output.name + ".partial")  # not io.files, which would load a part of the package
+            part.write_text(json.dumps([asdict(row) for row in rows.values()], indent=1) + "\n", "utf-8")
+            part.replace(output)
             print(f"{key[0]} {key[1]}: {caught_by or 'SURVIVED'} ({rows[key].seconds} CPU s)", flush=True)
     table(list(rows.values()))
 
 
 def table(rows: Sequence[Row]) -> None:
     """Print how many faults of each part were caught, and which were not."""
-    print("| Part | Faults | Caught |\n|---|---|---|")
-    for name in dict.fromkeys(row.part for row in rows):
-        these = [row for row in rows if row.part == name]
-        print(f"| {name} | {len(these)} | {sum(bool(row.caught_by) for row in these)} |")
+    parts = {name: [row for row in rows if row.part == name] for name in dict.fromkeys(row.part for row in rows)}
+    lines = [[name, len(these), sum(bool(row.caught_by) for row in these)] for name, these in parts.items()]
+    print(markdown(["Part", "Faults", "Caught"], lines))
     for row in rows:
         if not row.caught_by:
             print(f"- {row.module} {row.fault}")

@@ -11,7 +11,7 @@ import copy
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
+OPERATORS: dict[type[ast.AST], tuple[type[ast.AST], ...]] = {
     ast.Lt: (ast.LtE, ast.GtE),
     ast.LtE: (ast.Lt, ast.Gt),
     ast.Gt: (ast.GtE, ast.LtE),
@@ -22,57 +22,30 @@ COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
     ast.IsNot: (ast.Is,),
     ast.In: (ast.NotIn,),
     ast.NotIn: (ast.In,),
+    ast.And: (ast.Or,),
+    ast.Or: (ast.And,),
+    ast.Add: (ast.Sub,),
+    ast.Sub: (ast.Add,),
+    ast.Mult: (ast.Div,),
+    ast.BitAnd: (ast.BitOr,),
+    ast.BitOr: (ast.BitAnd,),
+    ast.LShift: (ast.RShift,),
+    ast.RShift: (ast.LShift,),
+    **dict.fromkeys((ast.Div, ast.FloorDiv, ast.Mod, ast.Pow), (ast.Mult,)),
 }
+"""What an operator is taken for."""
 
-ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
-    ast.Add: ast.Sub,
-    ast.Sub: ast.Add,
-    ast.Mult: ast.Div,
-    ast.Div: ast.Mult,
-    ast.FloorDiv: ast.Mult,
-    ast.Mod: ast.Mult,
-    ast.Pow: ast.Mult,
-    ast.BitAnd: ast.BitOr,
-    ast.BitOr: ast.BitAnd,
-    ast.LShift: ast.RShift,
-    ast.RShift: ast.LShift,
-}
-
-_PAIRS = (
-    ("min", "max"),
-    ("amin", "amax"),
-    ("argmin", "argmax"),
-    ("minimum", "maximum"),
-    ("clamp_min", "clamp_max"),
-    ("any", "all"),
-    ("sum", "mean"),
-    ("zeros", "ones"),
-    ("zeros_like", "ones_like"),
-    ("sin", "cos"),
-    ("floor", "ceil"),
-    ("exp", "expm1"),
-    ("log", "log1p"),
-)
-NAMES = {one: other for pair in _PAIRS for one, other in (pair, pair[::-1])}
+_PAIRS = """min max, amin amax, argmin argmax, minimum maximum, clamp_min clamp_max, any all, sum mean, zeros ones,
+zeros_like ones_like, sin cos, floor ceil, exp expm1, log log1p"""
+NAMES = {a: b for pair in _PAIRS.split(",") for a, b in (pair.split(), pair.split()[::-1])}
 """Functions and methods that are taken for one another."""
 
-DROPPED = {
-    "clamp",
-    "clamp_min",
-    "clamp_max",
-    "abs",
-    "sqrt",
-    "square",
-    "log",
-    "exp",
-    "detach",
-    "flip",
-    "cumsum",
-    "round",
-}
+DROPPED = {*"clamp clamp_min clamp_max abs sqrt square log exp detach flip cumsum round".split()}
 """Methods of a tensor that a mutant leaves out."""
 
 _NOT_MUTATED = (ast.Raise, ast.JoinedStr, ast.Import, ast.ImportFrom, ast.arg)
+
+Node = ast.expr | ast.stmt
 
 
 @dataclass(frozen=True)
@@ -102,81 +75,59 @@ def mutations(source: str) -> list[Mutation]:
     for line in source.encode().splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
     found = []
-    for node, changed in _changes(ast.parse(source)):
-        before = ast.get_source_segment(source, node)
-        assert before is not None and node.end_lineno is not None and node.end_col_offset is not None
-        after = ast.unparse(changed)
-        after = f"({after})" if isinstance(changed, ast.expr) and not isinstance(changed, ast.Constant) else after
-        start, stop = starts[node.lineno - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset
-        found.append(Mutation(node.lineno, node.col_offset + 1, start, stop, before, after))
+    for node in _nodes(ast.parse(source), inside=False):
+        for changed in _changes(node):
+            before = ast.get_source_segment(source, node)
+            assert before is not None and node.end_lineno is not None and node.end_col_offset is not None
+            after = ast.unparse(changed)
+            after = f"({after})" if isinstance(changed, ast.expr) and not isinstance(changed, ast.Constant) else after
+            start, stop = starts[node.lineno - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset
+            found.append(Mutation(node.lineno, node.col_offset + 1, start, stop, before, after))
     return sorted(found, key=lambda mutation: (mutation.start, mutation.stop, mutation.after))
 
 
-def _changes(tree: ast.Module) -> Iterator[tuple[ast.expr | ast.stmt, ast.expr | ast.stmt]]:
-    """Nodes in functions, and what they could be by mistake."""
-    for node in _nodes(tree, inside=False):
-        if isinstance(node, ast.stmt):
-            yield from ((node, changed) for changed in _statements(node))
-        elif isinstance(node, ast.expr):
-            yield from ((node, changed) for changed in _expressions(node))
-
-
-def _nodes(node: ast.AST, inside: bool) -> Iterator[ast.AST]:
+def _nodes(node: ast.AST, inside: bool) -> Iterator[Node]:
     """What is computed in functions: no annotations, decorators, docstrings and messages."""
     for name, value in ast.iter_fields(node):
         if name in ("annotation", "returns", "decorator_list"):
             continue
         for child in value if isinstance(value, list) else [value]:
-            if not isinstance(child, ast.AST) or isinstance(child, _NOT_MUTATED) or _is_text(child):
+            is_text = isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant)
+            if not isinstance(child, ast.AST) or isinstance(child, _NOT_MUTATED) or is_text:
                 continue
             within = inside or isinstance(child, (ast.FunctionDef, ast.Lambda))
-            if within:
+            if within and isinstance(child, Node):
                 yield child
             yield from _nodes(child, within)
 
 
-def _is_text(node: ast.AST) -> bool:
-    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-
-
-def _statements(node: ast.stmt) -> Iterator[ast.stmt]:
+def _changes(node: Node) -> Iterator[Node]:
+    """What a node could be by mistake."""
     if isinstance(node, ast.AugAssign) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)):
         yield ast.Pass()
-    if isinstance(node, ast.AugAssign) and type(node.op) in ARITHMETIC:
-        yield _with(node, op=ARITHMETIC[type(node.op)]())
-
-
-def _expressions(node: ast.expr) -> Iterator[ast.expr]:
-    if isinstance(node, ast.Compare):
+    if isinstance(node, (ast.AugAssign, ast.BinOp, ast.BoolOp)):
+        yield from (_with(node, op=other()) for other in OPERATORS.get(type(node.op), ()))
+    elif isinstance(node, ast.Compare):
         for place, op in enumerate(node.ops):
-            for other in COMPARISONS[type(op)]:
+            for other in OPERATORS[type(op)]:
                 yield _with(node, ops=[*node.ops[:place], other(), *node.ops[place + 1 :]])
-    elif isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC:
-        yield _with(node, op=ARITHMETIC[type(node.op)]())
-    elif isinstance(node, ast.BoolOp):
-        yield _with(node, op=ast.Or() if isinstance(node.op, ast.And) else ast.And())
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.Not, ast.USub, ast.Invert)):
         yield node.operand
     elif isinstance(node, ast.IfExp):
         yield _with(node, body=node.orelse, orelse=node.body)
     elif isinstance(node, ast.Constant):
         yield from (ast.Constant(value) for value in _values(node.value))
-    elif isinstance(node, ast.Call):
-        yield from _calls(node)
+    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in NAMES:
+        yield _with(node, func=ast.Name(NAMES[node.func.id], ast.Load()))
+    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+        of, name = node.func.value, node.func.attr
+        if name in NAMES:
+            yield _with(node, func=_with(node.func, attr=NAMES[name]))
+        if name in DROPPED and not (isinstance(of, ast.Name) and of.id in ("torch", "math")):
+            yield of
 
 
-def _calls(node: ast.Call) -> Iterator[ast.expr]:
-    called = node.func
-    if isinstance(called, ast.Name) and called.id in NAMES:
-        yield _with(node, func=ast.Name(NAMES[called.id], ast.Load()))
-    elif isinstance(called, ast.Attribute):
-        if called.attr in NAMES:
-            yield _with(node, func=_with(called, attr=NAMES[called.attr]))
-        if called.attr in DROPPED and not (isinstance(called.value, ast.Name) and called.value.id in ("torch", "math")):
-            yield called.value
-
-
-def _values(value: object) -> list[object]:
+def _values(value: object) -> list[bool | int | float]:
     """Other values of a constant: the other of two, the next and none of whole numbers, twice and none of others."""
     if isinstance(value, bool):
         return [not value]
@@ -187,7 +138,7 @@ def _values(value: object) -> list[object]:
     return []
 
 
-def _with(node: ast.expr | ast.stmt, **fields: object) -> ast.expr | ast.stmt:
+def _with(node: Node, **fields: object) -> Node:
     changed = copy.copy(node)
     for name, value in fields.items():
         setattr(changed, name, value)

@@ -1,8 +1,8 @@
 """Long runs: does memory grow, are handles left, does work slow down?
 
-    python benchmarks/soak.py training --minutes 60 --json training.json
-    python benchmarks/soak.py rendering --minutes 60 --json rendering.json
-    python benchmarks/soak.py viewer --minutes 60 --json viewer.json
+    python -m lab.robustness.soak training --minutes 60 --json training.json
+    python -m lab.robustness.soak rendering --minutes 60 --json rendering.json
+    python -m lab.robustness.soak viewer --minutes 60 --json viewer.json
 
 Each watches a process of its own from outside: its memory, open files and sockets, threads, and CPU seconds for a unit
 of its work, which other programs on the machine stretch less than seconds. Printed are medians over the first and the
@@ -19,18 +19,19 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Literal
+from typing import Literal
 
 import psutil
 import tyro
-from options import write_whole
 
 import pointsplat_ns as ps
+from lab.common.printing import markdown, start
+from lab.common.results import write_json
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.commands import train_scene_command
 from pointsplat_ns.rooms import write_room
@@ -40,17 +41,15 @@ What = Literal["training", "rendering", "viewer"]
 WARM = 0.1
 """Share of the time at the beginning that is left out."""
 
+PORT = "7351"
+
 RENDER = """
-import sys
+import itertools, sys
 import pointsplat_ns as ps
 room = ps.load(sys.argv[1])
-views = ps.sample_views(room, 6)
-done = 0
-while True:
-    for view in views:
-        ps.render(room, view)
-        done += 1
-        print(done, flush=True)
+for done, view in enumerate(itertools.cycle(ps.sample_views(room, 6)), 1):
+    ps.render(room, view)
+    print(done, flush=True)
 """
 
 
@@ -69,7 +68,7 @@ class Sample:
 class Watched:
     """A process, and the number of units of work that it has said it did."""
 
-    def __init__(self, words: list[str], counts: re.Pattern[str] | None):
+    def __init__(self, words: list[str], counts: str | None):
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
         self.process = subprocess.Popen(
             words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment, errors="replace"
@@ -82,11 +81,11 @@ class Watched:
         assert self.process.stdout is not None
         for line in self.process.stdout:
             self.last = line.strip() or self.last
-            if self._counts is not None and (found := self._counts.search(line)):
+            if self._counts is not None and (found := re.search(self._counts, line)):
                 self.done = int(found[1])
 
-    def sample(self, start: float) -> Sample:
-        """How the process is now.
+    def sample(self, seconds: float) -> Sample | None:
+        """How the process is now; None while it starts.
 
         Raises:
             PointSplatError: if it has ended.
@@ -94,45 +93,13 @@ class Watched:
         if self.process.poll() is not None:
             raise PointSplatError(f"it ended with status {self.process.returncode}: {self.last}")
         seen = psutil.Process(self.process.pid)
-        cpu = seen.cpu_times()
-        return Sample(
-            time.monotonic() - start, seen.memory_info().rss / 2**20, seen.num_fds(), seen.num_threads(),
-            cpu.user + cpu.system, self.done,
-        )  # fmt: skip
+        cpu, memory = seen.cpu_times(), seen.memory_info().rss / 2**20
+        sample = Sample(seconds, memory, seen.num_fds(), seen.num_threads(), cpu.user + cpu.system, self.done)
+        return sample if self.done else None
 
 
-def soak(
-    what: tyro.conf.Positional[What],
-    minutes: float = 60,
-    every: float = 10,
-    side: int = 96,
-    json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
-) -> None:
-    """Watch one kind of work for some time.
-
-    Args:
-        what: training of a small room, drawing the room that ships, or its viewer with a client that moves about, goes
-            and comes again each half minute.
-        minutes: how long.
-        every: seconds between two looks.
-        side: width of the training's photos, pixels.
-        json_file: all samples go there, after each look.
-    """
-    with tempfile.TemporaryDirectory() as folder, _started(what, Path(folder), side) as watched:
-        start, samples = time.monotonic(), []
-        while (now := time.monotonic() - start) < 60 * minutes:
-            if watched.done:  # it works, not only starts
-                samples.append(watched.sample(start))
-            elif watched.process.poll() is not None:
-                raise PointSplatError(f"it ended with status {watched.process.returncode}: {watched.last}")
-            write_whole(json_file, {"what": what, "minutes": now / 60, "samples": [asdict(s) for s in samples]})
-            time.sleep(every)
-    for line in report(what, samples):
-        print(line)
-
-
-def report(what: str, samples: list[Sample]) -> list[str]:
-    """Medians over the first and the last quarter, a Markdown row each.
+def report(what: str, samples: list[Sample]) -> str:
+    """Medians over the first and the last quarter, as a Markdown table.
 
     Raises:
         PointSplatError: if there are too few samples.
@@ -141,27 +108,20 @@ def report(what: str, samples: list[Sample]) -> list[str]:
     quarter = len(samples) // 4
     if quarter < 2:
         raise PointSplatError(f"{len(samples)} looks at the process; expected at least 8: take more minutes")
-    first, last = samples[:quarter], samples[-quarter:]
-
-    def row(name: str, of: Callable[[list[Sample]], float], form: str) -> str:
-        return f"| {what}: {name} | {of(first):{form}} | {of(last):{form}} |"
-
-    def cost(part: list[Sample]) -> float:
-        return 1000 * (part[-1].cpu - part[0].cpu) / max(1, part[-1].done - part[0].done)
-
-    done, hours = samples[-1].done, samples[-1].seconds / 3600
-    return [
-        f"| {what}, {hours:.2f} h, {done:,} units | first quarter | last quarter |",
-        "|---|---|---|",
-        row("memory, MiB", lambda part: median(s.mebibytes for s in part), ".0f"),
-        row("open files and sockets", lambda part: median(s.handles for s in part), ".0f"),
-        row("threads", lambda part: median(s.threads for s in part), ".0f"),
-        row("CPU ms a unit", cost, ".1f"),
+    parts = samples[:quarter], samples[-quarter:]
+    names = {"mebibytes": "memory, MiB", "handles": "open files and sockets", "threads": "threads"}
+    rows = [
+        [f"{what}: {name}", *(f"{median(getattr(sample, field) for sample in part):.0f}" for part in parts)]
+        for field, name in names.items()
     ]
+    cost = [1000 * (part[-1].cpu - part[0].cpu) / max(1, part[-1].done - part[0].done) for part in parts]
+    rows.append([f"{what}: CPU ms a unit", *(f"{value:.1f}" for value in cost)])
+    title = f"{what}, {samples[-1].seconds / 3600:.2f} h, {samples[-1].done:,} units"
+    return markdown([title, "first quarter", "last quarter"], rows)
 
 
 @contextmanager
-def _started(what: What, folder: Path, side: int) -> Iterator[Watched]:
+def started(what: What, folder: Path, side: int) -> Iterator[Watched]:
     """The process, which is interrupted at the end."""
     room = folder / "room.ply"
     ps.save(ps.example_room()[::4], room)
@@ -170,12 +130,12 @@ def _started(what: What, folder: Path, side: int) -> Iterator[Watched]:
         write_room(folder / "room", 1, 24, side, 3 * side // 4)
         options = {"pipeline.model.stop-split-at": 1000, "scale-schedules": "False", "steps-per-save": 500}
         words = train_scene_command(folder / "room", folder, "soak", 10**7, "t", 4000, options).split()
-        watched = Watched(_console(words), re.compile(r"^\W*(\d+) \(\d+\.\d+%\)"))
+        watched = Watched(_console(words), r"^\W*(\d+) \(\d+\.\d+%\)")
     elif what == "rendering":
-        watched = Watched([sys.executable, "-c", RENDER, str(room)], re.compile(r"^(\d+)$"))
+        watched = Watched([sys.executable, "-c", RENDER, str(room)], r"^(\d+)$")
     else:
-        watched = Watched(_console(["pointsplat", "view", str(room), "--port", "7351"]), None)
-        threading.Thread(target=_move, args=(watched, "ws://127.0.0.1:7351", stop), daemon=True).start()
+        watched = Watched(_console(["pointsplat", "view", str(room), "--port", PORT]), None)
+        threading.Thread(target=_move, args=(watched, f"ws://127.0.0.1:{PORT}", stop), daemon=True).start()
     try:
         yield watched
     finally:
@@ -214,22 +174,36 @@ def _move(watched: Watched, url: str, stop: threading.Event) -> None:
                     end = time.monotonic() + 0.5
                     while (left := end - time.monotonic()) > 0:
                         try:
-                            data = socket.recv(timeout=left)
+                            watched.done += str(socket.recv(timeout=left)).count("BackgroundImageMessage")
                         except TimeoutError:
                             break
-                        watched.done += str(data).count("BackgroundImageMessage")
         except (OSError, WebSocketException):
             time.sleep(1)  # it has not started yet
 
 
-def main() -> None:
-    """Run; what goes wrong ends it with one line."""
-    try:
-        tyro.cli(soak)
-    except PointSplatError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(1)
+def main(
+    what: tyro.conf.Positional[What], minutes: float = 60, every: float = 10, side: int = 96, json: Path | None = None
+) -> None:
+    """Watch one kind of work for some time.
+
+    Args:
+        what: training of a small room, drawing the room that ships, or its viewer with a client that moves about, goes
+            and comes again each half minute.
+        minutes: how long.
+        every: seconds between two looks.
+        side: width of the training's photos, pixels.
+        json: all samples go there, after each look.
+    """
+    samples: list[Sample] = []
+    with tempfile.TemporaryDirectory() as folder, started(what, Path(folder), side) as watched:
+        begin = time.monotonic()
+        while (now := time.monotonic() - begin) < 60 * minutes:
+            if (sample := watched.sample(now)) is not None:
+                samples.append(sample)
+            write_json(json, {"what": what, "minutes": now / 60, "samples": [asdict(s) for s in samples]})
+            time.sleep(every)
+    print(report(what, samples))
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

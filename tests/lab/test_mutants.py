@@ -1,4 +1,4 @@
-"""benchmarks/mutants.py on a module of its own: what it catches, what it reports, and what it leaves alone."""
+"""lab/robustness/mutants.py on a module of its own: what it catches, what it reports, and what it leaves alone."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import os
 from pathlib import Path
 
 import pytest
+
+from lab.robustness import mutants, mutations
 
 SOURCE = '''"""A module of 2 functions."""
 
@@ -54,17 +56,15 @@ def steps(tmp_path) -> Path:
 
 
 @pytest.fixture()
-def mutants(benchmark, monkeypatch):
-    """The program, told of that module alone."""
-    module = benchmark("mutants")
-    monkeypatch.setattr(module, "PARTS", {"steps": module.Part(("steps.py",), ("tests/test_*.py",))})
-    monkeypatch.setattr(module, "LONGEST", 1)
-    monkeypatch.setattr(module, "LOADED", ())
-    return module
+def of_steps_alone(monkeypatch):
+    """The program is told of that module alone."""
+    monkeypatch.setattr(mutants, "PARTS", {"steps": mutants.Part(("steps.py",), ("tests/test_*.py",))})
+    monkeypatch.setattr(mutants, "LONGEST", 1)
+    monkeypatch.setattr(mutants, "LOADED", ())
 
 
-def test_faults_are_what_functions_compute_and_no_text(benchmark):
-    found = [str(mutation) for mutation in benchmark("mutations").mutations(SOURCE)]
+def test_faults_are_what_functions_compute_and_no_text():
+    found = [str(mutation) for mutation in mutations.mutations(SOURCE)]
     assert found == [
         "6:19: 0 -> 1",
         "8:8: x > 5 -> (x <= 5)",
@@ -84,7 +84,7 @@ def test_faults_are_what_functions_compute_and_no_text(benchmark):
     ]
 
 
-def test_what_no_test_sees_survives_and_the_rest_is_caught(steps, mutants, capsys):
+def test_what_no_test_sees_survives_and_the_rest_is_caught(steps, of_steps_alone, capsys):
     (steps / "steps.py").write_text(FEW)
     output = steps / "rows.json"
 
@@ -108,20 +108,19 @@ def test_what_no_test_sees_survives_and_the_rest_is_caught(steps, mutants, capsy
     assert said.count("CPU s") == 1
 
 
-def test_the_same_seed_draws_the_same_faults(steps, mutants):
+def test_the_same_seed_draws_the_same_faults(steps, of_steps_alone):
     part = mutants.PARTS["steps"]
     first = mutants.drawn(part, 4, 1, steps)
     assert len(first) == 4 and first == mutants.drawn(part, 4, 1, steps) != mutants.drawn(part, 4, 2, steps)
 
 
-def test_a_test_that_fails_anyway_catches_nothing(steps, mutants):
+def test_a_test_that_fails_anyway_catches_nothing(steps, of_steps_alone):
     (steps / "tests" / "test_steps.py").write_text("def test_nothing():\n    assert False\n")
     with pytest.raises(RuntimeError, match="test_nothing fails on the code as it is"):
         mutants.main(steps / "rows.json", count=1, parts=("steps",), root=steps)
 
 
-def test_every_part_has_modules_and_tests(benchmark):
-    mutants = benchmark("mutants")
+def test_every_part_has_modules_and_tests():
     for name, part in mutants.PARTS.items():
         modules = part.sources(mutants.ROOT)
         assert modules and all(list(mutants.ROOT.glob(pattern)) for pattern in (*part.first, *part.then)), name
