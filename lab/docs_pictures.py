@@ -1,7 +1,7 @@
 """Draws the pictures of the documentation's concepts, all from the room that ships.
 
-    python benchmarks/docs_pictures.py                  # all of them, to docs/concepts
-    python benchmarks/docs_pictures.py --only budgets   # one
+    python -m lab.docs_pictures                  # all of them, to docs/concepts
+    python -m lab.docs_pictures --only budgets   # one
 
 Each is made by the functions that its page is about; figures in the titles are measured while drawing.
 """
@@ -15,14 +15,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from torch import Tensor
 
 import pointsplat_ns as ps
+from lab.common.printing import save_figure, start
 from pointsplat_ns.geometry.cameras import invert_rigid
-from pointsplat_ns.io.files import replacing
 from pointsplat_ns.looking.sampling import estimated_up
 
 SHOWN = 0
@@ -89,11 +88,6 @@ def heat(values: Tensor, most: float) -> Tensor:
     return torch.from_numpy(np.asarray(colormaps["inferno"](shares))[..., :3])
 
 
-def save(figure: Figure, path: Path) -> None:
-    with replacing(path) as part:
-        figure.savefig(part, dpi=100, format="jpg", pil_kwargs={"quality": 82, "optimize": True})
-
-
 def grid(rows: Images, titles: Sequence[str], path: Path) -> None:
     """Images of one size side by side, a title above each of the first row."""
     across = 3.4 if len(titles) < 4 else 2.9  # inches
@@ -104,7 +98,7 @@ def grid(rows: Images, titles: Sequence[str], path: Path) -> None:
             axis.set_axis_off()
     for axis, title in zip(figure.axes, titles, strict=False):
         axis.set_title(title, fontsize=12 if len(titles) < 4 else 14)
-    save(figure, path)
+    save_figure(figure, path, dpi=100, pil_kwargs={"quality": 82, "optimize": True})
 
 
 def splats(path: Path) -> None:
@@ -162,7 +156,7 @@ def sampled(path: Path) -> None:
         axis.imshow(np.asarray(drawn(room(), number - 1).clamp(0, 1)))
         axis.set_title(f"{number}", fontsize=11, color="crimson", pad=2)
         axis.set_axis_off()
-    save(figure, path)
+    save_figure(figure, path, dpi=100, pil_kwargs={"quality": 82, "optimize": True})
 
 
 def repaired(path: Path) -> None:
@@ -197,23 +191,14 @@ def layers(path: Path) -> None:
     depth = image[..., 3]
     worst = (image[..., :3] - exact[..., :3]).abs().amax(-1)
     digits = (worst.clamp_min(1e-8).log10() + 8) / 4  # 1e-8 is black, 1e-4 and more white
-    titles = [
-        "colour",
-        f"depth, 0 to {depth.max():.1f} units",
-        f"not covered, 0 to {1 - alpha.min():.2f}",
-        "error of float32",
-    ]
+    titles = ["colour", f"depth, 0 to {depth.max():.1f} units", f"not covered, 0 to {1 - alpha.min():.2f}"]
+    titles.append("error of float32")
     shown = [image[..., :3].float(), heat(depth, depth.max().item()), heat(1 - alpha, (1 - alpha).max().item())]
     grid([[*shown, heat(digits, 1.0)]], titles, path)
 
 
 PICTURES: dict[str, Callable[[Path], None]] = {
-    "splats": splats,
-    "methods": methods,
-    "budgets": budgets,
-    "sampled": sampled,
-    "repaired": repaired,
-    "layers": layers,
+    draw.__name__: draw for draw in (splats, methods, budgets, sampled, repaired, layers)
 }
 
 
@@ -226,8 +211,7 @@ def main(folder: Path = Path("docs/concepts"), only: tuple[str, ...] = ()) -> No
     """
     for name in only or PICTURES:
         PICTURES[name](folder / f"{name}.jpg")
-        print(f"{folder / name}.jpg: {(folder / f'{name}.jpg').stat().st_size / 1e3:.0f} kB", flush=True)
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    start(main)

@@ -1,6 +1,6 @@
 """Trains the same photos with ``splatfacto-cpu`` and with OpenSplat's CPU backend: held-out PSNR over time.
 
-    python benchmarks/opensplat.py replica/kitchen replica/office0 --opensplat opensplat --downscale 2 --plot curves.png
+    python -m lab.training.opensplat replica/kitchen replica/office0 --opensplat opensplat --downscale 2 --plot curves.png
 
 OpenSplat (https://github.com/pierotofy/OpenSplat, AGPL) is a program of its own, built by whoever runs this. Both get
 the same folder in nerfstudio's layout: photos already made smaller, poses, and the seed points that ``replica-data``
@@ -17,27 +17,26 @@ Time is that of all threads together, in minutes of the processor: with one thre
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from json import dumps, loads
 from pathlib import Path
 
 import numpy as np
 import psutil
 import torch
 import tyro
-from held_out import mean_psnr
-from options import write_whole
 from PIL import Image
 from plyfile import PlyData, PlyElement
-from rich.console import Console
-from rich.table import Table
 
 import pointsplat_ns as ps
+from lab.common.compare import mean_psnr
+from lab.common.printing import console, save_figure, start, table
+from lab.common.results import write_json
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
@@ -67,8 +66,7 @@ class Look:
 
 
 def main(
-    scenes: tuple[Path, ...],
-    /,
+    scenes: tyro.conf.Positional[tuple[Path, ...]],
     opensplat: Path,
     steps: int = 2000,
     ours: int | None = None,
@@ -77,7 +75,7 @@ def main(
     threads: int = 1,
     output: Path = Path("outputs/opensplat"),
     plot: Path | None = None,
-    json_file: Path | None = None,
+    json: Path | None = None,
 ) -> None:
     """Train each scene three times, and print what the held-out photos say of it.
 
@@ -91,7 +89,7 @@ def main(
         threads: of each training.
         output: folder for the photos and all trainings. A finished training there is not repeated.
         plot: draw PSNR over time here, as a PNG.
-        json_file: write all figures here.
+        json: write all figures here.
     """
     found: list[Look] = []
     environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
@@ -105,9 +103,7 @@ def main(
         views, photos = dataset_photos(_run(folder / _slug(OURS)), "test", sys.maxsize)
         for method in lengths:
             found += looked_at(path.name, method, folder / _slug(method), views, photos)
-            write_whole(
-                json_file, {"threads": threads, "downscale": downscale, "looks": [asdict(look) for look in found]}
-            )
+            write_json(json, {"threads": threads, "downscale": downscale, "looks": [asdict(look) for look in found]})
     print_table(found)
     if plot is not None:
         draw(found, plot)
@@ -141,12 +137,12 @@ def exported(scene: Path, folder: Path, downscale: int) -> None:
     _write_points(folder / "points.ply", points, colors)
     theirs = [{**frame, "file_path": f"../{frame['file_path']}"} for frame in frames["train"]]
     (folder / "train" / "transforms.json").write_text(
-        json.dumps({**common, "ply_file_path": "../points.ply", "frames": theirs}), "utf-8"
+        dumps({**common, "ply_file_path": "../points.ply", "frames": theirs}), "utf-8"
     )
     names = {split: [frame["file_path"] for frame in frames[split]] for split in frames}
     lists = {"train_filenames": names["train"], "val_filenames": names["test"], "test_filenames": names["test"]}
     whole = {**common, "ply_file_path": "points.ply", "frames": frames["train"] + frames["test"], **lists}
-    (folder / "transforms.json").write_text(json.dumps(whole), "utf-8")
+    (folder / "transforms.json").write_text(dumps(whole), "utf-8")
 
 
 def centred(principal: torch.Tensor, size: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -161,10 +157,8 @@ _INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
 
 def _write_points(path: Path, points: torch.Tensor, colors: torch.Tensor) -> None:
     """As text, in the order of properties that OpenSplat wants."""
-    rows = np.empty(len(points), [(axis, "f4") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")])
-    for columns, values in (("xyz", points), (("red", "green", "blue"), colors)):
-        for column, of_column in zip(columns, values.T.numpy(), strict=True):
-            rows[column] = of_column
+    kinds = [(axis, "f4") for axis in "xyz"] + [(color, "u1") for color in ("red", "green", "blue")]
+    rows = np.array([(*point, *color) for point, color in zip(points.tolist(), colors.tolist(), strict=True)], kinds)
     PlyData([PlyElement.describe(rows, "vertex")], text=True).write(path)
 
 
@@ -215,7 +209,7 @@ def train(words: list[str], folder: Path, environment: dict[str, str]) -> None:
                 times.setdefault(str(file.relative_to(folder)), (spent, clock))
     if process.returncode:
         raise PointSplatError(f"{words[0]}: it ended with status {process.returncode}; see {folder / 'log.txt'}")
-    record.write_text(json.dumps(times), "utf-8")
+    record.write_text(dumps(times), "utf-8")
 
 
 def _cpu_seconds(process: psutil.Process) -> float:
@@ -246,7 +240,7 @@ def _step(file: str) -> int:
 def looked_at(scene: str, method: str, folder: Path, views: Views, photos: list[torch.Tensor]) -> list[Look]:
     """Judge all that a training saved, in the order of time."""
     looks = []
-    times: dict[str, tuple[float, float]] = json.loads((folder / "times.json").read_text("utf-8"))
+    times: dict[str, tuple[float, float]] = loads((folder / "times.json").read_text("utf-8"))
     for file, (spent, clock) in sorted(times.items(), key=lambda item: _step(item[0])):
         if spent:
             gaussians: Gaussians = ps.load(folder / file)
@@ -257,52 +251,41 @@ def looked_at(scene: str, method: str, folder: Path, views: Views, photos: list[
 
 def print_table(found: list[Look]) -> None:
     """A row a training: its end, and when it was as good as OpenSplat's better end."""
-    table = Table(
-        "scene", "trained by", "steps", "Gaussians", "PSNR, dB", "minutes", "as good as OpenSplat after", "share"
-    )
+    rows = []
     for scene in dict.fromkeys(look.scene for look in found):
-        trainings = {
-            method: [look for look in found if (look.scene, look.method) == (scene, method)] for method in METHODS
-        }
+        trainings = {method: [look for look in found if (look.scene, look.method) == (scene, method)] for method in METHODS}
         best = max((trainings[method][-1] for method in (DEFAULTS, SCALED)), key=lambda look: look.psnr)
         for method, looks in trainings.items():
             end = looks[-1]
             steps = max(look.step for look in looks if look.step < sys.maxsize)
             reached = next((look.minutes for look in looks if look.psnr >= best.psnr), None)
+            after = ["never", ""] if reached is None else [f"{reached:.1f}", f"{reached / best.minutes:.2f}"]
             row = [scene, method, f"{steps:,}", f"{end.gaussians:,}", f"{end.psnr:.2f}", f"{end.minutes:.1f}"]
-            row += ["never", ""] if reached is None else [f"{reached:.1f}", f"{reached / best.minutes:.2f}"]
-            table.add_row(*row)
-    Console(width=140).print(table)
+            rows.append([*row, *after])
+    heads = ("scene", "trained by", "steps", "Gaussians", "PSNR, dB", "minutes", "as good as OpenSplat after", "share")
+    console().print(table("held-out photos", heads, rows))
 
 
 METHODS = (OURS, SCALED, DEFAULTS)
-TICKS = (0.3, 1, 3, 10, 30, 100)
 
 
 def draw(found: list[Look], path: Path) -> None:
     """Draw PSNR over the minutes, a panel a scene."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-    from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
+    from matplotlib.figure import Figure
 
     scenes = list(dict.fromkeys(look.scene for look in found))
-    figure, panels = plt.subplots(1, len(scenes), figsize=(4.2 * len(scenes), 3.6), squeeze=False, layout="constrained")
-    for panel, scene in zip(panels[0], scenes, strict=True):
+    figure = Figure(figsize=(4.2 * len(scenes), 3.6), layout="constrained")
+    panels = figure.subplots(1, len(scenes), squeeze=False)[0]
+    for panel, scene in zip(panels, scenes, strict=True):
         for method in METHODS:
             looks = [look for look in found if (look.scene, look.method) == (scene, method)]
             panel.plot([look.minutes for look in looks], [look.psnr for look in looks], marker=".", label=method)
         panel.set(title=scene, xlabel="minutes of the processor", xscale="log")
-        panel.xaxis.set(
-            major_locator=FixedLocator(TICKS), major_formatter=ScalarFormatter(), minor_locator=NullLocator()
-        )
         panel.grid(alpha=0.3)
-    panels[0][0].set_ylabel("PSNR of held-out photos, dB")
-    panels[0][0].legend(fontsize="small")
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    panels[0].set_ylabel("PSNR of held-out photos, dB")
+    panels[0].legend(fontsize="small")
+    save_figure(figure, path)
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    start(main)

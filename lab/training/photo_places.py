@@ -1,7 +1,7 @@
 """Does a scene tell where its photos were taken? Runs know; their Gaussians are asked.
 
-    python benchmarks/photo_places.py RUN... [--picture photo_places.jpg]
-    python benchmarks/photo_places.py RUN... --sh 0      # by sizes, as if there were no SH
+    python -m lab.training.photo_places RUN... [--picture photo_places.jpg]
+    python -m lab.training.photo_places RUN... --sh 0      # by sizes, as if there were no SH
 
 For each run: how well photos from the best of the places compared explain the SH (below 2 the scene has not told),
 without SH how sizes and distances from it correlate (below 0.48 it has not); how far from a training pose the places
@@ -20,10 +20,11 @@ from pathlib import Path
 
 import torch
 import tyro
-from held_out import name_of
 from torch import Tensor
 
 import pointsplat_ns as ps
+from lab.common.printing import markdown, save_figure, start
+from lab.common.scenes import name_of
 from pointsplat_ns.gaussians import MAX_SH_DEGREE
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.looking.content import content_size, positions_in_units, views_in_units
@@ -84,9 +85,8 @@ def asked(run: Path, sh: int) -> Map:
         distance = f"{float((found[1] * torch.cdist(found[0], eyes).amin(1)).sum()) / size:.1%}"
     best = float(torch.cat([at_eyes, at_any]).max())
     off = math.degrees(math.acos(max(-1.0, min(1.0, float(estimated_up(dense) @ up_of_cameras(poses))))))
-    print(
-        f"| {name_of(run)} | {best:.2f} | {distance} | {away:.1%} | {more:.0%} | {alike:.2f} | {off:.0f} |", flush=True
-    )
+    cells = (name_of(run), f"{best:.2f}", distance, f"{away:.1%}", f"{more:.0%}", f"{alike:.2f}", f"{off:.0f}")
+    print(f"| {' | '.join(cells)} |", flush=True)
     return mapped(name_of(run), witnesses, eyes)
 
 
@@ -116,21 +116,19 @@ def mapped(name: str, witnesses: Witnesses, eyes: Tensor) -> Map:
 
 def draw(maps: list[Map], path: Path) -> None:
     """Maps beside one another, as a picture."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(3.6 * len(maps), 3.9), layout="constrained")
-    FigureCanvasAgg(figure)
     for axes, drawn in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps, strict=True):
         side = (-drawn.extent, drawn.extent)
         axes.imshow(drawn.votes, origin="lower", extent=(*side, *side))
         axes.scatter(*drawn.gaussians[::3].T, s=1, c="white", alpha=0.35, linewidths=0)
         axes.scatter(*drawn.eyes.T, s=9, c="red", linewidths=0)
         axes.set(xlim=side, ylim=side, xticks=[], yticks=[], title=drawn.name)
-    figure.savefig(path, dpi=100)
+    save_figure(figure, path, dpi=100)
 
 
-def main(runs: tyro.conf.Positional[tuple[Path, ...]], /, picture: Path | None = None, sh: int = MAX_SH_DEGREE) -> None:
+def main(runs: tyro.conf.Positional[tuple[Path, ...]], picture: Path | None = None, sh: int = MAX_SH_DEGREE) -> None:
     """Print a table, and draw maps if asked to.
 
     Args:
@@ -138,14 +136,12 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]], /, picture: Path | None =
         picture: file to draw the maps into.
         sh: cut scenes to this SH degree first.
     """
-    print(
-        "| | explained, best place | from a pose | any place | poses explain more | weights alike | up, degrees off |"
-    )
-    print("|---|---|---|---|---|---|---|")
+    print(markdown(["", "explained, best place", "from a pose", "any place", "poses explain more", "weights alike",
+                    "up, degrees off"], []), flush=True)  # fmt: skip
     maps = [asked(run, sh) for run in runs]
     if picture is not None:
         draw(maps, picture)
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    start(main)

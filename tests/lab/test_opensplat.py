@@ -1,4 +1,4 @@
-"""benchmarks/opensplat.py: what both programs get, and what is noted while one trains."""
+"""lab/training/opensplat.py: what both programs get, and what is noted while one trains."""
 
 from __future__ import annotations
 
@@ -11,17 +11,13 @@ import torch
 from plyfile import PlyData
 
 import pointsplat_ns as ps
+from lab.training import opensplat
 from making import cloud
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
 
 
-@pytest.fixture()
-def opensplat(benchmark):
-    return benchmark("opensplat")
-
-
-def test_both_get_the_same_photos_poses_and_points_and_one_of_them_no_held_out_frame(opensplat, wall_scene, tmp_path):
+def test_both_get_the_same_photos_poses_and_points_and_one_of_them_no_held_out_frame(wall_scene, tmp_path):
     opensplat.exported(wall_scene, tmp_path, 2)
     parser = ReplicaDataParserConfig(data=wall_scene).setup()
     train, test = (parser.get_dataparser_outputs(split) for split in ("train", "test"))
@@ -38,13 +34,13 @@ def test_both_get_the_same_photos_poses_and_points_and_one_of_them_no_held_out_f
     assert points.count == len(train.metadata["points3D_xyz"]) and points["red"].dtype.itemsize == 1
 
 
-def test_photos_are_cut_so_that_the_principal_point_is_in_their_middle(opensplat):
+def test_photos_are_cut_so_that_the_principal_point_is_in_their_middle():
     for principal, expected in (((160.0, 120.0), (0, 0, 320, 240)), ((150.2, 131.0), (0, 22, 300, 218))):
         corner, size = opensplat.centred(torch.tensor(principal), torch.tensor([320, 240]))
         assert (*corner.tolist(), *size.tolist()) == expected
 
 
-def test_times_of_what_a_training_saves_are_noted_and_a_finished_one_is_left_alone(opensplat, tmp_path):
+def test_times_of_what_a_training_saves_are_noted_and_a_finished_one_is_left_alone(tmp_path):
     scene = tmp_path / "scene.ply"
     ps.save(cloud(10), scene)
     program = f"import shutil, time; time.sleep(0.3); shutil.copy({str(scene)!r}, 'splat_5.ply'); time.sleep(0.3); "
@@ -58,7 +54,7 @@ def test_times_of_what_a_training_saves_are_noted_and_a_finished_one_is_left_alo
         opensplat.train([sys.executable, "-c", "raise SystemExit(3)"], tmp_path / "other", {})
 
 
-def test_the_table_says_when_ours_is_as_good_as_the_better_of_the_others(opensplat, tmp_path, capsys):
+def test_the_table_says_when_ours_is_as_good_as_the_better_of_the_others(tmp_path, capsys):
     ends = {opensplat.OURS: 30.0, opensplat.SCALED: 28.0, opensplat.DEFAULTS: 20.0}
     found = [
         opensplat.Look("kitchen", method, step, minutes, minutes, 10, psnr - 5 * (step == 1))
