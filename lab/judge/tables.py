@@ -107,8 +107,8 @@ def leads(rows: list[Row], method: str, rivals: tuple[str, ...] | None) -> list[
 
 
 def summary(found: list[Row], column: str) -> Iterator[Line]:
-    """Lines of a table of leads: those of each group of scenes, then its mean and its least lead with the scene that has
-    it; last, these of all scenes of several groups."""
+    """Lines of a table of leads: those of each group of scenes, then its mean and its least lead with its scene; last,
+    mean and least of all scenes of several groups."""
     groups = grouped(found, lambda lead: group_of(lead["scene"]))
     for group, members in groups.items():
         known = [lead for lead in members if column in lead]

@@ -95,12 +95,22 @@ PARTS = {
     "scores": Part(
         tuple(f"pointsplat_ns/pruning/{name}" for name in _SCORES),
         tuple(f"tests/pruning/test_{name}" for name in _SCORES),
-        ("tests/pruning/test_methods.py", "tests/pruning/test_select.py", _SAME_RESULT, "tests/compression/test_prune.py"),
+        (
+            "tests/pruning/test_methods.py",
+            "tests/pruning/test_select.py",
+            _SAME_RESULT,
+            "tests/compression/test_prune.py",
+        ),
     ),
     "merge": Part(
         ("pointsplat_ns/pruning/*.py", "pointsplat_ns/merging/*.py"),
         ("tests/*ing/test_covariance.py", "tests/*ing/test_matching.py"),
-        ("tests/pruning/test_*.py", "tests/*ing/test_merge*.py", _SAME_RESULT, "tests/compression/test_threads_agree.py"),
+        (
+            "tests/pruning/test_*.py",
+            "tests/*ing/test_merge*.py",
+            _SAME_RESULT,
+            "tests/compression/test_threads_agree.py",
+        ),
         left_out=_SCORES,
     ),
     "refiner": Part(

@@ -7,6 +7,7 @@ It needs CUDA, and gsplat compiles its kernels when first used, in some minutes.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from statistics import median
 
@@ -58,9 +59,9 @@ def main(scene: Path | None = None, views: int = 6, rounds: int = 3) -> None:
         for backend in BACKENDS:
             for grads in (False, True):
                 times = [
-                    [1e3 * seconds_of(lambda view=view: drawn(dense, view, factor, backend, grads)) for view in looked_from]
+                    [1e3 * seconds_of(partial(drawn, dense, view, factor, backend, grads)) for view in looked_from]
                     for _ in range(rounds + 1)
-                ]  # fmt: skip
+                ]
                 counted = sorted(value for row in times[1:] for value in row)
                 what = f"{round(looked_from[0].width * factor)} pixels, {backend}, image{' and gradients' * grads}"
                 print(f"{what}: {median(counted):.2f} ms ({counted[0]:.2f} to {counted[-1]:.2f})", flush=True)

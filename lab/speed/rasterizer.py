@@ -13,6 +13,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -210,7 +211,7 @@ def run_case(case: Case, args: Args, module: Any) -> Result:
             image = case.draw(name)[0].clamp(0, 1)
             errors |= {f"{name} max": float((image - exact).abs().max()), f"{name} PSNR": float(psnr(image, exact))}
     functions: dict[str, Callable[[], dict[str, float]]] = {
-        name: lambda name=name: case.time_variant(name) for name in args.variants
+        name: partial(case.time_variant, name) for name in args.variants
     }
     functions["stages"] = case.time_stages
     if module is not None:
@@ -220,7 +221,7 @@ def run_case(case: Case, args: Args, module: Any) -> Result:
     with_peer = pairs is not None and pairs <= MOST_PAIRS
     if with_peer:
         for name, options in PEERS.items():
-            functions[name] = lambda name=name, peer=Yardstick(module, *options): case.time_yardstick(name, peer)
+            functions[name] = partial(case.time_yardstick, name, Yardstick(module, *options))
     seconds = timed(functions, args.repeats, args.budget, args.fastest)
     functions.clear()  # the peers let go of what they kept
     if with_peer:
@@ -294,7 +295,9 @@ def print_tables(results: list[Result], variants: tuple[str, ...]) -> None:
             found = slope([sizes(r) for r in rows], [r.both(base) for r in rows])
             if found is not None:
                 lines.append([name, against, len(rows), ratio(found)])
-    console().print(table(f"Slopes of log time of {base}, both ways (1: linear)", ["", "over", "cases", "slope"], lines))
+    console().print(
+        table(f"Slopes of log time of {base}, both ways (1: linear)", ["", "over", "cases", "slope"], lines)
+    )
 
 
 def main(args: Args) -> None:

@@ -158,7 +158,11 @@ def main(
                 with busy_machine(processes):
                     found[name].append(measured_apart(work, name, options))
             every, one, chosen = (median(values) for values in found.values())
-            cells = [*(f"{value:.3g}" for value in (every, one, chosen)), f"{every / chosen:.2f}", f"{one / chosen:.2f}"]
+            cells = [
+                *(f"{value:.3g}" for value in (every, one, chosen)),
+                f"{every / chosen:.2f}",
+                f"{one / chosen:.2f}",
+            ]
             print(f"| {TITLES[work]} | {processes} | {' | '.join(cells)} |", flush=True)
 
 

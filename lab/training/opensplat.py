@@ -1,6 +1,6 @@
 """Trains the same photos with ``splatfacto-cpu`` and with OpenSplat's CPU backend: held-out PSNR over time.
 
-    python -m lab.training.opensplat replica/kitchen replica/office0 --opensplat opensplat --downscale 2 --plot curves.png
+    python -m lab.training.opensplat replica/kitchen replica/office0 --opensplat opensplat --plot curves.png
 
 OpenSplat (https://github.com/pierotofy/OpenSplat, AGPL) is a program of its own, built by whoever runs this. Both get
 the same folder in nerfstudio's layout: photos already made smaller, poses, and the seed points that ``replica-data``
@@ -249,11 +249,16 @@ def looked_at(scene: str, method: str, folder: Path, views: Views, photos: list[
     return looks
 
 
+def looks_of(found: list[Look], scene: str, method: str) -> list[Look]:
+    """The looks at one training, in order."""
+    return [look for look in found if (look.scene, look.method) == (scene, method)]
+
+
 def print_table(found: list[Look]) -> None:
     """A row a training: its end, and when it was as good as OpenSplat's better end."""
     rows = []
     for scene in dict.fromkeys(look.scene for look in found):
-        trainings = {method: [look for look in found if (look.scene, look.method) == (scene, method)] for method in METHODS}
+        trainings = {method: looks_of(found, scene, method) for method in METHODS}
         best = max((trainings[method][-1] for method in (DEFAULTS, SCALED)), key=lambda look: look.psnr)
         for method, looks in trainings.items():
             end = looks[-1]
@@ -278,7 +283,7 @@ def draw(found: list[Look], path: Path) -> None:
     panels = figure.subplots(1, len(scenes), squeeze=False)[0]
     for panel, scene in zip(panels, scenes, strict=True):
         for method in METHODS:
-            looks = [look for look in found if (look.scene, look.method) == (scene, method)]
+            looks = looks_of(found, scene, method)
             panel.plot([look.minutes for look in looks], [look.psnr for look in looks], marker=".", label=method)
         panel.set(title=scene, xlabel="minutes of the processor", xscale="log")
         panel.grid(alpha=0.3)

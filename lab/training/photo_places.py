@@ -5,16 +5,13 @@
 
 For each run: how well photos from the best of the places compared explain the SH (below 2 the scene has not told),
 without SH how sizes and distances from it correlate (below 0.48 it has not); how far from a training pose the places
-found are, by their shares, and any place of the same box is, in shares of the content's diagonal; how often a
-training pose explains more than any place does; and the correlation, over the Gaussians that photos show, of the
-logarithms of how large they are in photos and of the weights that merging gives them without poses; and how far the
-scene's estimated up is from that of its cameras, which people hold level. The picture shows what explains the SH,
+found are, by their shares, and any place of the same box is, in shares of the content's diagonal; and how often a
+training pose explains more than any place does. The picture shows what explains the SH,
 from above, at the height of the training poses, these in red, and some Gaussians.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,26 +24,16 @@ from lab.common.printing import markdown, save_figure, start
 from lab.common.scenes import name_of
 from pointsplat_ns.gaussians import MAX_SH_DEGREE
 from pointsplat_ns.geometry.cameras import invert_rigid
-from pointsplat_ns.looking.content import content_size, positions_in_units, views_in_units
-from pointsplat_ns.looking.sampling import estimated_up
+from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.looking.traces import Witnesses, photo_places
-from pointsplat_ns.looking.view_source import MERGED_FROM
-from pointsplat_ns.looking.windows import RESOLUTION
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning import cut_sh
-from pointsplat_ns.pruning.merging import DEFAULTS
-from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.rounds import first_step
-from pointsplat_ns.pruning.merging.viewpoints import view_weights
 
 ANY = 500
 """Number of places that the poses are compared with."""
 
 CELLS = 48
 """Side of the maps."""
-
-SEEN = 8.0
-"""Gaussians whose weight is less than the largest one's by more than this, in logarithms, are not correlated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,32 +62,13 @@ def asked(run: Path, sh: int) -> Map:
     at_eyes, at_any = witnesses.votes(eyes), witnesses.votes(anywhere)
     more = (at_eyes[:, None] > at_any).float().mean()
     away = float(torch.cdist(anywhere, eyes).amin(1).mean()) / size
-    blind = first_step(Participants.of(dense, torch.arange(len(dense))), None, RESOLUTION, DEFAULTS)
-    given = blind.weights.area.clamp_min(1e-12).log()
-    in_photos = log_sizes(dense[blind.participants.members], poses.spread(MERGED_FROM), *content_size(dense))
-    seen = in_photos > in_photos.max() - SEEN
-    alike = torch.corrcoef(torch.stack([in_photos[seen], given[seen]]))[0, 1]
     distance = "not told"
     if found is not None:
         distance = f"{float((found[1] * torch.cdist(found[0], eyes).amin(1)).sum()) / size:.1%}"
     best = float(torch.cat([at_eyes, at_any]).max())
-    off = math.degrees(math.acos(max(-1.0, min(1.0, float(estimated_up(dense) @ up_of_cameras(poses))))))
-    cells = (name_of(run), f"{best:.2f}", distance, f"{away:.1%}", f"{more:.0%}", f"{alike:.2f}", f"{off:.0f}")
+    cells = (name_of(run), f"{best:.2f}", distance, f"{away:.1%}", f"{more:.0%}")
     print(f"| {' | '.join(cells)} |", flush=True)
     return mapped(name_of(run), witnesses, eyes)
-
-
-def up_of_cameras(poses: ps.Views) -> Tensor:
-    """The direction (3,) that the cameras' sideways axes lie most nearly across, on the side of their tops, float64."""
-    rotations = poses.viewmats[:, :3, :3].double()
-    axis = torch.linalg.svd(rotations[:, 0], full_matrices=True).Vh[2]
-    return axis if float(axis @ rotations[:, 1].mean(0)) < 0 else -axis
-
-
-def log_sizes(scene: ps.Gaussians, poses: ps.Views, centre: Tensor, size: float) -> Tensor:
-    """Logarithms of how large a unit of area at each Gaussian is in the photos of these poses, (N,)."""
-    means, views = positions_in_units(scene.means, centre, size), views_in_units(poses, centre, size)
-    return view_weights(means, views, DEFAULTS.outside_weight, DEFAULTS).clamp_min(1e-12).log()
 
 
 def mapped(name: str, witnesses: Witnesses, eyes: Tensor) -> Map:
@@ -136,8 +104,7 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]], picture: Path | None = No
         picture: file to draw the maps into.
         sh: cut scenes to this SH degree first.
     """
-    print(markdown(["", "explained, best place", "from a pose", "any place", "poses explain more", "weights alike",
-                    "up, degrees off"], []), flush=True)  # fmt: skip
+    print(markdown(["", "explained, best place", "from a pose", "any place", "poses explain more"], []), flush=True)
     maps = [asked(run, sh) for run in runs]
     if picture is not None:
         draw(maps, picture)
