@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import tyro
@@ -20,7 +21,7 @@ from lab.common.printing import markdown
 from lab.common.results import Row, grouped
 from lab.common.scenes import group_of
 from lab.judge.scenes import LPIPS_WIDTH, MEASURES, PHOTOS
-from lab.judge.tables import AHEAD, all_leads, at_order, means, summary
+from lab.judge.tables import AHEAD, all_leads, at_order, means
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.tables.splat_transform import NAME
 
@@ -149,11 +150,12 @@ class Figures:
 
     def lead(self, method: str, at: int | str, column: str) -> dict[float, tuple[float, float, str]]:
         """By budget: mean lead of a way in dB, the least one, and the scene that has it."""
-        lines = list(summary(self.leads.get((method, at), []), column))
-        if not lines:
-            return {}
-        (_, mean, _), (_, least, scenes) = lines[-2:]
-        return {keep: (mean[keep], least[keep], scenes[keep]) for keep in mean}
+        known = [lead for lead in self.leads.get((method, at), []) if column in lead]
+        found = {}
+        for keep, same in grouped(known, lambda lead: lead["keep"]).items():
+            least = min(same, key=lambda lead: lead[column])
+            found[keep] = (fmean(lead[column] for lead in same), least[column], least["scene"])
+        return found
 
     def worst_lead(self, method: str, keep: float, ats: list[int | str]) -> tuple[float, str, int | str] | None:
         """The least lead at a budget over several widths: dB, the scene, the width."""

@@ -9,7 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from lab.common.compare import METRICS
-from lab.common.printing import megabytes, number
+from lab.common.printing import megabytes, number, table
 from lab.common.results import Row, grouped
 from lab.common.scenes import JUDGED, TUNING, group_of
 from lab.common.ways import WAYS
@@ -34,11 +34,11 @@ HEADS: dict[str, tuple[str, Callable[[Any], str]]] = {
 AHEAD = {"covered_psnr": "against the dense scene's renders", "photo_psnr": "against held-out photos"}
 """What leads are taken of, and its name."""
 
+GROUPS = ("tuning", "judged", "other", "all")
+"""Groups of scenes, as means are shown."""
+
 BEHIND = {"prune": None, "compact": ("prune",)}
 """Whose leads are told, and over whom; None: over all modes of splat-transform."""
-
-Line = tuple[str, dict[float, float], dict[float, str]]
-"""A line of a table of leads: its name, dB by budget, and what stands beside them."""
 
 
 def at_order(at: int | str) -> tuple[bool, int | str]:
@@ -106,30 +106,6 @@ def leads(rows: list[Row], method: str, rivals: tuple[str, ...] | None) -> list[
     return result
 
 
-def summary(found: list[Row], column: str) -> Iterator[Line]:
-    """Lines of a table of leads: those of each group of scenes, then its mean and its least lead with its scene; last,
-    mean and least of all scenes of several groups."""
-    groups = grouped(found, lambda lead: group_of(lead["scene"]))
-    for group, members in groups.items():
-        known = [lead for lead in members if column in lead]
-        for scene, same in grouped(known, lambda lead: lead["scene"]).items():
-            beside = {lead["keep"]: lead[f"{column}_peer"].removeprefix(NAME).strip() for lead in same}
-            yield scene, {lead["keep"]: lead[column] for lead in same}, beside
-        yield from _mean_and_worst(known, column, group)
-    if len(groups) > 1:
-        yield from _mean_and_worst([lead for lead in found if column in lead], column, "all")
-
-
-def _mean_and_worst(known: list[Row], column: str, name: str) -> Iterator[Line]:
-    """The last two lines of a group of scenes, in :func:`summary`; none if there is no lead."""
-    budgets = grouped(known, lambda lead: lead["keep"])
-    worst = {keep: min(same, key=lambda lead: lead[column]) for keep, same in budgets.items()}
-    if known:
-        yield f"{name} mean".strip(), {k: fmean(lead[column] for lead in same) for k, same in budgets.items()}, {}
-        least = {keep: lead[column] for keep, lead in worst.items()}
-        yield f"{name} worst".strip(), least, {keep: lead["scene"] for keep, lead in worst.items()}
-
-
 def all_leads(rows: list[Row]) -> list[Row]:
     """The leads of ``prune`` over the best mode of splat-transform, and of ``compact`` over ``prune``, in dB, for each
     scene, budget and width. The best mode is chosen anew for each of these and each PSNR."""
@@ -147,58 +123,59 @@ def summaries(rows: list[Row]) -> dict[str, list[Row]]:
 
 def scene_table(rows: list[Row]) -> Table:
     """The rows of one scene; a dash for what cannot be had, no column for what none has."""
-    shown = Table(title=f"{rows[0]['scene']}: against the dense scene's renders; MB: peak memory; photos last")
     columns = [name for name in HEADS if any(row.get(name) is not None for row in rows)]
-    for name in ("at", "kept", "way", *(HEADS[column][0] for column in columns)):
-        shown.add_column(name, justify="left" if name == "way" else "right")
-    for (at, keep), same in grouped(rows, lambda row: (row["at"], row["keep"])).items():
-        for row in same:
-            start = [str(at), f"{100 * keep:g} %"] if row is same[0] else ["", ""]
-            cells = [HEADS[name][1](row.get(name)) for name in columns]
-            shown.add_row(*start, row["method"], *cells, end_section=row is same[-1])
-    return shown
+    lines = [
+        [row["at"], f"{100 * row['keep']:g} %", row["method"], *(HEADS[name][1](row.get(name)) for name in columns)]
+        for row in rows
+    ]
+    title = f"{rows[0]['scene']}: against the dense scene's renders; MB: peak memory; photos last"
+    return table(title, ["at", "kept", "way", *(HEADS[column][0] for column in columns)], lines, left=["way"])
 
 
 def mean_tables(rows: list[Row]) -> Iterator[Table]:
     """For each width, mean, median and worst over scenes."""
     by_width = grouped(means(rows), lambda mean: mean["at"])
     for at, same in sorted(by_width.items(), key=lambda item: at_order(item[0])):
-        shown = Table(title=f"{_at(at)}: mean / median / worst over scenes; seconds and MB of peak memory: means")
         columns = [name for name in MEASURES if any(name in mean for mean in same)]
-        for name in ("for", "kept", "way", "scenes", *(HEADS[column][0] for column in columns), "worst", "s", "MB"):
-            shown.add_column(name, justify="left" if name in ("for", "way", "worst") else "right")
-        by_budget = grouped(sorted(same, key=lambda mean: -mean["keep"]), lambda mean: (mean["group"], mean["keep"]))
-        for (group, keep), members in sorted(by_budget.items(), key=lambda item: _group_order(item[0][0])):
-            for mean in members:
-                start = [group, f"{100 * keep:g} %"] if mean is members[0] else ["", ""]
-                cells = [_three(mean, column) for column in columns]
-                costs = [HEADS[name][1](mean.get(name)) for name in ("seconds", "peak_bytes")]
-                worst = mean.get("covered_psnr_worst_scene", "-")
-                start += [mean["method"], str(mean["scenes"])]
-                shown.add_row(*start, *cells, worst, *costs, end_section=mean is members[-1])
-        yield shown
+        lines = []
+        for mean in sorted(same, key=lambda mean: (GROUPS.index(mean["group"]), -mean["keep"])):
+            about = [mean["group"], f"{100 * mean['keep']:g} %", mean["method"], mean["scenes"]]
+            costs = [HEADS[name][1](mean.get(name)) for name in ("seconds", "peak_bytes")]
+            worst = mean.get("covered_psnr_worst_scene", "-")
+            lines.append([*about, *(_three(mean, column) for column in columns), worst, *costs])
+        heads = ["for", "kept", "way", "scenes", *(HEADS[column][0] for column in columns), "worst", "s", "MB"]
+        title = f"{_at(at)}: mean / median / worst over scenes; seconds and MB of peak memory: means"
+        yield table(title, heads, lines, left=["way", "worst"])
 
 
 def lead_tables(rows: list[Row]) -> Iterator[Table]:
     """For each width, who is ahead of whom by how much, with mean and worst over scenes."""
     by_kind = grouped(all_leads(rows), lambda lead: (lead["method"], lead["at"]))
     for method, rivals in BEHIND.items():
+        over = f"the best mode of {NAME}" if rivals is None else " or ".join(rivals)
         for at in sorted({at for found, at in by_kind if found == method}, key=at_order):
             for column, where in AHEAD.items():
-                over = f"the best mode of {NAME}" if rivals is None else " or ".join(rivals)
-                if lines := list(summary(by_kind[method, at], column)):
-                    yield _lead_table(lines, f"{_at(at)}: {method} minus {over}, PSNR in dB {where}")
+                if known := [lead for lead in by_kind[method, at] if column in lead]:
+                    keeps = sorted({lead["keep"] for lead in known}, reverse=True)
+                    title = f"{_at(at)}: {method} minus {over}, PSNR in dB {where}"
+                    yield table(
+                        title, ["scene", *(f"{100 * keep:g} %" for keep in keeps)], _lead_lines(known, column, keeps)
+                    )
 
 
-def _lead_table(lines: list[Line], title: str) -> Table:
-    shown = Table("scene", title=title)
-    keeps = sorted({keep for _, values, _ in lines for keep in values}, reverse=True)
-    for keep in keeps:
-        shown.add_column(f"{100 * keep:g} %")
-    for name, values, beside in lines:
-        cells = [f"{values[keep]:+.2f} {beside.get(keep, '')}".strip() if keep in values else "-" for keep in keeps]
-        shown.add_row(name, *cells, end_section=name.endswith("worst"))
-    return shown
+def _lead_lines(known: list[Row], column: str, keeps: list[float]) -> Iterator[list[str]]:
+    """The leads of each scene over the best of its rivals; for each group of scenes and for all, mean and worst."""
+    groups = grouped(known, lambda lead: group_of(lead["scene"]) or "other")
+    for group, members in (groups | ({"all": known} if len(groups) > 1 else {})).items():
+        for scene, same in grouped(members, lambda lead: lead["scene"]).items() if group != "all" else ():
+            beside = {lead["keep"]: f"{lead[column]:+.2f} {lead[f'{column}_peer'].removeprefix(NAME)}" for lead in same}
+            yield [scene, *(beside.get(keep, "-") for keep in keeps)]
+        budgets = grouped(members, lambda lead: lead["keep"])
+        means = {keep: fmean(lead[column] for lead in same) for keep, same in budgets.items()}
+        worst = {keep: min(same, key=lambda lead: lead[column]) for keep, same in budgets.items()}
+        yield [f"{group} mean", *(f"{means[keep]:+.2f}" if keep in means else "-" for keep in keeps)]
+        least = (worst.get(keep) for keep in keeps)
+        yield [f"{group} worst", *("-" if lead is None else f"{lead[column]:+.2f} {lead['scene']}" for lead in least)]
 
 
 def scene_list() -> Table:
@@ -210,11 +187,6 @@ def scene_list() -> Table:
     for name in (*TUNING, *JUDGED, *others):
         shown.add_row(name, group_of(name) or "other", path_of(name).name if path_of(name).is_file() else "-")
     return shown
-
-
-def _group_order(group: str) -> int:
-    known = ("tuning", "judged", "other", "all")
-    return known.index(group)
 
 
 def _three(mean: Row, column: str) -> str:
