@@ -1,6 +1,6 @@
 """Writes docs/record/results.md and its figure from what ``pointsplat tables`` measured.
 
-    python benchmarks/tables_record.py docs/record/results.json
+    python -m lab.judge.tables_record docs/record/results.json
 
 ``prune`` and ``compact`` are left out: judge.py measures them, in views that no decision used.
 """
@@ -14,6 +14,7 @@ from typing import Any
 
 import tyro
 
+from lab.common.printing import start
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.tables.cells import About, Cell
 from pointsplat_ns.tables.figure import medians, plot_figure
@@ -23,7 +24,7 @@ from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_4, OURS
 from pointsplat_ns.tables.writing import markdown_table
 from pointsplat_ns.tradeoff.journal import restored_point
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 TABLES = (1, 3, 4)
 """Tables of quality. Table 2 has times, which need an idle machine."""
@@ -32,7 +33,7 @@ FIGURE = "results_figure4.png"
 
 PAGE = """# The paper's networks and scores on two rooms
 
-`benchmarks/tables_record.py` writes this page from [results.json](results.json), which
+`lab/judge/tables_record.py` writes this page from [results.json](results.json), which
 [`pointsplat tables`](../tables.md) measured on two rooms of `pointsplat rooms`:
 
 ```bash
@@ -118,4 +119,4 @@ def main(file: tyro.conf.Positional[Path], record: Path = ROOT / "docs" / "recor
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    start(main)

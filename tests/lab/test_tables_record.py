@@ -1,4 +1,4 @@
-"""benchmarks/tables_record.py: the record of the paper's tables is what was measured."""
+"""lab/judge/tables_record.py: the record of the paper's tables is what was measured."""
 
 from __future__ import annotations
 
@@ -7,19 +7,16 @@ from pathlib import Path
 
 import pytest
 
+from lab.judge import tables_record as record
+
 RECORD = Path(__file__).parents[2] / "docs" / "record"
 
 
-@pytest.fixture(scope="module")
-def record(benchmark):
-    return benchmark("tables_record")
-
-
-def test_page_is_what_the_program_writes_from_the_rows(record):
+def test_page_is_what_the_program_writes_from_the_rows():
     assert record.page(record.read(RECORD / "results.json")) == (RECORD / "results.md").read_text("utf-8")
 
 
-def test_a_changed_row_changes_the_page(record, tmp_path):
+def test_a_changed_row_changes_the_page(tmp_path):
     content = json.loads((RECORD / "results.json").read_text("utf-8"))
     [cell] = [cell for cell in content["cells"] if cell["point"]["key"] == "room52/paper/10%"]
     cell["point"]["against_photos"]["psnr"] += 2.0
@@ -29,12 +26,12 @@ def test_a_changed_row_changes_the_page(record, tmp_path):
     assert "| 10 % | PointSplat\\* | 11.91 |" in after  # of two scenes
 
 
-def test_prune_and_compact_are_left_to_the_judge(record):
+def test_prune_and_compact_are_left_to_the_judge():
     ways = {way for group in record.read(RECORD / "results.json") for scene in group.scenes for way, _ in scene.cells}
     assert "paper" in ways and not ways & {"merge", "compact"}
 
 
-def test_another_file_is_refused_by_name(record, tmp_path):
+def test_another_file_is_refused_by_name(tmp_path):
     path = tmp_path / "other.json"
     path.write_text("{}")
     with pytest.raises(SystemExit, match="other.json: cannot be read"):
