@@ -83,7 +83,6 @@ class Part:
 
 _SCORES = ("scores.py", "coverage.py", "view_scores.py")
 _SAME_RESULT = "tests/test_same_result.py"
-_REPAIR = tuple(f"tests/compression/test_{name}.py" for name in ("repair", "fine_tune", "compact", "feedback_training"))
 
 PARTS = {
     "rasterizer": Part(
@@ -95,22 +94,12 @@ PARTS = {
     "scores": Part(
         tuple(f"pointsplat_ns/pruning/{name}" for name in _SCORES),
         tuple(f"tests/pruning/test_{name}" for name in _SCORES),
-        (
-            "tests/pruning/test_methods.py",
-            "tests/pruning/test_select.py",
-            _SAME_RESULT,
-            "tests/compression/test_prune.py",
-        ),
+        ("tests/pruning/test_[ms]e*.py", _SAME_RESULT, "tests/compression/test_prune.py"),
     ),
     "merge": Part(
-        ("pointsplat_ns/pruning/*.py", "pointsplat_ns/merging/*.py"),
-        ("tests/*ing/test_covariance.py", "tests/*ing/test_matching.py"),
-        (
-            "tests/pruning/test_*.py",
-            "tests/*ing/test_merge*.py",
-            _SAME_RESULT,
-            "tests/compression/test_threads_agree.py",
-        ),
+        ("pointsplat_ns/pruning/**/*.py",),
+        (),
+        ("tests/pruning/**/test_*.py", _SAME_RESULT, "tests/compression/test_threads_agree.py"),
         left_out=_SCORES,
     ),
     "refiner": Part(
@@ -120,10 +109,11 @@ PARTS = {
     ),
     "repair": Part(
         tuple(f"pointsplat_ns/compression/{name}.py" for name in ("repair", "feedback", "optimiser")),
-        ("tests/compression/test_feedback.py", "tests/compression/test_optimiser.py"),
-        (*_REPAIR, "tests/refiner/test_feedback.py", _SAME_RESULT),
+        (),
+        ("tests/compression/test_[fr]e*.py", "tests/refiner/test_feedback.py", _SAME_RESULT, "tests/compression/*.py"),
     ),
 }
+"""Parts of the code. A pattern takes modules and tests that are moved within their folder along."""
 
 
 @dataclass(frozen=True)
