@@ -22,11 +22,11 @@ PROGRAMS = sorted(
 
 ASK_FOR_HELP = """
 import os, runpy, sys
-import torch, tyro  # takes seconds, so once for all; each program then runs in a process of its own
+import lab.common.compare, lab.common.scenes  # take seconds, so once for all; then each runs in a process of its own
 for program in sys.argv[1:]:
     if os.fork() == 0:
         sys.argv = [program, "--help"]
-        runpy.run_module(program, run_name="__main__")
+        runpy.run_module(program, run_name="__main__", alter_sys=True)
         sys.exit("it did not end after its help")
     assert os.wait()[1] == 0, program
 """
