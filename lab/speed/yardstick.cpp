@@ -1,5 +1,5 @@
 // A plain single-threaded rasterizer of 3D Gaussians in the classic design, forward and backward: what
-// benchmarks/rasterizer.py compares with. Scalar code on one core, nothing of it is used by the package.
+// lab/speed/rasterizer.py compares with. Scalar code on one core, nothing of it is used by the package.
 //
 //   projection: EWA splatting, SH colours of degree 3, a square of `extent` standard deviations around each mean, or,
 //               if that is 0, the tight box around the ellipse on which alpha falls to its threshold
