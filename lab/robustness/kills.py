@@ -78,7 +78,7 @@ COMMANDS = (
     Command("lod", pointsplat("lod scene.ply --levels 50% 20% -o OUT/lod")),
     Command(
         "tradeoff",
-        pointsplat("tradeoff scene.ply -o OUT --points 3 --views 2 --side 48 --drawn exact --repairs none"),
+        pointsplat("tradeoff scene.ply -o OUT --points 3 --views 2 --resolution 48x36 --drawn exact --repairs none"),
     ),
     Command("tables", pointsplat(f"tables scene.ply -o OUT {TABLES}")),
     Command("rooms", pointsplat("rooms -o OUT --seeds 0 1 --frames 3 --width 32 --height 24")),

@@ -48,7 +48,8 @@ def merging(scene: Path | None, data: Path | None, seconds: float) -> float:
 
 def repairing(scene: Path | None, data: Path | None, seconds: float) -> float:
     """Seconds of a step of a repair."""
-    from pointsplat_ns.compression.repair import RepairBudget, repair
+    from pointsplat_ns.compression.repair import repair
+    from pointsplat_ns.compression.requests import RepairBudget
     from pointsplat_ns.looking.view_source import ViewSource
 
     dense = ps.example_room() if scene is None else ps.load(scene)
