@@ -92,7 +92,6 @@ def test_no_module_replaces_parts_of_others_by_mocks(path):
     assert not [name for name in imports_of(path) if name.split(".")[0] in ("unittest", "mock", "pytest")]
 
 
-def test_benchmarks_and_tests_are_not_imported_by_the_package():
+def test_the_lab_and_tests_are_not_imported_by_the_package():
     names = {name.split(".")[0] for path in PACKAGE.rglob("*.py") for name in imports_of(path)}
-    local = {path.stem for path in (REPOSITORY / "benchmarks").glob("*.py")} | {"benchmarks", "tests", "making"}
-    assert names & local == set()
+    assert names & {"lab", "tests", "making"} == set()

@@ -125,7 +125,7 @@ def test_wheel_holds(wheels, name):
         assert archive.getinfo(name).file_size == (ROOT / name).stat().st_size
 
 
-def test_wheel_leaves_out_tests_and_benchmarks(wheels):
+def test_wheel_leaves_out_tests_and_the_lab(wheels):
     with zipfile.ZipFile(wheels["wheel"]) as archive:
         tops = {name.split("/")[0] for name in archive.namelist()}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"pointsplat_ns", "method_configs"}

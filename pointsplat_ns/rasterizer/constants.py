@@ -48,7 +48,7 @@ class Quality:
 EXACT = Quality()
 
 QUALITIES = {"exact": EXACT, "balanced": Quality(alpha_min=2 / 255), "fast": Quality(alpha_min=8 / 255)}
-"""Thresholds by name; what they gain and lose is measured by benchmarks/quality.py. Only the lowest alpha pays.
+"""Thresholds by name; what they gain and lose is measured by lab/speed/rasterizer.py. Only the lowest alpha pays.
 
 A higher stop threshold skips the opaque Gaussian that would have finished a pixel, and is wrong by up to 0.5 where it
 does. A lower degree of the harmonics loses far more for less time. exp2 in bfloat16 takes twice the time of float32,

@@ -85,11 +85,11 @@ def test_command_is_one_that_works(command, tmp_path, monkeypatch, capsys):
         assert started.no_python and started.training_script in ("pointsplat", "ns-train"), "no rule for this program"
         check_arguments((started.training_script, *started.training_script_args), monkeypatch, capsys)
     elif program == "python" and words[1:2] == ("-m",):
-        assert words[2] == "pytest", "no rule for this module"
-        assert all((ROOT / word).exists() for word in words[3:] if not word.startswith("-"))
-    elif program == "python":
-        assert Path(words[1]).parts[0] == "benchmarks", "no rule for this script"
-        check_arguments(words, monkeypatch, capsys)
+        if words[2] == "pytest":
+            assert all((ROOT / word).exists() for word in words[3:] if not word.startswith("-"))
+        else:
+            assert words[2].startswith("lab."), "no rule for this module"
+            check_arguments(words, monkeypatch, capsys)
     elif program == "make":
         targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), flags=re.MULTILINE)
         assert {word for word in words[1:] if "=" not in word} <= set(targets)
@@ -162,7 +162,7 @@ def test_options_named_in_text_exist(monkeypatch, capsys):
         ("ns-train", "splatfacto-cpu", "scannetpp-seeded"),
         ("ns-render", "interpolate"),
     ]
-    programs += [("python", f"benchmarks/{name}.py") for name in ("compaction", "judge", "rasterizer")]
+    programs += [("python", "-m", words[2]) for words in {c.words[:3] for c in COMMANDS} if "lab." in str(words[2:])]
     helps = "\n".join(help_of(words, monkeypatch, capsys) for words in programs)
     known = set(re.findall(r"--[a-z][\w.-]*", helps)) | OF_OTHERS | {"--help"}
     unknown = {
@@ -188,7 +188,7 @@ def test_names_of_the_package_in_text_exist():
 
 
 def test_paths_named_in_text_exist():
-    tops = "pointsplat_ns|benchmarks|docs|tests|method_configs"
+    tops = "pointsplat_ns|lab|docs|tests|method_configs"
     missing = {
         f"{page.name}: {code}"
         for page, code in inline_code()

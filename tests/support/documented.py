@@ -9,6 +9,7 @@ import re
 import runpy
 import shlex
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
+    ROOT / "lab" / "README.md",
     EXAMPLE.with_name("README.md"),
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
@@ -130,19 +132,12 @@ def parsers_only(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def start(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Start a console script, or a script by ``python path``, in this process."""
-    with monkeypatch.context() as patch:
-        if words[0] == "python":
-            script = ROOT / words[1]
-            patch.setattr(sys, "argv", [str(script), *words[2:]])
-            patch.syspath_prepend(str(script.parent))
-            before = set(sys.modules)
-            try:
-                runpy.run_path(str(script), run_name="__main__")
-            finally:
-                for name in set(sys.modules) - before:  # the script's neighbours, which have names such as "report"
-                    if str(script.parent) in (getattr(sys.modules[name], "__file__", None) or ""):
-                        del sys.modules[name]
+    """Start a console script, or a program of the lab by ``python -m module``, in this process."""
+    with monkeypatch.context() as patch, warnings.catch_warnings():
+        if words[:2] == ("python", "-m"):
+            warnings.simplefilter("ignore", RuntimeWarning)  # the module may be imported already
+            patch.setattr(sys, "argv", [words[2], *words[3:]])
+            runpy.run_module(words[2], run_name="__main__", alter_sys=True)
         else:
             [script] = importlib.metadata.entry_points(group="console_scripts", name=words[0])
             patch.setattr(sys, "argv", list(words))

@@ -19,7 +19,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.system.kernels import on_threads
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-BENCHMARKS = REPOSITORY / "benchmarks"
+LAB = REPOSITORY / "lab"
 
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 """Real captures, splats and weights that tests read in place; they skip where it is absent."""

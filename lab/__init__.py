@@ -1,0 +1,1 @@
+"""Programs that measure the package and its tests; README.md says which one to run when."""

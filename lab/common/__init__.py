@@ -1,0 +1,1 @@
+"""What several programs of the lab share: lists of scenes, comparison of pictures, clocks, results, tables."""

@@ -1,0 +1,119 @@
+"""Clocks, memory, and slopes over sizes."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+
+_clock = time.perf_counter
+
+
+def use_cpu_time() -> None:
+    """From now on the clock counts CPU seconds of this process, which others on the machine do not stretch."""
+    global _clock
+    _clock = time.process_time
+
+
+def now() -> float:
+    """Seconds on the clock, after all work on a GPU is done."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    return _clock()
+
+
+def seconds_of(call: Callable[[], object]) -> float:
+    """Seconds that a call takes."""
+    start = now()
+    call()
+    return now() - start
+
+
+def timed(
+    functions: dict[str, Callable[[], dict[str, float]]], repeats: int, budget: float, fastest: bool = False
+) -> dict[str, float]:
+    """Call every function once a round and take medians, so that a busy moment of the machine hits all alike.
+
+    Args:
+        functions: each measures itself and returns seconds by name.
+        repeats: rounds counted; one more comes before them, to warm up.
+        budget: seconds after which no new round is begun. At least one round is counted: the first if it alone
+            took more than half of the budget.
+        fastest: take the fastest round of each figure in place of the median.
+    """
+    begin = time.perf_counter()
+    rounds: list[dict[str, float]] = []
+    for i in range(repeats + 1):
+        seconds: dict[str, float] = {}
+        for function in functions.values():
+            seconds |= function()
+        spent = time.perf_counter() - begin
+        if i > 0 or spent > budget / 2:
+            rounds.append(seconds)
+        if rounds and spent + spent / (i + 1) > budget:
+            break
+    choose = min if fastest else statistics.median
+    return {name: choose([r[name] for r in rounds]) for name in rounds[0]}
+
+
+def peak_extra_bytes(function: Callable[[], object], device: torch.device) -> int | None:
+    """Memory that ``function`` takes at its highest above what was held before; None where it cannot be known.
+
+    On a CPU: the resident high-water mark of the process (Linux), after giving freed memory back.
+    """
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+        before = torch.cuda.memory_allocated()
+        torch.cuda.reset_peak_memory_stats()
+        function()
+        torch.cuda.synchronize()
+        return torch.cuda.max_memory_allocated() - before
+    try:
+        ctypes.CDLL(None).malloc_trim(0)
+        start_of_peak()
+        before = status_bytes("VmHWM")
+        function()
+        return max(0, status_bytes("VmHWM") - before)
+    except (OSError, AttributeError):
+        return None
+
+
+def start_of_peak() -> None:
+    """Set the high-water mark of this process to what is resident now (Linux).
+
+    Raises:
+        OSError: where the system does not offer that.
+    """
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+def status_bytes(field: str) -> int:
+    """Bytes of a field of ``/proc/self/status``, such as ``VmHWM``.
+
+    Raises:
+        OSError: where there is no such field.
+    """
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(field + ":"):
+            return 1024 * int(line.split()[1])
+    raise OSError(f"/proc/self/status has no {field}")
+
+
+def slope(xs: Sequence[float], ys: Sequence[float | None]) -> float | None:
+    """Least-squares slope of log y over log x: 1 where y is linear in x.
+
+    Pairs that are not positive are left out; None where what remains does not even double x.
+
+    >>> round(slope([100, 200, 400], [1.0, 2.0, 4.0]), 6)
+    1.0
+    """
+    points = [(math.log(x), math.log(y)) for x, y in zip(xs, ys, strict=True) if y is not None and min(x, y) > 0]
+    u, v = [x for x, _ in points], [y for _, y in points]
+    if not points or max(u) - min(u) < math.log(2):
+        return None
+    return statistics.linear_regression(u, v).slope

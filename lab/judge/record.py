@@ -1,0 +1,332 @@
+"""The record of what lab/judge/judge.py measured: rows as JSON, tables as a page, and the table of the README.
+
+    python -m lab.judge.record judge.json judge_photos.json                            # takes new rows
+    python -m lab.judge.record docs/record/judge.json docs/record/judge_photos.json    # writes the tables again
+
+Rows of camera paths go to ``judge.json``, rows of held-out photos to ``judge_photos.json``. Both are files that
+``judge.py --resume`` takes up. A scene counts at a budget once prune, compact and a mode of splat-transform are there.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import tyro
+
+from lab.common.printing import markdown
+from lab.common.results import Row, grouped
+from lab.common.scenes import group_of
+from lab.judge.scenes import LPIPS_WIDTH, MEASURES, PHOTOS
+from lab.judge.tables import AHEAD, all_leads, at_order, means
+from pointsplat_ns.io.files import replacing
+from pointsplat_ns.tables.splat_transform import NAME
+
+ROOT = Path(__file__).parents[2]
+
+OURS = ("prune", "compact")
+"""Our ways, as rows call them."""
+
+WAYS = (NAME, *OURS)
+"""What tables show, in this order; splat-transform is the best of its modes."""
+
+DIGITS = {"seconds": 1, "cpu_seconds": 1, "peak_bytes": -6} | {
+    name: 3 if name.endswith("psnr") else 4 for name in MEASURES
+}
+"""Digits after the point that rows keep: a tenth of what tables show, or finer."""
+
+START, END = "<!-- judge -->", "<!-- /judge -->"
+"""What stands around the table in the README."""
+
+PAGE = """# What smaller scenes lose
+
+`lab/judge/record.py` writes this page from [judge.json](judge.json) and [judge_photos.json](judge_photos.json), which
+`lab/judge/judge.py` measured. [benchmarks.md](../benchmarks.md#a-judge-that-is-not-the-defendant) says how.
+
+- Splats are judged in at most {views} views of a camera path that was written by hand, at several widths.
+- Captures are judged in the poses of at most {views} held-out photos, at the size of the photos.
+- Every way gets the PLY alone: no photos and no poses.
+- PSNR is in dB, against renders of the dense scene. All squared error is divided by the share of the pixels that the
+  dense scene covers, so an empty background does not raise it.
+- {peer} stands for the best of its modes: {modes}.
+  The mode is chosen anew for each scene, budget, width and measure.
+- A scene counts at a budget once all three ways are measured.
+"""
+
+
+def read(paths: Iterable[Path]) -> tuple[list[Row], dict[str, Any]]:
+    """All rows of some files of judge.py, rounded, and their settings.
+
+    Raises:
+        SystemExit: if a file cannot be read or is no such file, or two have different settings or one row twice.
+    """
+    rows: list[Row] = []
+    settings: dict[str, Any] = {}
+    for path in paths:
+        try:
+            content = json.loads(path.read_text("utf-8"))
+            found, its_own = content["rows"], content["settings"]
+            keys = [_key(row) for row in found]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise SystemExit(f"{path}: cannot be read ({error!r}); expected a file that judge.py wrote") from error
+        if settings and its_own != settings:
+            raise SystemExit(f"{path}: was written with {its_own}, the files before with {settings}; expected the same")
+        if twice := {*keys} & {_key(row) for row in rows}:
+            raise SystemExit(f"{path}: has rows that another file has, of {sorted({key[0] for key in twice})}")
+        settings, rows = its_own, rows + [rounded(row) for row in found]
+    return rows, settings
+
+
+def _key(row: Row) -> tuple[Any, ...]:
+    return row["scene"], row["at"], row["keep"], row["method"]
+
+
+def rounded(row: Row) -> Row:
+    """A row with only the digits that mean something."""
+    result = dict(row)
+    for name, digits in DIGITS.items():
+        if result.get(name) is not None:
+            result[name] = round(result[name], digits) if digits > 0 else int(round(result[name], digits))
+    return result
+
+
+def write_rows(rows: list[Row], settings: dict[str, Any], target: Path) -> None:
+    """Write rows as a file that judge.py takes up, one row a line."""
+    lines = ",\n".join(json.dumps(row) for row in rows)
+    with replacing(target) as part:
+        part.write_text(f'{{"settings": {json.dumps(settings)}, "rows": [\n{lines}\n]}}\n', "utf-8")
+
+
+def complete(rows: list[Row]) -> list[Row]:
+    """The rows of those scenes, widths and budgets that have every one of :data:`WAYS`."""
+    result = []
+    for same in grouped(rows, lambda row: (row["scene"], row["at"], row["keep"])).values():
+        measured = [row for row in same if not row["failed"]]
+        there = {NAME if row["method"].startswith(NAME) else row["method"] for row in measured}
+        if there >= {*WAYS}:
+            result += measured
+    return result
+
+
+def best_peers(rows: list[Row]) -> Iterator[Row]:
+    """One row of splat-transform for each scene, width and budget: the best of its modes by each measure, and the costs
+    of the mode of the best PSNR."""
+    peers = [row for row in rows if row["method"].startswith(NAME)]
+    for same in grouped(peers, lambda row: (row["scene"], row["at"], row["keep"])).values():
+        found = dict(max(same, key=lambda row: row["covered_psnr"]), method=NAME)
+        for name in MEASURES:
+            known = [row[name] for row in same if row[name] is not None]
+            if known:
+                found[name] = (min if name.endswith("lpips") else max)(known)
+        yield found
+
+
+class Figures:
+    """Means and leads over scenes.
+
+    Args:
+        rows: of any scenes, widths, budgets and ways.
+    """
+
+    def __init__(self, rows: list[Row]):
+        self.rows = complete(rows)
+        shown = [*best_peers(self.rows), *(row for row in self.rows if row["method"] in OURS)]
+        self.ats = sorted({row["at"] for row in shown}, key=at_order)
+        self.keeps = sorted({row["keep"] for row in shown}, reverse=True)
+        # Groups come in order, "all" last if there are several: the last one is that of all scenes.
+        self.means: dict[tuple[Any, ...], Row] = {}
+        for at in self.ats:
+            here = means([row for row in shown if row["at"] == at])
+            self.means |= {(at, mean["keep"], mean["method"]): mean for mean in here}
+        self.leads = grouped(all_leads(self.rows), lambda lead: (lead["method"], lead["at"]))
+
+    def scenes(self, at: int | str) -> str:
+        """How many scenes there are at a width: a number, or a span if budgets differ."""
+        counts = {mean["scenes"] for (where, _, _), mean in self.means.items() if where == at}
+        return f"{min(counts)} to {max(counts)}" if len(counts) > 1 else str(*counts)
+
+    def lead(self, method: str, at: int | str, column: str) -> dict[float, tuple[float, float, str]]:
+        """By budget: mean lead of a way in dB, the least one, and the scene that has it."""
+        known = [lead for lead in self.leads.get((method, at), []) if column in lead]
+        found = {}
+        for keep, same in grouped(known, lambda lead: lead["keep"]).items():
+            least = min(same, key=lambda lead: lead[column])
+            found[keep] = (fmean(lead[column] for lead in same), least[column], least["scene"])
+        return found
+
+    def worst_lead(self, method: str, keep: float, ats: list[int | str]) -> tuple[float, str, int | str] | None:
+        """The least lead at a budget over several widths: dB, the scene, the width."""
+        found = [(at, self.lead(method, at, "covered_psnr").get(keep)) for at in ats]
+        known = [(lead[1], lead[2], at) for at, lead in found if lead is not None]
+        return min(known, key=lambda lead: lead[0], default=None)
+
+
+def page(rows: list[Row], settings: dict[str, Any]) -> str:
+    """The page of all tables."""
+    figures = Figures(rows)
+    modes = sorted({row["method"] for row in rows if row["method"].startswith(NAME)})
+    parts = [
+        PAGE.format(
+            views=settings["views"],
+            peer=NAME,
+            modes=", ".join(mode.removeprefix(NAME).strip() for mode in modes),
+        ),
+        "## Scenes\n\n" + SCENES + "\n\n" + _scene_table(rows, figures),
+    ]
+    for at in figures.ats:
+        title = "Held-out photos" if at == PHOTOS else f"{at} pixels wide"
+        parts.append(
+            f"## {title}\n\n{_count(figures.scenes(at))}. PSNR against renders of the dense scene:\n\n"
+            + _mean_table(figures, at, "covered_psnr", 2)
+        )
+        if at == PHOTOS:
+            parts.append("PSNR against the photos:\n\n" + _mean_table(figures, at, "photo_psnr", 2))
+        for column, where in AHEAD.items():
+            if table := _lead_table(figures, at, column):
+                parts.append(f"Leads in dB {where}:\n\n{table}")
+        if at in (LPIPS_WIDTH, PHOTOS) and (table := _mean_table(figures, at, "dense_lpips", 3)):
+            parts.append(f"LPIPS against renders of the dense scene, lower is better:\n\n{table}")
+    parts.append("## Time\n\n" + TIME + "\n\n" + _cost_table(figures))
+    if failed := [row for row in rows if row["failed"]]:
+        lines = "\n".join(f"- {row['scene']}, {_share(row['keep'])}: {row['method']}" for row in failed)
+        parts.append(f"## Failed\n\n{lines}")
+    return "\n\n".join(part.strip() for part in parts) + "\n"
+
+
+LEARNED = ("mujoco_tabletop", "pc_playbot", "pc_statue_st_peter", "lounge")
+"""Scenes of the list "judged" that the network of ``compact``'s repairs was trained on (FEEDBACK.md beside it)."""
+
+SCENES = f"""No constant is chosen on scenes of the list "judged". Scenes of no list are "other". Three rules exist
+because a judged scene had shown the need; their constants come from scenes for tuning: repairs hold from nearer places
+(rock), merging holds before a white background (ethiopianHead), repairs take no views that large Gaussians fill
+(apt_kitchen_balcony).
+[benchmarks.md](../benchmarks.md#scenes) says where the scenes come from.
+The network that sets the steps of `compact` was trained on {", ".join(LEARNED)}."""
+
+TIME = """CPU seconds and peak memory of one process, with starting, reading and writing: mean and largest over scenes.
+splat-transform stands for the mode of the best PSNR."""
+
+
+def _scene_table(rows: list[Row], figures: Figures) -> str:
+    lines = []
+    for (at, scene), same in sorted(grouped(rows, lambda row: (row["at"] == PHOTOS, row["scene"])).items()):
+        there = {row["keep"] for row in figures.rows if row["scene"] == scene}
+        kept = ", ".join(_share(keep) for keep in sorted(there, reverse=True)) or "none yet"
+        where = "held-out photos" if at else "camera path"
+        lines.append([scene, f"{same[0]['gaussians']:,}", where, group_of(scene) or "other", kept])
+    return markdown(["scene", "Gaussians", "views", "list", "budgets measured"], lines)
+
+
+def _mean_table(figures: Figures, at: int | str, column: str, digits: int) -> str:
+    lines = []
+    for keep in figures.keeps:
+        for way in WAYS:
+            mean = figures.means.get((at, keep, way), {})
+            if column in mean:
+                values = [f"{mean[name]:.{digits}f}" for name in (column, f"{column}_median", f"{column}_worst")]
+                lines.append([_share(keep), _way(way), *values, mean[f"{column}_worst_scene"], str(mean["scenes"])])
+    return markdown(["kept", "way", "mean", "median", "worst", "of", "scenes"], lines) if lines else ""
+
+
+def _lead_table(figures: Figures, at: int | str, column: str) -> str:
+    ours, repaired = (figures.lead(method, at, column) for method in OURS)
+    lines = []
+    for keep in figures.keeps:
+        if keep in ours and keep in repaired:
+            cells = [
+                text
+                for mean, least, scene in (ours[keep], repaired[keep])
+                for text in (f"{mean:+.2f}", f"{least:+.2f} ({scene})")
+            ]
+            lines.append([_share(keep), *cells])
+    heads = ["kept", f"`prune` over {NAME}", "worst", "`compact` over `prune`", "worst"]
+    return markdown(heads, lines) if lines else ""
+
+
+def _cost_table(figures: Figures) -> str:
+    lines = []
+    at = {photos: next((at for at in figures.ats if (at == PHOTOS) == photos), None) for photos in (False, True)}
+    for name, where in (("splats", at[False]), ("captures", at[True])):
+        for keep in figures.keeps:
+            for way in WAYS:
+                mean = figures.means.get((where, keep, way))
+                if mean is not None:
+                    seconds = [f"{mean[f'cpu_seconds{end}']:.0f}" for end in ("", "_worst")]
+                    memory = [f"{1e-9 * mean[f'peak_bytes{end}']:.2f}" for end in ("", "_worst")]
+                    lines.append([name, _share(keep), _way(way), *seconds, *memory])
+    return markdown(["scenes", "kept", "way", "CPU s", "largest", "GB", "largest"], lines) if lines else ""
+
+
+def readme_table(rows: list[Row]) -> str:
+    """The table of the README: means of all three ways, and worst leads."""
+    figures = Figures(rows)
+    lines = []
+    for at in figures.ats:
+        cells = []
+        for keep in figures.keeps:
+            found = [figures.means.get((at, keep, way)) for way in WAYS]
+            known = [f"{mean['covered_psnr']:.1f}" for mean in found if mean is not None]
+            cells.append(" / ".join(known) or "-")
+        name = "poses of held-out photos" if at == PHOTOS else f"{at} pixels wide"
+        lines.append([f"{name} ({_count(figures.scenes(at))})", *cells])
+    for method, what in (("prune", "worst lead of `prune`"), ("compact", "worst gain by `compact`")):
+        worst = [figures.worst_lead(method, keep, figures.ats) for keep in figures.keeps]
+        lines.append([what, *("-" if lead is None else f"{lead[0]:+.1f} ({lead[1]}, {lead[2]})" for lead in worst)])
+    return markdown(["kept", *map(_share, figures.keeps)], lines)
+
+
+def put_between(text: str, new: str, path: Path) -> str:
+    """A text in which a new part stands between the marks.
+
+    Raises:
+        SystemExit: if the text does not have both marks, once each and in order.
+    """
+    if text.count(START) != 1 or text.count(END) != 1 or text.index(START) > text.index(END):
+        raise SystemExit(f"{path}: expected {START} and then {END}, once each")
+    before, rest = text.split(START)
+    return f"{before}{START}\n\n{new}\n\n{END}{rest.split(END)[1]}"
+
+
+def _count(scenes: str) -> str:
+    return f"{scenes} scene{'' if scenes == '1' else 's'}"
+
+
+def _share(keep: float) -> str:
+    return f"{100 * keep:g} %"
+
+
+def _way(way: str) -> str:
+    return f"`{way}`" if way in OURS else way
+
+
+def main(
+    files: tyro.conf.Positional[tuple[Path, ...]],
+    record: Path = ROOT / "docs" / "record",
+    readme: Path = ROOT / "README.md",
+) -> None:
+    """Write the record of what judge.py measured.
+
+    Args:
+        files: that judge.py wrote with --json.
+        record: folder for judge.json, judge_photos.json and judge.md.
+        readme: the page that has a table between two marks.
+    """
+    rows, settings = read(files)
+    if not complete(rows):
+        raise SystemExit(f"{', '.join(map(str, files))}: no scene has {', '.join(WAYS)} at one budget")
+    with_table = put_between(readme.read_text("utf-8"), readme_table(rows), readme)
+    record.mkdir(parents=True, exist_ok=True)
+    for name, photos in (("judge.json", False), ("judge_photos.json", True)):
+        if some := [row for row in rows if (row["at"] == PHOTOS) == photos]:
+            write_rows(some, settings, record / name)
+    for target, written in ((record / "judge.md", page(rows, settings)), (readme, with_table)):
+        with replacing(target) as part:
+            part.write_text(written, "utf-8")
+        print(target)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

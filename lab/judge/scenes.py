@@ -1,0 +1,144 @@
+"""Scenes to judge smaller ones by, and what smaller ones lose in their views."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lab.common.compare import METRICS, metrics_of, photos_of
+from lab.common.scenes import name_of
+from lab.judge.camera_paths import path_of, views_of
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io import read_scene
+from pointsplat_ns.metrics import finite_psnr
+from pointsplat_ns.metrics.lpips import Lpips
+from pointsplat_ns.rasterizer import render, render_with_alpha
+from pointsplat_ns.views import Views
+
+PHOTOS = "photos"
+"""In place of a width: the poses of held-out photos, at the photos' own size."""
+
+LPIPS_WIDTH = 960
+"""Width, pixels, above which LPIPS is not computed: it would take longer than all else."""
+
+MEASURES = ("covered_psnr", *(f"{against}_{column}" for against in ("dense", "photo") for column in METRICS))
+"""What is measured: PSNR of what the dense scene covers (:func:`covered_psnr`); then each metric over all pixels,
+against the dense scene's renders and against photos."""
+
+Measures = dict[str, float | None]
+
+
+@dataclass(frozen=True)
+class Look:
+    """Views of one size."""
+
+    at: int | str  # width in pixels, or PHOTOS
+    views: Views
+    photos: list[Tensor] | None = None  # [H, W, 3], one a view
+
+
+@dataclass(frozen=True)
+class JudgedScene:
+    """A dense scene, and the views that smaller ones are compared with it in."""
+
+    name: str
+    dense: Gaussians
+    looks: tuple[Look, ...]
+    digest: str
+    """Tells the scene and its path from others: rows of another digest are of another scene."""
+
+
+def load(path: Path, widths: tuple[int, ...], count: int) -> JudgedScene:
+    """A scene with at most ``count`` of its views, evenly spread.
+
+    Args:
+        path: a PLY that has a camera path of its name, looked at in every width; or a Splatfacto run, looked at from
+            the poses of its held-out photos, in their size.
+        widths: of the pictures of a camera path, pixels.
+        count: largest number of views.
+
+    Raises:
+        SystemExit: if a PLY has no camera path.
+        SceneError: if the scene cannot be read.
+    """
+    dense = read_scene(path)
+    digest = hashlib.sha256()
+    for tensor in dense.tensors():
+        digest.update(tensor.contiguous().numpy().tobytes())
+    if path.suffix == ".ply":
+        name, along = path.stem, path_of(path.stem)
+        looks = tuple(Look(width, views_of(along, width).spread(count)) for width in widths)
+        digest.update(along.read_bytes())
+    else:
+        name, views, photos = photos_of(path, "test", count)
+        looks = (Look(PHOTOS, views, photos),)
+    return JudgedScene(name, dense, looks, digest.hexdigest()[:16])
+
+
+def check(paths: tuple[Path, ...]) -> list[str]:
+    """The names of scenes, once it is known that each can be judged.
+
+    Raises:
+        SystemExit: if a scene is not there, a PLY has no camera path, or two scenes have one name.
+        SceneError: if something is neither a PLY nor a run.
+    """
+    for path in paths:
+        if not path.exists():
+            raise SystemExit(f"{path}: no such file or folder; expected a PLY file or a run")
+    names = [name_of(path) for path in paths]
+    if len({*names}) < len(names):
+        raise SystemExit(f"two scenes have one name: {', '.join(names)}; expected different ones")
+    for path in paths:
+        if path.suffix == ".ply":
+            views_of(path_of(path.stem), 16)
+    return names
+
+
+@torch.no_grad()
+def losses(scene: JudgedScene, smalls: list[Gaussians], lpips: Lpips | None) -> Iterator[tuple[int, Look, Measures]]:
+    """What smaller scenes lose: the number of each, the look, and means over its views (:data:`MEASURES`), None where
+    there is no photo, no LPIPS, or no pixel that the dense scene covers.
+
+    The dense scene is drawn once for each look, and kept until the next.
+    """
+    for look in scene.looks:
+        drawn = [render_with_alpha(scene.dense, view) for view in look.views]
+        network = lpips if look.views.width <= LPIPS_WIDTH else None
+        covered = [float(alpha.double().mean()) for _, alpha in drawn]
+        renders = [image for image, _ in drawn]
+        del drawn
+        for number, small in enumerate(smalls):
+            yield number, look, _measures(small, look, renders, covered, network)
+
+
+def covered_psnr(image: Tensor, render: Tensor, covered: float) -> float:
+    """PSNR, dB, of the squared error of a picture (H, W, 3) spread over the share ``covered`` of the pixels that the
+    dense scene covers. Empty background does not make it better, and a halo beside an object makes it worse."""
+    return finite_psnr(image, render) + 10 * math.log10(covered)
+
+
+def _measures(
+    small: Gaussians, look: Look, renders: list[Tensor], covered: list[float], lpips: Lpips | None
+) -> Measures:
+    values: dict[str, list[float]] = {}
+
+    def note(found: dict[str, Any]) -> None:
+        for name, value in found.items():
+            values.setdefault(name, []).append(value)
+
+    for i, view in enumerate(look.views):
+        image = render(small, view)
+        if covered[i] > 0:
+            note({"covered_psnr": covered_psnr(image, renders[i], covered[i])})
+        note({f"dense_{name}": value for name, value in metrics_of(image, renders[i], lpips).items()})
+        if look.photos is not None:
+            note({f"photo_{name}": value for name, value in metrics_of(image, look.photos[i], lpips).items()})
+    return {name: fmean(values[name]) if name in values else None for name in MEASURES}

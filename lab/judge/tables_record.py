@@ -1,0 +1,122 @@
+"""Writes docs/record/results.md and its figure from what ``pointsplat tables`` measured.
+
+    python -m lab.judge.tables_record docs/record/results.json
+
+``prune`` and ``compact`` are left out: judge.py measures them, in views that no decision used.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from lab.common.printing import start
+from pointsplat_ns.io.files import replacing
+from pointsplat_ns.tables.cells import About, Cell
+from pointsplat_ns.tables.figure import medians, plot_figure
+from pointsplat_ns.tables.layout import Layout, Table, figure_medians
+from pointsplat_ns.tables.means import Group, SceneCells
+from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_4, OURS
+from pointsplat_ns.tables.writing import markdown_table
+from pointsplat_ns.tradeoff.journal import restored_point
+
+ROOT = Path(__file__).parents[2]
+
+TABLES = (1, 3, 4)
+"""Tables of quality. Table 2 has times, which need an idle machine."""
+
+FIGURE = "results_figure4.png"
+
+PAGE = """# The paper's networks and scores on two rooms
+
+`lab/judge/tables_record.py` writes this page from [results.json](results.json), which
+[`pointsplat tables`](../tables.md) measured on two rooms of `pointsplat rooms`:
+
+```bash
+pointsplat tables outputs/room52 outputs/room53 -o results --views 5 --side 320 --scoring-views 12 \\
+    --fine-tune 60 --refiners refiners/dual-010 refiners/dual-030 refiners/concat-010 refiners/concat-030 \\
+    --groups rooms=room52,room53
+```
+
+- Pictures are small: {sizes}. `prune` and `compact` are measured [at larger sizes](judge.md).
+- The scenes are not of the paper's datasets. The paper's figures do not compare.
+- Fine-tuning is 60 steps; the published baselines take thousands. The networks (size `small`) learned in 690 steps at
+  most; the published ones learned far longer. Two seeds of one training can differ by more than the two networks do.
+- PSNR (dB), SSIM and LPIPS (AlexNet) are means over scenes, against held-out photos. "Renders" means against the dense
+  scene's renders in the same poses. "Loses most" names the scene that loses most PSNR, its PSNR and the difference.
+- \\*: nothing is fine-tuned or refined.
+- Measured on {machines}.
+"""
+
+
+def read(path: Path) -> list[Group]:
+    """The groups of scenes of a file that ``pointsplat tables`` wrote, without the cells of ``prune`` and ``compact``.
+
+    Raises:
+        SystemExit: if the file cannot be read or is none.
+    """
+    left_out = {way.name for way in OURS}
+    try:
+        content = json.loads(path.read_text("utf-8"))
+        cells = [_cell(values) for values in content["cells"] if values["way"] not in left_out]
+        scenes: dict[str, list[SceneCells]] = {name: [] for name in content["groups"]}
+        for about in (About(**values) for values in content["scenes"]):
+            own = {(cell.way, cell.point.share): cell for cell in cells if cell.point.key.startswith(f"{about.name}/")}
+            scenes[about.group].append(SceneCells(about, own))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SystemExit(f"{path}: cannot be read ({error!r}); expected tables.json of `pointsplat tables`") from error
+    return [Group(name, tuple(members)) for name, members in scenes.items()]
+
+
+def _cell(values: dict[str, Any]) -> Cell:
+    return Cell(**{**values, "point": restored_point(values["point"])})
+
+
+def tables_of(group: Group) -> list[Table]:
+    """The tables of a group, without rows that were not measured."""
+    found = [
+        dataclasses.replace(
+            table,
+            sections=tuple(tuple(row for row in rows if "not measured" not in row) for rows in table.sections),
+            notes=(),
+        )
+        for table in Layout(group, (), {}).tables()
+        if table.number in TABLES
+    ]
+    if known := medians(group):
+        found.append(figure_medians(group, (DENSE_WAY, *FIGURE_4), known))
+    return found
+
+
+def page(groups: list[Group]) -> str:
+    """The page of all tables."""
+    abouts = [scene.about for group in groups for scene in group.scenes]
+    text = PAGE.format(
+        sizes=", ".join(f"{about.width} x {about.height} ({about.name})" for about in abouts),
+        machines="; ".join(sorted({about.machine for about in abouts})),
+    )
+    tables = [markdown_table(table) for group in groups for table in tables_of(group)]
+    figure = f"![Opacity and volume]({FIGURE})\n\n*Figure 4: opacity and volume of the Gaussians kept.*\n"
+    return "\n".join([text, *tables, figure])
+
+
+def main(file: tyro.conf.Positional[Path], record: Path = ROOT / "docs" / "record") -> None:
+    """Write the record of the paper's tables.
+
+    Args:
+        file: tables.json of ``pointsplat tables``.
+        record: folder for results.md and its figure.
+    """
+    groups = read(file)
+    with replacing(record / "results.md") as part:
+        part.write_text(page(groups), "utf-8")
+    plot_figure(groups, record / FIGURE)
+    print(record / "results.md")
+
+
+if __name__ == "__main__":
+    start(main)
