@@ -57,8 +57,8 @@ PAGE = """# What smaller scenes lose
 """
 
 
-def read(paths: Iterable[Path]) -> tuple[list[Row], dict[str, Any]]:
-    """All rows of some files of judge.py, rounded, and their settings.
+def read(paths: Iterable[Path], program: str = "judge.py") -> tuple[list[Row], dict[str, Any]]:
+    """All rows of some files of judge.py or another program, rounded, and their settings.
 
     Raises:
         SystemExit: if a file cannot be read or is no such file, or two have different settings or one row twice.
@@ -68,15 +68,17 @@ def read(paths: Iterable[Path]) -> tuple[list[Row], dict[str, Any]]:
     for path in paths:
         try:
             content = json.loads(path.read_text("utf-8"))
-            found, its_own = content["rows"], content["settings"]
-            keys = [_key(row) for row in found]
+            new, its_own = content["rows"], content["settings"]
+            keys = [_key(row) for row in new]
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise SystemExit(f"{path}: cannot be read ({error!r}); expected a file that judge.py wrote") from error
+            raise SystemExit(f"{path}: cannot be read ({error!r}); expected a file that {program} wrote") from error
         if settings and its_own != settings:
-            raise SystemExit(f"{path}: was written with {its_own}, the files before with {settings}; expected the same")
+            other = [name for name in {**settings, **its_own} if settings.get(name) != its_own.get(name)]
+            found = ", ".join(f"{name} {its_own.get(name)}, the files before {settings.get(name)}" for name in other)
+            raise SystemExit(f"{path}: was written with {found}; expected the same")
         if twice := {*keys} & {_key(row) for row in rows}:
             raise SystemExit(f"{path}: has rows that another file has, of {sorted({key[0] for key in twice})}")
-        settings, rows = its_own, rows + [rounded(row) for row in found]
+        settings, rows = its_own, rows + [rounded(row) for row in new]
     return rows, settings
 
 
