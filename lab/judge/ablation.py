@@ -6,7 +6,7 @@
 
 A PLY is looked at along the camera path of its name in ``lab/judge/paths``, a Splatfacto run from the poses of its
 held-out photos. A run is merged twice: without poses, and with those of its training photos. ``lab/judge/variants.py``
-has the variants. Constants are chosen on scenes for tuning (``python -m lab.judge.judge --list``).
+has the variants. Choose constants on scenes for tuning (``python -m lab.judge.judge --list``).
 """
 
 from __future__ import annotations

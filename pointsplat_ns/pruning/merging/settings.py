@@ -1,7 +1,8 @@
 """The settings of merging: every tuned number, with its meaning and its unit.
 
 A number that only keeps float32 or float64 in range stands beside the formula that needs it. All other numbers are
-here. A field says how it is turned off where it stands for a rule of its own.
+here. A field says how it is turned off where it stands for a rule of its own. ``lab/judge/ablation.py`` measures each
+again.
 """
 
 from __future__ import annotations
