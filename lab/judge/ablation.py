@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from statistics import fmean
 from typing import Annotated
@@ -22,6 +23,7 @@ import tyro
 
 from lab.common.printing import console, start, table
 from lab.common.results import Results, Row
+from lab.common.scenes import room
 from lab.common.ways import count_of
 from lab.judge import ablation_record as record
 from lab.judge.judge import LEAST_WIDTH, known_rows
@@ -36,7 +38,7 @@ from pointsplat_ns.system.progress import progress_bar
 from pointsplat_ns.views import Views
 
 Task = tuple[int | str, float, str]
-"""Where the result is looked at and whether poses are given (``at`` of a row), the share to keep, a variant."""
+"""``at`` of a row (where the result is looked at, and whether poses are given), the share to keep, the variant."""
 
 
 class Judge:
@@ -70,6 +72,12 @@ def tasks_of(scene: JudgedScene, known: list[Row], keeps: tuple[float, ...], var
     there = {(row["at"], row["keep"], row["method"]) for row in record.current(known)}
     tasks = [(at, keep, name) for at in ats for keep in keeps for name in (BASELINE, *variants)]
     return [task for task in tasks if task not in there]
+
+
+@cache
+def warm_up() -> None:
+    """Merge a small room once, so that the first row does not count the seconds of imports."""
+    merge(room(3_000), 300)
 
 
 def row_of(scene: JudgedScene, task: Task, judge: Judge, poses: Views | None, report: Callable[[float], None]) -> Row:
@@ -108,6 +116,7 @@ def measure(scene: JudgedScene, path: Path, tasks: list[Task], results: Results,
     """
     rows = {record.key(row): row for row in stay}
     poses = dataset_views(path, "train") if any(at == record.POSES for at, _, _ in tasks) else None
+    warm_up()
     with progress_bar() as show:
         judge = Judge(scene)
         for done, task in enumerate(tasks):

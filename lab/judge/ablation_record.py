@@ -110,7 +110,7 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
         of_table = [summary for summary in found if summary.name in table.variants]
         if of_table:
             parts += [f"## {table.title}", _variant_table(of_table, keeps, name, settings)]
-    if moved := [name for name, value in variants.default_values().items() if settings.get(name) != value]:
+    if moved := [name for name, value in variants.default_values().items() if settings.get(name, value) != value]:
         parts.append(f"Defaults that have changed since: {', '.join(f'`{name}`' for name in moved)}.")
     return "\n\n".join(part.strip() for part in parts) + "\n"
 

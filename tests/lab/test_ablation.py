@@ -152,6 +152,7 @@ def test_a_run_is_merged_without_poses_and_with_them(trained_walls, tmp_path, mo
         given.append(views)
         return merge(scene, k, progress, views, settings=settings)
 
+    ablation.warm_up()
     monkeypatch.setattr(ablation, "merge", recorded)
     ablation.main((run,), keep=(0.5,), variants=("no_regrouping",), views=2, json_path=results)
     assert [row["at"] for row in rows_of(results)] == ["photos"] * 2 + ["photos, poses given"] * 2
@@ -220,6 +221,8 @@ def test_the_page_names_defaults_that_are_others_than_when_it_was_measured():
     assert "have changed" not in record.page(ROWS, settings)
     said = record.page(ROWS, {**settings, "merging.neighbours": 99})
     assert "Defaults that have changed since: `merging.neighbours`." in said
+    del settings["merging.neighbours"]  # which was no setting then
+    assert "have changed" not in record.page(ROWS, settings)
 
 
 def test_the_record_of_several_files_is_written_and_gives_the_same_page_again(tmp_path, capsys):
