@@ -18,8 +18,8 @@ from nerfstudio.configs import external_methods
 
 from making import SHARED_DATA
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking import search
 from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.settings import DEFAULTS
 from pointsplat_ns.views import Views
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
@@ -253,5 +253,5 @@ def ball_views(hollow_ball: Gaussians) -> Views:
 
 @pytest.fixture()
 def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The search for views ends at the first places that show nothing, not at the fourth: each time takes seconds."""
-    monkeypatch.setattr(search, "_FRUITLESS", 1)
+    """The search for views ends after one round without a view, not after four: each round takes seconds."""
+    monkeypatch.setitem(vars(DEFAULTS), "max_fruitless_rounds", 1)

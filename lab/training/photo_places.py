@@ -3,11 +3,11 @@
     python -m lab.training.photo_places RUN... [--picture photo_places.jpg]
     python -m lab.training.photo_places RUN... --sh 0      # by sizes, as if there were no SH
 
-For each run: how well photos from the best of the places compared explain the SH (below 2 the scene has not told),
-without SH how sizes and distances from it correlate (below 0.48 it has not); how far from a training pose the places
-found are, by their shares, and any place of the same box is, in shares of the content's diagonal; and how often a
-training pose explains more than any place does. The picture shows what explains the SH,
-from above, at the height of the training poses, these in red, and some Gaussians.
+For each run: the evidence of the best place (explained energy of the SH, at least 2 in a scene that tells; without SH,
+correlation of sizes and distances, at least 0.48); the distance from a training pose of the places found, by their
+shares, and of random places, in shares of the content's diagonal; and how often a training pose has more evidence than
+a random place. The picture shows the evidence from above, at the height of the training poses, with these in red, and
+some Gaussians.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from lab.common.scenes import name_of
 from pointsplat_ns.gaussians import MAX_SH_DEGREE
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.looking.content import content_size
-from pointsplat_ns.looking.traces import Witnesses, photo_places
+from pointsplat_ns.looking.traces import PhotoEvidence, photo_places
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning import cut_sh
 
@@ -41,7 +41,7 @@ class Map:
     """What explains the SH at one height, seen from above."""
 
     name: str
-    votes: Tensor  # [CELLS, CELLS]
+    evidence: Tensor  # [CELLS, CELLS]
     extent: float  # half of its side
     eyes: Tensor  # [E, 2]
     gaussians: Tensor  # [n, 2]
@@ -53,13 +53,13 @@ def asked(run: Path, sh: int) -> Map:
     dense, poses = ps.load(run), dataset_views(run, "train")
     dense = cut_sh(dense, sh) if dense.sh_degree > sh else dense
     eyes = invert_rigid(poses.viewmats.double())[:, :3, 3]
-    witnesses = Witnesses.of(dense, torch.Generator().manual_seed(0))
-    if len(witnesses.means) == 0:
+    evidence = PhotoEvidence.of(dense, torch.Generator().manual_seed(0))
+    if len(evidence.means) == 0:
         raise SystemExit(f"{run} has no opaque Gaussian")
     size = content_size(dense)[1]
-    anywhere = witnesses.places(ANY, torch.Generator().manual_seed(0))
+    anywhere = evidence.candidates(ANY, torch.Generator().manual_seed(0))
     found = photo_places(dense)
-    at_eyes, at_any = witnesses.votes(eyes), witnesses.votes(anywhere)
+    at_eyes, at_any = evidence.at(eyes), evidence.at(anywhere)
     more = (at_eyes[:, None] > at_any).float().mean()
     away = float(torch.cdist(anywhere, eyes).amin(1).mean()) / size
     distance = "not told"
@@ -68,18 +68,18 @@ def asked(run: Path, sh: int) -> Map:
     best = float(torch.cat([at_eyes, at_any]).max())
     cells = (name_of(run), f"{best:.2f}", distance, f"{away:.1%}", f"{more:.0%}")
     print(f"| {' | '.join(cells)} |", flush=True)
-    return mapped(name_of(run), witnesses, eyes)
+    return mapped(name_of(run), evidence, eyes)
 
 
-def mapped(name: str, witnesses: Witnesses, eyes: Tensor) -> Map:
+def mapped(name: str, evidence: PhotoEvidence, eyes: Tensor) -> Map:
     """The map of a scene; the axis along which its poses spread least is taken to be upright."""
     middle = eyes.mean(0)
     axes = torch.linalg.svd(eyes - middle, full_matrices=True).Vh[:2]  # level, as far as the poses are
-    at, gaussians = (eyes - middle) @ axes.T, (witnesses.means - middle) @ axes.T
+    at, gaussians = (eyes - middle) @ axes.T, (evidence.means - middle) @ axes.T
     extent = 1.15 * float(torch.cat([gaussians.abs().quantile(0.8, dim=0), at.abs().amax(0)]).max())
     line = torch.linspace(-extent, extent, CELLS, dtype=torch.float64)
     cells = torch.cartesian_prod(line, line).flip(1)  # rows from bottom to top
-    return Map(name, witnesses.votes(middle + cells @ axes).view(CELLS, CELLS), extent, at, gaussians)
+    return Map(name, evidence.at(middle + cells @ axes).view(CELLS, CELLS), extent, at, gaussians)
 
 
 def draw(maps: list[Map], path: Path) -> None:
@@ -89,7 +89,7 @@ def draw(maps: list[Map], path: Path) -> None:
     figure = Figure(figsize=(3.6 * len(maps), 3.9), layout="constrained")
     for axes, drawn in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps, strict=True):
         side = (-drawn.extent, drawn.extent)
-        axes.imshow(drawn.votes, origin="lower", extent=(*side, *side))
+        axes.imshow(drawn.evidence, origin="lower", extent=(*side, *side))
         axes.scatter(*drawn.gaussians[::3].T, s=1, c="white", alpha=0.35, linewidths=0)
         axes.scatter(*drawn.eyes.T, s=9, c="red", linewidths=0)
         axes.set(xlim=side, ylim=side, xticks=[], yticks=[], title=drawn.name)

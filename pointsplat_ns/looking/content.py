@@ -1,4 +1,4 @@
-"""Where the content of a scene is, and how large: what positions, distances and sizes are measured by."""
+"""The content of a scene: its centre and size, the scene in units of it, and fewer Gaussians that cover as much."""
 
 from __future__ import annotations
 
@@ -10,67 +10,73 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.views import Views
 
 UNITS = 10.0
-"""Diagonal of the content after :func:`in_units`: all sizes that rendering knows, as that of its near plane, are small
+"""Diagonal of the content after :func:`in_units`. The sizes that rendering knows, such as its near plane, are small
 against it."""
 
 
-def content_box(scene: Gaussians) -> tuple[Tensor, Tensor]:
-    """Corners (3,), (3,) of the box that holds 90 % of the scene's opacity along each axis, float64.
+def content_box(scene: Gaussians, settings: LookingSettings = DEFAULTS) -> tuple[Tensor, Tensor]:
+    """Corners (3,), (3,) of the box that holds 90 % of the scene's opacity along each axis, scene units, float64.
+
+    Args:
+        scene: N Gaussians.
+        settings: ``content_quantiles``.
 
     Raises:
         DataError: if nothing of the scene is visible.
     """
     means, alphas = scene.means.double(), scene.alphas.double()
-    seen = scene.usable() & (alphas > 0)
-    if not bool(seen.any()):
+    visible = scene.usable() & (alphas > 0)
+    if not bool(visible.any()):
         raise DataError("nothing of the scene can be seen, so there is no place to look from")
-    means, alphas = means[seen], alphas[seen]
+    means, alphas = means[visible], alphas[visible]
     corners = []
     for axis in means.unbind(1):
         ranked, order = axis.sort()
         below = alphas[order].cumsum(0)
-        at = torch.searchsorted(below, below[-1] * below.new_tensor([0.05, 0.95])).clamp_max(len(ranked) - 1)
-        corners.append(ranked[at])
+        ends = torch.searchsorted(below, below[-1] * below.new_tensor(settings.content_quantiles))
+        corners.append(ranked[ends.clamp_max(len(ranked) - 1)])
     low, high = torch.stack(corners, dim=1)
     return low, high
 
 
-def content_diagonal(scene: Gaussians, low: Tensor, high: Tensor) -> float:
-    """Diagonal of the box with corners ``low`` (3,) and ``high`` (3,) that :func:`content_box` gives, scene units. If
-    the box is a point (one Gaussian, or all at one position), four times the largest standard deviation; 1 if that is
-    0."""
-    return float((high - low).norm()) or 4 * float(scene.stds[scene.usable()].double().amax()) or 1.0
+def content_size(scene: Gaussians, box: tuple[Tensor, Tensor] | None = None) -> tuple[Tensor, float]:
+    """Centre and diagonal of the content of a scene.
 
+    Args:
+        scene: N Gaussians.
+        box: corners (3,), (3,) as :func:`content_box` gives them; by default they are computed.
 
-def content_size(scene: Gaussians) -> tuple[Tensor, float]:
-    """Centre (3,) float64 and diagonal of the box that holds most of a scene's opacity; of the largest Gaussian if that
-    box is a point; 1 if that is a point as well."""
+    Returns:
+        Centre (3,), float64, on the CPU, and diagonal, scene units. If the box is a point (one Gaussian, or all at one
+        position), the diagonal is four times the largest standard deviation, or 1 if that is 0 or not finite. Without
+        ``box``, a scene that shows nothing has its centre at 0 and a diagonal of 1.
+    """
     try:
-        low, high = content_box(scene)
-    except DataError:  # nothing can be seen
+        low, high = content_box(scene) if box is None else box
+    except DataError:
         return torch.zeros(3, dtype=torch.float64), 1.0
-    size = float((high - low).norm())
-    if size == 0:
-        size = float(scene.stds[scene.usable()].double().amax())
+    size = float((high - low).norm()) or 4 * float(scene.stds[scene.usable()].double().amax())
     return 0.5 * (low + high).cpu(), size if 0 < size < math.inf else 1.0
 
 
 def positions_in_units(positions: Tensor, centre: Tensor, size: float) -> Tensor:
-    """Positions (..., 3) where the content has its centre at 0 and a diagonal of :data:`UNITS`, float64."""
+    """Positions (..., 3) moved and scaled so that the content has its centre at 0 and a diagonal of :data:`UNITS`,
+    float64."""
     return (positions.double() - centre.to(positions.device)) * (UNITS / size)
 
 
 def in_units(scene: Gaussians, centre: Tensor, size: float) -> Gaussians:
-    """A scene moved and scaled as :func:`positions_in_units` moves and scales positions."""
+    """A scene, moved and scaled as by :func:`positions_in_units`."""
     means = positions_in_units(scene.means, centre, size).to(scene.dtype)
     return scene.replace(means=means, scales=scene.scales + math.log(UNITS / size))
 
 
 def views_in_units(views: Views, centre: Tensor, size: float) -> Views:
-    """Views of a scene as views of it :func:`in_units`, float64, on the CPU."""
+    """Views of a scene, changed into views of the scene :func:`in_units`; float64, on the CPU."""
     viewmats = views.viewmats.double().cpu().clone()
     viewmats[:, :3, 3] += viewmats[:, :3, :3] @ centre
     viewmats[:, :3, 3] *= UNITS / size
@@ -79,17 +85,18 @@ def views_in_units(views: Views, centre: Tensor, size: float) -> Views:
     return dataclasses.replace(views, viewmats=viewmats, Ks=Ks, background=background, near_plane=near_plane)
 
 
-def thinned(scene: Gaussians, most: int) -> Gaussians:
-    """At most about ``most`` Gaussians, evenly taken, grown so that they cover as much as all."""
-    step = max(1, len(scene) // most)
-    return _grown(Gaussians(*(value[::step] for value in scene.tensors())), step)
+def thinned(scene: Gaussians, max_count: int) -> Gaussians:
+    """Every so many-th Gaussian, about ``max_count`` at most, enlarged so that they cover as much as all."""
+    step = max(1, len(scene) // max_count)
+    return _enlarged(Gaussians(*(value[::step] for value in scene.tensors())), step)
 
 
-def some_of(scene: Gaussians, members: Tensor, step: int) -> Gaussians:
-    """Every so many-th of the members (n,), without SH, grown so that they cover as much as all."""
-    return _grown(scene.replace(features_rest=scene.features_rest[:, :0])[members[::step]], step)
+def every_nth(scene: Gaussians, members: Tensor, step: int) -> Gaussians:
+    """Every ``step``-th of the Gaussians with indices ``members`` (n,), without SH, enlarged so that they cover as much
+    as all members."""
+    return _enlarged(scene.replace(features_rest=scene.features_rest[:, :0])[members[::step]], step)
 
 
-def _grown(scene: Gaussians, step: int) -> Gaussians:
-    """Gaussians that stand for so many each."""
+def _enlarged(scene: Gaussians, step: int) -> Gaussians:
+    """Gaussians with ``step`` times the area."""
     return scene.replace(scales=scene.scales + 0.5 * math.log(step))

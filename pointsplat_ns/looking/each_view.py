@@ -7,25 +7,25 @@ from typing import TypeVar
 
 import torch
 
+from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.system.threads import in_threads
 from pointsplat_ns.views import View
 
 T = TypeVar("T")
 
-AT_ONCE = 2_000_000
-"""Largest number of Gaussians in all that are rendered at once, as each render takes memory; but always two scenes."""
 
-
-def each_view(views: Sequence[View], count: int, function: Callable[[View], T]) -> Iterator[T]:
-    """The result of a function for each view, in order. Several views are computed at once, but no more than
-    :data:`AT_ONCE` allows.
+def each_view(
+    views: Sequence[View], count: int, function: Callable[[View], T], settings: LookingSettings = DEFAULTS
+) -> Iterator[T]:
+    """The results of a function for each view, in order. Several views are computed at once.
 
     Args:
-        views: any number of them.
-        count: number of Gaussians that are rendered in each.
-        function: of a view, without gradients.
+        views: any number of views.
+        count: number of Gaussians that are rendered in each view.
+        function: function of a view; it runs without gradients.
+        settings: ``max_count_at_once``.
     """
-    at_once = max(2, AT_ONCE // max(1, count))
+    at_once = max(2, settings.max_count_at_once // max(1, count))
     for first in range(0, len(views), at_once):
         results: dict[int, T] = {}
 

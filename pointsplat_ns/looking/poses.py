@@ -1,4 +1,4 @@
-"""Cameras at given places, as sampled views are made of them."""
+"""Cameras at given places, from which sampled views are made."""
 
 from __future__ import annotations
 
@@ -7,20 +7,25 @@ import math
 import torch
 from torch import Tensor
 
+from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.views import Views
 
-FIELD_OF_VIEW = 70.0
-"""Field of view across the longer side of the image, degrees: that of a phone's main camera."""
-
 BACKGROUND = (0.0, 0.0, 0.0)
-
-NEAR_PLANE = 1e-3
-"""Depth that sampled views start at, as a share of the diagonal of the content's box."""
+"""Background of sampled views, RGB: black."""
 
 
 def look_at(positions: Tensor, targets: Tensor, up: Tensor | None = None) -> Tensor:
-    """World-to-camera matrices (C, 4, 4) of cameras at ``positions`` (C, 3) that look at ``targets`` (C, 3), with
-    ``up`` (3,), by default z, up where that is possible; OpenCV axes."""
+    """World-to-camera matrices of cameras that look at targets.
+
+    Args:
+        positions: (C, 3) of the cameras.
+        targets: (C, 3); where a target is at its camera's position, the camera looks along x.
+        up: (3,) direction that is up in the pictures, of any length; by default z. Cameras that look along it have
+            another direction up.
+
+    Returns:
+        (C, 4, 4), OpenCV axes.
+    """
     forward = targets - positions
     length = forward.norm(dim=1, keepdim=True)
     ahead = forward.new_tensor([1.0, 0.0, 0.0]).expand_as(forward)
@@ -38,9 +43,16 @@ def look_at(positions: Tensor, targets: Tensor, up: Tensor | None = None) -> Ten
     return viewmats
 
 
-def views_of(viewmats: Tensor, width: int, height: int, near_plane: float) -> Views:
-    """Views (C) over black of :data:`FIELD_OF_VIEW`, from world-to-camera matrices (C, 4, 4)."""
-    focal = 0.5 * max(width, height) / math.tan(math.radians(FIELD_OF_VIEW) / 2)
+def views_of(viewmats: Tensor, width: int, height: int, diagonal: float, settings: LookingSettings = DEFAULTS) -> Views:
+    """Views over black from world-to-camera matrices.
+
+    Args:
+        viewmats: (C, 4, 4).
+        width, height: size of the pictures, pixels.
+        diagonal: of the content, in the unit of ``viewmats``.
+        settings: ``field_of_view`` and ``near_plane``.
+    """
+    focal = 0.5 * max(width, height) / math.tan(math.radians(settings.field_of_view) / 2)
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=viewmats.dtype)
     Ks = K.repeat(len(viewmats), 1, 1)
-    return Views(viewmats, Ks, width, height, torch.tensor(BACKGROUND), near_plane=near_plane)
+    return Views(viewmats, Ks, width, height, torch.tensor(BACKGROUND), near_plane=settings.near_plane * diagonal)

@@ -1,6 +1,6 @@
-"""Samples views of a scene that comes without cameras: where people would stand, and what they would look at.
+"""Samples views of a scene that comes without cameras: from where people would stand, towards what they would look at.
 
-All is done in units of the content (its diagonal is 10), so that the scene's own unit does not matter.
+All is in units of the content (its diagonal is 10), so that the scene's own unit does not matter.
 """
 
 from __future__ import annotations
@@ -12,41 +12,36 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.content import UNITS, content_box, content_diagonal, in_units, positions_in_units, thinned
-from pointsplat_ns.looking.poses import NEAR_PLANE, views_of
-from pointsplat_ns.looking.search import DISTANCE, ENCLOSED, PLACES, TOO_NEAR, Search
+from pointsplat_ns.looking.content import UNITS, content_box, content_size, in_units, thinned
+from pointsplat_ns.looking.poses import views_of
+from pointsplat_ns.looking.search import Search
+from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.looking.surface import Surface
-from pointsplat_ns.looking.traces import photo_places
+from pointsplat_ns.looking.traces import PhotoPlaces, log_widths, photo_places
 from pointsplat_ns.looking.upright import UprightBox, pointing_up, upright_axis
 from pointsplat_ns.views import Views
-
-PROBED = 5_000
-"""Number of Gaussians, at most, of the depth images that test a view."""
-
-_BLUR_PROBED = 40_000
-"""Number of Gaussians, at most, of the pictures in which blur is measured. 5,000 of them are too few: large ones then
-hide the others."""
-
-_MOSTLY = 0.85
-"""Least share of the free places of a room's box that are enclosed. Beside an object there are others."""
-
-_AS_MUCH = 0.9
-"""Least share of what is seen from outside that the enclosed places of a room see."""
 
 
 @torch.no_grad()
 def sample_views(
-    scene: Gaussians, count: int, width: int = 320, height: int = 240, seed: int = 0, up: Tensor | None = None
+    scene: Gaussians,
+    count: int,
+    width: int = 320,
+    height: int = 240,
+    seed: int = 0,
+    up: Tensor | None = None,
+    settings: LookingSettings = DEFAULTS,
 ) -> Views:
     """Sample cameras that look at a scene as people would.
 
-    A scene that is seen whole from enclosed places in it is a room: cameras then stand in free space at the height of
-    eyes and look about level. Any other is looked at from around. Of many such views, those are taken that show most of
-    what the views before them have not shown, in the middle of the picture rather than at its edge; a small depth image
-    tests that nothing is in the way. Ask for all the views at once that are wanted, as they then complete each other.
+    A scene whose points are visible from enclosed places in it is a room: cameras stand in free space at the height of
+    eyes and look about level. In other scenes, cameras stand around the content as well. Of many candidates, the next
+    view is the one with the largest coverage gain: it shows points that earlier views have not shown, in the middle of
+    the picture rather than at its edge. A small depth image tests that nothing is in the way. Views complete each
+    other, so ask for all of them at once.
 
-    Where the Gaussians say from where photos were taken (:mod:`pointsplat_ns.looking.traces`), half of the cameras
-    stand about there and look at what photos showed.
+    If the Gaussians tell where photos were taken (:mod:`pointsplat_ns.looking.traces`), half of the cameras stand near
+    these places and look at the parts that photos showed.
 
     Args:
         scene: N Gaussians.
@@ -54,12 +49,13 @@ def sample_views(
         width: of the images, pixels.
         height: of the images, pixels. The field of view is 70 degrees across the longer side.
         seed: the same scene and seed give the same views, another seed gives others.
-        up: (3,) which way is up in the world, of any length; by default it is estimated from the scene
+        up: (3,) direction that is up in the world, of any length; by default it is estimated from the scene
             (:mod:`pointsplat_ns.looking.upright`).
+        settings: tuned numbers, see :mod:`pointsplat_ns.looking.settings`.
 
     Returns:
         ``count`` views, on the CPU, over black: ``viewmats`` (count, 4, 4) from world to camera in OpenCV axes and
-        ``Ks`` (count, 3, 3) in pixels, float64, with a near plane that suits the scene's size. Fewer where the search
+        ``Ks`` (count, 3, 3) in pixels, float64, with a near plane that suits the scene's size. Fewer if the search
         finds fewer.
 
     Raises:
@@ -73,25 +69,27 @@ def sample_views(
         >>> len(views), tuple(views.viewmats.shape), (views.width, views.height)
         (3, (3, 4, 4), (64, 48))
     """
-    return views_about(scene, photo_places(scene), count, width, height, seed, up)
+    return views_about(scene, photo_places(scene, settings), count, width, height, seed, up, settings=settings)
 
 
 @torch.no_grad()
 def views_about(
     scene: Gaussians,
-    photos: tuple[Tensor, Tensor] | None,
+    photos: PhotoPlaces | None,
     count: int,
     width: int = 320,
     height: int = 240,
     seed: int = 0,
     up: Tensor | None = None,
     sharp: bool = True,
+    settings: LookingSettings = DEFAULTS,
 ) -> Views:
-    """As :func:`sample_views`, with what :func:`~pointsplat_ns.looking.traces.photo_places` says of the scene.
+    """Sample views as :func:`sample_views` does, near photo places that are known already.
 
     Args:
-        sharp: whether views that a few large Gaussians fill are left out, as nobody takes such photos. Renders are then
-            compared where they matter; without it, views stand in more places.
+        photos: the scene's :func:`~pointsplat_ns.looking.traces.photo_places`.
+        sharp: whether blurred views are refused, which a few large Gaussians fill, because nobody takes such photos.
+            Renders are then compared where they matter; without the rule, views stand in more places.
     """
     if count < 1:
         raise DataError(f"{count} views asked for; expected at least 1")
@@ -102,24 +100,28 @@ def views_about(
         if up.shape != (3,) or not 0 < float(up.norm()) < math.inf:
             raise DataError(f"up is {up.tolist()}; expected three numbers, not all 0")
         up = up / up.norm()
-    centre, diagonal, surface = _content_surface(scene)
-    photos = _places_in_units(photos, centre, diagonal)
+    centre, diagonal, surface = _content_surface(scene, settings)
+    photos = None if photos is None else photos.in_units(centre, diagonal)
     box, inside = _upright(surface, photos, up)
-    small = in_units(thinned(scene, PROBED), centre, diagonal)
-    fine, sizes = None, None
+    probe = in_units(thinned(scene, settings.probe_count), centre, diagonal)
+    fine, widths = None, None
     if sharp:
-        fine = in_units(thinned(scene, _BLUR_PROBED), centre, diagonal)
-        sizes = _widths(fine) / math.sqrt(max(1, len(scene) // _BLUR_PROBED))
+        fine = in_units(thinned(scene, settings.blur_count), centre, diagonal)
+        widths = log_widths(fine.scales).nan_to_num(-100.0).exp()
+        widths = widths / math.sqrt(max(1, len(scene) // settings.blur_count))  # before it was enlarged
     generator = torch.Generator().manual_seed(seed)
 
-    def found(inside: bool, about: tuple[Tensor, Tensor] | None, count: int) -> Tensor:
-        return Search(small, fine, sizes, surface, box, inside, width, height, generator, about).views(count)
+    def found(inside: bool, photos: PhotoPlaces | None, count: int) -> Tensor:
+        search = Search(probe, fine, widths, surface, box, inside, width, height, generator, photos, settings)
+        return search.views(count)
 
-    near_photos = found(inside, photos, count // 2) if photos is not None and count > 1 else torch.empty(0, 4, 4)
+    near_photos = torch.empty(0, 4, 4, dtype=torch.float64)
+    if photos is not None:
+        near_photos = found(inside, photos, int(settings.photo_share * count))
     others = found(inside, None, count - len(near_photos))
     if len(near_photos) + len(others) == 0:
         others = found(not inside, None, count)
-    taken = _alternating(near_photos.double(), others)
+    taken = _alternating(near_photos, others)
     if len(taken) == 0:
         raise DataError(
             "no free place to look at the scene from was found; give a run whose data is at hand, which has poses"
@@ -127,83 +129,56 @@ def views_about(
     rotation, translation = taken[:, :3, :3], taken[:, :3, 3]
     viewmats = taken.clone()
     viewmats[:, :3, 3] = translation * (diagonal / UNITS) - rotation @ centre
-    return views_of(viewmats, width, height, NEAR_PLANE * diagonal)
+    return views_of(viewmats, width, height, diagonal, settings)
 
 
 def _alternating(first: Tensor, second: Tensor) -> Tensor:
-    """Matrices (n, 4, 4) and (m, 4, 4) in turn, (n + m, 4, 4), so that a few of them are of both kinds."""
+    """Matrices (n, 4, 4) and (m, 4, 4), evenly mixed, (n + m, 4, 4): a few of them contain both kinds."""
     ranks = torch.cat([(torch.arange(len(some)) + 0.5) / max(1, len(some)) for some in (first, second)])
     return torch.cat([first, second])[ranks.argsort(stable=True)]
 
 
 @torch.no_grad()
-def estimated_up(scene: Gaussians) -> Tensor:
-    """Which way is up in a scene, (3,) float64 of length 1, as :func:`sample_views` takes it.
+def estimated_up(scene: Gaussians, settings: LookingSettings = DEFAULTS) -> Tensor:
+    """Direction that is up in a scene, (3,) float64 of length 1, as :func:`sample_views` takes it.
 
     Raises:
         DataError: if nothing of the scene is visible.
     """
-    return _stood_up(scene, photo_places(scene))[0].up
+    centre, diagonal, surface = _content_surface(scene, settings)
+    photos = photo_places(scene, settings)
+    return _upright(surface, None if photos is None else photos.in_units(centre, diagonal))[0].up
 
 
-@torch.no_grad()
-def is_room(scene: Gaussians) -> bool:
-    """Whether a scene that does not tell where its photos were taken is looked at from inside.
-
-    Raises:
-        DataError: if nothing of the scene is visible.
-    """
-    return _stood_up(scene, None)[1]
+def _content_surface(scene: Gaussians, settings: LookingSettings) -> tuple[Tensor, float, Surface]:
+    """Centre (3,) and diagonal of the content, scene units, and its surface."""
+    centre, diagonal = content_size(scene, content_box(scene, settings))
+    return centre, diagonal, Surface.of(scene, centre, diagonal, settings)
 
 
-def _stood_up(scene: Gaussians, photos: tuple[Tensor, Tensor] | None) -> tuple[UprightBox, bool]:
-    """As :func:`_upright`, of a scene and places in its own unit."""
-    centre, diagonal, surface = _content_surface(scene)
-    return _upright(surface, _places_in_units(photos, centre, diagonal))
-
-
-def _places_in_units(
-    photos: tuple[Tensor, Tensor] | None, centre: Tensor, diagonal: float
-) -> tuple[Tensor, Tensor] | None:
-    """Places of photos and their shares, in units of the content."""
-    return None if photos is None else (positions_in_units(photos[0], centre, diagonal), photos[1])
-
-
-def _content_surface(scene: Gaussians) -> tuple[Tensor, float, Surface]:
-    """Centre (3,) and diagonal of the content, and its surface in units of it."""
-    low, high = content_box(scene)
-    diagonal = content_diagonal(scene, low, high)
-    centre = 0.5 * (low + high).cpu()
-    return centre, diagonal, Surface.of(scene, centre, diagonal)
-
-
-def _upright(
-    surface: Surface, photos: tuple[Tensor, Tensor] | None, up: Tensor | None = None
-) -> tuple[UprightBox, bool]:
-    """The upright box of a scene, by the direction ``up`` (3,) if it is known, and whether the scene is a room."""
+def _upright(surface: Surface, photos: PhotoPlaces | None, up: Tensor | None = None) -> tuple[UprightBox, bool]:
+    """The upright box of a scene, with the direction ``up`` (3,) if it is known, and whether the scene is a room."""
     axis = upright_axis(surface, photos) if up is None else up
-    inside = _is_room(surface, UprightBox.of(surface, axis))
+    inside = is_room(surface, UprightBox.of(surface, axis))
     return UprightBox.of(surface, pointing_up(surface, axis, inside) if up is None else up), inside
 
 
-def _widths(scene: Gaussians) -> Tensor:
-    """Geometric means (N,) of the two larger standard deviations of Gaussians, float64; finite."""
-    logs = scene.scales.double().sort(dim=1).values[:, 1:].mean(1)
-    return logs.clamp(-100.0, 100.0).nan_to_num(-100.0).exp()
-
-
-def _is_room(surface: Surface, box: UprightBox) -> bool:
-    """Whether the scene is one to look at from inside."""
+def is_room(surface: Surface, box: UprightBox) -> bool:
+    """Whether a scene is one to look at from inside: most of its free places are enclosed, and nearly all points that
+    are visible from outside are visible from them as well."""
+    settings = surface.settings
     generator = torch.Generator().manual_seed(0)
-    places = box.places(4 * PLACES, generator)
-    places = places[surface.clearance(places) > TOO_NEAR][:PLACES]
+    places = box.places(settings.box_draws * settings.places, generator, settings)
+    places = places[surface.clearance(places) > settings.min_clearance][: settings.places]
     if len(places) == 0:
         return False
-    seen, around = surface.seen_from(places)
-    enclosed = around >= ENCLOSED
-    if float(enclosed.float().mean()) < _MOSTLY:
+    visible, enclosure = surface.visible_from(places)
+    enclosed = enclosure >= settings.min_enclosure
+    if float(enclosed.float().mean()) < settings.min_enclosed_places:
         return False
-    outside = torch.randn(PLACES, 3, generator=generator, dtype=torch.float64)
-    outside = outside / outside.norm(dim=1, keepdim=True) * DISTANCE[1]
-    from_inside, from_outside = (some.any(0).float().mean() for some in (seen[enclosed], surface.seen_from(outside)[0]))
-    return float(from_inside) >= _AS_MUCH * float(from_outside)
+    outside = torch.randn(settings.places, 3, generator=generator, dtype=torch.float64)
+    outside = outside / outside.norm(dim=1, keepdim=True) * settings.distances[1]
+    from_inside, from_outside = (
+        float(some.any(0).float().mean()) for some in (visible[enclosed], surface.visible_from(outside)[0])
+    )
+    return from_inside >= settings.min_visible_inside * from_outside

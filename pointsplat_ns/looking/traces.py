@@ -1,113 +1,81 @@
-"""Traces that photos leave in a scene: how much they showed of each part of it, and where they were taken.
+"""Traces that photos leave in the Gaussians of a scene: where photos were taken, and which parts they showed.
 
-A scene is trained from nothing, or from round Gaussians of one colour. Each photo that shows a Gaussian moves its SH
-coefficients, and pulls it flat onto the surface; what no photo shows stays as it was. So the energy of the SH and the
-flatness of a neighbourhood tell how much it was looked at, with what was in the way taken into account.
+Training starts without SH, or with round Gaussians of one colour. Each photo that shows a Gaussian changes its SH
+coefficients and flattens it onto the surface. A Gaussian that no photo shows stays as it was. So the energy of the SH
+and the flatness of a neighbourhood grow with the number of photos that showed it, occlusion included.
 
-A photo from direction d moves the coefficients f along Y(d), the basis there. So the part of the colour that depends
-on the direction, f . Y, is large where photos were taken from, and small elsewhere. A place from which it is large for
-many Gaussians is one where photos were taken. Without SH, sizes tell, if less: training splits what is large in a
-photo, so that Gaussians are small near the places of photos and large far from them.
+A photo from direction d moves the coefficients f along Y(d), the SH basis there. So the part of the colour that depends
+on the direction, f . Y, is large towards photo places and small elsewhere: a photo place is one where it is large for
+many Gaussians. Without SH, sizes give weaker evidence: training splits Gaussians that are large in a photo, so that
+they are small near photo places and large far from them.
 
-None of this is in the literature that we know of; it was found on trained scenes whose poses are known, see
-``docs/concepts/sampled_views.md``.
+The method was found on trained scenes with known poses, see ``docs/concepts/sampled_views.md``. We know of no
+publication.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool1d
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.content import positions_in_units
+from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.system.pieces import in_pieces
 
-NEIGHBOURHOOD = 129
-"""Number of Gaussians along the curve whose mean says how much a place was seen; one alone says little."""
 
-ENERGY_POWER = 0.75
-"""Exponent of the mean energy of the SH; with that of the mean flatness, 1, fitted to the poses of four captures."""
+class PhotoPlaces(NamedTuple):
+    """Places where photos were taken."""
 
-FLATNESS_POWER = 2.0
-"""Exponent of the mean flatness where there are no SH."""
+    places: Tensor  # [P, 3] float64, scene units
+    shares: Tensor  # [P] shares of the photos, which sum to 1
 
-FAINTEST = 1e-4
-"""SH coefficients, root of the sum of squares, below which no photo is taken to have changed them."""
-
-LARGEST = 1e3
-"""SH coefficients are taken to be at most this: a colour of 1 is white."""
-
-FLATTEST = 7.0
-"""Largest flatness, logarithm of width over thickness: flat Gaussians of any kind are alike."""
-
-MOST_LOG = 100.0
-"""Bound of log-scales, either way, when sizes are compared: some are infinite."""
-
-MOST_FACTOR = 8.0
-"""Bound of the logarithm of a factor, either way from the median's."""
-
-PROBED = 1_500
-"""Number of Gaussians, at most, that are asked for the places of photos."""
-
-OPAQUE_ENOUGH = 0.1
-"""Least opacity of these."""
-
-CANDIDATES = 2_000
-"""Number of places that are compared."""
-
-ASKED_FIRST, PROMISING = 300, 0.8
-"""Number of them that are compared first, and share of :data:`TELLING` that the best of these must reach for the others
-to be compared as well."""
-
-AROUND = 1.5
-"""Size of the box that these are in, relative to one that holds 96 % of those Gaussians along each axis."""
-
-TELLING = 2.0
-"""How much more than SH of no direction a place must explain, for the scene to have told where photos were taken.
-The captures reach 3.3 to 3.7 where photos were taken; scenes seen from all around 1.2 to 1.6, and their best places lie
-in the wrong parts of them (-0.1 to -0.4 dB)."""
-
-CONTRAST = 16
-"""Shares of places rise with this power of what they explain."""
-
-TELLING_SIZE, CONTRAST_OF_SIZE = 0.48, 8
-"""The same for sizes: least correlation of the logarithms of size and distance, and its power. The captures that are
-looked at from outside reach 0.50 to 0.78, those of rooms, where any free place will do, 0.23 to 0.46."""
-
-LEAST_SHARE = 0.01
-"""Places of a smaller share than this, relative to the best one's, are left out."""
+    def in_units(self, centre: Tensor, size: float) -> PhotoPlaces:
+        """The places in units of the content, see :func:`~pointsplat_ns.looking.content.positions_in_units`."""
+        return PhotoPlaces(positions_in_units(self.places, centre, size), self.shares)
 
 
-def how_much_seen(scene: Gaussians, members: Tensor) -> Tensor:
-    """How much photos showed of the neighbourhood of each member, relative to the median, (n,) float32.
+def trace_factors(scene: Gaussians, members: Tensor, settings: LookingSettings = DEFAULTS) -> Tensor:
+    """Trace factor of each member: large where photos showed its neighbourhood well, 1 for the median member.
 
-    Mean energy of the SH to the power 3/4, times the mean flatness, the geometric mean of width over thickness; without
-    SH, that squared. 1 for all if the Gaussians have no SH and are equally flat.
+    The mean energy of the SH and the exponential of the mean flatness, each to a power. The flatness is the logarithm
+    of width over thickness.
 
     Args:
         scene: N Gaussians.
         members: (n,) indices, n at least 1, in an order in which neighbours are near each other.
+        settings: ``trace_neighbourhood``, ``max_log_factor``, the exponents and the bounds of SH and flatness.
+
+    Returns:
+        (n,) float32; 1 for all if the Gaussians have no SH and are equally flat.
     """
-    energy = means_around(in_pieces(lambda rows: _energy(scene.features_rest[rows].double()), members), NEIGHBOURHOOD)
-    flatness = means_around(in_pieces(lambda rows: _flatness(scene.scales[rows].double()), members), NEIGHBOURHOOD)
-    power = 1.0 if bool((energy > 0).any()) else FLATNESS_POWER
-    logs = ENERGY_POWER * (energy + FAINTEST**2).log() + power * flatness
-    return (logs - logs.median()).clamp(-MOST_FACTOR, MOST_FACTOR).exp().float()
+
+    def local_means(values: Tensor) -> Tensor:
+        return means_around(values, settings.trace_neighbourhood)
+
+    energy = local_means(in_pieces(lambda rows: _energy(scene.features_rest[rows].double(), settings), members))
+    flatness = local_means(in_pieces(lambda rows: _flatness(scene.scales[rows].double(), settings), members))
+    has_sh = bool((energy > 0).any())
+    exponent = settings.flatness_exponent if has_sh else settings.flatness_exponent_without_sh
+    logs = settings.energy_exponent * (energy + settings.min_sh**2).log() + exponent * flatness
+    return (logs - logs.median()).clamp(-settings.max_log_factor, settings.max_log_factor).exp().float()
 
 
-def _energy(rest: Tensor) -> Tensor:
+def _energy(sh: Tensor, settings: LookingSettings) -> Tensor:
     """Sums of squares (n,) of SH coefficients (n, K, 3)."""
-    return rest.clamp(-LARGEST, LARGEST).square().sum((1, 2))
+    return sh.clamp(-settings.max_sh, settings.max_sh).square().sum((1, 2))
 
 
-def _flatness(scales: Tensor) -> Tensor:
+def _flatness(scales: Tensor, settings: LookingSettings) -> Tensor:
     """Logarithms (n,) of width over thickness of log-scales (n, 3)."""
     thickness, width, length = scales.sort(dim=1).values.unbind(1)
-    return (0.5 * (width + length) - thickness).nan_to_num(0.0).clamp(0.0, FLATTEST)
+    return (0.5 * (width + length) - thickness).nan_to_num(0.0).clamp(0.0, settings.max_flatness)
 
 
 def means_around(values: Tensor, count: int) -> Tensor:
@@ -117,78 +85,95 @@ def means_around(values: Tensor, count: int) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Witnesses:
-    """Some Gaussians of a scene that say from where photos showed them: by their SH; if none has any, by their size."""
+class PhotoEvidence:
+    """Gaussians of a scene whose SH are compared with candidate photo places; if none has SH, their sizes are."""
 
     means: Tensor  # [n, 3] float64, scene units
     sh: Tensor  # [n, K, 3] float32, SH coefficients of degrees 1 and up, of length 1
     sizes: Tensor  # [n] float64, logarithms of the geometric means of width and length
+    settings: LookingSettings = DEFAULTS
 
     @staticmethod
-    def of(scene: Gaussians, generator: torch.Generator) -> Witnesses:
-        """At most :data:`PROBED` Gaussians drawn from a scene that have SH; if none has, four times as many others, as
-        the size of one says less."""
-        drawn = torch.randperm(len(scene), generator=generator)[: 8 * PROBED]
+    def of(scene: Gaussians, generator: torch.Generator, settings: LookingSettings = DEFAULTS) -> PhotoEvidence:
+        """Gaussians that are drawn from those with SH; if there are none, from all that are opaque enough."""
+        count = settings.evidence_count
+        drawn = torch.randperm(len(scene), generator=generator)[: settings.evidence_draws * count]
         some = scene[drawn.to(scene.device)].to("cpu")
-        sh = unit_sh(some.features_rest)
-        telling = some.usable() & (some.alphas > OPAQUE_ENOUGH)
-        with_sh = telling & (sh != 0).any(2).any(1)
-        chosen = with_sh.nonzero()[:PROBED, 0] if bool(with_sh.any()) else telling.nonzero()[: 4 * PROBED, 0]
-        sizes = some.scales[chosen].double().clamp(-MOST_LOG, MOST_LOG).sort(dim=1).values[:, 1:].mean(1)
-        return Witnesses(some.means[chosen].double(), sh[chosen], sizes)
+        sh = unit_sh(some.features_rest, settings)
+        opaque = some.usable() & (some.alphas > settings.min_evidence_opacity)
+        with_sh = opaque & (sh != 0).any(2).any(1)
+        if bool(with_sh.any()):
+            chosen = with_sh.nonzero()[:count, 0]
+        else:
+            chosen = opaque.nonzero()[: settings.size_evidence_factor * count, 0]
+        return PhotoEvidence(some.means[chosen].double(), sh[chosen], log_widths(some.scales[chosen]), settings)
 
     @property
-    def have_sh(self) -> bool:
-        """Whether they tell by their SH."""
+    def has_sh(self) -> bool:
+        """Whether SH are compared, not sizes."""
         return bool((self.sh != 0).any())
 
-    def places(self, count: int, generator: torch.Generator) -> Tensor:
-        """Places (count, 3) drawn evenly from the box that those of photos are looked for in, float64."""
-        low, high = torch.quantile(self.means, self.means.new_tensor([0.02, 0.98]), dim=0)
-        spread = torch.rand(count, 3, generator=generator).double() - 0.5
-        return 0.5 * (low + high) + AROUND * (high - low) * spread
+    def candidates(self, count: int, generator: torch.Generator) -> Tensor:
+        """Candidate places (count, 3), drawn evenly from a box around the Gaussians, float64."""
+        low, high = torch.quantile(self.means, self.means.new_tensor(self.settings.outlier_quantiles), dim=0)
+        offsets = torch.rand(count, 3, generator=generator).double() - 0.5
+        return 0.5 * (low + high) + self.settings.place_box_factor * (high - low) * offsets
 
-    def votes(self, places: Tensor) -> Tensor:
-        """How well photos from each place (P, 3) explain the SH, relative to SH of no direction, or the sizes: how the
-        logarithms of size and distance correlate; (P,) float32."""
-        if self.have_sh:
-            return torch.stack([explained(self.means - place, self.sh).mean() for place in places])
+    def at(self, places: Tensor) -> Tensor:
+        """Evidence for each place (P, 3), (P,) float32.
+
+        Mean of the :func:`explained_energy`; without SH, the correlation of the logarithms of size and distance.
+        """
+        if self.has_sh:
+            return torch.stack(
+                [explained_energy(self.means - place, self.sh, self.settings).mean() for place in places]
+            )
         return torch.stack([correlation(log_norms(self.means - place), self.sizes) for place in places]).float()
 
 
-def photo_places(scene: Gaussians) -> tuple[Tensor, Tensor] | None:
-    """Where the photos were taken that a scene was trained on, as far as its Gaussians tell.
+def photo_places(scene: Gaussians, settings: LookingSettings = DEFAULTS) -> PhotoPlaces | None:
+    """Where the photos of a scene were taken, estimated from its Gaussians.
 
     Args:
         scene: N Gaussians.
+        settings: those of photo places.
 
     Returns:
-        Places (P, 3), in the scene's unit, float64, and their shares (P,), which sum to 1; None if they do not tell.
-        Deterministic.
+        The places and their shares; None without enough evidence. Deterministic.
     """
     generator = torch.Generator().manual_seed(0)
-    witnesses = Witnesses.of(scene, generator)
-    if len(witnesses.means) == 0:
+    evidence = PhotoEvidence.of(scene, generator, settings)
+    if len(evidence.means) == 0:
         return None
-    places = witnesses.places(CANDIDATES, generator)
-    telling, contrast = (TELLING, CONTRAST) if witnesses.have_sh else (TELLING_SIZE, CONTRAST_OF_SIZE)
-    votes = witnesses.votes(places[:ASKED_FIRST])
-    if not float(votes.max()) >= PROMISING * telling:
+    needed, exponent = settings.min_sh_evidence, settings.sh_share_exponent
+    if not evidence.has_sh:
+        needed, exponent = settings.min_size_evidence, settings.size_share_exponent
+    places = evidence.candidates(settings.candidate_places, generator)
+    found = evidence.at(places[: settings.first_places])
+    if not float(found.max()) >= settings.promising_share * needed:
         return None
-    votes = torch.cat([votes, witnesses.votes(places[ASKED_FIRST:])])
-    best = float(votes.max())
-    if best < telling:
+    if len(places) > settings.first_places:
+        found = torch.cat([found, evidence.at(places[settings.first_places :])])
+    best = float(found.max())
+    if best < needed:
         return None
-    shares = (votes.clamp_min(0) / best) ** contrast
-    chosen = shares > LEAST_SHARE
-    return places[chosen], shares[chosen] / shares[chosen].sum()
+    shares = (found.clamp_min(0) / best) ** exponent
+    chosen = shares > settings.min_place_share
+    return PhotoPlaces(places[chosen], shares[chosen] / shares[chosen].sum())
 
 
-def unit_sh(rest: Tensor) -> Tensor:
-    """SH coefficients (n, K, 3) at a length of 1, or 0 if they are :data:`FAINTEST`, float32."""
-    rest = rest.double().clamp(-LARGEST, LARGEST)
-    length = _energy(rest).sqrt()[:, None, None]
-    return torch.where(length > FAINTEST, rest / length.clamp_min(FAINTEST), 0.0).float()
+def unit_sh(sh: Tensor, settings: LookingSettings = DEFAULTS) -> Tensor:
+    """SH coefficients (n, K, 3), scaled to a length of 1 for each Gaussian, float32; 0 if they are at most
+    ``min_sh`` long."""
+    sh = sh.double().clamp(-settings.max_sh, settings.max_sh)
+    length = _energy(sh, settings).sqrt()[:, None, None]
+    return torch.where(length > settings.min_sh, sh / length.clamp_min(settings.min_sh), 0.0).float()
+
+
+def log_widths(scales: Tensor) -> Tensor:
+    """Logarithms (n,) of the geometric means of the two larger standard deviations of log-scales (n, 3), float64;
+    finite, or NaN where a log-scale is."""
+    return scales.double().clamp(-100.0, 100.0).sort(dim=1).values[:, 1:].mean(1)
 
 
 def log_norms(offsets: Tensor) -> Tensor:
@@ -201,17 +186,19 @@ def correlation(a: Tensor, b: Tensor) -> Tensor:
     return torch.corrcoef(torch.stack([a, b]))[0, 1].nan_to_num(0.0)
 
 
-def explained(offsets: Tensor, rest: Tensor) -> Tensor:
-    """Share of the energy of SH that lies along the basis in some directions, relative to that of SH of no direction.
+def explained_energy(offsets: Tensor, sh: Tensor, settings: LookingSettings = DEFAULTS) -> Tensor:
+    """Share of the energy of SH that lies along the basis in one direction each, relative to its mean over SH of random
+    directions.
 
     Args:
         offsets: (n, 3) from an eye to Gaussians, of any length.
-        rest: (n, K, 3) SH coefficients of degrees 1 and up, of length 1.
+        sh: (n, K, 3) SH coefficients of degrees 1 and up, of length 1.
+        settings: ``min_sh``.
 
     Returns:
-        (n,) float32, 0 to K: large if photos were taken from that direction.
+        (n,) float32 in [0, K]: large if photos were taken from that direction.
     """
     directions = (offsets / offsets.norm(dim=1, keepdim=True).clamp_min(torch.finfo(offsets.dtype).tiny)).float()
-    basis = sh_basis(directions, math.isqrt(rest.shape[1] + 1) - 1)[:, 1:]
-    along = (rest * basis[:, :, None]).sum(1).square().sum(1) / basis.square().sum(1).clamp_min(FAINTEST)
-    return along * rest.shape[1]
+    basis = sh_basis(directions, math.isqrt(sh.shape[1] + 1) - 1)[:, 1:]
+    along = (sh * basis[:, :, None]).sum(1).square().sum(1) / basis.square().sum(1).clamp_min(settings.min_sh)
+    return along * sh.shape[1]

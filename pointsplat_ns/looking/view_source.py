@@ -9,24 +9,20 @@ from functools import cached_property
 from itertools import count as counted
 from pathlib import Path
 
-from torch import Tensor
-
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run
 from pointsplat_ns.looking.sampling import views_about
-from pointsplat_ns.looking.traces import photo_places
+from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
+from pointsplat_ns.looking.traces import PhotoPlaces, photo_places
 from pointsplat_ns.looking.windows import RESOLUTION, middle_sized
 from pointsplat_ns.views import RasterizeMode, View, Views, spread_indices
 
 MERGED_FROM = 48
-"""Maximum number of known views that merging looks from."""
+"""Maximum number of known views from which merging computes visibility weights."""
 
 COMPARED_VIEWS = 12
-"""Maximum number of views that renders are compared in."""
-
-SAMPLED_AT_ONCE = 32
-"""Number of further views sampled at a time."""
+"""Maximum number of views in which renders are compared."""
 
 
 class ViewSource:
@@ -40,6 +36,7 @@ class ViewSource:
         dataset_views: function that reads the poses of a run's dataset.
         resolution: width and height, pixels, of the pictures that people look at. By default given views and photos
             have their own, and sampled views 1920 x 1080.
+        settings: tuned numbers, see :mod:`pointsplat_ns.looking.settings`.
     """
 
     def __init__(
@@ -49,8 +46,9 @@ class ViewSource:
         run: Path | str | None = None,
         dataset_views: Callable[[Path | str], Views] | None = None,
         resolution: tuple[int, int] | None = None,
+        settings: LookingSettings = DEFAULTS,
     ):
-        self._resolution = resolution
+        self._resolution, self._settings = resolution, settings
         self._scene, self._given, self._run, self._dataset_views = scene, given, run, dataset_views
         self.origin = ""
         """Text that says where views came from; empty until there are some."""
@@ -105,16 +103,18 @@ class ViewSource:
     def _sampled(self, count: int, seed: int) -> Views:
         """Sampled views, which get the run's rasterize mode."""
         width, height = self.resolution
-        views = views_about(self._scene, self._photos, count, width=width, height=height, seed=seed)
+        views = views_about(
+            self._scene, self._photos, count, width=width, height=height, seed=seed, settings=self._settings
+        )
         return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
 
     @cached_property
-    def _photos(self) -> tuple[Tensor, Tensor] | None:
-        return photo_places(self._scene)
+    def _photos(self) -> PhotoPlaces | None:
+        return photo_places(self._scene, self._settings)
 
     def known(self, count: int) -> Views | None:
-        """At most ``count`` of the views that need not be sampled: given ones, or those of the dataset's training
-        poses; None if there are none."""
+        """At most ``count`` known views: given ones, or those of the dataset's training poses; None if there are
+        none."""
         if self.given is None and self._of_dataset is None:
             return None
         return self.views(count)
@@ -124,7 +124,7 @@ class ViewSource:
         return views if self._resolution is None else views.resized(max(self._resolution))
 
     def whole(self) -> Views:
-        """The views that renders are compared in, at their full size: at most :data:`COMPARED_VIEWS`."""
+        """The views in which renders are compared, at their full size: at most :data:`COMPARED_VIEWS`."""
         return self._whole
 
     @cached_property
@@ -132,21 +132,21 @@ class ViewSource:
         return self.views(COMPARED_VIEWS)
 
     def compared(self) -> Views:
-        """The views that renders are compared in, at :func:`~pointsplat_ns.looking.windows.middle_side`."""
-        return middle_sized(self._whole)
+        """The views in which renders are compared, at :func:`~pointsplat_ns.looking.windows.middle_sized` size."""
+        return middle_sized(self._whole, self._settings)
 
     def scored(self, count: int) -> Views:
         """At most ``count`` views for scores and for fine-tuning, of the size of :meth:`compared`."""
-        return middle_sized(self.views(count))
+        return middle_sized(self.views(count), self._settings)
 
     def others(self, seed: int = 0) -> Iterator[View]:
-        """Views to optimise on, without end: none of those that :meth:`compared` gives, and of the same size.
+        """Views to optimise on, without end: none of the :meth:`compared` ones, and of the same size.
 
-        The given views and the dataset's poses come in random order, each once before any is repeated. If there are no
-        more of them than are compared, views are sampled in free space, each time others.
+        Known views come in random order, each once before any is repeated. If they are too few beside the compared
+        ones, new views are sampled without end.
 
         Args:
-            seed: of the order.
+            seed: seed of the order, and of sampled views.
 
         Raises:
             DataError: if none can be sampled.
@@ -155,17 +155,17 @@ class ViewSource:
         known = self.given if self.given is not None else self._of_dataset
         if known is not None and len(known) > 2 * len(compared):
             left = sorted(set(range(len(known))) - set(spread_indices(len(known), COMPARED_VIEWS)))
-            rest, generator = middle_sized(self._at_resolution(known)), random.Random(seed)
+            rest, generator = middle_sized(self._at_resolution(known), self._settings), random.Random(seed)
             while True:
                 for index in generator.sample(left, len(left)):
                     yield rest[index]
+        at_once, every = self._settings.sampled_at_once, self._settings.opposite_background_every
         for batch in counted(1):
-            sampled = middle_sized(self._sampled(SAMPLED_AT_ONCE, SAMPLED_AT_ONCE * seed + batch))
+            sampled = middle_sized(self._sampled(at_once, at_once * seed + batch), self._settings)
             sampled = dataclasses.replace(
                 sampled, background=compared.background, rasterize_mode=compared.rasterize_mode
             )
             for turn, index in enumerate(random.Random(batch).sample(range(len(sampled)), len(sampled))):
                 view = sampled[index]
-                # Nobody knows before which background a scene without known views is shown: every fourth has another.
-                other = known is None and turn % 4 == 3
-                yield dataclasses.replace(view, background=1 - view.background) if other else view
+                opposite = known is None and every > 0 and turn % every == every - 1
+                yield dataclasses.replace(view, background=1 - view.background) if opposite else view

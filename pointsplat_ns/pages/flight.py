@@ -21,13 +21,14 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.looking.content import (
     content_box,
-    content_diagonal,
+    content_size,
     in_units,
     positions_in_units,
     views_in_units,
 )
-from pointsplat_ns.looking.poses import NEAR_PLANE, look_at
+from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.sampling import estimated_up, sample_views
+from pointsplat_ns.looking.settings import DEFAULTS
 from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.system.progress import Progress, silent
@@ -75,7 +76,7 @@ class Stage:
         """
         need_usable(scene)
         low, high = content_box(scene)
-        centre, size = 0.5 * (low + high).cpu(), content_diagonal(scene, low, high)
+        centre, size = content_size(scene, (low, high))
         up = estimated_up(scene).cpu()
         if views is None or len(views) == 0:
             views = _sampled(scene, centre, size, up)
@@ -161,4 +162,4 @@ def _sampled(scene: Gaussians, centre: Tensor, size: float, up: Tensor) -> Views
         width, height = _SIZE
         K = torch.tensor([[0.7 * width, 0, width / 2], [0, 0.7 * width, height / 2], [0, 0, 1]], dtype=torch.float64)
         viewmats = look_at(eye[None], centre[None], up)
-        return Views(viewmats, K[None], width, height, torch.zeros(3), near_plane=NEAR_PLANE * size)
+        return Views(viewmats, K[None], width, height, torch.zeros(3), near_plane=DEFAULTS.near_plane * size)

@@ -20,7 +20,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.geometry.quaternions import rotation_matrices
 from pointsplat_ns.looking.content import thinned
-from pointsplat_ns.looking.sampling import PROBED
+from pointsplat_ns.looking.settings import DEFAULTS
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.rasterizer import render_depth
 from pointsplat_ns.system.memory import share_freed_memory
@@ -69,7 +69,7 @@ class Viewer:
         self.origin = first.source.origin
         """Text that says where the first view comes from."""
         self._up = up_of(self._starts) if up is None else up
-        self._small = thinned(first.scene, PROBED)
+        self._small = thinned(first.scene, DEFAULTS.probe_count)
         self._painters: dict[int, Painter] = {}
         self._notes: dict[int, Any] = {}
         self._at = 0

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from making import ball, box_room
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.content import UNITS, content_size, in_units, thinned
+from pointsplat_ns.looking.content import UNITS, content_box, content_size, in_units, thinned
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views
@@ -24,11 +25,24 @@ def test_in_units_all_sizes_are_alike(factor):
     assert size == pytest.approx(UNITS, rel=1e-3) and float(centre.abs().max()) < 1e-3 * UNITS
 
 
-def test_the_size_of_a_point_is_that_of_its_gaussian_and_of_nothing_one():
+def test_content_at_one_position_is_four_standard_deviations_large():
     one = ball(1)
-    assert content_size(one)[1] == pytest.approx(float(one.stds.max()))
-    assert content_size(one.replace(scales=torch.full((1, 3), -math.inf)))[1] == 1.0
-    assert content_size(one.replace(opacities=torch.full((1, 1), -math.inf)))[1] == 1.0
+    stacked = Gaussians(*(torch.cat([value, value]) for value in one.tensors()))
+    for scene in (one, stacked):
+        centre, size = content_size(scene)
+        assert size == pytest.approx(4 * float(one.stds.max()))
+        torch.testing.assert_close(centre, one.means[0].double())
+
+
+@pytest.mark.parametrize("name", ["scales", "opacities"])
+def test_content_without_a_size_or_that_is_not_visible_has_size_one(name):
+    one = ball(1)
+    assert content_size(one.replace(**{name: torch.full_like(getattr(one, name), -math.inf)}))[1] == 1.0
+
+
+def test_the_box_of_content_that_is_not_visible_is_an_error():
+    with pytest.raises(DataError, match="nothing of the scene can be seen"):
+        content_box(ball(3, opacity=-math.inf))
 
 
 def test_a_thinned_scene_covers_as_much():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,7 +13,8 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.traces import MOST_FACTOR, correlation, how_much_seen, log_norms, photo_places
+from pointsplat_ns.looking.settings import DEFAULTS
+from pointsplat_ns.looking.traces import correlation, log_norms, photo_places, trace_factors
 from pointsplat_ns.pruning.merging import merge
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
@@ -156,31 +158,33 @@ def halves(factor: float = 10.0) -> Gaussians:
     return scene.replace(means=means, features_rest=rest, scales=torch.full((2000, 3), -2.0))
 
 
-def test_a_neighbourhood_of_strong_sh_was_seen_much():
-    seen = how_much_seen(halves(2.0), torch.arange(2000))
-    # 2 ^ (2 * 3/4), where neighbourhoods do not mix
-    ratio = seen[:900].double().log().mean() - seen[1100:].double().log().mean()
-    assert float(ratio.exp()) == pytest.approx(2**1.5, rel=0.05)
-    assert seen.dtype == torch.float32 and float(seen.log().median().abs()) < 1
-
-
-def test_flat_neighbourhoods_were_seen_much():
-    scene = halves(1.0)
+def flattened(scene: Gaussians) -> Gaussians:
+    """A scene whose first 1,000 Gaussians are a third as thick."""
     scales = scene.scales.clone()
     scales[:1000, 1] -= math.log(3)
-    flat = scene.replace(scales=scales)
-    seen = how_much_seen(flat, torch.arange(2000))
-    ratio = seen[:900].double().log().mean() - seen[1100:].double().log().mean()
-    assert float(ratio.exp()) == pytest.approx(3, rel=0.1)
+    return scene.replace(scales=scales)
 
 
-def test_without_sh_flatness_counts_squared():
-    scene = halves(1.0)
-    scales = scene.scales.clone()
-    scales[:1000, 1] -= math.log(3)
-    seen = how_much_seen(scene.replace(scales=scales, features_rest=scene.features_rest[:, :0]), torch.arange(2000))
-    ratio = seen[:900].double().log().mean() - seen[1100:].double().log().mean()
-    assert float(ratio.exp()) == pytest.approx(9, rel=0.2)
+def without_sh(scene: Gaussians) -> Gaussians:
+    return scene.replace(features_rest=scene.features_rest[:, :0])
+
+
+@pytest.mark.parametrize(
+    ("scene", "options", "ratio", "tolerance"),
+    [
+        pytest.param(halves(2.0), {}, 2**1.5, 0.05, id="SH energy to the power 3/4"),
+        pytest.param(flattened(halves(1.0)), {}, 3, 0.1, id="flatness"),
+        pytest.param(without_sh(flattened(halves(1.0))), {}, 9, 0.2, id="flatness squared without SH"),
+        pytest.param(halves(2.0), {"energy_exponent": 0.0}, 1, 0.05, id="SH energy off"),
+        pytest.param(flattened(halves(1.0)), {"flatness_exponent": 0.0}, 1, 0.1, id="flatness off"),
+    ],
+)
+def test_trace_factors_grow_with(scene, options, ratio, tolerance):
+    factors = trace_factors(scene, torch.arange(2000), replace(DEFAULTS, **options))
+    # tolerances: the SH of both halves are random
+    apart = factors[:900].double().log().mean() - factors[1100:].double().log().mean()
+    assert float(apart.exp()) == pytest.approx(ratio, rel=tolerance)
+    assert factors.dtype == torch.float32 and float(factors.log().median().abs()) < 1
 
 
 def test_views_of_a_scene_without_sh_are_sampled_where_sizes_tell():
@@ -193,8 +197,8 @@ def test_views_of_a_scene_without_sh_are_sampled_where_sizes_tell():
 
 def test_all_is_seen_alike_if_nothing_tells():
     scene = ball(500, 0).replace(scales=torch.full((500, 3), -3.0))
-    assert how_much_seen(scene, torch.arange(500)).tolist() == [1.0] * 500
-    assert how_much_seen(scene, torch.tensor([7])).tolist() == [1.0]
+    assert trace_factors(scene, torch.arange(500)).tolist() == [1.0] * 500
+    assert trace_factors(scene, torch.tensor([7])).tolist() == [1.0]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -207,9 +211,9 @@ def test_extremes_stay_within_bounds(dtype):
         scales = scene.scales.clone()
         scales[:500] = -math.inf
         scales[500:800, 0], scales[800:900, 2] = -math.inf, 0.5 * largest
-        seen = how_much_seen(scene.replace(features_rest=rest, scales=scales), torch.arange(2000))
+        seen = trace_factors(scene.replace(features_rest=rest, scales=scales), torch.arange(2000))
         assert bool(seen.isfinite().all())
-        assert float(seen.log().abs().max()) <= MOST_FACTOR + 1e-5
+        assert float(seen.log().abs().max()) <= DEFAULTS.max_log_factor + 1e-5
 
 
 def test_merging_keeps_more_where_sh_tell_that_photos_looked():

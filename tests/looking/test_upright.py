@@ -13,6 +13,7 @@ from upright_scenes import TURNS, plates, room, tower, turned
 from making import ball, box_room
 from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.looking.surface import Surface
+from pointsplat_ns.looking.traces import PhotoPlaces
 from pointsplat_ns.looking.upright import UprightBox, level_directions, levelness, pointing_up, upright_axis
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -98,22 +99,24 @@ def test_points_stand_for_what_can_be_seen_and_are_finite():
 def test_a_wall_hides_what_is_behind_it():
     scene = plates(((1, 0, 0), (0, 1, 1)), ((2, 0, 0), (0, 0.5, 0.5)), density=400)
     surface = Surface.of(scene, torch.zeros(3, dtype=torch.float64), 10.0)
-    seen, around = surface.seen_from(torch.tensor([[-1.0, 0, 0], [4.0, 0, 0]], dtype=torch.float64))
+    visible, enclosure = surface.visible_from(torch.tensor([[-1.0, 0, 0], [4.0, 0, 0]], dtype=torch.float64))
     first = surface.points[:, 0] < 1.5
-    assert float(seen[0, first].float().mean()) > 0.95 and float(seen[0, ~first].float().mean()) < 0.05
-    assert float(seen[1, ~first].float().mean()) > 0.95
-    assert bool((around < 0.2).all())
+    assert float(visible[0, first].float().mean()) > 0.95 and float(visible[0, ~first].float().mean()) < 0.05
+    assert float(visible[1, ~first].float().mean()) > 0.95
+    assert bool((enclosure < 0.2).all())
     assert float(surface.clearance(torch.zeros(1, 3).double())) == pytest.approx(1.0, abs=0.1)
 
 
 def test_places_lie_level_across_the_axis_that_they_do_not_spread_along():
     ring = torch.stack([PLACES.cos(), PLACES.sin(), torch.zeros(60)], dim=1).double() + 5
     shares = torch.full((60,), 1 / 60)
-    found = levelness(torch.eye(3).double(), ring, shares)
+    found = levelness(torch.eye(3).double(), PhotoPlaces(ring, shares))
     assert torch.allclose(found, torch.tensor([0.0, 0.0, 1.0]).double(), atol=0.1)
     # a place that counts for nothing says nothing
     far = torch.cat([ring, torch.tensor([[5.0, 5.0, 1e6]]).double()])
-    assert torch.allclose(levelness(torch.eye(3).double(), far, torch.cat([shares, torch.zeros(1)])), found)
+    assert torch.allclose(
+        levelness(torch.eye(3).double(), PhotoPlaces(far, torch.cat([shares, torch.zeros(1)]))), found
+    )
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-200, 1e-30, 1e30])
@@ -121,7 +124,7 @@ def test_places_lie_level_across_the_axis_that_they_do_not_spread_along():
 def test_levelness_is_a_share_for_places_of_any_spread(size, dtype):
     places = (size * torch.stack([PLACES.cos(), PLACES.sin(), 0.1 * PLACES], dim=1).double()).to(dtype)
     for some in (places, places[:1]):
-        found = levelness(torch.eye(3).double(), some, torch.full((len(some),), 1 / len(some)))
+        found = levelness(torch.eye(3).double(), PhotoPlaces(some, torch.full((len(some),), 1 / len(some))))
         assert bool(((found >= 0) & (found <= 1)).all())
 
 
@@ -132,7 +135,7 @@ def test_where_photos_were_taken_decides_between_axes_that_suit_alike():
     for axis in range(3):
         ring = torch.zeros(60, 3).double()
         ring[:, (axis + 1) % 3], ring[:, (axis + 2) % 3] = 8 * PLACES.cos().double(), 8 * PLACES.sin().double()
-        found = upright_axis(surface, (ring, torch.full((60,), 1 / 60)))
+        found = upright_axis(surface, PhotoPlaces(ring, torch.full((60,), 1 / 60)))
         assert float(found[axis].abs()) > math.cos(math.radians(3))
 
 
@@ -141,6 +144,6 @@ def test_what_photos_showed_says_which_end_is_up():
     scene = plates(((0, 0, -1), (2, 2, 0)), ((0, 0, 1), (2, 2, 0)))
     surface = Surface.of(scene, *content_size(scene))
     above = surface.points[:, 2] > 0
-    for shown_below, up in ((9.0, UP), (1 / 9, -UP)):
-        seen = replace(surface, shown=torch.where(above, 1.0, shown_below))
-        assert torch.equal(pointing_up(seen, UP, True), up)
+    for factor_below, up in ((9.0, UP), (1 / 9, -UP)):
+        traced = replace(surface, trace_factors=torch.where(above, 1.0, factor_below))
+        assert torch.equal(pointing_up(traced, UP, True), up)

@@ -11,7 +11,9 @@ import torch
 from making import ball, box_room
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.traces import PhotoPlaces
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.looking.windows import sides_of
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
@@ -118,11 +120,11 @@ def test_views_are_spread_resized_and_checked(ball_views):
         Views(ball_views.viewmats, ball_views.Ks, 0, 8, torch.zeros(3))
 
 
-def test_sampled_poses_of_a_scene_whose_sh_tell_of_its_photos_say_so(monkeypatch):
+def test_sampled_poses_near_photo_places_say_so(monkeypatch):
     asked = []
-    told = torch.tensor([[0.5, 0.0, 0.0]], dtype=torch.float64), torch.ones(1)
-    monkeypatch.setattr("pointsplat_ns.looking.view_source.photo_places", lambda scene: asked.append(scene) or told)
+    photos = PhotoPlaces(torch.tensor([[0.5, 0.0, 0.0]], dtype=torch.float64), torch.ones(1))
+    monkeypatch.setattr(view_source, "photo_places", lambda scene, settings: asked.append(scene) or photos)
     source = ViewSource(box_room(0))
     assert len(source.views(3)) and len(source.compared())
     assert source.origin == "poses sampled in free space, half of them where photos were taken"
-    assert len(asked) == 1  # what takes seconds is asked once
+    assert len(asked) == 1  # the search for photo places takes seconds

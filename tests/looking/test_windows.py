@@ -10,8 +10,8 @@ import torch
 from making import ball
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.settings import DEFAULTS
 from pointsplat_ns.looking.windows import (
-    WINDOW,
     WindowRenders,
     middle_sized,
     parse_resolution,
@@ -39,7 +39,7 @@ def test_a_window_of_full_size_is_a_crop_of_the_whole_picture(scene, views, at):
     # ones there differ between window and whole.
     fine = scene.replace(scales=scene.scales - 3)
     whole, part = render(fine, views[0]), window(views[0], 640, at)
-    assert (part.width, part.height) == (WINDOW, 240)
+    assert (part.width, part.height) == (DEFAULTS.window_side, 240)
     left = min(max(round(at[0] * 640 - 160), 0), 640 - 320)
     top = min(max(round(at[1] * 480 - 120), 0), 480 - 240)
     crop = whole[top : top + 240, left : left + 320]
@@ -54,8 +54,8 @@ def test_a_window_beyond_the_full_size_shows_what_is_seen_from_nearer(views):
 
 
 def test_the_smallest_window_is_the_reduced_picture(scene, views):
-    part = window(views[0], WINDOW, (0.9, 0.1))
-    small = views.resized(WINDOW)[0]
+    part = window(views[0], DEFAULTS.window_side, (0.9, 0.1))
+    small = views.resized(DEFAULTS.window_side)[0]
     assert (part.width, part.height) == (small.width, small.height)
     torch.testing.assert_close(part.K, small.K)
 

@@ -7,7 +7,7 @@ transmittance. Divided by its opacity and area, that is large near the cameras, 
 Pictures are small. 3DGS rasterizers widen every projected Gaussian by 0.3 pixels, which would make Gaussians below the
 size of a pixel seem large. The antialiased rasterizer lowers their opacity by as much, so it counts right.
 
-Where the scene tells where its photos were taken, the weight is multiplied by how much photos showed of the place
+Where the scene tells where its photos were taken, the weight is multiplied by the trace factor
 (:mod:`~pointsplat_ns.looking.traces`).
 """
 
@@ -20,9 +20,9 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.content import some_of
+from pointsplat_ns.looking.content import every_nth
 from pointsplat_ns.looking.each_view import each_view
-from pointsplat_ns.looking.traces import how_much_seen
+from pointsplat_ns.looking.traces import trace_factors
 from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
 from pointsplat_ns.pruning.merging.viewpoints import Viewpoints
@@ -38,10 +38,10 @@ def visibility_weights(participants: Participants, viewpoints: Viewpoints | None
         return torch.ones(len(members))
     step = -(-len(members) // settings.max_count_drawn)
     rows = members if step == 1 else torch.arange(-(-len(members) // step))
-    drawn = participants.in_units(scene if step == 1 else some_of(scene, members, step))
+    drawn = participants.in_units(scene if step == 1 else every_nth(scene, members, step))
     weights = covered_per_area(drawn, rows, viewpoints.views, settings)
     weights = weights.repeat_interleave(step)[: len(members)]
-    return weights * how_much_seen(scene, members) if viewpoints.photos_found else weights
+    return weights * trace_factors(scene, members) if viewpoints.photos_found else weights
 
 
 def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: MergeSettings = DEFAULTS) -> Tensor:

@@ -119,7 +119,7 @@ def test_weights_are_bounded_whatever_the_scene(dtype, case):
 @pytest.mark.parametrize("found_photos", [True, False])
 def test_traces_count_where_the_scene_tells_of_its_photos(monkeypatch, found_photos):
     monkeypatch.setattr(visibility, "covered_per_area", lambda scene, rows, views, settings: torch.full((30,), 0.5))
-    monkeypatch.setattr(visibility, "how_much_seen", lambda scene, members: torch.full((30,), 16.0))
+    monkeypatch.setattr(visibility, "trace_factors", lambda scene, members: torch.full((30,), 16.0))
     viewpoints = Viewpoints(of_origin((0, -6, 1)), photos_found=found_photos)
     found = visibility_weights(Participants.of(cloud(30), torch.arange(30)), viewpoints, DEFAULTS)
     assert found.tolist() == [8.0 if found_photos else 0.5] * 30

@@ -1,0 +1,393 @@
+"""The settings of looking: every tuned number, with its meaning and its unit.
+
+A number that only keeps float32 or float64 in range stands beside the formula that needs it. All other numbers are
+here. A field says how its rule is turned off, where it stands for a rule of its own. A unit is a tenth of the diagonal
+of the scene's content, see :data:`~pointsplat_ns.looking.content.UNITS`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LookingSettings:
+    """Settings of :mod:`pointsplat_ns.looking`.
+
+    Example:
+        >>> from dataclasses import replace
+        >>> replace(DEFAULTS, photo_share=0.0).places  # everything as by default, but no views near photo places
+        48
+    """
+
+    # Content (content.py) and renders (each_view.py)
+
+    content_quantiles: tuple[float, float] = (0.05, 0.95)
+    """Quantiles of opacity, or of surface points, along each axis, between which the content lies."""
+
+    outlier_quantiles: tuple[float, float] = (0.02, 0.98)
+    """Quantiles of positions beyond which Gaussians or points count as outliers; (0, 1) keeps all."""
+
+    max_area_quantile: float = 0.99
+    """Quantile that bounds the area of Gaussians where areas are weights, so that a few giants do not count for all; 1
+    turns the bound off."""
+
+    max_count_at_once: int = 2_000_000
+    """Largest number of Gaussians, summed over the views that are rendered at once. Each render takes memory. At least
+    two views are rendered at once."""
+
+    # Cameras (poses.py)
+
+    field_of_view: float = 70.0
+    """Field of view across the longer side of a sampled view, degrees: that of a phone's main camera."""
+
+    near_plane: float = 1e-3
+    """Near plane of sampled views, as a share of the diagonal of the content."""
+
+    # Trace factors (traces.py)
+
+    trace_neighbourhood: int = 129
+    """Number of Gaussians along a space-filling curve over which traces are averaged, odd. One Gaussian says little."""
+
+    energy_exponent: float = 0.75
+    """Exponent of the mean energy of the SH in a trace factor; 0 turns it off. Fitted, together with that of the
+    flatness, to the poses of four captures."""
+
+    flatness_exponent: float = 1.0
+    """Exponent of the mean flatness in a trace factor; 0 turns it off."""
+
+    flatness_exponent_without_sh: float = 2.0
+    """Exponent of the mean flatness in scenes without SH; 0 turns it off."""
+
+    min_sh: float = 1e-4
+    """Length of a vector of SH coefficients, root of the sum of squares, up to which it counts as not trained."""
+
+    max_sh: float = 1e3
+    """Bound of the absolute value of an SH coefficient. A colour of 1 is white."""
+
+    max_flatness: float = 7.0
+    """Bound of the flatness, the logarithm of width over thickness: flat Gaussians of any kind are alike."""
+
+    max_log_factor: float = 8.0
+    """Bound of the absolute value of the logarithm of a trace factor; 0 turns trace factors off."""
+
+    # Photo places (traces.py)
+
+    evidence_count: int = 1_500
+    """Largest number of Gaussians whose SH are compared with candidate places."""
+
+    evidence_draws: int = 8
+    """Number of Gaussians that are drawn for each of ``evidence_count``, because some have no SH or are faint."""
+
+    size_evidence_factor: int = 4
+    """As many times more Gaussians are compared by their size, because one size says less than one vector of SH."""
+
+    min_evidence_opacity: float = 0.1
+    """Smallest opacity of a compared Gaussian, in [0, 1]."""
+
+    candidate_places: int = 2_000
+    """Number of candidate places."""
+
+    first_places: int = 300
+    """Number of candidate places that are compared first."""
+
+    promising_share: float = 0.8
+    """The other candidate places are compared if one of the first has at least this share of the needed evidence; 0
+    compares all."""
+
+    place_box_factor: float = 1.5
+    """Size of the box of candidate places, relative to that of the compared Gaussians without outliers."""
+
+    min_sh_evidence: float = 2.0
+    """Smallest evidence of the best place by SH: explained energy relative to SH of random directions; infinity turns
+    photo places off in scenes with SH. Captures reach 3.3 to 3.7 at photo places. Scenes seen from all around reach 1.2
+    to 1.6, and their best places lie in wrong parts of them (-0.1 to -0.4 dB). ``lab/training/photo_places.py`` prints
+    it."""
+
+    sh_share_exponent: float = 16
+    """Exponent of the evidence by SH in the share of a place."""
+
+    min_size_evidence: float = 0.48
+    """Smallest evidence of the best place by size: correlation of the logarithms of size and distance; infinity turns
+    photo places off in scenes without SH. Captures from outside reach 0.50 to 0.78, rooms, where any free place will
+    do, 0.23 to 0.46. ``lab/training/photo_places.py`` prints it."""
+
+    size_share_exponent: float = 8
+    """Exponent of the evidence by size in the share of a place."""
+
+    min_place_share: float = 0.01
+    """Places with a smaller share, relative to the largest one, are left out."""
+
+    # Surface points (surface.py)
+
+    surface_points: int = 12_288
+    """Number of points that are drawn from a scene."""
+
+    min_surface_opacity: float = 0.1
+    """Smallest opacity of the Gaussians that points are drawn from, if there are any: a haze hides nothing; 0 turns the
+    rule off."""
+
+    surface_exponent: float = 0.5
+    """Points are drawn by opacity times area to this power: between the number of Gaussians (0), which is large where
+    photos show detail, and their area (1)."""
+
+    max_surface_offset: float = 1.5
+    """Bound of the distance of a point from the centre of its Gaussian along each axis, standard deviations."""
+
+    direction_rows: int = 40
+    """Number of rows of the grid of directions around a place, even. Cells have equal solid angles."""
+
+    direction_columns: int = 80
+    """Number of columns of that grid, even: 4.5 degrees each."""
+
+    relative_depth_tolerance: float = 0.05
+    """A point is visible if it is at most this share farther than the nearest point of its cell, plus
+    ``depth_tolerance``."""
+
+    depth_tolerance: float = 0.1
+    """See ``relative_depth_tolerance``, units."""
+
+    clearance_neighbours: int = 5
+    """The clearance of a place is the distance of its nearest point but this many less one: a few points may float in
+    the air."""
+
+    # Up (upright.py)
+
+    upright_points: int = 4_096
+    """Largest number of points from which up is estimated."""
+
+    content_radius: float = 6.0
+    """Largest distance from the centre of the content of points that belong to it, units."""
+
+    upright_directions: int = 400
+    """Number of directions that are tried, evenly over half of a sphere: about 7 degrees apart."""
+
+    refined_directions: int = 8
+    """Number of the best directions that are refined."""
+
+    refining_angles: tuple[float, ...] = (4.0, 2.0, 1.0, 0.5)
+    """Angles by which the best directions are turned, step by step, degrees."""
+
+    normal_deviation: float = 8.0
+    """Standard deviation of the angle within which a surface counts as level or vertical, degrees."""
+
+    slab_thickness: float = 0.1
+    """Thickness of the slabs in which points are counted by height, units; two neighbours hold one level surface."""
+
+    min_uprightness: float = 0.07
+    """Smallest uprightness of the best direction. Scenes without any level or vertical surface reach less; z is then
+    up. 0 turns the rule off."""
+
+    usual_axis_factors: tuple[float, float] = (1.3, 1.64)
+    """Factors of the uprightness of the world's z and y axes; (0, 0) turns the rule off. Most scenes stand along y, as
+    COLMAP's first camera does, or along z, as nerfstudio's do; and in a room, walls are as flat as the floor. Of 23
+    scenes with known up, 17 are found within 10 degrees; 14 without these factors and ``usual_direction_weight``."""
+
+    usual_axis_factors_with_photos: tuple[float, float] = (1.05, 1.05)
+    """The same for scenes whose photo places are known, which say more."""
+
+    photo_level_weight: float = 0.1
+    """Weight of the levelness of photo places in the uprightness; 0 turns it off. For a desk that was walked around,
+    half of it would be enough; without it, the desk's up is 88 degrees wrong."""
+
+    usual_direction_weight: float = 0.25
+    """Weight of the usual direction, z or -y, against the height of the centre of mass, as a share of the scene's
+    height; 0 turns it off. Bouquets and plants are widest at their top."""
+
+    lift_trace_exponent: float = 0.5
+    """Exponent of the trace factors in the centre of mass; 0 turns them off. People look at what stands on the
+    floor."""
+
+    box_yaw_step: float = 5.0
+    """Angle between the upright boxes that are tried, degrees."""
+
+    min_box_half_side: float = 2.5
+    """Smallest half side of the box that places are drawn from, units; 0 turns the rule off."""
+
+    # Rooms (sampling.py)
+
+    min_enclosure: float = 0.6
+    """Smallest share of all directions in which a place has a surface, for the place to be enclosed."""
+
+    min_enclosed_places: float = 0.85
+    """Smallest share of the free places of its box that are enclosed, for a scene to be a room."""
+
+    min_visible_inside: float = 0.9
+    """Smallest share of the points, relative to those that are visible from outside, that are visible from the enclosed
+    places of a room."""
+
+    # Places and directions of candidate views (search.py)
+
+    places: int = 48
+    """Largest number of places whose views compete in one round."""
+
+    draws: int = 2
+    """Number of places that are drawn for each of ``places``, because some are not free."""
+
+    box_draws: int = 4
+    """The same for places in the upright box."""
+
+    turns_inside: int = 8
+    """Number of views from each enclosed place, and from each place near photo places."""
+
+    turns_outside: int = 4
+    """Number of views from each other place."""
+
+    eye_heights: tuple[float, float] = (0.3, 0.75)
+    """Smallest and largest height of cameras in a room, as shares of its height; (0, 1) turns the rule off."""
+
+    pitch_mean: float = -10.0
+    """Mean pitch of cameras in a room, degrees; above 0 is up."""
+
+    pitch_deviation: float = 8.0
+    """Standard deviation of the pitch, degrees."""
+
+    pitch_bounds: tuple[float, float] = (-30.0, 10.0)
+    """Smallest and largest pitch, degrees."""
+
+    elevations: tuple[float, float] = (-5.0, 60.0)
+    """Smallest and largest elevation of cameras outside of the content, seen from its centre, degrees."""
+
+    min_height_outside: float = 0.05
+    """Smallest height of cameras outside of the content, as a share of the height of its box."""
+
+    distances: tuple[float, float] = (5.5, 9.5)
+    """Smallest and largest distance of cameras outside of the content from its centre, units."""
+
+    target_share: float = 0.7
+    """Cameras outside look at a point between the centre and at most this share of the way to a visible point; 0 makes
+    all look at the centre."""
+
+    # Views near photo places (search.py)
+
+    photo_share: float = 0.5
+    """Share of the views that stand near photo places, if the scene tells them; 0 turns the rule off."""
+
+    photo_place_deviation: float = 0.4
+    """Standard deviation of candidates from photo places along each axis, units: the distance between these."""
+
+    photo_target_distance: float = 1.0
+    """Distance at which points are half as likely to be looked at as near ones, units; infinity turns the rule off."""
+
+    min_photo_value: float = 0.6
+    """Smallest value of the points that a view shows, relative to that of a good view; 0 turns the rule off."""
+
+    good_view_quantile: float = 0.9
+    """Quantile of the candidates that counts as a good view."""
+
+    # Coverage gain of a view (search.py)
+
+    gain_points: int = 4_096
+    """Number of points that views compete for."""
+
+    half_gain_distance: float = 4.0
+    """Distance at which a point counts half, because it is small in the picture, units; infinity turns the rule off."""
+
+    half_gain_angle: float = 0.015
+    """Angle that a Gaussian's standard deviation subtends at which its points count half, radians; infinity turns the
+    rule off. Photos are taken from where most Gaussians are smaller. In compact scenes of seven captures and splats it
+    gains 0.2 dB."""
+
+    edge_loss: float = 0.5
+    """Share of the gain that points at the edge of the picture lose; 0 turns the rule off."""
+
+    half_gain_coverage: float = 0.1
+    """Coverage at which the gain of a point has halved. A view from nearby with the point in its middle adds 1."""
+
+    # Tests of a view (search.py)
+
+    probe_count: int = 5_000
+    """Largest number of Gaussians in the depth images that test a view."""
+
+    probe_side: int = 32
+    """Longer side of these images, pixels."""
+
+    min_clearance: float = 0.5
+    """Smallest distance of a camera from surfaces, units; 0 turns the rule off."""
+
+    min_clearance_photos: float = 0.1
+    """The same near photo places: photos may show a small part of the content from nearby."""
+
+    opaque_alpha: float = 0.5
+    """Alpha above which a pixel of a depth image shows a surface, in [0, 1]."""
+
+    max_near_pixels: float = 0.05
+    """Share of pixels with a surface below the smallest distance from which on a view is refused; above 1 turns the
+    rule off."""
+
+    min_alpha_inside: float = 0.7
+    """Smallest mean alpha of a view in a room, in [0, 1]; 0 turns the rule off."""
+
+    min_alpha_outside: float = 0.05
+    """Smallest mean alpha of any other view, in [0, 1]: an object may stand before nothing; 0 turns the rule off."""
+
+    blur_count: int = 40_000
+    """Largest number of Gaussians in the pictures that measure blur. 5,000 are too few: large ones then hide the
+    others."""
+
+    blur_side: int = 64
+    """Longer side of these pictures, pixels."""
+
+    max_blur: float = 0.04
+    """Largest blur of a view: median over pixels of the angle that Gaussians' standard deviations subtend, radians;
+    infinity turns the rule off. In the photos of six captures it is 0.009 to 0.026, in half of the views that are
+    sampled there without this rule 0.04 to 0.5."""
+
+    coarse_blur: float = 2.0
+    """The largest blur is at least this multiple of the angle that the median Gaussian subtends from half the content's
+    diagonal; 0 turns it off. Scenes of few, large Gaussians need it."""
+
+    blur_growth: float = 2.0
+    """Factor of the largest blur after a round that finds too few views; 1 turns it off."""
+
+    # End of the search (search.py)
+
+    round_views: int = 16
+    """Largest number of views that are taken in one round, before other places are drawn."""
+
+    max_refused: int = 32
+    """Number of refused candidates in a row after which a round ends. In trained scenes three were the most."""
+
+    max_fruitless_rounds: int = 4
+    """Number of rounds in a row without a view after which the search ends."""
+
+    round_factor: float = 2.0
+    """The search ends after this multiple of the rounds that it needs if no view is refused, plus ``extra_rounds``."""
+
+    extra_rounds: int = 2
+    """See ``round_factor``."""
+
+    # Windows (windows.py)
+
+    window_side: int = 320
+    """Longer side of a window, and of the smallest picture, pixels."""
+
+    window_alpha_side: int = 64
+    """Longer side of the pictures whose alpha decides where windows lie, pixels."""
+
+    # Views to optimise on (view_source.py)
+
+    sampled_at_once: int = 32
+    """Number of views that are sampled at a time."""
+
+    opposite_background_every: int = 4
+    """Of the sampled views of a scene without known views, one of this many has the opposite background, because nobody
+    knows before which one the scene is shown; 0 turns the rule off."""
+
+    # Coverage (coverage.py)
+
+    coverage_side: int = 160
+    """Longer side of the pictures in which coverage is counted, pixels."""
+
+    min_covered_pixels: float = 0.05
+    """Smallest sum of blend weights over the pixels of a picture, for the picture to show a Gaussian, pixels."""
+
+    coverage_views: int = 96
+    """Number of sampled views that say, together with the given ones, what is visible at all."""
+
+    coverage_seed: int = 96
+    """Seed of these views."""
+
+
+DEFAULTS = LookingSettings()
+"""The settings that scenes are looked at with by default."""
