@@ -1,4 +1,4 @@
-"""The share of what can be seen that views show."""
+"""Coverage: the share of the visible content that views show."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ def test_views_all_around_show_nearly_all_and_one_side_less():
     assert 0.05 < coverage(scene, one_side) < 0.75
 
 
-def test_a_view_shows_nothing_twice():
+def test_one_view_shows_nothing_twice():
     scene = ball(600)
     views = sample_views(scene, 1, 64, 48)
     assert coverage(scene, views) == 0.0 and coverage(scene, views, times=1) > 0.05
 
 
-def test_of_a_scene_that_cannot_be_seen_nothing_is_shown():
+def test_a_scene_that_is_not_visible_has_coverage_zero():
     scene = ball(50)
     views = sample_views(scene, 2, 64, 48)
     assert coverage(scene.replace(opacities=torch.full_like(scene.opacities, -30.0)), views) == 0.0

@@ -1,4 +1,4 @@
-"""What a scene tells of the photos that it was trained on."""
+"""Traces of photos in a scene: photo places and trace factors."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_sh_learned_by_gradient_descent_tell_where_the_photos_were_taken():
     assert float(towards @ eyes.mean(0) / eyes.mean(0).norm()) > 0.7
 
 
-def grown_from(eye: torch.Tensor, degree: int = 0) -> Gaussians:
+def sized_by_distance_from(eye: torch.Tensor, degree: int = 0) -> Gaussians:
     """A full ball whose Gaussians are the larger the farther they are from an eye (3,)."""
     generator = torch.manual_seed(2)
     shell = ball(3000, degree, opacity=5.0)
@@ -62,21 +62,21 @@ def grown_from(eye: torch.Tensor, degree: int = 0) -> Gaussians:
 @pytest.mark.parametrize("degree", [0, 3])
 def test_without_sh_sizes_tell_where_photos_were_taken(degree):
     eye = torch.tensor([0.7, 0.2, 0.0])
-    places, shares = photo_places(grown_from(eye, degree))
+    places, shares = photo_places(sized_by_distance_from(eye, degree))
     assert float(shares.sum()) == pytest.approx(1) and bool((shares > 0).all())
     towards = torch.nn.functional.normalize((shares[:, None] * places).sum(0), dim=0)
     assert float(towards @ eye.double() / eye.norm()) > 0.95
 
 
-def test_random_sizes_say_nothing_about_places():
-    scene = grown_from(torch.zeros(3))
+def test_random_sizes_are_no_evidence():
+    scene = sized_by_distance_from(torch.zeros(3))
     scales = torch.randn(3000, 3, generator=torch.manual_seed(3)) - 2
     assert photo_places(scene.replace(scales=scales)) is None
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_places_told_by_sizes_move_and_grow_with_the_scene(scale):
-    scene = Gaussians(*(value.double() for value in grown_from(torch.tensor([0.7, 0.2, 0.0])).tensors()))
+def test_photo_places_by_size_move_and_scale_with_the_scene(scale):
+    scene = Gaussians(*(value.double() for value in sized_by_distance_from(torch.tensor([0.7, 0.2, 0.0])).tensors()))
     places, shares = photo_places(scene)
     moved = scene.replace(means=scale * (scene.means + 100), scales=scene.scales + math.log(scale))
     other, as_large = photo_places(moved)
@@ -85,7 +85,7 @@ def test_places_told_by_sizes_move_and_grow_with_the_scene(scale):
 
 
 def test_infinite_sizes_and_gaussians_at_one_position_break_nothing():
-    scene = grown_from(torch.tensor([0.7, 0.2, 0.0]))
+    scene = sized_by_distance_from(torch.tensor([0.7, 0.2, 0.0]))
     scales = scene.scales.clone()
     scales[::7, 0] = -math.inf
     scales[::11] = -math.inf
@@ -114,7 +114,7 @@ def test_log_norms_of_nothing_are_finite():
 
 
 @pytest.mark.parametrize(
-    "silent",
+    "scene",
     [
         normal_scene(3000),
         ball(500, 0),
@@ -124,12 +124,12 @@ def test_log_norms_of_nothing_are_finite():
     ],
     ids=["random", "degree 0", "zero", "invisible", "NaN"],
 )
-def test_sh_without_a_direction_say_nothing_about_places(silent):
-    assert photo_places(silent) is None
+def test_scenes_without_evidence_have_no_photo_places(scene):
+    assert photo_places(scene) is None
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_places_move_and_grow_with_the_scene(scale):
+def test_photo_places_by_sh_move_and_scale_with_the_scene(scale):
     scene = Gaussians(*(value.double() for value in photographed().tensors()))
     places, shares = photo_places(scene)
     moved = scene.replace(means=scale * (scene.means + 100))
@@ -139,7 +139,7 @@ def test_places_move_and_grow_with_the_scene(scale):
 
 
 @pytest.mark.parametrize("factor", [1e-30, 1e3, 1e38])
-def test_the_size_of_sh_says_nothing_about_places_and_breaks_nothing(factor):
+def test_photo_places_are_found_from_sh_of_any_length_but_zero(factor):
     scene = photographed()
     large = scene.replace(features_rest=(scene.features_rest.double() * factor).clamp(-3e38, 3e38).float())
     found = photo_places(large)
@@ -189,13 +189,13 @@ def test_trace_factors_grow_with(scene, options, ratio, tolerance):
 
 def test_views_of_a_scene_without_sh_are_sampled_where_sizes_tell():
     eye = torch.tensor([1.5, 0.0, 0.0])
-    views = sample_views(grown_from(eye), 6, 64, 48)
+    views = sample_views(sized_by_distance_from(eye), 6, 64, 48)
     assert len(views) == 6
     eyes = invert_rigid(views.viewmats[::2])[:, :3, 3]  # every other one is near where photos were taken
     assert float((eyes[:, 0] / eyes.norm(dim=1)).mean()) > 0.7
 
 
-def test_all_is_seen_alike_if_nothing_tells():
+def test_trace_factors_are_one_if_all_gaussians_are_alike():
     scene = ball(500, 0).replace(scales=torch.full((500, 3), -3.0))
     assert trace_factors(scene, torch.arange(500)).tolist() == [1.0] * 500
     assert trace_factors(scene, torch.tensor([7])).tolist() == [1.0]
@@ -211,16 +211,16 @@ def test_extremes_stay_within_bounds(dtype):
         scales = scene.scales.clone()
         scales[:500] = -math.inf
         scales[500:800, 0], scales[800:900, 2] = -math.inf, 0.5 * largest
-        seen = trace_factors(scene.replace(features_rest=rest, scales=scales), torch.arange(2000))
-        assert bool(seen.isfinite().all())
-        assert float(seen.log().abs().max()) <= DEFAULTS.max_log_factor + 1e-5
+        factors = trace_factors(scene.replace(features_rest=rest, scales=scales), torch.arange(2000))
+        assert bool(factors.isfinite().all())
+        assert float(factors.log().abs().max()) <= DEFAULTS.max_log_factor + 1e-5
 
 
-def test_merging_keeps_more_where_sh_tell_that_photos_looked():
-    """What no photo showed is there as well, of the same shape."""
-    shown = photographed(1100)
-    hidden = shown.replace(means=shown.means + 5.0, features_rest=torch.zeros_like(shown.features_rest))
-    scene = Gaussians(*(torch.cat(pair) for pair in zip(shown.tensors(), hidden.tensors(), strict=True)))
+def test_merging_keeps_more_where_trace_factors_are_large():
+    """The second half has the same shape, but no photo showed it."""
+    first = photographed(1100)
+    second = first.replace(means=first.means + 5.0, features_rest=torch.zeros_like(first.features_rest))
+    scene = Gaussians(*(torch.cat(pair) for pair in zip(first.tensors(), second.tensors(), strict=True)))
     assert photo_places(scene) is not None
     near = torch.cdist(merge(scene, 400).scene.means, torch.stack([torch.zeros(3), torch.full((3,), 5.0)])).argmin(1)
     assert int((near == 0).sum()) > 270

@@ -139,8 +139,8 @@ def test_where_photos_were_taken_decides_between_axes_that_suit_alike():
         assert float(found[axis].abs()) > math.cos(math.radians(3))
 
 
-def test_what_photos_showed_says_which_end_is_up():
-    """Two floors, one of which photos showed much."""
+def test_the_end_with_larger_trace_factors_is_below():
+    """Two floors, one with larger trace factors."""
     scene = plates(((0, 0, -1), (2, 2, 0)), ((0, 0, 1), (2, 2, 0)))
     surface = Surface.of(scene, *content_size(scene))
     above = surface.points[:, 2] > 0
