@@ -80,7 +80,8 @@ class LookingSettings:
     """Number of Gaussians that are drawn for each of ``evidence_count``, because some have no SH or are faint."""
 
     size_evidence_factor: int = 4
-    """As many times more Gaussians are compared by their size, because one size says less than one vector of SH."""
+    """Number of Gaussians that are compared by size, as a multiple of ``evidence_count``, because one size says less
+    than one vector of SH."""
 
     min_evidence_opacity: float = 0.1
     """Smallest opacity of a compared Gaussian, in [0, 1]."""
@@ -92,8 +93,8 @@ class LookingSettings:
     """Number of candidate places that are compared first."""
 
     promising_share: float = 0.8
-    """The other candidate places are compared if one of the first has at least this share of the needed evidence; 0
-    compares all."""
+    """Share of the needed evidence that the best of the first places must have, for the other candidates to be
+    compared; 0 compares all."""
 
     place_box_factor: float = 1.5
     """Size of the box of candidate places, relative to that of the compared Gaussians without outliers."""
@@ -128,8 +129,8 @@ class LookingSettings:
     rule off."""
 
     surface_exponent: float = 0.5
-    """Points are drawn by opacity times area to this power: between the number of Gaussians (0), which is large where
-    photos show detail, and their area (1)."""
+    """Exponent of opacity times area in the chance of a Gaussian to get a point. 0 counts Gaussians, which are many
+    where photos show detail; 1 counts their area."""
 
     max_surface_offset: float = 1.5
     """Bound of the distance of a point from the centre of its Gaussian along each axis, standard deviations."""
@@ -138,18 +139,18 @@ class LookingSettings:
     """Number of rows of the grid of directions around a place, even. Cells have equal solid angles."""
 
     direction_columns: int = 80
-    """Number of columns of that grid, even: 4.5 degrees each."""
+    """Number of columns of the grid of directions around a place, even: 4.5 degrees each."""
 
     relative_depth_tolerance: float = 0.05
-    """A point is visible if it is at most this share farther than the nearest point of its cell, plus
-    ``depth_tolerance``."""
+    """A point is visible if it is at most this share, plus ``depth_tolerance``, farther than the nearest point of its
+    cell."""
 
     depth_tolerance: float = 0.1
-    """See ``relative_depth_tolerance``, units."""
+    """Distance that is added to ``relative_depth_tolerance``, units."""
 
     clearance_neighbours: int = 5
-    """The clearance of a place is the distance of its nearest point but this many less one: a few points may float in
-    the air."""
+    """Rank of the point, nearest first, whose distance is the clearance of a place. A few points may float in the
+    air."""
 
     # Up (upright.py)
 
@@ -157,7 +158,7 @@ class LookingSettings:
     """Largest number of points from which up is estimated."""
 
     content_radius: float = 6.0
-    """Largest distance from the centre of the content of points that belong to it, units."""
+    """Radius, around the centre of the content, within which points belong to the content, units."""
 
     upright_directions: int = 400
     """Number of directions that are tried, evenly over half of a sphere: about 7 degrees apart."""
@@ -184,7 +185,8 @@ class LookingSettings:
     scenes with known up, 17 are found within 10 degrees; 14 without these factors and ``usual_direction_weight``."""
 
     usual_axis_factors_with_photos: tuple[float, float] = (1.05, 1.05)
-    """The same for scenes whose photo places are known, which say more."""
+    """Factors of the uprightness of the world's z and y axes in scenes with photo places, which are better evidence;
+    (0, 0) turns the rule off."""
 
     photo_level_weight: float = 0.1
     """Weight of the levelness of photo places in the uprightness; 0 turns it off. For a desk that was walked around,
@@ -225,7 +227,7 @@ class LookingSettings:
     """Number of places that are drawn for each of ``places``, because some are not free."""
 
     box_draws: int = 4
-    """The same for places in the upright box."""
+    """Number of places that are drawn from the upright box for each of ``places``, because some are not free."""
 
     turns_inside: int = 8
     """Number of views from each enclosed place, and from each place near photo places."""
@@ -300,13 +302,14 @@ class LookingSettings:
     """Largest number of Gaussians in the depth images that test a view."""
 
     probe_side: int = 32
-    """Longer side of these images, pixels."""
+    """Longer side of the depth images that test a view, pixels."""
 
     min_clearance: float = 0.5
     """Smallest distance of a camera from surfaces, units; 0 turns the rule off."""
 
     min_clearance_photos: float = 0.1
-    """The same near photo places: photos may show a small part of the content from nearby."""
+    """Smallest distance of a camera near photo places from surfaces, units; 0 turns the rule off. Photos may show a
+    small part of the content from nearby."""
 
     opaque_alpha: float = 0.5
     """Alpha above which a pixel of a depth image shows a surface, in [0, 1]."""
@@ -326,7 +329,7 @@ class LookingSettings:
     others."""
 
     blur_side: int = 64
-    """Longer side of these pictures, pixels."""
+    """Longer side of the pictures that measure blur, pixels."""
 
     max_blur: float = 0.04
     """Largest blur of a view: median over pixels of the angle that Gaussians' standard deviations subtend, radians;
@@ -355,7 +358,7 @@ class LookingSettings:
     """The search ends after this multiple of the rounds that it needs if no view is refused, plus ``extra_rounds``."""
 
     extra_rounds: int = 2
-    """See ``round_factor``."""
+    """Number of rounds that are added to those of ``round_factor``."""
 
     # Windows (windows.py)
 
@@ -386,7 +389,7 @@ class LookingSettings:
     """Number of sampled views that say, together with the given ones, what is visible at all."""
 
     coverage_seed: int = 96
-    """Seed of these views."""
+    """Seed of the sampled views that coverage adds."""
 
 
 DEFAULTS = LookingSettings()
