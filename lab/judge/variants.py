@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
+from pointsplat_ns.looking import settings as looking
 from pointsplat_ns.pruning.merging import settings as merging
 
 BASELINE = "default"
@@ -82,8 +83,54 @@ MERGING = {
 }
 """Variants of :class:`~pointsplat_ns.pruning.merging.MergeSettings`, which ``merge`` is given."""
 
-LOOKING: dict[str, Variant] = {}
-"""Variants of the settings of :mod:`pointsplat_ns.looking`, which are in force while ``merge`` runs."""
+LOOKING = {
+    "all_positions": variant(outlier_quantiles=(0.0, 1.0)),
+    "no_max_area": variant(max_area_quantile=1.0),
+    "trace_neighbourhood_33": variant(trace_neighbourhood=33),
+    "no_energy": variant(energy_exponent=0.0),
+    "no_flatness": variant(flatness_exponent=0.0),
+    "no_flatness_without_sh": variant(flatness_exponent_without_sh=0.0),
+    "no_trace_factors": variant("What photos showed does not count.", max_log_factor=0.0),
+    "evidence_count_500": variant(evidence_count=500),
+    "first_places_all": variant(promising_share=0.0),
+    "no_sh_evidence": variant(min_sh_evidence=1e9),
+    "sh_share_exponent_4": variant(sh_share_exponent=4.0),
+    "no_size_evidence": variant(min_size_evidence=1e9),
+    "size_share_exponent_2": variant(size_share_exponent=2.0),
+    "no_min_surface_opacity": variant(min_surface_opacity=0.0),
+    "surface_exponent_0": variant(surface_exponent=0.0),
+    "surface_exponent_1": variant(surface_exponent=1.0),
+    "no_min_uprightness": variant(min_uprightness=0.0),
+    "no_usual_axes": variant(usual_axis_factors=(0.0, 0.0)),
+    "no_usual_axes_with_photos": variant(
+        "World axes are not preferred as up where photo places are known.", usual_axis_factors_with_photos=(0.0, 0.0)
+    ),
+    "no_photo_level": variant(photo_level_weight=0.0),
+    "no_usual_direction": variant(usual_direction_weight=0.0),
+    "no_lift_traces": variant(lift_trace_exponent=0.0),
+    "no_min_box": variant(min_box_half_side=0.0),
+    "never_a_room": variant("No scene counts as a room.", min_enclosed_places=2.0),
+    "places_24": variant(places=24),
+    "any_eye_height": variant(eye_heights=(0.0, 1.0)),
+    "level_views": variant("Views in rooms look level.", pitch_mean=0.0, pitch_deviation=0.0),
+    "target_centre": variant(target_share=0.0),
+    "no_photo_views": variant(photo_share=0.0),
+    "photo_views_only": variant(photo_share=1.0),
+    "photo_place_deviation_0.2": variant(photo_place_deviation=0.2),
+    "no_photo_target_distance": variant(photo_target_distance=1e9),
+    "no_min_photo_value": variant(min_photo_value=0.0),
+    "no_half_gain_distance": variant(half_gain_distance=1e9),
+    "no_half_gain_angle": variant(half_gain_angle=1e9),
+    "no_edge_loss": variant(edge_loss=0.0),
+    "half_gain_coverage_1": variant(half_gain_coverage=1.0),
+    "no_clearance": variant("Cameras may stand in surfaces.", min_clearance=0.0, min_clearance_photos=0.0),
+    "no_max_near_pixels": variant(max_near_pixels=2.0),
+    "no_min_alpha_inside": variant(min_alpha_inside=0.0),
+    "no_min_alpha_outside": variant(min_alpha_outside=0.0),
+    "window_side_160": variant(window_side=160),
+}
+"""Variants of :class:`~pointsplat_ns.looking.settings.LookingSettings`, which are in force while ``merge`` runs.
+Merging does not test views for blur, so there are no variants of blur."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +142,10 @@ class Table:
     variants: dict[str, Variant]
 
 
-TABLES = {"merging": Table("Merging", merging.DEFAULTS, MERGING)}
+TABLES = {
+    "merging": Table("Merging", merging.DEFAULTS, MERGING),
+    "looking": Table("Looking", looking.DEFAULTS, LOOKING),
+}
 """All variants. Names differ between tables."""
 
 

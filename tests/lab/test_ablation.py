@@ -13,6 +13,7 @@ from lab.judge import ablation, camera_paths, scenes, variants
 from lab.judge import ablation_record as record
 from making import box_room
 from pointsplat_ns.io import read_scene, write_ply
+from pointsplat_ns.looking.settings import LookingSettings
 from pointsplat_ns.pruning.merging import DEFAULTS, MergeSettings, merge
 
 PATH = {
@@ -45,6 +46,17 @@ def test_some_variant_changes_each_field_of_merging_and_none_changes_nothing():
     for table in variants.TABLES.values():
         for name, found in table.variants.items():
             assert dataclasses.replace(table.defaults, **found.changes) != table.defaults, name
+
+
+NOT_OF_MERGING = {"opposite_background_every", "max_blur", "coarse_blur", "blur_growth"}
+"""Rules of looking that merging does not use."""
+
+
+def test_some_variant_turns_off_each_rule_of_looking_that_can_be():
+    docstrings = variants.field_docstrings(LookingSettings)
+    rules = {field for field, text in docstrings.items() if re.search(r"\bturns\b.*\boff\b", text)}
+    changed = {field for found in variants.LOOKING.values() for field in found.changes}
+    assert len(rules) > 20 and rules - changed == NOT_OF_MERGING
 
 
 @pytest.mark.parametrize("name", variants.names())
