@@ -327,7 +327,7 @@ def test_a_repair_knows_how_close_the_scene_is_where_there_is_anything(scene, vi
 
     monkeypatch.setattr(compact_module, "repair", repair)
     result = compacted(scene, trained(tiny_refiner()), views, repair=REPAIRED)
-    assert result.reference.covered < 0.95
+    assert result.reference.covered < 0.97  # so the PSNR over covered pixels is another
     assert told == [pytest.approx(result.before.psnr + 10 * math.log10(result.reference.covered))]
 
 
