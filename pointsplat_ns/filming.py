@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from pointsplat_ns.api import Source, load
 from pointsplat_ns.compression.placing import axis_named
-from pointsplat_ns.compression.posed_scene import need_seen, views_for
+from pointsplat_ns.compression.posed_scene import check_views_show, views_for
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
@@ -96,7 +96,7 @@ def render_path(
     given = views_for(scene, views).resized(LONGEST_SIDE) if isinstance(views, (str, Path)) else views
     loaded = [source if isinstance(source, Gaussians) else load(source) for source in sources]
     if given is not None and isinstance(views, (str, Path)):
-        need_seen(loaded[0], given, views)
+        check_views_show(loaded[0], given, views)
     way: str | Path = path if not isinstance(path, Views) else "dataset"
     if given is not None and kind == "frames" and seconds is None and way in ("auto", "dataset"):
         shot = replace(shot, seconds=max(1, len(given)) / (fps or FPS))

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pointsplat_ns.compression.compact import compact_scene
 from pointsplat_ns.compression.requests import CompactRequest, Effort, RepairBudget
-from pointsplat_ns.compression.scene_folder import WHOLE, Command, Shard, output_folder, settle_folder
-from pointsplat_ns.compression.scene_task import Made, Options, SceneResult
+from pointsplat_ns.compression.scene_folder import WHOLE, Command, Shard, output_folder, run_on_folder
+from pointsplat_ns.compression.scene_task import Options, SceneResult, SmallerScene
 from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
@@ -118,7 +118,7 @@ def compact_folder(
     else:
         make = functools.partial(_compacted, refiner, device, replace(request, refiner=None), size)
     with progress_bar(progress if rank == 0 else False) as report:
-        results = settle_folder(
+        results = run_on_folder(
             folder, target, Command("compact", make, options), jobs, part.within(rank, world_size), force, report
         )
     return sorted(gathered(results), key=lambda result: result.name)
@@ -133,14 +133,14 @@ def _compacted(
     request: CompactRequest,
     resolution: tuple[int, int] | None,
     path: Path,
-) -> Made:
+) -> SmallerScene:
     """One scene of a folder, made smaller. The request comes without its refiner, as other processes load their own."""
     dense = read_scene(path)
     source = ViewSource(dense, run=path, dataset_views=dataset_views, resolution=resolution)
     result = compact_scene(dense, replace(request, refiner=_refiner_on(refiner, device)), source)
     if result.repaired is not None and result.repaired.interrupted:
         raise KeyboardInterrupt  # which is meant for all scenes, not for the repair of this one
-    return Made(result.scene, len(dense), result.psnr)
+    return SmallerScene(result.scene, len(dense), result.psnr)
 
 
 def _found(
@@ -151,11 +151,11 @@ def _found(
     repairs: tuple[Repair, ...],
     resolution: tuple[int, int] | None,
     path: Path,
-) -> Made:
+) -> SmallerScene:
     """The cheapest of a scene of a folder that meets targets."""
     dense = read_scene(path)
     subject = subject_of(dense, path, refiner=_refiner_on(refiner, device), resolution=resolution)
     result = find_scene(subject, targets, by, repairs, silent)
     if result.interrupted:
         raise KeyboardInterrupt  # which is meant for all scenes, not for the search of this one
-    return Made(result.scene, len(dense), result.psnr)
+    return SmallerScene(result.scene, len(dense), result.psnr)

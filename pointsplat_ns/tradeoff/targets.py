@@ -16,7 +16,7 @@ from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from pointsplat_ns.compression.budget_search import FILE_SIZE, FIRST_SHARE
+from pointsplat_ns.compression.budget_search import BUDGETS
 from pointsplat_ns.compression.count_search import SearchSettings, find_count
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.pruning import ply_bytes, resolve_keep
@@ -200,7 +200,7 @@ class Search:
         most = self.plan.count if self._best is None else self._most(way, self._point(self._best).bytes)
         if most < 1:
             return None
-        first = most if most < self.plan.count else resolve_keep(self.plan.count, FIRST_SHARE)
+        first = most if most < self.plan.count else resolve_keep(self.plan.count, BUDGETS.first_share)
         found = find_count(psnr, wanted, at_least=True, first=first, most=most, slope=self._slope, settings=SEARCH)
         if found.count is None:
             return None
@@ -240,7 +240,7 @@ class Search:
         limit = math.floor(1e6 * self.targets.mb)
         found = find_count(
             lambda count: math.log(self._point(replace(way, count=count)).bytes), math.log(max(limit, 1)),
-            at_least=False, first=self._most(way, limit + 1), most=self.plan.count, slope=1.0, settings=FILE_SIZE,
+            at_least=False, first=self._most(way, limit + 1), most=self.plan.count, slope=1.0, settings=BUDGETS.size,
         )  # fmt: skip
         if found.count is None:
             raise BudgetError(

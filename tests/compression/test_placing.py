@@ -88,7 +88,7 @@ def test_the_frame_of_a_run_is_undone(tmp_path):
 
 def test_a_transform_that_is_no_similarity_is_refused(tmp_path):
     run = SimpleNamespace(folder=tmp_path, transform=torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0]))[:3], scale=1.0)
-    with pytest.raises(SceneError, match="no rotation with one scale"):
+    with pytest.raises(SceneError, match="not a rotation with one scale"):
         frame_of(run)
 
 
