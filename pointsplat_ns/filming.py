@@ -19,8 +19,8 @@ from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.system.packages import need
 from pointsplat_ns.system.progress import Progress, tracked
-from pointsplat_ns.viewing.camera_path import FPS, LONGEST_SIDE, Shot, camera_path
-from pointsplat_ns.viewing.film import Cast, Split, frames_of
+from pointsplat_ns.viewing.camera_path import FPS, LONGEST_SIDE, FilmSettings, camera_path
+from pointsplat_ns.viewing.film import FilmScenes, Split, render_frames
 from pointsplat_ns.viewing.video import check_output, write_frames
 from pointsplat_ns.views import RasterizeMode, Views
 
@@ -89,7 +89,7 @@ def render_path(
     """
     if split not in ("side-by-side", "wipe"):
         raise PointSplatError(f"split is {split!r}; expected side-by-side or wipe")
-    shot = Shot(width, height, fps, seconds)
+    settings = FilmSettings(width, height, fps, seconds)
     upward = None if up is None else axis_named(up)
     kind = check_output(output, force)
     sources = [scene] if other is None else [scene, other]
@@ -99,17 +99,17 @@ def render_path(
         check_views_show(loaded[0], given, views)
     way: str | Path = path if not isinstance(path, Views) else "dataset"
     if given is not None and kind == "frames" and seconds is None and way in ("auto", "dataset"):
-        shot = replace(shot, seconds=max(1, len(given)) / (fps or FPS))
+        settings = replace(settings, seconds=max(1, len(given)) / (fps or FPS))
     looked_from = _source(scene, loaded[0], path if isinstance(path, Views) else given)
-    chosen = camera_path(loaded[0], looked_from, way, shot, kind == "picture", upward)
+    chosen = camera_path(loaded[0], looked_from, way, settings, kind == "picture", upward)
     modes = [_mode(source, chosen.views.rasterize_mode) for source in sources]
     if labels is None:
         labels = [f"{_name(s, i)}, {len(g):,} Gaussians" for i, (s, g) in enumerate(zip(sources, loaded, strict=True))]
-    cast = Cast(
+    film = FilmScenes(
         loaded[0], loaded[1] if other is not None else None, (modes[0], modes[-1]), split, labels if other else ()
     )
     logger.info("%d frames of %d x %d: %s", len(chosen.views), chosen.views.width, chosen.views.height, chosen.origin)
-    frames = tracked(frames_of(cast, chosen.views, chosen.fps), "rendering", len(chosen.views), progress)
+    frames = tracked(render_frames(film, chosen.views, chosen.fps), "rendering", len(chosen.views), progress)
     return write_frames(frames, output, chosen.fps, force)
 
 
@@ -149,15 +149,15 @@ def open_viewer(
         True
     """
     need("viser", "the viewer in the browser")
-    from pointsplat_ns.viewing.viewer import Exhibit, Viewer
+    from pointsplat_ns.viewing.viewer import ViewedScene, Viewer
 
-    upward, exhibits = None if up is None else axis_named(up), []
+    upward, scenes = None if up is None else axis_named(up), []
     for index, source in enumerate([scene] if other is None else [scene, other]):
         loaded = source if isinstance(source, Gaussians) else load(source)
         path = None if isinstance(source, Gaussians) else Path(source)
         views, mode = _source(source, loaded, None), _mode(source, "classic")
-        exhibits.append(Exhibit(_name(source, index), path, loaded, views, mode))
-    return Viewer(exhibits, host, port, upward)
+        scenes.append(ViewedScene(_name(source, index), path, loaded, views, mode))
+    return Viewer(scenes, host, port, upward)
 
 
 def _source(scene: Source, loaded: Gaussians, given: Views | None) -> ViewSource:

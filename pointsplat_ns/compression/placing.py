@@ -91,10 +91,10 @@ def _frame_at(path: str | Path) -> Similarity:
         raise SceneError(
             f"{path}: not a Splatfacto run; expected the folder of the run, which has the frame of its data"
         )
-    return frame_of(run)
+    return run_frame(run)
 
 
-def frame_of(run: Run) -> Similarity:
+def run_frame(run: Run) -> Similarity:
     """The similarity from the frame of a run's data to the frame of its scene.
 
     Raises:
