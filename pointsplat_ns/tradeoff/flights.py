@@ -8,7 +8,7 @@ from typing import Any
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import write_json
-from pointsplat_ns.pages.flight import Stage
+from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pruning import ply_bytes
 
 MAX_BYTES = 4_000_000
@@ -20,7 +20,7 @@ _RATIO = 20
 _KEYS = {"scenes", "views", "up", "near", "background", "antialiased", "drag"}
 
 
-def keep_flight(stage: Stage, scene: Gaussians, name: str, path: Path) -> bool:
+def keep_flight(stage: FlightFrame, scene: Gaussians, name: str, path: Path) -> bool:
     """Write a scene for the page, if it is small enough for that.
 
     Args:

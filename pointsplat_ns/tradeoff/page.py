@@ -15,7 +15,7 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.pages.flight import SCRIPTS
 from pointsplat_ns.pages.html import page
-from pointsplat_ns.pages.pictures import AMPLIFIED, error_colors, error_map, fit, read_png
+from pointsplat_ns.pages.pictures import ERROR_GAIN, error_colors, error_map, fit, read_png
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.flights import read_flight_beside
 from pointsplat_ns.tradeoff.front import (
@@ -143,8 +143,8 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
         or sweep.points[0],
         "rows": rows,
         "columns": [(name, _TITLES[name]) for name in shown],
-        "amplified": AMPLIFIED,
-        "full_level": math.ceil(255 / AMPLIFIED),
+        "amplified": ERROR_GAIN,
+        "full_level": math.ceil(255 / ERROR_GAIN),
         "within_db": WITHIN_DB,
         "above_db": ABOVE_DB,
         "ramp": ["#" + bytes(color).hex() for color in error_colors()[::17].tolist()],

@@ -14,7 +14,7 @@ from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS
 from pointsplat_ns.looking.windows import size_text
-from pointsplat_ns.pages.flight import Stage
+from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pruning import method_named
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.flights import keep_flight
@@ -180,10 +180,10 @@ class Sweep:
         return self.journal.points[setting]
 
     @cached_property
-    def _stage(self) -> Stage | None:
+    def _stage(self) -> FlightFrame | None:
         """Where flights through scenes begin; None if nothing of the dense one is visible."""
         try:
-            return Stage.of(self.subject.dense, self.measurer.looked_at.views)
+            return FlightFrame.of(self.subject.dense, self.measurer.looked_at.views)
         except DataError:
             return None
 
