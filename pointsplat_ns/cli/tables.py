@@ -49,14 +49,13 @@ def tables(
         json_output: print what is in tables.json, and nothing else on standard output.
     """
     import pointsplat_ns as ps
-    from pointsplat_ns.tables.outputs import JSON
 
     found = ps.measure_tables(
         scenes, output, keeps=keeps, refiners=refiners, groups=groups, only=only, views=views, side=side,
         scoring_views=scoring_views, fine_tune=fine_tune, splat_transform=splat_transform, force=force, progress=True,
     )  # fmt: skip
     if json_output:
-        print_json({"output": output, **json.loads((output / JSON).read_text("utf-8"))})
+        print_json({"output": output, **json.loads((output / "tables.json").read_text("utf-8"))})
         return
     for group in found:
         cells = sum(len(scene.cells) for scene in group.scenes)

@@ -22,8 +22,8 @@ from pointsplat_ns.tables.means import Group
 from pointsplat_ns.tables.measuring import Measuring
 from pointsplat_ns.tables.outputs import OUTPUTS, write_tables
 from pointsplat_ns.tables.refiners import Refiners
-from pointsplat_ns.tables.scene import Opened, TableOptions, TableScene
-from pointsplat_ns.tables.ways import SHARES
+from pointsplat_ns.tables.scene import OpenedScene, TableOptions, TableScene
+from pointsplat_ns.tables.ways import PROTOCOL
 from pointsplat_ns.tradeoff.judging import LookedAt
 
 TRAINING_PHOTOS = 60
@@ -34,7 +34,7 @@ def measure_tables(
     scenes: Sequence[str | Path],
     folder: str | Path,
     *,
-    keeps: Sequence[float] = SHARES,
+    keeps: Sequence[float] = PROTOCOL.shares,
     refiners: Sequence[str | Path] = (),
     groups: Sequence[str] = (),
     only: Sequence[str] = (),
@@ -166,7 +166,7 @@ def _dataset(path: Path) -> str:
         return ""
 
 
-def _open(path: Path, options: TableOptions) -> Opened:
+def _open(path: Path, options: TableOptions) -> OpenedScene:
     """Read a scene, its views, and its photos if there are any."""
     dense = read_scene(path)
 
@@ -174,7 +174,7 @@ def _open(path: Path, options: TableOptions) -> Opened:
         return ViewSource(dense, run=path, dataset_views=dataset_views)
 
     held_out, training = _looked_at(path, options) or _sampled(new_views(), options)
-    return Opened(dense, held_out.resized(options.side), training.resized(options.side), new_views)
+    return OpenedScene(dense, held_out.resized(options.side), training.resized(options.side), new_views)
 
 
 def _looked_at(path: Path, options: TableOptions) -> tuple[LookedAt, LookedAt] | None:
