@@ -18,7 +18,7 @@ from pointsplat_ns.tables.refiners import Refiners, Weights
 from pointsplat_ns.tables.scene import OpenedScene, TableOptions
 from pointsplat_ns.tables.splat_transform import SplatTransform
 from pointsplat_ns.tables.ways import PROTOCOL, Network, Way
-from pointsplat_ns.tradeoff.measuring import Made, make
+from pointsplat_ns.tradeoff.measuring import MadeScene, make
 from pointsplat_ns.tradeoff.settings import DENSE, EFFORTS, Setting
 
 
@@ -96,7 +96,7 @@ class Maker:
         if self._folder is not None:
             self._folder.cleanup()
 
-    def make(self, way: Way, share: float, progress: Progress) -> Made:
+    def make(self, way: Way, share: float, progress: Progress) -> MadeScene:
         """The scene of a measurable cell, and the cost of making it. The time includes scores that other cells share.
 
         Raises:
@@ -106,11 +106,11 @@ class Maker:
         """
         dense = self.scene.dense
         if way.name == DENSE:
-            return Made(dense, 0.0, None)
+            return MadeScene(dense, 0.0, None)
         count = resolve_keep(len(dense), share, dense.sh_degree)
         if way.mode is not None:
             scene, usage = self.tools.peer.modes[way.mode].reduce(self._ply(), count, timeout=7200.0)
-            return Made(scene.to(dense.device), usage.seconds, usage.peak_bytes)
+            return MadeScene(scene.to(dense.device), usage.seconds, usage.peak_bytes)
         if method_named(way.by).score is None:
             return make(dense, Setting(count, dense.sh_degree, way.repair, way.by), self.scene.new_views, progress)
         assert way.repair not in EFFORTS, "repairs are of merged scenes"
@@ -121,7 +121,7 @@ class Maker:
             scene = self.tools.weights(way.network, share, self.name).refiner(scene)
         if way.fine_tuned:
             scene = self._tuned(scene, functools.partial(progress, "fine-tuning"))
-        return Made(scene, before + time.perf_counter() - start, None)
+        return MadeScene(scene, before + time.perf_counter() - start, None)
 
     def _scored(self, way: Way, progress: functools.partial[None]) -> tuple[Tensor, float]:
         """Scores (N,), and the seconds of computing them."""

@@ -26,7 +26,7 @@ from pointsplat_ns.tables.scene import OpenedScene, TableScene
 from pointsplat_ns.tables.ways import PROTOCOL, Way, all_cells, cell_key
 from pointsplat_ns.tradeoff.judging import Judge, Judged
 from pointsplat_ns.tradeoff.machine import machine_text, one_at_a_time
-from pointsplat_ns.tradeoff.measuring import Made, point_of
+from pointsplat_ns.tradeoff.measuring import MadeScene, point_of
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import DENSE
 
@@ -203,7 +203,7 @@ class _SceneWork:
             height=held_out.views.height,
         )
 
-    def _point(self, way: Way, share: float, made: Made, judged: Judged) -> Point:
+    def _point(self, way: Way, share: float, made: MadeScene, judged: Judged) -> Point:
         command = ["pointsplat", "tables", str(self.scene.path), "-o", str(self.folder)]
         command += ["--only", self.key(way, share), *self.tools.words(way, share, self.scene.name)]
         repairs = {"fine-tuned": way.fine_tuned, "refiner": way.network is not None}

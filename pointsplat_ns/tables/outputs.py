@@ -90,8 +90,8 @@ def _notes(groups: Sequence[Group]) -> list[str]:
         )
     if any(group.dataset for group in groups):
         notes.append(
-            "The paper's Table 2 and Figure 4 do not say of which scenes they are, so nothing of theirs is shown beside "
-            "ours."
+            "The paper's Table 2 and Figure 4 do not say of which scenes they are, so nothing of theirs is shown "
+            "beside ours."
         )
     return notes
 

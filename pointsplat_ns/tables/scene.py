@@ -9,7 +9,7 @@ from pathlib import Path
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.tradeoff.judging import LookedAt
+from pointsplat_ns.tradeoff.judging import JudgedViews
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,9 +17,9 @@ class OpenedScene:
     """The data of a scene."""
 
     dense: Gaussians
-    held_out: LookedAt
+    held_out: JudgedViews
     """Views to judge scenes in, with held-out photos where there are some."""
-    training: LookedAt
+    training: JudgedViews
     """Views of fine-tuning, with training photos where there are some."""
     new_views: Callable[[], ViewSource]
     """Makes a new source of views, the same as for the commands ``prune`` and ``compact``."""

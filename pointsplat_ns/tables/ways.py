@@ -23,7 +23,7 @@ class Protocol:
     figure_share: float = 0.5
     """Share of the Gaussians in Figure 4."""
     seed: int = 0
-    """Seed of the order of views in fine-tuning. No other step of these tables draws from it."""
+    """Seed of the order of views in fine-tuning, and of random selection. No other step is random."""
 
 
 PROTOCOL = Protocol()
