@@ -1,4 +1,4 @@
-"""What is done to every scene of a folder."""
+"""The public function for all scenes of a folder."""
 
 from __future__ import annotations
 
@@ -45,41 +45,40 @@ def compact_folder(
     force: bool = False,
     progress: bool | Progress = False,
 ) -> list[SceneResult]:
-    """Make every scene of a folder smaller, as :func:`compact` does, and write the results to another folder.
+    """Compact every scene of a folder by :func:`compact`, and write the results to another folder.
 
-    A result that is there, unchanged, and of the same scene and options, is left alone: called again, this goes on with
-    what is not finished. Several calls may work on the same folders at once; each scene is claimed by one of them.
-    Under ``torchrun`` each process takes its part, waits for the others, and gives the results of all.
+    Unchanged results of the same scene and options are kept, so another call continues an interrupted one. Several
+    calls may work on the same folders at the same time; one of them claims each scene. Under ``torchrun`` each process
+    works on a part, waits for the others, and returns the results of all.
 
     Args:
         folder: scenes are the files with Gaussians below it, and the newest Splatfacto run of each experiment.
         output: folder for ``NAME.ply`` and its record ``NAME.ply.json`` of each scene, and the table ``scenes.csv``;
             by default beside ``folder``: ``scenes_compact`` for ``scenes``.
         keep: as for :func:`compact`.
-        refiner: what :func:`load_refiner` takes, or "shipped"; None for no refiner.
+        refiner: as for :func:`load_refiner`, or "shipped"; None for no refiner.
         by: as for :func:`compact`.
         sh: as for :func:`compact`.
         clean: as for :func:`compact`.
         effort: as for :func:`compact`.
-        seconds: of repairing each scene, as for :func:`compact`.
-        target_db: what each scene has to reach, as for :func:`compact`.
+        seconds: duration of the repair of each scene, as for :func:`compact`.
+        target_db: PSNR that each scene has to reach, as for :func:`compact`.
         target_ms: as for :func:`compact`.
         target_mb: as for :func:`compact`; of PLY files.
         resolution: as for :func:`prune`.
-        jobs: number of processes. More than one share the cores; a program that asks for them must be a file, with what
-            it does under ``if __name__ == "__main__":``, as for any Python program that starts processes.
+        jobs: number of processes, which share the cores. With more than one, the program must be a file whose main code
+            is under ``if __name__ == "__main__":``, as for any Python program that starts processes.
         shard: only a part of the scenes: "2/5" is the second of five.
-        force: overwrite files that this function did not write, that were changed since, or that it wrote with other
-            options.
-        progress: True shows a bar; a function is called with what is being done and the share done of it.
+        force: overwrite files of other origin, changed files, and results with other options.
+        progress: True shows a bar; a function is called with the name of the current task and its share done.
 
     Returns:
-        What became of each scene of the shard, sorted by name. A scene that fails does not stop the others; its status
-        is "failed".
+        The result of each scene of the shard, sorted by name. A failing scene does not stop the others; its status is
+        "failed".
 
     Raises:
-        BudgetError, PointSplatError: if the options fit no scene.
-        DataError: if there is no such shard, or no job.
+        BudgetError, PointSplatError: if an option is not valid.
+        DataError: if the shard or the number of jobs is not valid.
         SceneError: if there is no scene, or the output folder holds other results.
 
     Example:
@@ -134,12 +133,12 @@ def _compacted(
     resolution: tuple[int, int] | None,
     path: Path,
 ) -> SmallerScene:
-    """One scene of a folder, made smaller. The request comes without its refiner, as other processes load their own."""
+    """Compact one scene of a folder. The request has no refiner, because each process loads its own."""
     dense = read_scene(path)
     source = ViewSource(dense, run=path, dataset_views=dataset_views, resolution=resolution)
     result = compact_scene(dense, replace(request, refiner=_refiner_on(refiner, device)), source)
     if result.repaired is not None and result.repaired.interrupted:
-        raise KeyboardInterrupt  # which is meant for all scenes, not for the repair of this one
+        raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the repair of one scene
     return SmallerScene(result.scene, len(dense), result.psnr)
 
 
@@ -152,10 +151,10 @@ def _found(
     resolution: tuple[int, int] | None,
     path: Path,
 ) -> SmallerScene:
-    """The cheapest of a scene of a folder that meets targets."""
+    """Find the cheapest version of one scene of a folder that meets targets."""
     dense = read_scene(path)
     subject = subject_of(dense, path, refiner=_refiner_on(refiner, device), resolution=resolution)
     result = find_scene(subject, targets, by, repairs, silent)
     if result.interrupted:
-        raise KeyboardInterrupt  # which is meant for all scenes, not for the search of this one
+        raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the search of one scene
     return SmallerScene(result.scene, len(dense), result.psnr)
