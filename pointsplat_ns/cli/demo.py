@@ -57,8 +57,8 @@ def demo(
     compact_example(output, keep)
     need("nerfstudio", "the rest of the demo, which trains,")
     print(
-        "\nThat is a usable result. The demo now goes on to train scenes and a refiner of its own, for about 15 minutes "
-        "on two cores.\nIt may be stopped at any time with Ctrl-C; started again, it does "
+        "\nThat is a usable result. The demo now goes on to train scenes and a refiner of its own, for about "
+        "15 minutes on two cores.\nIt may be stopped at any time with Ctrl-C; started again, it does "
         "not repeat what it has finished.",
         flush=True,
     )
