@@ -58,7 +58,7 @@ def find_count(
     slope: float | None = None,
     settings: SearchSettings | None = None,
 ) -> FoundCount:
-    """Search for the smallest count whose measure reaches the target, or the largest whose measure stays below it.
+    """Search for the smallest count whose measure reaches the target, or the largest whose measure does not exceed it.
 
     Args:
         measure: from a count to a number that rises with it. It is called once for each count tried.

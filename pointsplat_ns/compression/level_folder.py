@@ -112,7 +112,7 @@ class LevelFolder:
         write_json({**FORMAT, "complete": complete, **about, "levels": rows}, self.folder / MANIFEST)
 
     def write_picture(self, images: Sequence[Tensor], captions: Sequence[str]) -> None:
-        """Draw images (H, W, 3) of one size with a caption below each; nothing if there is none.
+        """Draw images (H, W, 3) of one size with a caption below each; without images, draw none.
 
         Raises:
             SceneError: if it cannot be written.

@@ -195,13 +195,13 @@ class Levels:
             return [], []
         views, last = self.reference.views, self[-1].errors
         assert last is not None
-        shown = int(np.argsort(last.near.errors, kind="stable")[(len(views) - 1) // 2])
-        images, captions = [self.reference.renders[shown]], [f"dense: {len(self.dense):,} Gaussians"]
+        index_of_view = int(np.argsort(last.near.errors, kind="stable")[(len(views) - 1) // 2])
+        images, captions = [self.reference.renders[index_of_view]], [f"dense: {len(self.dense):,} Gaussians"]
         for index, level in enumerate(self):
             assert level.errors is not None
-            images.append(render(level.scene, views[shown]))
+            images.append(render(level.scene, views[index_of_view]))
             share = f"{100 * len(level.scene) / len(self.dense):.3g} %"
-            psnr = level.errors.view_psnr(shown)
+            psnr = level.errors.view_psnr(index_of_view)
             captions.append(f"level {index}: {len(level.scene):,} ({share}), {psnr:.1f} dB")
         return images, captions
 

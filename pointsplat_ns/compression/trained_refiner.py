@@ -137,10 +137,10 @@ def scenes_of_run(run: Run) -> tuple[dict[str, Path], str]:
     Raises:
         SceneError: if the scenes are no longer there.
     """
-    runs, plys, nothing = find_runs_and_plys(run.data, run.datamanager_fields.get("supervision", "auto"))
+    runs, plys, reason = find_runs_and_plys(run.data, run.datamanager_fields.get("supervision", "auto"))
     scenes = {name: scene.checkpoint for name, scene in runs.items()} | plys
     if not scenes:
-        raise SceneError(f"{run.config_path}: {nothing or f'{run.data}: no Gaussians in it'}; put its scenes back")
+        raise SceneError(f"{run.config_path}: {reason or f'{run.data}: no Gaussians in it'}; put its scenes back")
     return scenes, shown_scene(list(scenes), run.datamanager_fields.get("eval_scenes") or ())
 
 

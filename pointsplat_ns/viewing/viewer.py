@@ -120,11 +120,11 @@ class Viewer:
         self._budgets = []
         for viewed, selection in zip(self._scenes, self._selections, strict=True):
             gui.add_markdown(f"**{_code(viewed.name)}**")
-            slider = gui.add_slider("Kept, %", 1, 100, 1, 100, hint="Gaussians that are shown of this scene")
+            slider = gui.add_slider("Kept, %", 1, 100, 1, 100, hint="share of this scene's Gaussians")
             slider.on_update(_chooser(selection))
             self._budgets.append(gui.add_markdown(""))
         two = len(self._scenes) == 2
-        hint = "left of the line the first scene" if two else "left of the line what is kept, right of it all"
+        hint = "left of the line the first scene" if two else "left of the line the kept Gaussians, right of it all"
         self._line = gui.add_slider("Wipe, %", 0, 100, 1, 50 if two else 100, hint=hint)
         self._line.on_update(lambda _: self._redraw())
         self._side = gui.add_slider("Pixels", 240, 1920, 80, 960, hint="longer side of the picture at rest")
