@@ -143,7 +143,7 @@ def test_what_is_very_far_away_or_has_no_meaning_is_left_out_and_counted(tmp_pat
     means[3], means[7], means[9] = 1e6, math.nan, torch.tensor([0.0, -1e9, 0.0])
     with caplog.at_level(logging.WARNING):
         path = ps.write_page(scene.replace(means=means), tmp_path / "page.html", ["the ball"])
-    assert "the ball: 3 Gaussians, very far away or without meaning, are not in the page" in caplog.text
+    assert "the ball: 3 Gaussians, very far away or not finite, are not in the page" in caplog.text
     [shown] = scenes_in(path, tmp_path)
     assert len(shown) == 197 and shown.means.abs().max() < MAX_COORDINATE
 
