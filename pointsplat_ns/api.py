@@ -1,6 +1,6 @@
-"""The public functions on whole scenes; ``import pointsplat_ns as ps`` gives them all.
+"""The public functions on whole scenes; ``import pointsplat_ns as ps`` has them all.
 
-Each command of the command line does what one of these functions does.
+Each command of the command line calls one of these functions.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.views import Views
 
 EXAMPLE = Path(__file__).parent / "examples" / "room.ply"
-"""The scene that ships."""
+"""The shipped example scene."""
 
 
 def load(path: str | Path, scene: str | None = None) -> Gaussians:
@@ -38,14 +38,14 @@ def load(path: str | Path, scene: str | None = None) -> Gaussians:
     Args:
         path: a file of a scene (``.ply``, compressed or not, ``.spz``, ``.sog`` or its folder, ``.splat``,
             ``.ksplat``), a Splatfacto ``.ckpt``, a Splatfacto run (its folder or ``config.yml``), or a ``pointsplat``
-            run, whose dense scene is then pruned and refined as it was in the training.
-        scene: which scene of a ``pointsplat`` run; by default the first that it was not trained on, or the first.
+            run, whose dense scene is then pruned and refined as in its training.
+        scene: name of a scene of a ``pointsplat`` run; by default the first held-out one, or else the first.
 
     Returns:
-        The scene, float32 on the CPU. Log-scales and logits are kept as the file has them.
+        The scene, float32 on the CPU. Log-scales and logits are those of the file.
 
     Raises:
-        SceneError: if it is none of these, damaged, or has no such scene.
+        SceneError: if the path is none of these, is damaged, or has no such scene.
 
     Example:
         >>> import tempfile
@@ -59,8 +59,8 @@ def load(path: str | Path, scene: str | None = None) -> Gaussians:
         if scene is not None:
             raise SceneError(f"scene {scene!r}: {path} holds one scene; leave the name out")
         return read_scene(path)
-    scenes, shown = scenes_of_run(open_refiner_run(path, need_data=True))
-    chosen = shown if scene is None else scene
+    scenes, default = scenes_of_run(open_refiner_run(path, need_data=True))
+    chosen = default if scene is None else scene
     if chosen not in scenes:
         raise SceneError(f"scene {chosen!r}: no such scene in {path}; there are {', '.join(scenes)}")
     refiner = load_refiner(path)
@@ -102,10 +102,10 @@ def prune(
     Findings (SH bands dropped, PSNR reached, the origin of views) are logged at level INFO.
 
     Args:
-        scene: N Gaussians, or where to read them: a PLY, a checkpoint, or a Splatfacto run.
+        scene: N Gaussians, or the path of a PLY, a checkpoint, or a Splatfacto run.
         keep: size of the result: a ratio (0.3, "30%"), a count (50000), the size of a PLY ("12MB") or of a file of
             another format ("12MB.spz"), or "auto:35", the smallest scene whose renders reach 35 dB PSNR against those
-            of the given one ("auto" alone means 35). For .spz and .sog the count is searched for.
+            of the given scene ("auto" alone means 35). For .spz and .sog the count is searched.
         by: the method. "merge" replaces neighbours by one Gaussian each; the others keep Gaussians bit for bit:
             "coverage", "paper" (eq. 3), "authors", "opacity", "volume", "log-volume", "area", "random", and
             "lightgaussian" and "pup", which score Gaussians in ``views``.
@@ -113,23 +113,23 @@ def prune(
             40 dB.
         opacity_weight: lambda of "paper", "authors" and "log-volume", in [0, 1]; by default the paper's 0.3.
         clean: first remove Gaussians that cannot be drawn or seen; ``keep`` refers to the scene as given.
-        fine_tune: number of steps of optimising the result against renders of the given scene.
-        views: cameras, if anything has to be rendered: views, the run whose dataset has the poses, or a file
-            of cameras (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model). By
-            default those of the run that ``scene`` names, or poses sampled in free space.
+        fine_tune: number of optimisation steps of the result against renders of the given scene.
+        views: cameras for all rendering: views, the run whose dataset has the poses, or a file of cameras
+            (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model). By
+            default those of the run at ``scene``, or poses sampled in free space.
         resolution: width and height of the pictures that people look at, pixels: (1920, 1080) or "1920x1080".
             Decisions by rendering are made at this size. By default the size of the photos or of given views, else
             1920 x 1080.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
     Returns:
-        Exactly as many Gaussians as ``keep`` asks for, on the device of the given scene.
+        Exactly the number of Gaussians of ``keep``, on the device of the given scene.
 
     Raises:
-        BudgetError: if no such scene can be made.
+        BudgetError: if the budget cannot be met.
         SceneError: if no Gaussian can be drawn, or the file is not usable.
         DataError: if views are needed and there are none, or most cameras of a file see nothing of the scene.
-        PointSplatError: if there is no such method, or an option does not fit it.
+        PointSplatError: if the method is unknown, or an option does not fit it.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -145,11 +145,12 @@ def prune(
 def refine(scene: Gaussians, refiner: TrainedRefiner | None = None) -> Gaussians:
     """Refine a pruned scene by one forward pass of a trained network.
 
-    The network was trained on scenes pruned with ``refiner.settings``. :func:`compact` checks whether it helps.
+    The network was trained on scenes pruned with ``refiner.settings``. :func:`compact` compares renders before it
+    accepts the result.
 
     Args:
         scene: K Gaussians.
-        refiner: from :func:`load_refiner`; by default the one that ships.
+        refiner: from :func:`load_refiner`; by default the shipped one.
 
     Returns:
         K Gaussians on the device of the given scene.
@@ -184,22 +185,22 @@ def compact(
     resolution: tuple[int, int] | str | None = None,
     progress: bool | Progress = False,
 ) -> Compacted:
-    """Make a scene smaller, repair it, and check by rendering how far that helps.
+    """Make a scene smaller, repair it, and accept the repair by comparing renders.
 
-    A trained refiner, if one is given, refines the smaller scene. Learned steps then bring it closer to renders of the
-    given scene, for as long as ``effort`` or ``seconds`` says. No photos are needed. A refinement or repair that harms
+    A trained refiner, if given, refines the smaller scene. Learned steps then bring it closer to renders of the given
+    scene, for the duration of ``effort`` or ``seconds``. No photos are needed. A refinement or repair that harms
     pictures of any size is left out.
 
     With targets, a search chooses count, SH degree and repair: the smallest file that reaches ``target_db`` within the
     limits of time and size; without ``target_db``, the best scene within the limits.
 
     Args:
-        scene: N Gaussians, or where to read them: a PLY, a checkpoint, or a Splatfacto run.
-        keep: size of the result, as for :func:`prune`; an "auto" PSNR is reached before repairs. By default the setting
-            that the refiner was trained with, and a tenth without a refiner.
+        scene: N Gaussians, or the path of a PLY, a checkpoint, or a Splatfacto run.
+        keep: size of the result, as for :func:`prune`; an "auto" PSNR is reached before repairs. By default the budget
+            of the refiner's training, or a tenth without a refiner.
         refiner: from :func:`load_refiner`; by default none.
-        by: the method, as for :func:`prune`; by default the one that the refiner was trained with, and "merge" without
-            one.
+        by: the method, as for :func:`prune`; by default the method of the refiner's training, or "merge" without a
+            refiner.
         sh: SH bands to keep, as for :func:`prune`.
         clean: as for :func:`prune`.
         effort: "instant" takes no steps; "quick" and "thorough" take 48 and 400.
@@ -209,21 +210,21 @@ def compact(
         target_ms: longest time of a frame, milliseconds, drawn by this package in these views.
         target_mb: largest file, in units of 10^6 bytes.
         target_format: format of the file whose size counts: ".ply", ".spz", ".sog", ...
-        views: cameras that renders are compared in, as for :func:`prune`; at most 12 are used. If there are more than
-            twice as many, the others are used for the repair; else views are sampled in free space.
+        views: cameras to compare renders in, as for :func:`prune`; at most 12 are used. The repair uses the others if
+            there are more than twice as many; else it samples views in free space.
         resolution: as for :func:`prune`.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
     Returns:
         ``.scene``, ``.accepted`` (whether the refiner is in it), ``.psnr`` (dB against the given scene's renders),
-        ``.seconds``, ``.verdict`` (gains in words), and more: see :class:`Compacted`. ``.target`` says which scene
-        meets the targets, and which target the next cheaper scene misses.
+        ``.seconds``, ``.verdict`` (text on the gains), and more: see :class:`Compacted`. ``.target`` is text on the
+        scene that meets the targets, and on the target that the next cheaper scene misses.
 
     Raises:
-        BudgetError: if no such scene can be made; for targets, the text says what is reachable.
+        BudgetError: if the budget cannot be met; for targets, the text tells the reachable values.
         SceneError: if no Gaussian can be drawn, the file is not usable, or the SH degree exceeds the refiner's.
         DataError: if the budget or ``sh`` needs views and there are none.
-        PointSplatError: if there is no such method or effort, or the time is negative.
+        PointSplatError: if the method or effort is unknown, or the time is negative.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -249,30 +250,30 @@ def lod(
     force: bool = False,
     progress: bool | Progress = False,
 ) -> Levels:
-    """Make levels of detail: a scene merged to fewer and fewer Gaussians in one pass, the error of each measured.
+    """Make levels of detail: a scene merged to ever fewer Gaussians in one pass, with the error of each level.
 
-    Each level is merged from the one before, so levels are nested: every Gaussian has one parent in the next coarser
+    Each level is merged from the level before, so levels are nested: every Gaussian has one parent in the next coarser
     level.
 
     Args:
-        scene: N Gaussians, or where to read them: a PLY, a checkpoint, or a Splatfacto run.
+        scene: N Gaussians, or the path of a PLY, a checkpoint, or a Splatfacto run.
         levels: sizes of the levels, as ``keep`` of :func:`prune` except "auto"; in any order.
         sh: SH bands of every level, as for :func:`prune`.
-        views: cameras that renders are compared in, as for :func:`prune`; at most 12 are used.
+        views: cameras to compare renders in, as for :func:`prune`; at most 12 are used.
         resolution: as for :func:`prune`.
-        folder: where to write each level as soon as it is there, a manifest and a picture; see :meth:`Levels.save`.
+        folder: output folder for each level as soon as it is made, a manifest and a picture; see :meth:`Levels.save`.
         force: overwrite existing files in ``folder``.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
     Returns:
-        The levels, the finest first, with exactly the numbers of Gaussians asked for; their errors, and the parent of
+        The levels, the finest first, with exactly the requested numbers of Gaussians; their errors, and the parent of
         each Gaussian: see :class:`Levels`.
 
     Raises:
-        BudgetError: if a level does not fit the scene, or two mean the same number of Gaussians.
+        BudgetError: if a level does not fit the scene, or two levels have the same number of Gaussians.
         SceneError: if no Gaussian can be drawn, or a file or the folder is not usable.
-        DataError: if ``sh`` needs views and none can be had.
-        PointSplatError: if there is no such ``sh``.
+        DataError: if ``sh`` needs views and there are none.
+        PointSplatError: if ``sh`` is unknown.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -280,7 +281,7 @@ def lod(
         >>> [(len(level.scene), level.errors.near.psnr > 10) for level in levels]
         [(1572, True), (786, True), (100, True)]
     """
-    budgets = parse_levels(levels)  # this and the next before the scene is read
+    budgets = parse_levels(levels)  # these checks come before the scene is read
     PruneRequest(1.0, sh=sh)
     if folder is not None:
         check_folder(Path(folder), len(budgets), force)
@@ -299,10 +300,10 @@ def plot_views(
     views: Views | str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
 ) -> str:
-    """Draw the views that decisions about a scene are made in: a sheet of up to 16 pictures.
+    """Draw the views that decide about a scene: a sheet of up to 16 pictures.
 
     Args:
-        scene: N Gaussians, or where to read them.
+        scene: N Gaussians, or the path of a scene.
         path: the PNG file to write.
         views: as for :func:`prune`.
         resolution: as for :func:`prune`.
@@ -329,19 +330,19 @@ def plot_views(
 def lpips(pred: Tensor, target: Tensor, net: Literal["alex", "vgg"] = "alex") -> Tensor:
     """LPIPS, the perceptual distance of images (Zhang et al. 2018).
 
-    The backbone's weights are downloaded by torchvision when they are first needed, or taken from the folder or file
-    that the environment variable ``POINTSPLAT_LPIPS_WEIGHTS`` names.
+    torchvision downloads the backbone's weights at the first call, unless the environment variable
+    ``POINTSPLAT_LPIPS_WEIGHTS`` names a folder or file with them.
 
     Args:
         pred: (H, W, 3) or (B, H, W, 3), in [0, 1]; at least 31 pixels a side for "alex", 16 for "vgg".
         target: the same shape.
-        net: "alex" is what most papers report, "vgg" what most losses use.
+        net: the backbone: "alex" as in most papers, "vgg" as in most losses.
 
     Returns:
         A scalar, or (B,); 0 for identical images. Differentiable.
 
     Raises:
-        LpipsUnavailable: if the weights cannot be had; the text says why.
+        LpipsUnavailable: if the weights are not available; the text tells the reason.
         ImageError: if the images cannot be compared.
 
     Example:
@@ -360,4 +361,4 @@ def _is_refiner_run(path: str | Path) -> bool:
     try:
         return may_be_run(path) and open_run(path, need_data=False).method_name == REFINER_METHOD
     except SceneError:
-        return False  # a scene that stands alone, or nothing that can be read: who reads it says which
+        return False  # a single scene, or not readable: read_scene raises the error

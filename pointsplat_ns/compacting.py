@@ -1,4 +1,4 @@
-"""From options and the place of a scene to a smaller scene: the way of both the public functions and the commands."""
+"""Reads a scene and runs one request on it: shared by the public functions and the commands."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 logger = logging.getLogger("pointsplat_ns")
 
 Source = Gaussians | str | Path
-"""A dense scene, or where to read it."""
+"""A dense scene, or its path."""
 
-Looked = Views | str | Path | None
-"""Views, the run whose dataset has the poses, a file of cameras, or None for those that the scene's run has."""
+ViewsInput = Views | str | Path | None
+"""Views, the run whose dataset has the poses, a file of cameras, or None for those of the scene's run."""
 
 Resolution = tuple[int, int] | str | None
 """Width and height of pictures, pixels."""
@@ -36,26 +36,26 @@ Resolution = tuple[int, int] | str | None
 
 @dataclass(frozen=True)
 class Goal:
-    """What a search for the cheapest scene has to meet."""
+    """The goal of a search for the cheapest scene."""
 
     targets: Targets
     effort: Effort
-    """How long scenes may be repaired."""
+    """Effort of repairs."""
     suffix: str
-    """Of the format whose files' sizes count."""
+    """Suffix of the format whose size counts."""
 
 
 def prune_source(
     scene: Source,
     request: PruneRequest,
-    views: Looked = None,
+    views: ViewsInput = None,
     resolution: Resolution = None,
     progress: bool | Progress = False,
 ) -> tuple[Gaussians, Gaussians, float]:
     """Read a scene and prune it; notes are logged. Arguments as of :func:`pointsplat_ns.prune`.
 
     Returns:
-        The dense scene, the smaller one, and the seconds that pruning took.
+        The dense scene, the smaller scene, and the seconds of pruning.
     """
     from pointsplat_ns.compression.prune import prune_scene
 
@@ -72,17 +72,17 @@ def compact_source(
     scene: Source,
     request: CompactRequest,
     goal: Goal | None = None,
-    views: Looked = None,
+    views: ViewsInput = None,
     resolution: Resolution = None,
     progress: bool | Progress = False,
 ) -> tuple[Gaussians, Compacted]:
     """Read a scene and compact it; verdicts and notes are logged. Arguments as of :func:`pointsplat_ns.compact`.
 
     Args:
-        scene: N Gaussians, or where to read them.
-        request: how. A goal takes only its method and refiner, and decides the rest.
-        goal: what a search has to meet; None for no search.
-        views: where renders are compared.
+        scene: N Gaussians, or the path of a scene.
+        request: options. A search uses only its method and refiner, and decides the rest.
+        goal: the goal of a search; None for no search.
+        views: cameras to compare renders in.
         resolution: size of the pictures.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
@@ -120,12 +120,12 @@ def goal_of(
     """The goal of a search; None if no target is given.
 
     Args:
-        request: what is asked for beside targets.
-        keep: None if how much to keep is not asked for; a search decides it.
+        request: the other options.
+        keep: None if it is not given; a search decides it.
         db: least PSNR against the dense scene's renders, dB.
         ms: longest time of a frame, milliseconds.
         mb: largest file, in units of 10^6 bytes.
-        suffix: end of the names of files whose size counts.
+        suffix: suffix of the format whose size counts.
 
     Raises:
         BudgetError: if a target is not positive, or an option was given that a search decides.
@@ -138,8 +138,8 @@ def goal_of(
     return None if targets is None else Goal(targets, request.repair.effort, suffix)
 
 
-def read_source(scene: Source, views: Looked, resolution: Resolution) -> tuple[Gaussians, ViewSource]:
-    """The dense scene, and where renders of it are compared. Arguments as of :func:`pointsplat_ns.prune`.
+def read_source(scene: Source, views: ViewsInput, resolution: Resolution) -> tuple[Gaussians, ViewSource]:
+    """Read the dense scene, and make its source of views. Arguments as of :func:`pointsplat_ns.prune`.
 
     Raises:
         SceneError: if a file is missing or damaged, or the scene is a ``pointsplat`` run, which is pruned already.
@@ -165,7 +165,7 @@ def read_source(scene: Source, views: Looked, resolution: Resolution) -> tuple[G
     return dense, ViewSource(dense, run=run_of(scene, views), dataset_views=_dataset_views, resolution=size)
 
 
-def run_of(scene: Source, views: Looked) -> Path | None:
+def run_of(scene: Source, views: ViewsInput) -> Path | None:
     """The file or folder whose dataset may have the poses."""
     named = scene if views is None else views
     return Path(named) if isinstance(named, (str, Path)) else None

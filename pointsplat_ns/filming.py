@@ -1,4 +1,4 @@
-"""The public functions to look at scenes: films along camera paths, and a viewer in the browser."""
+"""The public functions to view scenes: films along camera paths, and a viewer in the browser."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from pointsplat_ns.api import Source, load
 from pointsplat_ns.compression.placing import axis_named
-from pointsplat_ns.compression.posed_scene import need_seen, views_for
+from pointsplat_ns.compression.posed_scene import check_views_show, views_for
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
@@ -19,8 +19,8 @@ from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.system.packages import need
 from pointsplat_ns.system.progress import Progress, tracked
-from pointsplat_ns.viewing.camera_path import FPS, LONGEST_SIDE, Shot, camera_path
-from pointsplat_ns.viewing.film import Cast, Split, frames_of
+from pointsplat_ns.viewing.camera_path import FPS, LONGEST_SIDE, FilmSettings, camera_path
+from pointsplat_ns.viewing.film import FilmScenes, Split, render_frames
 from pointsplat_ns.viewing.video import check_output, write_frames
 from pointsplat_ns.views import RasterizeMode, Views
 
@@ -47,27 +47,27 @@ def render_path(
     force: bool = False,
     progress: bool | Progress = False,
 ) -> int:
-    """Film a scene, or two from the same cameras, along a path.
+    """Film a scene, or two scenes with the same cameras, along a path.
 
     Args:
-        scene: N Gaussians, or where to read them.
+        scene: N Gaussians, or the path of a scene.
         output: ``.mp4`` for a video (H.264), a folder for PNG frames, ``.png`` for the first frame alone. It appears
             when it is complete.
-        other: a second scene in the same place, to compare with.
+        other: a second scene in the same frame, to compare with.
         path: "dataset" goes exactly through the poses of the run's dataset; "walk" past sampled views, smoothly and
-            upright; "orbit" about what they show, or round on the spot in a room; "auto" is "dataset" if there is one,
-            else "walk". Or a camera path that nerfstudio's viewer saved (JSON), or views to go through.
-        views: what "dataset", "walk" and "orbit" are made of, in place of the dataset's poses: views, or a file of
+            upright; "orbit" about their common content, or a turn on the spot in a room; "auto" is "dataset" if there
+            is one, else "walk". Or a camera path that nerfstudio's viewer saved (JSON), or views to go through.
+        views: views for "dataset", "walk" and "orbit", in place of the dataset's poses: views, or a file of
             cameras (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model).
-        split: two scenes are shown "side-by-side", or with a line that wipes ("wipe") from one to the other.
-        labels: what is written on two scenes; by default their names and counts. An empty list writes nothing.
+        split: layout of two scenes: "side-by-side", or "wipe" with a moving line between them.
+        labels: labels of two scenes; by default their names and counts. An empty list writes none.
         up: the axis that is up in the scene ("z", "-y"), for walks and orbits; by default it is estimated.
-        width: of the picture of one scene, pixels; by default that of the saved path, or of the photos, at most 960.
-        height: of the same.
-        fps: frames a second; by default 24, or what the saved path says.
-        seconds: how long; by default 10, or as long as it takes to show every pose of a dataset or a saved path. Of
-            ``views`` a folder gets one frame each by default.
-        force: overwrite what is there.
+        width: width of one scene's picture, pixels; by default that of the saved path, or of the photos, at most 960.
+        height: its height, pixels.
+        fps: frames a second; by default 24, or as in the saved path.
+        seconds: length; by default 10, or long enough for every pose of a dataset or a saved path. A folder gets one
+            frame for each of ``views`` by default.
+        force: overwrite existing files.
         progress: True shows a bar with the time left; a function is called with the share done.
 
     Returns:
@@ -75,9 +75,9 @@ def render_path(
 
     Raises:
         SceneError: if a scene is not usable, or the output cannot be written.
-        DataError: if there are no views to make a path of, the saved path is not usable, or most views of a file see
-            nothing of the scene.
-        PointSplatError: if a size, speed or length means nothing.
+        DataError: if there are no views for a path, the saved path is not usable, or most views of a file see nothing
+            of the scene.
+        PointSplatError: if a size, speed or length is not valid.
 
     Example:
         >>> import tempfile
@@ -89,27 +89,27 @@ def render_path(
     """
     if split not in ("side-by-side", "wipe"):
         raise PointSplatError(f"split is {split!r}; expected side-by-side or wipe")
-    shot = Shot(width, height, fps, seconds)
+    settings = FilmSettings(width, height, fps, seconds)
     upward = None if up is None else axis_named(up)
     kind = check_output(output, force)
     sources = [scene] if other is None else [scene, other]
     given = views_for(scene, views).resized(LONGEST_SIDE) if isinstance(views, (str, Path)) else views
     loaded = [source if isinstance(source, Gaussians) else load(source) for source in sources]
     if given is not None and isinstance(views, (str, Path)):
-        need_seen(loaded[0], given, views)
+        check_views_show(loaded[0], given, views)
     way: str | Path = path if not isinstance(path, Views) else "dataset"
     if given is not None and kind == "frames" and seconds is None and way in ("auto", "dataset"):
-        shot = replace(shot, seconds=max(1, len(given)) / (fps or FPS))
-    looked_from = _source(scene, loaded[0], path if isinstance(path, Views) else given)
-    chosen = camera_path(loaded[0], looked_from, way, shot, kind == "picture", upward)
+        settings = replace(settings, seconds=max(1, len(given)) / (fps or FPS))
+    view_source = _source(scene, loaded[0], path if isinstance(path, Views) else given)
+    chosen = camera_path(loaded[0], view_source, way, settings, kind == "picture", upward)
     modes = [_mode(source, chosen.views.rasterize_mode) for source in sources]
     if labels is None:
         labels = [f"{_name(s, i)}, {len(g):,} Gaussians" for i, (s, g) in enumerate(zip(sources, loaded, strict=True))]
-    cast = Cast(
+    film = FilmScenes(
         loaded[0], loaded[1] if other is not None else None, (modes[0], modes[-1]), split, labels if other else ()
     )
     logger.info("%d frames of %d x %d: %s", len(chosen.views), chosen.views.width, chosen.views.height, chosen.origin)
-    frames = tracked(frames_of(cast, chosen.views, chosen.fps), "rendering", len(chosen.views), progress)
+    frames = tracked(render_frames(film, chosen.views, chosen.fps), "rendering", len(chosen.views), progress)
     return write_frames(frames, output, chosen.fps, force)
 
 
@@ -121,26 +121,27 @@ def open_viewer(
     host: str = "127.0.0.1",
     port: int = 7007,
 ) -> Viewer:
-    """Show a scene, or two from the same camera, in the browser. Everything is drawn by this machine's processor; no
-    GPU is needed.
+    """Show a scene, or two scenes with the same camera, in the browser. This machine's processor draws; no GPU is
+    needed.
 
     It opens upright: at the first of the dataset's poses if there are any, else at a sampled view.
 
     Args:
-        scene: N Gaussians, or where to read them.
-        other: a second scene in the same place, to compare with; by default the first is compared with all of itself.
+        scene: N Gaussians, or the path of a scene.
+        other: a second scene in the same frame, to compare with; by default the first is compared with all of itself.
         up: the axis that is up in the scene ("z", "-y"); by default it is estimated.
-        host: the address to listen on; by default only this machine is answered. Whoever reaches another one may look.
-        port: the first port that is tried; 0 takes any that is free.
+        host: the address to listen on; by default only this machine has access. With another address, every machine
+            that reaches it has access.
+        port: the first port to try; 0 takes any free port.
 
     Returns:
-        The viewer, to be closed, or used in a ``with`` block; ``url`` says where it is.
+        The viewer, to be closed, or used in a ``with`` block; ``url`` is its address.
 
     Raises:
         SceneError: if a scene is not usable.
-        DataError: if there is no place to look from.
+        DataError: if there are no views.
         MissingPackageError: if viser is not installed.
-        PointSplatError: if the port cannot be listened on.
+        PointSplatError: if no port is free.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -149,15 +150,15 @@ def open_viewer(
         True
     """
     need("viser", "the viewer in the browser")
-    from pointsplat_ns.viewing.viewer import Exhibit, Viewer
+    from pointsplat_ns.viewing.viewer import ViewedScene, Viewer
 
-    upward, exhibits = None if up is None else axis_named(up), []
+    upward, scenes = None if up is None else axis_named(up), []
     for index, source in enumerate([scene] if other is None else [scene, other]):
         loaded = source if isinstance(source, Gaussians) else load(source)
         path = None if isinstance(source, Gaussians) else Path(source)
         views, mode = _source(source, loaded, None), _mode(source, "classic")
-        exhibits.append(Exhibit(_name(source, index), path, loaded, views, mode))
-    return Viewer(exhibits, host, port, upward)
+        scenes.append(ViewedScene(_name(source, index), path, loaded, views, mode))
+    return Viewer(scenes, host, port, upward)
 
 
 def _source(scene: Source, loaded: Gaussians, given: Views | None) -> ViewSource:
@@ -167,7 +168,7 @@ def _source(scene: Source, loaded: Gaussians, given: Views | None) -> ViewSource
 
 
 def _mode(scene: Source, usual: RasterizeMode) -> RasterizeMode:
-    """How a scene was trained to be drawn; ``usual`` if it does not say."""
+    """The rasterize mode of a scene's training; ``usual`` if it is not known."""
     if isinstance(scene, Gaussians) or not may_be_run(scene):
         return usual
     try:
@@ -177,7 +178,7 @@ def _mode(scene: Source, usual: RasterizeMode) -> RasterizeMode:
 
 
 def _name(scene: Source, index: int) -> str:
-    """What a scene is called: by its run's experiment, or its file."""
+    """The name of a scene: its run's experiment, or its file."""
     if isinstance(scene, Gaussians):
         return ("first", "second")[index]
     if may_be_run(scene):

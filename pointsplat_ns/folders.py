@@ -1,4 +1,4 @@
-"""What is done to every scene of a folder."""
+"""The public function for all scenes of a folder."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pointsplat_ns.compression.compact import compact_scene
 from pointsplat_ns.compression.requests import CompactRequest, Effort, RepairBudget
-from pointsplat_ns.compression.scene_folder import WHOLE, Command, Shard, output_folder, settle_folder
-from pointsplat_ns.compression.scene_task import Made, Options, SceneResult
+from pointsplat_ns.compression.scene_folder import WHOLE, Command, Shard, output_folder, run_on_folder
+from pointsplat_ns.compression.scene_task import Options, SceneResult, SmallerScene
 from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
@@ -45,41 +45,40 @@ def compact_folder(
     force: bool = False,
     progress: bool | Progress = False,
 ) -> list[SceneResult]:
-    """Make every scene of a folder smaller, as :func:`compact` does, and write the results to another folder.
+    """Compact every scene of a folder by :func:`compact`, and write the results to another folder.
 
-    A result that is there, unchanged, and of the same scene and options, is left alone: called again, this goes on with
-    what is not finished. Several calls may work on the same folders at once; each scene is claimed by one of them.
-    Under ``torchrun`` each process takes its part, waits for the others, and gives the results of all.
+    Unchanged results of the same scene and options are kept, so another call continues an interrupted one. Several
+    calls may work on the same folders at the same time; one of them claims each scene. Under ``torchrun`` each process
+    works on a part, waits for the others, and returns the results of all.
 
     Args:
         folder: scenes are the files with Gaussians below it, and the newest Splatfacto run of each experiment.
         output: folder for ``NAME.ply`` and its record ``NAME.ply.json`` of each scene, and the table ``scenes.csv``;
             by default beside ``folder``: ``scenes_compact`` for ``scenes``.
         keep: as for :func:`compact`.
-        refiner: what :func:`load_refiner` takes, or "shipped"; None for no refiner.
+        refiner: as for :func:`load_refiner`, or "shipped"; None for no refiner.
         by: as for :func:`compact`.
         sh: as for :func:`compact`.
         clean: as for :func:`compact`.
         effort: as for :func:`compact`.
-        seconds: of repairing each scene, as for :func:`compact`.
-        target_db: what each scene has to reach, as for :func:`compact`.
+        seconds: duration of the repair of each scene, as for :func:`compact`.
+        target_db: PSNR that each scene has to reach, as for :func:`compact`.
         target_ms: as for :func:`compact`.
         target_mb: as for :func:`compact`; of PLY files.
         resolution: as for :func:`prune`.
-        jobs: number of processes. More than one share the cores; a program that asks for them must be a file, with what
-            it does under ``if __name__ == "__main__":``, as for any Python program that starts processes.
+        jobs: number of processes, which share the cores. With more than one, the program must be a file whose main code
+            is under ``if __name__ == "__main__":``, as for any Python program that starts processes.
         shard: only a part of the scenes: "2/5" is the second of five.
-        force: overwrite files that this function did not write, that were changed since, or that it wrote with other
-            options.
-        progress: True shows a bar; a function is called with what is being done and the share done of it.
+        force: overwrite files of other origin, changed files, and results with other options.
+        progress: True shows a bar; a function is called with the name of the current task and its share done.
 
     Returns:
-        What became of each scene of the shard, sorted by name. A scene that fails does not stop the others; its status
-        is "failed".
+        The result of each scene of the shard, sorted by name. A failing scene does not stop the others; its status is
+        "failed".
 
     Raises:
-        BudgetError, PointSplatError: if the options fit no scene.
-        DataError: if there is no such shard, or no job.
+        BudgetError, PointSplatError: if an option is not valid.
+        DataError: if the shard or the number of jobs is not valid.
         SceneError: if there is no scene, or the output folder holds other results.
 
     Example:
@@ -118,7 +117,7 @@ def compact_folder(
     else:
         make = functools.partial(_compacted, refiner, device, replace(request, refiner=None), size)
     with progress_bar(progress if rank == 0 else False) as report:
-        results = settle_folder(
+        results = run_on_folder(
             folder, target, Command("compact", make, options), jobs, part.within(rank, world_size), force, report
         )
     return sorted(gathered(results), key=lambda result: result.name)
@@ -133,14 +132,14 @@ def _compacted(
     request: CompactRequest,
     resolution: tuple[int, int] | None,
     path: Path,
-) -> Made:
-    """One scene of a folder, made smaller. The request comes without its refiner, as other processes load their own."""
+) -> SmallerScene:
+    """Compact one scene of a folder. The request has no refiner, because each process loads its own."""
     dense = read_scene(path)
     source = ViewSource(dense, run=path, dataset_views=dataset_views, resolution=resolution)
     result = compact_scene(dense, replace(request, refiner=_refiner_on(refiner, device)), source)
     if result.repaired is not None and result.repaired.interrupted:
-        raise KeyboardInterrupt  # which is meant for all scenes, not for the repair of this one
-    return Made(result.scene, len(dense), result.psnr)
+        raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the repair of one scene
+    return SmallerScene(result.scene, len(dense), result.psnr)
 
 
 def _found(
@@ -151,11 +150,11 @@ def _found(
     repairs: tuple[Repair, ...],
     resolution: tuple[int, int] | None,
     path: Path,
-) -> Made:
-    """The cheapest of a scene of a folder that meets targets."""
+) -> SmallerScene:
+    """Find the cheapest version of one scene of a folder that meets targets."""
     dense = read_scene(path)
     subject = subject_of(dense, path, refiner=_refiner_on(refiner, device), resolution=resolution)
     result = find_scene(subject, targets, by, repairs, silent)
     if result.interrupted:
-        raise KeyboardInterrupt  # which is meant for all scenes, not for the search of this one
-    return Made(result.scene, len(dense), result.psnr)
+        raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the search of one scene
+    return SmallerScene(result.scene, len(dense), result.psnr)

@@ -1,8 +1,7 @@
 """The one container of a 3D Gaussian scene.
 
-Parameters are stored as Splatfacto and the 3DGS PLY store them (natural-log scales, opacity
-logits, unnormalised wxyz quaternions, SH coefficients), so that nothing is lost on the way in or
-out. Activated values are properties, computed when asked for.
+Parameters are stored as in Splatfacto and the 3DGS PLY (natural-log scales, opacity logits, unnormalised wxyz
+quaternions, SH coefficients), so that reading and writing lose nothing. Activated values are computed properties.
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ MAX_SH_DEGREE = 3
 
 
 def sh_degree_of(num_rest: int) -> int:
-    """SH degree of a scene with ``num_rest`` coefficients beyond the constant one.
+    """SH degree of a scene with ``num_rest`` coefficients of degree 1 and higher for each colour channel.
 
     Raises:
-        SceneError: if no degree from 0 to 3 has that many.
+        SceneError: if no degree from 0 to 3 has this number.
     """
     for degree in range(MAX_SH_DEGREE + 1):
         if (degree + 1) ** 2 - 1 == num_rest:
@@ -51,7 +50,8 @@ class Gaussians:
         features_rest: (N, (d+1)^2 - 1, 3) the other coefficients of SH degree d, from 0 to 3.
 
     Raises:
-        SceneError: if a shape, device or dtype does not fit the others, or no SH degree has so many coefficients.
+        SceneError: if a shape, device or dtype does not fit the others, or no SH degree has this number of
+            coefficients.
 
     Example:
         Two Gaussians: a grey ball of standard deviation 0.1, nearly opaque, and a red disc beside it.
@@ -102,7 +102,7 @@ class Gaussians:
 
     @classmethod
     def empty(cls, sh_degree: int = 0, **kwargs: Any) -> Gaussians:
-        """A scene of no Gaussians; ``kwargs`` (dtype, device) go to ``torch.empty``."""
+        """A scene without Gaussians; ``kwargs`` (dtype, device) go to ``torch.empty``."""
         rest = (sh_degree + 1) ** 2 - 1
         shapes = ((0, 3), (0, 3), (0, 4), (0, 1), (0, 3), (0, rest, 3))
         return cls(*(torch.empty(shape, **kwargs) for shape in shapes))
@@ -150,7 +150,7 @@ class Gaussians:
 
     @property
     def device(self) -> torch.device:
-        """Where all parameters are."""
+        """Device of all parameters."""
         return self.means.device
 
     @property
@@ -184,8 +184,8 @@ class Gaussians:
         return 4e-6 * sum(value.numel() for value in self.tensors())
 
     def usable(self) -> Tensor:
-        """Mask (N,) of Gaussians that can be drawn: nothing is NaN and nothing is infinite, but for
-        opacity logits (+-Inf are opacity 1 and 0) and log-scales of -Inf (a flat axis)."""
+        """Mask (N,) of drawable Gaussians: no value is NaN or infinite, except opacity logits (+-Inf are opacity 1 and
+        0) and log-scales of -Inf (a flat axis)."""
         ok = torch.ones(len(self), dtype=torch.bool, device=self.device)
         for name, value in self.items():
             flat = value.reshape(len(self), -1) if len(self) else value.reshape(0, 1)
@@ -194,7 +194,7 @@ class Gaussians:
             elif name == "scales":
                 bad = flat.isnan() | (flat == torch.inf)
             elif bool(flat.sum().isfinite()):
-                continue  # a finite sum has only finite terms; thirty times faster than looking at each
+                continue  # a finite sum has only finite terms; thirty times faster than a test of each
             else:
                 bad = ~flat.isfinite()
             ok &= ~bad.any(dim=1)

@@ -1,4 +1,4 @@
-"""Pinhole cameras to look at a scene from."""
+"""Pinhole cameras."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 
 RasterizeMode = Literal["classic", "antialiased"]
-"""How a scene was trained to be drawn (nerfstudio's ``rasterize_mode``)."""
-
+"""The rasterize mode of a scene's training (nerfstudio's ``rasterize_mode``)."""
 
 NEAR_PLANE = 0.01
 """Near plane of gsplat, scene units."""
@@ -21,17 +20,17 @@ NEAR_PLANE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One pinhole camera, and how a scene is drawn from it. An element of :class:`Views`.
+    """One pinhole camera and its rendering settings. An element of :class:`Views`.
 
     Attributes:
         viewmat: (4, 4), takes world to camera coordinates, OpenCV axes (x right, y down, z forward); a rigid motion
             in scene units.
         K: (3, 3) intrinsics in pixels, the first pixel's centre at (0.5, 0.5).
-        width: of the image, pixels.
-        height: of the image, pixels.
+        width: width of the image, pixels.
+        height: height of the image, pixels.
         background: (3,) colour behind the scene, RGB in [0, 1].
-        rasterize_mode: how the scene was trained to be drawn.
-        near_plane: depth below which nothing is drawn, scene units; gsplat's by default.
+        rasterize_mode: "classic" or "antialiased", as in the scene's training.
+        near_plane: least depth of drawn Gaussians, scene units; gsplat's by default.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -51,7 +50,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """C pinhole cameras of one image size, and how a scene is drawn from them.
+    """C pinhole cameras of one image size and their rendering settings.
 
     ``views[0]`` and iteration give a :class:`View`; slices, lists of indices, index tensors and boolean masks give
     :class:`Views`.
@@ -60,11 +59,11 @@ class Views:
         viewmats: (C, 4, 4), take world to camera coordinates, OpenCV axes (x right, y down, z forward); rigid motions
             in scene units.
         Ks: (C, 3, 3) intrinsics in pixels, the first pixel's centre at (0.5, 0.5).
-        width: of every image, pixels.
-        height: of every image, pixels.
+        width: width of every image, pixels.
+        height: height of every image, pixels.
         background: (3,) colour behind the scene, RGB in [0, 1].
-        rasterize_mode: how the scene was trained to be drawn.
-        near_plane: depth below which nothing is drawn, scene units; gsplat's by default.
+        rasterize_mode: "classic" or "antialiased", as in the scene's training.
+        near_plane: least depth of drawn Gaussians, scene units; gsplat's by default.
 
     Raises:
         DataError: if a shape does not fit the others, or the image has no pixel.
@@ -117,13 +116,13 @@ class Views:
         return (self[index] for index in range(len(self)))
 
     def spread(self, count: int) -> Views:
-        """At most ``count`` of the views, evenly spread over their order, the first and the last among them."""
+        """At most ``count`` of the views, evenly spread over their order, with the first and the last."""
         if count >= len(self):
             return self
         return self[spread_indices(len(self), count)]
 
     def resized(self, max_side: int) -> Views:
-        """The same views with the longer side of the image at most ``max_side`` pixels; never more pixels than now."""
+        """The same views with the longer side of the image at most ``max_side`` pixels; images are never enlarged."""
         factor = max_side / max(self.width, self.height)
         if factor >= 1:
             return self
@@ -133,7 +132,7 @@ class Views:
 
 
 def spread_indices(length: int, count: int) -> list[int]:
-    """At most ``count`` indices below ``length``, evenly spread, the first and the last among them."""
+    """At most ``count`` indices below ``length``, evenly spread, with the first and the last."""
     if count >= length:
         return list(range(length))
     return torch.linspace(0, length - 1, count).round().long().tolist()

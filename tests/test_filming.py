@@ -15,7 +15,7 @@ import pointsplat_ns as ps
 from making import ball, decoded, run_of
 from pointsplat_ns.cli import main
 from pointsplat_ns.geometry.cameras import viewmats_to_opengl
-from pointsplat_ns.viewing.split_screen import pixels_of
+from pointsplat_ns.viewing.split_screen import to_uint8
 from posing import inria, written
 
 SMALL = {"width": 64, "height": 48, "fps": 10}
@@ -53,7 +53,7 @@ def test_film_through_given_views_shows_each_of_them(scene, tmp_path):
     ps.render_path(scene, tmp_path / "frames", path=views, fps=10, seconds=0.7)
     frames = frames_in(tmp_path / "frames")
     for view in views:
-        shown = pixels_of(ps.render(scene, view)).astype(int)
+        shown = to_uint8(ps.render(scene, view)).astype(int)
         assert min(np.abs(frame - shown).max() for frame in frames) <= 1
 
 
@@ -64,7 +64,7 @@ def test_film_of_a_run_goes_exactly_through_its_photos(trained_walls, tmp_path, 
     views, frames = ps.dataset_views(run), frames_in(tmp_path / "frames")
     assert count == len(frames) == 20 and "along the poses of the dataset" in caplog.text
     for view in views:  # antialiased, over white
-        shown = pixels_of(ps.render(ps.load(run), view)).astype(int)
+        shown = to_uint8(ps.render(ps.load(run), view)).astype(int)
         assert min(np.abs(frame - shown).max() for frame in frames) <= 1
 
 
@@ -87,7 +87,7 @@ def test_saved_path_gives_size_speed_and_cameras(scene, tmp_path):
     (tmp_path / "path.json").write_text(json.dumps(saved))
     assert ps.render_path(scene, tmp_path / "frames", path=tmp_path / "path.json") == 2
     for frame, view in zip(frames_in(tmp_path / "frames"), views, strict=True):
-        assert np.abs(frame - pixels_of(ps.render(scene, view)).astype(int)).max() <= 1
+        assert np.abs(frame - to_uint8(ps.render(scene, view)).astype(int)).max() <= 1
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_picture_is_the_first_frame(scene, tmp_path):
     ps.render_path(scene, tmp_path / "one.png", **SMALL)
     shown = np.asarray(Image.open(tmp_path / "one.png"))
     best = ps.sample_views(scene, 12, 64, 48)[0]
-    assert np.abs(shown - pixels_of(ps.render(scene, best)).astype(int)).max() <= 2
+    assert np.abs(shown - to_uint8(ps.render(scene, best)).astype(int)).max() <= 2
 
 
 def test_up_may_be_said(scene, tmp_path):
@@ -154,7 +154,7 @@ def test_viewer_begins_with_the_poses_of_a_run(trained_walls):
     with ps.open_viewer(run, port=0) as viewer:
         assert viewer.origin == "poses of the dataset"
         assert torch.equal(viewer._starts[0].viewmat, ps.dataset_views(run)[0].viewmat)
-        assert viewer._exhibits[0].mode == "antialiased" and viewer._exhibits[0].name == "wall-b"
+        assert viewer._scenes[0].mode == "antialiased" and viewer._scenes[0].name == "wall-b"
 
 
 def test_address_that_cannot_be_listened_on_ends_the_command_in_one_line(files, capsys):
@@ -188,7 +188,7 @@ def test_a_folder_gets_a_frame_for_each_pose_of_a_file(scene, files, tmp_path):
     assert len(frames) == 4
     for view, frame in zip(views, frames, strict=True):
         assert (
-            np.abs(frame - pixels_of(ps.render(scene, view)).astype(int)).mean() < 1
+            np.abs(frame - to_uint8(ps.render(scene, view)).astype(int)).mean() < 1
         )  # poses are written with few digits
     given = ps.render_path(scene, tmp_path / "two", views=views, path="walk", seconds=0.2, **SMALL)
     assert given == len(frames_in(tmp_path / "two")) == 2

@@ -15,9 +15,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-ABOUT = "Makes trained 3D Gaussian Splatting scenes smaller, and looks at them. `--version` prints the version."
-
-
 COMMANDS = (
     *(
         "prune",
@@ -35,7 +32,7 @@ COMMANDS = (
     ),
     *("make-refiner", "make-feedback", "demo"),
 )
-"""The commands. Each is a function of the module of its name, which is only imported when it runs."""
+"""The commands. Each is a function in a module of the same name, which is imported when the command runs."""
 
 
 class _PrintHandler(logging.Handler):
@@ -67,10 +64,10 @@ def _end(number: int, frame: Any) -> None:
 
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """Let a lost terminal (SIGHUP) and a request to end (SIGTERM) unwind the program; by default they kill it."""
+    """Let a lost terminal (SIGHUP) and a termination request (SIGTERM) unwind the program instead of killing it."""
     names = [name for name in ("SIGHUP", "SIGTERM") if hasattr(signal, name)]  # Windows has no SIGHUP
     numbers = [getattr(signal, name) for name in names]
-    if threading.current_thread() is not threading.main_thread():  # no other may set handlers
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may set handlers
         numbers = []
     before = {n: signal.signal(n, _end) for n in numbers if signal.getsignal(n) is signal.SIG_DFL}
     try:
@@ -94,7 +91,7 @@ def _what_failed(error: Exception) -> str:
 
 
 def _is_lack_of_memory(error: RuntimeError) -> bool:
-    """Whether torch could not allocate a tensor. On a CPU it has no type of its own for that."""
+    """Whether torch could not allocate a tensor. On a CPU this has no exception type of its own."""
     import torch
 
     return isinstance(error, torch.cuda.OutOfMemoryError) or "can't allocate memory" in str(error)
@@ -107,7 +104,7 @@ def _command(name: str) -> Callable[..., None]:
 
 
 def _all(args: list[str]) -> dict[str, Callable[..., None]]:
-    """All commands, for help on the program, for completion in shells, and where no command is named."""
+    """All commands, for the program's help, shell completion, and calls without a command."""
     commands = {name: _command(name) for name in COMMANDS}
     if args in (["-h"], ["--help"]):
         return _redescribed(commands, _first_sentence)
@@ -122,7 +119,7 @@ def _redescribed(
     """The same commands with other docstrings."""
 
     def with_text(command: Any) -> Callable[..., None]:
-        # A copy, as tyro looks into what a wrapper wraps.
+        # A copy, because tyro unwraps wrappers.
         same = types.FunctionType(command.__code__, command.__globals__, command.__name__, command.__defaults__)
         same.__annotations__, same.__kwdefaults__ = command.__annotations__, command.__kwdefaults__
         same.__doc__ = describe(inspect.getdoc(command) or "")
@@ -132,21 +129,20 @@ def _redescribed(
 
 
 def _first_sentence(text: str) -> str:
-    """What the list of commands says of each."""
+    """The first sentence, for the list of commands."""
     return re.split(r"(?<=\.)\s", text, maxsplit=1)[0]
 
 
 def _options_in_lines(text: str) -> str:
-    """A docstring with each option on a line of its own: the completion that tyro 1.0 writes for bash takes further
-    lines for further words."""
+    """A docstring with each option on one line: bash completion of tyro 1.0 takes further lines for further words."""
     return re.sub(r"\n {8,}", " ", text)
 
 
 def main(args: list[str] | None = None) -> None:
     """Run one subcommand.
 
-    Input that cannot be used, files that cannot be read or written, and a lack of memory end it with one line and exit
-    status 1, and so does a package that is missing; Ctrl-C ends it with 130, another signal with 128 plus its number
+    Unusable input, files that cannot be read or written, a lack of memory and a missing package end it with one line
+    and exit status 1; Ctrl-C ends it with 130, another signal with 128 plus its number
     (:data:`pointsplat_ns.cli.help.STATUSES`). With ``--json``, standard output has one JSON value and nothing else.
     """
     import tyro
@@ -166,7 +162,9 @@ def main(args: list[str] | None = None) -> None:
             elif args and args[0] in COMMANDS:
                 tyro.cli(_command(args[0]), prog=f"pointsplat {args[0]}", args=args[1:])
             else:
-                tyro.extras.subcommand_cli_from_dict(_all(args), prog="pointsplat", description=ABOUT, args=args)
+                about = "Makes trained 3D Gaussian Splatting scenes smaller, and looks at them."
+                about += " `--version` prints the version."
+                tyro.extras.subcommand_cli_from_dict(_all(args), prog="pointsplat", description=about, args=args)
             sys.stdout.flush()  # so that a full disk or a closed pipe is noticed here
     except PointSplatError as error:
         print(f"error: {error}", file=sys.stderr)

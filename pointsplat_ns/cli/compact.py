@@ -71,13 +71,13 @@ def compact(
             room.ply, compact.ply in the folder of a run. For a folder of scenes, another folder; by default
             rooms_compact beside rooms.
         keep: size of the result, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before repairs. By
-            default the setting that the refiner was trained with; without one 0.1.
+            default the budget of the refiner's training; without a refiner 0.1.
         refiner: a trained network that refines the scene before the steps: a pointsplat run (its folder or config.yml),
-            a .safetensors file, or shipped, the one that ships; by default none. --using is the same.
-        by: the method of prune; by default the one that the refiner was trained with; without one merge.
+            a .safetensors file, or shipped; by default none. --using is the same.
+        by: the method of prune; by default the method of the refiner's training; without a refiner merge.
         sh: SH bands to keep, as for prune: all, up to a degree, or auto.
         clean: as for prune: first remove Gaussians that cannot be drawn or seen.
-        effort: how long to repair then: not at all (instant), 48 steps (quick, about as long as merging takes), or 400.
+        effort: length of the repair: no steps (instant), 48 (quick, about as long as merging takes), or 400 (thorough).
         seconds: duration of the repair, in place of --effort. Ctrl-C ends it earlier and keeps the scene so far.
         target_db: search for the smallest file of at least this PSNR against renders of the dense scene. The search
             chooses count, SH degree and repair, in place of --keep and --sh.
@@ -93,11 +93,11 @@ def compact(
         html_limit: largest size of that file, MB. If both scenes take more, the dense one is left out.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
-        jobs: of a folder: number of processes that share its scenes and the cores; by default 1.
-        shard: of a folder: only a part of its scenes; 2/5 is the second of five. Under torchrun each process takes its
+        jobs: for a folder: number of processes that share its scenes and the cores; by default 1.
+        shard: for a folder: only a part of its scenes; 2/5 is the second of five. Under torchrun each process takes its
             part.
-        threads: how many to use, in each process. By default the number is chosen while the work goes on, and is lower
-            while other programs keep the machine busy. Another number may change results by rounding.
+        threads: number of threads of each process. By default it adapts to the work and to other programs. Another
+            number may change results by rounding.
         json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps

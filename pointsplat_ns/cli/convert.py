@@ -32,12 +32,12 @@ def convert(
         output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog, meta.json (a SOG as a
             folder), .splat or .glb.
         sh: SH bands to keep: all, or up to a degree.
-        up: the axis that shall point up: x, y, z, -x, -y or -z. What is up in the scene is estimated; -y:z says that it
-            is -y. Write --up=-y for a negative axis.
+        up: the new up axis: x, y, z, -x, -y or -z. The old up direction is estimated; -y:z names it as -y. Write
+            --up=-y for a negative axis.
         scale: factor on positions and sizes.
-        original_frame: of a Splatfacto run: undo the turn, shift and scale that nerfstudio gave its data.
-        spz_version: of an .spz file. 4 is newer, and fewer viewers read it.
-        spz_sh_bits: of an .spz file: bits of SH coefficients, of degree 1 and of the others, up to 8. More bits are a
+        original_frame: for a Splatfacto run: undo nerfstudio's rotation, shift and scale of its data.
+        spz_version: version of an .spz file. 4 is newer, and fewer viewers read it.
+        spz_sh_bits: bits of SH coefficients in an .spz file, for degree 1 and for the others, up to 8. More bits give a
             larger file and a better picture.
         force: overwrite an existing file.
         json_output: print the result as JSON, and nothing else on standard output.

@@ -1,4 +1,4 @@
-"""``pointsplat demo``: compacts the scene that ships, then trains scenes and a refiner on synthetic rooms."""
+"""``pointsplat demo``: compacts the shipped scene, then trains scenes and a refiner on synthetic rooms."""
 
 from __future__ import annotations
 
@@ -7,22 +7,16 @@ import shutil
 import time
 from pathlib import Path
 
-UNSEEN = "room2"
-"""The room that the refiner is not trained on."""
+HELD_OUT = "room2"
+"""The room without a part in the refiner's training."""
 
 TIMESTAMP = "demo"
-"""Folder name of the runs, the same in each call, so that finished ones are found again."""
+"""Folder name of the runs, constant so that finished runs are found again."""
 
-ROOMS = ("room0", "room1", UNSEEN)
+ROOMS = ("room0", "room1", HELD_OUT)
 
-FOLDERS = ("rooms", "scenes", "refiner", "pictures")
-"""What the demo makes in its folder, besides files."""
-
-INSTEAD = "start over with --force, or name another --output"
-"""Advice where a training of another number of steps has finished."""
-
-TRAINING_MINUTES = 15
-"""Duration of training on two cores, minutes."""
+ADVICE = "start over with --force, or name another --output"
+"""Advice if a training with another number of steps is finished."""
 
 
 def demo(
@@ -54,17 +48,17 @@ def demo(
     from pointsplat_ns.nerfstudio_plugin.running import finished
     from pointsplat_ns.system.packages import need
 
-    for folder in FOLDERS if force else ():
+    for folder in ("rooms", "scenes", "refiner", "pictures") if force else ():
         if (output / folder).exists():
             shutil.rmtree(output / folder)
     scenes, refiner = training_folders(output)
     for training, steps in [*((scene, scene_steps) for scene in scenes.values()), (refiner, refiner_steps)]:
-        finished(training, steps, INSTEAD)  # another number of steps is refused before anything is made
+        finished(training, steps, ADVICE)  # refuses another number of steps before the work
     compact_example(output, keep)
     need("nerfstudio", "the rest of the demo, which trains,")
     print(
-        f"\nThat is a usable result. The demo now goes on to train scenes and a refiner of its own, for about "
-        f"{TRAINING_MINUTES} minutes on two cores.\nIt may be stopped at any time with Ctrl-C; started again, it does "
+        "\nThat is a usable result. The demo now goes on to train scenes and a refiner of its own, for about "
+        "15 minutes on two cores.\nIt may be stopped at any time with Ctrl-C; started again, it does "
         "not repeat what it has finished.",
         flush=True,
     )
@@ -72,7 +66,7 @@ def demo(
 
 
 def training_folders(output: Path) -> tuple[dict[str, Path], Path]:
-    """Folders of the trained scenes by the names of their rooms, and that of the trained refiner."""
+    """Folders of the trained scenes by room, and the folder of the trained refiner."""
     from pointsplat_ns.io.runs import REFINER_METHOD
     from pointsplat_ns.nerfstudio_plugin.commands import SCENE_METHOD, run_folder
 
@@ -81,7 +75,7 @@ def training_folders(output: Path) -> tuple[dict[str, Path], Path]:
 
 
 def compact_example(output: Path, keep: float) -> None:
-    """Compact the scene that ships, and draw it before and after.
+    """Compact the shipped scene, and draw it before and after.
 
     Args:
         output: folder for the scene, the smaller one and the image.
@@ -103,7 +97,8 @@ def compact_example(output: Path, keep: float) -> None:
 def train_and_judge(
     output: Path, keep: float, scene_steps: int, refiner_steps: int, photos: tuple[int, int, int]
 ) -> None:
-    """Train a scene of each of three rooms and a refiner on two of them; evaluate it on the third, and export that one.
+    """Train a scene of each of three rooms and a refiner on two of them; evaluate it on the third, and export the
+    third.
 
     Args:
         output: folder for all results.
@@ -125,24 +120,24 @@ def train_and_judge(
         if not (rooms / name).is_dir():
             print(write_room(rooms / name, int(name[4:]), *photos))
     for name, scene_run in scene_runs.items():
-        if not finished(scene_run, scene_steps, INSTEAD):
+        if not finished(scene_run, scene_steps, ADVICE):
             remove_interrupted(scene_run)
             run(train_scene_command(rooms / name, scenes, name, scene_steps, TIMESTAMP, seed_points=20_000))
-    if not finished(trained, refiner_steps, INSTEAD):
+    if not finished(trained, refiner_steps, ADVICE):
         remove_interrupted(trained)
         options = {"pipeline.model.keep": keep, "pipeline.model.size": "tiny"}
-        run(train_refiner_command(scenes, refiners, "rooms", refiner_steps, TIMESTAMP, (UNSEEN,), options))
+        run(train_refiner_command(scenes, refiners, "rooms", refiner_steps, TIMESTAMP, (HELD_OUT,), options))
     evaluation, pictures = output / "evaluation.json", output / "pictures"
     run(evaluate_command(trained, evaluation, pictures))
-    refined, small = output / f"{UNSEEN}_refined.ply", output / f"{UNSEEN}_compact.ply"
+    refined, small = output / f"{HELD_OUT}_refined.ply", output / f"{HELD_OUT}_compact.ply"
     run(shlex.join(["pointsplat", "export", str(trained), "-o", str(refined), "--force"]))
-    dense, views = scene_runs[UNSEEN], output / "compact.png"
+    dense, views = scene_runs[HELD_OUT], output / "compact.png"
     words = ["pointsplat", "compact", str(dense), "--keep", f"{keep:g}", "-o", str(small), "--picture", str(views)]
     run(shlex.join([*words, "--force"]))
 
     results = read_evaluation(evaluation)
     picture = output / "before_after.png"
-    before_after(sorted(pictures.glob(f"{UNSEEN}_*.png")), results["scenes"][UNSEEN], picture)
+    before_after(sorted(pictures.glob(f"{HELD_OUT}_*.png")), results["scenes"][HELD_OUT], picture)
     show_report(results)
     config = shlex.quote(str(trained / "config.yml"))
     print(f"{refined}: open it in any 3DGS viewer, or run ns-viewer --load-config {config}")
@@ -171,6 +166,6 @@ def before_after(views: list[Path], scene: dict, path: Path, rows: int = 3) -> N
         values = scene[variant]
         size = f"{values['gaussians']:,} Gaussians, {values['megabytes']:.1f} MB"
         titles.append(f"{variant}: {size}, {values['psnr']:.1f} dB")
-    shown = views[:: max(1, len(views) // rows)][:rows]
-    images: list[list[ArrayLike]] = [[*array_split(imread(view), len(titles), axis=1)] for view in shown]
+    chosen = views[:: max(1, len(views) // rows)][:rows]
+    images: list[list[ArrayLike]] = [[*array_split(imread(view), len(titles), axis=1)] for view in chosen]
     side_by_side(images, titles, path)

@@ -24,7 +24,7 @@ def export(
     Args:
         run: the run's folder, config.yml or checkpoint.
         output: the file to write, of any format as for prune.
-        scene: which scene of a pointsplat run; by default the first that it was not trained on, or the first.
+        scene: name of a scene of a pointsplat run; by default the first held-out one, or else the first.
         force: overwrite an existing file.
         json_output: print the result as JSON, and nothing else on standard output.
     """

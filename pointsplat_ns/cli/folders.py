@@ -27,7 +27,7 @@ def compact_folder(
     Args:
         folder: the folder.
         output: the folder for results.
-        poses, picture, html, dry_run: what is refused here.
+        poses, picture, html, dry_run: options that folders do not support.
         json_output: print JSON in place of a table.
         options: further ones of :func:`pointsplat_ns.compact_folder`.
 

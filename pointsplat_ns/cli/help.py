@@ -1,4 +1,4 @@
-"""What ``--help`` says beyond the options: examples of every command, and what exit statuses mean."""
+"""Text of ``--help`` after the options: examples of every command, and meanings of exit statuses."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     ),
     "demo": (("in a folder of its own", "pointsplat demo --output outputs/try --keep 0.2"),),
 }
-"""Command lines of every command, with what each is for."""
+"""Command lines of every command, with the purpose of each."""
 
 STATUSES = {
     0: "done",
@@ -72,9 +72,7 @@ STATUSES = {
     130: "Ctrl-C (SIGINT)",
     143: "asked to end (SIGTERM)",
 }
-"""What exit statuses mean."""
-
-_COMPLETION = "Completion of commands and options in your shell: docs/command_line.md."
+"""Meanings of exit statuses."""
 
 
 def after_help(args: list[str]) -> str:
@@ -92,4 +90,6 @@ def after_help(args: list[str]) -> str:
         lines = [line for what, command in EXAMPLES[args[0]] for line in (f"  # {what}", f"  {command}")]
         return "\n".join(["examples:", *lines])
     table = [f"  {status:<5}{meaning}" for status, meaning in STATUSES.items()]
-    return "\n".join(["exit status:", *table, "", "`pointsplat COMMAND --help` has examples.", _COMPLETION])
+    examples = "`pointsplat COMMAND --help` has examples."
+    completion = "Completion of commands and options in your shell: docs/command_line.md."
+    return "\n".join(["exit status:", *table, "", examples, completion])

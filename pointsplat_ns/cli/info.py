@@ -1,4 +1,4 @@
-"""``pointsplat info``: what is in a scene."""
+"""``pointsplat info``: figures of a scene."""
 
 from __future__ import annotations
 
@@ -10,9 +10,6 @@ from pointsplat_ns.cli.scene_options import Resolution, Scene, check_output
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_info import SceneInfo
-
-WIDTH = 40
-"""Characters of the longest bar."""
 
 
 def info(
@@ -26,8 +23,8 @@ def info(
 
     Args:
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
-        views: a .png file for a sheet of the views that other commands look at the scene from, if no poses are given.
-        resolution: size of these views, in pixels. By default that of the photos where there are any, else 1920x1080.
+        views: a .png file for a sheet of the views that other commands use without --poses.
+        resolution: size of these views, pixels. By default the size of the photos, if there are any, else 1920x1080.
         force: overwrite an existing file.
         json_output: print JSON, and nothing else on standard output.
     """
@@ -68,6 +65,7 @@ def _print(found: SceneInfo) -> None:
 
 def _bars(title: str, counts: dict[str, int]) -> None:
     print(f"{title}:")
+    width = 40  # characters of the longest bar
     most = max([*counts.values(), 1])
     for name, count in counts.items():
-        print(f"  {name:>6} {'#' * round(WIDTH * count / most):<{WIDTH}} {count:,}")
+        print(f"  {name:>6} {'#' * round(width * count / most):<{width}} {count:,}")

@@ -41,18 +41,17 @@ def lod(
 
     Args:
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
-        levels: how much each level keeps, in any order: ratios (0.3), percentages (30%), counts (50000) or sizes of the
+        levels: sizes of the levels, in any order: ratios (0.3), percentages (30%), counts (50000) or sizes of the
             file (12MB).
         output: the folder for the levels (level_0.ply is the finest), their parents, the manifest lod.json and the
             picture lod.png; by default beside the scene: room_lod for room.ply, lod in the folder of a run.
-        sh: SH bands of every level: all, up to a degree, or auto, those without which renders stay within 40 dB.
-        poses: a file of cameras to look from: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
-            COLMAP model.
-        resolution: size of the pictures that people look at, in pixels; what is decided by rendering is decided at this
-            size. By default that of the photos where there are any, else 1920x1080.
+        sh: SH bands of every level: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
+        poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model.
+        resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
+            default the size of the photos, if there are any, else 1920x1080.
         force: overwrite existing files.
-        threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
-            programs keep the machine busy. Another number may change results by rounding.
+        threads: number of threads. By default it adapts to the work and to other programs. Another number may
+            change results by rounding.
         json_output: print the manifest, and nothing else on standard output.
     """
     import pointsplat_ns as ps

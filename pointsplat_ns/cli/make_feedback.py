@@ -30,12 +30,12 @@ def make_feedback(
         output: file for the network.
         keep: budgets that the scenes are merged to: ratios (0.3), percentages (30%) or counts (50000).
         updates: number of updates of the network, at most.
-        seconds: end after this time, with fewer updates; the learning rate falls with the time then.
+        seconds: time limit; the learning rate then falls with the time.
         at_once: number of repairs in an update.
         seed: seed of the initial weights and of all choices.
-        start: go on from this network, with a third of the learning rate, instead of from one that does nothing yet.
-        threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
-            programs keep the machine busy. Another number may change results by rounding.
+        start: continue from this network with a third of the learning rate; by default from a network with plain Adam.
+        threads: number of threads. By default it adapts to the work and to other programs. Another number may
+            change results by rounding.
     """
     import functools
     import math
@@ -60,7 +60,7 @@ def make_feedback(
             if first:
                 print(f"{path}: {len(ready[-1].dense):,} Gaussians, {len(ready[-1].views)} views")
         with progress_bar(first) as show:
-            told = functools.partial(show, "training")
-            train_feedback(ready, updates, at_once, seed, output, told, seconds or math.inf, known)
+            report = functools.partial(show, "training")
+            train_feedback(ready, updates, at_once, seed, output, report, seconds or math.inf, known)
     if first:
         print(f"{output}: the network")

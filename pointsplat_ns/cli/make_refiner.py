@@ -37,5 +37,5 @@ def make_refiner(
     result = ps.make_refiner(output, weights, size, steps, rooms, workers, seed)
     show_report(result.results)
     print(f"{result.weights}: the refiner, {result.weights.stat().st_size / 1e6:.1f} MB")
-    print(f"{result.card}: what it was made of, and what it does")
+    print(f"{result.card}: its training and results")
     print(f"{result.pictures}: photo, dense, pruned and refined side by side")

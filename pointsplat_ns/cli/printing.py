@@ -1,4 +1,4 @@
-"""What commands print of their results: for people, or as JSON."""
+"""Prints results of commands, as text or as JSON."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _OUTPUT: ContextVar[IO[str] | None] = ContextVar("output", default=None)
 
 @contextmanager
 def only_json(args: list[str]) -> Iterator[None]:
-    """If arguments ask for JSON: while the context is open, nothing but :func:`print_json` writes to standard output.
-    All else that is printed, also by libraries, goes to standard error."""
+    """With ``--json`` in the arguments, only :func:`print_json` writes to standard output in this context. All other
+    output, also of libraries, goes to standard error."""
     if "--json" not in args:
         yield
         return
@@ -44,13 +44,13 @@ def print_json(content: Any) -> None:
 
 
 def scene_result(before: int | None, scene: Gaussians, seconds: float, where: Path | None) -> dict[str, Any]:
-    """What JSON says of a scene that was made.
+    """The JSON values of a result.
 
     Args:
-        before: Gaussians of the scene that it was made from; None if it was made from no other.
-        scene: the scene.
-        seconds: how long making it took.
-        where: the file that was written; None in a dry run, whose ``bytes`` are those of a PLY.
+        before: number of Gaussians in the dense scene; None if there is no such scene.
+        scene: the resulting scene.
+        seconds: duration.
+        where: the written file; None in a dry run, whose ``bytes`` are those of a PLY.
     """
     from pointsplat_ns.pruning import ply_bytes
 

@@ -63,8 +63,8 @@ def prune(
         plot: a .png file for a plot of the distributions of opacity and volume, before and after.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
-        threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
-            programs keep the machine busy. Another number may change results by rounding.
+        threads: number of threads. By default it adapts to the work and to other programs. Another number may
+            change results by rounding.
         json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps

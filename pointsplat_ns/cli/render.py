@@ -32,23 +32,23 @@ def render(
 
     Args:
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
-        other: a second scene in the same place, to compare with.
+        other: a second scene in the same frame, to compare with.
         output: .mp4 for a video, a folder for PNG frames, .png for the first frame alone; by default a video beside the
             scene: room.mp4 for room.ply, render.mp4 in the folder of a run. It appears when it is complete.
         path: dataset (exactly through the poses of the run's dataset), walk (past sampled views), orbit (about what
             they show), auto (dataset if there is one, else walk), or a camera path that nerfstudio's viewer saved
             (.json).
         poses: a file of cameras in place of those of the dataset: cameras.json of 3DGS, transforms.json of nerfstudio,
-            or the folder of a COLMAP model. A folder then gets one frame for each, unless --seconds says otherwise.
-        split: how two scenes are shown.
-        labels: what is written on two scenes; by default their names and counts. "" writes nothing on one.
+            or the folder of a COLMAP model. A folder then gets one frame for each, unless --seconds is given.
+        split: layout of two scenes.
+        labels: labels of two scenes; by default their names and counts. "" writes none on one.
         up: the axis that is up in the scene, for walks and orbits: x, y, z, -x, -y or -z; by default it is estimated.
             Write --up=-y for a negative axis.
-        width: of the picture of one scene, pixels; by default that of the saved path, or of the photos, at most 960.
-        height: of the same.
-        fps: frames a second; by default 24, or what the saved path says.
-        seconds: how long; by default 10, or as long as it takes to show every pose of the dataset or the saved path.
-        force: overwrite what is there.
+        width: width of one scene's picture, pixels; by default that of the saved path, or of the photos, at most 960.
+        height: its height, pixels.
+        fps: frames a second; by default 24, or as in the saved path.
+        seconds: length; by default 10, or long enough for every pose of the dataset or the saved path.
+        force: overwrite existing files.
         json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps

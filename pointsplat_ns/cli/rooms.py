@@ -20,7 +20,7 @@ def rooms(
 ) -> None:
     """Generate furnished rooms with photos, depth images and poses, in the Replica layout.
 
-    Rooms that are there already are left alone: after an interruption the same command goes on.
+    Existing rooms are kept, so the same command continues after an interruption.
 
     Args:
         output: folder for the scenes room0, room1..., named by their seeds.

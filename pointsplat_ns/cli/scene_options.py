@@ -18,12 +18,12 @@ def output_beside(scene: Path, suffix: str) -> Path:
     """The default path of the result.
 
     Args:
-        scene: the file or folder that is read.
+        scene: the input file or folder.
         suffix: last part of the result's name.
 
     Returns:
         For a file, a path beside it: ``room_pruned.ply`` for ``room.ply``. For a run, a path in its folder:
-        ``pruned.ply``; never in its checkpoint folder, as nerfstudio takes every file there for a checkpoint.
+        ``pruned.ply``; never in its checkpoint folder, because nerfstudio takes every file there for a checkpoint.
     """
     if scene.is_dir():
         return scene / f"{suffix}.ply"
@@ -38,7 +38,7 @@ def need_one_scene(path: Path) -> None:
     """Refuse a folder of scenes where a single scene is expected.
 
     Raises:
-        SceneError: if it is one.
+        SceneError: if the path is a folder of scenes.
     """
     from pointsplat_ns.errors import SceneError
     from pointsplat_ns.io.scene import ACCEPTED, is_folder_of_scenes
@@ -54,7 +54,7 @@ def check_outputs(scene: Path | None, picture: Path | None, force: bool) -> None
     """Check output paths before the long computations.
 
     Args:
-        scene: the file to write, of any format that is written; None for none.
+        scene: the file to write, of any writable format; None for none.
         picture: the .png file to write; None for none.
         force: whether existing files may be overwritten.
 
@@ -71,11 +71,11 @@ def check_outputs(scene: Path | None, picture: Path | None, force: bool) -> None
 
 
 def check_output(path: Path | None, kind: str, force: bool) -> None:
-    """Check the path of one file to write that is no scene.
+    """Check the path of one file to write other than a scene.
 
     Args:
         path: the file; None for none.
-        kind: the suffix that its name must have.
+        kind: required suffix.
         force: whether an existing file may be overwritten.
 
     Raises:
@@ -122,15 +122,15 @@ def check_poses(poses: Path | None) -> None:
 
 
 def in_format_of(keep: str, output: Path) -> str:
-    """A budget as :func:`~pointsplat_ns.pruning.parse_keep` reads it: a size without a format, such as 5MB, means one
-    of the file that is written."""
+    """A budget for :func:`~pointsplat_ns.pruning.parse_keep`: a size without a format, such as 5MB, gets the format of
+    the output."""
     from pointsplat_ns.io.formats import format_to_write
 
     return keep.strip() + format_to_write(output).budget_suffix if keep.strip().lower().endswith("mb") else keep
 
 
 def warn_if_larger(keep: str | None, output: Path) -> None:
-    """Warn if a file is larger than its budget: a scene changed after pruning may compress less well."""
+    """Warn if a file is larger than its budget: a repaired scene may compress less well than the pruned one."""
     from pointsplat_ns.io.files import logger
     from pointsplat_ns.pruning import Megabytes, parse_keep
 
@@ -143,12 +143,12 @@ def warn_if_larger(keep: str | None, output: Path) -> None:
 
 
 def file_bytes(path: Path) -> int:
-    """Size of a scene's file; of a SOG folder, which its meta.json stands for, of its parts together."""
+    """Size of a scene's file in bytes; for the meta.json of a SOG folder, of all parts together."""
     return sum(part.stat().st_size for part in map(path.with_name, _file_names(path)) if part.exists())
 
 
 def _file_names(path: Path) -> tuple[str, ...]:
-    """Names of the files that a scene is written to: of a SOG folder, which its meta.json stands for, all parts."""
+    """Names of a scene's files: one, or for the meta.json of a SOG folder, all parts."""
     from pointsplat_ns.io.formats import SOG_META, SOG_PARTS
 
     return (path.name, *SOG_PARTS) if path.name == SOG_META else (path.name,)

@@ -36,27 +36,26 @@ def tables(
             files of scenes.
         output: folder for the cells, tables.md, tables.tex, tables.json and figure4.png.
         keeps: shares of the Gaussians in Tables 1 and 2.
-        refiners: weights for the rows with a network: runs or .safetensors. Each row takes those that were trained for
-            it, by what they say of themselves.
+        refiners: weights for the rows with a network: runs or .safetensors files. Each row takes those with fitting
+            metadata.
         groups: NAME=SCENE,SCENE...; means are taken over groups.
-        only: names or patterns of cells, such as fox/merge/10%, to measure again, and no others.
+        only: names or patterns of cells, such as fox/merge/10%. Only these are measured, also if they were before.
         views: largest number of held-out views of a scene.
         side: largest side of all images, pixels; photos are reduced.
-        scoring_views: largest number of training poses that LightGaussian and PUP-3DGS score from.
+        scoring_views: largest number of training poses for the scores of LightGaussian and PUP-3DGS.
         fine_tune: steps of fine-tuning, against at most 60 training photos.
-        splat_transform: the program; by default the one that npx finds, if any.
-        force: start over with the scenes that are named.
-        json_output: print what is in tables.json, and nothing else on standard output.
+        splat_transform: path of the program; by default npx searches it.
+        force: start over with the given scenes.
+        json_output: print the content of tables.json, and nothing else on standard output.
     """
     import pointsplat_ns as ps
-    from pointsplat_ns.tables.outputs import JSON
 
     found = ps.measure_tables(
         scenes, output, keeps=keeps, refiners=refiners, groups=groups, only=only, views=views, side=side,
         scoring_views=scoring_views, fine_tune=fine_tune, splat_transform=splat_transform, force=force, progress=True,
     )  # fmt: skip
     if json_output:
-        print_json({"output": output, **json.loads((output / JSON).read_text("utf-8"))})
+        print_json({"output": output, **json.loads((output / "tables.json").read_text("utf-8"))})
         return
     for group in found:
         cells = sum(len(scene.cells) for scene in group.scenes)

@@ -37,29 +37,28 @@ def tradeoff(
     instead, and writes it.
 
     Args:
-        scene: a 3DGS .ply, a Splatfacto checkpoint, or a run (its folder or config.yml), whose held-out photos are then
-            used where they are found.
+        scene: a 3DGS .ply, a Splatfacto checkpoint, or a run (its folder or config.yml). Held-out photos of a
+            run are used where they are found.
         output: the folder for points, pictures, tables, plots and the page; by default beside the scene: room_tradeoff
             for room.ply, tradeoff in the folder of a run.
-        points: largest number of scenes, the dense one among them.
-        within: the recommended point is the fastest that loses at most so many dB against photos; without photos, as
-            much as is expected of its renders.
-        by: methods of prune; the first one is walked, others are measured at three budgets.
-        repairs: what may repair: nothing, the refiner alone, or compact's efforts quick and thorough.
+        points: largest number of scenes, with the dense scene.
+        within: largest loss of the recommended point against photos, dB. Without photos the loss is estimated from
+            renders.
+        by: methods of prune; the first is measured in detail, others at three budgets.
+        repairs: repairs to try: none, the refiner alone, or compact's efforts quick and thorough.
         views: largest number of views; without photos at most 12.
-        poses: a file of cameras to look from: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
-            COLMAP model; no photos are used then.
-        resolution: size of the pictures that people look at, in pixels; scenes are made for it, and judged and timed in
-            the pictures that compact compares in. By default that of the photos where there are any, else 1920x1080.
-        drawn: how frames may be drawn: exact, of all scenes; fast and half (so, and at half the resolution) of a few.
-        target_db: find the smallest scene of at least this PSNR against the dense scene's renders.
-        target_ms: and of at most so many milliseconds a frame. Without --target-db, find the best within the limits.
-        target_mb: and of at most so many megabytes.
+        poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model;
+            no photos are used then.
+        resolution: size of the pictures that people look at, pixels. Scenes are made for this size, and judged and
+            timed in the pictures of comparisons. By default the size of the photos, if there are any, else 1920x1080.
+        drawn: qualities of frames: exact for all scenes; fast, and half (fast at half the resolution), for a few.
+        target_db: search for the smallest scene with at least this PSNR against the dense scene's renders.
+        target_ms: longest time of a frame, milliseconds. Without --target-db, search for the best within the limits.
+        target_mb: largest file, megabytes.
         force: start over, and overwrite results in the folder.
-        threads: how many to use. By default the number is chosen while the work goes on, and is lower while other
-            programs keep the machine busy. Another number may change results by rounding. Frames are timed
-            on all.
-        json_output: print what is in tradeoff.json, and nothing else on standard output.
+        threads: number of threads. By default it adapts to the work and to other programs. Another number may
+            change results by rounding. Frames are timed on all threads.
+        json_output: print the content of tradeoff.json, and nothing else on standard output.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.system.threads import fixed_threads

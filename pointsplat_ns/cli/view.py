@@ -21,11 +21,12 @@ def view(
 
     Args:
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
-        other: a second scene in the same place, to compare with; by default the first is compared with all of itself.
+        other: a second scene in the same frame, to compare with; by default the first is compared with all of itself.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z; by default it is estimated. Write --up=-y for a
             negative axis.
-        host: the address to listen on; by default only this machine is answered. Whoever reaches another one may look.
-        port: the first port that is tried; 0 takes any that is free.
+        host: the address to listen on; by default only this machine has access. With another address, every machine
+            that reaches it has access.
+        port: the first port to try; 0 takes any free port.
     """
     import pointsplat_ns as ps
 

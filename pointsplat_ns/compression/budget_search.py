@@ -1,4 +1,4 @@
-"""Budgets that only trying can meet: a quality of renders, which needs no photos, and a size of a compressed file."""
+"""Finds the number of Gaussians for budgets without a formula: a PSNR of renders, or the size of a compressed file."""
 
 from __future__ import annotations
 
@@ -17,23 +17,31 @@ from pointsplat_ns.pruning.sh_bands import cut_sh
 from pointsplat_ns.system.progress import silent
 from pointsplat_ns.views import Views
 
-SH_PSNR = 40.0
-"""PSNR in dB that renders without some SH bands must reach against renders with all bands. An independent error of this
-size lowers the PSNR of an ``auto`` budget of 35 dB by 1.2 dB."""
 
-FIRST_SHARE, USUAL_SLOPE = 0.3, 6.0
-"""Share of the Gaussians that is tried first for a quality; gain of merged scenes for each e-fold of the count, dB."""
+@dataclass(frozen=True)
+class BudgetSettings:
+    """Settings of the searches."""
 
-QUALITY = SearchSettings(tolerance=0.1)
-"""For PSNR in dB: 0.1 dB above what is asked for is near enough."""
+    sh_psnr: float = 40.0
+    """PSNR, in dB, of renders without some SH bands against renders with all bands, for ``sh="auto"``. An independent
+    error of this size lowers the PSNR of an ``auto`` budget of 35 dB by 1.2 dB."""
+    first_share: float = 0.3
+    """Share of the Gaussians at the first try for a PSNR."""
+    slope: float = 6.0
+    """Usual gain of merged scenes for each e-fold of the count, dB."""
+    psnr: SearchSettings = SearchSettings(tolerance=0.1)
+    """Search for a PSNR in dB: it ends within 0.1 dB above the target."""
+    size: SearchSettings = SearchSettings(tolerance=-math.log(0.95), tries=3)
+    """Search for the logarithm of a file's size: it ends at 95 % of the limit. Each try makes a scene, so tries are
+    few."""
 
-FILE_SIZE = SearchSettings(tolerance=-math.log(0.95), tries=3)
-"""For logarithms of file sizes: a file of at least 95 % of the limit is large enough, and each try makes a scene."""
+
+BUDGETS = BudgetSettings()
 
 
 @dataclass(frozen=True, eq=False)
 class FoundQuality:
-    """A scene whose renders are close enough."""
+    """The smallest scene found that reaches a PSNR."""
 
     scene: Gaussians
     psnr: float
@@ -46,7 +54,7 @@ class FoundQuality:
 
 @dataclass(frozen=True, eq=False)
 class FoundSize:
-    """A scene whose file is small enough."""
+    """The largest scene found whose file fits a limit."""
 
     scene: Gaussians
     size: int
@@ -64,8 +72,8 @@ def smallest_within(
 ) -> FoundQuality:
     """Search for the smallest scene of a method whose renders reach ``psnr`` against those of the dense scene.
 
-    The PSNR is that of the mean squared error over all pixels of all views, so bad views count more. The result has
-    been rendered and reaches ``psnr``. If quality does not always rise with the count, a smaller one may exist.
+    The PSNR is that of the mean squared error over all pixels of all views, so bad views count more. The result was
+    rendered and reaches ``psnr``. A smaller such scene may exist where PSNR does not always rise with the count.
 
     Args:
         dense: N Gaussians.
@@ -95,8 +103,8 @@ def smallest_within(
             progress(len(tried) / (len(tried) + 2))
         return tried[count]
 
-    first = max(1, round(FIRST_SHARE * n))
-    find_count(measure, psnr, at_least=True, first=first, most=n, slope=USUAL_SLOPE, settings=QUALITY)
+    first = max(1, round(BUDGETS.first_share * n))
+    find_count(measure, psnr, at_least=True, first=first, most=n, slope=BUDGETS.slope, settings=BUDGETS.psnr)
     if best is None:
         raise BudgetError(f"all {n} Gaussians reach {tried[n]:.1f} dB, not {psnr:g} dB; ask for less")
     return best
@@ -109,12 +117,12 @@ def largest_within(
     limit: int,
     progress: Callable[[float], None],
 ) -> FoundSize:
-    """Search for a scene whose file has at most ``limit`` bytes, and not much less.
+    """Search for the largest scene of a method whose file has at most ``limit`` bytes.
 
     Args:
-        full: N Gaussians; if all fit, they are kept.
+        full: N Gaussians; all are kept if they fit.
         make: from a count K to a scene of K Gaussians.
-        kind: a format whose size depends on the scene.
+        kind: a compressed format, whose size depends on the content.
         limit: bytes.
         progress: called with the share done, in [0, 1].
 
@@ -134,7 +142,7 @@ def largest_within(
         progress(len(tried) / (len(tried) + 2))
         return math.log(tried[count])
 
-    find_count(measure, math.log(limit), at_least=False, first=n, most=n, slope=1.0, settings=FILE_SIZE)
+    find_count(measure, math.log(limit), at_least=False, first=n, most=n, slope=1.0, settings=BUDGETS.size)
     if best is None:
         raise BudgetError(
             f"keep is {limit / 1e6:g}MB{kind.suffix}, too small for one Gaussian; expected at least "
@@ -144,13 +152,13 @@ def largest_within(
 
 
 def _size(scene: Gaussians, kind: Format) -> int:
-    """Bytes of a scene's file, which leaves out what cannot be drawn."""
+    """Bytes of a scene's file, without unusable Gaussians."""
     assert kind.encode is not None
     scene = scene.detach().to("cpu", torch.float32)
     return len(kind.encode(scene[scene.usable()], silent))
 
 
-def needed_sh_degree(dense: Gaussians, views: Views, psnr: float = SH_PSNR) -> tuple[int, float]:
+def needed_sh_degree(dense: Gaussians, views: Views, psnr: float = BUDGETS.sh_psnr) -> tuple[int, float]:
     """The lowest SH degree whose renders reach ``psnr`` (dB) against those of the whole scene, and the PSNR reached."""
     reference = DenseReference(dense, views)
     for degree in range(dense.sh_degree):

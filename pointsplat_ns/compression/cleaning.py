@@ -1,10 +1,9 @@
-"""Finds the Gaussians of a scene that no picture needs, so that they take nothing of a budget.
+"""Finds the Gaussians of a scene that no picture needs, so that a budget is spent on the others.
 
 Two rules remove a Gaussian. The first: it cannot be drawn, because a value is NaN or infinite, or because it is fainter
-than the rasterizer draws. The second: it is seen from nowhere. Cameras stand at places in free space and look in all
+than the rasterizer draws. The second: no camera sees it. Cameras stand at places in free space and look in all
 directions; a Gaussian is unseen if it has no blend weight (its opacity at a pixel times the transmittance in front of
-it) on any pixel of any image. So a large background that is visible stays, and so does a lamp that hangs in the air.
-docs/cleaning.md says when it pays.
+it) on any pixel of any image. So a visible background stays, and so does a lamp that hangs in the air.
 """
 
 from __future__ import annotations
@@ -31,17 +30,17 @@ from pointsplat_ns.views import Views
 
 @dataclass(frozen=True)
 class CleaningSettings:
-    """Where cleaning looks from."""
+    """Cameras of cleaning."""
 
     places: int = 16
-    """Number of places that are looked around from. More places remove less and take longer."""
+    """Number of places of cameras. More places remove less and take longer."""
     side: int = 32
-    """Pixels across each of the six images of a place. Time hardly depends on it. A coarse image shows more small
-    Gaussians, because none is drawn thinner than a pixel."""
+    """Width of each of the six images of a place, pixels. It hardly changes the time. A coarse image shows more small
+    Gaussians, because the rasterizer draws none thinner than a pixel."""
     seed: int = 17
-    """Seed of the places. Views to compare renders in are sampled with another seed."""
+    """Seed of the places. Views for comparisons have another seed."""
     checked_views: int = 4
-    """Maximum number of views in which renders are compared with the dense scene's."""
+    """Maximum number of views for comparisons with the dense scene."""
 
 
 SETTINGS = CleaningSettings()
@@ -51,10 +50,10 @@ SETTINGS = CleaningSettings()
 class Junk:
     """The Gaussians of a scene that no picture needs."""
 
-    undrawable: Tensor  # [A] int64, those that are not usable first, then the faintest first
-    unseen: Tensor  # [B] int64, the faintest first
+    undrawable: Tensor  # [A] int64, unusable Gaussians first, then by rising opacity
+    unseen: Tensor  # [B] int64, by rising opacity
     places: int
-    """Number of places that were looked around from; 0 if none was found, and nothing counts as unseen then."""
+    """Number of places of cameras; 0 if there is no free space, and no Gaussian is unseen then."""
 
     def __len__(self) -> int:
         return len(self.undrawable) + len(self.unseen)
@@ -62,7 +61,7 @@ class Junk:
 
 @dataclass(frozen=True, eq=False)
 class Cleaning:
-    """Which Gaussians of a scene to leave out, and what that changes."""
+    """The junk of a scene, with notes on how renders change without it."""
 
     junk: Junk
     count: int
@@ -71,7 +70,7 @@ class Cleaning:
     """A line of text for each rule."""
 
     def apply(self, scene: Gaussians, at_least: int) -> Gaussians:
-        """The scene without its junk, but never fewer than ``at_least`` Gaussians: the best of the junk stays then.
+        """The scene without its junk. The most opaque junk stays where fewer than ``at_least`` Gaussians would remain.
 
         Args:
             scene: the scene as read, perhaps with fewer SH bands.
@@ -83,9 +82,9 @@ class Cleaning:
 
 @torch.no_grad()
 def find_junk(scene: Gaussians, progress: Progress = silent) -> Junk:
-    """Find the Gaussians that cannot be drawn, and those that are seen from nowhere.
+    """Find the Gaussians that cannot be drawn, and those that no camera sees.
 
-    The same scene gives the same result, and so does the scene in another unit of length, but for rounding.
+    The result is deterministic. It does not depend on the scene's unit of length, but for rounding.
 
     Args:
         scene: N Gaussians.
@@ -99,45 +98,45 @@ def find_junk(scene: Gaussians, progress: Progress = silent) -> Junk:
     order = torch.where(usable, scene.alphas, -1.0).sort(stable=True).indices
     undrawable = order[~drawable[order]]
     drawn = drawable.nonzero()[:, 0]
-    seen = ~drawable  # undrawable Gaussians must not count as unseen too
+    visible = ~drawable  # so that no undrawable Gaussian is counted as unseen too
     places = 0
     if len(drawn):
         part = scene[drawn]
-        part = in_units(part, *content_size(part))  # so that the scene's own unit of length does not matter
+        part = in_units(part, *content_size(part))  # independent of the scene's unit of length
         try:
-            around = _views_all_around(part)
+            views = _views_all_around(part)
         except DataError:
             return Junk(undrawable.cpu(), drawn[:0].cpu(), 0)
-        shown = _shown(part, around, progress)
-        places = len(around) // 6
-        seen[drawn] = shown | ~shown.any()  # images that show nothing say nothing about the scene
-    return Junk(undrawable.cpu(), order[~seen[order]].cpu(), places)
+        has_pixels = _has_pixels(part, views, progress)
+        places = len(views) // 6
+        visible[drawn] = has_pixels | ~has_pixels.any()  # empty images are no evidence
+    return Junk(undrawable.cpu(), order[~visible[order]].cpu(), places)
 
 
-def _shown(scene: Gaussians, views: Views, progress: Progress) -> Tensor:
+def _has_pixels(scene: Gaussians, views: Views, progress: Progress) -> Tensor:
     """Whether each Gaussian (N,) has a blend weight on any pixel of any view."""
-    shown = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
+    has_pixels = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
     for done, pixels in enumerate(each_view(list(views), len(scene), lambda view: pixels_of(scene, view))):
-        shown |= pixels > 0
-        progress("looking for what cannot be seen", (done + 1) / len(views))
-    return shown
+        has_pixels |= pixels > 0
+        progress("looking for unseen Gaussians", (done + 1) / len(views))
+    return has_pixels
 
 
 def clean_scene(dense: Gaussians, at_least: int, views: ViewSource, progress: Progress = silent) -> Cleaning:
-    """Find the junk of a scene, and measure what renders lose without it.
+    """Find the junk of a scene, and measure the PSNR of renders without it.
 
     Args:
         dense: N Gaussians.
-        at_least: number of Gaussians that have to remain, in 1..N.
-        views: where renders are compared. They choose nothing.
+        at_least: least number of Gaussians that remain, in 1..N.
+        views: views to compare renders in. They do not decide which Gaussians are junk.
         progress: called with the name of the task and the share of it that is done, in [0, 1].
     """
     junk = find_junk(dense, progress=progress)
     dropped = _first(junk, len(dense) - at_least)
     if len(dropped) == 0:
-        why = f"; {len(junk):,} could go, but all are asked for" if len(junk) else ""
+        why = f"; {len(junk):,} could go, but the budget keeps all" if len(junk) else ""
         return Cleaning(junk, len(dense), (f"clean: nothing removed{why}",))
-    progress("checking what cleaning changes", 0.0)
+    progress("comparing renders without junk", 0.0)
     reference = _reference(dense, views)
     places = f"looking around from {junk.places} places" if junk.places else "no free place to look from was found"
     rules = (
@@ -173,13 +172,13 @@ def _closeness(reference: DenseReference, scene: Gaussians) -> str:
 
 
 def _first(junk: Junk, count: int) -> Junk:
-    """The first ``count`` of the junk: undrawable Gaussians, then unseen ones, the faintest first."""
+    """The first ``count`` of the junk: undrawable Gaussians, then unseen ones, by rising opacity."""
     undrawable = junk.undrawable[:count]
     return Junk(undrawable, junk.unseen[: count - len(undrawable)], junk.places)
 
 
 def _without(scene: Gaussians, indices: Tensor) -> Gaussians:
-    """The scene without some Gaussians, the others in their order."""
+    """The scene without the Gaussians at some indices; the others keep their order."""
     if len(indices) == 0:
         return scene
     kept = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
@@ -188,12 +187,13 @@ def _without(scene: Gaussians, indices: Tensor) -> Gaussians:
 
 
 def _views_all_around(scene: Gaussians) -> Views:
-    """Views in all six directions from places all over free space; six after one another for each place.
+    """Views in six directions from places in free space, six in a row for each place.
 
     Raises:
         DataError: if there is no free space.
     """
-    without_sh = scene.replace(features_rest=scene.features_rest[:, :0])  # SH may tell where photos were taken
+    # Without SH, so that places do not depend on where photos were taken.
+    without_sh = scene.replace(features_rest=scene.features_rest[:, :0])
     places = invert_rigid(sample_views(without_sh, SETTINGS.places, seed=SETTINGS.seed).viewmats)[:, :3, 3]
     rotations = _six_directions().to(places)
     viewmats = torch.eye(4).to(places).repeat(len(places), 6, 1, 1)

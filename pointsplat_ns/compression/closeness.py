@@ -25,11 +25,11 @@ class Closeness:
     ssim: float | None
     """Mean over views; None if views are smaller than SSIM's window."""
     width: int | None = None
-    """Of the pictures, pixels, if it is known."""
+    """Width of the pictures, pixels; None if it is not known."""
 
     @property
     def where(self) -> str:
-        """Text: in how many views, and how wide they are."""
+        """Text: the number of views, and their width."""
         return views_text(len(self.errors)) + ("" if self.width is None else f" of {self.width} pixels")
 
     @property
@@ -49,7 +49,7 @@ class Closeness:
 
 
 class DenseReference:
-    """Renders of the dense scene that other scenes are compared with.
+    """Renders of the dense scene, for comparison with other scenes.
 
     Args:
         dense: the dense scene.
@@ -86,8 +86,8 @@ class DenseReference:
         return Closeness(tuple(errors), similarity, self.views.width)
 
     def psnr_of_covered(self, psnr: float) -> float:
-        """A PSNR over all pixels of all views, dB, if all that is wrong lies in the pixels that the dense scene covers:
-        of these alone. A small thing in a large empty picture is not closer to the dense one for being small."""
+        """PSNR over the pixels that the dense scene covers, dB, from the PSNR over all pixels. It assumes that other
+        pixels have no error. An object that covers few pixels gets no better figure for its empty background."""
         return psnr + 10 * math.log10(self.covered) if self.covered > 0 else psnr
 
     def psnr(self, scene: Gaussians) -> tuple[float, float]:

@@ -1,5 +1,5 @@
-"""Compacts a scene in three stages: prune, refine, repair. Each stage is kept as far as it brings renders closer to the
-dense scene's."""
+"""Compacts a scene in three stages: prune, refine, repair. Each change is accepted by comparing renders with those of
+the dense scene."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from typing import Literal
 
-from pointsplat_ns.compression.acceptance import Comparison, Reason, as_far_as_it_helps
+from pointsplat_ns.compression.acceptance import Comparison, Reason, accept_change
 from pointsplat_ns.compression.closeness import Closeness, DenseReference
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import repair
@@ -24,15 +24,15 @@ from pointsplat_ns.views import Views
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """One stage of compaction: the scene that it made, and figures."""
+    """One stage of compaction: its scene and its figures."""
 
     name: Literal["prune", "refine", "repair"]
     scene: Gaussians
-    """The scene after the share ``strength`` of the stage; after all of it, if the stage is left out."""
+    """The scene after the share ``strength`` of the stage; after the whole stage, if it is left out."""
     after: Closeness | None
     """Errors of ``scene`` against the dense scene's renders; None if it was not compared."""
     before: Closeness | None = None
-    """Errors of the scene that the stage started from; None for pruning."""
+    """Errors of the scene before the stage; None for pruning."""
     strength: float = 1.0
     """Share of the change in ``scene``, in (0, 1]."""
     reason: Reason | None = None
@@ -42,7 +42,7 @@ class Stage:
     seconds: float = 0.0
     """Duration of a repair."""
     interrupted: bool = False
-    """Whether Ctrl-C ended a repair before its time."""
+    """Whether Ctrl-C ended a repair early."""
 
     @property
     def accepted(self) -> bool:
@@ -62,19 +62,20 @@ class Compacted:
     """
 
     stages: tuple[Stage, ...]
-    """Pruning, then refinement and repair where they were tried. Scenes are on the device of the dense one."""
+    """Pruning, then refinement and repair where they were tried. Scenes are on the device of the dense scene."""
     notes: tuple[str, ...]
-    """Lines of text: SH bands dropped, PSNR reached, where views came from."""
+    """Lines of text: SH bands dropped, PSNR reached, origin of the views."""
     reference: DenseReference | None
-    """Renders of the dense scene that the stages were compared with; None if there are no views."""
+    """Renders of the dense scene, for comparison with each stage; None if there are no views."""
     seconds: float
     """Total duration."""
     uncompared: str = ""
     """Why there are no views to compare renders in; empty if there are."""
     target: str = ""
-    """What a search for targets found: at what cost, and what the next cheaper scene would have missed; else empty."""
+    """Text on the search for targets: the cost, and the target that the next cheaper scene misses; empty if there was
+    no search."""
     interrupted: bool = False
-    """Whether that search was interrupted."""
+    """Whether the search for targets was interrupted."""
 
     def _stage(self, name: str) -> Stage | None:
         return next((stage for stage in self.stages if stage.name == name), None)
@@ -101,7 +102,7 @@ class Compacted:
 
     @property
     def strength(self) -> float:
-        """Share of the refiner's residuals in ``refined``, in (0, 1]: the best one tried, or 1 if none helps."""
+        """Accepted share of the refiner's residuals in ``refined``, in (0, 1]; 1 if none is accepted."""
         return (self._stage("refine") or self.stages[0]).strength
 
     @property
@@ -154,7 +155,7 @@ class Compacted:
 
     @property
     def verdict(self) -> str:
-        """Text: what refinement and repair gained, or why they were left out; one line each."""
+        """Text on refinement and repair, one line each: the gain, or the reason to leave it out."""
         from pointsplat_ns.compression.verdicts import verdict_of
 
         return verdict_of(self)
@@ -163,16 +164,16 @@ class Compacted:
 def compact_scene(
     dense: Gaussians, request: CompactRequest, views: ViewSource | None = None, progress: Progress = silent
 ) -> Compacted:
-    """Make a scene smaller, refine it if a network is given, and repair it as long as the budget says.
+    """Make a scene smaller, refine it if there is a refiner, and repair it for the budget of the request.
 
-    The smaller scene is rendered and compared with renders of the dense scene. Refinement and repair are kept as far as
-    they help (:mod:`~pointsplat_ns.compression.acceptance`). A requested PSNR (``auto``) is reached before refinement,
-    so that it holds in any case. The repair uses views other than those compared.
+    Refinement and repair are accepted by comparing renders with those of the dense scene
+    (:mod:`~pointsplat_ns.compression.acceptance`). A requested PSNR (``auto``) is reached before refinement, so that it
+    holds in any case. The repair uses other views than the comparison.
 
     Args:
         dense: N Gaussians.
-        request: how.
-        views: views that renders are compared in; by default sampled in free space.
+        request: options.
+        views: source of views; by default poses sampled in free space.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
 
     Returns:
@@ -214,8 +215,8 @@ def as_compacted(dense: Gaussians, pruned: Gaussians, views: ViewSource, notes: 
     Args:
         dense: the scene before.
         pruned: the scene after.
-        views: views that renders are compared in.
-        notes: of how it was pruned.
+        views: source of the views to compare renders in.
+        notes: lines of text on the pruning.
     """
     reference = DenseReference(dense, views.compared())
     return Compacted((Stage("prune", pruned, reference.closeness(pruned)),), notes, reference, 0.0)
@@ -238,7 +239,7 @@ def _refine(
         return Stage("refine", refined, None, last.after, reason=Reason.NOT_FINITE)
     if judge is None or last.after is None:
         return Stage("refine", refined, None, reason=Reason.NOT_COMPARED)
-    change = as_far_as_it_helps(judge, last.after, last.scene, refined, progress)
+    change = accept_change(judge, last.after, last.scene, refined, progress)
     scene = change.scene if change.reason is None else refined
     return Stage("refine", scene, change.closeness, last.after, change.strength, change.reason)
 
@@ -251,14 +252,14 @@ def _repair(
     views: ViewSource,
     progress: Progress,
 ) -> Stage | None:
-    """The repair by optimisation; None if there is no time for it, nothing to compare in, or nothing to gain.
+    """The repair; None if its budget is empty, there are no views, or the scene has no error.
 
     Args:
         last: the last stage that was kept.
         dense: N Gaussians, on the device that renders.
-        request: how.
-        judge: what compares; None if there are no views.
-        views: where views come from.
+        request: options.
+        judge: compares scenes with the dense scene; None if there are no views.
+        views: source of views.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
     """
     if judge is None or last.after is None or request.repair.empty or last.after.psnr == math.inf:
@@ -267,7 +268,7 @@ def _repair(
     psnr = judge.reference.psnr_of_covered(last.after.psnr)
     report = functools.partial(progress, "repairing")
     repaired = repair(last.scene.to(dense.device), dense, views, request.repair, report, psnr=psnr)
-    change = as_far_as_it_helps(judge, last.after, last.scene, repaired.scene)
+    change = accept_change(judge, last.after, last.scene, repaired.scene)
     scene = change.scene if change.reason is None else repaired.scene.to(last.scene.device)
     figures = (repaired.steps, repaired.seconds, repaired.interrupted)
     return Stage("repair", scene, change.closeness, last.after, change.strength, change.reason, *figures)

@@ -1,8 +1,8 @@
-"""One search for all budgets that only trying can meet: quality of renders, size of a compressed file, time of a frame.
+"""One search for all budgets without a formula: PSNR of renders, size of a compressed file, time of a frame.
 
-Each of them rises with the number of Gaussians, nearly in a straight line over the logarithm of the number. So the next
-count to try is found by interpolation between a count below the target and one above it, or by extrapolation as long as
-all tried lie on one side.
+Each measure rises with the number of Gaussians, nearly linearly in the logarithm of the number. So the next count is
+interpolated between a count below the target and one above it. As long as all tried counts lie on one side, it is
+extrapolated.
 """
 
 from __future__ import annotations
@@ -14,31 +14,28 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """When a search ends."""
+    """When a search ends, and how it steps."""
 
     precision: float = 1.05
     """Largest ratio of a count that meets the target to the neighbouring one that misses it."""
     tolerance: float = 0.0
     """Distance from the target, in units of the measure, at which a count that meets the target is good enough."""
     tries: float = math.inf
-    """Largest number of counts that are tried once one has met the target."""
-
-
-STEP_UP, STEP_DOWN = 2.0, 0.25
-"""Factors to the next count, where nothing is known about how fast the measure rises."""
-
-LARGEST_STEP = 16.0
-"""Largest factor between two counts in an extrapolation."""
-
-BEYOND = 1.05
-"""Factor by which extrapolations go beyond the target, so that it lies between two counts afterwards."""
-
-INSIDE = 0.03
-"""Share of the interval by which an interpolated count is moved to the side that meets the target, so that the last
-count tried is likely to meet it."""
-
-NEAREST = 0.15
-"""Least distance of an interpolated count from the ends, as a share of the interval, so that each try narrows it."""
+    """Largest number of counts tried, once one has met the target."""
+    step_up: float = 2.0
+    """Factor to the next larger count where no slope is known."""
+    step_down: float = 0.25
+    """Factor to the next smaller count where no slope is known."""
+    largest_step: float = 16.0
+    """Largest factor between two counts in an extrapolation."""
+    overshoot: float = 1.05
+    """Factor on an extrapolated step, so that the next two counts enclose the target. 1 where there is a tolerance."""
+    margin: float = 0.03
+    """Share of the interval by which an interpolated count moves to the side that meets the target, so that the last
+    count tried is likely to meet it. 0 where there is a tolerance."""
+    inset: float = 0.15
+    """Least distance of an interpolated count from both ends, as a share of the interval, so that each try narrows
+    it."""
 
 
 @dataclass(frozen=True)
@@ -61,16 +58,16 @@ def find_count(
     slope: float | None = None,
     settings: SearchSettings | None = None,
 ) -> FoundCount:
-    """Search for the smallest count whose measure is at least the target, or the largest whose measure is at most that.
+    """Search for the smallest count whose measure reaches the target, or the largest whose measure does not exceed it.
 
     Args:
-        measure: from a count to a number that rises with it. It is called once for each count that is tried.
+        measure: from a count to a number that rises with it. It is called once for each count tried.
         target: the number to reach, or not to exceed.
-        at_least: whether the target is to be reached. If not, it is not to be exceeded.
-        first: the count that is tried first.
+        at_least: whether the measure has to reach the target; if not, it must not exceed it.
+        first: the first count tried.
         most, least: bounds of the count.
-        slope: rise of the measure for each e-fold of the count, if it is known.
-        settings: when the search ends.
+        slope: rise of the measure for each e-fold of the count; None if it is not known.
+        settings: when the search ends, and how it steps.
 
     Example:
         >>> find_count(lambda count: count / 10, 42.0, at_least=True, first=1000, most=1000).count in range(420, 442)
@@ -80,7 +77,7 @@ def find_count(
     """
     settings = settings or SearchSettings()
     aimed = target + (0.5 if at_least else -0.5) * settings.tolerance
-    low, high = least - 1, most + 1  # below the target, and above it or at it; as long as not measured, out of bounds
+    low, high = least - 1, most + 1  # counts below the target, and at or above it; out of bounds until measured
     values: dict[int, float] = {}
     best: int | None = None
     count = min(max(first, least), most)
@@ -96,34 +93,36 @@ def find_count(
         if close or good_enough or high - low <= 1 or (best is not None and len(values) >= settings.tries):
             return FoundCount(best, slope)
         if low in values and high in values:
-            inside = 0.0 if settings.tolerance else INSIDE if at_least else -INSIDE
-            guess = _between(low, high, values[low], values[high], aimed, inside)
+            margin = 0.0 if settings.tolerance else settings.margin if at_least else -settings.margin
+            guess = _interpolated(low, high, values[low], values[high], aimed, margin, settings)
         else:
             tried = low if low in values else high
-            beyond = 1.0 if settings.tolerance else BEYOND
-            guess = _outside(tried, aimed - values[tried], slope, tried == low, beyond)
+            guess = _extrapolated(tried, aimed - values[tried], slope, tried == low, settings)
         if guess * settings.precision > most and most not in values:
             guess = most
         count = min(high - 1, max(low + 1, round(guess)))
 
 
-def _between(low: int, high: int, below: float, above: float, aimed: float, inside: float) -> float:
-    """The count where a straight line through two measured ones is at the number that is aimed at."""
-    share = (aimed - below) / (above - below) + inside if math.isfinite(above - below) and above > below else 0.5
-    return low * (high / low) ** min(1 - NEAREST, max(NEAREST, share))
+def _interpolated(
+    low: int, high: int, below: float, above: float, aimed: float, margin: float, settings: SearchSettings
+) -> float:
+    """The count where the line through two measured counts reaches ``aimed``, moved by a margin."""
+    share = (aimed - below) / (above - below) + margin if math.isfinite(above - below) and above > below else 0.5
+    return low * (high / low) ** min(1 - settings.inset, max(settings.inset, share))
 
 
-def _outside(tried: int, gap: float, slope: float | None, up: bool, beyond: float) -> float:
-    """The count where a straight line through a measured one closes a gap, and a little further."""
+def _extrapolated(tried: int, gap: float, slope: float | None, up: bool, settings: SearchSettings) -> float:
+    """The count where the line through one measured count closes the gap to the target."""
     if slope is None or not math.isfinite(gap):
-        return tried * (STEP_UP if up else STEP_DOWN)
-    factor = beyond * math.exp(min(abs(gap) / slope, math.log(LARGEST_STEP)))
+        return tried * (settings.step_up if up else settings.step_down)
+    overshoot = 1.0 if settings.tolerance else settings.overshoot
+    factor = overshoot * math.exp(min(abs(gap) / slope, math.log(settings.largest_step)))
     return tried * factor if up else tried / factor
 
 
 def _slope(values: dict[int, float], target: float, known: float | None) -> float | None:
-    """Rise for each e-fold between the two measured counts that are nearest to the target, None if there is none; what
-    was known before, if fewer were measured."""
+    """Rise for each e-fold between the two measured counts nearest to the target; None if it is not positive. With
+    fewer than two counts, the known slope."""
     nearest = sorted((count for count in values if math.isfinite(values[count])), key=lambda n: abs(values[n] - target))
     if len(nearest) < 2:
         return known

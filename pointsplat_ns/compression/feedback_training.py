@@ -1,8 +1,9 @@
-"""Trains the feedback refiner across scenes: it repairs pruned scenes, and learns from how close they have come.
+"""Trains the feedback network across scenes: it repairs pruned scenes and maximises the PSNR that they reach.
 
-An update repairs a few pruned scenes for some steps each, from sampled views, and then renders them from others. The
-mean PSNR of these renders is differentiated with respect to the network through all steps. What the network sees counts
-as constant, as usual for learned optimisers (Andrychowicz et al., arXiv 1606.04474): no second derivatives are needed.
+An update repairs a few pruned scenes for some steps each in sampled views, and then renders them in other views. The
+mean PSNR of these renders is differentiated with respect to the network through all steps. The features of the network
+count as constants, as usual for learned optimisers (Andrychowicz et al., arXiv 1606.04474), which avoids second
+derivatives.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from torch import Tensor
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.feedback import REPAIR, Feedback
 from pointsplat_ns.compression.optimiser import gradients_of
-from pointsplat_ns.compression.repair import share_of_rates, share_of_start
+from pointsplat_ns.compression.repair import initial_rate_factor, rate_factor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import sample_views
@@ -33,51 +34,57 @@ from pointsplat_ns.system import processes
 from pointsplat_ns.system.threads import suitable_threads
 from pointsplat_ns.views import Views
 
-STEPS = (REPAIR.fewest_steps, 12, 24, REPAIR.most_steps)
-"""Lengths of the repairs that the network learns from."""
 
-AT_ONCE, TIMES = 32, 6
-"""Views of a scene: so many sampled at once, so many times."""
+@dataclass(frozen=True)
+class FeedbackTrainingSettings:
+    """Settings of the training."""
 
-SIDE = 400
-"""Their longer side, pixels, as in repairs."""
+    steps: tuple[int, ...] = (REPAIR.fewest_steps, 12, 24, REPAIR.most_steps)
+    """Numbers of steps of the repairs."""
+    batch_views: int = 32
+    """Views of a scene in a batch of the sampler."""
+    view_batches: int = 6
+    """Batches of views of a scene."""
+    side: int = 400
+    """Longer side of the views, pixels, as in repairs."""
+    least_error: float = 1e-5
+    """Added to mean squared errors (50 dB), so that nearly correct scenes do not dominate the loss."""
+    rate: float = 3e-3
+    """Learning rate of the network's Adam; it falls like the rates of repairs."""
+    rate_of_trained: float = 1e-3
+    """The same where training continues from a trained network."""
+    warm_up: int = 20
+    """Updates until the learning rate is reached."""
+    save_interval: float = 60.0
+    """Seconds between intermediate saves."""
+    backend: Literal["auto"] = "auto"
+    """Rasterizer: gsplat where its CUDA kernels are installed, which are several times as fast."""
 
-FLOOR = 1e-5
-"""Added to mean squared errors, so that scenes that are nearly right do not rule: 50 dB."""
 
-RATE, WARM_UP = 3e-3, 20
-"""Learning rate of Adam, and updates until it is reached; then it falls as those of repairs do."""
-
-RATE_GOING_ON = 1e-3
-"""The same where training goes on from a trained network."""
-
-BACKEND: Literal["auto"] = "auto"
-"""What draws: gsplat where there are its CUDA kernels, which are several times as fast there."""
-
-SAVED_EVERY = 60.0
-"""Seconds between intermediate saves."""
+TRAINING = FeedbackTrainingSettings()
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingScene:
-    """A dense scene, what was made of it, and views of it."""
+    """A dense scene, its pruned scenes, and views of it."""
 
     name: str
     dense: Gaussians
     pruned: dict[str, Gaussians]
-    """By budget."""
+    """Pruned scenes by budget."""
     psnr: dict[str, float]
-    """Of what was made of it, by budget, against the dense scene's renders, over what that covers, dB."""
+    """PSNR of each pruned scene by budget, over the pixels that the dense scene covers, dB."""
     views: Views
 
     @classmethod
-    def of(cls, name: str, dense: Gaussians, keep: Sequence[str], times: int = TIMES) -> TrainingScene:
+    def of(cls, name: str, dense: Gaussians, keep: Sequence[str], view_batches: int | None = None) -> TrainingScene:
         """Merge a scene to each budget, and sample views of it."""
-        sampled = [sample_views(dense, AT_ONCE, seed=100 + number) for number in range(times)]
+        batches = TRAINING.view_batches if view_batches is None else view_batches
+        sampled = [sample_views(dense, TRAINING.batch_views, seed=100 + number) for number in range(batches)]
         viewmats, Ks = (torch.cat([getattr(v, field) for v in sampled]) for field in ("viewmats", "Ks"))
         first = sampled[0]
         views = Views(viewmats, Ks, first.width, first.height, first.background, near_plane=first.near_plane)
-        views = views.resized(SIDE)
+        views = views.resized(TRAINING.side)
         pruned = {budget: prune(dense, budget, "merge") for budget in keep}
         reference = DenseReference(dense, views.spread(COMPARED_VIEWS))
         psnr = {budget: reference.psnr_of_covered(reference.psnr(scene)[0]) for budget, scene in pruned.items()}
@@ -87,21 +94,31 @@ class TrainingScene:
 def roll_out(
     network: FeedbackRefiner, scene: TrainingScene, budget: str, steps: int, generator: random.Random
 ) -> Tensor:
-    """How close a repair comes in views that it has not seen: the PSNR half-way or so and the mean of two views at the
-    end, each with half the weight, dB. Differentiable in the network."""
+    """Repair a pruned scene, and measure its PSNR in views that the repair does not use.
+
+    Args:
+        network: sets the steps; the result is differentiable in its parameters.
+        scene: the scene.
+        budget: key of its pruned scene.
+        steps: number of steps.
+        generator: chooses views, and the step of the first measurement.
+
+    Returns:
+        PSNR in dB: half of it from one view between a quarter and all of the steps, half from two views at the end.
+    """
     chosen = generator.sample(range(len(scene.views)), steps + 3)
-    looked_at = {generator.randrange(max(1, steps // 4), steps): chosen[steps : steps + 1], steps: chosen[steps + 1 :]}
-    now, share = scene.pruned[budget], share_of_start(scene.psnr[budget])
+    measured = {generator.randrange(max(1, steps // 4), steps): chosen[steps : steps + 1], steps: chosen[steps + 1 :]}
+    now, factor = scene.pruned[budget], initial_rate_factor(scene.psnr[budget])
     feedback = Feedback(now, len(scene.dense))
     reached: list[Tensor] = []
     for step in range(steps):
         view = scene.views[chosen[step]]
-        feedback.observe(gradients_of(now.detach(), view, _target(scene, chosen[step]), BACKEND))
+        feedback.observe(gradients_of(now.detach(), view, _target(scene, chosen[step]), TRAINING.backend))
         factors = network(feedback.features(now.detach(), step / steps, steps))
-        now = feedback.moved(now, share * share_of_rates(step / steps), factors)
-        if step + 1 in looked_at:
-            seen = [_decibels(_drawn(now, scene, index), _target(scene, index)) for index in looked_at[step + 1]]
-            reached.append(torch.stack(seen).mean())
+        now = feedback.moved(now, factor * rate_factor(step / steps), factors)
+        if step + 1 in measured:
+            psnrs = [_decibels(_drawn(now, scene, index), _target(scene, index)) for index in measured[step + 1]]
+            reached.append(torch.stack(psnrs).mean())
     return 0.5 * torch.stack(reached).sum()
 
 
@@ -115,65 +132,67 @@ def train_feedback(
     seconds: float = math.inf,
     start: FeedbackRefiner | None = None,
 ) -> FeedbackRefiner:
-    """Train a network.
+    """Train a feedback network.
 
-    Processes that are connected (:mod:`pointsplat_ns.system.processes`) share the repairs of each update among them.
-    What is learned is the same, to rounding. Updates whose gradients are not finite are left out.
+    Connected processes (:mod:`pointsplat_ns.system.processes`) share the repairs of each update. The result is the same
+    up to rounding. Updates with gradients that are not finite are skipped.
 
     Args:
-        scenes: on one device, where all is computed; the same in every process.
+        scenes: scenes on one device, which computes everything; the same in every process.
         updates: number of steps of the network's optimiser.
         at_once: repairs whose gradients are averaged in an update.
-        seed: of the network's initial weights and of all choices.
-        output: file that the network is saved to now and then, and at the end, by the first process.
+        seed: seed of the initial weights and of all choices.
+        output: file for the network; the first process saves it at intervals and at the end.
         progress: called with the share done, in [0, 1].
-        seconds: after which training ends with fewer updates; the rates fall with the time then.
-        start: a trained network to go on from, which is not changed; by default one that changes nothing yet.
+        seconds: time limit; training may end with fewer updates, and the learning rate falls with the time.
+        start: a trained network to continue from; not changed. By default training starts from a network with zero
+            steps.
 
     Returns:
         The network, in evaluation mode.
 
     Raises:
-        DataError: if there is no scene, one has too few views for a repair, or there are fewer repairs in an update
-            than processes.
+        DataError: if there is no scene, a scene has too few views for a repair, or an update has fewer repairs than
+            there are processes.
     """
     size, rank = processes.world_size(), processes.rank()
     if not scenes:
         raise DataError("no scene to train on; expected at least one")
     if at_once < size:
         raise DataError(f"{at_once} repairs in an update; expected at least as many as processes, {size}")
+    needed_views = max(TRAINING.steps) + 3
     for scene in scenes:
-        if len(scene.views) < max(STEPS) + 3:
-            raise DataError(f"{scene.name}: {len(scene.views)} views; expected at least {max(STEPS) + 3}")
+        if len(scene.views) < needed_views:
+            raise DataError(f"{scene.name}: {len(scene.views)} views; expected at least {needed_views}")
     generator = random.Random(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = FeedbackRefiner().to(scenes[0].dense.device)
     if start is not None:
         network.load_state_dict(start.state_dict())
-    rate = RATE if start is None else RATE_GOING_ON
+    rate = TRAINING.rate if start is None else TRAINING.rate_of_trained
     adam = torch.optim.Adam(network.parameters(), lr=rate, betas=(0.9, 0.99))
     metadata = {"scenes": [scene.name for scene in scenes], "keep": [*scenes[0].pruned], "repairs_per_update": at_once}
     began = time.monotonic()
     saved, update, done = began, 0, 0.0
     while done < 1:
-        adam.param_groups[0]["lr"] = rate * min(1, (update + 1) / WARM_UP) * share_of_rates(done)
+        adam.param_groups[0]["lr"] = rate * min(1, (update + 1) / TRAINING.warm_up) * rate_factor(done)
         adam.zero_grad()
         for number in range(at_once):
             scene = generator.choice(scenes)
             budget = generator.choice(list(scene.pruned))
-            steps = generator.choice(STEPS)
-            its_own = random.Random(generator.getrandbits(64))
+            steps = generator.choice(TRAINING.steps)
+            own_generator = random.Random(generator.getrandbits(64))
             if number % size == rank:
                 with suitable_threads(scene.dense.device):
-                    (-roll_out(network, scene, budget, steps, its_own) * (size / at_once)).backward()
+                    (-roll_out(network, scene, budget, steps, own_generator) * (size / at_once)).backward()
         processes.average_gradients(network.parameters())
         if torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0).isfinite():
             adam.step()
         update += 1
         now = time.monotonic()
-        done = processes.gathered([max(update / updates, (now - began) / seconds)])[0]  # by the first one's clock
-        if output is not None and rank == 0 and (now - saved > SAVED_EVERY or done >= 1):
+        done = processes.gathered([max(update / updates, (now - began) / seconds)])[0]  # the clock of the first process
+        if output is not None and rank == 0 and (now - saved > TRAINING.save_interval or done >= 1):
             save_feedback_refiner(network, output, {**metadata, "updates": update})
             saved = now
         if progress is not None:
@@ -182,7 +201,7 @@ def train_feedback(
 
 
 def _drawn(gaussians: Gaussians, scene: TrainingScene, index: int) -> Tensor:
-    return render(gaussians, scene.views[index], backend=BACKEND)
+    return render(gaussians, scene.views[index], backend=TRAINING.backend)
 
 
 @torch.no_grad()
@@ -191,4 +210,4 @@ def _target(scene: TrainingScene, index: int) -> Tensor:
 
 
 def _decibels(image: Tensor, target: Tensor) -> Tensor:
-    return -10 * torch.log10((image - target).square().mean() + FLOOR)
+    return -10 * torch.log10((image - target).square().mean() + TRAINING.least_error)

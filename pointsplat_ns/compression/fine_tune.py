@@ -24,7 +24,7 @@ def fine_tune(
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> Gaussians:
-    """Optimise the parameters of a scene so that its renders match target images. The count does not change.
+    """Optimise the parameters of a scene so that its renders match target images. The number of Gaussians is kept.
 
     Each step renders one view and takes one step of Adam on 0.8 L1 + 0.2 (1 - SSIM). Each view comes once before any
     is repeated. Values that are not finite (the logit of opacity 1, the log-scale of a flat axis) do not change.
@@ -32,10 +32,10 @@ def fine_tune(
     Args:
         scene: K Gaussians.
         views: C views.
-        targets: the dense scene, whose renders are then the targets; or C images (H, W, 3) in [0, 1], one per view.
+        targets: the dense scene, whose renders are the targets; or C images (H, W, 3) in [0, 1], one per view.
         steps: number of optimisation steps.
-        rates: learning rates by parameter name, which replace those of 3DGS; that of the means is multiplied
-            by the extent of the scene.
+        rates: learning rates by parameter name, in place of those of 3DGS. The rate of the means is multiplied by the
+            extent of the scene.
         seed: seed of the order of the views.
         progress: called with the share done, in [0, 1].
 

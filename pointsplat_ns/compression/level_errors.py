@@ -1,5 +1,4 @@
-"""The errors of a level of detail: of its renders, as seen from where they were made and from farther away, and of the
-places of its Gaussians."""
+"""Errors of a level of detail: of its renders in near and farther views, and of the positions of its Gaussians."""
 
 from __future__ import annotations
 
@@ -16,32 +15,27 @@ from pointsplat_ns.rasterizer import render, render_depth
 from pointsplat_ns.views import Views
 
 FARTHER = (2, 4, 8)
-"""How many times as far away errors are also measured."""
-
-_DEPTH_SIDE = 100
-"""Longer side, in pixels, of the depth images that the distance of the compared views is taken from."""
-
-_CHUNK = 1 << 20
-"""Gaussians at a time whose distances are computed in float64."""
+"""Factors on the distance of the compared views, at which errors are measured too."""
 
 
 @dataclass(frozen=True, eq=False)
 class FarReference:
-    """What should be seen from so many times as far as the compared views: a scene there covers as many times fewer
-    pixels a side, and each shows the mean of a square of those of the near image."""
+    """Target images at a multiple of the distance of the compared views. The scene covers a smaller part of the picture
+    there, so a target is a near render with each square of ``times`` x ``times`` pixels averaged."""
 
     times: int
+    """The multiple."""
     views: Views
-    """The compared views with so many times fewer pixels a side."""
+    """The compared views with width and height divided by ``times``."""
     targets: list[Tensor]
-    """The dense scene's near renders, averaged over squares of pixels."""
+    """The averaged renders of the dense scene."""
 
     @torch.no_grad()
     def psnr(self, scene: Gaussians) -> float:
         """PSNR of a scene's renders over all pixels of all views, dB.
 
-        The dense scene itself does not reach inf: Gaussians smaller than a pixel are drawn as large as one, so its
-        renders from afar are coarser than what should be seen, and those of a level can be closer to that.
+        The dense scene itself does not reach inf: the rasterizer draws Gaussians no thinner than a pixel, so its
+        distant renders are coarser than the targets. A level can be closer to the targets than the dense scene.
         """
         pairs = zip(self.views, self.targets, strict=True)
         errors = [float((render(scene, view).double() - target).square().mean()) for view, target in pairs]
@@ -55,7 +49,7 @@ class RenderErrors:
     near: Closeness
     """In the compared views."""
     farther: dict[int, float]
-    """PSNR, dB, by how many times as far the level is seen from: see :class:`FarReference`."""
+    """PSNR in dB by multiple of the distance, see :class:`FarReference`."""
 
     def view_psnr(self, index: int) -> float:
         """PSNR of one compared view, dB."""
@@ -64,8 +58,8 @@ class RenderErrors:
 
 @dataclass(frozen=True)
 class Displacement:
-    """How far the centres of the dense scene's Gaussians are from those of the level's that they were merged into,
-    scene units. Gaussians that were dropped do not count."""
+    """Distances from the centres of the dense scene's Gaussians to the centres of the Gaussians that contain them in
+    the level, scene units. Dropped Gaussians do not count."""
 
     rms: float
     median: float
@@ -74,7 +68,7 @@ class Displacement:
 
 
 def far_references(reference: DenseReference) -> list[FarReference]:
-    """What should be seen from each of :data:`FARTHER` for which the compared views have enough pixels."""
+    """The targets at each of :data:`FARTHER`, as far as the compared views have enough pixels."""
     views = reference.views
     found = []
     for times in FARTHER:
@@ -94,27 +88,26 @@ def _averaged(image: Tensor, side: int) -> Tensor:
 
 @torch.no_grad()
 def displacement(dense: Gaussians, level: Gaussians, assignment: Tensor) -> Displacement:
-    """How far merging moved the centres of Gaussians.
+    """Measure how far merging moved the centres of Gaussians.
 
     Args:
         dense: N Gaussians.
-        level: K Gaussians that they were merged into.
-        assignment: (N,) index in ``level`` of the Gaussian that each is in; -1 if dropped. At least one is not.
+        level: K Gaussians, merged from ``dense``.
+        assignment: (N,) index in ``level`` for each Gaussian of ``dense``; -1 if dropped. At least one is not dropped.
     """
     own = (assignment >= 0).nonzero()[:, 0]
-    distances = torch.cat(
-        [(dense.means[i].double() - level.means[assignment[i]].double()).norm(dim=1) for i in own.split(_CHUNK)]
-    )
+    pieces = own.split(1 << 20)  # because float64 takes memory
+    distances = torch.cat([(dense.means[i].double() - level.means[assignment[i]].double()).norm(dim=1) for i in pieces])
     median, p95 = np.quantile(distances.cpu().numpy(), (0.5, 0.95))
     return Displacement(math.sqrt(float(distances.square().mean())), float(median), float(p95))
 
 
 @torch.no_grad()
-def distance_seen(dense: Gaussians, reference: DenseReference) -> float | None:
-    """The median depth of what the compared views show, scene units; None if they show nothing."""
+def median_depth(dense: Gaussians, reference: DenseReference) -> float | None:
+    """The median depth over the covered pixels of the compared views, scene units; None if no pixel is covered."""
     depths = []
-    for view in replace(reference.views, rasterize_mode="classic").resized(_DEPTH_SIDE):
+    for view in replace(reference.views, rasterize_mode="classic").resized(100):
         depth, alpha = render_depth(dense, view)
         depths.append(depth[alpha > 0.5].double().cpu())
-    seen = torch.cat(depths)
-    return float(seen.median()) if len(seen) else None
+    covered = torch.cat(depths)
+    return float(covered.median()) if len(covered) else None

@@ -1,4 +1,4 @@
-"""The folder that levels of detail are written to: a PLY and the parents of each level, a manifest, and a picture."""
+"""The folder of written levels of detail: a PLY and the parents of each level, a manifest, and a picture."""
 
 from __future__ import annotations
 
@@ -16,16 +16,10 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import content_hash, write_ply
 from pointsplat_ns.io.files import replacing, write_json
 
-FORMAT, VERSION = "pointsplat-lod", 1
-"""Name and version of the manifest's format. The version rises when a reader of the old one would go wrong."""
+FORMAT = {"format": "pointsplat-lod", "version": 1}
+"""Format of the manifest. The version rises with each change that readers of the old version misread."""
 
 MANIFEST, PICTURE = "lod.json", "lod.png"
-
-MAX_BYTES = 1 << 24
-"""A manifest has about 1 kB a level."""
-
-_COLUMNS, _INCHES = 3, 5.0
-"""Images side by side in the picture, and the width of each, inches."""
 
 
 def file_names(index: int) -> tuple[str, str]:
@@ -34,7 +28,7 @@ def file_names(index: int) -> tuple[str, str]:
 
 
 def check_folder(folder: Path, count: int, force: bool) -> None:
-    """Check, before the long computations, that ``count`` levels may be written to a folder.
+    """Check that ``count`` levels may be written to a folder, before the long computations.
 
     Args:
         folder: need not exist.
@@ -42,8 +36,8 @@ def check_folder(folder: Path, count: int, force: bool) -> None:
         force: whether existing files may be overwritten.
 
     Raises:
-        SceneError: if it is a file or named like one, or holds a file that must not be overwritten. Levels that were
-            interrupted may be.
+        SceneError: if it is a file or named like one, or holds a file that must not be overwritten. Levels of an
+            interrupted command may be overwritten.
     """
     if folder.suffix.lower() in (".ply", ".json", ".png"):
         raise SceneError(f"{folder}: levels are several files; expected the name of a folder")
@@ -56,20 +50,22 @@ def check_folder(folder: Path, count: int, force: bool) -> None:
 
 
 def is_unfinished(folder: Path) -> bool:
-    """Whether the levels in a folder are those of a command that was interrupted."""
+    """Whether a folder holds the levels of an interrupted command."""
     path = folder / MANIFEST
     try:
-        if path.stat().st_size > MAX_BYTES:
+        if path.stat().st_size > 1 << 24:  # a manifest has about 1 kB for each level
             return False
         manifest = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError, RecursionError):
         return False
-    return isinstance(manifest, dict) and manifest.get("format") == FORMAT and manifest.get("complete") is False
+    return (
+        isinstance(manifest, dict) and manifest.get("format") == FORMAT["format"] and manifest.get("complete") is False
+    )
 
 
 class LevelFolder:
     """Writes levels to a folder, one after the other. Every file is written beside and renamed, so that an interruption
-    leaves whole files and a manifest that is true of them.
+    leaves whole files and a manifest that fits them.
 
     Args:
         folder: created with the first file.
@@ -92,8 +88,8 @@ class LevelFolder:
             SceneError: if a file cannot be written.
         """
         if not self._written:
-            # Older levels are overwritten from here on.
-            write_json({"format": FORMAT, "version": VERSION, "complete": False, "levels": []}, self.folder / MANIFEST)
+            # From here on older levels are overwritten.
+            write_json({**FORMAT, "complete": False, "levels": []}, self.folder / MANIFEST)
             (self.folder / PICTURE).unlink(missing_ok=True)
         scene_name, parents_name = file_names(len(self._written))
         write_ply(scene, self.folder / scene_name)
@@ -102,22 +98,21 @@ class LevelFolder:
         self._written.append({**self._facts(scene_name), "parents": self._facts(parents_name)})
 
     def write_manifest(self, about: dict[str, Any], levels: Sequence[dict[str, Any]], complete: bool = True) -> None:
-        """Write the manifest of the levels that were written so far.
+        """Write the manifest of the levels written so far.
 
         Args:
-            about: facts of all levels together.
-            levels: facts of each level that was written.
-            complete: whether these are all.
+            about: facts on all levels together.
+            levels: facts on each written level.
+            complete: whether these are all levels.
 
         Raises:
             SceneError: if it cannot be written.
         """
         rows = [{**files, **facts} for files, facts in zip(self._written, levels, strict=True)]
-        head = {"format": FORMAT, "version": VERSION, "complete": complete}
-        write_json({**head, **about, "levels": rows}, self.folder / MANIFEST)
+        write_json({**FORMAT, "complete": complete, **about, "levels": rows}, self.folder / MANIFEST)
 
     def write_picture(self, images: Sequence[Tensor], captions: Sequence[str]) -> None:
-        """Draw images (H, W, 3) of one size with a caption below each; nothing if there is none.
+        """Draw images (H, W, 3) of one size with a caption below each; without images, draw none.
 
         Raises:
             SceneError: if it cannot be written.
@@ -126,10 +121,10 @@ class LevelFolder:
 
         if not images:
             return
-        columns = min(_COLUMNS, len(images))
+        columns, panel = min(3, len(images)), 5.0  # inches across
         rows = math.ceil(len(images) / columns)
         height, width = images[0].shape[:2]
-        size = (_INCHES * columns, rows * (_INCHES * height / width + 0.4))
+        size = (panel * columns, rows * (panel * height / width + 0.4))
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False).ravel()
         for axis in axes[len(images) :]:

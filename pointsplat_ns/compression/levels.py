@@ -1,7 +1,7 @@
-"""Levels of detail: a scene merged to fewer and fewer Gaussians in one pass, the error of each level measured.
+"""Levels of detail: a scene merged to ever fewer Gaussians in one pass, with the error of each level.
 
-Each level is merged from the one before, so levels are nested: every Gaussian of a level is in one Gaussian of the next
-coarser level, its parent.
+Each level is merged from the level before, so levels are nested: every Gaussian has one parent in the next coarser
+level.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from pointsplat_ns.compression.level_errors import (
     FarReference,
     RenderErrors,
     displacement,
-    distance_seen,
     far_references,
+    median_depth,
 )
 from pointsplat_ns.compression.level_folder import LevelFolder
 from pointsplat_ns.compression.prune import prune_scene
@@ -53,9 +53,9 @@ class Level:
     """K Gaussians."""
     parents: Tensor  # [M] int32, index in ``scene`` of the parent of each Gaussian of the level before; -1 if dropped
     dropped: int
-    """Number of Gaussians of the dense scene that are in none of this level, as they are too faint to be drawn."""
+    """Number of Gaussians of the dense scene without a place in this level, because they are too faint to be drawn."""
     displacement: Displacement
-    """How far merging moved the centres of the dense scene's Gaussians, scene units."""
+    """Distances by which merging moved the centres of the dense scene's Gaussians, scene units."""
     median_size: float
     """Median of the Gaussians' largest standard deviations, scene units."""
     errors: RenderErrors | None
@@ -64,7 +64,7 @@ class Level:
     """Duration of merging from the level before."""
 
     def facts(self, whole: int) -> dict[str, Any]:
-        """What the manifest says of the level; ``whole`` is the number of Gaussians of the dense scene."""
+        """The manifest's entry of the level; ``whole`` is the number of Gaussians of the dense scene."""
         errors, near = self.errors, self.errors and self.errors.near
         return {
             "count": len(self.scene),
@@ -90,28 +90,27 @@ class Levels:
         >>> levels = ps.lod(ps.example_room()[::20], ["50%", "10%"])
         >>> [len(level.scene) for level in levels]
         [1572, 314]
-        >>> whole = levels.assignment(1)  # which Gaussian of the second level each of the dense scene is in
+        >>> whole = levels.assignment(1)  # index in the second level, for each Gaussian of the dense scene
         >>> len(whole), int(whole.max())
         (3143, 313)
     """
 
     dense: Gaussians
-    """The N Gaussians that the levels were made of, with all SH bands; those that cannot be drawn are left out."""
+    """The N Gaussians of the dense scene with all SH bands, without undrawable ones."""
     levels: tuple[Level, ...]
     """The finest first."""
     reference: DenseReference | None
-    """Renders of the dense scene that levels were compared with; None if there are no views."""
+    """Renders of the dense scene, for comparison with the levels; None if there are no views."""
     farther: dict[int, float]
-    """PSNR in dB of the dense scene itself, by how many times as far it is seen from: what levels are to be compared
-    with there."""
+    """PSNR in dB of the dense scene itself by multiple of the distance: the reference for levels in distant views."""
     distance: float | None
-    """Median depth of what the views of ``reference`` show, scene units."""
+    """Median depth over the covered pixels of ``reference``, scene units."""
     origin: str
-    """Where those views came from."""
+    """Origin of those views."""
     source: SourceFile | None
-    """The file that the dense scene was read from; None if it was given as Gaussians."""
+    """The file of the dense scene; None if it was given as Gaussians."""
     notes: tuple[str, ...]
-    """Lines of text: SH bands dropped, where views came from, why nothing was compared."""
+    """Lines of text: SH bands dropped, origin of the views, why nothing was compared."""
 
     @property
     def scenes(self) -> list[Gaussians]:
@@ -133,7 +132,7 @@ class Levels:
         return iter(self.levels)
 
     def assignment(self, index: int) -> Tensor:
-        """Index (N,) int64, in the level at ``index``, of the Gaussian that each of ``dense`` is in; -1 if dropped."""
+        """Index (N,) int64 in the level at ``index`` for each Gaussian of ``dense``; -1 if dropped."""
         *finer, last = (level.parents.long() for level in self.levels[: range(len(self))[index] + 1])
         for parents in reversed(finer):
             last = _parents_of_parents(parents, last)
@@ -155,12 +154,12 @@ class Levels:
         self._finish(out)
 
     def _finish(self, out: LevelFolder) -> None:
-        """Write the picture and the manifest of levels that were written."""
+        """Write the picture and the manifest of the written levels."""
         out.write_picture(*self._picture())
         out.write_manifest(*self._manifest())
 
     def _manifest(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        """What the manifest says of all levels together, and of each."""
+        """The manifest's facts on all levels together, and on each."""
         dense, file, views = self.dense, self.source, None
         boxes = {"all": (dense.means.amin(dim=0), dense.means.amax(dim=0))}
         if bool((dense.alphas > 0).any()):
@@ -190,19 +189,19 @@ class Levels:
 
     @torch.no_grad()
     def _picture(self) -> tuple[list[Tensor], list[str]]:
-        """Images of the dense scene and of every level, and captions: of the view whose error at the coarsest level is
-        the median; none if there is no view."""
+        """Images and captions of the dense scene and of every level, in the view with the median error at the coarsest
+        level; none if there is no view."""
         if self.reference is None:
             return [], []
         views, last = self.reference.views, self[-1].errors
         assert last is not None
-        shown = int(np.argsort(last.near.errors, kind="stable")[(len(views) - 1) // 2])
-        images, captions = [self.reference.renders[shown]], [f"dense: {len(self.dense):,} Gaussians"]
+        index_of_view = int(np.argsort(last.near.errors, kind="stable")[(len(views) - 1) // 2])
+        images, captions = [self.reference.renders[index_of_view]], [f"dense: {len(self.dense):,} Gaussians"]
         for index, level in enumerate(self):
             assert level.errors is not None
-            images.append(render(level.scene, views[shown]))
+            images.append(render(level.scene, views[index_of_view]))
             share = f"{100 * len(level.scene) / len(self.dense):.3g} %"
-            psnr = level.errors.view_psnr(shown)
+            psnr = level.errors.view_psnr(index_of_view)
             captions.append(f"level {index}: {len(level.scene):,} ({share}), {psnr:.1f} dB")
         return images, captions
 
@@ -218,11 +217,11 @@ def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
         levels: ratios, percentages, counts and sizes as for ``keep``; a text may hold several, separated by spaces.
 
     Raises:
-        BudgetError: if there is none, or one is not a budget or can only be found by rendering.
+        BudgetError: if there is no level, or a level is not a budget or needs a search.
     """
     levels = levels.split() if isinstance(levels, str) else levels
     if not levels:
-        raise BudgetError("no level is asked for; expected at least one, such as 50%")
+        raise BudgetError("no level given; expected at least one, such as 50%")
     parsed: list[tuple[str, Keep]] = []
     for level in levels:
         text = level if isinstance(level, str) else _text(level)
@@ -248,7 +247,7 @@ def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int) -> list
     """The number of Gaussians of each level of a scene of ``n``, descending.
 
     Raises:
-        BudgetError: if a level does not fit the scene, or two levels mean the same number.
+        BudgetError: if a level does not fit the scene, or two levels have the same number.
     """
     texts: dict[int, str] = {}
     for text, budget in levels:
@@ -272,24 +271,24 @@ def make_levels(
     force: bool = False,
     progress: Progress = silent,
 ) -> Levels:
-    """Make levels of detail in one pass, measure each, and write each as soon as it is there.
+    """Make levels of detail in one pass, and measure and write each level as soon as it is made.
 
     Args:
-        dense: N Gaussians. Those that cannot be drawn are left out first, and their number is logged.
+        dense: N Gaussians. Undrawable ones are left out first, and their number is logged.
         levels: see :func:`parse_levels`; in any order.
         sh: SH bands of every level, as for :class:`~pointsplat_ns.compression.requests.PruneRequest`.
-        views: source of the views that renders are compared in; merging looks from them where they need not be sampled.
-            By default poses sampled in free space.
-        source: the file that ``dense`` was read from, for the manifest.
-        folder: where to write; None writes nothing.
+        views: source of the views to compare renders in; merging uses them too where they are known. By default poses
+            sampled in free space.
+        source: the file of ``dense``, for the manifest.
+        folder: output folder; None writes nothing.
         force: overwrite existing files.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
 
     Raises:
-        BudgetError: if a level does not fit the scene, or two mean the same number of Gaussians.
+        BudgetError: if a level does not fit the scene, or two levels have the same number of Gaussians.
         SceneError: if no Gaussian can be drawn, or the folder cannot be written to.
         DataError: if ``sh`` needs views and there are none.
-        PointSplatError: if there is no such ``sh``.
+        PointSplatError: if ``sh`` is unknown.
     """
     budgets = parse_levels(levels)
     out = None if folder is None else LevelFolder(folder, len(budgets), force)
@@ -304,7 +303,7 @@ def make_levels(
     try:
         reference = DenseReference(dense, views.compared())
         afar = far_references(reference)
-        distance = distance_seen(dense, reference)
+        distance = median_depth(dense, reference)
     except DataError as error:
         notes = (*notes, f"the levels' errors are not measured: {error}")
     if views.origin and views.origin not in notes:
@@ -315,7 +314,7 @@ def make_levels(
     def so_far() -> Levels:
         return Levels(dense, tuple(made), reference, farther, distance, views.origin, source, notes)
 
-    before = torch.arange(len(dense), device=dense.device)  # [N] index in the level before of the one that each is in
+    before = torch.arange(len(dense), device=dense.device)  # [N] index in the level before
     start = time.perf_counter()
     known = views.known(MERGED_FROM)
     for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), known, views.resolution):
@@ -350,8 +349,8 @@ def make_levels(
 
 
 def _parents(finer: Tensor, coarser: Tensor, count: int) -> Tensor:
-    """Parent (count,) int32 of each Gaussian of a level in the next one, from the assignments (N,) to both; -1 if it
-    was dropped."""
+    """Parent (count,) int32 of each Gaussian of a level in the next coarser level, from the assignments (N,) to both;
+    -1 if dropped."""
     parents = torch.full((count,), -1, dtype=torch.int32, device=finer.device)
     kept = finer >= 0
     parents[finer[kept]] = coarser[kept].int()
@@ -359,5 +358,5 @@ def _parents(finer: Tensor, coarser: Tensor, count: int) -> Tensor:
 
 
 def _parents_of_parents(parents: Tensor, further: Tensor) -> Tensor:
-    """Indices (M,) two levels on; -1 where dropped."""
+    """Indices (M,) of the parents of parents; -1 where dropped."""
     return torch.where(parents >= 0, further[parents.clamp_min(0)], -1)

@@ -29,9 +29,6 @@ RATES = {
 }
 """Learning rates by parameter, as in 3DGS."""
 
-SSIM_WEIGHT = 0.2
-"""Weight of 1 - SSIM in the loss, as in 3DGS; L1 has the rest."""
-
 
 @dataclass(frozen=True)
 class AdamSettings:
@@ -42,12 +39,12 @@ class AdamSettings:
     betas: tuple[float, float] = (0.9, 0.999)
     """Decays of the averages of the gradient and of its square."""
     damping: float = 0.0
-    """Adam's epsilon, as a share of the root mean square of a parameter's gradient over what is seen in the first step
-    that sees any. 0 leaves an epsilon of 1e-15."""
+    """Adam's epsilon for each parameter, as a share of the root mean square of its nonzero gradients in the first step
+    that has any. 0 leaves an epsilon of 1e-15."""
 
 
 class Adam:
-    """Averages of the gradients of a scene's parameters, and the steps that follow from them.
+    """Adam for the parameters of a scene: averages of gradients, and the steps from them.
 
     Args:
         scene: K Gaussians, at the start.
@@ -67,24 +64,24 @@ class Adam:
 
     @torch.no_grad()
     def observe(self, gradients: dict[str, Tensor]) -> None:
-        """Take in the gradients of the loss in one view, all finite, by parameter."""
+        """Update the averages by the gradients of one view's loss, by parameter; all finite."""
         self._steps += 1
         beta, square_beta = self._settings.betas
         for name in RATES:
             gradient = gradients[name]
             if self._settings.damping:
-                self._damping[name] = self._damping[name] or self._settings.damping * seen_rms(gradient)
+                self._damping[name] = self._damping[name] or self._settings.damping * nonzero_rms(gradient)
             self._first[name].lerp_(gradient, 1 - beta)
             self._second[name].mul_(square_beta).addcmul_(gradient, gradient, value=1 - square_beta)
-            root = (self._second[name] / self._whole(1)).sqrt_()
-            self._directions[name] = (self._first[name] / self._whole(0)).div_(root.add_(self._epsilon(name)))
+            root = (self._second[name] / self._weight_sum(1)).sqrt_()
+            self._directions[name] = (self._first[name] / self._weight_sum(0)).div_(root.add_(self._epsilon(name)))
 
     def moves(self, share: float, factors: Tensor | None = None) -> dict[str, Tensor]:
-        """The step of each parameter: Adam's, multiplied by factors.
+        """The step of each parameter: Adam's step times factors.
 
         Args:
-            share: of the learning rates.
-            factors: (K, 6), one a kind of parameter; None is 1.
+            share: factor on all learning rates.
+            factors: (K, 6), a factor for each Gaussian and parameter; None is 1.
         """
         moves = {}
         for kind, name in enumerate(RATES):
@@ -99,8 +96,8 @@ class Adam:
         moves = self.moves(share, factors)
         return Gaussians(**{name: value + moves[name] for name, value in scene.items()})
 
-    def _whole(self, which: int) -> float:
-        """The sum of the weights in an average that began at 0."""
+    def _weight_sum(self, which: int) -> float:
+        """The sum of the weights in an average, for bias correction; ``which`` indexes ``betas``."""
         return 1 - self._settings.betas[which] ** self._steps
 
     def _epsilon(self, name: str) -> float:
@@ -113,15 +110,15 @@ def optimised(
     examples: Iterator[tuple[View, Tensor]],
     choose: Callable[[Gaussians], tuple[float, Tensor | None]] = lambda scene: (1.0, None),
 ) -> Iterator[Gaussians]:
-    """Scenes after each step, without end. Values that are not finite (the logit of opacity 1, the log-scale of a flat
-    axis) do not change.
+    """Yield the scene after each step, without end. Values that are not finite (the logit of opacity 1, the log-scale
+    of a flat axis) do not change.
 
     Args:
         scene: K Gaussians; not changed.
-        adam: made of the scene.
-        examples: views, and the image (H, W, 3) in [0, 1] that each should show; without end.
-        choose: from the scene before a step to its share of the learning rates and its factors, see
-            :meth:`Adam.moves`. It is called when the gradients of the step are known.
+        adam: its averages; made from the same scene.
+        examples: views and their target images (H, W, 3) in [0, 1], without end.
+        choose: from the scene before a step to the arguments ``share`` and ``factors`` of :meth:`Adam.moves`. It is
+            called after the gradients of the step are computed.
     """
     scene = scene.detach()
     while True:
@@ -133,8 +130,7 @@ def optimised(
 
 
 def extent(scene: Gaussians) -> float:
-    """How far the Gaussians of a scene reach from their mean position, but for the farthest tenth, scene units; 1 if
-    they are all in one place."""
+    """The 90 % quantile of the distances from the mean position, scene units; 1 if all Gaussians are in one place."""
     with one_thread():
         centred = scene.means.detach().double() - scene.means.detach().double().mean(0)
         return float(centred.norm(dim=1).quantile(0.9)) or 1.0
@@ -143,14 +139,13 @@ def extent(scene: Gaussians) -> float:
 def gradients_of(
     scene: Gaussians, view: View, target: Tensor, backend: Literal["torch", "auto"] = "torch"
 ) -> dict[str, Tensor]:
-    """Gradients of the loss of one view by parameter. What is not finite is 0, and so are the gradients of values that
-    are not finite themselves.
+    """Gradients of the loss of one view by parameter. A gradient is 0 where it or the value itself is not finite.
 
     Args:
         scene: K Gaussians.
-        view: what is rendered.
-        target: (H, W, 3) image that it should look like, in [0, 1].
-        backend: what draws, as for :func:`pointsplat_ns.rasterizer.render`.
+        view: the camera.
+        target: (H, W, 3) target image in [0, 1].
+        backend: the rasterizer, as for :func:`pointsplat_ns.rasterizer.render`.
     """
     leaves = scene.map(lambda value: value.detach().requires_grad_())
     with torch.enable_grad():
@@ -164,16 +159,17 @@ def _finite_gradient(value: Tensor) -> Tensor:
     return value.grad.nan_to_num_(0.0, 0.0, 0.0).masked_fill_(~value.detach().isfinite(), 0.0)
 
 
-def seen_rms(gradient: Tensor) -> float:
+def nonzero_rms(gradient: Tensor) -> float:
     """Root mean square of the gradients that are not 0, in float64; 0 if all are."""
-    seen = gradient[gradient != 0].double()
+    nonzero = gradient[gradient != 0].double()
     with one_thread():
-        return float(seen.square().mean().sqrt()) if seen.numel() else 0.0
+        return float(nonzero.square().mean().sqrt()) if nonzero.numel() else 0.0
 
 
 def _loss(image: Tensor, target: Tensor) -> Tensor:
+    """The loss of 3DGS for an image (H, W, 3); L1 alone for images smaller than SSIM's window."""
     l1 = (image - target).abs().mean()
     if min(image.shape[:2]) < SSIM_WINDOW:
         return l1
     similarity = mean_ssim(image.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None])
-    return (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - similarity)
+    return 0.8 * l1 + 0.2 * (1 - similarity)

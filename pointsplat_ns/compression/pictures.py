@@ -20,16 +20,10 @@ from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import spread_indices
 
-_SHEET_COLUMNS, _SHEET_SIDE = 4, 320
-"""Rows and columns of a sheet of views, and longer side of its pictures, pixels."""
-
-SHOWN_VIEWS = 3
-"""Number of views in the image, spread over those compared."""
-
 
 @torch.no_grad()
 def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> str:
-    """Draw some of the compared views: the dense scene, and the scene after each stage, side by side.
+    """Draw three of the compared views: the dense scene, and the scene after each stage, side by side.
 
     Args:
         dense: the scene that was compacted.
@@ -37,7 +31,7 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> st
         path: the PNG file to write.
 
     Returns:
-        A line of text: the columns of the image, or why there is none.
+        A line of text: the columns of the image, or the reason for none.
 
     Raises:
         SceneError: if the file cannot be written.
@@ -53,9 +47,9 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> st
         True
     """
     if result.reference is None:
-        return f"{path}: not drawn, as there is no view to draw"
+        return f"{path}: not drawn, because there are no views"
     views, renders = result.reference.views, result.reference.renders
-    shown = spread_indices(len(views), SHOWN_VIEWS)
+    rows_of = spread_indices(len(views), 3)
     names, titles, scenes = ["dense"], [_title("dense", dense, None)], []
     for stage in result.stages:
         if stage.after is not None:
@@ -64,7 +58,7 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> st
             names.append(name + (share if stage.accepted else " (left out)"))
             titles.append(_title(names[-1], stage.scene, stage.after))
             scenes.append(stage.scene)
-    rows = [[renders[i].cpu(), *(render(scene, views[i]).cpu() for scene in scenes)] for i in shown]
+    rows = [[renders[i].cpu(), *(render(scene, views[i]).cpu() for scene in scenes)] for i in rows_of]
     side_by_side(rows, titles, path)
     return f"{path}: {', '.join(names)}, side by side"
 
@@ -76,24 +70,24 @@ def _title(name: str, scene: Gaussians, close: Closeness | None) -> str:
 
 @torch.no_grad()
 def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
-    """Draw the views that decisions about a scene are made in.
+    """Draw up to 16 of the views that decide about a scene, as a sheet of four columns.
 
     Args:
         dense: N Gaussians on the CPU.
-        source: where views come from.
+        source: source of views.
         path: the PNG file to write.
 
     Returns:
-        Text: where the views come from, the estimated up direction, and the share of visible content in the views.
+        Text: the origin of the views, the estimated up direction, and the share of visible content in the views.
 
     Raises:
         DataError: if there are no views.
         SceneError: if the file cannot be written.
     """
     views = source.views(MERGED_FROM)
-    pictures = [render(dense, view) for view in views.spread(_SHEET_COLUMNS**2).resized(_SHEET_SIDE)]
+    columns = 4
+    pictures = [render(dense, view) for view in views.spread(columns**2).resized(320)]
     share = coverage(dense, views)
-    columns = _SHEET_COLUMNS
     rows = [pictures[first : first + columns] for first in range(0, len(pictures), columns)]
     rows[-1] += [torch.ones_like(pictures[0])] * (columns - len(rows[-1]))
     side_by_side(rows, [""] * columns, path)

@@ -1,4 +1,4 @@
-"""Turns, scales and moves scenes: to another up direction, another unit, or the frame of a run's data."""
+"""Turns, scales and moves scenes: to another up direction, unit of length, or frame of a run's data."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from pointsplat_ns.geometry.quaternions import quaternions_of
 from pointsplat_ns.io.runs import Run, may_be_run, open_run
 from pointsplat_ns.looking.sampling import estimated_up
 from pointsplat_ns.refiner.augmentation import Transform
-
-_AXES = {"x": 0, "y": 1, "z": 2}
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +47,12 @@ def place(
     """Turn and scale a scene, or move it back to the frame of the data that it was trained on.
 
     nerfstudio turns, centres and scales the poses of a dataset before training. ``original_frame`` undoes this, so
-    that the scene fits the poses, meshes and measurements of the data. It comes first, then ``up``, then ``scale``.
+    that the scene fits the poses, meshes and measurements of the data. It applies first, then ``up``, then ``scale``.
 
     Args:
         scene: N Gaussians.
-        up: "z" turns the scene about the origin so that up is the z axis; also "x", "y", "-x", "-y" and "-z". The up
-            direction of the given scene is estimated, unless it is named: "-y:z" turns -y to z.
+        up: new up direction, one of "x", "y", "z", "-x", "-y" and "-z"; the scene turns about the origin. The old up
+            direction is estimated, unless it is named: "-y:z" turns -y to z.
         scale: factor on positions and sizes, above 0.
         original_frame: the Splatfacto run of the scene (its folder, ``config.yml`` or checkpoint).
 
@@ -62,9 +60,9 @@ def place(
         N Gaussians on the same device.
 
     Raises:
-        PointSplatError: if ``up`` is no axis, or ``scale`` is not above 0.
-        DataError: if up is to be estimated, and nothing of the scene is visible.
-        SceneError: if ``original_frame`` is no run.
+        PointSplatError: if ``up`` is not an axis, or ``scale`` is not above 0.
+        DataError: if up has to be estimated, and no Gaussian is visible.
+        SceneError: if ``original_frame`` is not a run.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -90,11 +88,13 @@ def place(
 def _frame_at(path: str | Path) -> Similarity:
     run = open_run(path, need_data=False) if may_be_run(path) else None
     if run is None or not run.is_gaussian_scene:
-        raise SceneError(f"{path}: not a Splatfacto run, which knows the frame of its data; expected its folder")
-    return frame_of(run)
+        raise SceneError(
+            f"{path}: not a Splatfacto run; expected the folder of the run, which has the frame of its data"
+        )
+    return run_frame(run)
 
 
-def frame_of(run: Run) -> Similarity:
+def run_frame(run: Run) -> Similarity:
     """The similarity from the frame of a run's data to the frame of its scene.
 
     Raises:
@@ -104,13 +104,15 @@ def frame_of(run: Run) -> Similarity:
     size = float(torch.linalg.det(linear).abs()) ** (1 / 3)
     matrix = linear / size if size > 0 else linear
     if not size > 0 or float((matrix @ matrix.T - torch.eye(3)).abs().max()) > 1e-4:  # saved with about 7 digits
-        raise SceneError(f"{run.folder}: its transform is no rotation with one scale; expected what nerfstudio saves")
+        raise SceneError(
+            f"{run.folder}: its transform is not a rotation with one scale; expected the file that nerfstudio saved"
+        )
     u, _, v = torch.linalg.svd(matrix)
     return Similarity(u @ v, size * run.scale, run.transform[:, 3].double() * run.scale)
 
 
 def _directions(up: str) -> tuple[Tensor | None, Tensor]:
-    """The up direction of the scene, None if it is to be estimated, and the wanted one."""
+    """The up direction of the scene (None: to be estimated) and the wanted up direction."""
     match = re.fullmatch(r"(?:([+-]?[xyz]):)?([+-]?[xyz])", up.strip().lower())
     if not match:
         raise PointSplatError(f"up is {up!r}; expected an axis such as z or -y, or two such as -y:z (from -y to z)")
@@ -130,12 +132,12 @@ def axis_named(text: str) -> Tensor:
 
 def _axis(text: str) -> Tensor:
     axis = torch.zeros(3, dtype=torch.float64)
-    axis[_AXES[text[-1]]] = -1.0 if text[0] == "-" else 1.0
+    axis["xyz".index(text[-1])] = -1.0 if text[0] == "-" else 1.0
     return axis
 
 
 def _turn(start: Tensor, end: Tensor) -> Tensor:
-    """The smallest rotation (3, 3) from one direction to another; any of the smallest if they are opposite."""
+    """The smallest rotation (3, 3) from one direction to another; one of many if they are opposite."""
     cosine = float(start @ end)
     if cosine < -1 + 1e-12:
         side = torch.linalg.cross(start, torch.eye(3, dtype=torch.float64)[int(start.abs().argmin())])

@@ -1,4 +1,4 @@
-"""A scene, and views of it from a file of cameras: read together, as the views must be in the scene's frame."""
+"""Reads a scene together with views from a file of cameras, and checks that both have the same frame."""
 
 from __future__ import annotations
 
@@ -19,45 +19,34 @@ from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.views import View, Views
 
 LONGEST_SIDE = 1600
-"""Maximum of the longer side of pictures, pixels. 3DGS training reduces photos to as much."""
-
-_CHECKED_MEANS, _CHECKED_VIEWS = 4096, 256
-"""Numbers of Gaussians and of cameras that are checked, evenly taken; a few hundredths of a second."""
-
-_TAIL = 0.05
-"""Share of the Gaussians, at each end of each axis, that do not count: far floaters stand in any camera's picture."""
-
-
-_SMALLEST = 0.02
-"""Least width of the scene's content that counts as seen, as a share of the picture's: from far enough away, many a
-camera has a dot of it in the picture."""
+"""Largest longer side of pictures, pixels, as in 3DGS training."""
 
 
 def read_posed(scene: Gaussians | Path | str, poses: Path | str) -> tuple[Gaussians, Views]:
-    """A scene, and the views of it that a file has. The file is read first, and both are checked against each other.
+    """Read a scene and its views. The file of cameras is read first; then both are checked against each other.
 
     Args:
-        scene: N Gaussians, or where to read them.
+        scene: N Gaussians, or the path of a scene.
         poses: as for :func:`views_for`.
 
     Raises:
-        SceneError, DataError: as :func:`views_for`, :func:`~pointsplat_ns.io.read_scene` and :func:`need_seen`.
+        SceneError, DataError: as :func:`views_for`, :func:`~pointsplat_ns.io.read_scene` and :func:`check_views_show`.
     """
     views = views_for(scene, poses)
     dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
-    need_seen(dense, views, poses)
+    check_views_show(dense, views, poses)
     return dense, views
 
 
 def views_for(scene: Gaussians | Path | str, poses: Path | str) -> Views:
-    """The views of a scene that a file has.
+    """Read the views of a scene from a file.
 
     A ``dataparser_transforms.json`` in the scene's run, beside the scene or beside the poses moves them into the
-    scene's frame. They are drawn as the scene's run was trained to be.
+    scene's frame. The views have the rasterize mode of the scene's run.
 
     Args:
-        scene: N Gaussians, or where they are read from.
-        poses: what :func:`~pointsplat_ns.io.camera_files.read_views` takes.
+        scene: N Gaussians, or the path of a scene.
+        poses: as for :func:`~pointsplat_ns.io.camera_files.read_views`.
 
     Returns:
         C views of at most 1600 pixels on the longer side.
@@ -71,37 +60,42 @@ def views_for(scene: Gaussians | Path | str, poses: Path | str) -> Views:
     path = Path(scene)
     views = read_views(poses, _transforms_of(path)).resized(LONGEST_SIDE)
     if may_be_run(path):
-        with suppress(SceneError):  # a checkpoint outside a run, or no scene; who reads it says which
+        with suppress(SceneError):  # a checkpoint outside a run, or not a scene: read_scene says which
             views = replace(views, rasterize_mode=open_run(path, need_data=False).rasterize_mode)
     return views
 
 
-def need_seen(scene: Gaussians, views: Views, poses: Path | str) -> None:
-    """Refuse views most of which see nothing of a scene.
+def check_views_show(scene: Gaussians, views: Views, poses: Path | str) -> None:
+    """Refuse views if the scene is not in the picture in most of them.
+
+    A view shows the scene if a visible Gaussian is in the picture, and the content is at least 2 % as wide as the
+    picture: many a distant camera has a dot of the scene in its picture. The content leaves out 5 % of the Gaussians at
+    each end of each axis, because far floaters are in the picture of nearly any camera. An even choice of up to 4096
+    Gaussians and 256 cameras is checked.
 
     Args:
-        scene: N Gaussians; a scene of which nothing is visible is not refused here.
+        scene: N Gaussians; a scene without a visible Gaussian is not refused here.
         views: C cameras.
-        poses: where they were read from, for the error.
+        poses: path of the cameras, for the error.
 
     Raises:
-        DataError: if fewer than half of them have a visible Gaussian in the picture, and the scene at a visible size.
+        DataError: if fewer than half of the views show the scene.
     """
     visible = (scene.usable() & (scene.alphas >= ALPHA_MIN)).nonzero()[:, 0]
-    means = scene.means[visible[:: max(1, len(visible) // _CHECKED_MEANS)]].double().cpu()
+    means = scene.means[visible[:: max(1, len(visible) // 4096)]].double().cpu()
     if len(means) == 0:
         return
-    low, high = (torch.quantile(means, share, dim=0, interpolation="nearest") for share in (_TAIL, 1 - _TAIL))
+    low, high = (torch.quantile(means, share, dim=0, interpolation="nearest") for share in (0.05, 0.95))
     means = means[((means >= low) & (means <= high)).all(1)]
-    checked = views.spread(_CHECKED_VIEWS)
-    away = (invert_rigid(checked.viewmats.double())[:, :3, 3] - 0.5 * (low + high)).norm(dim=1)
+    checked = views.spread(256)
+    distances = (invert_rigid(checked.viewmats.double())[:, :3, 3] - 0.5 * (low + high)).norm(dim=1)
     across = checked.Ks[:, 0, 0].double() * (high - low).norm()  # pixels, at a distance of 1
-    large = (across >= _SMALLEST * checked.width * away) | bool((low == high).all())
-    seeing = sum(bool(_in_picture(means, view).any()) for view, shown in zip(checked, large, strict=True) if shown)
-    if 2 * seeing < len(checked):
+    large = (across >= 0.02 * checked.width * distances) | bool((low == high).all())
+    showing = sum(bool(_in_picture(means, view).any()) for view, wide in zip(checked, large, strict=True) if wide)
+    if 2 * showing < len(checked):
         raise DataError(
-            f"{poses}: {seeing} of {len(checked)} cameras see anything of the scene; expected at least half; poses and "
-            "scene are probably in different frames: nerfstudio moves and scales scenes, and its run says how in "
+            f"{poses}: {showing} of {len(checked)} cameras see anything of the scene; expected at least half; poses "
+            "and scene are probably in different frames: nerfstudio moves and scales scenes, and its run says how in "
             "dataparser_transforms.json; put that file beside the scene"
         )
 
@@ -110,12 +104,12 @@ def _in_picture(means: Tensor, view: View) -> Tensor:
     """Whether positions (N, 3) are in front of a camera and in its picture, (N,) bool."""
     at = means @ view.viewmat[:3, :3].to(means).T + view.viewmat[:3, 3].to(means)
     x, y, w = (at @ view.K.to(means).T).unbind(1)
-    # Multiplied by the depth, so that nothing is divided by it.
+    # The bounds are multiplied by the depth instead of dividing by it, which may be 0.
     return (w > 0) & (x >= 0) & (x <= view.width * w) & (y >= 0) & (y <= view.height * w)
 
 
 def _transforms_of(scene: Path) -> Path | None:
-    """The ``dataparser_transforms.json`` of the run that a scene is in, or beside its file."""
+    """The ``dataparser_transforms.json`` of the scene's run, or beside its file."""
     folder = scene if scene.is_dir() else scene.parent
     if scene.suffix == ".ckpt" and not (folder / CONFIG_NAME).is_file():
         folder = folder.parent

@@ -1,7 +1,7 @@
-"""Pruning with all options: first cleaning and SH bands, then the count by any method and budget, then fine-tuning.
+"""Pruning with all options: cleaning and SH bands first, then a method and a budget, then fine-tuning.
 
-Views are only looked up or sampled if they are needed: for a budget in dB, ``auto`` SH, a method that scores by views,
-cleaning that removes anything, or fine-tuning.
+Views are read or sampled only where they are needed: for a budget in dB, ``auto`` SH, a method that scores by views,
+cleaning that removes a Gaussian, or fine-tuning.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ SCORED_VIEWS = 40
 
 @dataclass(frozen=True, eq=False)
 class Pruned:
-    """A smaller scene, with notes on how it was made."""
+    """A smaller scene, with notes."""
 
     scene: Gaussians
     notes: tuple[str, ...]
-    """Lines of text: SH bands dropped, PSNR reached, where views came from."""
+    """Lines of text: SH bands dropped, PSNR reached, origin of the views."""
 
 
 def prune_scene(
@@ -54,8 +54,8 @@ def prune_scene(
 
     Args:
         dense: N Gaussians.
-        request: how.
-        views: source of views, if they are needed; by default poses sampled in free space.
+        request: options.
+        views: source of views; by default poses sampled in free space.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
 
     Raises:
@@ -79,8 +79,8 @@ def prune_scene(
         notes += cleaning.notes
     report = functools.partial(progress, f"by {request.by}")
     if count is not None:
-        seen_from, weight = _seen_from(request, views), request.opacity_weight
-        scene = prune(start, count, request.by, seen_from, weight, report, notes.append, views.resolution)
+        method_views, weight = _views_of_method(request, views), request.opacity_weight
+        scene = prune(start, count, request.by, method_views, weight, report, notes.append, views.resolution)
     else:
         make = _pruner(start, request, views, report)
         if cleaning is not None:
@@ -117,8 +117,8 @@ def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress, n
     return cut_sh(dense, degree)
 
 
-def _seen_from(request: PruneRequest, views: ViewSource) -> Views | Callable[[], Views] | None:
-    """The views of a method. Merging takes only known views, because it samples its own."""
+def _views_of_method(request: PruneRequest, views: ViewSource) -> Views | Callable[[], Views] | None:
+    """The views that a method needs. Merging gets known views only, because it samples its own."""
     if request.method.needs_views:
         return functools.partial(views.scored, SCORED_VIEWS)
     return views.known(MERGED_FROM) if request.method.score is None else None
@@ -141,8 +141,8 @@ def _pruner(
 def _refilling(
     make: Callable[[int], Gaussians], cleaning: Cleaning, full: Gaussians, most: int
 ) -> Callable[[int], Gaussians]:
-    """``make`` also for counts above ``most``, the number of Gaussians in the cleaned scene. Such a scene gets the best
-    of its junk back."""
+    """``make`` extended to counts above ``most``, the number of Gaussians in the cleaned scene. Such a scene gets the
+    most opaque of its junk back."""
     return lambda count: make(count) if count <= most else cleaning.apply(full, count)
 
 
@@ -155,14 +155,14 @@ def _search(
     progress: Callable[[float], None],
     notes: list[str],
 ) -> Gaussians:
-    """The scene of a budget that only trying counts can meet; adds a line to ``notes``.
+    """The scene of a budget that needs a search; adds a line to ``notes``.
 
     Args:
-        dense: the scene that renders are compared with.
-        start: the largest scene that may be kept.
+        dense: the reference of comparisons.
+        start: the largest scene allowed.
         make: from a count to a scene of that many Gaussians.
         request: its budget is a PSNR, or the size of a compressed file.
-        views: views that renders are compared in.
+        views: source of the views to compare renders in.
         progress: called with the share done, in [0, 1].
         notes: lines of text.
     """

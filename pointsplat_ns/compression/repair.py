@@ -1,4 +1,4 @@
-"""Repairs a smaller scene by what it can see: learned steps against the dense scene's own renders, from fresh views."""
+"""Repairs a smaller scene by learned optimisation steps against renders of the dense scene, each in a new view."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from pointsplat_ns.refiner.feedback import FeedbackRefiner, shipped_feedback_ref
 from pointsplat_ns.system.threads import one_thread
 from pointsplat_ns.views import View
 
-__all__ = ["STEPS", "Effort", "RepairBudget", "Repaired", "repair", "share_of_rates", "share_of_start"]
+__all__ = ["STEPS", "Effort", "RepairBudget", "Repaired", "repair", "rate_factor", "initial_rate_factor"]
 
 
 @dataclass(frozen=True)
 class Repaired:
-    """A repaired scene, and what it took."""
+    """A repaired scene, and its cost."""
 
     scene: Gaussians
     steps: int
     seconds: float
     interrupted: bool
-    """Whether Ctrl-C ended it before its time."""
+    """Whether Ctrl-C ended the repair early."""
 
 
 def repair(
@@ -46,38 +46,38 @@ def repair(
 ) -> Repaired:
     """Optimise a smaller scene against renders of the dense one; its number of Gaussians does not change.
 
-    Each step renders both from a view. A network sees what the gradients of the loss have said of each Gaussian, and
-    sets how far it moves (:mod:`~pointsplat_ns.refiner.feedback`). The views are none of
-    those that results are compared in, and come from :meth:`ViewSource.others`: no sampled view comes twice, so that
-    there is none to overfit. Ctrl-C ends the repair; what has been reached is returned.
+    Each step renders both scenes in one view. A network reads the gradients of each Gaussian and sets how far it moves
+    (:mod:`~pointsplat_ns.refiner.feedback`). The views come from :meth:`ViewSource.others`: other views than those of
+    comparisons, and no sampled view twice, which prevents overfitting. Ctrl-C ends the repair, and the scene of the
+    last step is returned.
 
     Args:
         scene: K Gaussians; not changed.
         dense: N Gaussians on the same device.
-        views: where views come from.
-        budget: how long.
+        views: source of views.
+        budget: length of the repair.
         progress: called with the share done, in [0, 1].
-        network: on the scene's device; by default the one that ships, None for the steps of Adam.
-        psnr: of the scene's renders against the dense one's, over what that covers
-            (:meth:`~pointsplat_ns.compression.closeness.DenseReference.psnr_of_covered`), dB: what is nearly right is
-            moved by smaller steps.
+        network: on the scene's device; by default the shipped one, None for plain Adam.
+        psnr: PSNR of ``scene`` over the pixels that the dense scene covers, dB
+            (:meth:`~pointsplat_ns.compression.closeness.DenseReference.psnr_of_covered`). Above
+            ``REPAIR.nearly_right`` the steps are smaller.
 
     Raises:
-        DataError: if there is no place to look from.
+        DataError: if there is no free space for a camera.
     """
     start = time.perf_counter()
     if network == "shipped":
         network = shipped_feedback_refiner(scene.device)
-    feedback, first_share = Feedback(scene, len(dense)), share_of_start(psnr)
+    feedback, first_factor = Feedback(scene, len(dense)), initial_rate_factor(psnr)
     steps, done, interrupted = 0, 0.0, False
 
     def choose(scene: Gaussians) -> tuple[float, Tensor | None]:
         factors = None
         if network is not None:
             expected = budget.steps_in_all(steps, done) or REPAIR.most_steps
-            with torch.no_grad(), one_thread():  # so small that threads would only change how its sums are rounded
+            with torch.no_grad(), one_thread():  # the same rounding for any number of threads
                 factors = network(feedback.features(scene, done, expected))
-        return first_share * share_of_rates(done), factors
+        return first_factor * rate_factor(done), factors
 
     scenes = optimised(scene, feedback, _examples(dense, views), choose)
     try:
@@ -93,24 +93,24 @@ def repair(
 
 
 def _examples(dense: Gaussians, views: ViewSource) -> Iterator[tuple[View, Tensor]]:
-    """Views and renders of the dense scene from them, without end."""
+    """Views and renders of the dense scene in them, without end."""
     for view in views.others():
         with torch.no_grad():
             target = render(dense, view)
         yield view, target
 
 
-def share_of_rates(done: float) -> float:
-    """What is left of the learning rates when a share of the steps, in [0, 1], is done: it falls as a cosine."""
-    return REPAIR.last_share + (1 - REPAIR.last_share) * 0.5 * (1 + math.cos(math.pi * done))
+def rate_factor(done: float) -> float:
+    """Factor on the learning rates when a share of the steps, in [0, 1], is done: a falling half cosine."""
+    return REPAIR.last_factor + (1 - REPAIR.last_factor) * 0.5 * (1 + math.cos(math.pi * done))
 
 
-def share_of_start(psnr: float) -> float:
-    """Share of the learning rates for a scene of a PSNR, dB: 1 up to ``REPAIR.nearly_right``, then in proportion to the
-    root mean square error.
+def initial_rate_factor(psnr: float) -> float:
+    """Factor on all learning rates for a scene of some PSNR, dB: 1 up to ``REPAIR.nearly_right``, then proportional to
+    the root mean square error.
 
     Example:
-        >>> [round(share_of_start(psnr), 3) for psnr in (20, 35, 41, 55)]
+        >>> [round(initial_rate_factor(psnr), 3) for psnr in (20, 35, 41, 55)]
         [1.0, 1.0, 0.501, 0.1]
     """
     return min(1.0, 10 ** ((REPAIR.nearly_right - psnr) / 20))

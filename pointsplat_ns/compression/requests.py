@@ -1,4 +1,4 @@
-"""The options of pruning and compacting: each checked once, before a scene is read, and passed on as one object."""
+"""Requests: all options of pruning or of compacting in one object, checked before a scene is read."""
 
 from __future__ import annotations
 
@@ -32,11 +32,10 @@ SH_CHOICES = ("all", "auto", "0", "1", "2", "3")
 COMPACT_KEEP = 0.1
 """Share of the Gaussians that ``compact`` keeps by default."""
 
-
 Effort = Literal["instant", "quick", "thorough"]
 
 STEPS: dict[Effort, int] = {"instant": 0, "quick": 48, "thorough": 400}
-"""Steps of each effort. Those of "quick" take about as long as merging 100,000 to a million Gaussians."""
+"""Number of repair steps of each effort. "quick" takes about as long as merging 100,000 to a million Gaussians."""
 
 
 def default_device() -> torch.device:
@@ -46,16 +45,16 @@ def default_device() -> torch.device:
 
 @dataclass(frozen=True)
 class RepairBudget:
-    """How long to repair.
+    """Length of a repair, in steps or seconds.
 
     Raises:
         PointSplatError: if it is not a positive time or one of :data:`STEPS`.
     """
 
     effort: Effort = "quick"
-    """A number of steps, see :data:`STEPS`: the result is the same however fast the machine is."""
+    """Number of steps, see :data:`STEPS`. The result does not depend on the speed of the machine."""
     seconds: float | None = None
-    """Wall-clock time, which goes before ``effort``: the result depends on the machine."""
+    """Wall-clock time, in place of ``effort``. The result depends on the speed of the machine."""
 
     def __post_init__(self) -> None:
         if self.effort not in STEPS:
@@ -65,17 +64,17 @@ class RepairBudget:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no time for any step."""
+        """Whether the budget has no step."""
         return self.seconds == 0 if self.seconds is not None else STEPS[self.effort] == 0
 
     def share_done(self, steps: int, seconds: float) -> float:
-        """Share of the budget that ``steps`` steps, which took ``seconds``, have used; 1 or more at the end. The budget
-        must not be empty."""
+        """Used share of the budget after ``steps`` steps and ``seconds`` seconds; 1 or more at the end. The budget must
+        not be empty."""
         return seconds / self.seconds if self.seconds is not None else steps / STEPS[self.effort]
 
     def steps_in_all(self, steps: int, done: float) -> int | None:
-        """Number of steps that fit the budget, if ``steps`` steps have used a share ``done`` of it; None if that is not
-        known yet."""
+        """Expected number of steps in the budget, if ``steps`` steps used the share ``done`` of it; None before the
+        first step of a budget in seconds."""
         if self.seconds is None:
             return STEPS[self.effort]
         return round(steps / done) if done else None
@@ -86,11 +85,11 @@ NO_REPAIR = RepairBudget("instant")
 
 @dataclass(frozen=True)
 class PruneRequest:
-    """How to prune a scene.
+    """Options of pruning.
 
     Raises:
-        BudgetError: if ``keep`` is no budget.
-        PointSplatError: if there is no such method, or an option does not fit it.
+        BudgetError: if ``keep`` is not a budget.
+        PointSplatError: if the method is unknown, or an option does not fit it.
 
     Example:
         >>> PruneRequest("30%", sh="1").count_of(1000, sh_degree=1)
@@ -98,19 +97,19 @@ class PruneRequest:
     """
 
     keep: Keep | str
-    """Ratio, count, size of the file, or the PSNR that renders must reach against those of the dense scene."""
+    """Ratio, count, size of the file, or PSNR of renders against those of the dense scene."""
     by: str = "merge"
     """One of :data:`~pointsplat_ns.pruning.METHODS`."""
     sh: str = "all"
     """"all" keeps the SH bands, a digit cuts them to that degree, "auto" cuts them to the lowest degree whose renders
-    reach :data:`~pointsplat_ns.compression.budget_search.SH_PSNR` against those of the dense scene."""
+    reach 40 dB against those with all bands (:class:`~pointsplat_ns.compression.budget_search.BudgetSettings`)."""
     opacity_weight: float | None = None
-    """Lambda of the methods that weigh opacity; None is the paper's."""
+    """Lambda of the methods that weigh opacity; None is the paper's value."""
     clean: bool = False
-    """Whether to remove first what no picture needs (:mod:`~pointsplat_ns.compression.cleaning`). ``keep`` still refers
-    to the dense scene, and the result has exactly as many Gaussians."""
+    """Whether to remove Gaussians that no picture needs first (:mod:`~pointsplat_ns.compression.cleaning`). ``keep``
+    still refers to the dense scene, and the result has exactly that number of Gaussians."""
     fine_tune: int = 0
-    """Number of steps of optimising the result against renders of the dense scene."""
+    """Number of optimisation steps of the result against renders of the dense scene."""
     budget: Keep = field(init=False)
     """``keep``, parsed if it is text."""
 
@@ -131,8 +130,7 @@ class PruneRequest:
         return method_named(self.by)
 
     def count_of(self, n: int, sh_degree: int) -> int | None:
-        """Number of Gaussians to keep of ``n``; None if only trying counts tells it (a PSNR, or the size of a
-        compressed file).
+        """Number of Gaussians to keep of ``n``; None if it needs a search (a PSNR, or the size of a compressed file).
 
         Args:
             n: number of Gaussians in the dense scene.
@@ -150,13 +148,13 @@ class PruneRequest:
 
 @dataclass(frozen=True, eq=False)
 class CompactRequest:
-    """How to compact a scene: prune it, refine it if there is a refiner, and repair it."""
+    """Options of compacting: prune a scene, refine it if there is a refiner, and repair it."""
 
     prune: PruneRequest
     refiner: TrainedRefiner | None = None
-    """None for none."""
+    """None for no refinement."""
     repair: RepairBudget = NO_REPAIR
-    """How long to repair."""
+    """Length of the repair."""
 
     @classmethod
     def of(
@@ -171,12 +169,12 @@ class CompactRequest:
         """A request from options that may be missing.
 
         Args:
-            refiner: None for none.
-            keep: None is the setting that the refiner was trained with; without a refiner, :data:`COMPACT_KEEP`.
-            by: None is the method that the refiner was trained with; without a refiner, merging.
+            refiner: None for no refinement.
+            keep: None is the budget of the refiner's training; without a refiner, :data:`COMPACT_KEEP`.
+            by: None is the method of the refiner's training; without a refiner, merging.
             sh: as of :class:`PruneRequest`.
             clean: as of :class:`PruneRequest`.
-            repair: how long to repair; by default not at all.
+            repair: length of the repair; by default there is none.
 
         Raises:
             BudgetError, PointSplatError: as :class:`PruneRequest`.
@@ -197,7 +195,7 @@ class CompactRequest:
         """Refuse a scene whose SH degree exceeds the refiner's, before the long computations.
 
         Raises:
-            SceneError: if the degree that is left after pruning is known to exceed it.
+            SceneError: if the degree after pruning is certain to exceed it.
         """
         if self.refiner is None:
             return

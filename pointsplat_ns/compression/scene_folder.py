@@ -1,4 +1,4 @@
-"""Works on every scene of a folder, in shards and in several processes, and writes a table of the results."""
+"""Runs a command on every scene of a folder, in shards and in several processes, and writes a table of the results."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pointsplat_ns.compression.scene_task import (
-    Made,
     Options,
     SceneResult,
     SceneTask,
+    SmallerScene,
     known_result,
+    make_result,
     note_failure,
     remove_unfinished,
-    settle,
 )
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io.discovery import RESULTS_NAME, find_scenes
@@ -34,16 +34,13 @@ TABLE_NAME, LOCK_NAME = "scenes.csv", ".scenes.lock"
 
 FORMAT = "pointsplat-scenes"
 
-_SLOW_IMPORTS = ("pointsplat_ns.folders", "kornia.metrics", "plyfile", "safetensors.torch", "scipy.spatial")
-"""Slow imports that the processes share: they are made once, before processes are forked."""
-
 
 @dataclass(frozen=True)
 class Shard:
     """One of several parts of a list, as ``2/5``: the second of five.
 
     Raises:
-        DataError: if there is no such part.
+        DataError: if the index is not in 1..count.
 
     Example:
         >>> Shard.of("2/3").part(list("abcdefg"))
@@ -60,14 +57,14 @@ class Shard:
 
     @classmethod
     def of(cls, text: str) -> Shard:
-        """The shard that a text such as ``2/5`` means."""
+        """The shard of a text such as ``2/5``."""
         numbers = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
         if numbers is None:
             raise DataError(f"shard {text!r}; expected which one of how many, such as 1/4")
         return cls(int(numbers[1]), int(numbers[2]))
 
     def within(self, rank: int, world_size: int) -> Shard:
-        """The part of this shard that one of several processes takes, by its rank from 0 on."""
+        """The part of this shard for one of several processes, by its rank from 0 on."""
         return Shard((self.index - 1) * world_size + rank + 1, self.count * world_size)
 
     def part(self, items: Sequence) -> list:
@@ -80,22 +77,21 @@ WHOLE = Shard(1, 1)
 
 @dataclass(frozen=True)
 class Command:
-    """The work on every scene. It is pickled for other processes, so ``make`` has to be a function of a module, or a
-    partial of one.
-    """
+    """A command to run on every scene. It is pickled for other processes, so ``make`` has to be a function of a module,
+    or a partial of one."""
 
     name: str
-    make: Callable[[Path], Made]
+    make: Callable[[Path], SmallerScene]
     options: Options
     """All options that ``make`` depends on."""
 
     @property
     def description(self) -> dict[str, object]:
-        """The content of the file that describes the results in their folder."""
+        """The content of the file that describes the results of a folder."""
         return {"format": FORMAT, "command": self.name, "options": dict(self.options)}
 
 
-def settle_folder(
+def run_on_folder(
     folder: Path,
     output: Path,
     command: Command,
@@ -104,18 +100,18 @@ def settle_folder(
     force: bool = False,
     progress: Progress = silent,
 ) -> list[SceneResult]:
-    """Apply a command to every scene of a folder, and write the results to another folder.
+    """Run a command on every scene of a folder, and write the results to another folder.
 
-    Finished results are kept, so the next call continues an interrupted one. Several processes may work on the same
-    folders at the same time; each scene is claimed by one of them.
+    Finished results are kept, so the next call continues an interrupted call. Several processes may work on the same
+    folders at the same time; one of them claims each scene.
 
     Args:
         folder: searched by :func:`~pointsplat_ns.io.discovery.find_scenes`.
         output: folder for ``NAME.ply`` and its record ``NAME.ply.json``, and the table ``scenes.csv``.
-        command: the work.
-        jobs: number of processes; 1 works in this one.
-        shard: the part of the scenes that is worked on here.
-        force: overwrite files that this function did not write, or wrote with other options.
+        command: the command.
+        jobs: number of processes; 1 uses the calling process.
+        shard: the part of the scenes to work on.
+        force: overwrite files of other origin or with other options.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
 
     Returns:
@@ -131,22 +127,22 @@ def settle_folder(
     tasks = shard.part(everything)
     _check_and_describe(output, command, force)
     results: dict[str, SceneResult] = {}
-    work = functools.partial(settle, make=command.make, options=command.options, force=force)
+    work = functools.partial(make_result, make=command.make, options=command.options, force=force)
     try:
-        with contextlib.closing(_settled(work, tasks, jobs)) as settled:
+        with contextlib.closing(_results(work, tasks, jobs)) as finished:
             progress(command.name, 0.0)
-            for result in settled:
+            for result in finished:
                 results[result.name] = result
                 progress(command.name, len(results) / len(tasks))
                 if result.status == "failed":
                     logger.warning("%s failed: %s", result.name, result.error)
-    finally:  # also when it is interrupted
+    finally:  # also after an interruption
         _write_table(output, everything, results)
     return [results[task.name] for task in tasks]
 
 
 def output_folder(folder: Path, suffix: str) -> Path:
-    """The folder beside a folder where results go by default: ``scenes_compact`` for ``scenes``."""
+    """The default output folder, beside a folder: ``scenes_compact`` for ``scenes``."""
     place = Path(os.path.abspath(folder))
     return place.with_name(f"{place.name}_{suffix}")
 
@@ -157,16 +153,18 @@ def _tasks(folder: Path, output: Path) -> list[SceneTask]:
     return [SceneTask(scene.name, scene.path, output / f"{scene.name}.ply") for scene in find_scenes(folder)]
 
 
-def _settled(
+def _results(
     work: Callable[[SceneTask], SceneResult | None], tasks: Sequence[SceneTask], jobs: int
 ) -> Generator[SceneResult, None, None]:
     if jobs == 1:
         return in_turn(work, tasks)
-    return in_processes(work, tasks, jobs, _given_up, _clear, preload=_SLOW_IMPORTS)
+    # Slow imports are made once, before processes are forked.
+    slow = ("pointsplat_ns.folders", "kornia.metrics", "plyfile", "safetensors.torch", "scipy.spatial")
+    return in_processes(work, tasks, jobs, _given_up, _clear, preload=slow)
 
 
 def _given_up(task: SceneTask, how: str) -> SceneResult:
-    """The result of a scene whose processes were killed again and again."""
+    """The result of a scene whose processes were killed repeatedly."""
     _clear(task)
     failed = task.result("failed", error=f"every process that worked on it ended early; the last {how}")
     note_failure(task, failed)

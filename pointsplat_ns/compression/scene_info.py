@@ -22,12 +22,6 @@ from pointsplat_ns.pruning.sh_bands import band_energies
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.progress import silent
 
-_SHARES = (1.0, 0.5, 0.3, 0.1, 0.03)
-"""Shares of the Gaussians for which sizes of files are given."""
-
-_SAMPLED = 20_000
-"""Largest number of Gaussians that are encoded to estimate the size of a compressed file."""
-
 
 @dataclass(frozen=True)
 class SceneInfo:
@@ -55,8 +49,8 @@ class SceneInfo:
     suspicious: dict[str, int]
     """Number of rows by kind of defect; kinds without rows are left out."""
     file_bytes: dict[str, dict[str, int]]
-    """Bytes of a file by format and share of the Gaussians that is kept. Those of ``.spz`` are an estimate, and left
-    out where the scene is too large for it."""
+    """Bytes of a file by format and share of the Gaussians that is kept. Sizes of ``.spz`` are estimates,
+    without an entry where the scene is too large for the format."""
 
     def as_dict(self) -> dict[str, Any]:
         """The figures as numbers, lists and dictionaries that JSON can hold."""
@@ -67,8 +61,8 @@ def info(scene: Gaussians | str | Path) -> SceneInfo:
     """Measure a scene.
 
     Args:
-        scene: N Gaussians, or where to read them. Undrawable Gaussians of a file are counted too; other functions drop
-            them when they read it.
+        scene: N Gaussians, or the path of a scene. Undrawable Gaussians of a file are counted too; other functions drop
+            them when reading.
 
     Raises:
         SceneError: if the file is not usable.
@@ -122,7 +116,7 @@ def _by_powers_of_ten(log_sizes: Tensor) -> dict[str, int]:
 
 
 def _corners(means: Tensor, outside: float) -> list[list[float]]:
-    """Corners of the box of the positions, without a share of them at either end of each axis."""
+    """Corners of the box of the positions, without the share ``outside`` of them at each end of each axis."""
     if not len(means):
         return []
     ranked = means.sort(dim=0).values
@@ -131,15 +125,16 @@ def _corners(means: Tensor, outside: float) -> list[list[float]]:
 
 
 def _sizes(kind: Format, scene: Gaussians) -> dict[str, int]:
-    """Bytes of a file by share. SPZ is estimated from a sample; empty for formats whose size cannot be told."""
-    counts = {f"{share:.0%}": int(share * len(scene) + 0.5) for share in _SHARES}
+    """Bytes of a file by share of the Gaussians. SPZ is estimated from up to 20,000 of them; empty for SOG and formats
+    without a size."""
+    counts = {f"{share:.0%}": int(share * len(scene) + 0.5) for share in (1.0, 0.5, 0.3, 0.1, 0.03)}
     if kind.bytes_of is not None:
         return {text: kind.bytes_of(count, scene.sh_degree) for text, count in counts.items()}
     if kind.suffix != ".spz" or kind.encode is None:  # the palette of SOG does not grow with the scene
         return {}
-    sample = scene[:: max(-(-len(scene) // _SAMPLED), 1)]
+    sample = scene[:: max(-(-len(scene) // 20_000), 1)]
     try:
         each = len(kind.encode(sample, silent)) / max(len(sample), 1)
-    except SceneError:  # positions beyond what 24 bits hold
+    except SceneError:  # positions that do not fit 24 bits
         return {}
     return {text: round(each * count) for text, count in counts.items()}

@@ -1,4 +1,4 @@
-"""One of many scenes: the lock of the process that works on it, its result, and the record beside the result.
+"""One scene of a folder: the lock of the process that works on it, its result, and the record of the result.
 
 The record of a result ``room.ply`` is ``room.ply.json``. A result is finished if its record has the hashes of the input
 file, of the options and of the result itself.
@@ -53,7 +53,7 @@ class SceneResult:
     output: str
     """Path of the PLY that was written."""
     status: Status
-    """``done before``: by an earlier call, or by another process. ``open``: not tried yet, or left to another shard."""
+    """``done before``: by an earlier call, or by another process. ``open``: not tried yet, or in another shard."""
     before: int | None = None
     """Gaussians of the scene."""
     after: int | None = None
@@ -69,7 +69,7 @@ class SceneResult:
 
 
 @dataclass(frozen=True)
-class Made:
+class SmallerScene:
     """A smaller scene, and figures for the table."""
 
     scene: Gaussians
@@ -102,7 +102,9 @@ class SceneTask:
         return self.output.with_name(f".{self.output.name}.lock")
 
 
-def settle(task: SceneTask, make: Callable[[Path], Made], options: Options, force: bool = False) -> SceneResult | None:
+def make_result(
+    task: SceneTask, make: Callable[[Path], SmallerScene], options: Options, force: bool = False
+) -> SceneResult | None:
     """Make the result of a scene, unless it is finished or another process works on it.
 
     An error gives a result with the status ``failed``. It leaves no file but its record.
@@ -111,7 +113,7 @@ def settle(task: SceneTask, make: Callable[[Path], Made], options: Options, forc
         task: the scene.
         make: from the path of the scene to the smaller scene.
         options: all options that ``make`` depends on.
-        force: overwrite a result that this function did not write, or that was changed since.
+        force: overwrite a file of other origin, or a changed result.
 
     Returns:
         The result; None if another process works on the scene.
@@ -127,7 +129,7 @@ def settle(task: SceneTask, make: Callable[[Path], Made], options: Options, forc
             if result is None:
                 _check_overwriting(task, force)
                 result = _write(task, make(task.source), key, options, start)
-            task.lock.unlink(missing_ok=True)  # a process that gets the lock now finds the scene finished
+            task.lock.unlink(missing_ok=True)  # the next process to get the lock finds the scene finished
             return result
     except Exception as error:  # one scene must not stop the others
         kind = "" if isinstance(error, (PointSplatError, OSError)) else f"{type(error).__name__}: "
@@ -150,13 +152,13 @@ def remove_unfinished(task: SceneTask) -> None:
 
 def note_failure(task: SceneTask, failed: SceneResult) -> None:
     """Write the record of a failed scene, for the tables of other processes. An earlier result keeps its record."""
-    with suppress(SceneError):  # the folder may be what failed
+    with suppress(SceneError):  # the folder itself may have failed
         if not task.output.exists():
             _write_record(task, failed, {})
 
 
 def known_result(task: SceneTask) -> SceneResult:
-    """The result in a scene's record; it is not checked against files."""
+    """The result in a scene's record, without a check of its files."""
     record = _read_record(task)
     if record is None:
         return task.result("open")
@@ -172,7 +174,7 @@ def _key(task: SceneTask, options: Options) -> str:
 
 
 def _finished(task: SceneTask, key: str) -> SceneResult | None:
-    """The result of an earlier call, if it is there, unchanged, and of the same scene and options."""
+    """The result of an earlier call, if it is unchanged and of the same scene and options; else None."""
     record = _read_record(task)
     if record is None or record.get("key") != key or not _as_written(task, record):
         return None
@@ -180,7 +182,7 @@ def _finished(task: SceneTask, key: str) -> SceneResult | None:
 
 
 def _as_written(task: SceneTask, record: Mapping[str, Any]) -> bool:
-    """Whether a result exists and was not changed since it was written."""
+    """Whether a result exists and is unchanged."""
     return task.output.is_file() and content_hash(task.output) == record.get("sha256")
 
 
@@ -196,7 +198,7 @@ def _check_overwriting(task: SceneTask, force: bool) -> None:
         )
 
 
-def _write(task: SceneTask, made: Made, key: str, options: Options, start: float) -> SceneResult:
+def _write(task: SceneTask, made: SmallerScene, key: str, options: Options, start: float) -> SceneResult:
     """Write a result and its record. A process killed in between leaves the record alone: the scene is unfinished."""
     with replacing(task.output) as part:
         write_ply(made.scene, part)
@@ -208,7 +210,7 @@ def _write(task: SceneTask, made: Made, key: str, options: Options, start: float
             psnr=made.psnr if made.psnr is not None and math.isfinite(made.psnr) else None,
             seconds=time.perf_counter() - start,
         )
-        task.output.unlink(missing_ok=True)  # else it could stand beside a record that is not its own
+        task.output.unlink(missing_ok=True)  # an old scene must not stand beside the new record
         _write_record(task, done, {"key": key, "sha256": content_hash(part), "options": dict(options)})
     return done
 
@@ -223,9 +225,6 @@ def _is_number(value: Any, kind: type) -> bool:
     return value is None or (isinstance(value, (int, float)) and isinstance(value, (kind, int)) and abs(value) < 1e18)
 
 
-_FACTS = {"before": int, "after": int, "megabytes": float, "psnr": float, "seconds": float}
-
-
 def _read_record(task: SceneTask) -> dict[str, Any] | None:
     """The content of a scene's record; None if it is missing or damaged."""
     try:
@@ -234,5 +233,6 @@ def _read_record(task: SceneTask) -> dict[str, Any] | None:
         return None
     if not isinstance(record, dict) or record.get("status") not in ("done", "failed"):
         return None
-    numbers = all(_is_number(record.get(name), kind) for name, kind in _FACTS.items())
+    kinds = {"before": int, "after": int, "megabytes": float, "psnr": float, "seconds": float}
+    numbers = all(_is_number(record.get(name), kind) for name, kind in kinds.items())
     return record if numbers and isinstance(record.get("error"), str) else None

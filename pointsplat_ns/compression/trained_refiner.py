@@ -1,6 +1,6 @@
-"""Loads trained refiners with their pruning settings: the one that ships, a file of weights, or a run.
+"""Loads trained refiners with their pruning settings: the shipped one, a file of weights, or a run.
 
-Everything is read without nerfstudio and without executing a run's ``config.yml``.
+Reading needs no nerfstudio and does not execute a run's ``config.yml``.
 """
 
 from __future__ import annotations
@@ -23,8 +23,6 @@ from pointsplat_ns.pruning import PruneSettings, method_named
 from pointsplat_ns.refiner import Refiner, WeightsError, preset, read_metadata, read_refiner
 from pointsplat_ns.refiner.weights import PRETRAINED
 from pointsplat_ns.system.threads import suitable_threads
-
-_PREFIX = "_model.refiner."
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +61,12 @@ def load_refiner(path: Path | str | None = None, device: torch.device | str | No
 
     Args:
         path: a ``.safetensors`` file, or a ``pointsplat`` run (its folder, ``config.yml`` or checkpoint); by default
-            the refiner that ships (``pointsplat_ns/refiner/pretrained/CARD.md`` says what it was trained on).
-        device: where to run it; by default CUDA if available, else the CPU.
+            the shipped refiner (``pointsplat_ns/refiner/pretrained/CARD.md`` describes its training).
+        device: device of the network; by default CUDA if available, else the CPU.
 
     Raises:
         WeightsError: if the file is missing, damaged or of another kind.
-        SceneError: if ``path`` is not such a run.
+        SceneError: if ``path`` is not a ``pointsplat`` run.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -97,15 +95,15 @@ def load_refiner(path: Path | str | None = None, device: torch.device | str | No
 
 
 SHIPPED = "shipped"
-"""Name of the refiner that ships, where a path may stand."""
+"""Name of the shipped refiner, in place of a path."""
 
 
 def refiner_at(path: Path | str | None, device: torch.device | str | None = None) -> TrainedRefiner | None:
-    """A trained refiner, or none.
+    """A trained refiner, or None.
 
     Args:
         path: as for :func:`load_refiner`, or :data:`SHIPPED`; None for no refiner.
-        device: where to run it.
+        device: device of the network.
 
     Raises:
         WeightsError, SceneError: as :func:`load_refiner`.
@@ -128,32 +126,31 @@ def open_refiner_run(path: Path | str, need_data: bool) -> Run:
 
 
 def scenes_of_run(run: Run) -> tuple[dict[str, Path], str]:
-    """The files of the dense scenes that a ``pointsplat`` run was trained on, and the scene that viewers and exporters
-    get.
+    """The training scenes of a ``pointsplat`` run, and the scene for viewers and exporters.
 
     Args:
         run: opened with its data.
 
     Returns:
-        Checkpoints and PLY files by the names that the training gave the scenes, and the name of the shown scene.
+        Checkpoints and PLY files of the dense scenes by name, and the name of the scene for viewers and exporters.
 
     Raises:
         SceneError: if the scenes are no longer there.
     """
-    runs, plys, nothing = find_runs_and_plys(run.data, run.datamanager_fields.get("supervision", "auto"))
+    runs, plys, reason = find_runs_and_plys(run.data, run.datamanager_fields.get("supervision", "auto"))
     scenes = {name: scene.checkpoint for name, scene in runs.items()} | plys
     if not scenes:
-        raise SceneError(f"{run.config_path}: {nothing or f'{run.data}: no Gaussians in it'}; put its scenes back")
+        raise SceneError(f"{run.config_path}: {reason or f'{run.data}: no Gaussians in it'}; put its scenes back")
     return scenes, shown_scene(list(scenes), run.datamanager_fields.get("eval_scenes") or ())
 
 
 def settings_from(saved: Mapping[str, Any]) -> PruneSettings:
-    """Pruning settings from a run's model settings or a file's metadata, in which methods without an opacity weight may
-    have one.
+    """Pruning settings from a run's model settings or a file's metadata. The opacity weight is ignored for methods that
+    have none.
 
     Raises:
         KeyError: if a setting is missing.
-        PointSplatError, TypeError, ValueError, OverflowError: if one is not usable.
+        PointSplatError, TypeError, ValueError, OverflowError: if a setting is not usable.
     """
     by, saved_weight = saved["by"], saved.get("opacity_weight")
     weight = None if saved_weight is None else float(saved_weight)
@@ -164,7 +161,7 @@ def network_options(settings: Mapping[str, Any]) -> dict[str, Any]:
     """The network options in a run's model settings, as changes to the preset of its size.
 
     Raises:
-        KeyError: if one is missing.
+        KeyError: if an option is missing.
     """
     return {name: settings[name] for name in ("encoder", "use_appearance", "use_position", "norm")}
 
@@ -176,7 +173,8 @@ def _read_run(run: Run) -> tuple[Refiner, PruneSettings]:
         settings = settings_from(run.model_fields)
         allow_splatfacto_checkpoints()  # for the numbers in the schedulers' state
         state = torch.load(run.checkpoint, map_location="cpu", weights_only=True, mmap=True)["pipeline"]
-        network.load_state_dict({k[len(_PREFIX) :]: v for k, v in state.items() if k.startswith(_PREFIX)})
+        prefix = "_model.refiner."
+        network.load_state_dict({k[len(prefix) :]: v for k, v in state.items() if k.startswith(prefix)})
     except KeyError as error:
         raise SceneError(
             f"{run.config_path}: lacks {error}; expected a {REFINER_METHOD} run of this version"

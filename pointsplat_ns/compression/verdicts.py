@@ -1,4 +1,4 @@
-"""What is said of a compacted scene: what refinement and repair gained, or why they were left out."""
+"""Text on a compacted scene: the gains of refinement and repair, or the reasons to leave them out."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from pointsplat_ns.compression.closeness import Closeness
 if TYPE_CHECKING:
     from pointsplat_ns.compression.compact import Compacted, Stage
 
-_NOUNS = {"refine": "refinement", "repair": "repair"}
-
 _REASONS = {
     Reason.NO_GAIN: "it does not help",
     Reason.SMALL_GAIN: f"it brings less than {ACCEPTANCE.min_gain:g} dB",
@@ -21,7 +19,7 @@ _REASONS = {
 
 
 def verdict_of(result: Compacted) -> str:
-    """One line of text for each stage after pruning; one line if there is none."""
+    """One line of text for each stage after pruning; one line if there are no such stages."""
     lines = [_line(stage, result) for stage in result.stages[1:]]
     if lines:
         return "\n".join(lines)
@@ -31,7 +29,7 @@ def verdict_of(result: Compacted) -> str:
 
 
 def _line(stage: Stage, result: Compacted) -> str:
-    noun, before, after = _NOUNS[stage.name], stage.before, stage.after
+    noun, before, after = "refinement" if stage.name == "refine" else "repair", stage.before, stage.after
     if stage.reason is Reason.NOT_FINITE:
         unsound = int((result.pruned.usable() & ~stage.scene.usable()).sum())
         return f"{noun} left out: {unsound:,} of {len(stage.scene):,} refined Gaussians are not finite"
@@ -55,7 +53,7 @@ def _uncompared(result: Compacted) -> str:
 
 
 def _figures(before: Closeness, after: Closeness) -> str:
-    """Errors before and after in words."""
+    """Text with the errors before and after."""
     figures = f"{before.psnr:.2f} -> {after.psnr:.2f} dB against the dense scene's renders in {before.where}"
     if before.ssim is not None and after.ssim is not None:
         figures += f", SSIM {before.ssim:.3f} -> {after.ssim:.3f}"

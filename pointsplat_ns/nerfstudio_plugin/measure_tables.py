@@ -22,9 +22,9 @@ from pointsplat_ns.tables.means import Group
 from pointsplat_ns.tables.measuring import Measuring
 from pointsplat_ns.tables.outputs import OUTPUTS, write_tables
 from pointsplat_ns.tables.refiners import Refiners
-from pointsplat_ns.tables.scene import Opened, TableOptions, TableScene
-from pointsplat_ns.tables.ways import SHARES
-from pointsplat_ns.tradeoff.judging import LookedAt
+from pointsplat_ns.tables.scene import OpenedScene, TableOptions, TableScene
+from pointsplat_ns.tables.ways import PROTOCOL
+from pointsplat_ns.tradeoff.judging import JudgedViews
 
 TRAINING_PHOTOS = 60
 """Largest number of photos that fine-tuning sees. All of them are in memory, at first in their full size."""
@@ -34,7 +34,7 @@ def measure_tables(
     scenes: Sequence[str | Path],
     folder: str | Path,
     *,
-    keeps: Sequence[float] = SHARES,
+    keeps: Sequence[float] = PROTOCOL.shares,
     refiners: Sequence[str | Path] = (),
     groups: Sequence[str] = (),
     only: Sequence[str] = (),
@@ -166,7 +166,7 @@ def _dataset(path: Path) -> str:
         return ""
 
 
-def _open(path: Path, options: TableOptions) -> Opened:
+def _open(path: Path, options: TableOptions) -> OpenedScene:
     """Read a scene, its views, and its photos if there are any."""
     dense = read_scene(path)
 
@@ -174,24 +174,24 @@ def _open(path: Path, options: TableOptions) -> Opened:
         return ViewSource(dense, run=path, dataset_views=dataset_views)
 
     held_out, training = _looked_at(path, options) or _sampled(new_views(), options)
-    return Opened(dense, held_out.resized(options.side), training.resized(options.side), new_views)
+    return OpenedScene(dense, held_out.resized(options.side), training.resized(options.side), new_views)
 
 
-def _looked_at(path: Path, options: TableOptions) -> tuple[LookedAt, LookedAt] | None:
+def _looked_at(path: Path, options: TableOptions) -> tuple[JudgedViews, JudgedViews] | None:
     """Held-out photos, and photos to train on; None if there are none."""
     if not may_be_run(path):
         return None
     try:
-        held_out = LookedAt(*dataset_photos(path, "test", options.views), "held-out photos")
+        held_out = JudgedViews(*dataset_photos(path, "test", options.views), "held-out photos")
         count = max(TRAINING_PHOTOS, options.scoring_views)
-        return held_out, LookedAt(*dataset_photos(path, "train", count), "training photos")
+        return held_out, JudgedViews(*dataset_photos(path, "train", count), "training photos")
     except (SceneError, DataError) as error:
         logger.warning("%s: no photos to compare with: %s", path, error)
         return None
 
 
-def _sampled(source: ViewSource, options: TableOptions) -> tuple[LookedAt, LookedAt]:
+def _sampled(source: ViewSource, options: TableOptions) -> tuple[JudgedViews, JudgedViews]:
     """Views alone, to judge in and to train on."""
-    held_out = LookedAt.compared(source, options.views)
+    held_out = JudgedViews.compared(source, options.views)
     training = source.views(max(TRAINING_PHOTOS, options.scoring_views))
-    return held_out, LookedAt(training, None, source.origin)
+    return held_out, JudgedViews(training, None, source.origin)

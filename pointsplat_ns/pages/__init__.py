@@ -1,1 +1,1 @@
-"""Pages in one HTML file each, which open offline from a double click: their look, their pictures, their safety."""
+"""HTML pages in one file each, which open offline: templates, scripts, pictures and security policy."""

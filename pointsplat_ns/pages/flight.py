@@ -1,7 +1,7 @@
-"""Scenes to fly through in a page: what the scripts of a page need to draw them, compressed as SPZ.
+"""The data of a page that flies through scenes: views, and scenes compressed as SPZ.
 
-Everything is in units of the content of one scene, so that scenes of any size and place keep the same precision, and
-cameras move at a speed that suits them.
+Lengths are in units of the content of one scene, so that precision and camera speed do not depend on the scene's size
+and position.
 """
 
 from __future__ import annotations
@@ -37,42 +37,39 @@ from pointsplat_ns.views import Views
 logger = logging.getLogger("pointsplat_ns")
 
 SCRIPTS = ("spz.js", "splats.js", "camera.js", "flight.js")
-"""What draws a flight, for :func:`~pointsplat_ns.pages.html.page`, which has to let it have workers."""
+"""Scripts of a flight, for :func:`~pointsplat_ns.pages.html.page` with ``with_workers``."""
 
 VIEWS = 6
-"""Number of views, at most, that a page leads to."""
+"""Maximum number of views in a page."""
 
-REACH = 2047.0
-"""Gaussians farther from the middle of the content (units, 10 to its diagonal) are left out: up to there, positions in
-SPZ have steps of 1/4096 of a unit."""
-
-_SIZE = (960, 600)
-"""Size of sampled views: the shape of the stage."""
+MAX_COORDINATE = 2047.0
+"""Largest coordinate of a Gaussian in a page, in units of the content (10 to its diagonal); farther ones are left out.
+Positions in SPZ have steps of 1/4096 of a unit up to there."""
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
-    """Views that scenes of one place are looked at from."""
+class FlightFrame:
+    """The unit of length, the up direction and the views of a page, common to all of its scenes."""
 
-    centre: Tensor  # [3] float64, of the content, scene units
-    size: float  # of the content, scene units
+    centre: Tensor  # [3] float64, centre of the content, scene units
+    size: float  # size of the content, scene units
     up: Tensor  # [3] float64
     views: Views  # in units of the content
     inside: bool
-    """Whether the first view is from within the content: a room to look around in, not an object to circle about."""
+    """Whether the first camera is inside the content: a room to look around in, not an object to orbit."""
 
     @staticmethod
-    def of(scene: Gaussians, views: Views | None = None) -> Stage:
-        """The stage for a scene and smaller ones made of it.
+    def of(scene: Gaussians, views: Views | None = None) -> FlightFrame:
+        """The frame of a scene, which also suits smaller versions of it.
 
         Args:
             scene: N Gaussians.
-            views: where to look from; at most :data:`VIEWS` of them are taken. By default they are sampled. A flight
-                begins at the one that has most Gaussians in its picture.
+            views: at most :data:`VIEWS` of them are used; by default they are sampled. A flight starts at the view with
+                most Gaussians in its picture.
 
         Raises:
             SceneError: if no Gaussian can be drawn.
-            DataError: if nothing of the scene is visible.
+            DataError: if no Gaussian is visible.
         """
         need_usable(scene)
         low, high = content_box(scene)
@@ -81,25 +78,25 @@ class Stage:
         if views is None or len(views) == 0:
             views = _sampled(scene, centre, size, up)
         views = views_in_units(views.spread(VIEWS), centre, size)
-        shown = _in_picture(positions_in_units(scene.means, centre, size).cpu(), views)
-        views = views[shown.argsort(descending=True, stable=True)]
+        counts = _in_picture(positions_in_units(scene.means, centre, size).cpu(), views)
+        views = views[counts.argsort(descending=True, stable=True)]
         up = _nearest_axis(-views.viewmats[:, 1, :3].double().mean(0), up)
         half = positions_in_units(high, centre, size).cpu().abs()
-        return Stage(centre, size, up, views, bool((_eyes(views)[0].abs() < half).all()))
+        return FlightFrame(centre, size, up, views, bool((_eyes(views)[0].abs() < half).all()))
 
     def packed(self, scene: Gaussians, name: str, progress: Progress = silent) -> dict[str, str]:
-        """A scene for the page: its name, how much it is, and itself, in units of the content, as base64 of SPZ 3.
+        """A scene for the page: its name, text on its size, and its data in units of the content as base64 of SPZ 3.
 
         Args:
             scene: N Gaussians.
-            name: for people.
+            name: name in the page.
             progress: called while compressing.
         """
         placed = in_units(scene.detach(), self.centre.to(scene.device), self.size).to("cpu", torch.float32)
-        near = placed.usable() & (placed.means.abs() <= REACH).all(1)
+        near = placed.usable() & (placed.means.abs() <= MAX_COORDINATE).all(1)
         left_out = int((~near).sum())
         if left_out:
-            logger.warning("%s: %d Gaussians, very far away or without meaning, are not in the page", name, left_out)
+            logger.warning("%s: %d Gaussians, very far away or not finite, are not in the page", name, left_out)
         # A tenth of the time of level 9, for 3 % more bytes.
         spz = base64.b64encode(encode_spz(placed[near], progress, level=6)).decode("ascii")
         megabytes = ply_bytes(len(scene), scene.sh_degree) / 1e6
@@ -109,7 +106,7 @@ class Stage:
         """Data for ``flight.js``.
 
         Args:
-            packed: what :meth:`packed` gives of one or two scenes; the first is shown on the left.
+            packed: results of :meth:`packed` for one or two scenes; the first is on the left.
         """
         fov = 2 * torch.atan(0.5 * max(self.views.width, self.views.height) / self.views.Ks[:, 0, 0].abs())
         return {
@@ -139,27 +136,28 @@ def _in_picture(points: Tensor, views: Views) -> Tensor:
     x, y, z = (views.viewmats[:, :3, :3] @ points.T + views.viewmats[:, :3, 3:]).unbind(1)
     u = x / z * views.Ks[:, 0, :1] + views.Ks[:, 0, 2:]
     v = y / z * views.Ks[:, 1, 1:2] + views.Ks[:, 1, 2:]
-    seen = (z > views.near_plane) & (u > 0) & (u < views.width) & (v > 0) & (v < views.height)
-    return seen.sum(1)
+    inside = (z > views.near_plane) & (u > 0) & (u < views.width) & (v > 0) & (v < views.height)
+    return inside.sum(1)
 
 
 def _nearest_axis(camera_up: Tensor, estimated: Tensor) -> Tensor:
-    """The direction nearest to the mean of the cameras' own ``camera_up`` (3,), as people hold cameras upright: up as
-    it is estimated, an axis of the world, or the opposite of one of them."""
+    """The candidate nearest to ``camera_up`` (3,), the mean up direction of the cameras, which people hold upright.
+    Candidates are the estimated up direction, the world axes, and their opposites."""
     axes = torch.cat([estimated[None], torch.eye(3, dtype=torch.float64)])
     axes = torch.cat([axes, -axes])
     return axes[(axes @ camera_up).argmax()]
 
 
 def _sampled(scene: Gaussians, centre: Tensor, size: float, up: Tensor) -> Views:
-    """Views of a scene that has none: sampled, or else one from outside that shows all of it."""
+    """Sampled views of a scene, of the size of the page; where sampling fails, one from outside that shows all of
+    it."""
+    width, height = 960, 600
     try:
-        return sample_views(scene, VIEWS, *_SIZE, up=up)
+        return sample_views(scene, VIEWS, width, height, up=up)
     except DataError:
         lift = math.radians(20.0)
         aside = level_directions(up, torch.zeros(1, dtype=torch.float64))[0]
         eye = centre + 0.8 * size * (math.cos(lift) * aside + math.sin(lift) * up)
-        width, height = _SIZE
         K = torch.tensor([[0.7 * width, 0, width / 2], [0, 0.7 * width, height / 2], [0, 0, 1]], dtype=torch.float64)
         viewmats = look_at(eye[None], centre[None], up)
         return Views(viewmats, K[None], width, height, torch.zeros(3), near_plane=DEFAULTS.near_plane * size)

@@ -1,4 +1,4 @@
-"""HTML from the templates of this package, as one file that loads nothing."""
+"""HTML from the templates of this package, as one file without external resources."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    # JSON has no NaN and no infinity: a browser would refuse all of the data.
+    # Browsers refuse JSON with NaN or infinity.
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "ensure_ascii": False, "separators": (",", ":")}
     return environment
 
@@ -32,17 +32,17 @@ def _environment() -> Environment:
 def page(template: str, scripts: tuple[str, ...] = (), *, with_workers: bool = False, **values: Any) -> str:
     """One HTML page with its style, scripts and data in it.
 
-    Its policy (CSP) lets a browser run and apply the script and style that are named by their hashes and show pictures
-    that are in the page, and load nothing else: a text that slipped through the escaping could do nothing.
+    Its content security policy allows the script and style with the page's hashes and embedded pictures, and no other
+    resource. So a text without escaping could run no code.
 
     Args:
         template: name of a template that extends ``base.html``.
-        scripts: names of the scripts to put in, in this order.
-        with_workers: let the scripts start workers, whose programs are parts of them.
-        values: what the template shows. Texts are escaped; bytes of a file's name that are no characters become "?".
+        scripts: names of the scripts, in their order in the page.
+        with_workers: allow workers, whose programs are parts of the scripts.
+        values: variables of the template. Texts are escaped; undecodable bytes of file names become "?".
 
     Raises:
-        ValueError: if a value that the template gives to a script is NaN or infinite.
+        ValueError: if a number for a script is NaN or infinite.
     """
     from pointsplat_ns import __version__
 
@@ -57,7 +57,12 @@ def page(template: str, scripts: tuple[str, ...] = (), *, with_workers: bool = F
         "base-uri 'none'",
         "form-action 'none'",
     )
-    fixed = {"style": _as_it_is(style), "script": _as_it_is(script), "policy": "; ".join(rules), "version": __version__}
+    fixed = {
+        "style": _unescaped(style),
+        "script": _unescaped(script),
+        "policy": "; ".join(rules),
+        "version": __version__,
+    }
     text = _environment().get_template(template).render(**fixed, **values)
     return text.encode("utf-8", "replace").decode("utf-8")
 
@@ -69,8 +74,8 @@ def _source(name: str) -> str:
     return environment.loader.get_source(environment, name)[0]
 
 
-def _as_it_is(text: str) -> Markup:
-    """A style or script of our own, not to be escaped: a browser does not read entities within these elements."""
+def _unescaped(text: str) -> Markup:
+    """A style or script of this package, without escaping: browsers do not decode entities in these elements."""
     from markupsafe import Markup
 
     assert not re.search(r"</s|<!--", text), "would end its element"
@@ -78,5 +83,5 @@ def _as_it_is(text: str) -> Markup:
 
 
 def _hash(text: str) -> str:
-    """The name of an inline script or style in a content security policy."""
+    """The hash of an inline script or style for a content security policy."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii")

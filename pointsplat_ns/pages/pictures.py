@@ -1,4 +1,4 @@
-"""Pictures for a page: read from PNG files, compressed together to a number of bytes."""
+"""Pictures for a page: read from PNG files, compressed together to a limit of bytes."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.files import one_line
 from pointsplat_ns.system.progress import Progress, tracked
 
-AMPLIFIED = 8
-"""Factor by which error maps show the difference, so that 32 of 255 levels have the brightest colour."""
+ERROR_GAIN = 8
+"""Factor on differences in error maps: 32 of 255 levels have the brightest colour."""
 
 
 def read_png(path: Path, width: int, height: int) -> np.ndarray:
@@ -27,7 +27,7 @@ def read_png(path: Path, width: int, height: int) -> np.ndarray:
         height: expected height in pixels.
 
     Raises:
-        DataError: if the file is missing, is no PNG, is damaged, or has another size.
+        DataError: if the file is missing, not a PNG, damaged, or of another size.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -45,10 +45,10 @@ def read_png(path: Path, width: int, height: int) -> np.ndarray:
 
 
 def error_map(picture: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """The difference of two pictures at half their size, as colours from black over red to white.
+    """The difference of two pictures at half size, as colours from black over red to white.
 
-    Of the three channels, the one that differs most counts. Its difference is averaged over 2 x 2 pixels, which takes a
-    fifth of the bytes, and amplified :data:`AMPLIFIED` times.
+    The largest difference of the three channels is averaged over 2 x 2 pixels, which takes a fifth of the bytes, and
+    multiplied by :data:`ERROR_GAIN`.
 
     Args:
         picture: (H, W, 3) uint8.
@@ -68,11 +68,11 @@ def error_map(picture: np.ndarray, reference: np.ndarray) -> np.ndarray:
     height, width = difference.shape
     even = np.pad(difference, ((0, height % 2), (0, width % 2)), mode="edge")
     mean = even.reshape((height + 1) // 2, 2, (width + 1) // 2, 2).mean(axis=(1, 3))
-    return error_colors()[np.minimum(AMPLIFIED * mean, 255).round().astype(np.uint8)]
+    return error_colors()[np.minimum(ERROR_GAIN * mean, 255).round().astype(np.uint8)]
 
 
 def error_colors() -> np.ndarray:
-    """The colours of error maps, (256, 3) uint8: a ramp that gets brighter all the way, as an amount should."""
+    """The colours of error maps, (256, 3) uint8, with rising brightness."""
     stops = np.array([[0, 0, 0], [70, 20, 90], [190, 50, 70], [250, 140, 40], [255, 235, 150], [255, 255, 255]])
     places = np.linspace(0, 255, len(stops))
     return (
@@ -86,21 +86,20 @@ def fit(
     """Data URIs of pictures as WebP, at the best quality at which all of them together fit.
 
     Args:
-        pictures: functions that give (H, W, 3) uint8. They are called anew for each quality that is tried, so that only
-            one picture at a time takes memory.
+        pictures: functions that return (H, W, 3) uint8. They are called again for each quality, so that only one
+            picture at a time takes memory.
         limit: maximum of the sum of the URIs' lengths, in bytes.
         progress: show a progress bar.
 
     Returns:
-        One URI for each picture, and a text that says how they were compressed.
+        One URI for each picture, and text on the compression.
 
     Raises:
-        DataError: if they do not fit at the lowest quality either.
+        DataError: if they do not fit at the lowest quality.
     """
-    # Drawn at random: every twelfth picture may be of one kind.
-    # These tell whether a quality is worth trying on all.
+    # A random sample estimates the size, because every twelfth picture may be of one kind.
     sample = random.Random(0).sample(pictures, min(24, len(pictures)))
-    for side in (None, 480, 320, 160):  # longest sides, pixels; None leaves them
+    for side in (None, 480, 320, 160):  # largest sides, pixels; None keeps the size
         for level in (90, 82, 74, 66, 58, 50, 42, 34):  # best first
             if sum(len(_uri(picture(), level, side)) for picture in sample) * len(pictures) > limit * len(sample):
                 continue

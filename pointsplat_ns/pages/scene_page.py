@@ -1,4 +1,4 @@
-"""One scene, or two to compare, as an HTML file to fly through."""
+"""Writes an HTML file that flies through one scene, or two in comparison."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger, replacing
-from pointsplat_ns.pages.flight import SCRIPTS, Stage
+from pointsplat_ns.pages.flight import SCRIPTS, FlightFrame
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.system.progress import Progress, progress_bar
@@ -29,30 +29,29 @@ def write_page(
 ) -> Path:
     """Write one HTML file that opens offline and shows a scene to fly through, or two with a wipe between them.
 
-    The file has everything in it and loads nothing. A browser with WebGL 2 draws the scenes by the same formulas as
-    :func:`~pointsplat_ns.render`. They are in it as SPZ, written as text, with a tenth to a quarter of the bytes of a
-    PLY; what that loses stands in docs/formats.md. Where two scenes would make the file too large, the larger one is
-    left out, which the page and a warning say.
+    The file needs no other file. A browser with WebGL 2 draws the scenes by the same formulas as
+    :func:`~pointsplat_ns.render`. Scenes are stored as SPZ in text, with a tenth to a quarter of the bytes of a PLY;
+    docs/formats.md gives the loss. Where two scenes make the file too large, the larger one is left out, with a warning
+    and a note in the page.
 
     Args:
         scenes: one scene, or two: the first is on the left of the wipe.
         path: the file to write.
         names: a name for each scene; by default the title, or "left" and "right".
-        title: of the page; by default the name of the file.
+        title: title of the page; by default the name of the file.
         notes: lines of text for the reader.
-        views: where buttons of the page lead; by default sampled from the first scene. It opens at the one with most
-            Gaussians in its picture. Their background is behind the scenes, and they say whether the scenes were
-            trained with antialiasing.
-        limit_mb: size of the file, at most, in units of 10^6 bytes.
-        progress: True shows a bar; a function is called with what is being done and the share done of it.
+        views: views of the page's buttons; by default sampled from the first scene. The page opens at the view with
+            most Gaussians in its picture. Background and rasterize mode of the views apply to all scenes.
+        limit_mb: maximum size of the file, in units of 10^6 bytes.
+        progress: True shows a bar; a function is called with the name of the task and its share done.
 
     Returns:
         ``path``.
 
     Raises:
-        PointSplatError: if there are no scenes or more than two, names do not fit them, or one alone is too large.
+        PointSplatError: if there are no scenes or more than two, names do not fit, or one scene alone is too large.
         SceneError: if no Gaussian of a scene can be drawn, or the file cannot be written.
-        DataError: if nothing of the first scene is visible.
+        DataError: if no Gaussian of the first scene is visible.
 
     Example:
         >>> import tempfile
@@ -78,22 +77,22 @@ def write_page(
     rows = [_row(name, scene) for name, scene in zip(names, scenes, strict=True)]
     with progress_bar(progress) as report:
         report("looking for views", 0.0)
-        stage = Stage.of(scenes[0], views)
+        frame = FlightFrame.of(scenes[0], views)
 
         def packed(name: str, scene: Gaussians) -> dict[str, str]:
-            return stage.packed(scene, name, lambda _, share: report(f"compressing {name}", share))
+            return frame.packed(scene, name, lambda _, share: report(f"compressing {name}", share))
 
-        shown = [packed(name, scene) for name, scene in zip(names, scenes, strict=True)]
+        included = [packed(name, scene) for name, scene in zip(names, scenes, strict=True)]
         missing = ""
         while True:
-            flight = stage.data(shown)
+            flight = frame.data(included)
             values = {"title": title, "rows": rows, "notes": notes, "missing": missing, "flight": flight}
             text = page(
                 "scene.html", (*SCRIPTS, "scene.js"), with_workers=True, **values, data={"flight": flight}
             ).encode("utf-8")  # fmt: skip
             if len(text) <= 1e6 * limit_mb:
                 break
-            shown, missing = _without_the_largest(shown, path, len(text), limit_mb)
+            included, missing = _without_the_largest(included, path, len(text), limit_mb)
             logger.warning("%s: %s", path, missing)
     with replacing(path) as part:
         part.write_bytes(text)
@@ -101,32 +100,32 @@ def write_page(
 
 
 def check_limit(limit_mb: float) -> None:
-    """Refuse, before the long computations, a limit that no page could keep.
+    """Refuse an impossible limit before the long computations.
 
     Raises:
-        PointSplatError: if it is not above 0.
+        PointSplatError: if the limit is not above 0.
     """
     if not limit_mb > 0:
         raise PointSplatError(f"a page of at most {limit_mb:g} MB; expected a number above 0")
 
 
 def _without_the_largest(
-    shown: list[dict[str, str]], path: Path, size: int, limit_mb: float
+    included: list[dict[str, str]], path: Path, size: int, limit_mb: float
 ) -> tuple[list[dict[str, str]], str]:
-    """The other scenes, and a line of text on the one that is left out.
+    """The scenes without the largest, and a line of text on the largest.
 
     Raises:
-        PointSplatError: if there is no other.
+        PointSplatError: if there is only one scene.
     """
     excess = f"the page would have {size / 1e6:.1f} MB, more than the {limit_mb:g} MB allowed"
-    if len(shown) == 1:
+    if len(included) == 1:
         raise PointSplatError(f"{path}: {excess}; expected a larger limit, or fewer Gaussians")
-    largest = max(shown, key=lambda scene: len(scene["spz"]))
-    return [scene for scene in shown if scene is not largest], f"{largest['name']} is left out: with it {excess}"
+    largest = max(included, key=lambda scene: len(scene["spz"]))
+    return [scene for scene in included if scene is not largest], f"{largest['name']} is left out: with it {excess}"
 
 
 def _row(name: str, scene: Gaussians) -> dict[str, Any]:
-    """A scene for the table of the page."""
+    """The row of a scene in the table of the page."""
     megabytes = ply_bytes(len(scene), scene.sh_degree) / 1e6
     return {
         "name": name,

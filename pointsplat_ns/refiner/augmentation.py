@@ -1,7 +1,7 @@
 """Data augmentation: rotations, reflections and colour changes of scenes.
 
-A :class:`Transform` can be undone. So a refiner trained on ``undo(refiner(apply(scene)))`` sees many variants of a
-scene, while the target images do not change.
+A :class:`Transform` has an inverse. A refiner trained on ``undo(refiner(apply(scene)))`` gets many variants of a scene,
+while the target images do not change.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Transform:
 
     @cached_property
     def matrix(self) -> Tensor:
-        """Orthogonal (3, 3) float64 that positions are multiplied by."""
+        """Orthogonal (3, 3) float64, the factor on positions."""
         return rotation_matrices(self.quat.double()[None])[0] * (-1.0 if self.mirrored else 1.0)
 
     def apply(self, scene: Gaussians) -> Gaussians:
@@ -52,8 +52,8 @@ class Transform:
         )
 
     def _color(self, scene: Gaussians) -> tuple[Tensor, Tensor]:
-        """Factors on SH coefficients, and the offset added to the constant ones. Colours are 0.5 + SH_C0 dc, so a
-        factor on colours changes the 0.5, too."""
+        """Factors on SH coefficients, and the offset of the constant ones. Colours are 0.5 + SH_C0 dc, so a factor on
+        colours changes the 0.5 too."""
         gains = self.gains.to(scene.means)
         return gains, 0.5 * (gains - 1.0) / SH_C0
 
@@ -78,8 +78,8 @@ class Transform:
 
 
 def random_transform(generator: torch.Generator | None = None) -> Transform:
-    """A transform drawn at random: any rotation, or (half of them, as most scenes have z up) one about z; mirrored or
-    not; gains and order of the colour channels.
+    """A random transform: a rotation (half of the time about z, as most scenes have z up), a reflection or none, gains
+    and order of the colour channels.
 
     Args:
         generator: on the CPU; torch's own by default.
@@ -95,7 +95,7 @@ def random_transform(generator: torch.Generator | None = None) -> Transform:
 
 @lru_cache(maxsize=1)
 def _directions() -> tuple[Tensor, Tensor]:
-    """Unit directions (M, 3) all around, and the basis of degree 3 there, (M, 16), float64."""
+    """Random unit directions (M, 3), and the SH basis of degree 3 in them (M, 16), float64."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1)
     return directions, sh_basis(directions, 3)

@@ -15,18 +15,14 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE
 
 CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
-"""Space-filling curves that a stage may serialize its points along."""
+"""Space-filling curves for the serialization of points."""
 
 FINE_BITS = 16
-"""Bits per axis of the finest position code; every grid of the network is a coarsening of it."""
-
-
-MAX_SIZE = 1 << 16
-"""No number of channels, heads, points or layers may exceed this; the published network has 1024 at most."""
+"""Bits per axis of the finest position code. Every grid of the network is coarser."""
 
 
 class RefinerConfigError(PointSplatError, ValueError):
-    """A refiner configuration that is not valid."""
+    """An invalid refiner configuration."""
 
 
 @dataclass
@@ -41,7 +37,7 @@ class RefinerConfig:
     """
 
     sh_degree: int = MAX_SH_DEGREE
-    """Highest SH degree that the network reads and repairs; scenes of a lower one are padded with zeros."""
+    """Highest SH degree of the network's input and output; scenes of a lower degree are padded with zeros."""
     encoder: Literal["dual", "concat"] = "dual"
     """``dual`` gates geometry by appearance (paper eq. 4 to 6); ``concat`` is one concatenated vector (SplatFormer)."""
     use_appearance: bool = True
@@ -52,11 +48,11 @@ class RefinerConfig:
     """Channels of each encoder branch."""
     unit_gate: bool = False
     """Multiply the softmax gate by its number of channels, so that gates average 1 and not 1/32. The next layer could
-    learn this factor, but training is faster if it is there from the start."""
+    learn this factor, but training is faster with it."""
     color_hidden: int = 32
-    """Hidden channels of the MLP that reduces the SH coefficients beyond the constant one."""
+    """Hidden channels of the MLP that reduces the SH coefficients of degree 1 and higher."""
     color_dim: int = 8
-    """Channels that those coefficients are reduced to."""
+    """Output channels of that MLP."""
     grid: int | None = 384
     """Cells along the unit cube at the finest level (at most 512); None adapts the cell to the spacing of the scene."""
     strides: tuple[int, ...] = (1, 2, 2, 2)
@@ -78,7 +74,7 @@ class RefinerConfig:
     mlp_ratio: int = 4
     """Hidden width of a block's MLP over its channels."""
     drop_path: float = 0.3
-    """Chance that the deepest block's branch is dropped for a point in training; shallower blocks drop less."""
+    """Probability of dropping the deepest block's branch for a point in training; shallower blocks have less."""
     curves: tuple[str, ...] = ("hilbert", "hilbert-trans", "z", "z-trans")
     """Serialization curves; block i of a stage uses curve i (shuffled in training). Memory is laid out by the first."""
     norm: Literal["scene", "batch", "layer"] = "scene"
@@ -138,7 +134,7 @@ class RefinerConfig:
 
     @property
     def num_rest(self) -> int:
-        """SH coefficients a channel beyond the constant one."""
+        """SH coefficients of degree 1 and higher for each colour channel."""
         return (self.sh_degree + 1) ** 2 - 1
 
     @property
@@ -172,7 +168,7 @@ class RefinerConfig:
 
 
 def _check_type(name: str, kind: str, value: Any) -> None:
-    """Check a setting against its annotation; whole numbers also against their range, but for the SH degree's."""
+    """Check the type of a setting against its annotation, and whole numbers against their range."""
     if kind.startswith("Literal") or kind == "tuple[str, ...]":
         texts = value if isinstance(value, tuple) else (value,)
         _require(all(isinstance(text, str) for text in texts), f"{name} is {value!r}; expected text")
@@ -183,12 +179,12 @@ def _check_type(name: str, kind: str, value: Any) -> None:
         _require(number, f"{name} is {value!r}; expected a number")
     elif value is not None or "None" not in kind:
         numbers = value if kind == "tuple[int, ...]" else (value,)
-        least = 0 if name == "sh_degree" else 1
+        least, most = 0 if name == "sh_degree" else 1, 1 << 16  # the published network has 1024 at most
         whole = isinstance(numbers, tuple) and all(isinstance(n, int) and not isinstance(n, bool) for n in numbers)
         _require(
-            whole and all(least <= n <= MAX_SIZE for n in numbers),
+            whole and all(least <= n <= most for n in numbers),
             f"{name} is {_short(value)}; expected {'whole numbers' if kind != 'int' else 'a whole number'} of "
-            f"{least} to {MAX_SIZE}",
+            f"{least} to {most}",
         )
 
 

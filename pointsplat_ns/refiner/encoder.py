@@ -13,9 +13,9 @@ from pointsplat_ns.system.threads import one_thread
 class BatchNorm(nn.BatchNorm1d):
     """Batch norm over points: ``[N, C] -> [N, C]``.
 
-    Differs from torch's in two ways. For a single point, which has no variance, the running statistics
-    are used. And at first the running statistics are plain averages, until the momentum exceeds one over the
-    number of steps: otherwise their initial values would still count after a short training.
+    It differs from torch's in two ways. A single point, which has no variance, uses the running statistics. And the
+    running statistics start as plain averages, until the momentum exceeds one over the number of steps; otherwise their
+    initial values would still count after a short training.
     """
 
     MOMENTUM = 0.01
@@ -50,7 +50,7 @@ class SceneNorm(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         if x.shape[0] < 2:
             return (x - x) * self.weight + self.bias
-        with one_thread():  # shared between threads, its sums are rounded by their number
+        with one_thread():  # the same rounding for any number of threads
             return nn.functional.batch_norm(x, None, None, self.weight, self.bias, True, 0.0, self.eps)
 
 
@@ -115,5 +115,5 @@ class ConcatEncoder(nn.Module):
 
 
 def make_encoder(config: RefinerConfig) -> nn.Module:
-    """The encoder that a configuration asks for."""
+    """The encoder of a configuration."""
     return DualBranchEncoder(config) if config.encoder == "dual" else ConcatEncoder()

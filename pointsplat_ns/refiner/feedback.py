@@ -1,10 +1,10 @@
-"""The feedback refiner: a small network that sees what renders say of each Gaussian, and sets how far it moves.
+"""The feedback network: a small network that reads the gradients of each Gaussian, and sets how far it moves.
 
-The refiner of the paper sees a scene and not its error. This one sees the error: after each render it is given, for
-every Gaussian by itself, what the gradients of the rendering loss have been so far. It multiplies the steps of Adam, by
-kind of parameter, so that nothing moves where no gradient says so. Untrained it changes nothing, and what remains is
-Adam. Such learned optimisers are due to Andrychowicz et al. (arXiv 1606.04474); G3R (arXiv 2409.19405) and QuickSplat
-(ICCV 2025) use gradients as the input of networks that reconstruct scenes.
+The refiner of the paper reads a scene and not its error. This network reads the error: after each render it gets the
+gradients of the rendering loss so far, for each Gaussian by itself. Its output multiplies the steps of Adam by a factor
+for each parameter, so Gaussians without gradients do not move. An untrained network gives plain Adam. Such learned
+optimisers are due to Andrychowicz et al. (arXiv 1606.04474); G3R (arXiv 2409.19405) and QuickSplat (ICCV 2025) use
+gradients as the input of networks that reconstruct scenes.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from pointsplat_ns.io.files import write_tensors
 from pointsplat_ns.refiner.weights import checked_tensors, opened_weights
 
 PARAMETERS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
-"""Kinds of parameters, each of which has a factor."""
+"""Parameters, each with a factor for each Gaussian."""
 
 FEATURES = 39
-"""Numbers that the network sees of a Gaussian, see :mod:`pointsplat_ns.compression.feedback`."""
+"""Number of features of a Gaussian, see :mod:`pointsplat_ns.compression.feedback`."""
 
-REACH = 2.0
-"""Bound of the logarithms of the factors: from 1/7 to 7."""
+MAX_LOG_FACTOR = 2.0
+"""Bound of the factors' logarithms: factors are from 1/7 to 7."""
 
 FORMAT = "pointsplat-feedback/2"
 
 PRETRAINED = Path(__file__).parent / "pretrained" / "feedback.safetensors"
-"""The network that ships; ``CARD.md`` beside it describes its training and results."""
+"""The shipped network; ``CARD.md`` beside it describes its training and results."""
 
 
 class FeedbackRefiner(nn.Module):
-    """An MLP that every Gaussian goes through by itself.
+    """An MLP on the features of each Gaussian.
 
     Example:
         >>> FeedbackRefiner()(torch.zeros(5, FEATURES)).unique().tolist()
@@ -56,12 +56,12 @@ class FeedbackRefiner(nn.Module):
         self.mlp = nn.Sequential(*layers, last)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Factors of the steps, (N, 6) above 0, one a kind of :data:`PARAMETERS`.
+        """Factors of the steps, (N, 6), above 0, in the order of :data:`PARAMETERS`.
 
         Args:
             features: (N, :data:`FEATURES`).
         """
-        return (REACH * torch.tanh(self.mlp(features) / REACH)).exp()
+        return (MAX_LOG_FACTOR * torch.tanh(self.mlp(features) / MAX_LOG_FACTOR)).exp()
 
 
 def save_feedback_refiner(network: FeedbackRefiner, path: Path | str, metadata: dict[str, Any] | None = None) -> None:
@@ -76,7 +76,7 @@ def save_feedback_refiner(network: FeedbackRefiner, path: Path | str, metadata: 
 
 
 def read_feedback_refiner(path: Path | str = PRETRAINED, device: torch.device | str = "cpu") -> FeedbackRefiner:
-    """Read a network, in evaluation mode; by default the one that ships.
+    """Read a network, in evaluation mode; by default the shipped one.
 
     Raises:
         WeightsError: if the file is missing, damaged or of another kind.
@@ -90,5 +90,5 @@ def read_feedback_refiner(path: Path | str = PRETRAINED, device: torch.device | 
 
 @lru_cache(maxsize=2)
 def shipped_feedback_refiner(device: torch.device) -> FeedbackRefiner:
-    """The network that ships, read once a device."""
+    """The shipped network, read once for each device."""
     return read_feedback_refiner(device=device)

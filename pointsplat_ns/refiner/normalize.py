@@ -1,8 +1,8 @@
 """Normalises a scene to the unit cube, and computes the network's input features.
 
-Positions are centred and divided by one extent, so that the aspect ratio is kept; log-scales are shifted by the
-logarithm of that extent. So the input does not depend on the scene's unit and position. Only the input is clamped:
-residuals are added to the original parameters.
+Positions are centred and divided by one extent, which keeps the aspect ratio; log-scales are shifted by the logarithm
+of that extent. So the input does not depend on the scene's unit and position. Only the input is clamped: residuals are
+added to the original parameters.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ class InputRanges:
     """Units and limits that bring the network's input to order 1. Trained weights depend on them."""
 
     opacity_limit: float = 12.0
-    """Opacity logits are clamped to this either way: beyond, opacity is 0 or 1 within 1e-5."""
+    """Bound of opacity logits, where opacity is 0 or 1 within 1e-5."""
     opacity_unit: float = 4.0
-    """Opacity logits are divided by this."""
+    """Divisor of opacity logits."""
     log_scale_centre: float = -5.0
     """Typical log of a standard deviation in the unit cube: 4 cm in a room of 6 m."""
     log_scale_unit: float = 2.0
-    """Log-scales, centred, are divided by this."""
+    """Divisor of centred log-scales."""
     log_scale_limit: float = 6.0
-    """Then they are clamped to this either way."""
+    """Bound of centred and divided log-scales."""
     sh_limit: float = 8.0
-    """SH coefficients are clamped to this either way; displayable colours need no more than 1.8."""
+    """Bound of SH coefficients; displayable colours need at most 1.8."""
 
 
 RANGES = InputRanges()
@@ -60,13 +60,12 @@ class UnitCube:
 
 
 def unit_cube(means: Tensor) -> UnitCube:
-    """The cube that a scene is normalised by.
+    """The unit cube of a scene.
 
-    The core of the scene is the box of its positions without the outermost 1 % at either end of
-    each axis (at least one position, from 8 positions on). The box may reach beyond the core by half
-    of the core's longest side, but not beyond the positions. A scene without outliers keeps its full
-    extent; an outlier, however far, at most doubles it, so that it cannot squeeze the rest into one
-    cell. The cube shares the box's centre and has its longest side, or 1 where that is zero.
+    The core of the scene is the box of its positions without the outermost 1 % at each end of each axis (at least one
+    position, from 8 positions on). The box of all positions is cut to the core plus half of the core's longest side in
+    each direction. A scene without outliers keeps its full extent; an outlier at most doubles it. The cube has the
+    centre and the longest side of the cut box, or side 1 where that is zero.
 
     Args:
         means: finite positions, at least one.  # [N, 3] scene units
@@ -92,7 +91,7 @@ class Features:
     scales: Tensor  # [N, 3] log-scale in the unit cube, centred and scaled
     opacities: Tensor  # [N, 1] logit, scaled
     features_dc: Tensor  # [N, 3]
-    features_rest: Tensor  # [N, 3 * num_rest] zero beyond the scene's degree
+    features_rest: Tensor  # [N, 3 * num_rest] zero above the scene's degree
     quat_scale: Tensor  # [N, 1] signed length: the scene's quaternion is this times ``quats``
 
     def permute(self, order: Tensor, inverse: Tensor) -> Features:
@@ -106,7 +105,7 @@ def gaussian_features(scene: Gaussians, cube: UnitCube, num_rest: int, dtype: to
     Args:
         scene: usable Gaussians (``scene.usable()`` holds for all), N of them.
         cube: the scene's unit cube, on the scene's device.
-        num_rest: coefficients a channel that the network reads beyond the constant one.
+        num_rest: SH coefficients of degree 1 and higher for each colour channel of the network.
         dtype: floating type of the network.
     """
     log_scale_limit, sh_limit = RANGES.log_scale_limit, RANGES.sh_limit
@@ -126,18 +125,18 @@ def gaussian_features(scene: Gaussians, cube: UnitCube, num_rest: int, dtype: to
 
 
 def canonical_quats(quats: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit quaternions of one sign, and what they were divided by.
+    """Unit quaternions of one sign, and their signed lengths.
 
-    A quaternion and its negative are the same rotation; the one whose first non-zero component is positive is taken.
-    Zero, and what is shorter than :data:`~pointsplat_ns.geometry.quaternions.SHORTEST`, becomes the identity, with a
-    length of 1. Components are divided by the largest before they are squared, so
-    that neither 1e-30 underflows nor 1e30 overflows.
+    A quaternion and its negative are the same rotation; the first non-zero component of the result is positive.
+    Quaternions shorter than :data:`~pointsplat_ns.geometry.quaternions.SHORTEST` become the identity, with a length of
+    1. Components are divided by the largest before squaring, so that 1e-30 does not underflow and 1e30 does not
+    overflow.
 
     Args:
         quats: finite wxyz of any length.  # [N, 4]
 
     Returns:
-        unit quaternions [N, 4] and signed lengths [N, 1], with ``quats = unit * length`` but for zero.
+        unit quaternions [N, 4] and signed lengths [N, 1], with ``quats = unit * length`` for nonzero ones.
     """
     quats = zero_as_identity(quats)
     largest = quats.abs().amax(dim=1, keepdim=True).detach()

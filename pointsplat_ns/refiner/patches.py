@@ -1,8 +1,8 @@
 """Applies a function to patches of points, a few patches at a time; see :mod:`~pointsplat_ns.refiner.rows` for why.
 
-A patch is K points that are consecutive along a curve. A last patch of fewer points is filled up with the points before
-it, which keep the result of their own patch. With at most K points in all there is one patch. With K = 1 each patch is
-a single point.
+A patch is K consecutive points along a curve. A last patch of fewer points is filled up with the points before it,
+which keep the result of their own patch. With at most K points in all there is one patch. With K = 1 each patch is a
+single point.
 
 Shapes: N points, C channels, P patches of K points.
 """
@@ -24,7 +24,7 @@ Order = tuple[Tensor, Tensor]
 def by_patches(
     function: Callable[[Tensor], Tensor],  # [P * K, C] -> [P * K, C], each patch by itself
     x: Tensor,  # [N, C]
-    width: int,  # of the widest tensor that the function makes
+    width: int,  # columns of the widest tensor within the function
     patch: int = 1,
     order: Order | None = None,  # None: the order in memory
 ) -> Tensor:
@@ -42,17 +42,17 @@ def by_patches(
 def add_by_patches(
     function: Callable[[Tensor], Tensor],  # [P * K, C] -> [P * K, C], each patch by itself
     x: Tensor,  # [N, C]
-    width: int,  # of the widest tensor that the function makes
+    width: int,  # columns of the widest tensor within the function
     patch: int = 1,
     order: Order | None = None,  # None: the order in memory
 ) -> Tensor:
-    """``x + function(x)`` in place of ``x``, without gradients: nothing of the size of ``x`` is allocated. # [N, C]"""
+    """``x + function(x)`` in place of ``x``, without gradients and without a second tensor of that size. # [N, C]"""
     patch, full = _whole_patches(len(x), patch)
     along = None if order is None else order[0]
     last = None
-    if full < len(x):  # read before it changes: the last patch borrows points of the one before
-        borrowing = x[len(x) - patch :] if along is None else x.index_select(0, along[len(x) - patch :])
-        last = function(borrowing)[full - len(x) :]
+    if full < len(x):  # read before it changes: the last patch includes points of the one before
+        filled = x[len(x) - patch :] if along is None else x.index_select(0, along[len(x) - patch :])
+        last = function(filled)[full - len(x) :]
     add_by_rows(function, x, rows_at_a_time(width, patch), along, full)
     if last is not None:
         add_rows(x, last, along, full)
@@ -60,6 +60,6 @@ def add_by_patches(
 
 
 def _whole_patches(n: int, patch: int) -> tuple[int, int]:
-    """Number of points in a patch if there are ``n`` in all, and number of points in whole patches."""
+    """Number of points in a patch, and in all whole patches together, of ``n`` points."""
     patch = max(1, min(patch, n))
     return patch, n // patch * patch

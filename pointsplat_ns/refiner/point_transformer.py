@@ -45,10 +45,8 @@ class SubmanifoldConv(nn.Module):
 
 
 class PatchAttention(nn.Module):
-    """Multi-head attention within patches of K points that are consecutive along a curve.
-
-    :mod:`~pointsplat_ns.refiner.patches` describes the last patch if the number of points is not a multiple of K. With
-    at most K points in all, this is plain attention.
+    """Multi-head attention within patches of K consecutive points along a curve, see
+    :mod:`~pointsplat_ns.refiner.patches`. With at most K points in all, this is plain attention.
     """
 
     def __init__(self, channels: int, heads: int, patch: int):
@@ -62,7 +60,7 @@ class PatchAttention(nn.Module):
         return by_patches(self._attend, x, self.qkv.out_features, self.patch, order)
 
     def _attend(self, x: Tensor) -> Tensor:
-        """``[P * K, C] -> [P * K, C]``: the points of each patch to one another."""
+        """Attention among the points of each patch: ``[P * K, C] -> [P * K, C]``."""
         points, channels = x.shape
         size = min(self.patch, points)
         q, k, v = self.qkv(x).view(-1, size, 3, self.heads, channels // self.heads).permute(2, 0, 3, 1, 4)
@@ -99,7 +97,7 @@ class Block(nn.Module):
         patch: int = 1,
         order: Order | None = None,
     ) -> Tensor:
-        """``x + drop(branch(x))``, in place if neither gradients nor dropping need ``x``. ``width`` is that of the
+        """``x + drop(branch(x))``, in place if neither gradients nor dropping need ``x``. ``width`` is the width of the
         branch's widest layer; ``patch`` and ``order`` define the patches."""
         if torch.is_grad_enabled() or self.training:
             return self._drop(by_patches(branch, x, width, patch, order)).add_(x)
@@ -142,7 +140,7 @@ class Pool(nn.Module):
 
 
 class Unpool(nn.Module):
-    """Back to the finer level: each point gets its cell's features, added to its own."""
+    """To the next finer level: the features of each point's cell are added to its own."""
 
     def __init__(self, in_channels: int, skip_channels: int, out_channels: int, norm: str):
         super().__init__()

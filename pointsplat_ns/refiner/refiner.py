@@ -47,9 +47,9 @@ class Refiner(nn.Module):
         self.heads = ResidualHeads(config.backbone_dim + config.encoded_dim, config)
 
     def prepare(self, scene: Gaussians) -> Structure | None:
-        """The neighbour tables of a scene, which depend on its positions, on the scene's device.
+        """Build the neighbour tables of a scene's positions, on the scene's device.
 
-        Build them once per scene and pass them to :meth:`forward` at every step. None if no Gaussian can be drawn.
+        Build them once for a scene and pass them to :meth:`forward` at every step. None if no Gaussian can be drawn.
 
         Raises:
             SceneError: if the SH degree exceeds the network's.
@@ -66,15 +66,15 @@ class Refiner(nn.Module):
         return dataclasses.replace(build_structure(scene[usable], self.config), usable=usable)
 
     def forward(self, scene: Gaussians, structure: Structure | None = None) -> Gaussians:
-        """The refined scene, in the frame, dtype and order of the given one.
+        """The refined scene, in the frame, dtype and order of ``scene``.
 
         Args:
-            scene: N Gaussians of an SH degree up to the configuration's.
-            structure: the result of :meth:`prepare` for these positions; built here if None.
+            scene: N Gaussians of at most the network's SH degree.
+            structure: the result of :meth:`prepare` for these positions; None builds it here.
 
         Raises:
             SceneError: if the scene cannot be refined (see :meth:`prepare`).
-            ValueError: if the structure belongs to another number of Gaussians or configuration.
+            ValueError: if the structure is of another number of Gaussians or configuration.
         """
         if structure is None:
             structure = self.prepare(scene)
@@ -104,7 +104,7 @@ class Refiner(nn.Module):
         return {name: permute(value, structure.inverse, structure.order) for name, value in residuals.items()}
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters by the name under which a learning rate may be set: ``encoder``, ``backbone`` and the heads'."""
+        """Parameters by name of their learning rate: ``encoder``, ``backbone``, and the attribute of each head."""
         groups = {"encoder": list(self.encoder.parameters()), "backbone": list(self.backbone.parameters())}
         groups.update({name: list(mlp.parameters()) for name, mlp in self.heads.mlps.items()})
         return {name: parameters for name, parameters in groups.items() if parameters}

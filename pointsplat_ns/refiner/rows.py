@@ -1,7 +1,7 @@
 """Applies row-wise functions to a few thousand rows at a time, so that intermediate results fit into a CPU's cache.
 
-Allocating a tensor of tens of megabytes takes longer than the matrix product that fills it, as the system provides each
-of its pages anew. The memory of tensors of a few megabytes is reused.
+Allocating a tensor of tens of megabytes takes longer than the matrix product that fills it, because the system provides
+each page anew. The memory of tensors of a few megabytes is reused.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-CELLS = 2**20
+MAX_ELEMENTS = 2**20
 """Largest number of elements of the widest tensor in one call on a CPU: 4 MB in float32."""
 
 
 def rows_at_a_time(width: int, multiple: int = 1) -> int:
     """Number of rows of ``width`` elements that a CPU computes in one call: a positive multiple of ``multiple``."""
-    return max(1, CELLS // (width * multiple)) * multiple
+    return max(1, MAX_ELEMENTS // (width * multiple)) * multiple
 
 
 def by_rows(
@@ -42,12 +42,12 @@ def add_by_rows(
     function: Callable[[Tensor], Tensor],  # [R, C] -> [R, C]
     x: Tensor,  # [N, C]
     rows: int,
-    order: Tensor | None = None,  # [N] a permutation: which rows go together; None: consecutive ones
+    order: Tensor | None = None,  # [N] a permutation that groups the rows; None: consecutive rows
     stop: int | None = None,
 ) -> Tensor:
     """``x + function(x)`` in place of ``x``, without gradients; on a CPU ``rows`` rows at a time.
 
-    Nothing of the size of ``x`` is allocated. Rows along ``order`` from ``stop`` on are left alone. # [N, C]
+    No second tensor of the size of ``x`` is allocated. Rows along ``order`` from ``stop`` on do not change. # [N, C]
     """
     stop = len(x) if stop is None else stop
     step = rows if x.device.type == "cpu" else max(1, stop)
@@ -64,7 +64,7 @@ def add_rows(
     order: Tensor | None,  # [N] a permutation, or None
     start: int,
 ) -> None:
-    """Add ``part`` in place to R rows of ``x``: those from ``start`` on along ``order``."""
+    """Add ``part`` in place to R rows of ``x``, from ``start`` on along ``order``."""
     if order is None:
         x[start : start + len(part)] += part
     else:

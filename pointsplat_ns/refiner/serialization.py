@@ -1,8 +1,8 @@
 """Space-filling curves in three dimensions: from integer coordinates to positions along a curve.
 
-Points that are close along a curve are close in space, so that a patch of consecutive points is a
-neighbourhood. Both curves are hierarchical: the code of a coarser cell is the code of any of its
-points without the last three bits per halving. That makes one sort serve all grids of the network.
+Points that are close along a curve are close in space, so a patch of consecutive points is a neighbourhood. Both curves
+are hierarchical: the code of a coarser cell is the code of any of its points without the last three bits per halving.
+So one sort serves all grids of the network.
 """
 
 from __future__ import annotations

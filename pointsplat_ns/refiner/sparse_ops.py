@@ -1,7 +1,7 @@
 """The sparse operations of the network: permutation, maximum and mean per cluster, submanifold convolution.
 
-The first, second and fourth have a backward of their own. Autograd's backward of a gather accumulates row by row; for a
-permutation or distinct targets a gather is enough. Nothing here allocates more than a few times [N, C].
+The first, second and fourth have their own backward. Autograd's backward of a gather accumulates row by row; for a
+permutation or distinct targets a gather is enough. No function allocates more than a few times [N, C].
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class _SubmanifoldConv(Function):
 
 
 def _parts(kernel_map: KernelMap, x: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """Offset and indices of all pairs; on a CPU as many at a time as fit into its cache."""
+    """Offset and indices of all pairs, on a CPU in parts that fit into its cache."""
     for k, (i, j) in enumerate(kernel_map):
         rows = rows_at_a_time(x.shape[1]) if x.device.type == "cpu" else max(1, len(i))
         for part_i, part_j in zip(i.split(rows), j.split(rows), strict=True):

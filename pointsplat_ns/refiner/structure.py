@@ -1,4 +1,4 @@
-"""Neighbour tables and curve orders of a scene: derived from positions alone, built once, used at every step.
+"""Neighbour tables and curve orders of a scene, from positions alone: built once, used at every step.
 
 Points are stored along the first curve of the configuration, so that the points of a cell are consecutive at every
 level, and neighbours are close in memory.
@@ -17,12 +17,24 @@ from pointsplat_ns.refiner.config import FINE_BITS, RefinerConfig
 from pointsplat_ns.refiner.normalize import UnitCube, unit_cube
 from pointsplat_ns.refiner.serialization import curve_codes
 
-FIXED_GRID_BITS = 7
-"""With a fixed grid, the finest code splits each cell into 2^7 per axis: a grid of 512 then needs 16 bits."""
 
-ADAPTIVE_OCCUPANCY = 0.6
-"""An adapted grid is the coarsest one with at least this many occupied cells per distinct position: one or two points
-per cell, with neighbours in the adjacent cells."""
+@dataclass(frozen=True)
+class StructureSettings:
+    """Settings of grids and neighbour tables."""
+
+    fixed_grid_bits: int = 7
+    """Bits per axis by which the finest code splits the cells of a fixed grid: a grid of 512 needs 16 bits in all."""
+    occupancy: float = 0.6
+    """Least number of occupied cells per distinct position in an adapted grid, which is the coarsest such grid: one or
+    two points share a cell, and neighbours are in adjacent cells."""
+    table_per_cell: int = 128
+    """Largest number of entries (4 bytes each) per occupied cell in a table of the whole grid, which finds neighbours.
+    Larger grids are searched, which is three to eight times slower."""
+    table_limit: int = 2**26
+    """Largest number of entries of that table: 256 MB."""
+
+
+STRUCTURE = StructureSettings()
 
 HALF_KERNEL = [
     (dx, dy, dz)
@@ -32,13 +44,6 @@ HALF_KERNEL = [
     if (dx, dy, dz) > (0, 0, 0)
 ]  # fmt: skip
 """The 13 offsets of a 3x3x3 kernel that come after the centre; the other 13 are their negatives."""
-
-TABLE_PER_CELL = 128
-"""Neighbours are looked up in a table of the whole grid if it has at most this many entries (of 4 bytes) per occupied
-cell. Otherwise they are searched for, which works for any grid but is three to eight times slower."""
-
-TABLE_LIMIT = 2**26
-"""Maximum number of entries of that table: 256 MB."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +67,12 @@ class Structure:
     inverse: Tensor  # [N] place in memory of each Gaussian of the scene
     levels: list[GridLevel]
     cells_per_side: float  # of the first level, along the unit cube
-    built_for: tuple  # the settings that it depends on
-    usable: Tensor | None = None  # [T] mask of the scene's Gaussians that it covers, N of them; None: it covers all
+    built_for: tuple  # :func:`structure_key` of its configuration
+    usable: Tensor | None = None  # [T] mask of the N Gaussians in the structure; None: all
 
     @property
     def total(self) -> int:
-        """Gaussians of the scene, those that cannot be drawn included."""
+        """Number of Gaussians of the scene, with undrawable ones."""
         return len(self.order if self.usable is None else self.usable)
 
     def to(self, device: torch.device | str) -> Structure:
@@ -94,19 +99,19 @@ def structure_key(config: RefinerConfig) -> tuple:
 def build_structure(scene: Gaussians, config: RefinerConfig) -> Structure:
     """Levels of a scene.
 
-    Points that share even the finest code (a 2^-16 of the cube) are ordered by all their
-    parameters, so that the result depends on the set of Gaussians and not on their order.
+    Points with equal finest codes (1 / 2^16 of the cube) are ordered by all their parameters, so that the result does
+    not depend on the order of the Gaussians.
 
     Args:
         scene: at least one usable Gaussian.
         config: ``grid``, ``strides`` and ``curves`` are used.
     """
     cube = unit_cube(scene.means)
-    units = 2**FINE_BITS if config.grid is None else config.grid << FIXED_GRID_BITS
+    units = 2**FINE_BITS if config.grid is None else config.grid << STRUCTURE.fixed_grid_bits
     fine = ((cube.positions(scene.means) + 0.5) * units).long().clamp_(0, units - 1)
     codes = curve_codes(fine, FINE_BITS, config.curves)
     order, depths = _canonical_order(scene, codes[0])
-    shift = FIXED_GRID_BITS if config.grid is not None else _adaptive_shift(depths)
+    shift = STRUCTURE.fixed_grid_bits if config.grid is not None else _adaptive_shift(depths)
     cells_per_side = units / 2**shift
 
     levels = []
@@ -146,7 +151,7 @@ def neighbour_pairs(cells: Tensor) -> list[tuple[Tensor, Tensor]]:
     m = len(cells)
     side = int(cells.max()) + 3  # two empty cells after the last along each axis, so that no offset wraps around
     keys = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
-    if side**3 <= min(TABLE_PER_CELL * m, TABLE_LIMIT):
+    if side**3 <= min(STRUCTURE.table_per_cell * m, STRUCTURE.table_limit):
         numbered, j = _look_up(keys, side)
     else:
         numbered, j = _search(keys, side)
@@ -155,7 +160,7 @@ def neighbour_pairs(cells: Tensor) -> list[tuple[Tensor, Tensor]]:
 
 
 def _look_up(keys: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """Pairs by a table of the whole grid: index of the offset times M plus i, increasing, and j. # [P], [P]"""
+    """Pairs from a table of the whole grid: index of the offset times M plus i, increasing, and j. # [P], [P]"""
     table = torch.zeros(side**3, dtype=torch.int32, device=keys.device)
     table[keys] = torch.arange(1, len(keys) + 1, dtype=torch.int32, device=keys.device)
     steps = [[(dx * side + dy) * side + dz] for dx, dy, dz in HALF_KERNEL]
@@ -166,14 +171,14 @@ def _look_up(keys: Tensor, side: int) -> tuple[Tensor, Tensor]:
 
 
 def _search(keys: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """The same pairs by search among the sorted keys, whatever the size of the grid. # [P], [P]"""
+    """The same pairs by search among the sorted keys, for grids of any size. # [P], [P]"""
     m = len(keys)
-    keys, index = keys.to(torch.int32 if side**3 < 2**31 else torch.int64).sort()  # half as wide takes half as long
+    keys, index = keys.to(torch.int32 if side**3 < 2**31 else torch.int64).sort()  # half the width takes half the time
     following = (keys[1:] == keys[:-1] + 1).nonzero()[:, 0]  # offset (0, 0, 1)
     found = [index.index_select(0, following)]
     partners = [index.index_select(0, following + 1)]
-    # The three cells of another column (dx, dy) follow one another in the sorted keys: one search finds all. Its
-    # targets are sorted as well, which halves its time.
+    # The three cells of another column (dx, dy) are consecutive in the sorted keys, so one search finds them all. Its
+    # targets are sorted too, which halves its time.
     columns = [(i, (dx * side + dy) * side - 1) for i, (dx, dy, dz) in enumerate(HALF_KERNEL) if dz == -1]
     numbers, steps = torch.tensor(columns, device=keys.device)[:, :, None].unbind(1)
     numbered, target = (index + numbers * m).flatten(), (keys + steps.to(keys.dtype)).flatten()
@@ -191,8 +196,8 @@ def _search(keys: Tensor, side: int) -> tuple[Tensor, Tensor]:
 
 def _canonical_order(scene: Gaussians, codes: Tensor) -> tuple[Tensor, Tensor]:
     """Indices of the scene sorted by code, with ties sorted by the parameters; and for each code the position, from 1,
-    of the highest bit in which it differs from the code before. With ``s`` bits dropped per axis, a new cell begins
-    where this exceeds ``3 * s``. # [N], [N]"""
+    of the highest bit that differs from the previous code. With ``s`` bits dropped per axis, a new cell begins where
+    this position exceeds ``3 * s``. # [N], [N]"""
     codes, order = codes.sort(stable=True)
     depths = torch.frexp((codes[1:] ^ codes[:-1]).double()).exponent
     depths = torch.cat([depths.new_full((1,), 64), depths])
@@ -211,22 +216,22 @@ def _canonical_order(scene: Gaussians, codes: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _adaptive_shift(depths: Tensor) -> int:
-    """Bits to drop per axis of the finest codes, so that about one or two positions share a cell."""
+    """Bits per axis to drop from the finest codes, so that one or two positions share a cell."""
     cells = torch.bincount(depths, minlength=65).flip(0).cumsum(0).flip(0).tolist()  # of at least that many bits
     for shift in range(FINE_BITS, 0, -1):
-        if cells[3 * shift + 1] >= ADAPTIVE_OCCUPANCY * cells[1]:
+        if cells[3 * shift + 1] >= STRUCTURE.occupancy * cells[1]:
             return shift
     return 0
 
 
 def _runs(depths: Tensor, shift: int) -> tuple[Tensor, Tensor]:
-    """Cell of each place [M], first place of each cell [R], of cells that drop ``shift`` bits per axis."""
+    """Cell of each place [M] and first place of each cell [R], with ``shift`` bits per axis dropped."""
     starts = depths > 3 * shift
     return starts.cumsum(0) - 1, starts.nonzero()[:, 0]
 
 
 def _coarser_pair(along: Tensor, cluster: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Order of the next level and its inverse: a curve that visits all points of a cell in one go visits the cells in
+    """Order of the next level and its inverse. A curve visits all points of a cell in a row, so it visits the cells in
     the order of their first points."""
     cells = cluster.index_select(0, along)
     starts = torch.ones_like(cells, dtype=torch.bool)

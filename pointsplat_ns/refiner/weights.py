@@ -18,11 +18,11 @@ from pointsplat_ns.refiner.refiner import Refiner
 FORMAT = "pointsplat-refiner/1"
 
 PRETRAINED = Path(__file__).parent / "pretrained" / "refiner.safetensors"
-"""The refiner that ships; ``CARD.md`` beside it describes its training and results."""
+"""The shipped refiner; ``CARD.md`` beside it describes its training and results."""
 
 
 class WeightsError(PointSplatError):
-    """A file that does not hold a usable refiner."""
+    """A file without a usable refiner."""
 
 
 def save_refiner(refiner: Refiner, path: str | Path, metadata: dict[str, Any] | None = None) -> None:
@@ -42,10 +42,10 @@ def save_refiner(refiner: Refiner, path: str | Path, metadata: dict[str, Any] | 
 
 
 def read_refiner(path: str | Path, device: torch.device | str = "cpu") -> Refiner:
-    """Read a refiner from a file; it is in evaluation mode.
+    """Read a refiner in evaluation mode from a file.
 
-    The file may come from anybody: its configuration, and the names, shapes and types of its tensors, are checked
-    before memory is taken for them.
+    The file is not trusted: its configuration and the names, shapes and types of its tensors are checked before memory
+    is allocated.
 
     Raises:
         WeightsError: if the file is missing, damaged, of another kind, or its tensors do not fit.
@@ -59,8 +59,8 @@ def read_refiner(path: str | Path, device: torch.device | str = "cpu") -> Refine
 
 
 def checked_tensors(file: Any, expected: dict[str, torch.Tensor], path: Path) -> dict[str, torch.Tensor]:
-    """The tensors of an opened file, whose names, shapes and kinds of numbers must be those of ``expected``; these are
-    compared before memory is taken.
+    """The tensors of an opened file. Their names, shapes and kinds of numbers are compared with ``expected`` before
+    memory is allocated.
 
     Raises:
         WeightsError: if they do not fit, or are not finite.
@@ -85,7 +85,7 @@ def checked_tensors(file: Any, expected: dict[str, torch.Tensor], path: Path) ->
 
 
 def read_metadata(path: str | Path) -> dict[str, Any]:
-    """The metadata that was given to :func:`save_refiner`.
+    """The metadata of a file written by :func:`save_refiner`.
 
     Raises:
         WeightsError: if the file is missing, damaged or of another kind.
@@ -96,13 +96,16 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
 
 
 @contextmanager
-def opened_weights(path: Path, form: str, what: str) -> Iterator[tuple[Any, dict[str, str]]]:
-    """A file of weights, of which only the header has been read, and that header's texts.
+def opened_weights(path: Path, expected_format: str, what: str) -> Iterator[tuple[Any, dict[str, str]]]:
+    """Open a file of weights, and read its header only.
 
     Args:
         path: the .safetensors file.
-        form: the text that the header's entry "format" must be.
-        what: what it holds, for errors.
+        expected_format: expected text of the header's entry "format".
+        what: noun for the content, for errors.
+
+    Yields:
+        The opened file and the texts of its header.
 
     Raises:
         WeightsError: if the file is missing, damaged or of another kind.
@@ -114,8 +117,9 @@ def opened_weights(path: Path, form: str, what: str) -> Iterator[tuple[Any, dict
     try:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
-            if header.get("format") != form:
-                raise WeightsError(f"{path}: not {what}: format {header.get('format')!r}; expected {form!r}")
+            found = header.get("format")
+            if found != expected_format:
+                raise WeightsError(f"{path}: not {what}: format {found!r}; expected {expected_format!r}")
             yield file, header
     except (SafetensorError, OSError, ValueError) as error:
         raise WeightsError(
@@ -137,7 +141,7 @@ def _json(header: dict[str, str], key: str, path: Path) -> dict[str, Any]:
 
 
 def _hollow(header: dict[str, str], tensors: int, path: Path) -> Refiner:
-    """The network that a file describes, whose parameters have shapes but take no memory."""
+    """The network of a file's configuration; its parameters have shapes but take no memory."""
     if "config" not in header:
         raise WeightsError(f"{path}: lacks the entry 'config'; expected refiner weights, as save_refiner writes them")
     try:
@@ -154,7 +158,7 @@ def _hollow(header: dict[str, str], tensors: int, path: Path) -> Refiner:
 
 
 def _shape(tensors: dict[str, Any], name: str) -> tuple[int, ...] | str:
-    """The shape of a tensor, or of one in a file that has not been read."""
+    """The shape of a tensor, or of an unread tensor in a file."""
     if name not in tensors:
         return "nothing"
     tensor = tensors[name]

@@ -1,4 +1,4 @@
-"""The cells of one scene: what was measured, by which command and version, kept in a journal."""
+"""The cells of one scene: measurements with their commands and versions, in a journal."""
 
 from __future__ import annotations
 
@@ -25,55 +25,62 @@ CELLS = "cells.json"
 
 FORM = Form("pointsplat-tables-cells", 1, "cells", "a scene's tables")
 
-OPACITY_BINS = 40
-"""Equal bins of opacity, from 0 to 1."""
 
-VOLUME_SPAN = (-20.0, 4.0)
-"""Decades of volume, scene units cubed, that bins cover; what is smaller or larger counts in the first or the last."""
+@dataclass(frozen=True)
+class HistogramBins:
+    """Bins of the distributions in Figure 4."""
 
-VOLUME_BINS = 48
+    opacity: int = 40
+    """Number of equal bins of opacity, from 0 to 1."""
+    volume: int = 48
+    """Number of equal bins of log10 of the volume."""
+    volume_span: tuple[float, float] = (-20.0, 4.0)
+    """Range of log10 of the volume, scene units cubed; values outside count in the first or the last bin."""
+
+
+BINS = HistogramBins()
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One scene, made smaller in one way, measured."""
+    """The measurement of one scene, made smaller in one way."""
 
     way: str
     """Name of the way; see :mod:`~pointsplat_ns.tables.ways`."""
     point: Point
-    """What was measured. Its key is the cell's, its command measures the cell again."""
+    """Figures. Its key is the key of the cell, and its command measures the cell again."""
     made_with: str
-    """What it was made with besides the package: weights, another program, steps of fine-tuning."""
+    """Tools besides the package: weights, another program, steps of fine-tuning."""
     seed: int
     version: str
-    """Of the package."""
+    """Version of the package."""
     commit: str
-    """Of its source, with ``+`` where it was changed; empty if that is not known."""
+    """Commit of its source, with ``+`` if it has changes; empty if it is not known."""
     opacities: tuple[int, ...] | None = None
     """Number of Gaussians in each bin of opacity; None for cells that are not in Figure 4."""
     volumes: tuple[int, ...] | None = None
-    """And of the logarithm of the volume."""
+    """The same for bins of log10 of the volume."""
 
 
 @dataclass(frozen=True)
 class About:
-    """What the cells of a scene have in common, for the reader."""
+    """Facts on a scene and its views, for the reader."""
 
     name: str
     path: str
     dataset: str
     group: str
     origin: str
-    """Where the views came from that scenes are judged in."""
+    """Origin of the views that scenes are judged in."""
     machine: str
     views: int
-    """Their number."""
+    """Number of views."""
     width: int
     height: int
 
 
 def identity(scene: TableScene, options: TableOptions, machine: str) -> dict[str, str | int]:
-    """What all cells of a scene have in common: they can be compared with one another."""
+    """Values that all cells of a scene have in common, so that they can be compared."""
     return {
         "file": scene.sha256,
         "machine": machine,
@@ -84,21 +91,21 @@ def identity(scene: TableScene, options: TableOptions, machine: str) -> dict[str
 
 
 class CellJournal:
-    """The cells of one scene, on disk as soon as they are measured.
+    """The cells of one scene, written as soon as they are measured.
 
     Args:
-        folder: of all tables; the scene has a folder in it.
-        name: of the scene.
+        folder: folder of all tables; the scene has a folder in it.
+        name: name of the scene.
 
     Raises:
-        SceneError: if there is a journal that cannot be read.
+        SceneError: if the scene's journal cannot be read.
     """
 
     def __init__(self, folder: Path, name: str):
         self.path = folder / name / CELLS
         self.about: About | None = None
         self.cells: dict[tuple[str, float], Cell] = {}
-        """By way and share."""
+        """Cells by way and share."""
         self._of: dict[str, Any] = {}
         if self.path.exists():
             self._of, cells = FORM.read(self.path, _cell)
@@ -106,7 +113,7 @@ class CellJournal:
             self.cells = {(cell.way, cell.point.share): cell for cell in cells}
 
     def check(self, wanted: Mapping[str, str | int]) -> None:
-        """Check that cells of an identity may stand beside those that are there.
+        """Check that new cells of an identity are comparable with the existing ones.
 
         Raises:
             SceneError: if those are of another scene, other views or another machine.
@@ -115,11 +122,11 @@ class CellJournal:
             FORM.check(self.path, self._of, wanted)
 
     def add(self, cell: Cell, about: About, of: Mapping[str, str | int]) -> None:
-        """Take a cell in, in the place of an older one, and write all.
+        """Add a cell, or replace an older one, and write all cells.
 
         Args:
-            cell: what was measured.
-            about, of: what the reader is told of the scene, and its identity.
+            cell: the cell.
+            about, of: facts on the scene for the reader, and its identity.
 
         Raises:
             SceneError: if they cannot be written.
@@ -129,10 +136,10 @@ class CellJournal:
         FORM.write(self.path, self._of, list(self.cells.values()))
 
     def regroup(self, group: str) -> None:
-        """Put a scene of which there are cells into another group.
+        """Move a scene with cells to another group.
 
         Raises:
-            SceneError: if that cannot be written.
+            SceneError: if the journal cannot be written.
         """
         if self.about is not None and self.about.group != group:
             self.about = dataclasses.replace(self.about, group=group)
@@ -141,12 +148,12 @@ class CellJournal:
 
 
 def distributions(scene: Gaussians, way: str, share: float) -> tuple[tuple[int, ...] | None, tuple[int, ...] | None]:
-    """Numbers of Gaussians in the bins of opacity and of volume, for cells that Figure 4 shows; else None twice."""
+    """Numbers of Gaussians in the bins of opacity and of volume, for cells of Figure 4; else None twice."""
     if (way, share) not in FIGURE_CELLS:
         return None, None
     usable = scene[scene.usable()]
-    volumes = (log_volume(usable) / math.log(10)).clamp(*VOLUME_SPAN)
-    return _counts(usable.alphas, OPACITY_BINS, (0.0, 1.0)), _counts(volumes, VOLUME_BINS, VOLUME_SPAN)
+    volumes = (log_volume(usable) / math.log(10)).clamp(*BINS.volume_span)
+    return _counts(usable.alphas, BINS.opacity, (0.0, 1.0)), _counts(volumes, BINS.volume, BINS.volume_span)
 
 
 def _counts(values: Tensor, bins: int, span: tuple[float, float]) -> tuple[int, ...]:
@@ -155,15 +162,15 @@ def _counts(values: Tensor, bins: int, span: tuple[float, float]) -> tuple[int, 
 
 
 def _cell(values: dict[str, Any]) -> Cell:
-    """A cell from what :func:`dataclasses.asdict` made of it.
+    """The inverse of :func:`dataclasses.asdict` for a cell.
 
     Raises:
-        ValueError, TypeError, KeyError: if it is none.
+        ValueError, TypeError, KeyError: if the values are not those of a cell.
     """
     bins = {name: None if values[name] is None else tuple(values[name]) for name in ("opacities", "volumes")}
     cell = Cell(**{**values, **bins, "point": restored_point(values["point"])})
     check_types(cell)
-    for counts, number in ((cell.opacities, OPACITY_BINS), (cell.volumes, VOLUME_BINS)):
+    for counts, number in ((cell.opacities, BINS.opacity), (cell.volumes, BINS.volume)):
         if counts is not None and len(counts) != number:
             raise ValueError(f"{len(counts)} bins in place of {number}")
     return cell

@@ -1,4 +1,4 @@
-"""Figure 4: distributions of opacity and volume of what methods keep at half the Gaussians."""
+"""Figure 4: distributions of opacity and volume of the Gaussians that methods keep at half the count."""
 
 from __future__ import annotations
 
@@ -9,28 +9,30 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.tables.cells import OPACITY_BINS, VOLUME_BINS, VOLUME_SPAN
+from pointsplat_ns.tables.cells import BINS
 from pointsplat_ns.tables.means import Group
-from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_4, FIGURE_SHARE
+from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_4, PROTOCOL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_COLOURS = {"lightgaussian": "tab:orange", "pup": "gray", "paper": "tab:blue", "merge": "tab:green", "dense": "black"}
-"""The first three as in the paper."""
 
-_OPACITIES = np.linspace(0.0, 1.0, OPACITY_BINS + 1)
-_VOLUMES = np.linspace(*VOLUME_SPAN, VOLUME_BINS + 1)
+def _opacity_edges() -> np.ndarray:
+    return np.linspace(0.0, 1.0, BINS.opacity + 1)
+
+
+def _volume_edges() -> np.ndarray:
+    return np.linspace(*BINS.volume_span, BINS.volume + 1)
 
 
 def medians(group: Group) -> dict[str, tuple[float, float]]:
-    """Medians of opacity and of log10 of the volume (scene units cubed), by way, interpolated within bins; every scene
-    has the same weight. Ways that were not measured are left out."""
+    """Medians of opacity and of log10 of the volume (scene units cubed), by way, interpolated within bins. All scenes
+    have the same weight. Ways without measurements are left out."""
     found = {}
-    for way, share in _shown():
+    for way, share in _cells_of_figure():
         both = densities(group, way, share)
         if both is not None:
-            found[way] = (_median(both[0], _OPACITIES), _median(both[1], _VOLUMES))
+            found[way] = (_median(both[0], _opacity_edges()), _median(both[1], _volume_edges()))
     return found
 
 
@@ -55,16 +57,16 @@ def plot_figure(groups: Sequence[Group], path: Path) -> None:
 
     figure = Figure(figsize=(11, 3.6 * len(groups)), layout="constrained")
     for group, (left, right) in zip(groups, figure.subplots(len(groups), 2, squeeze=False), strict=True):
-        for way, share in _shown():
+        for way, share in _cells_of_figure():
             both = densities(group, way, share)
             if both is not None:
-                _stairs(left, both[0], _OPACITIES, way)
-                _stairs(right, both[1], _VOLUMES, way)
+                _stairs(left, both[0], _opacity_edges(), way)
+                _stairs(right, both[1], _volume_edges(), way)
         right.set_xlim(*_extent(group))
         left.set_xlabel("opacity")
         right.set_xlabel("log10 of the volume, scene units cubed")
         left.set_ylabel("% of the Gaussians in a bin")
-        left.set_title(f"{group.name}, {100 * FIGURE_SHARE:g} % kept", fontsize=10)
+        left.set_title(f"{group.name}, {100 * PROTOCOL.figure_share:g} % kept", fontsize=10)
     drawn = [axis for axis in figure.axes if axis.has_data()]
     if drawn:
         figure.legend(*drawn[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, fontsize=8)
@@ -72,21 +74,24 @@ def plot_figure(groups: Sequence[Group], path: Path) -> None:
         figure.savefig(part, dpi=110, format="png")
 
 
-def _shown() -> list[tuple[str, float]]:
-    return [(DENSE_WAY.name, 1.0), *((way.name, FIGURE_SHARE) for way in FIGURE_4)]
+def _cells_of_figure() -> list[tuple[str, float]]:
+    """Ways and shares of Figure 4, the dense scene first."""
+    return [(DENSE_WAY.name, 1.0), *((way.name, PROTOCOL.figure_share) for way in FIGURE_4)]
 
 
 def _extent(group: Group) -> tuple[float, float]:
-    """Where the volumes are that are not too rare to be seen."""
-    found = [both[1] for way, share in _shown() if (both := densities(group, way, share)) is not None]
-    seen: np.ndarray = np.flatnonzero(np.max(found, axis=0) > 1e-3) if found else np.empty(0, int)
-    return (_VOLUMES[seen[0]], _VOLUMES[seen[-1] + 1]) if len(seen) else VOLUME_SPAN
+    """Range of log10 of the volume over the bins with more than 0.1 % of the Gaussians."""
+    found = [both[1] for way, share in _cells_of_figure() if (both := densities(group, way, share)) is not None]
+    filled: np.ndarray = np.flatnonzero(np.max(found, axis=0) > 1e-3) if found else np.empty(0, int)
+    edges = _volume_edges()
+    return (edges[filled[0]], edges[filled[-1] + 1]) if len(filled) else BINS.volume_span
 
 
 def _stairs(axis: Axes, shares: np.ndarray, edges: np.ndarray, way: str) -> None:
     labels = {known.name: known.label for known in (DENSE_WAY, *FIGURE_4)}
+    colors = {"lightgaussian": "tab:orange", "pup": "gray", "paper": "tab:blue", "merge": "tab:green", "dense": "black"}
     style = "--" if way == DENSE_WAY.name else "-"
-    axis.stairs(100 * shares, edges, color=_COLOURS[way], linestyle=style, label=labels[way], linewidth=1.4)
+    axis.stairs(100 * shares, edges, color=colors[way], linestyle=style, label=labels[way], linewidth=1.4)
 
 
 def _median(shares: np.ndarray, edges: np.ndarray) -> float:

@@ -1,4 +1,4 @@
-"""Lays means out as the paper's tables: rows of text, which are then written as Markdown and as LaTeX."""
+"""Arranges means as the paper's tables: rows of text, for Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from pointsplat_ns.tables.means import Group, Mean
 from pointsplat_ns.tables.paper import published
 from pointsplat_ns.tables.ways import (
-    ABLATED,
     DENSE_WAY,
-    FIGURE_SHARE,
     IMAGE_DRIVEN,
     OURS,
     PEERS,
     POINTSPLAT,
+    PROTOCOL,
     TABLE_1,
     TABLE_3,
     TABLE_4,
@@ -24,8 +23,8 @@ from pointsplat_ns.tables.ways import (
 )
 from pointsplat_ns.tradeoff.points import Quality
 
-NOTHING = "-"
-"""Where there is no figure."""
+NO_FIGURE = "-"
+"""Text of an empty cell."""
 
 Row = tuple[str, ...]
 
@@ -38,9 +37,9 @@ class Table:
     title: str
     header: Row
     sections: tuple[tuple[Row, ...], ...]
-    """Rows, in parts that a line divides."""
+    """Rows, in sections with a line between them."""
     notes: tuple[str, ...] = ()
-    """Below the table: what was not measured, and why."""
+    """Lines below the table: missing cells, and the reasons."""
 
 
 class Layout:
@@ -48,15 +47,15 @@ class Layout:
 
     Args:
         group: the scenes.
-        shares: of Tables 1 and 2; those of cells that are there are added.
-        missing: why cells could not be measured, by key.
+        shares: shares in Tables 1 and 2; the shares of measured cells are added.
+        missing: reasons for missing cells, by key.
     """
 
     def __init__(self, group: Group, shares: Sequence[float], missing: Mapping[str, str]):
         self.group, self.missing = group, missing
-        names = {way.name for way in TABLE_1} - {way.name for way in TABLE_4}  # of which some are in other tables, too
-        there = {share for scene in group.scenes for way, share in scene.cells if way in names}
-        self.shares = sorted({*shares, *there}, reverse=True)
+        names = {way.name for way in TABLE_1} - {way.name for way in TABLE_4}  # Table 4 has other shares
+        measured = {share for scene in group.scenes for way, share in scene.cells if way in names}
+        self.shares = sorted({*shares, *measured}, reverse=True)
 
     def tables(self) -> list[Table]:
         """Tables 1 to 4."""
@@ -76,7 +75,7 @@ class Layout:
             rows = []
             for way, share in block:
                 mean = self.group.mean(way.name, share)
-                figures: Row = ("not measured", NOTHING, NOTHING, NOTHING)
+                figures: Row = ("not measured", NO_FIGURE, NO_FIGURE, NO_FIGURE)
                 if mean is not None:
                     figures = (f"{mean.gaussians:,.0f}", _fps(mean.fps), f"{mean.megabytes:.2f}", self._scenes(mean))
                 rows.append((_percent(share), way.label, *figures))
@@ -85,24 +84,24 @@ class Layout:
         return Table(2, self._title("Efficiency"), header, tuple(sections), notes)
 
     def _table_3(self) -> Table:
-        rows = [((f"{weight:g}", way.label), way, ABLATED) for weight, way in TABLE_3]
+        rows = [((f"{weight:g}", way.label), way, PROTOCOL.ablation_share) for weight, way in TABLE_3]
         sections = [rows[i : i + 2] for i in range(0, len(rows), 2)]
-        title = f"Lambda of the paper's score, {_percent(ABLATED)} kept"
+        title = f"Lambda of the paper's score, {_percent(PROTOCOL.ablation_share)} kept"
         return self._of_quality(3, title, ("lambda", "method"), sections)
 
     def _table_4(self) -> Table:
         branches = (("", "", ""), ("yes", "", ""), ("yes", "", "yes"), ("yes", "yes", ""), ("yes", "yes", "yes"))
         rows = [
-            ((number, *used), way, ABLATED)
+            ((number, *used), way, PROTOCOL.ablation_share)
             for number, used, way in zip(("I", "II", "III", "IV", "V"), branches, TABLE_4, strict=True)
         ]
         first = ("model", "geometry", "appearance", "position")
-        return self._of_quality(4, f"The dual-branch encoder, {_percent(ABLATED)} kept", first, [rows])
+        return self._of_quality(4, f"The dual-branch encoder, {_percent(PROTOCOL.ablation_share)} kept", first, [rows])
 
     def _of_quality(
         self, number: int, title: str, first: Row, sections: Sequence[Sequence[tuple[Row, Way, float]]]
     ) -> Table:
-        """A table of PSNR, SSIM and LPIPS, with the paper's where the dataset is the same."""
+        """A table of PSNR, SSIM and LPIPS, with the paper's figures where the dataset is the same."""
         cells = [(way, share) for section in sections for _, way, share in section]
         dataset = self.group.dataset
         with_paper = any(published(number, dataset, way.name, share) for way, share in cells)
@@ -116,7 +115,7 @@ class Layout:
         def row(words: Row, way: Way, share: float) -> Row:
             mean = self.group.mean(way.name, share)
             if mean is None:
-                figures: Row = ("not measured",) + (NOTHING,) * (7 if self.group.has_photos else 4)
+                figures: Row = ("not measured",) + (NO_FIGURE,) * (7 if self.group.has_photos else 4)
             else:
                 figures = _quality(mean.photos) if self.group.has_photos else ()
                 figures += (*_quality(mean.renders), _worst(mean), self._scenes(mean))
@@ -134,7 +133,7 @@ class Layout:
         return f"{count}" if mean.scenes == count else f"{mean.scenes} of {count}"
 
     def _reasons(self, cells: Sequence[tuple[Way, float]]) -> tuple[str, ...]:
-        """Why rows are empty or have fewer scenes, each reason once."""
+        """Reasons for empty rows and missing scenes, each once."""
         rows: dict[str, dict[str, list[str]]] = {}
         for way, share in cells:
             for scene in self.group.scenes:
@@ -157,13 +156,13 @@ def figure_medians(group: Group, ways: Sequence[Way], medians: Mapping[str, tupl
 
     Args:
         group: the scenes.
-        ways: of the rows.
-        medians: of opacity and of the logarithm of the volume, by name of the way.
+        ways: the rows.
+        medians: medians of opacity and of log10 of the volume, by name of the way.
     """
     rows = tuple(
         (way.label, f"{medians[way.name][0]:.2f}", f"{medians[way.name][1]:.1f}") for way in ways if way.name in medians
     )
-    title = f"Medians of Figure 4: {group.name}, {_percent(FIGURE_SHARE)} kept"
+    title = f"Medians of Figure 4: {group.name}, {_percent(PROTOCOL.figure_share)} kept"
     return Table(0, title, ("method", "opacity", "log10 of the volume"), (rows,))
 
 
@@ -177,14 +176,14 @@ def _percent(share: float) -> str:
 
 def _quality(quality: Quality | None) -> Row:
     if quality is None:
-        return (NOTHING,) * 3
-    psnr = NOTHING if math.isinf(quality.psnr) else f"{quality.psnr:.2f}"
-    return psnr, f"{quality.ssim:.3f}", NOTHING if quality.lpips is None else f"{quality.lpips:.3f}"
+        return (NO_FIGURE,) * 3
+    psnr = NO_FIGURE if math.isinf(quality.psnr) else f"{quality.psnr:.2f}"
+    return psnr, f"{quality.ssim:.3f}", NO_FIGURE if quality.lpips is None else f"{quality.lpips:.3f}"
 
 
 def _worst(mean: Mean) -> str:
     if math.isinf(mean.worst_psnr):
-        return NOTHING
+        return NO_FIGURE
     lost = "" if mean.worst_loss is None or mean.worst_loss == 0 else f" ({-mean.worst_loss:+.2f})"
     return f"{mean.worst} {mean.worst_psnr:.2f}{lost}"
 

@@ -1,4 +1,4 @@
-"""Makes the scene of a cell, and says with what, or why it cannot be made."""
+"""Makes the scene of a cell, and tells its tools or the reason why it cannot be made."""
 
 from __future__ import annotations
 
@@ -15,23 +15,20 @@ from pointsplat_ns.io import write_ply
 from pointsplat_ns.pruning import method_named, resolve_keep, score_of, select
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tables.refiners import Refiners, Weights
-from pointsplat_ns.tables.scene import Opened, TableOptions
+from pointsplat_ns.tables.scene import OpenedScene, TableOptions
 from pointsplat_ns.tables.splat_transform import SplatTransform
-from pointsplat_ns.tables.ways import SEED, Network, Way
-from pointsplat_ns.tradeoff.measuring import Made, make
+from pointsplat_ns.tables.ways import PROTOCOL, Network, Way
+from pointsplat_ns.tradeoff.measuring import MadeScene, make
 from pointsplat_ns.tradeoff.settings import DENSE, EFFORTS, Setting
-
-LONGEST = 7200.0
-"""Seconds after which another program is ended."""
 
 
 class Tools:
-    """What cells are made with besides the package: weights and splat-transform, looked for when first needed.
+    """The tools of cells besides the package: weights and splat-transform, searched for when first needed.
 
     Args:
-        options: how the cells are measured.
+        options: options of the measurement.
         refiners: weights to choose from.
-        program: splat-transform's path; by default what npx finds, which may be nothing.
+        program: splat-transform's path; by default npx searches it.
     """
 
     def __init__(self, options: TableOptions, refiners: Refiners, program: str | None = None):
@@ -43,7 +40,7 @@ class Tools:
         return SplatTransform(self.program)
 
     def missing(self, way: Way, share: float, scene: str) -> str:
-        """Why a cell cannot be measured; empty if it can.
+        """The reason why a cell cannot be measured; empty if it can.
 
         Args:
             way, share: the cell.
@@ -57,8 +54,7 @@ class Tools:
         return "" if way.network is None else self.refiners.find(way.network, share, scene)[1]
 
     def made_with(self, way: Way, share: float, scene: str) -> str:
-        """What a cell that can be measured is made with, as far as it is not the same for all: text that is the same if
-        and only if a measured cell need not be measured again."""
+        """Text on the tools of a measurable cell. A measured cell with the same text need not be measured again."""
         if way.mode is not None:
             return self.peer.modes[way.mode].label
         if way.network is not None:
@@ -66,13 +62,13 @@ class Tools:
         return f"{self.options.fine_tune} steps" if way.fine_tuned else ""
 
     def weights(self, network: Network, share: float, scene: str) -> Weights:
-        """The weights of a cell that can be measured."""
+        """The weights of a measurable cell."""
         weights, _ = self.refiners.find(network, share, scene)
         assert weights is not None
         return weights
 
     def words(self, way: Way, share: float, scene: str) -> list[str]:
-        """The options of a command that measures a cell with the same tools."""
+        """The options of the command that measures a cell with the same tools."""
         words = self.options.words
         if way.network is not None:
             words += ["--refiners", str(self.weights(way.network, share, scene).path)]
@@ -85,37 +81,36 @@ class Maker:
     """Makes the scenes of one scene's cells. Scores are computed once for all budgets, which changes no result.
 
     Args:
-        scene: what has been read.
-        name: of the scene.
+        scene: the opened scene.
+        name: name of the scene.
         tools: weights and programs.
     """
 
-    def __init__(self, scene: Opened, name: str, tools: Tools):
+    def __init__(self, scene: OpenedScene, name: str, tools: Tools):
         self.scene, self.name, self.tools = scene, name, tools
         self._scores: dict[tuple[str, float | None], tuple[Tensor, float]] = {}
         self._folder: tempfile.TemporaryDirectory[str] | None = None
 
     def close(self) -> None:
-        """Remove what was written for other programs."""
+        """Remove files for other programs."""
         if self._folder is not None:
             self._folder.cleanup()
 
-    def make(self, way: Way, share: float, progress: Progress) -> Made:
-        """The scene of a cell that can be measured, and what making it took; with scores, as if no other cell had
-        needed them.
+    def make(self, way: Way, share: float, progress: Progress) -> MadeScene:
+        """The scene of a measurable cell, and the cost of making it. The time includes scores that other cells share.
 
         Raises:
             ProgramFailed: if another program fails.
             SceneError: if its result cannot be read, or the SH degree exceeds the refiner's.
-            DataError: if there is no view to look from.
+            DataError: if there are no views.
         """
         dense = self.scene.dense
         if way.name == DENSE:
-            return Made(dense, 0.0, None)
+            return MadeScene(dense, 0.0, None)
         count = resolve_keep(len(dense), share, dense.sh_degree)
         if way.mode is not None:
-            scene, usage = self.tools.peer.modes[way.mode].reduce(self._ply(), count, LONGEST)
-            return Made(scene.to(dense.device), usage.seconds, usage.peak_bytes)
+            scene, usage = self.tools.peer.modes[way.mode].reduce(self._ply(), count, timeout=7200.0)
+            return MadeScene(scene.to(dense.device), usage.seconds, usage.peak_bytes)
         if method_named(way.by).score is None:
             return make(dense, Setting(count, dense.sh_degree, way.repair, way.by), self.scene.new_views, progress)
         assert way.repair not in EFFORTS, "repairs are of merged scenes"
@@ -126,10 +121,10 @@ class Maker:
             scene = self.tools.weights(way.network, share, self.name).refiner(scene)
         if way.fine_tuned:
             scene = self._tuned(scene, functools.partial(progress, "fine-tuning"))
-        return Made(scene, before + time.perf_counter() - start, None)
+        return MadeScene(scene, before + time.perf_counter() - start, None)
 
     def _scored(self, way: Way, progress: functools.partial[None]) -> tuple[Tensor, float]:
-        """Scores (N,), and the seconds that they took."""
+        """Scores (N,), and the seconds of computing them."""
         key = way.by, way.opacity_weight
         if key not in self._scores:
             method, start = method_named(way.by), time.perf_counter()
@@ -141,13 +136,15 @@ class Maker:
         return self._scores[key]
 
     def _tuned(self, scene: Gaussians, progress: functools.partial[None]) -> Gaussians:
-        """Optimised against training photos, or the dense scene's renders where there are none."""
+        """The scene optimised against training photos, or the dense scene's renders where there are no photos."""
         training = self.scene.training
         targets = self.scene.dense if training.photos is None else training.photos
-        return fine_tune(scene, training.views, targets, self.tools.options.fine_tune, seed=SEED, progress=progress)
+        return fine_tune(
+            scene, training.views, targets, self.tools.options.fine_tune, seed=PROTOCOL.seed, progress=progress
+        )
 
     def _ply(self) -> Path:
-        """The dense scene as other programs read it."""
+        """The dense scene as a PLY for other programs."""
         if self._folder is None:
             self._folder = tempfile.TemporaryDirectory()
             write_ply(self.scene.dense, Path(self._folder.name) / "dense.ply")

@@ -1,4 +1,4 @@
-"""Means of cells over the scenes of a group, with the scene that loses most."""
+"""Means of cells over the scenes of a group, with the scene of the largest loss."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class SceneCells:
 
     about: About
     cells: dict[tuple[str, float], Cell]
-    """By way and share."""
+    """Cells by way and share."""
 
     def loss(self, point: Point) -> float | None:
-        """What a point loses of the dense scene's PSNR against photos, dB; None where it is not known."""
+        """Loss of PSNR against photos from the dense scene to a point, dB; None where it is not known."""
         dense = self.cells.get((DENSE_WAY.name, 1.0))
         if point.against_photos is None or dense is None or dense.point.against_photos is None:
             return None
@@ -34,35 +34,35 @@ class SceneCells:
 
 @dataclass(frozen=True)
 class Mean:
-    """A row of a table: means over the scenes that have it."""
+    """A row of a table: means over the scenes with this cell."""
 
     photos: Quality | None
-    """None unless all of them have held-out photos."""
+    """None unless all scenes have held-out photos."""
     renders: Quality
     gaussians: float
     megabytes: float
     fps: float | None
-    """Frames a second; None if other programs kept the machine busy while they were timed."""
+    """Frames a second; None if other programs kept the machine busy during the timing."""
     scenes: int
-    """Number of scenes that it is the mean of."""
+    """Number of scenes in the mean."""
     worst: str
-    """The scene that loses most."""
+    """Name of the scene with the largest loss."""
     worst_psnr: float
-    """Its PSNR, dB: against photos, or against the dense scene's renders where there are none."""
+    """Its PSNR, dB: against photos, or against the dense scene's renders where there are no photos."""
     worst_loss: float | None
     """Its loss of PSNR against photos, dB, compared to the dense scene; None where it is not known."""
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Scenes that means are taken over."""
+    """Scenes with common means."""
 
     name: str
     scenes: tuple[SceneCells, ...]
 
     @property
     def dataset(self) -> str:
-        """The dataset of the paper that all scenes belong to; empty if there is none."""
+        """The dataset of the paper that has all scenes; empty if there is none."""
         datasets = {scene.about.dataset for scene in self.scenes}
         return datasets.pop() if len(datasets) == 1 and datasets <= {*DATASETS} else ""
 
@@ -72,7 +72,7 @@ class Group:
         return any(cell.point.against_photos is not None for scene in self.scenes for cell in scene.cells.values())
 
     def mean(self, way: str, share: float) -> Mean | None:
-        """The mean of a cell over the scenes that have it; None if none has."""
+        """The mean of a cell over the scenes with it; None if no scene has it."""
         found = [(scene, scene.cells[way, share].point) for scene in self.scenes if (way, share) in scene.cells]
         if not found:
             return None
@@ -93,12 +93,12 @@ class Group:
 
 
 def _disturbed(point: Point) -> bool:
-    """Whether the time of a frame means nothing."""
+    """Whether the time of a frame is not usable."""
     return not 0 < point.frame_ms < math.inf or (point.others_cores is not None and is_busy(point.others_cores))
 
 
 def _badness(scene: SceneCells, point: Point) -> tuple[float, float]:
-    """The larger, the worse: by the loss, or else by the PSNR."""
+    """Sort key that rises with the loss, or else with falling PSNR."""
     loss, quality = scene.loss(point), point.against_photos or point.against_dense
     return -quality.psnr if loss is None else loss, -quality.psnr
 
@@ -107,7 +107,7 @@ def read_groups(folder: Path) -> list[Group]:
     """All scenes below a folder of tables, in groups; the paper's datasets first, the others by name.
 
     Raises:
-        SceneError: if a journal cannot be read, or there is none.
+        SceneError: if a journal cannot be read, or there is no journal.
     """
     scenes: dict[str, list[SceneCells]] = {}
     for path in sorted(folder.glob(f"*/{CELLS}")):

@@ -1,4 +1,4 @@
-"""Measures the cells of tables, one after the other, and keeps each as soon as it is known."""
+"""Measures the cells of tables one after the other, and writes each as soon as it is measured."""
 
 from __future__ import annotations
 
@@ -22,35 +22,32 @@ from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.system.source_version import source_commit
 from pointsplat_ns.tables.cells import About, Cell, CellJournal, distributions, identity
 from pointsplat_ns.tables.making import Maker, Tools
-from pointsplat_ns.tables.scene import Opened, TableScene
-from pointsplat_ns.tables.ways import SEED, Way, all_cells, cell_key
+from pointsplat_ns.tables.scene import OpenedScene, TableScene
+from pointsplat_ns.tables.ways import PROTOCOL, Way, all_cells, cell_key
 from pointsplat_ns.tradeoff.judging import Judge, Judged
 from pointsplat_ns.tradeoff.machine import machine_text, one_at_a_time
-from pointsplat_ns.tradeoff.measuring import Made, point_of
+from pointsplat_ns.tradeoff.measuring import MadeScene, point_of
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import DENSE
 
 logger = logging.getLogger("pointsplat_ns")
 
-OTHERS = "scenes"
-"""The group of scenes of no dataset of the paper's, unless the user names another."""
-
 
 class Measuring:
-    """Measures what is not there yet of some scenes' cells.
+    """Measures the missing cells of some scenes.
 
     Args:
-        scenes: of different names.
-        folder: of all tables.
-        shares: of Table 1.
+        scenes: scenes with different names.
+        folder: folder of all tables.
+        shares: shares of Table 1.
         tools: weights, programs and options.
-        only: patterns of keys, as ``fox/merge/10%`` or ``*/merge/*``. If there are any, only cells that match one are
-            measured, and those again if they are there.
-        progress: called with what is being done and the share of it that is done, in [0, 1].
+        only: patterns of keys, such as ``fox/merge/10%`` or ``*/merge/*``. If given, only matching cells are measured,
+            also those with a measurement.
+        progress: called with the name of the current task and its share done, in [0, 1].
 
     Raises:
-        SceneError: if the folder holds cells of other scenes, views or another machine, or what is no journal.
-        PointSplatError: if two scenes have one name, or nothing matches ``only``.
+        SceneError: if the folder holds cells of other scenes, views or another machine, or a damaged journal.
+        PointSplatError: if two scenes have one name, or no cell matches ``only``.
     """
 
     def __init__(
@@ -77,14 +74,14 @@ class Measuring:
                 f"{', '.join(only)}: no such cell; expected a name such as fox/merge/10%, or a pattern"
             )
         self.missing: dict[str, str] = {}
-        """Why cells could not be measured, by key."""
+        """Reasons for missing cells, by key."""
         self._seconds: dict[str, list[float]] = {}
 
     def run(self) -> None:
-        """Measure. A cell that cannot be made is left out, with the reason in :attr:`missing`.
+        """Measure all cells. A cell that cannot be made is left out, with the reason in :attr:`missing`.
 
         Raises:
-            KeyboardInterrupt: what was measured is on disk.
+            KeyboardInterrupt: measured cells are on disk.
         """
         wanted = []
         for work, way, share in self._cells:
@@ -106,7 +103,7 @@ class Measuring:
         furthest, of = 0.0, done + 1 + len(later)
 
         def show(what: str, part: float) -> None:
-            # Making a scene has several tasks that each begin at 0; the whole never goes back.
+            # Making a scene has several tasks that each start at 0; the total must not fall.
             nonlocal furthest
             furthest = max(furthest, 0.7 * part if what else 0.7 + 0.3 * part)
             self.progress("measuring", (done + furthest) / of)
@@ -116,7 +113,7 @@ class Measuring:
         try:
             with one_at_a_time(self.progress):
                 cell = work.measure(way, share, show)
-        except PointSplatError as error:  # of this way alone: the others go on
+        except PointSplatError as error:  # other cells continue
             self.missing[key] = str(error)
             logger.warning("%s: left out: %s", key, error)
             return
@@ -126,14 +123,14 @@ class Measuring:
         logger.info("%s: %s%s%s", key, _figures(cell.point), again, left)
 
     def _minutes(self, later: list[str]) -> int:
-        """How long more cells may take: as long as others of the same way, or of any."""
+        """Expected minutes for more cells, from the means of the same way, or of all ways."""
         usual = fmean(seconds for measured in self._seconds.values() for seconds in measured)
         expected = sum(fmean(self._seconds[name]) if name in self._seconds else usual for name in later)
         return max(1, math.ceil(expected / 60))
 
 
 class _SceneWork:
-    """One scene, which is read when its first cell is measured."""
+    """One scene, read for its first measurement."""
 
     def __init__(self, scene: TableScene, folder: Path, tools: Tools, machine: str):
         self.scene, self.folder, self.tools, self.machine = scene, folder, tools, machine
@@ -150,12 +147,12 @@ class _SceneWork:
         return self.tools.missing(way, share, self.scene.name)
 
     def has(self, way: Way, share: float) -> bool:
-        """Whether a cell that can be measured has been, with the same weights, program and steps."""
+        """Whether a measurable cell was measured with the same weights, program and steps."""
         cell = self.journal.cells.get((way.name, share))
         return cell is not None and cell.made_with == self.tools.made_with(way, share, self.scene.name)
 
     @cached_property
-    def _opened(self) -> tuple[Opened, Maker, Judge]:
+    def _opened(self) -> tuple[OpenedScene, Maker, Judge]:
         opened = self.scene.open(self.tools.options)
         need_usable(opened.dense)
         judge = Judge(opened.dense, opened.held_out)
@@ -164,13 +161,13 @@ class _SceneWork:
         return opened, Maker(opened, self.scene.name, self.tools), judge
 
     def close(self) -> None:
-        """Forget what has been read, which takes memory."""
+        """Free the memory of the opened scene."""
         if "_opened" in vars(self):
             self._opened[1].close()
             del self._opened
 
     def measure(self, way: Way, share: float, show: Progress) -> Cell:
-        """Measure a cell and keep it."""
+        """Measure a cell and write it."""
         _, maker, judge = self._opened
         made = maker.make(way, share, show)
         judged = judge.judge(made.scene, self.key(way, share), lambda part: show("", part))
@@ -181,7 +178,7 @@ class _SceneWork:
             way=way.name,
             point=self._point(way, share, made, judged),
             made_with=self.tools.made_with(way, share, self.scene.name),
-            seed=SEED,
+            seed=PROTOCOL.seed,
             version=__version__,
             commit=source_commit(),
             opacities=opacities,
@@ -193,7 +190,7 @@ class _SceneWork:
     @property
     def _about(self) -> About:
         held_out = self._opened[0].held_out
-        known = self.journal.about.group if self.journal.about is not None else self.scene.dataset or OTHERS
+        known = self.journal.about.group if self.journal.about is not None else self.scene.dataset or "scenes"
         return About(
             name=self.scene.name,
             path=str(self.scene.path),
@@ -206,7 +203,7 @@ class _SceneWork:
             height=held_out.views.height,
         )
 
-    def _point(self, way: Way, share: float, made: Made, judged: Judged) -> Point:
+    def _point(self, way: Way, share: float, made: MadeScene, judged: Judged) -> Point:
         command = ["pointsplat", "tables", str(self.scene.path), "-o", str(self.folder)]
         command += ["--only", self.key(way, share), *self.tools.words(way, share, self.scene.name)]
         repairs = {"fine-tuned": way.fine_tuned, "refiner": way.network is not None}
@@ -242,7 +239,7 @@ def _figures(point: Point) -> str:
 
 
 def _difference(before: Cell, now: Cell) -> str:
-    """Whether a cell that was measured again came out the same."""
+    """Text on the difference of a repeated measurement."""
     same = ("against_dense", "against_photos", "gaussians")
     if all(getattr(before.point, name) == getattr(now.point, name) for name in same):
         return "the same quality as before"

@@ -1,4 +1,4 @@
-"""What is written of all cells of a folder: tables in Markdown and LaTeX, every figure in JSON, and Figure 4."""
+"""Writes all cells of a folder: tables in Markdown and LaTeX, all figures in JSON, and Figure 4."""
 
 from __future__ import annotations
 
@@ -11,16 +11,13 @@ from pointsplat_ns.io.files import replacing, write_json
 from pointsplat_ns.tables.figure import medians, plot_figure
 from pointsplat_ns.tables.layout import Layout, Table, figure_medians
 from pointsplat_ns.tables.means import Group, read_groups
-from pointsplat_ns.tables.paper import UNNAMED, published
+from pointsplat_ns.tables.paper import published
 from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_4
 from pointsplat_ns.tables.writing import latex_document, markdown_table, markdown_text
 from pointsplat_ns.tradeoff.machine import is_busy
 
-MARKDOWN, LATEX, JSON, FIGURE = "tables.md", "tables.tex", "tables.json", "figure4.png"
-
-OUTPUTS = (MARKDOWN, LATEX, JSON, FIGURE)
-
-FORMAT, VERSION = "pointsplat-tables", 1
+OUTPUTS = ("tables.md", "tables.tex", "tables.json", "figure4.png")
+"""Names of the written files."""
 
 READING = (
     "Figures are means over scenes. PSNR (dB), SSIM and LPIPS (AlexNet) are against held-out photos; those of "
@@ -31,31 +28,31 @@ READING = (
 
 
 def write_tables(folder: Path, shares: Sequence[float], missing: Mapping[str, str]) -> list[Group]:
-    """Write the tables of all scenes that have cells in a folder.
+    """Write the tables of all scenes with cells in a folder.
 
     Args:
-        folder: with a folder for each scene.
-        shares: of Table 1, for rows that were not measured.
-        missing: why cells could not be measured, by key.
+        folder: has a folder for each scene.
+        shares: shares of Table 1, for rows without measurements.
+        missing: reasons for missing cells, by key.
 
     Returns:
         The scenes in groups.
 
     Raises:
-        SceneError: if a journal cannot be read, there is none, or a file cannot be written.
+        SceneError: if a journal cannot be read, there is no journal, or a file cannot be written.
     """
     groups = read_groups(folder)
     tables = {group.name: Layout(group, shares, missing).tables() for group in groups}
     for group in groups:
         if found := medians(group):
             tables[group.name].append(figure_medians(group, (DENSE_WAY, *FIGURE_4), found))
-    write_json(_content(groups, missing), folder / JSON)
-    with replacing(folder / MARKDOWN) as part:
+    write_json(_content(groups, missing), folder / "tables.json")
+    with replacing(folder / "tables.md") as part:
         part.write_text(_markdown(groups, tables), encoding="utf-8")
-    with replacing(folder / LATEX) as part:
+    with replacing(folder / "tables.tex") as part:
         every = [table for members in tables.values() for table in members]
         part.write_text(latex_document(every, [READING.replace("\\", ""), *_notes(groups)]), encoding="utf-8")
-    plot_figure(groups, folder / FIGURE)
+    plot_figure(groups, folder / "figure4.png")
     return groups
 
 
@@ -74,12 +71,12 @@ def _markdown(groups: Sequence[Group], tables: Mapping[str, Sequence[Table]]) ->
             )
             lines.append("| " + " | ".join(map(markdown_text, words)) + " |")
         lines += ["", *(markdown_table(table) for table in tables[group.name])]
-    lines += [f"![Figure 4]({FIGURE})", "", "*Figure 4: opacity and volume of the Gaussians kept.*", ""]
+    lines += ["![Figure 4](figure4.png)", "", "*Figure 4: opacity and volume of the Gaussians kept.*", ""]
     return "\n".join(lines)
 
 
 def _notes(groups: Sequence[Group]) -> list[str]:
-    """Lines of text on what the figures mean."""
+    """Lines of text on the conditions of the measurements."""
     machines = sorted({scene.about.machine for group in groups for scene in group.scenes})
     cells = [cell for group in groups for scene in group.scenes for cell in scene.cells.values()]
     made = sorted({f"{cell.version}, commit {cell.commit}" if cell.commit else cell.version for cell in cells})
@@ -92,14 +89,17 @@ def _notes(groups: Sequence[Group]) -> list[str]:
             f"{max(busy):.1f} cores. Table 2 leaves their frames a second out; --only measures them again."
         )
     if any(group.dataset for group in groups):
-        notes.append(UNNAMED)
+        notes.append(
+            "The paper's Table 2 and Figure 4 do not say of which scenes they are, so nothing of theirs is shown "
+            "beside ours."
+        )
     return notes
 
 
 def _content(groups: Sequence[Group], missing: Mapping[str, str]) -> dict[str, Any]:
     return {
-        "format": FORMAT,
-        "version": VERSION,
+        "format": "pointsplat-tables",
+        "version": 1,
         "groups": {group.name: [scene.about.name for scene in group.scenes] for group in groups},
         "scenes": [dataclasses.asdict(scene.about) for group in groups for scene in group.scenes],
         "cells": [

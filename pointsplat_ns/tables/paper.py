@@ -1,13 +1,11 @@
-"""What the paper's tables say (arXiv 2604.09903). Shown only beside figures of the same datasets."""
+"""Figures of the paper's tables (arXiv 2604.09903), for comparison on the same datasets only."""
 
 from __future__ import annotations
 
 from pointsplat_ns.tradeoff.points import Quality
 
-REPLICA, SCANNETPP = "Replica", "ScanNet++"
-
-DATASETS = (SCANNETPP, REPLICA)
-"""In the order of the paper's columns."""
+DATASETS = ("ScanNet++", "Replica")
+"""Datasets in the order of the paper's columns."""
 
 Both = tuple[float, float, float, float, float, float]
 """PSNR (dB), SSIM and LPIPS on ScanNet++, then on Replica."""
@@ -60,19 +58,15 @@ _TABLE_4: dict[str, tuple[float, float, float]] = {
     "pointsplat-iv": (22.65, 0.846, 0.388),
     "pointsplat": (23.46, 0.855, 0.374),
 }
-"""On one dataset, which the paper does not name: figures of rows I and V are those of ScanNet++ in Table 3."""
-
-UNNAMED = (
-    "The paper's Table 2 and Figure 4 do not say of which scenes they are, so nothing of theirs is shown beside ours."
-)
+"""Figures on ScanNet++: the paper does not name the dataset, but rows I and V are equal to Table 3 on ScanNet++."""
 
 
 def published(table: int, dataset: str, way: str, share: float) -> Quality | None:
-    """What the paper has for a row against held-out photos; None if nothing.
+    """The paper's figures of a row against held-out photos; None if there are none.
 
     Args:
         table: 1, 3 or 4.
-        dataset: one of :data:`DATASETS`; of any other there is nothing.
+        dataset: one of :data:`DATASETS`; others give None.
         way: name of the way.
         share: share of the Gaussians kept.
 
@@ -85,8 +79,8 @@ def published(table: int, dataset: str, way: str, share: float) -> Quality | Non
     if dataset not in DATASETS:
         return None
     if table == 4:
-        return Quality(*_TABLE_4[way]) if dataset == SCANNETPP and way in _TABLE_4 else None
+        return Quality(*_TABLE_4[way]) if dataset == "ScanNet++" and way in _TABLE_4 else None
     both = {1: _TABLE_1, 3: _TABLE_3}[table].get((way, share))
     if both is None:
         return None
-    return Quality(*(both[:3] if dataset == SCANNETPP else both[3:]))
+    return Quality(*(both[:3] if dataset == "ScanNet++" else both[3:]))

@@ -1,4 +1,4 @@
-"""Finds the weights that a row of the tables needs among those given, by what each file says of itself."""
+"""Finds the weights for a row of the tables among given files, by the metadata of each file."""
 
 from __future__ import annotations
 
@@ -16,28 +16,25 @@ from pointsplat_ns.pruning.scores import DEFAULT_OPACITY_WEIGHT
 from pointsplat_ns.refiner import read_metadata
 from pointsplat_ns.tables.ways import Network
 
-WEIGHTS_FILE = "refiner.safetensors"
-"""In the folder of a finished training; unlike a checkpoint it names the scenes that it was trained on."""
-
 
 @dataclass(frozen=True, eq=False)
 class Weights:
     """A trained refiner."""
 
     path: Path
-    """As it was named."""
+    """Path as given."""
     refiner: TrainedRefiner
     trained_on: frozenset[str]
-    """Names of scenes; empty if they are not known."""
+    """Names of training scenes; empty if they are not known."""
 
     @cached_property
     def digest(self) -> str:
-        """Of the file: the first 12 hexadecimal digits of its SHA-256."""
+        """The first 12 hexadecimal digits of the file's SHA-256."""
         return source_file(self.refiner.source).sha256[:12]
 
     @property
     def network(self) -> Network:
-        """What it is."""
+        """Description of the network and its training."""
         config, settings = self.refiner.network.config, self.refiner.settings
         weight = settings.opacity_weight
         if weight is None and method_named(settings.by).weighs_opacity:
@@ -46,7 +43,7 @@ class Weights:
 
     @property
     def text(self) -> str:
-        """One line that tells it from others."""
+        """One line that identifies the weights."""
         return f"weights {self.digest} ({self.network}, keep {self.refiner.settings.keep:g})"
 
 
@@ -57,21 +54,21 @@ class Refiners:
         paths: as for :func:`pointsplat_ns.load_refiner`.
 
     Raises:
-        WeightsError, SceneError: if one is none.
+        WeightsError, SceneError: if a path has no refiner.
     """
 
     def __init__(self, paths: Sequence[Path]):
         self.all = tuple(map(_read, paths))
 
     def find(self, network: Network, share: float, scene: str) -> tuple[Weights | None, str]:
-        """The weights for a row, and why there are none.
+        """The weights for a row, or the reason for none.
 
-        Of several, those are taken whose training budget is nearest to ``share``, by their ratio. Weights that were
-        trained on the scene are none: a scene tests nothing that was learned from it.
+        Of several, the weights with the training budget nearest to ``share`` are taken, by ratio. Weights trained on
+        the scene itself are excluded.
 
         Args:
-            network: what is needed.
-            share: share of the Gaussians that is kept.
+            network: the needed network.
+            share: share of the Gaussians kept.
             scene: name of the scene.
         """
         fitting = [weights for weights in self.all if weights.network == network]
@@ -84,12 +81,12 @@ class Refiners:
 
 
 def _distance(keep: float | int, share: float) -> float:
-    """How far a training budget is from a share; one in Gaussians is farther than any share."""
+    """Distance of a training budget from a share; infinite for budgets in Gaussians."""
     return abs(math.log(keep / share)) if keep <= 1 else math.inf
 
 
 def _read(path: Path) -> Weights:
-    inside = path / WEIGHTS_FILE
+    inside = path / "refiner.safetensors"  # of a finished training; a checkpoint does not name its training scenes
     file = inside if path.is_dir() and inside.is_file() else path
     metadata = read_metadata(file) if file.suffix.lower() == ".safetensors" else {}
     return Weights(path, load_refiner(file), _names(metadata.get("scenes")))

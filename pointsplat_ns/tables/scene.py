@@ -1,4 +1,4 @@
-"""A scene of the tables: what it is called, and what is read of it when a cell has to be measured."""
+"""A scene of the tables: its name, and its data once a cell has to be measured."""
 
 from __future__ import annotations
 
@@ -9,53 +9,52 @@ from pathlib import Path
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.tradeoff.judging import LookedAt
+from pointsplat_ns.tradeoff.judging import JudgedViews
 
 
 @dataclass(frozen=True, eq=False)
-class Opened:
-    """A scene that has been read."""
+class OpenedScene:
+    """The data of a scene."""
 
     dense: Gaussians
-    held_out: LookedAt
-    """What scenes are judged in: held-out photos, or views alone where there are none."""
-    training: LookedAt
-    """What fine-tuning sees: training photos, or views alone."""
+    held_out: JudgedViews
+    """Views to judge scenes in, with held-out photos where there are some."""
+    training: JudgedViews
+    """Views of fine-tuning, with training photos where there are some."""
     new_views: Callable[[], ViewSource]
-    """A fresh source of views: the one that the commands ``prune`` and ``compact`` have."""
+    """Makes a new source of views, the same as for the commands ``prune`` and ``compact``."""
 
 
 @dataclass(frozen=True, eq=False)
 class TableScene:
-    """A scene that has not been read yet."""
+    """A scene that is opened when needed."""
 
     name: str
     path: Path
-    """As the user named it."""
+    """Path as the user gave it."""
     sha256: str
-    """Of the file with its Gaussians."""
+    """Hash of the file with its Gaussians."""
     dataset: str
-    """The dataset of the paper that it belongs to, "Replica" or "ScanNet++"; empty if it is another."""
+    """Its dataset of the paper, "Replica" or "ScanNet++"; empty for others."""
     group: str | None
-    """What means are taken over: scenes with the same name of a group. None for that of cells that are there, or the
-    dataset's."""
-    open: Callable[[TableOptions], Opened]
+    """Name of its group, over which means are taken. None is the group of existing cells, or else the dataset."""
+    open: Callable[[TableOptions], OpenedScene]
 
 
 @dataclass(frozen=True)
 class TableOptions:
-    """How the cells are measured.
+    """Options of the measurement.
 
     Raises:
-        PointSplatError: if one means nothing.
+        PointSplatError: if an option is below 1.
     """
 
     views: int = 10
     """Largest number of held-out views of a scene."""
     side: int = 640
-    """Largest side of their images, and of those that are fine-tuned on and scored from, pixels."""
+    """Longer side of the images for judging, fine-tuning and scoring, at most, pixels."""
     scoring_views: int = 40
-    """Largest number of training poses that LightGaussian and PUP-3DGS score from."""
+    """Largest number of training poses for the scores of LightGaussian and PUP-3DGS."""
     fine_tune: int = 300
     """Steps of fine-tuning."""
 
@@ -66,7 +65,7 @@ class TableOptions:
 
     @property
     def words(self) -> list[str]:
-        """The options as words of the command, those that are not the defaults."""
+        """The options that are not defaults, as words of the command."""
         usual = vars(TableOptions())
         changed = {name: value for name, value in vars(self).items() if value != usual[name]}
         return [word for name, value in changed.items() for word in (f"--{name.replace('_', '-')}", str(value))]

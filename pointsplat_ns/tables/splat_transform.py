@@ -1,4 +1,4 @@
-"""splat-transform's decimation, the peer of merging: a Node package that is run if it can be had."""
+"""splat-transform's decimation, the peer of merging: a Node package, used where it is installed."""
 
 from __future__ import annotations
 
@@ -16,13 +16,6 @@ from pointsplat_ns.system.programs import ProgramFailed, Usage, run_measured
 
 NAME = "splat-transform"
 
-ANSWERS = 120.0
-"""Seconds within which the program has to say its version; npx first looks for it."""
-
-UNIFORM, ADAPTIVE = "--decimate", "--decimate-adaptive"
-ADAPTIVE_SINCE = 3
-"""The major version that came with the second mode."""
-
 
 @dataclass(frozen=True)
 class Reducer:
@@ -33,16 +26,19 @@ class Reducer:
     """The command line for a PLY to read, a number of Gaussians, and a PLY to write."""
 
     def reduce(self, source: Path, count: int, timeout: float | None = None) -> tuple[Gaussians, Usage]:
-        """What the program makes of a PLY, and what it took, with reading and writing.
+        """Run the program on a PLY.
 
         Args:
-            source: the PLY; nothing is left beside it.
+            source: the PLY; no file is left beside it.
             count: number of Gaussians to keep.
-            timeout: seconds after which the program is ended.
+            timeout: time limit of the program, seconds.
+
+        Returns:
+            The smaller scene, and the cost with reading and writing.
 
         Raises:
-            ProgramFailed: if it fails, takes too long or writes no file.
-            SceneError: if what it wrote cannot be read.
+            ProgramFailed: if the program fails, takes too long or writes no file.
+            SceneError: if its file cannot be read.
         """
         with tempfile.TemporaryDirectory(dir=source.parent) as folder:
             target = Path(folder) / "small.ply"
@@ -58,11 +54,11 @@ class SplatTransform:
 
     Attributes:
         version: such as "3.7.0".
-        missing: why it cannot be run; empty if it can.
-        modes: its ways to make a PLY smaller: ``--decimate``, and from version 3 on ``--decimate-adaptive``.
+        missing: the reason why it cannot be run; empty if it can.
+        modes: its modes of decimation: ``--decimate``, and from version 3 on ``--decimate-adaptive``.
 
     Args:
-        program: the path of the program; by default what ``npx --no-install splat-transform`` finds.
+        program: the path of the program; by default ``npx --no-install splat-transform`` searches it.
     """
 
     def __init__(self, program: str | None = None):
@@ -71,7 +67,7 @@ class SplatTransform:
         self.modes: tuple[Reducer, ...] = ()
         try:
             found = subprocess.run(
-                [*self.command, "--version"], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=ANSWERS
+                [*self.command, "--version"], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=120
             )
         except (OSError, subprocess.TimeoutExpired) as error:
             self.missing = f"{self.command[0]}: {error.__class__.__name__}"
@@ -82,10 +78,11 @@ class SplatTransform:
             return
         self.version = version[1]
         label = f"{NAME} {self.version}"
-        if int(version[2]) < ADAPTIVE_SINCE:
-            self.modes = (self._mode(label, UNIFORM),)
+        if int(version[2]) < 3:
+            self.modes = (self._mode(label, "--decimate"),)
         else:
-            self.modes = (self._mode(f"{label} -d", UNIFORM), self._mode(f"{label} adaptive", ADAPTIVE))
+            adaptive = self._mode(f"{label} adaptive", "--decimate-adaptive")
+            self.modes = (self._mode(f"{label} -d", "--decimate"), adaptive)
 
     def _mode(self, label: str, option: str) -> Reducer:
         def command(source: Path, count: int, target: Path) -> list[str]:

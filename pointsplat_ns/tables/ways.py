@@ -1,4 +1,4 @@
-"""The rows of the paper's tables and of ours: ways of making a scene smaller, by name."""
+"""The rows of the tables: ways of making a scene smaller, by name."""
 
 from __future__ import annotations
 
@@ -9,30 +9,34 @@ from typing import Literal
 from pointsplat_ns.pruning.scores import DEFAULT_OPACITY_WEIGHT
 from pointsplat_ns.tradeoff.settings import DENSE, Repair
 
-SHARES = (0.5, 0.3, 0.1)
-"""Shares of the Gaussians that the paper's Tables 1 and 2 keep."""
 
-ABLATED = 0.1
-"""The share of its Tables 3 and 4."""
+@dataclass(frozen=True)
+class Protocol:
+    """Settings of the paper's tables."""
 
-WEIGHTS = (0.1, 0.3, 0.5, 0.7, 0.9)
-"""Lambda of its Table 3."""
+    shares: tuple[float, ...] = (0.5, 0.3, 0.1)
+    """Shares of the Gaussians in Tables 1 and 2."""
+    ablation_share: float = 0.1
+    """Share of the Gaussians in Tables 3 and 4."""
+    opacity_weights: tuple[float, ...] = (0.1, 0.3, 0.5, 0.7, 0.9)
+    """Lambda in Table 3."""
+    figure_share: float = 0.5
+    """Share of the Gaussians in Figure 4."""
+    seed: int = 0
+    """Seed of the order of views in fine-tuning, and of random selection. No other step is random."""
 
-FIGURE_SHARE = 0.5
-"""The share of its Figure 4."""
 
-SEED = 0
-"""Of the order in which fine-tuning sees views, and of a random selection. Nothing else here is random."""
+PROTOCOL = Protocol()
 
 
 @dataclass(frozen=True)
 class Network:
-    """What the weights of a refiner have to be for a row: which network, trained on scenes pruned how."""
+    """The refiner that a row needs: its architecture, and the pruning of its training scenes."""
 
     encoder: Literal["dual", "concat"] = "dual"
     by: str = "paper"
     opacity_weight: float | None = DEFAULT_OPACITY_WEIGHT
-    """Lambda of the selection that it was trained on; None for methods that have none."""
+    """Lambda of that pruning; None for methods without it."""
     use_appearance: bool = True
     use_position: bool = True
 
@@ -53,21 +57,21 @@ class Way:
     """A way of making a scene smaller."""
 
     name: str
-    """As cells call it; fit for a shell without quotes."""
+    """Name in keys of cells; needs no quotes in a shell."""
     label: str
-    """As tables call it."""
+    """Name in tables."""
     by: str = ""
-    """The method of pruning; empty for what another program does."""
+    """Method of pruning; empty for another program."""
     opacity_weight: float | None = None
-    """Lambda of the paper's score; None for its default, and for methods that have none."""
+    """Lambda of the paper's score; None for its default, and for methods without it."""
     fine_tuned: bool = False
-    """Whether it is optimised for the scene afterwards, against its training photos."""
+    """Whether the scene is fine-tuned against its training photos."""
     network: Network | None = None
-    """The refiner that repairs it, if one does."""
+    """The refiner; None for none."""
     repair: Repair = "none"
-    """The effort of ``compact``."""
+    """Effort of ``compact``."""
     mode: int | None = None
-    """For splat-transform: which of its modes."""
+    """Index of splat-transform's mode; None for other ways."""
 
 
 DENSE_WAY = Way(DENSE, "3DGS (dense)")
@@ -78,23 +82,23 @@ IMAGE_DRIVEN = (
     Way("pup", "PUP-3DGS*", "pup"),
     Way("pup-tuned", "PUP-3DGS", "pup", fine_tuned=True),
 )
-"""Methods that look at images of the scene; the star says that nothing was fine-tuned."""
+"""Methods that use images of the scene; a star marks methods without fine-tuning."""
 
 PAPER = Way("paper", "PointSplat*", "paper")
 POINTSPLAT = Way("pointsplat", "PointSplat", "paper", network=Network())
 
 GEOMETRY_DRIVEN = (
-    # The paper does not say what selects the Gaussians of this row. Not its own score, which "boosts" it.
+    # The paper does not say how the Gaussians of this row are selected; not by its own score, which "boosts" it.
     Way("splatformer", "SplatFormer", "random", network=Network("concat", "random", None)),
     PAPER,
     Way("paper-splatformer", "PointSplat* + SplatFormer", "paper", network=Network("concat")),
     POINTSPLAT,
 )
-"""Methods of the paper that look at nothing but the Gaussians."""
+"""Methods of the paper that use the Gaussians alone."""
 
 MERGE = Way("merge", "merge (our default)", "merge")
 OURS = (MERGE, Way("compact", "compact", "merge", repair="quick"))
-"""What ``pointsplat prune`` and ``pointsplat compact`` do by default."""
+"""The defaults of ``pointsplat prune`` and ``pointsplat compact``."""
 
 PEERS = (
     Way("splat-transform", "splat-transform", mode=0),
@@ -111,14 +115,14 @@ def selected(weight: float) -> Way:
 
 
 def refined(weight: float) -> Way:
-    """And refined."""
+    """The paper's selection at a lambda, refined."""
     if weight == DEFAULT_OPACITY_WEIGHT:
         return POINTSPLAT
     network = Network(opacity_weight=weight)
     return Way(f"pointsplat-{weight:g}", POINTSPLAT.label, "paper", weight, network=network)
 
 
-TABLE_3 = tuple((weight, way(weight)) for weight in WEIGHTS for way in (selected, refined))
+TABLE_3 = tuple((weight, way(weight)) for weight in PROTOCOL.opacity_weights for way in (selected, refined))
 
 
 def _ablated(name: str, label: str, appearance: bool, position: bool) -> Way:
@@ -135,26 +139,26 @@ TABLE_4 = (
 """Rows I to V."""
 
 FIGURE_4 = (IMAGE_DRIVEN[0], IMAGE_DRIVEN[2], PAPER, MERGE)
-"""Whose Gaussians Figure 4 shows: the paper's three, and our default."""
+"""Ways in Figure 4: the paper's three, and the default of this package."""
 
-FIGURE_CELLS = {(DENSE, 1.0), *((way.name, FIGURE_SHARE) for way in FIGURE_4)}
-"""Ways and shares whose distributions are kept for it."""
+FIGURE_CELLS = {(DENSE, 1.0), *((way.name, PROTOCOL.figure_share) for way in FIGURE_4)}
+"""Ways and shares with distributions for Figure 4."""
 
 
 def all_cells(shares: Sequence[float]) -> list[tuple[Way, float]]:
-    """Every way and share of all tables, each once, in the order in which they are measured: what takes little time
-    first.
+    """Every way and share of all tables, each once, in the order of measurement: quick ones first.
 
     Args:
-        shares: of Table 1.
+        shares: shares of Table 1.
     """
-    cells = [(DENSE_WAY, 1.0), *((way, ABLATED) for _, way in TABLE_3), *((way, ABLATED) for way in TABLE_4)]
+    ablations = dict.fromkeys([*(way for _, way in TABLE_3), *TABLE_4])
+    cells = [(DENSE_WAY, 1.0), *((way, PROTOCOL.ablation_share) for way in ablations)]
     cells += [(way, share) for way in (*GEOMETRY_DRIVEN, *OURS, *IMAGE_DRIVEN, *PEERS) for share in shares]
     return list(dict.fromkeys(cells))
 
 
 def cell_key(scene: str, way: Way, share: float) -> str:
-    """What a cell is called.
+    """The key of a cell.
 
     Example:
         >>> cell_key("fox", MERGE, 0.1)

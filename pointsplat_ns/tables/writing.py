@@ -7,34 +7,27 @@ from collections.abc import Sequence
 
 from pointsplat_ns.tables.layout import Row, Table
 
-_MARKDOWN = re.compile(r"([\\`*_{}\[\]<>#|~])")
-
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    **{character: f"\\{character}" for character in "&%$#_{}"},
-}
-
 
 def markdown_text(text: str) -> str:
-    """Text that Markdown shows as it is.
+    """Text with Markdown's special characters escaped.
 
     Example:
         >>> print(markdown_text("PointSplat* of room_1"))
         PointSplat\\* of room\\_1
     """
-    return _MARKDOWN.sub(r"\\\1", " ".join(text.split()))
+    return re.sub(r"([\\`*_{}\[\]<>#|~])", r"\\\1", " ".join(text.split()))
 
 
 def latex_text(text: str) -> str:
-    """Text that LaTeX shows as it is.
+    """Text with LaTeX's special characters escaped.
 
     Example:
         >>> print(latex_text("50 % of room_1"))
         50 \\% of room\\_1
     """
-    return "".join(_LATEX.get(character, character) for character in " ".join(text.split()))
+    escaped = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    escaped |= {character: f"\\{character}" for character in "&%$#_{}"}
+    return "".join(escaped.get(character, character) for character in " ".join(text.split()))
 
 
 def markdown_table(table: Table) -> str:
@@ -52,7 +45,7 @@ def _line(row: Row) -> str:
 
 
 def latex_table(table: Table) -> str:
-    """A table in LaTeX, for documents that use the package ``booktabs``; the notes are comments."""
+    """A table in LaTeX with the package ``booktabs``; the notes are comments."""
     columns = "".join("l" if i < 2 else "r" for i in range(len(table.header)))
     name = f"% Table {table.number} of the paper" if table.number else "%"
     lines = [name, r"\begin{table*}", r"\centering", rf"\caption{{{latex_text(table.title)}}}"]

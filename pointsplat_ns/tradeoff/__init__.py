@@ -1,1 +1,1 @@
-"""The trade of a scene in hand, measured: quality against frame time, Gaussians and bytes."""
+"""Measures the tradeoff of a scene: quality against frame time, number of Gaussians and bytes."""

@@ -23,24 +23,24 @@ from pointsplat_ns.tradeoff.walk import Plan
 def find_scene(
     subject: Subject, targets: Targets, by: str, repairs: tuple[Repair, ...], progress: Progress
 ) -> Compacted:
-    """Find the cheapest scene that meets targets, as :class:`~pointsplat_ns.tradeoff.targets.Search` does.
+    """Find the cheapest scene that meets targets by :class:`~pointsplat_ns.tradeoff.targets.Search`.
 
-    Scenes are judged in the views of :func:`~pointsplat_ns.tradeoff.measuring.views_to_judge`, as they are read from
-    files of the subject's format. Frames are timed only if there is a target for it. Where Ctrl-C ends the search, the
-    cheapest scene found so far is given.
+    Scenes are judged in the views of :func:`~pointsplat_ns.tradeoff.measuring.views_to_judge`, after writing and
+    reading them in the subject's format. Frames are timed only for a target of time. Ctrl-C ends the search with the
+    cheapest scene found so far.
 
     Args:
         subject: the scene.
-        targets: what to meet.
+        targets: the targets.
         by: the method of pruning.
-        repairs: repairs that may be tried.
+        repairs: repairs to try.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
 
     Raises:
-        BudgetError: if no scene meets all targets; the text says what is reachable.
+        BudgetError: if no scene meets all targets; the text tells the reachable values.
         SceneError: if no Gaussian can be drawn.
-        DataError: if there is no view.
-        KeyboardInterrupt: if it is interrupted before a scene meets all targets.
+        DataError: if there are no views.
+        KeyboardInterrupt: on an interruption before any scene meets all targets.
     """
     start = time.perf_counter()
     dense, timed = subject.dense, targets.ms is not None
@@ -74,7 +74,7 @@ def find_scene(
 
 
 def _estimated(subject: Subject) -> Callable[[int, int], int]:
-    """The size of a file, bytes, by count and SH degree, if all Gaussians take as much as the dense scene's."""
+    """Estimate of a file's size in bytes by count and SH degree, from the mean bytes of the dense scene's Gaussians."""
 
     @functools.cache
     def whole(degree: int) -> int:

@@ -1,4 +1,4 @@
-"""Scenes of a sweep, kept for its page to fly through."""
+"""Files with the scenes of a sweep, for flights in its page."""
 
 from __future__ import annotations
 
@@ -8,49 +8,44 @@ from typing import Any
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import write_json
-from pointsplat_ns.pages.flight import Stage
+from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pruning import ply_bytes
 
 MAX_BYTES = 4_000_000
-"""Largest size of a page's scenes; the rest of the page is for its pictures."""
-
-_RATIO = 20
-"""A PLY of more than so many times that size is not tried: in a page, scenes have a tenth of its bytes or more."""
-
-_KEYS = {"scenes", "views", "up", "near", "background", "antialiased", "drag"}
+"""Largest size of a page's scenes in bytes; the rest of the page is for its pictures."""
 
 
-def keep_flight(stage: Stage, scene: Gaussians, name: str, path: Path) -> bool:
-    """Write a scene for the page, if it is small enough for that.
+def keep_flight(frame: FlightFrame, scene: Gaussians, name: str, path: Path) -> bool:
+    """Write a scene for the page, if it is small enough.
 
     Args:
-        stage: where it is looked at from.
+        frame: unit, up direction and views of the page.
         scene: N Gaussians.
-        name: of the scene, for people.
+        name: name in the page.
         path: the file, at :func:`~pointsplat_ns.tradeoff.points.flight_path`.
 
     Returns:
         Whether it was written.
 
     Raises:
-        SceneError: if it cannot be written.
+        SceneError: if the file cannot be written.
     """
-    if ply_bytes(len(scene), scene.sh_degree) > _RATIO * MAX_BYTES:
+    if ply_bytes(len(scene), scene.sh_degree) > 20 * MAX_BYTES:  # SPZ in a page has at least a tenth of the bytes
         return False
-    packed = stage.packed(scene, name)
-    if len(packed["spz"]) > 0.99 * MAX_BYTES:  # the views take some as well
+    packed = frame.packed(scene, name)
+    if len(packed["spz"]) > 0.99 * MAX_BYTES:  # the rest is for the views
         return False
-    write_json(stage.data([packed]), path)
+    write_json(frame.data([packed]), path)
     return True
 
 
 def read_flight_beside(path: Path, dense: Path) -> dict[str, Any] | None:
-    """A scene that :func:`keep_flight` wrote, with the dense scene on the left if both fit; None if it was too large,
-    or the file holds something else.
+    """Read a scene of :func:`keep_flight`, with the dense scene on the left if both fit; None if there is no such file,
+    or it holds something else.
 
     Args:
-        path: of the scene.
-        dense: of the dense scene, which may be the same.
+        path: file of the scene.
+        dense: file of the dense scene, which may be the same.
     """
     flight = _read(path)
     beside = _read(dense) if dense != path else None
@@ -67,7 +62,8 @@ def _read(path: Path) -> dict[str, Any] | None:
         flight = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    scenes = flight["scenes"] if isinstance(flight, dict) and flight.keys() == _KEYS else None
+    keys = {"scenes", "views", "up", "near", "background", "antialiased", "drag"}
+    scenes = flight["scenes"] if isinstance(flight, dict) and flight.keys() == keys else None
     known = (
         isinstance(scenes, list) and scenes and all(isinstance(s, dict) and type(s.get("spz")) is str for s in scenes)
     )

@@ -1,8 +1,8 @@
-"""The points worth having: the Pareto front, the loss of each point in dB, and the fastest within a loss.
+"""The Pareto front of points, the loss of each point in dB, and the fastest point within a loss.
 
-Where there are photos, the loss is measured: the PSNR of the dense scene against them less that of the smaller one.
-Where there are none, it is estimated: a trained scene is typically :data:`PHOTO_PSNR` away from its photos, the change
-of a smaller scene is independent of that error, and such squared errors add up.
+With photos, the loss is measured: the PSNR of the dense scene minus the PSNR of the smaller scene. Without photos it is
+estimated: a trained scene typically has :data:`PHOTO_PSNR` against its photos, the change of a smaller scene is
+independent of that error, and such squared errors add up.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Literal
 from pointsplat_ns.tradeoff.points import Point, Quality, speed_of
 
 Reference = Literal["renders", "photos"]
-"""What a point was compared with: renders of the dense scene, or held-out photos."""
+"""Targets of a comparison: renders of the dense scene, or held-out photos."""
 Metric = Literal["psnr", "ssim", "lpips"]
 Cost = Literal["frame_ms", "gaussians", "bytes"]
 
@@ -23,8 +23,7 @@ METRICS: tuple[Metric, ...] = ("psnr", "ssim", "lpips")
 COSTS: tuple[Cost, ...] = ("frame_ms", "gaussians", "bytes")
 
 PHOTO_PSNR = 27.0
-"""PSNR in dB of a trained scene against held-out photos, where it is not known: about that of 3DGS on the captures of
-papers."""
+"""Assumed PSNR in dB of a trained scene against held-out photos: about that of 3DGS on the captures of papers."""
 
 
 def quality_of(point: Point, reference: Reference, metric: Metric) -> float | None:
@@ -35,9 +34,9 @@ def quality_of(point: Point, reference: Reference, metric: Metric) -> float | No
 
 
 def pareto_front(points: Sequence[Point], cost: Cost, reference: Reference, metric: Metric) -> list[Point]:
-    """The points that no other beats in both cost and quality, cheapest first.
+    """The points that no other point beats in both cost and quality, cheapest first.
 
-    Of points that are equal in both, the first is taken. Points without the metric are left out.
+    Of points with equal cost and quality, the first is taken. Points without the metric are left out.
     """
     sign = -1 if metric == "lpips" else 1  # LPIPS is a distance: less is better
     judged = [(point, sign * value) for point in points if (value := quality_of(point, reference, metric)) is not None]
@@ -51,11 +50,11 @@ def pareto_front(points: Sequence[Point], cost: Cost, reference: Reference, metr
 
 
 def fastest_first(points: Sequence[Point], trusted: bool = True) -> list[Point]:
-    """The points by their time of a frame; of those as fast, the fewer Gaussians and the smaller file first.
+    """The points sorted by time of a frame, then number of Gaussians, then size of the file.
 
     Args:
         points: any points.
-        trusted: whether times can be trusted. If not, the number of Gaussians counts in their place.
+        trusted: whether times can be trusted. If not, the time is ignored.
     """
     return sorted(points, key=lambda point: (point.frame_ms if trusted else 0.0, point.gaussians, point.bytes))
 
@@ -68,13 +67,13 @@ def fastest_within(points: Sequence[Point], db: float, trusted: bool = True) -> 
 
 
 def fastest_above(points: Sequence[Point], db: float, trusted: bool = True) -> Point | None:
-    """The fastest point of at least ``db`` PSNR against the dense scene's renders; None only if there is none, as the
-    dense scene itself has an infinite PSNR. ``trusted`` as for :func:`fastest_first`."""
+    """The fastest point with at least ``db`` dB against the dense scene's renders; None if there are no points, because
+    the dense scene itself has an infinite PSNR. ``trusted`` as for :func:`fastest_first`."""
     return _fastest(points, "renders", db, trusted)
 
 
 def _fastest(points: Sequence[Point], reference: Reference, least: float, trusted: bool) -> Point | None:
-    # 1e-9: a difference of two decimal numbers is not exact, and 0.5 dB less than 30.1 is not 29.6.
+    # 1e-9, because differences of decimal numbers are not exact: 30.1 - 0.5 is not 29.6.
     for point in fastest_first(points, trusted):
         quality = quality_of(point, reference, "psnr")
         if quality is not None and quality >= least - 1e-9:
@@ -110,7 +109,7 @@ def loss_of(point: Point, dense: Point) -> float:
 
 
 def recommend(points: Sequence[Point], within: float, trusted: bool = True) -> tuple[Point, str]:
-    """The fastest point within a loss, and a line of text that says so.
+    """The fastest point within a loss, and a line of text on it.
 
     Args:
         points: the dense scene, then others.

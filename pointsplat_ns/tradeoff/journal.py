@@ -1,6 +1,6 @@
-"""Journals: every record is written as soon as it is measured, so that an interrupted command goes on where it was.
+"""Journals: every record is written as soon as it is measured, so that an interrupted command can continue.
 
-``points.json`` is that of a sweep; :mod:`pointsplat_ns.tables` keeps its cells in files of the same shape.
+``points.json`` is the journal of a sweep; :mod:`pointsplat_ns.tables` keeps its cells in files of the same form.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Identity = Mapping[str, str | int]
 T = TypeVar("T")
 
 MOST_BYTES = 16_000_000
-"""Largest journal that is read; a thousand points take one megabyte."""
+"""Largest size of a journal, bytes; a thousand points take one megabyte."""
 
 
 @dataclass(frozen=True)
@@ -45,18 +45,18 @@ class Form:
         """Write all records.
 
         Raises:
-            SceneError: if they cannot be written.
+            SceneError: if the file cannot be written.
         """
         rows = [dataclasses.asdict(record) for record in records]
         content = {"format": self.name, "version": self.version, "of": dict(identity), self.records: rows}
         write_json(content, path)
 
     def read(self, path: Path, restored: Callable[[dict[str, Any]], T]) -> tuple[dict[str, Any], list[T]]:
-        """The identity and the records of a file, which may come from anybody.
+        """Read the identity and the records of a file. The file is not trusted.
 
         Args:
             path: the file.
-            restored: makes a record of what :func:`dataclasses.asdict` made of it; see :func:`check_types`.
+            restored: makes a record from the result of :func:`dataclasses.asdict`; see :func:`check_types`.
 
         Raises:
             SceneError: if the file is not such a journal, or damaged.
@@ -77,12 +77,12 @@ class Form:
             ) from error
 
     def check(self, path: Path, of: Identity, identity: Identity) -> None:
-        """Check that the records of a file are those wanted.
+        """Check the identity of a file.
 
         Args:
             path: the file, for the error.
-            of: its identity.
-            identity: the values that it must have in common with it.
+            of: the identity of the file.
+            identity: the expected values.
 
         Raises:
             SceneError: if they differ.
@@ -98,7 +98,7 @@ class Form:
 POINTS = "points.json"
 
 POINTS_FORM = Form("pointsplat-tradeoff-points", 2, "points", "a sweep")
-"""Version 1 timed each point alone, as the clock said it: its times do not compare with those of today."""
+"""Points of version 1 were timed without the dense scene beside them, so their times are not comparable."""
 
 
 class Journal:
@@ -123,10 +123,10 @@ class Journal:
                 self._take(point)
 
     def add(self, point: Point) -> None:
-        """Take a point in, and write all of them.
+        """Add a point, and write all points.
 
         Raises:
-            SceneError: if they cannot be written.
+            SceneError: if the file cannot be written.
         """
         self._take(point)
         points = ([self.dense] if self.dense is not None else []) + [*self.points.values()]
@@ -147,10 +147,10 @@ def _point_of_sweep(values: dict[str, Any]) -> Point:
 
 
 def restored_point(values: dict[str, Any]) -> Point:
-    """A point from what :func:`dataclasses.asdict` made of it.
+    """The inverse of :func:`dataclasses.asdict` for a point.
 
     Raises:
-        ValueError, TypeError, KeyError: if it is none.
+        ValueError, TypeError, KeyError: if the values are not those of a point.
     """
     qualities = {name: _quality(values[name]) for name in ("against_dense", "against_photos")}
     point = Point(**{**values, **qualities})
@@ -170,11 +170,11 @@ def check_types(of: DataclassInstance) -> None:
     """Check that the values of a record have the types of its fields.
 
     Raises:
-        ValueError: if one has not.
+        ValueError: if a value has another type.
     """
     for field in dataclasses.fields(of):
         value, kind = getattr(of, field.name), str(field.type)
-        if not _FITS[kind.removesuffix(" | None")](value) and not (value is None and kind.endswith("None")):
+        if not _has_type(value, kind.removesuffix(" | None")) and not (value is None and kind.endswith("None")):
             raise ValueError(f"{field.name} is {value!r}")
 
 
@@ -182,12 +182,14 @@ def _is_count(value: Any) -> bool:
     return type(value) is int and value >= 0
 
 
-_FITS: dict[str, Callable[[Any], bool]] = {
-    "str": lambda value: isinstance(value, str),
-    "int": _is_count,
-    "float": lambda value: type(value) in (int, float) and not math.isnan(value),
-    "Quality": lambda value: isinstance(value, Quality),
-    "Point": lambda value: isinstance(value, Point),
-    "tuple[int, ...]": lambda value: isinstance(value, tuple) and all(map(_is_count, value)),
-}
-"""Whether a value fits, by the annotation of its field."""
+def _has_type(value: Any, kind: str) -> bool:
+    """Whether a value fits the annotation of a field."""
+    checks: dict[str, Callable[[Any], bool]] = {
+        "str": lambda value: isinstance(value, str),
+        "int": _is_count,
+        "float": lambda value: type(value) in (int, float) and not math.isnan(value),
+        "Quality": lambda value: isinstance(value, Quality),
+        "Point": lambda value: isinstance(value, Point),
+        "tuple[int, ...]": lambda value: isinstance(value, tuple) and all(map(_is_count, value)),
+    }
+    return checks[kind](value)

@@ -1,7 +1,7 @@
 """Judges scenes: against the dense scene's renders and photos, and by the time of a frame.
 
-On a shared machine a frame may take twice as long in one minute as in the next. So each frame is timed beside one of
-the dense scene in the same view: both slow down alike, and the ratio of their times stays.
+On a shared machine the time of a frame may double within a minute. So each frame is timed beside a frame of the dense
+scene in the same view: both slow down alike, and the ratio of their times stays.
 """
 
 from __future__ import annotations
@@ -31,42 +31,39 @@ from pointsplat_ns.tradeoff.settings import Drawn, draw
 from pointsplat_ns.views import View, Views, spread_indices
 
 ROUNDS = 3
-"""Times that each view is drawn and timed, of the dense scene and of the one judged in turn."""
-
-SHOWN_VIEWS = 6
-"""Largest number of views of which pictures are kept."""
+"""Number of timed frames of each view, alternating between the dense scene and the judged scene."""
 
 
 @dataclass(frozen=True)
-class LookedAt:
+class JudgedViews:
     """The views that scenes are judged in."""
 
     views: Views
     photos: list[Tensor] | None  # [H, W, 3] in [0, 1], the photo of each view; None where there are none
     origin: str
-    """Text: where the views came from."""
+    """Text on the origin of the views."""
 
     @staticmethod
-    def compared(source: ViewSource, count: int) -> LookedAt:
-        """At most ``count`` views without photos: those that ``compact`` compares in, on which nothing is optimised.
+    def compared(source: ViewSource, count: int) -> JudgedViews:
+        """At most ``count`` views without photos: the views of comparisons in ``compact``, which no optimisation uses.
 
         Raises:
-            DataError: if there are none.
+            DataError: if there are no views.
         """
         views = source.compared().spread(min(count, COMPARED_VIEWS))
-        return LookedAt(views, None, source.origin)
+        return JudgedViews(views, None, source.origin)
 
-    def resized(self, side: int) -> LookedAt:
+    def resized(self, side: int) -> JudgedViews:
         """The same with at most ``side`` pixels on the longer side; photos are averaged over the areas of pixels."""
         views = self.views.resized(side)
         if self.photos is None or views is self.views:
-            return LookedAt(views, self.photos, self.origin)
+            return JudgedViews(views, self.photos, self.origin)
         size = (views.height, views.width)
         photos = [
             torch.nn.functional.interpolate(photo.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
             for photo in self.photos
         ]
-        return LookedAt(views, photos, self.origin)
+        return JudgedViews(views, photos, self.origin)
 
 
 @dataclass(frozen=True)
@@ -88,10 +85,10 @@ class Judge:
 
     Args:
         dense: the dense scene.
-        looked_at: in which views.
-        folder: of the sweep: pictures are written to it; None for none.
-        dense_ms: time of a frame of the dense scene, milliseconds, that times are given in proportion to; by default as
-            measured beside the first scene that is timed.
+        judged_views: the views, with photos if there are some.
+        folder: folder of the sweep, for pictures; None writes none.
+        dense_ms: time of a frame of the dense scene in milliseconds, the unit of measured ratios; by default it is
+            measured beside the first timed scene.
 
     Raises:
         DataError: if the views are too small for SSIM.
@@ -100,9 +97,9 @@ class Judge:
 
     @torch.no_grad()
     def __init__(
-        self, dense: Gaussians, looked_at: LookedAt, folder: Path | None = None, dense_ms: float | None = None
+        self, dense: Gaussians, judged_views: JudgedViews, folder: Path | None = None, dense_ms: float | None = None
     ):
-        self.views, self.photos, self.folder = looked_at.views, looked_at.photos, folder
+        self.views, self.photos, self.folder = judged_views.views, judged_views.photos, folder
         self.dense, self.dense_ms = dense, dense_ms
         if min(self.views.width, self.views.height) < SSIM_WINDOW:
             raise DataError(
@@ -110,9 +107,9 @@ class Judge:
             )
         self.renders = [render(dense, view) for view in self.views]
         self.lpips, self.no_lpips = _lpips(self.renders[0])
-        self.shown = spread_indices(len(self.views), SHOWN_VIEWS)
+        self.pictured = spread_indices(len(self.views), 6)
         if self.photos is not None:
-            self._write([self.photos[i] for i in self.shown], "photo")
+            self._write([self.photos[i] for i in self.pictured], "photo")
 
     @torch.no_grad()
     def judge(
@@ -122,26 +119,26 @@ class Judge:
 
         Args:
             scene: the scene to judge.
-            key: of its point.
+            key: key of its point.
             progress: called with the share done, in [0, 1].
             timed: whether to time it.
-            drawn: how its frames are drawn; those of the dense scene always are drawn exactly.
+            drawn: quality of its frames; frames of the dense scene are always exact.
         """
         images = []
         passes = 1 + 2 * ROUNDS * timed
         for view in self.views:
             images.append(draw(scene, view, drawn))
             progress(len(images) / (passes * len(self.views)))
-        self._write([images[i] for i in self.shown], key)
+        self._write([images[i] for i in self.pictured], key)
         photos = None if self.photos is None else self._quality(images, self.photos)
         times = self._time(scene, drawn) if timed else {}
         progress(1.0)
         return Judged(self._quality(images, self.renders), photos, **times)
 
     def _time(self, scene: Gaussians, drawn: Drawn) -> dict[str, float]:
-        """The times of :class:`Judged`: those of the dense scene's reference times the ratio that was measured now."""
+        """The times of :class:`Judged`: ``dense_ms`` times the measured ratio of frames."""
         others = OtherPrograms()
-        with fixed_threads(torch.get_num_threads()):  # else each could be timed on another number
+        with fixed_threads(torch.get_num_threads()):  # the same number for all frames
             pairs = [
                 (_timed(self.dense, view, "exact"), _timed(scene, view, drawn))
                 for _ in range(ROUNDS)
@@ -165,10 +162,10 @@ class Judge:
         )
 
     def pictures(self, key: str) -> list[Path]:
-        """Where the pictures of a point lie; nowhere without a folder."""
+        """Paths of the pictures of a point; empty without a folder."""
         if self.folder is None:
             return []
-        return [picture_path(self.folder, number, key) for number in range(len(self.shown))]
+        return [picture_path(self.folder, number, key) for number in range(len(self.pictured))]
 
     def _quality(self, images: list[Tensor], targets: list[Tensor]) -> Quality:
         """Means over the views."""
@@ -186,7 +183,7 @@ class Judge:
 
 
 def _timed(scene: Gaussians, view: View, drawn: Drawn) -> float:
-    """Seconds that drawing a view takes."""
+    """Seconds of drawing a view."""
     _wait_for(scene.device)
     start = time.perf_counter()
     draw(scene, view, drawn)
@@ -195,17 +192,17 @@ def _timed(scene: Gaussians, view: View, drawn: Drawn) -> float:
 
 
 def _wait_for(device: torch.device) -> None:
-    """Until a GPU is done."""
+    """Wait until a GPU is idle."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def _lpips(image: Tensor) -> tuple[Lpips | None, str]:
-    """LPIPS for images like one, if it can be had, and the reason if not. Nothing is downloaded."""
+    """LPIPS for images of this size, or None and the reason. Nothing is downloaded."""
     try:
         lpips = load_lpips("alex", download=False).to(image.device)
         lpips(image, image)
-    except LpipsUnavailable:  # whose text names folders; the page is for other people
+    except LpipsUnavailable:  # its text names folders, which the page must not show
         return None, "LPIPS is missing: its weights are not at hand; see docs/training.md on POINTSPLAT_LPIPS_WEIGHTS"
     except ImageError as error:  # an image too small for the network
         return None, f"LPIPS is missing: {error}"

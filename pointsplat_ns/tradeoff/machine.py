@@ -1,4 +1,4 @@
-"""The machine that times are measured on: its name, a lock for one measurement at a time, and whether it is busy."""
+"""The machine of measurements: its name, a lock for one measurement at a time, and whether it is busy."""
 
 from __future__ import annotations
 
@@ -17,11 +17,8 @@ from pointsplat_ns.system.progress import Progress
 LOCK = "pointsplat-measuring.lock"
 """Name of the lock's file, in the folder for temporary files."""
 
-TURN = 0.2
-"""Seconds after a measurement in which others that wait for the lock can take it; they look every 0.05."""
-
-BUSY_CORES = 0.25
-"""Cores that may be missing while frames are timed. Less does not show in medians."""
+LOCK_PAUSE = 0.2
+"""Pause after a measurement in seconds, so that waiting processes, which poll every 0.05 s, can take the lock."""
 
 
 def machine_text(device: torch.device) -> str:
@@ -46,10 +43,10 @@ def one_at_a_time(progress: Progress) -> Iterator[bool]:
     """Hold the lock of measurements on this machine while the context is open; wait for others that hold it.
 
     Args:
-        progress: called with the name of what is waited for.
+        progress: called with a text while waiting.
 
     Yields:
-        Whether it could be had: its file may belong to another user.
+        Whether the lock was taken: its file may belong to another user.
     """
     from filelock import FileLock, Timeout
 
@@ -66,23 +63,23 @@ def one_at_a_time(progress: Progress) -> Iterator[bool]:
         yield True
     finally:
         lock.release()
-        time.sleep(TURN)
+        time.sleep(LOCK_PAUSE)
 
 
 class OtherPrograms:
-    """Mean number of cores that other programs keep busy from here on."""
+    """Measures the mean number of cores that other programs use from now on."""
 
     def __init__(self) -> None:
         self._before = self._read()
 
     @staticmethod
     def _read() -> tuple[float, float, float]:
-        """Seconds on the clock, of all cores in use, and of this process."""
+        """Seconds: of the clock, of all used cores, and of this process."""
         import psutil
 
         times = psutil.cpu_times()
         idle = times.idle + getattr(times, "iowait", 0.0)
-        guests = getattr(times, "guest", 0.0) + getattr(times, "guest_nice", 0.0)  # counted as those of users, too
+        guests = getattr(times, "guest", 0.0) + getattr(times, "guest_nice", 0.0)  # also part of the user time
         own = psutil.Process().cpu_times()
         return time.monotonic(), sum(times) - idle - guests, own.user + own.system
 
@@ -93,15 +90,15 @@ class OtherPrograms:
 
 
 def is_busy(others: float) -> bool:
-    """Whether others use so many cores that too few are left for torch's threads."""
-    return others + torch.get_num_threads() > cores() + BUSY_CORES
+    """Whether others leave too few cores for torch's threads. A quarter of a core does not change medians."""
+    return others + torch.get_num_threads() > cores() + 0.25
 
 
 def busy_note(others: Sequence[float]) -> str:
     """A line of text if other programs disturbed measurements; else empty.
 
     Args:
-        others: cores that other programs kept busy in each of them.
+        others: cores that other programs used during each measurement.
     """
     disturbed = [cores_used for cores_used in others if is_busy(cores_used)]
     if not disturbed:

@@ -1,4 +1,4 @@
-"""Makes the scene of a setting as its command does, judges it and times it, while no other measurement runs."""
+"""Makes the scene of a setting like its command, judges it and times it, while no other measurement runs."""
 
 from __future__ import annotations
 
@@ -27,52 +27,52 @@ from pointsplat_ns.looking.windows import middle_sized
 from pointsplat_ns.pruning import cut_sh, need_usable, ply_bytes
 from pointsplat_ns.system.memory import PeakMemory
 from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.tradeoff.judging import Judge, Judged, LookedAt
+from pointsplat_ns.tradeoff.judging import Judge, Judged, JudgedViews
 from pointsplat_ns.tradeoff.machine import one_at_a_time
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import DENSE, EFFORTS, Naming, Setting
 from pointsplat_ns.views import Views
 
 HeldOut = Callable[[int], tuple[Views, list[Tensor]]]
-"""From a number to at most so many held-out photos (H, W, 3) of a scene's dataset, and the views that they show."""
+"""From a number to at most that many views of held-out photos, and the photos (H, W, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """The scene to be measured."""
+    """The scene of a measurement."""
 
     dense: Gaussians
     path: Path
-    """Where it was read from, as commands name it."""
+    """Path of the scene in commands."""
     name: str
     sha256: str
-    """Of the file."""
+    """Hash of the file."""
     new_views: Callable[[], ViewSource]
-    """A fresh source of its views: the one that its commands have."""
+    """Makes a new source of its views, the same as for its commands."""
     held_out: HeldOut | None = None
     """Its held-out photos; None if it cannot have any."""
     refiner: TrainedRefiner | None = None
-    """The network that repairs begin with; by default none, and the one that ships where it repairs alone."""
+    """The refiner before repairs. None is no refiner, but the shipped one for the repair ``refiner``."""
     suffix: str = ".ply"
-    """Of the format that smaller scenes are written in."""
+    """Suffix of the format of smaller scenes."""
     poses: Path | None = None
-    """The file of cameras that it is looked at from, as commands name it; None if there is none."""
+    """Path of its file of cameras in commands; None if there is none."""
     resolution: tuple[int, int] | None = None
-    """Width and height of pictures, pixels, if they were asked for; ``new_views`` has them too."""
+    """Width and height of pictures in pixels, if given; ``new_views`` has them too."""
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
+class MadeScene:
     """A smaller scene, and the cost of making it."""
 
     scene: Gaussians
     seconds: float
     peak_bytes: int | None
-    """Peak memory of this process meanwhile."""
+    """Peak memory of this process while making it."""
     notes: tuple[str, ...] = ()
     """Lines of text, as of :class:`~pointsplat_ns.compression.prune.Pruned`."""
     compacted: Compacted | None = None
-    """The whole result of a scene that was repaired; None of others."""
+    """The whole result for a repaired scene; None for others."""
 
 
 def make(
@@ -81,18 +81,18 @@ def make(
     new_views: Callable[[], ViewSource],
     progress: Progress,
     refiner: TrainedRefiner | None = None,
-) -> Made:
+) -> MadeScene:
     """Make the scene of a setting.
 
     Args:
         dense: N Gaussians.
-        setting: how.
-        new_views: called once for each scene, so that time and result are those of the command.
+        setting: the setting.
+        new_views: makes a source of views; called once for each scene, so that time and result equal the command's.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
         refiner: as for :class:`Subject`.
 
     Raises:
-        KeyboardInterrupt: also where a repair would keep its result so far.
+        KeyboardInterrupt: on Ctrl-C, also during a repair.
     """
     peak, start = PeakMemory(), time.perf_counter()
     sh = str(setting.sh_degree) if setting.sh_degree < dense.sh_degree else "all"
@@ -109,17 +109,16 @@ def make(
         if compacted.repaired is not None and compacted.repaired.interrupted:
             raise KeyboardInterrupt
         scene, notes = compacted.scene, compacted.notes
-    return Made(scene.to(dense.device), time.perf_counter() - start, peak.bytes(), notes, compacted)
+    return MadeScene(scene.to(dense.device), time.perf_counter() - start, peak.bytes(), notes, compacted)
 
 
 def through_file(scene: Gaussians, suffix: str) -> tuple[int, Gaussians]:
-    """The size of a scene's file, bytes, and the scene as it is read from it: to the bit from a PLY, with fewer bits
-    from others.
+    """The size of a scene's file in bytes, and the scene after writing and reading: exact for a PLY, with fewer bits
+    for other formats.
 
     Args:
         scene: N Gaussians.
-        suffix: of the format's files, such as ``.spz``. Of formats that are only written, as ``.glb``, the scene is
-            given back as it is.
+        suffix: suffix of the format, such as ``.spz``. Formats without a reader, such as ``.glb``, return ``scene``.
     """
     kind = format_to_write(suffix)
     if kind.suffix == ".ply":
@@ -130,17 +129,17 @@ def through_file(scene: Gaussians, suffix: str) -> tuple[int, Gaussians]:
         return path.stat().st_size, scene if kind.read is None else read_scene(path).to(scene.device)
 
 
-def views_to_judge(subject: Subject, count: int) -> tuple[LookedAt, str]:
-    """The views to judge scenes in, and a note; both of the size that ``compact`` compares in.
+def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
+    """The views to judge scenes in, of the size of comparisons in ``compact``, and a note.
 
-    They are those of held-out photos, or else those that ``compact`` compares in, which no repair is optimised on.
+    They are the views of held-out photos, or else the views of comparisons in ``compact``, which no repair uses.
 
     Args:
         subject: the scene.
         count: largest number of views.
 
     Raises:
-        DataError: if there is no view.
+        DataError: if there are no views.
     """
     note = ""
     if subject.held_out is not None:
@@ -148,11 +147,11 @@ def views_to_judge(subject: Subject, count: int) -> tuple[LookedAt, str]:
             views, photos = subject.held_out(count)
             whole = views if subject.resolution is None else views.resized(max(subject.resolution))
             middle = middle_sized(whole)
-            photographed = LookedAt(views, photos, "held-out photos of the dataset")
+            photographed = JudgedViews(views, photos, "held-out photos of the dataset")
             return photographed.resized(max(middle.width, middle.height)), ""
         except (SceneError, DataError) as error:
             note = f"there are no held-out photos: {error}"
-    return LookedAt.compared(subject.new_views(), count), note
+    return JudgedViews.compared(subject.new_views(), count), note
 
 
 class Measurer:
@@ -161,13 +160,13 @@ class Measurer:
     Args:
         subject: the scene.
         views: largest number of views.
-        progress: called with the name of what is waited for.
-        folder: for pictures; None for none.
-        timed: whether to time frames. If not, times are NaN, and others may measure meanwhile.
+        progress: called with a text while waiting for the lock.
+        folder: folder for pictures; None writes none.
+        timed: whether to time frames. If not, times are NaN, and other measurements may run at the same time.
 
     Raises:
         SceneError: if no Gaussian can be drawn.
-        DataError: if there is no view.
+        DataError: if there are no views.
     """
 
     def __init__(
@@ -176,38 +175,38 @@ class Measurer:
         need_usable(subject.dense)
         self.subject, self.dense, self.folder, self.timed = subject, subject.dense, folder, timed
         self.dense_ms: float | None = None
-        """Time of a frame of the dense scene, if it was measured earlier; set before anything is judged."""
+        """Time of a frame of the dense scene from an earlier measurement; set before the first judgement."""
         self.notes: dict[str, None] = {}
         self.naming = Naming(
             *(subject.path, subject.name, len(self.dense), self.dense.sh_degree, subject.poses, subject.resolution)
         )
-        self._kept: dict[Setting, Made] = {}
+        self._kept: dict[Setting, MadeScene] = {}
         self._progress = progress
         progress("looking for views", 0.0)
-        self.looked_at, note = views_to_judge(subject, views)
+        self.judged_views, note = views_to_judge(subject, views)
         self.note(note)
 
     def note(self, text: str) -> None:
-        """Keep a line of text for the reader; once, and not if it is empty."""
+        """Keep a line of text for the reader, once, unless it is empty."""
         if text:
             self.notes[text] = None
 
     @cached_property
     def judge(self) -> Judge:
         """The judge of all scenes."""
-        judge = Judge(self.dense, self.looked_at, self.folder, self.dense_ms)
+        judge = Judge(self.dense, self.judged_views, self.folder, self.dense_ms)
         self.note(judge.no_lpips)
         return judge
 
     def cut_psnr(self, degree: int) -> float:
-        """PSNR, dB, of the dense scene's renders without the SH bands above a degree, against its own."""
+        """PSNR in dB of the dense scene's renders without the SH bands above a degree, against all bands."""
         return self.judge.psnr(cut_sh(self.dense, degree))
 
     def measure_dense(self, show: Progress) -> Point:
         """The dense scene's point; ``show`` as for :meth:`measure`."""
         setting = Setting(len(self.dense), self.dense.sh_degree, by=DENSE)
         with self._alone():
-            point = self._point(setting, Made(self.dense, 0.0, None), DENSE, DENSE, "", show)
+            point = self._point(setting, MadeScene(self.dense, 0.0, None), DENSE, DENSE, "", show)
         return replace(point, against_dense=replace(point.against_dense, psnr=math.inf))
 
     def measure(self, setting: Setting, show: Progress) -> Point:
@@ -215,16 +214,15 @@ class Measurer:
 
         Args:
             setting: what to measure.
-            show: called with the name of the current task, empty while it is judged, and the share of it that is done.
+            show: called with the name of the current task (empty during the judgement) and its share done.
         """
         naming = self.naming
         names = (naming.key(setting), naming.label(setting), naming.command(setting))
         with self._alone():
             return self._point(setting, self.made(setting, show), *names, show)
 
-    def made(self, setting: Setting, show: Progress = silent) -> Made:
-        """The scene of a setting, made anew unless it is kept: the latest ones are, of no more Gaussians in all than
-        the dense scene has."""
+    def made(self, setting: Setting, show: Progress = silent) -> MadeScene:
+        """The scene of a setting. The latest scenes are kept, with no more Gaussians in all than the dense scene."""
         setting = setting.scene
         if setting not in self._kept:
             self._kept[setting] = make(self.dense, setting, self.subject.new_views, show, self.subject.refiner)
@@ -242,7 +240,7 @@ class Measurer:
         if not alone:
             self.note("another user's lock on measurements could not be taken: both may have measured at once")
 
-    def _point(self, setting: Setting, made: Made, key: str, label: str, command: str, show: Progress) -> Point:
+    def _point(self, setting: Setting, made: MadeScene, key: str, label: str, command: str, show: Progress) -> Point:
         size, scene = through_file(made.scene, self.subject.suffix)
         judged = self.judge.judge(scene, key, lambda share: show("", share), self.timed, setting.drawn)
         return point_of(
@@ -251,8 +249,8 @@ class Measurer:
         )  # fmt: skip
 
 
-def point_of(made: Made, judged: Judged, **named: Any) -> Point:
-    """The point of a scene that was made and judged; ``named`` are the other fields of :class:`Point`."""
+def point_of(made: MadeScene, judged: Judged, **named: Any) -> Point:
+    """The point of a made and judged scene; ``named`` are the other fields of :class:`Point`."""
     return Point(
         gaussians=len(made.scene), sh_degree=made.scene.sh_degree, seconds=made.seconds, peak_bytes=made.peak_bytes,
         **vars(judged), **named,

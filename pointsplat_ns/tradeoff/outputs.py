@@ -1,4 +1,4 @@
-"""The files that a sweep writes of its points: table, JSON, plots and the page."""
+"""Writes the files of a sweep: table, JSON, plots and the page."""
 
 from __future__ import annotations
 
@@ -22,20 +22,17 @@ PLOTS: dict[Cost, str] = {
     "bytes": "tradeoff_mb.png",
     "gaussians": "tradeoff_count.png",
 }
-"""Names of the plots by the cost that quality is plotted against."""
+"""Names of the plots by cost, the horizontal axis."""
 
 OUTPUTS = (TABLE, JSON, PAGE, *PLOTS.values())
-
-_AXES = {"frame_ms": "milliseconds a frame", "bytes": "size of the file, MB", "gaussians": "Gaussians"}
-_MARKERS = {"none": "o", "refiner": "v", "quick": "s", "thorough": "D"}
 
 
 def write_outputs(sweep: Tradeoff, folder: Path, progress: Progress = silent) -> None:
     """Write the table, the JSON, the plots and the page of a sweep.
 
     Args:
-        sweep: what was measured.
-        folder: of the sweep, with the pictures.
+        sweep: the points.
+        folder: folder of the sweep, with the pictures.
         progress: called while pictures are compressed for the page.
 
     Raises:
@@ -73,7 +70,7 @@ def plot(sweep: Tradeoff, cost: Cost, path: Path) -> None:
     """Draw the PSNR of all points, against the dense scene's renders and, if there are any, photos.
 
     Args:
-        sweep: what was measured.
+        sweep: the points.
         cost: the horizontal axis.
         path: the PNG file to write.
 
@@ -106,11 +103,12 @@ def _draw(axis: Axes, sweep: Tradeoff, cost: Cost, reference: Reference) -> None
 
     front = pareto_front(others, cost, reference, "psnr")
     axis.plot(*at(front), color="0.6", linewidth=1, zorder=1)
+    markers = {"none": "o", "refiner": "v", "quick": "s", "thorough": "D"}
     groups: dict[str, list[Point]] = {}
     for point in others:
         groups.setdefault(_group(point, dense), []).append(point)
     for name, members in groups.items():
-        drawn = axis.plot(*at(members), _MARKERS[members[0].repair], label=name, markersize=5)
+        drawn = axis.plot(*at(members), markers[members[0].repair], label=name, markersize=5)
         if cost == "frame_ms":
             low, high = [p.frame_ms_low for p in members], [p.frame_ms_high for p in members]
             axis.hlines(at(members)[1], low, high, drawn[0].get_color(), linewidth=0.8, alpha=0.6)
@@ -126,10 +124,11 @@ def _draw(axis: Axes, sweep: Tradeoff, cost: Cost, reference: Reference) -> None
     if best[0]:
         axis.plot(*best, "o", fillstyle="none", color="crimson", markersize=13, label="recommended")
     _plain_logarithmic(axis)
-    axis.set_xlabel(_AXES[cost] + (", median and quartiles over views" if cost == "frame_ms" else ""))
+    labels = {"frame_ms": "milliseconds a frame", "bytes": "size of the file, MB", "gaussians": "Gaussians"}
+    axis.set_xlabel(labels[cost] + (", median and quartiles over views" if cost == "frame_ms" else ""))
     axis.set_ylabel("PSNR, dB")
     axis.grid(alpha=0.3)
-    axis.legend(fontsize=8, loc="lower right")  # where a front that rises leaves room
+    axis.legend(fontsize=8, loc="lower right")  # a rising front leaves this corner free
 
 
 def _plain_logarithmic(axis: Axes) -> None:

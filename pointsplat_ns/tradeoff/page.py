@@ -1,4 +1,4 @@
-"""The trade of a scene as one HTML file: its front to hover and click, its pictures to compare, a recommendation."""
+"""Writes the tradeoff of a scene as one HTML file: an interactive front, pictures to compare, a recommendation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.pages.flight import SCRIPTS
 from pointsplat_ns.pages.html import page
-from pointsplat_ns.pages.pictures import AMPLIFIED, error_colors, error_map, fit, read_png
+from pointsplat_ns.pages.pictures import ERROR_GAIN, error_colors, error_map, fit, read_png
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.flights import read_flight_beside
 from pointsplat_ns.tradeoff.front import (
@@ -32,28 +32,21 @@ from pointsplat_ns.tradeoff.front import (
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, picture_path, speed_of
 
 MAX_BYTES = 10_000_000
-"""Largest size of the page: it goes through mail and opens at once."""
-
-WITHIN_DB = 0.5
-"""PSNR in dB to lose against photos, as the page asks at first."""
-
-ABOVE_DB = round(psnr_within(WITHIN_DB), 1)
-"""The same where there are no photos: PSNR to have against renders of the dense scene."""
+"""Largest size of the page in bytes, so that it fits into mails and opens quickly."""
 
 Picture = Callable[[], np.ndarray]
 
 
 def write_page(sweep: Tradeoff, folder: Path, output: Path, progress: bool | Progress = False) -> Path:
-    """Write one self-contained HTML file that shows a trade: it loads nothing and opens from a double click.
+    """Write one self-contained HTML file with the points of a sweep, which needs no other file.
 
-    It has the points' quality against their cost with the Pareto front, a slider along the front that shows every view
-    at each point beside the dense scene and the photo with an error map and a wipe, the fastest point that is good
-    enough with the command that makes it, and a table of all points. Views are those of which there is a picture of the
-    dense scene. The recommended scene is there to fly through, if it is at
-    :func:`~pointsplat_ns.tradeoff.points.flight_path`, beside the dense one if both fit.
+    It plots quality against cost with the Pareto front. A slider along the front shows every view beside the dense
+    scene and the photo, with an error map and a wipe. Below are the fastest good point with its command, and a table of
+    all points. Views are those with a picture of the dense scene. The page has a flight through the recommended scene,
+    if it is at :func:`~pointsplat_ns.tradeoff.points.flight_path`, beside the dense scene if both fit.
 
     Args:
-        sweep: what was measured. Its first point is the dense scene.
+        sweep: the points. The first is the dense scene.
         folder: the folder of the sweep, with the pictures at
             :func:`~pointsplat_ns.tradeoff.points.picture_path`. Photos may be missing.
         output: the file to write.
@@ -63,8 +56,8 @@ def write_page(sweep: Tradeoff, folder: Path, output: Path, progress: bool | Pro
         ``output``.
 
     Raises:
-        DataError: if there is no point or no view, if a picture is missing, damaged or of another size than the views,
-            or if the page does not fit into 10 MB.
+        DataError: if there is no point or no view, a picture is missing, damaged or of another size than the views, or
+            the page does not fit into 10 MB.
         SceneError: if the file cannot be written.
     """
     if not sweep.points:
@@ -95,7 +88,7 @@ def _pictures(sweep: Tradeoff, folder: Path) -> list[dict[str, Picture]]:
     """For each view, functions that read or compute its pictures, by name: a point's key, ``photo``, or ``renders:KEY``
     and ``photos:KEY`` for the error map of a point.
 
-    Error maps are computed from the PNG files: what compression for the page changes must not show as error.
+    Error maps are computed from the PNG files, so that they do not show errors of the page's compression.
     """
     dense = sweep.points[0].key
     views: list[dict[str, Picture]] = []
@@ -126,33 +119,35 @@ def _pictures(sweep: Tradeoff, folder: Path) -> list[dict[str, Picture]]:
 
 
 def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
-    """What the template shows without the help of a script."""
+    """Values for the template itself, without scripts."""
+    within_db = 0.5  # initial loss of PSNR against photos
+    above_db = round(psnr_within(within_db), 1)  # the same against renders, where there are no photos
     has_photos = quality_of(sweep.points[0], "photos", "psnr") is not None
     has_lpips = any(quality_of(point, "renders", "lpips") is not None for point in sweep.points)
     rows = [{"key": point.key, "label": point.label, "cells": _cells(point, sweep.points[0])} for point in sweep.points]
-    shown = [name for name in _TITLES if (has_photos or "photos" not in name) and (has_lpips or "lpips" not in name)]
+    columns = [name for name in _TITLES if (has_photos or "photos" not in name) and (has_lpips or "lpips" not in name)]
     if all(point.peak_bytes is None for point in sweep.points):
-        shown.remove("peak_bytes")
+        columns.remove("peak_bytes")
     return {
         "sweep": sweep,
         "views": views,
         "references": REFERENCES if has_photos else REFERENCES[:1],
         "metrics": METRICS if has_lpips else METRICS[:2],
-        "recommended": fastest_within(sweep.points, WITHIN_DB, sweep.times_trusted)
-        or fastest_above(sweep.points, ABOVE_DB, sweep.times_trusted)
+        "recommended": fastest_within(sweep.points, within_db, sweep.times_trusted)
+        or fastest_above(sweep.points, above_db, sweep.times_trusted)
         or sweep.points[0],
         "rows": rows,
-        "columns": [(name, _TITLES[name]) for name in shown],
-        "amplified": AMPLIFIED,
-        "full_level": math.ceil(255 / AMPLIFIED),
-        "within_db": WITHIN_DB,
-        "above_db": ABOVE_DB,
+        "columns": [(name, _TITLES[name]) for name in columns],
+        "amplified": ERROR_GAIN,
+        "full_level": math.ceil(255 / ERROR_GAIN),
+        "within_db": within_db,
+        "above_db": above_db,
         "ramp": ["#" + bytes(color).hex() for color in error_colors()[::17].tolist()],
     }
 
 
 def _data(sweep: Tradeoff) -> dict[str, Any]:
-    """What the scripts read, but for the pictures. An infinite number is the text "Infinity"."""
+    """Data for the scripts, except pictures. An infinite number is the text "Infinity"."""
 
     def qualities(point: Point, reference: Any) -> dict[str, float | str | None]:
         values = {metric: quality_of(point, reference, metric) for metric in METRICS}

@@ -1,4 +1,4 @@
-"""What was measured of a scene: one point for each way of making it smaller."""
+"""Measurements of a scene: one point for each way of making it smaller."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 @dataclass(frozen=True)
 class Quality:
-    """Means over views: PSNR in dB, SSIM, and LPIPS, which is None where its weights are not at hand."""
+    """Means over views: PSNR in dB, SSIM, and LPIPS, which is None without its weights."""
 
     psnr: float
     ssim: float
@@ -18,7 +18,7 @@ class Quality:
 
 @dataclass(frozen=True)
 class Point:
-    """One way of making a scene smaller, measured."""
+    """The measurement of one way of making a scene smaller."""
 
     key: str
     """Short name, unique in a sweep and fit for a file's name: ``dense``, ``10pct_sh3``, ``10pct_sh3_quick``."""
@@ -33,35 +33,34 @@ class Point:
     gaussians: int
     sh_degree: int
     repair: str
-    """``none``, or what repaired it: ``refiner``, ``quick``, ``thorough``."""
+    """Kind of repair: ``none``, ``refiner``, ``quick``, ``thorough``."""
     bytes: int
     """Size of the file."""
     against_dense: Quality
-    """Against renders of the dense scene. Its PSNR is infinite for the dense scene itself."""
+    """Quality against renders of the dense scene. The PSNR of the dense scene itself is infinite."""
     against_photos: Quality | None
-    """Against held-out photos; None where there are none."""
+    """Quality against held-out photos; None where there are none."""
     frame_ms: float
-    """Time of one frame, in milliseconds: that of the dense scene when the sweep began, times the median over views of
-    the share of it that a frame takes. Both were drawn in turn, so that points that are measured while the machine is
-    slower compare with others."""
+    """Time of one frame, in milliseconds: the dense scene's time at the start of the sweep, times the median over views
+    of the ratio to a frame of the dense scene. Both are drawn in turn, so that points are comparable when the machine
+    gets slower."""
     frame_ms_low: float
     frame_ms_high: float
     """The same with the quartiles over views."""
     seconds: float
-    """Time that making it took."""
+    """Duration of making the scene."""
     peak_bytes: int | None = None
-    """Peak memory of the process that made it; None where it was not measured."""
+    """Peak memory of the making process; None if it was not measured."""
     others_cores: float | None = None
-    """Cores that other programs kept busy while frames were timed; None where it was not measured."""
+    """Cores that other programs used during the timing; None if they were not measured."""
     clock_ms: float | None = None
-    """Median time of one frame over views, in milliseconds, as the clock said it when this point was measured; None
-    where it was not measured."""
+    """Median time of one frame over views by the clock, in milliseconds; None if it was not measured."""
     drawn: str = "exact"
-    """How its frames were drawn, for pictures and times: ``exact``, ``fast``, ``half``."""
+    """Quality of its frames, for pictures and times: ``exact``, ``fast``, ``half``."""
 
 
 class Speed(NamedTuple):
-    """How many times as fast as the dense scene frames are drawn: median over views, and quartiles.
+    """Ratio of the dense scene's time of a frame to that of a point: median over views, and quartiles.
 
     Example:
         >>> print(Speed(2.13, 1.94, 2.31))
@@ -77,13 +76,13 @@ class Speed(NamedTuple):
 
 
 def speed_of(point: Point, dense: Point) -> Speed:
-    """How many times as fast as the dense scene a point is drawn."""
+    """Speed of a point relative to the dense scene."""
     return Speed(*(dense.frame_ms / ms for ms in (point.frame_ms, point.frame_ms_high, point.frame_ms_low)))
 
 
 @dataclass(frozen=True)
 class Tradeoff:
-    """Every point that was measured of a scene. The first is the dense scene.
+    """All points of a scene. The first is the dense scene.
 
     Example:
         >>> import tempfile
@@ -101,32 +100,31 @@ class Tradeoff:
     machine: str
     """Processor, number of threads, device and version of torch, as text."""
     views_origin: str
-    """Where the views came from."""
+    """Origin of the views."""
     width: int
     height: int
     """Size of the views, in pixels."""
     points: tuple[Point, ...]
     notes: tuple[str, ...] = ()
-    """Lines of text for the reader: that the machine was busy and times are not to be trusted, that LPIPS is
-    missing."""
+    """Lines of text for the reader, such as on a busy machine or missing LPIPS."""
     times_trusted: bool = True
-    """Whether other programs left the machine alone while frames were timed."""
+    """Whether no other program disturbed the timing."""
     recommended: str = ""
-    """``key`` of the recommended point, or of the one found for targets."""
+    """``key`` of the recommended point, or of the point found for targets."""
     why: str = ""
-    """One line of text: what it was recommended or found for, and at what cost."""
+    """One line of text on the reason for it, and its cost."""
 
     def point(self, key: str) -> Point:
         """The point with a key.
 
         Raises:
-            KeyError: if there is none.
+            KeyError: if there is no such point.
         """
         return {point.key: point for point in self.points}[key]
 
 
 def picture_path(folder: Path, view: int, what: str) -> Path:
-    """Where the picture of a view lies.
+    """Path of the picture of a view.
 
     Args:
         folder: the folder of the sweep.
@@ -137,10 +135,10 @@ def picture_path(folder: Path, view: int, what: str) -> Path:
 
 
 def flight_path(folder: Path, key: str) -> Path:
-    """Where a point's scene lies, as the page shows it to fly through, if it is small enough for that.
+    """Path of a point's scene for flights in the page.
 
     Args:
         folder: the folder of the sweep.
-        key: the point's.
+        key: key of the point.
     """
     return folder / "scenes" / f"{key}.json"

@@ -1,4 +1,4 @@
-"""Settings: the ways of making a scene smaller that are measured, their names, and their commands."""
+"""Settings: measured ways of making a scene smaller, their names, and their commands."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.views import View
 
 Repair = Literal["none", "refiner", "quick", "thorough"]
-"""Nothing; the refiner alone; 48 steps; 400 steps."""
+"""Kinds of repair: none; the refiner alone; 48 steps; 400 steps."""
 
 REPAIRS: tuple[Repair, ...] = get_args(Repair)
 
 EFFORTS: dict[Repair, Effort] = {"refiner": "instant", "quick": "quick", "thorough": "thorough"}
-"""The effort of ``compact`` that each repair is."""
+"""The effort of ``compact`` for each repair."""
 
 
 def repairs_of(effort: Effort) -> tuple[Repair, Repair]:
-    """None, or the repair that is an effort of ``compact``."""
+    """No repair, and the repair of an effort of ``compact``."""
     return "none", next(repair for repair, known in EFFORTS.items() if known == effort)
 
 
 Drawn = Literal["exact", "fast", "half"]
-"""How frames are drawn: as they are; with ``quality="fast"``, that leaves out what is nearly transparent; or so and at
-half the resolution, enlarged."""
+"""Quality of frames: exact; with ``quality="fast"``, which skips nearly transparent Gaussians; or fast at half the
+resolution, enlarged."""
 
 DRAWN: tuple[Drawn, ...] = get_args(Drawn)
 
 DENSE = "dense"
-"""Key and method of the scene as it is."""
+"""Key and method of the dense scene."""
 
 
 @dataclass(frozen=True)
@@ -66,30 +66,23 @@ class Setting:
 
 
 def setting_of(point: Point) -> Setting:
-    """The setting that a point, other than the dense scene, was measured with.
+    """The setting of a point other than the dense scene.
 
     Raises:
-        PointSplatError: if there is no such repair, method or way to draw.
+        PointSplatError: if its repair, method or quality of frames is unknown.
     """
     repair, drawn = check_repairs((point.repair,))[0], check_drawn((point.drawn,))[0]
     return Setting(point.gaussians, point.sh_degree, repair, method_named(point.by).name, drawn)
 
 
 def draw(scene: Gaussians, view: View, drawn: Drawn) -> Tensor:
-    """The picture (H, W, 3) of a view."""
+    """Render a view (H, W, 3)."""
     return render(scene, view, "exact" if drawn == "exact" else "fast", 2 if drawn == "half" else 1)
-
-
-_CALLS: dict[Drawn, str] = {
-    "fast": 'ps.render(scene, views, quality="fast")',
-    "half": 'ps.render(scene, views, quality="fast", reduced=2)',
-}
-"""How a user draws so."""
 
 
 @dataclass(frozen=True)
 class Naming:
-    """What settings of a scene are called.
+    """Makes the keys, labels and commands of settings.
 
     Example:
         >>> naming = Naming(Path("room.ply"), "room", 60_000, 3)
@@ -100,19 +93,19 @@ class Naming:
     """
 
     path: Path
-    """The scene, as commands name it."""
+    """Path of the scene in commands."""
     name: str
     count: int
-    """Number of Gaussians in it."""
+    """Number of Gaussians in the dense scene."""
     sh_degree: int
-    """And their SH degree."""
+    """SH degree of the dense scene."""
     poses: Path | None = None
-    """The file of cameras that the scene is looked at from, as commands name it."""
+    """Path of the file of cameras in commands."""
     resolution: tuple[int, int] | None = None
-    """Width and height of pictures, pixels, if they were asked for."""
+    """Width and height of pictures in pixels, if given."""
 
     def key(self, setting: Setting) -> str:
-        """A short name that can be part of a file's name."""
+        """A short name that fits into names of files."""
         words = [f"{100 * setting.count / self.count:.4g}pct", f"sh{setting.sh_degree}"]
         words += [] if setting.repair == "none" else [setting.repair]
         words += [] if setting.by == "merge" else [setting.by]
@@ -120,7 +113,7 @@ class Naming:
         return "_".join(words)
 
     def label(self, setting: Setting) -> str:
-        """The same for people."""
+        """A name for people."""
         words = [f"{100 * setting.count / self.count:.3g} %" + ("" if setting.by == "merge" else f" by {setting.by}")]
         words += [] if setting.sh_degree == self.sh_degree else [f"SH degree {setting.sh_degree}"]
         repaired = "refined" if setting.repair == "refiner" else f"repaired ({setting.repair})"
@@ -129,8 +122,8 @@ class Naming:
         return ", ".join(words)
 
     def command(self, setting: Setting) -> str:
-        """The command that makes the scene, with a comment on how it is drawn if not exactly. Counts are exact, as
-        percentages may be rounded."""
+        """The command that makes the scene, with a comment on the quality of its frames unless exact. It has the count,
+        because percentages are rounded."""
         program = "prune" if setting.repair == "none" else "compact"
         words = ["pointsplat", program, str(self.path), "--keep", str(setting.count)]
         if self.poses is not None:
@@ -145,14 +138,17 @@ class Naming:
             words += ["--refiner", SHIPPED] if setting.repair == "refiner" else []
             words += ["--effort", EFFORTS[setting.repair]]
         command = shlex.join([*words, "-o", f"{self.name}_{self.key(setting.scene)}.ply"])
-        return command if setting.drawn == "exact" else f"{command}  # drawn by {_CALLS[setting.drawn]}"
+        if setting.drawn == "exact":
+            return command
+        reduced = ", reduced=2" if setting.drawn == "half" else ""
+        return f'{command}  # drawn by ps.render(scene, views, quality="fast"{reduced})'
 
 
 def check_repairs(repairs: tuple[str, ...]) -> tuple[Repair, ...]:
     """Repairs, each once, in the order of :data:`REPAIRS`.
 
     Raises:
-        PointSplatError: if none is given, or one is unknown.
+        PointSplatError: if there is no repair, or a repair is unknown.
     """
     unknown = [repair for repair in repairs if repair not in REPAIRS]
     if unknown or not repairs:
@@ -161,10 +157,10 @@ def check_repairs(repairs: tuple[str, ...]) -> tuple[Repair, ...]:
 
 
 def check_drawn(drawn: tuple[str, ...]) -> tuple[Drawn, ...]:
-    """Ways to draw, each once, in the order of :data:`DRAWN`.
+    """Qualities of frames, each once, in the order of :data:`DRAWN`.
 
     Raises:
-        PointSplatError: if one is unknown.
+        PointSplatError: if a quality of frames is unknown.
     """
     unknown = [way for way in drawn if way not in DRAWN]
     if unknown:

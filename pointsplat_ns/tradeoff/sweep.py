@@ -1,4 +1,4 @@
-"""Measures points of a scene's trade, one after the other, and keeps each as soon as it is measured."""
+"""Measures points of a scene one after the other, and writes each as soon as it is measured."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS
 from pointsplat_ns.looking.windows import size_text
-from pointsplat_ns.pages.flight import Stage
+from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pruning import method_named
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.flights import keep_flight
@@ -25,29 +25,29 @@ from pointsplat_ns.tradeoff.measuring import Measurer, Subject
 from pointsplat_ns.tradeoff.outputs import OUTPUTS, write_outputs
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, speed_of
 from pointsplat_ns.tradeoff.settings import DENSE, DRAWN, REPAIRS, Setting, check_drawn, check_repairs
-from pointsplat_ns.tradeoff.walk import MOST_DRAWINGS, Enough, Plan, drawings, walk
+from pointsplat_ns.tradeoff.walk import WALK, Enough, Plan, drawings, walk
 
 logger = logging.getLogger("pointsplat_ns")
 
 
 @dataclass(frozen=True)
 class Options:
-    """What to measure, and in how many views.
+    """Options of a sweep.
 
     Raises:
-        PointSplatError: if one means nothing.
+        PointSplatError: if an option is invalid.
     """
 
     points: int = 12
-    """Largest number of scenes, the dense one among them."""
+    """Largest number of scenes, with the dense scene."""
     within: float = 0.5
-    """Loss, dB, that the recommended point may have."""
+    """Largest loss of the recommended point, dB."""
     methods: tuple[str, ...] = ("merge",)
     repairs: tuple[str, ...] = ("none", "quick")
     views: int = COMPARED_VIEWS
     """Largest number of views."""
     drawn: tuple[str, ...] = DRAWN
-    """Ways to draw frames; of the other ways than the exact one, few scenes are measured."""
+    """Qualities of frames; few scenes are measured with other qualities than exact."""
 
     def __post_init__(self) -> None:
         if self.points < 2:
@@ -64,7 +64,7 @@ class Options:
         check_drawn(self.drawn)
 
     def plan(self, dense: Gaussians) -> Plan:
-        """What may be tried of a scene. Everything is drawn exactly; ``drawn`` are the other ways."""
+        """The plan of a scene. All scenes are drawn exactly; ``drawn`` has the other qualities."""
         methods = tuple(dict.fromkeys(self.methods))
         drawn = tuple(way for way in check_drawn(self.drawn) if way != "exact")
         return Plan(len(dense), dense.sh_degree, methods, check_repairs(self.repairs), self.within, drawn)
@@ -108,23 +108,23 @@ class Sweep:
         self.subject, self.folder, self.options, self.progress = subject, folder, options, progress
         self.measurer = Measurer(subject, options.views, progress, folder)
         self.plan = options.plan(subject.dense)
-        self.most = options.points + (MOST_DRAWINGS if self.plan.drawn else 0)
+        self.most = options.points + (WALK.drawings if self.plan.drawn else 0)
         self.machine = machine_text(subject.dense.device)
         self.journal = Journal(folder, self._identity())
         if self.journal.dense is not None:
             self.measurer.dense_ms = self.journal.dense.frame_ms
-        self._forget_those_without_pictures()
+        self._drop_points_without_pictures()
         self._seconds: list[float] = []
 
     def _identity(self) -> dict[str, str | int]:
-        """Values that points must have in common to be compared."""
-        subject, looked_at = self.subject, self.measurer.looked_at
-        views = looked_at.views
+        """Values that comparable points have in common."""
+        subject, judged_views = self.subject, self.measurer.judged_views
+        views = judged_views.views
         cameras = hashlib.sha256(views.viewmats.numpy().tobytes() + views.Ks.numpy().tobytes()).hexdigest()[:16]
         return {
             "scene": subject.sha256,
             "machine": self.machine,
-            "views": looked_at.origin,
+            "views": judged_views.origin,
             "number of views": len(views),
             "width": views.width,
             "height": views.height,
@@ -133,10 +133,10 @@ class Sweep:
         }
 
     def run(self) -> Tradeoff:
-        """Walk the front.
+        """Measure the points of the walk, and write the results.
 
         Raises:
-            KeyboardInterrupt, SystemExit: of Ctrl-C or another signal, after results of what was measured were written.
+            KeyboardInterrupt, SystemExit: on Ctrl-C or another signal, after writing the results so far.
         """
         dense, points = self.measure_dense(self.most), self.journal.points
 
@@ -165,11 +165,11 @@ class Sweep:
         return self.journal.dense
 
     def measure(self, setting: Setting, of: int | None = None) -> Point:
-        """The point of a setting; measured unless it has been.
+        """The point of a setting, measured if it is missing.
 
         Args:
-            setting: what to measure.
-            of: largest number of points that there will be; None if that is not known.
+            setting: the setting.
+            of: largest number of points in the end; None if it is not known.
         """
         if setting not in self.journal.points:
             start = time.perf_counter()
@@ -180,22 +180,22 @@ class Sweep:
         return self.journal.points[setting]
 
     @cached_property
-    def _stage(self) -> Stage | None:
-        """Where flights through scenes begin; None if nothing of the dense one is visible."""
+    def _frame(self) -> FlightFrame | None:
+        """The frame of flights; None if no Gaussian of the dense scene is visible."""
         try:
-            return Stage.of(self.subject.dense, self.measurer.looked_at.views)
+            return FlightFrame.of(self.subject.dense, self.measurer.judged_views.views)
         except DataError:
             return None
 
     def scene(self, setting: Setting) -> Gaussians:
-        """The scene of a setting, made anew unless it is one of the last."""
+        """The scene of a setting; the latest scenes are kept."""
         return self.measurer.made(setting, self.progress).scene
 
     def result(self, recommended: Point | None = None, why: str = "") -> Tradeoff:
-        """All points so far, the dense scene first and the others by their size.
+        """All points so far: the dense scene first, the others by size.
 
         Args:
-            recommended: a point; by default see :func:`~pointsplat_ns.tradeoff.front.recommend`.
+            recommended: the recommended point; by default see :func:`~pointsplat_ns.tradeoff.front.recommend`.
             why: a line of text on it.
         """
         dense = self.journal.dense
@@ -208,13 +208,13 @@ class Sweep:
         busy = busy_note([p.others_cores for p in points if p.others_cores is not None])
         if recommended is None:
             recommended, why = recommend(points, self.options.within, trusted=not busy)
-        looked_at = self.measurer.looked_at
+        judged_views = self.measurer.judged_views
         return Tradeoff(
             scene=self.subject.name,
             machine=self.machine,
-            views_origin=looked_at.origin,
-            width=looked_at.views.width,
-            height=looked_at.views.height,
+            views_origin=judged_views.origin,
+            width=judged_views.views.width,
+            height=judged_views.views.height,
             points=points,
             notes=(*([busy] if busy else []), *self.measurer.notes),
             times_trusted=not busy,
@@ -223,20 +223,20 @@ class Sweep:
         )
 
     def finish(self, recommended: Point | None = None, why: str = "") -> Tradeoff:
-        """Write and give the result; arguments as for :meth:`result`."""
+        """Write and return the result; arguments as for :meth:`result`."""
         self.progress("writing results", 0.0)
         result = self.result(recommended, why)
         write_outputs(result, self.folder, self.progress)
         return result
 
     def finish_early(self) -> None:
-        """Write the results of a sweep that is interrupted, if there are any."""
+        """Write the results of an interrupted sweep, if there are any."""
         if self.journal.dense is not None:
-            self.measurer.note("the sweep was interrupted: the same command goes on with it")
+            self.measurer.note("the sweep was interrupted: the same command continues it")
             self.finish()
 
-    def _forget_those_without_pictures(self) -> None:
-        """Points whose pictures somebody has removed are measured again: the page shows all of them."""
+    def _drop_points_without_pictures(self) -> None:
+        """Drop points with missing pictures, so that they are measured again: the page needs all pictures."""
 
         def pictured(key: str) -> bool:
             return all(path.is_file() for path in self.measurer.judge.pictures(key))
@@ -248,8 +248,8 @@ class Sweep:
                 del self.journal.points[setting]
 
     def _shower(self, done: int, of: int | None) -> Progress:
-        """Progress of one point as a part of the whole, if the whole is known. It never goes back, though making a
-        scene has several tasks that each begin at 0."""
+        """Progress of one point as a part of the total, if the total is known. It never falls, although making a scene
+        has several tasks that each start at 0."""
         furthest = 0.0
 
         def show(what: str, share: float) -> None:
@@ -264,8 +264,8 @@ class Sweep:
 
     def _take(self, point: Point, scene: Gaussians, seconds: float, of: int | None) -> None:
         """Keep a point, its scene for the page, and log its figures and the time left."""
-        if self._stage is not None:
-            keep_flight(self._stage, scene, point.label, flight_path(self.folder, point.key))
+        if self._frame is not None:
+            keep_flight(self._frame, scene, point.label, flight_path(self.folder, point.key))
         self.journal.add(point)
         self._seconds.append(seconds)
         done, dense = 1 + len(self.journal.points), self.journal.dense

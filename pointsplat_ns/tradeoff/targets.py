@@ -1,12 +1,12 @@
-"""The cheapest scene that meets targets: how many Gaussians, which SH degree, and whether to repair.
+"""Searches for the cheapest scene that meets targets: number of Gaussians, SH degree, and repair.
 
-A *way* is an SH degree and a repair. With a quality to reach, the cheapest scene is the smallest file that reaches it:
-of each way the smallest count is searched for, and ways whose files would be larger than one already found are left.
-Limits of time and size are then checked. With limits only, it is the best quality within them: of each way the largest
-count within the limits.
+A *way* is an SH degree and a repair. With a target of PSNR, the cheapest scene is the smallest file that reaches it:
+the smallest count of each way is searched, and ways with larger files than the best so far are skipped. Limits of time
+and size are checked afterwards. With limits only, the result is the best quality within them: the largest count of each
+way within the limits.
 
-Sizes are those of files of the format asked for. Where only writing a scene tells its size, counts are first estimated
-from the dense scene's file.
+Sizes are those of files of the requested format. For formats without a formula, counts are first estimated from the
+dense scene's file.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from pointsplat_ns.compression.budget_search import FILE_SIZE, FIRST_SHARE
+from pointsplat_ns.compression.budget_search import BUDGETS
 from pointsplat_ns.compression.count_search import SearchSettings, find_count
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.pruning import ply_bytes, resolve_keep
@@ -25,18 +25,15 @@ from pointsplat_ns.tradeoff.settings import Setting
 from pointsplat_ns.tradeoff.walk import Plan
 
 SEARCH = SearchSettings(precision=1.1)
-"""For qualities and times: each try makes, repairs and renders a scene."""
-
-FEWEST = 1e-3
-"""Share of the Gaussians below which no scene is tried for a limit of time: almost nothing is left to be drawn."""
+"""Search for PSNR and times. It is coarse, because each try makes, repairs and renders a scene."""
 
 
 @dataclass(frozen=True)
 class Targets:
-    """What a scene has to meet.
+    """Targets of a scene.
 
     Raises:
-        BudgetError: if there is none, or one is not a positive number.
+        BudgetError: if there is no target, or a target is not a positive number.
     """
 
     db: float | None = None
@@ -55,7 +52,7 @@ class Targets:
             raise BudgetError(f"no target is given; expected one of {', '.join(given)}")
 
     def missed(self, point: Point) -> list[str]:
-        """The targets that a point does not meet, in words; empty if it meets all."""
+        """Text on each target that a point misses; empty if it meets all."""
         words = []
         if self.db is not None and point.against_dense.psnr < self.db:
             words.append(f"{point.against_dense.psnr:.2f} dB where {self.db:g} are wanted")
@@ -75,14 +72,14 @@ def targets_of(
     clean: bool = False,
     seconds: float | None = None,
 ) -> Targets | None:
-    """Targets of which any may be missing; None if all are.
+    """Targets from options that may be missing; None if all are missing.
 
     Args:
         db, ms, mb: see :class:`Targets`.
-        keep, sh, clean, seconds: options of ``compact`` that say what the search decides.
+        keep, sh, clean, seconds: options of ``compact`` that the search decides.
 
     Raises:
-        BudgetError: if a target means nothing, or such an option was given beside one.
+        BudgetError: if a target is invalid, or such an option is given with a target.
     """
     if db is ms is mb is None:
         return None
@@ -103,20 +100,19 @@ class Found:
     setting: Setting
     point: Point
     why: str
-    """One line of text: the figures of the scene, and the targets that the next one tried would have missed."""
+    """One line of text: the figures of the scene, and the targets that the next cheaper scene misses."""
 
 
 class Search:
     """Searches for the cheapest scene that meets targets.
 
     Args:
-        targets: what to meet.
-        plan: what may be tried; of the methods only the first.
-        measure: from a setting to its point; the same each time.
+        targets: the targets.
+        plan: settings to try; only its first method is used.
+        measure: from a setting to its point; deterministic.
         cut_psnr: as for :func:`~pointsplat_ns.tradeoff.walk.walk`.
-        size: bytes of a file by count and SH degree; an estimate where only writing a scene tells it. By default those
-            of a PLY.
-        exact: whether files give scenes back as they are, as a PLY does.
+        size: bytes of a file by count and SH degree, or an estimate; by default of a PLY.
+        exact: whether files keep scenes exactly, as a PLY does.
     """
 
     def __init__(
@@ -133,13 +129,13 @@ class Search:
         self._measure, self._cut_psnr, self._size, self._exact = measure, cut_psnr, size, exact
         self._ends: list[Setting] = []  # the result of each way
         self._best: Setting | None = None
-        self._slope: float | None = None  # dB for each e-fold of the count, of the way before
+        self._slope: float | None = None  # dB for each e-fold of the count, from the previous way
 
     def run(self) -> Found:
         """Search.
 
         Raises:
-            BudgetError: if no scene meets all targets; the text says which one is the obstacle, and what is reachable.
+            BudgetError: if no scene meets all targets; the text tells the obstacle and the reachable values.
         """
         plan, by = self.plan, self.plan.methods[0]
         for repair in plan.repairs:
@@ -154,7 +150,7 @@ class Search:
         return self._found(self._best)
 
     def so_far(self) -> Found | None:
-        """The cheapest of what was tried that meets all targets, if the search was interrupted; None if none does."""
+        """The cheapest tried scene that meets all targets, for an interrupted search; None if no scene does."""
         meeting = [setting for setting, point in self.tried.items() if not self.targets.missed(point)]
         if not meeting:
             return None
@@ -163,18 +159,18 @@ class Search:
 
     @property
     def _wanted(self) -> float:
-        """PSNR, dB, that the dense scene must keep without some SH bands for an SH degree to be tried."""
+        """Least PSNR in dB of the dense scene without some SH bands for a try of that SH degree."""
         if self.targets.db is not None:
             return self.targets.db
         return -math.inf if self._best is None else self._point(self._best).against_dense.psnr
 
     def _cost(self, setting: Setting) -> float:
-        """What is to be small: the file, or if no quality is wanted, the lack of it."""
+        """The cost to minimise: the size of the file, or without a target of PSNR, the negative PSNR."""
         point = self._point(setting)
         return -point.against_dense.psnr if self.targets.db is None else point.bytes
 
     def _try(self, way: Setting) -> None:
-        """Search in a way, and keep the result if it is the best."""
+        """Search along a way, and keep the result if it is the best."""
         end = self._within(way) if self.targets.db is None else self._reaching(way, self.targets.db)
         if end is None:
             return
@@ -189,8 +185,8 @@ class Search:
         return self.tried[setting]
 
     def _reaching(self, way: Setting, wanted: float) -> Setting | None:
-        """The setting of a way with the fewest Gaussians that reaches a PSNR, if its file is smaller than that of the
-        best so far; else None."""
+        """The setting of a way with the fewest Gaussians that reaches a PSNR, if its file is smaller than the best so
+        far; else None."""
         whole = Setting(self.plan.count, self.plan.sh_degree, by=way.by)
 
         def psnr(count: int) -> float:
@@ -200,7 +196,7 @@ class Search:
         most = self.plan.count if self._best is None else self._most(way, self._point(self._best).bytes)
         if most < 1:
             return None
-        first = most if most < self.plan.count else resolve_keep(self.plan.count, FIRST_SHARE)
+        first = most if most < self.plan.count else resolve_keep(self.plan.count, BUDGETS.first_share)
         found = find_count(psnr, wanted, at_least=True, first=first, most=most, slope=self._slope, settings=SEARCH)
         if found.count is None:
             return None
@@ -208,15 +204,15 @@ class Search:
         return replace(way, count=found.count)
 
     def _within(self, way: Setting) -> Setting:
-        """The setting of a way with the most Gaussians that is within the limits of time and size.
+        """The setting of a way with the most Gaussians within the limits of time and size.
 
         Raises:
-            BudgetError: if none is.
+            BudgetError: if no setting is within them.
         """
         count, limit = self._fitting(way), self.targets.ms
         if limit is None:
             return replace(way, count=count)
-        least = min(count, max(1, round(FEWEST * self.plan.count)))
+        least = min(count, max(1, round(1e-3 * self.plan.count)))  # fewer draw almost nothing
         found = find_count(
             lambda count: math.log(self._point(replace(way, count=count)).frame_ms), math.log(limit), at_least=False,
             first=count, most=count, least=least, slope=1.0, settings=SEARCH,
@@ -230,17 +226,17 @@ class Search:
         return replace(way, count=found.count)
 
     def _fitting(self, way: Setting) -> int:
-        """The most Gaussians of a way whose file is within the limit of size, nearly.
+        """Nearly the largest count of a way whose file is within the limit of size.
 
         Raises:
-            BudgetError: if not even one fits.
+            BudgetError: if not even one Gaussian fits.
         """
         if self.targets.mb is None:
             return self.plan.count
         limit = math.floor(1e6 * self.targets.mb)
         found = find_count(
             lambda count: math.log(self._point(replace(way, count=count)).bytes), math.log(max(limit, 1)),
-            at_least=False, first=self._most(way, limit + 1), most=self.plan.count, slope=1.0, settings=FILE_SIZE,
+            at_least=False, first=self._most(way, limit + 1), most=self.plan.count, slope=1.0, settings=BUDGETS.size,
         )  # fmt: skip
         if found.count is None:
             raise BudgetError(
@@ -250,7 +246,7 @@ class Search:
         return found.count
 
     def _most(self, way: Setting, size: int) -> int:
-        """The most Gaussians of a way whose file should be smaller than ``size`` bytes; 0 if none is."""
+        """The largest count of a way with an expected file below ``size`` bytes; 0 if there is none."""
         counts = range(1, self.plan.count + 1)
         return bisect_left(counts, size, key=lambda count: self._size(count, way.sh_degree))
 
@@ -269,7 +265,7 @@ class Search:
         return Found(setting, point, why)
 
     def _obstacle(self) -> str:
-        """Why no scene meets all targets."""
+        """Text on the reason why no scene meets all targets."""
         if not self._ends:
             best = max(self.tried.values(), key=lambda point: point.against_dense.psnr)
             return (

@@ -1,20 +1,20 @@
-"""Walks the front of a scene's trade: measures where it bends, and stops where it is flat.
+"""Chooses the settings of a sweep: measures the front where it bends, and stops where it is flat.
 
-A *way* is a method, an SH degree and a repair; along a way only the number of Gaussians changes. The walk looks at the
-loss in dB (:func:`~pointsplat_ns.tradeoff.front.loss_of`), which is the same at each run, and never at times.
+A *way* is a method, an SH degree and a repair; along a way only the number of Gaussians changes. The walk depends on
+the loss in dB (:func:`~pointsplat_ns.tradeoff.front.loss_of`), which is the same in each run, and not on times.
 
-1. The first way, the first method with all SH bands and no repair, at a tenth. Then each repair there. One that gains
-   ``ACCEPTANCE.min_gain`` (:mod:`~pointsplat_ns.compression.acceptance`) over what came before it is used from here on.
+1. The first way, which is the first method with all SH bands and no repair, at a tenth. Then each repair there. A
+   repair with a gain of ``ACCEPTANCE.min_gain`` (:mod:`~pointsplat_ns.compression.acceptance`) becomes part of the way.
 2. This way at three tenths and at three hundredths.
-3. A lower SH degree matters if leaving out its bands of the dense scene costs no more than merging to a tenth did: then
-   the lowest such degree is measured at a tenth. If it loses less there than the first way does at the same size of the
-   file, it is measured at the other two as well.
-4. Other methods, if any were asked for, at these three.
-5. The fewest Gaussians of the first way within the wanted loss are searched for.
-6. Then, again and again: the gap between neighbours on a way (the dense scene is the upper end of each) whose losses
-   differ most is halved, in the logarithm of the number of Gaussians, until all are :data:`FLAT` or :data:`CLOSE`.
+3. The lowest SH degree at which the dense scene loses no more than by merging to a tenth is measured at a tenth. If it
+   loses less there than the first way at the same size of the file, it is measured at the other two shares too.
+4. Other methods, if requested, at these three shares.
+5. A search for the fewest Gaussians of the first way within the wanted loss.
+6. Repeatedly: of all gaps between neighbours on a way (the dense scene is the upper end of each), the gap with the
+   largest difference of losses is halved in the logarithm of the count, until all gaps are flat or close
+   (:class:`WalkSettings`).
 
-Then follow :func:`drawings`: some of these scenes, drawn faster.
+Then :func:`drawings` measures some of these scenes with faster frames.
 """
 
 from __future__ import annotations
@@ -33,35 +33,44 @@ from pointsplat_ns.tradeoff.front import loss_of, recommend
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import DRAWN, Drawn, Repair, Setting, setting_of
 
-TRIAL, OTHERS = 0.1, (0.3, 0.03)
-"""Share of the Gaussians at which ways are tried, and further shares that each way is measured at."""
 
-FLAT = 0.25
-"""Difference of losses, dB, below which a gap is flat: views chosen otherwise would change a loss by about as much."""
+@dataclass(frozen=True)
+class WalkSettings:
+    """Settings of the walk."""
 
-CLOSE = 1.1
-"""Ratio of counts below which nothing between them is measured."""
+    trial: float = 0.1
+    """Share of the Gaussians at which ways are tried."""
+    others: tuple[float, float] = (0.3, 0.03)
+    """Further shares for each way."""
+    flat: float = 0.25
+    """Difference of losses in dB below which a gap is flat: another choice of views changes a loss by as much."""
+    close: float = 1.1
+    """Ratio of counts below which a gap is not halved."""
+    fast_tries: int = 3
+    """Largest number of scenes with fast frames."""
 
-FAST_TRIES = 3
-"""Largest number of scenes that are drawn fast."""
+    @property
+    def drawings(self) -> int:
+        """Largest number of settings that :func:`drawings` measures."""
+        return self.fast_tries + 2
 
-MOST_DRAWINGS = FAST_TRIES + 2
-"""Largest number of settings that :func:`drawings` measures."""
+
+WALK = WalkSettings()
 
 Measure = Callable[[Setting], Point]
-"""From a setting to its point; the same each time."""
+"""From a setting to its point; deterministic."""
 
 
 class Enough(Exception):
-    """Raised by a measure when no more is to be measured; it ends a walk."""
+    """Raised by a measure to end a walk."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What may be tried of a scene."""
+    """Settings that a walk or a search may try."""
 
     count: int
-    """Number of Gaussians in it."""
+    """Number of Gaussians in the dense scene."""
     sh_degree: int
     methods: tuple[str, ...] = ("merge",)
     repairs: tuple[Repair, ...] = ("none", "quick")
@@ -74,14 +83,14 @@ def walk(plan: Plan, measure: Measure, dense: Point, cut_psnr: Callable[[int], f
     """Measure settings, one after the other, until all gaps are flat or the measure raises :class:`Enough`.
 
     Args:
-        plan: what may be tried.
-        measure: called for one setting more than once. The same points give the same walk, so that one that was
-            interrupted goes on where it was.
+        plan: settings to try.
+        measure: called for one setting more than once. The same points give the same walk, so that an interrupted walk
+            can continue.
         dense: the dense scene.
-        cut_psnr: from an SH degree to the PSNR, dB, of the dense scene's renders without the bands above, against its
-            own.
+        cut_psnr: from an SH degree to the PSNR in dB of the dense scene's renders without the bands above, against all
+            bands.
     """
-    trial, *others = counts = [*dict.fromkeys(resolve_keep(plan.count, share) for share in (TRIAL, *OTHERS))]
+    trial, *others = counts = [*dict.fromkeys(resolve_keep(plan.count, share) for share in (WALK.trial, *WALK.others))]
     losses: dict[Setting, float] = {}
 
     def loss(setting: Setting) -> float:
@@ -115,64 +124,64 @@ def walk(plan: Plan, measure: Measure, dense: Point, cut_psnr: Callable[[int], f
 
 
 def _search(way: Setting, counts: list[int], loss: Callable[[Setting], float], plan: Plan) -> None:
-    """Measure a way where its loss is the wanted one, between the counts that are known and the dense scene."""
+    """Search along a way for the count with the wanted loss, between the known counts and the dense scene."""
 
     def gain(count: int) -> float:
         return -(loss(replace(way, count=count)) if count < plan.count else 0.0)
 
     known = sorted(counts)
     first = next((count for count in known if gain(count) >= -plan.within), known[-1])
-    close = SearchSettings(precision=CLOSE)
+    close = SearchSettings(precision=WALK.close)
     find_count(gain, -plan.within, at_least=True, first=first, most=plan.count, least=known[0], settings=close)
 
 
 def drawings(plan: Plan, measured: Mapping[Setting, Point], dense: Point, measure: Measure) -> None:
-    """Measure settings that are drawn in other ways, when the walk is over; at most :data:`MOST_DRAWINGS`.
+    """Measure settings with other qualities of frames after the walk; at most ``WALK.drawings``.
 
-    Of the scenes within the wanted loss, the one with the fewest Gaussians is drawn fast. If that loses too much,
-    larger ones are tried. At half the resolution nothing is sharp, which shows least where little is left: the best
-    scenes of a tenth and three tenths are drawn so.
+    Of the scenes within the wanted loss, the scene with the fewest Gaussians is drawn fast. If that loses too much,
+    larger scenes are tried. Half the resolution blurs pictures, which matters least for small scenes: the best scenes
+    of a tenth and three tenths are drawn that way.
 
     Args:
         plan, dense: as for :func:`walk`.
-        measured: all that was measured.
-        measure: as for :func:`walk`; it need not raise anything.
+        measured: all points of the walk.
+        measure: as for :func:`walk`, but it need not end.
     """
     exact = {setting: point for setting, point in measured.items() if setting.drawn == "exact"}
     fewest, _ = recommend([dense, *exact.values()], plan.within, trusted=False)
     if "fast" in plan.drawn and fewest is not dense:
-        way, tries = replace(setting_of(fewest), drawn="fast"), iter(range(FAST_TRIES))
+        way, tries = replace(setting_of(fewest), drawn="fast"), iter(range(WALK.fast_tries))
 
         def gain(count: int) -> float:
             if next(tries, None) is None:
                 raise Enough
             return -loss_of(measure(replace(way, count=count)), dense)
 
-        close = SearchSettings(precision=CLOSE)
+        close = SearchSettings(precision=WALK.close)
         with suppress(Enough):
             find_count(gain, -plan.within, True, way.count, plan.count, least=way.count, settings=close)
     if "half" in plan.drawn:
-        for count in sorted({resolve_keep(plan.count, share) for share in (TRIAL, OTHERS[0])}):
+        for count in sorted({resolve_keep(plan.count, share) for share in (WALK.trial, WALK.others[0])}):
             scenes = [setting for setting in exact if setting.count == count]
             if scenes:
                 measure(replace(min(scenes, key=lambda setting: loss_of(exact[setting], dense)), drawn="half"))
 
 
 def _loss_at(size: int, losses: Mapping[Setting, float]) -> float:
-    """The loss at a size of the file, in bytes, between settings of one way."""
+    """The loss at a size of the file in bytes, interpolated between settings of one way."""
     settings = sorted(losses, key=lambda setting: setting.bytes)
     sizes = [math.log(setting.bytes) for setting in settings]
     return float(np.interp(math.log(size), sizes, [losses[setting] for setting in settings]))
 
 
 def _steepest(ways: list[Setting], losses: Mapping[Setting, float], whole: int) -> Setting | None:
-    """The middle of the gap to halve next; None if all are flat or close."""
-    best, steepest = None, FLAT
+    """The middle of the next gap to halve; None if all gaps are flat or close."""
+    best, steepest = None, WALK.flat
     for way in ways:
         chain = {s.count: loss for s, loss in losses.items() if replace(s, count=way.count) == way} | {whole: 0.0}
         counts = sorted(chain)
         for fewer, more in zip(counts, counts[1:], strict=False):
             middle = round(math.sqrt(fewer * more))
-            if chain[fewer] - chain[more] >= steepest and more >= CLOSE * fewer and middle not in (fewer, more):
+            if chain[fewer] - chain[more] >= steepest and more >= WALK.close * fewer and middle not in (fewer, more):
                 best, steepest = replace(way, count=middle), chain[fewer] - chain[more]
     return best

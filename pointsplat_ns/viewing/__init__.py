@@ -1,1 +1,1 @@
-"""Looking at scenes: camera paths, pictures of two scenes in one, videos, and the viewer in a browser."""
+"""Views of scenes: camera paths, split-screen pictures, videos, and the viewer in a browser."""

@@ -11,45 +11,45 @@ import numpy as np
 import torch
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.viewing.split_screen import Wipe, pixels_of, with_labels, with_line
+from pointsplat_ns.viewing.split_screen import Wipe, to_uint8, with_labels, with_line
 from pointsplat_ns.views import RasterizeMode, View, Views
 
 Split = Literal["side-by-side", "wipe"]
 
 
 @dataclass(frozen=True, eq=False)
-class Cast:
-    """Scenes of a film, and how they share the picture."""
+class FilmScenes:
+    """Scenes of a film, and their layout in the picture."""
 
     first: Gaussians
     second: Gaussians | None = None
     modes: tuple[RasterizeMode, RasterizeMode] = ("classic", "classic")
-    """The rasterize modes of both."""
+    """The rasterize modes of both scenes."""
     split: Split = "side-by-side"
     labels: Sequence[str] = ()
-    """Of the first and the second; none are written if there are none."""
+    """Labels of the first and the second scene; may be empty."""
 
 
-def frames_of(cast: Cast, views: Views, fps: float) -> Iterator[np.ndarray]:
-    """The frames (H, W, 3) uint8 of a film; twice as wide as the views if two scenes are side by side."""
+def render_frames(film: FilmScenes, views: Views, fps: float) -> Iterator[np.ndarray]:
+    """Draw the frames (H, W, 3) uint8 of a film; twice as wide as the views if two scenes are side by side."""
     for index, view in enumerate(views):
-        yield frame_of(cast, view, index / fps)
+        yield render_frame(film, view, index / fps)
 
 
 @torch.no_grad()
-def frame_of(cast: Cast, view: View, seconds: float = 0.0) -> np.ndarray:
-    """One frame (H, W, 3) uint8, at a time that places the line of a wipe."""
-    if cast.second is not None and cast.split == "wipe":
-        # To one side, 0.4 of the width from the middle, to the other and back within 6 s.
+def render_frame(film: FilmScenes, view: View, seconds: float = 0.0) -> np.ndarray:
+    """Draw one frame (H, W, 3) uint8; the time places the line of a wipe."""
+    if film.second is not None and film.split == "wipe":
+        # The line moves 0.4 of the width to one side of the middle, to the other side, and back within 6 s.
         at = 0.5 + 0.4 * math.sin(2 * math.pi * seconds / 6.0)
         column = round(at * view.width)
-        pictures = [Wipe(cast.first, cast.second, view, column, cast.modes)]
+        pictures = [Wipe(film.first, film.second, view, column, film.modes)]
     else:
-        scenes = [cast.first] if cast.second is None else [cast.first, cast.second]
-        modes = zip(cast.modes, cast.modes, strict=True)
+        scenes = [film.first] if film.second is None else [film.first, film.second]
+        modes = zip(film.modes, film.modes, strict=True)
         pictures = [Wipe(scene, None, view, modes=mode) for scene, mode in zip(scenes, modes, strict=False)]
         column = view.width
-    pixels = np.concatenate([pixels_of(picture.draw(0, picture.rows)) for picture in pictures], axis=1)
-    if cast.second is not None:
+    pixels = np.concatenate([to_uint8(picture.draw(0, picture.rows)) for picture in pictures], axis=1)
+    if film.second is not None:
         pixels = with_line(pixels, column)
-    return with_labels(pixels, cast.labels, column) if cast.labels else pixels
+    return with_labels(pixels, film.labels, column) if film.labels else pixels

@@ -1,4 +1,4 @@
-"""Reads camera paths that nerfstudio's viewer saved. What a stranger may have written is checked."""
+"""Reads camera paths that nerfstudio's viewer saved. Files are not trusted: all values are checked."""
 
 from __future__ import annotations
 
@@ -17,26 +17,30 @@ from pointsplat_ns.io.camera_files.cameras import finite
 from pointsplat_ns.io.files import logger, one_line, require_file
 from pointsplat_ns.views import Views
 
-MOST_BYTES = 64_000_000
-"""Maximum size of a file: nerfstudio writes about 500 bytes a frame."""
 
-MOST_FRAMES = 100_000
-MOST_PIXELS = 16_384
-"""Maximum of a picture's width and height."""
+@dataclass(frozen=True)
+class PathLimits:
+    """Limits of camera paths."""
 
-_RIGID = 1e-3
-"""Largest deviation of a rotation; nerfstudio writes 16 digits."""
+    bytes: int = 64_000_000
+    """Maximum size of a file: nerfstudio writes about 500 bytes a frame."""
+    frames: int = 100_000
+    """Maximum number of cameras."""
+    pixels: int = 16_384
+    """Maximum width and height of a picture."""
+    coordinate: float = 1e9
+    """Largest coordinate of a camera, scene units: its square is finite in float32."""
 
-_FARTHEST = 1e9
-"""Largest coordinate of a camera, scene units: squares of it are numbers in float32."""
+
+LIMITS = PathLimits()
 
 
 @dataclass(frozen=True, eq=False)
 class SavedPath:
-    """A camera path as it was saved."""
+    """A saved camera path."""
 
     views: Views
-    """One camera a frame, float64, over black."""
+    """One camera for each frame, float64, with a black background."""
     fps: float | None
     """Frames a second; None if the file does not say."""
 
@@ -47,18 +51,18 @@ def read_path(path: Path | str) -> SavedPath:
 
     Raises:
         SceneError: if there is no such file.
-        DataError: if it is too large, no such JSON, of no pinhole camera, or a camera is not one.
+        DataError: if the file is too large, is not such JSON, has another camera model, or has an invalid camera.
     """
     path = require_file(path, "a camera path saved by nerfstudio's viewer (JSON)")
-    if path.stat().st_size > MOST_BYTES:
+    if path.stat().st_size > LIMITS.bytes:
         raise DataError(f"{path}: {path.stat().st_size / 1e6:.0f} MB; expected a camera path of at most 64 MB")
     try:
         content = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: cannot be read as JSON ({one_line(error, 80)})") from error
     cameras = content.get("camera_path") if isinstance(content, dict) else None
-    if not isinstance(cameras, list) or not 0 < len(cameras) <= MOST_FRAMES:
-        raise DataError(f"{path}: no camera path; expected 'camera_path', a list of 1 to {MOST_FRAMES} cameras")
+    if not isinstance(cameras, list) or not 0 < len(cameras) <= LIMITS.frames:
+        raise DataError(f"{path}: no camera path; expected 'camera_path', a list of 1 to {LIMITS.frames} cameras")
     kind = content.get("camera_type", "perspective")
     if kind != "perspective":
         raise DataError(f"{path}: cameras are {str(kind)[:40]!r}; expected perspective ones")
@@ -76,8 +80,8 @@ def read_path(path: Path | str) -> SavedPath:
 
 def _size(value: Any, name: str, path: Path) -> int:
     number = finite(value)
-    if number is None or number != int(number) or not 1 <= number <= MOST_PIXELS:
-        raise DataError(f"{path}: {name} is {str(value)[:40]}; expected 1 to {MOST_PIXELS} pixels")
+    if number is None or number != int(number) or not 1 <= number <= LIMITS.pixels:
+        raise DataError(f"{path}: {name} is {str(value)[:40]}; expected 1 to {LIMITS.pixels} pixels")
     return int(number)
 
 
@@ -91,11 +95,12 @@ def _camera(camera: Any, index: int, height: int, path: Path) -> tuple[Tensor, f
     turn = pose[:3, :3]
     off = (turn @ turn.T - torch.eye(3)).abs().max()
     last = (pose[3] - pose.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max()
-    if not bool((off <= _RIGID) & (last <= _RIGID) & (torch.linalg.det(turn) > 0)):  # NaN fails too
+    rigid = (off <= 1e-3) & (last <= 1e-3) & (torch.linalg.det(turn) > 0)  # nerfstudio writes 16 digits
+    if not bool(rigid):  # NaN fails too
         raise DataError(f"{path}: the pose of camera {index} is no rigid motion; expected a rotation and a position")
-    if float(pose[:3, 3].abs().max()) > _FARTHEST:
+    if float(pose[:3, 3].abs().max()) > LIMITS.coordinate:
         raise DataError(
-            f"{path}: camera {index} is farther than {_FARTHEST:g} units from the origin; expected it nearer"
+            f"{path}: camera {index} is farther than {LIMITS.coordinate:g} units from the origin; expected it nearer"
         )
     fov = finite(camera.get("fov"))
     if fov is None or not 0.1 <= fov <= 179:

@@ -1,6 +1,6 @@
-"""What to draw next for somebody who moves a camera: small and quick while it moves, whole once it is still.
+"""Chooses the next picture for a viewer: small and quick while the camera moves, full size once it is still.
 
-Nothing here draws, sleeps or knows a camera: who draws asks for steps, and says how long each took.
+The schedule does not draw and knows no camera. The drawing thread takes steps and reports their durations.
 """
 
 from __future__ import annotations
@@ -14,17 +14,22 @@ from typing import Generic, TypeVar
 
 R = TypeVar("R")
 
-MOVING_SIDE = 240
-"""Smallest longer side while the camera moves. If that is too slow, Gaussians are left out."""
 
-LEAST_SHARE = 0.05
-"""Smallest share of the Gaussians drawn while the camera moves."""
+@dataclass(frozen=True)
+class ScheduleSettings:
+    """Settings of the schedule."""
 
-MOVING_SECONDS = 0.15
-"""How long a picture should take while the camera moves."""
+    moving_side: int = 240
+    """Smallest longer side of pictures while the camera moves, pixels. If that is too slow, Gaussians are left out."""
+    least_share: float = 0.05
+    """Smallest share of the Gaussians in pictures while the camera moves."""
+    moving_seconds: float = 0.15
+    """Target duration of a picture while the camera moves."""
+    rest_seconds: float = 0.3
+    """Time without motion before the full picture starts."""
 
-REST_SECONDS = 0.3
-"""How long a camera has to be still before the whole picture is begun."""
+
+SCHEDULE = ScheduleSettings()
 
 
 @dataclass(frozen=True)
@@ -33,24 +38,24 @@ class Step(Generic[R]):
 
     request: R
     number: int
-    """Of the request, ascending."""
+    """Number of the request, ascending."""
     side: int
     """Longer side of the picture, pixels."""
     share: float
     """Share of the Gaussians to draw, in (0, 1]."""
     moving: bool
-    """Whether it is quick enough for a camera that moves. It is then drawn to its end even if a newer request comes, as
-    nothing would ever be seen otherwise."""
+    """Whether the camera may be moving. Such a step is drawn to its end even after a newer request, because otherwise a
+    moving camera would get no picture."""
     whole: bool
-    """Whether it is the whole picture, with all Gaussians. One that is quick enough for a moving camera may be."""
+    """Whether it is the picture of full size with all Gaussians. A step of a moving camera may be that too."""
 
 
 class Schedule(Generic[R]):
-    """The steps from the newest request to its whole picture. May be used from several threads; one draws.
+    """The steps from the newest request to its full picture. Several threads may use it; one of them draws.
 
     Args:
-        full_side: longer side of the whole picture, pixels.
-        clock: gives seconds.
+        full_side: longer side of the full picture, pixels.
+        clock: returns seconds.
     """
 
     def __init__(self, full_side: int = 960, clock: Callable[[], float] = time.monotonic):
@@ -60,14 +65,14 @@ class Schedule(Generic[R]):
         self._number = 0
         self._asked = 0.0
         self._drawn = 0
-        """Longer side of what has been drawn of the newest request; 0 for nothing."""
+        """Longer side of the last picture of the newest request; 0 if there is none."""
         self._complete = True
         self._closed = False
         self._effort = 0.1
-        """Share of the work of the whole picture that is done while the camera moves."""
+        """Share of the full picture's work in a picture of a moving camera."""
 
     def submit(self, request: R, full_side: int | None = None) -> None:
-        """Draw this from now on, and nothing that was asked for before."""
+        """Replace the request; ``full_side`` may change the size of the full picture."""
         with self._changed:
             self._full_side = full_side or self._full_side
             self._request, self._number, self._asked = request, self._number + 1, self._clock()
@@ -75,7 +80,7 @@ class Schedule(Generic[R]):
             self._changed.notify_all()
 
     def close(self) -> None:
-        """End: :meth:`next` gives None, and every step is outdated."""
+        """End: :meth:`next` returns None, and every step is outdated."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -84,17 +89,17 @@ class Schedule(Generic[R]):
         """The next step to draw; waits until there is one.
 
         Args:
-            timeout: seconds to wait at most; by default without end.
+            timeout: longest wait in seconds; by default without limit.
 
         Returns:
-            None if the time is over, or the schedule was closed.
+            The step; None after the timeout, or if the schedule is closed.
         """
         end = None if timeout is None else time.monotonic() + timeout
         with self._changed:
             while not self._closed:
                 wait = None
                 if not self._complete:
-                    wait = self._asked + REST_SECONDS - self._clock() if self._drawn else 0.0
+                    wait = self._asked + SCHEDULE.rest_seconds - self._clock() if self._drawn else 0.0
                     if wait <= 0:
                         return self._step()
                 left = None if end is None else end - time.monotonic()
@@ -109,11 +114,11 @@ class Schedule(Generic[R]):
         return self._closed or (step.number != self._number and not step.moving)
 
     def done(self, step: Step[R], seconds: float) -> None:
-        """Say that a step was drawn, and how long it took."""
+        """Report that a step was drawn, and its duration."""
         with self._changed:
             if step.moving:
-                low, high = (0.2, 1.5)  # least and largest change from one picture to the next
-                change = math.sqrt(MOVING_SECONDS / max(seconds, 1e-3))  # by the root, so that it does not swing
+                low, high = (0.2, 1.5)  # least and largest factor from one picture to the next
+                change = math.sqrt(SCHEDULE.moving_seconds / max(seconds, 1e-3))  # the root prevents oscillation
                 self._effort = min(max(self._effort * min(max(change, low), high), self._least()), 1.0)
             if step.number == self._number:
                 self._drawn = step.side
@@ -121,19 +126,19 @@ class Schedule(Generic[R]):
             self._changed.notify_all()
 
     def _moving_side(self) -> int:
-        return min(MOVING_SIDE, self._full_side)
+        return min(SCHEDULE.moving_side, self._full_side)
 
     def _least(self) -> float:
         """The smallest effort: the smallest side, and the smallest share of the Gaussians."""
-        return (self._moving_side() / self._full_side) ** 2 * LEAST_SHARE
+        return (self._moving_side() / self._full_side) ** 2 * SCHEDULE.least_share
 
     def _step(self) -> Step[R]:
         assert self._request is not None
         full, smallest = self._full_side, self._moving_side()
         if self._drawn == 0:
             side = min(max(round(full * math.sqrt(self._effort)), smallest), full)
-            share = max(min(self._effort / (smallest / full) ** 2, 1.0), LEAST_SHARE)
+            share = max(min(self._effort / (smallest / full) ** 2, 1.0), SCHEDULE.least_share)
             return Step(self._request, self._number, side, share, moving=True, whole=side == full and share == 1.0)
-        # A picture of a size between comes first if the whole one is more than four times as large as the first.
+        # A picture of a middle size comes first if the full side is more than four times the side of the last picture.
         side = full if full <= 4.0 * self._drawn or self._drawn > smallest else round(math.sqrt(full * smallest))
         return Step(self._request, self._number, side, 1.0, moving=False, whole=side == full)

@@ -1,8 +1,7 @@
-"""viser's web server, closed to those whom it is not for.
+"""viser's web server with its security holes closed.
 
-viser 0.2.7 serves any file to who asks for a path with ``..``, talks to any page that the same browser has open, lets
-everybody ask for a public address, tells a service for statistics of each visit, and waits without end where it cannot
-listen.
+viser 0.2.7 serves any file for a path with ``..``, accepts connections from any page of the same browser, gives every
+client a public address on request, reports each visit to a statistics service, and hangs where it cannot listen.
 """
 
 from __future__ import annotations
@@ -21,23 +20,21 @@ import websockets.server as websockets_server
 from pointsplat_ns.errors import PointSplatError
 
 _SERVER: Any = websockets_server
-"""viser starts its server by ``serve`` of this module, which has it under an old name only."""
+"""The module whose ``serve`` viser calls."""
 
 POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob:; worker-src 'self' blob:; "
     "frame-ancestors 'none'"
 )
-"""Content security policy: the page asks nobody but this server for anything."""
-
-_LOCAL = ("localhost", "127.0.0.1", "::1")
+"""Content security policy: the page loads from this server alone."""
 
 
 class Server(viser.ViserServer):
-    """viser's server, never reached by a public address."""
+    """viser's server without public addresses."""
 
     def request_share_url(self, verbose: bool = True) -> None:
-        """Say that there is none."""
+        """Tell clients that there is no public address."""
         for client in self.get_clients().values():
             client.add_notification("Not shared", "This viewer has no public address; see its option --host.")
 
@@ -46,10 +43,11 @@ def start_server(host: str, port: int, label: str) -> Server:
     """Serve on the first free port from ``port`` on; 0 takes any.
 
     Raises:
-        PointSplatError: if nothing can be served there.
+        PointSplatError: if no port is free, or viser cannot be guarded.
     """
     port = free_port(host, port)
-    hosts = (*_LOCAL, host) if host in _LOCAL else None
+    local = ("localhost", "127.0.0.1", "::1")
+    hosts = (*local, host) if host in local else None
     with _guarded(hosts) as served, contextlib.redirect_stdout(io.StringIO()):  # viser prints its own lines
         server = Server(host=host, port=port, label=label, verbose=False)
     if not served:
@@ -59,10 +57,10 @@ def start_server(host: str, port: int, label: str) -> Server:
 
 
 def free_port(host: str, port: int) -> int:
-    """The first port from ``port`` on that nobody listens on.
+    """The first free port from ``port`` on.
 
     Raises:
-        PointSplatError: if there is none, or the host is not one of this machine.
+        PointSplatError: if no port is free, or the host is not an address of this machine.
     """
     if not 0 <= port < 65536:
         raise PointSplatError(f"port {port}; expected 0 to 65535")
@@ -81,12 +79,12 @@ def free_port(host: str, port: int) -> int:
 
 
 def refusal(path: str, headers: Mapping[str, str], hosts: tuple[str, ...] | None) -> http.HTTPStatus | None:
-    """Why a request is not served; None if it is.
+    """The status of a refused request; None if it is served.
 
     Args:
-        path: as it was asked for.
-        headers: of the request.
-        hosts: names that the server may be called by; None for any.
+        path: path of the request.
+        headers: headers of the request.
+        hosts: accepted names of the server; None for any.
     """
     target = path.partition("?")[0]
     parts = target.split("/")
@@ -94,16 +92,16 @@ def refusal(path: str, headers: Mapping[str, str], hosts: tuple[str, ...] | None
         return http.HTTPStatus.NOT_FOUND
     asked, origin = headers.get("Host", ""), headers.get("Origin")
     name = asked[1 : asked.find("]")] if asked.startswith("[") else asked.partition(":")[0]
-    if hosts is not None and name not in hosts:  # a page elsewhere whose name leads here
+    if hosts is not None and name not in hosts:  # a foreign page whose name resolves to this server
         return http.HTTPStatus.FORBIDDEN
-    if origin is not None and origin.partition("://")[2] != asked:  # a page elsewhere
+    if origin is not None and origin.partition("://")[2] != asked:  # a foreign page
         return http.HTTPStatus.FORBIDDEN
     return None
 
 
 @contextlib.contextmanager
 def _guarded(hosts: tuple[str, ...] | None) -> Iterator[list[bool]]:
-    """While this is open, servers that are started refuse what :func:`refusal` says. The list then holds one."""
+    """Make servers that start in this context refuse requests by :func:`refusal`. The list gets an entry for each."""
     plain, served = _SERVER.serve, []
 
     def serve(handler: Any, host: str, port: int, *, process_request: Any, **options: Any) -> Any:

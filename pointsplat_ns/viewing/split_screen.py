@@ -1,4 +1,4 @@
-"""Two scenes in one picture, seen from the same camera: the line between them, and labels."""
+"""Two scenes in one picture of one camera, with a line between them and labels."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 
 
 class Wipe:
-    """The picture of one or two scenes from one view: the first left of a column, the second from there on. What is not
-    seen of a scene is not drawn.
+    """The picture of one or two scenes in one view: the first left of a column, the second from there on. Hidden parts
+    of a scene are not drawn.
 
     Args:
         first: N Gaussians.
-        second: Gaussians; None leaves the picture to the first.
+        second: Gaussians; None draws the first alone.
         view: the camera of both.
-        column: where the second begins, pixels from 0 to the view's width.
+        column: first column of the second scene, pixels, from 0 to the view's width.
         modes: the rasterize modes of both; by default the view's.
-        quality: what to give up for speed.
+        quality: of the rasterizer.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Wipe:
         quality: QualityName = "exact",
     ):
         self.column = view.width if second is None else min(max(column, 0), view.width)
-        """Where the second scene begins, pixels."""
+        """First column of the second scene, pixels."""
         left, right = modes or (view.rasterize_mode, view.rasterize_mode)
         self._first = Drawing(first, replace(view, rasterize_mode=left), quality) if self.column > 0 else None
         self._second = None
@@ -68,14 +68,14 @@ class Wipe:
         return torch.cat(parts, dim=1)
 
 
-def pixels_of(picture: Tensor) -> np.ndarray:
+def to_uint8(picture: Tensor) -> np.ndarray:
     """A picture (H, W, 3) in [0, 1] as uint8."""
     return (255 * picture.clamp(0, 1)).round().to(torch.uint8).cpu().numpy()
 
 
 def with_line(pixels: np.ndarray, column: int) -> np.ndarray:
-    """A picture (H, W, 3) uint8 with a thin line before a column: white, dark at its sides so that it shows on white.
-    At either end of the picture there is none."""
+    """A picture (H, W, 3) uint8 with a thin line before a column: white with dark sides, so that it is visible on
+    white. There is no line at the ends of the picture."""
     if not 0 < column < pixels.shape[1]:
         return pixels
     pixels = pixels.copy()
@@ -87,9 +87,9 @@ def with_line(pixels: np.ndarray, column: int) -> np.ndarray:
 
 
 def with_labels(pixels: np.ndarray, labels: Sequence[str], column: int) -> np.ndarray:
-    """A picture (H, W, 3) uint8 with labels on dark ground: at the top left, and at the top right if there are two.
+    """A picture (H, W, 3) uint8 with labels on dark ground, at the top left and the top right.
 
-    Each is shortened to half of the picture, and is left out where its side of ``column`` is too narrow for it.
+    A label is shortened to half of the picture, and left out if its side of ``column`` is too narrow.
     """
     from PIL import Image, ImageDraw
 
@@ -115,12 +115,12 @@ def _font(size: int) -> FreeTypeFont:
     import matplotlib
     from PIL import ImageFont
 
-    # It has the letters of most languages; Pillow's own has only Latin ones.
+    # This font has the letters of most languages; Pillow's has Latin ones only.
     return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
 
 
 def _shortened(text: str, font: FreeTypeFont, longest: int) -> str:
-    """The text, its end replaced by dots if it is longer than so many pixels; empty if nothing fits."""
+    """The text with its end replaced by dots if it is wider than ``longest`` pixels; empty if no letter fits."""
     text = " ".join(text.split())
     if font.getlength(text) <= longest:
         return text

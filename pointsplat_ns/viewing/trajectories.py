@@ -1,4 +1,4 @@
-"""Camera paths made of some views of a scene: exactly through them, a walk past them, a turn about what they show."""
+"""Camera paths from views of a scene: exactly through them, a walk past them, an orbit about their content."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.views import Views
 
 STOPS = 12
-"""Maximum number of views that a walk passes."""
+"""Maximum number of views in a walk."""
 
 
 def along(views: Views, frames: int) -> Views:
     """A smooth path exactly through views, in their order: each is one of its frames.
 
-    Positions run without overshoot (PCHIP), rotations with steady acceleration (a spline of rotations), both in time
-    that is spent by the way and the turn from one view to the next.
+    Positions are interpolated without overshoot (PCHIP), rotations with continuous acceleration (a spline of
+    rotations). The time between two views is proportional to their distance plus their angle.
 
     Args:
-        views: C cameras; of more than ``frames``, some are left out.
+        views: C cameras; some are left out if there are more than ``frames``.
         frames: number of frames, at least 1.
 
     Returns:
@@ -49,12 +49,12 @@ def along(views: Views, frames: int) -> Views:
 
 
 def walk(views: Views, frames: int, up: Tensor | None = None) -> Views:
-    """A smooth, upright walk past some views of a scene, in an order that makes it short. Cameras do not lean.
+    """A smooth, upright walk past some views of a scene, in a short order. Cameras do not roll.
 
     Args:
-        views: C cameras; at most 12 of them, evenly spread, are passed.
+        views: C cameras; at most 12 of them, evenly spread, are used.
         frames: number of frames, at least 1.
-        up: (3,) of length 1, which way is up; by default as the views have it.
+        up: (3,) up direction of length 1; by default from the views.
 
     Returns:
         ``frames`` cameras, float64.
@@ -77,16 +77,16 @@ def walk(views: Views, frames: int, up: Tensor | None = None) -> Views:
 
 
 def orbit(views: Views, frames: int, centre: Tensor, up: Tensor | None = None) -> Views:
-    """A turn about what views look at, at their usual distance and height; it ends where it began.
+    """A closed orbit about the common focus of views, at their median distance and height.
 
-    Where no view is on some side, the path swings to and fro over the others. In a room, where views look away from
-    each other, it is one turn on the spot.
+    Where a side has no views, the path swings to and fro over the other sides. In a room, where views look away from
+    each other, the camera turns on the spot.
 
     Args:
         views: C cameras.
         frames: number of frames, at least 1.
-        centre: (3,) of the content of the scene, which decides where the views do not.
-        up: (3,) of length 1, which way is up; by default as the views have it.
+        centre: (3,) centre of the scene's content, for views without a common focus.
+        up: (3,) up direction of length 1; by default from the views.
 
     Returns:
         ``frames`` cameras, float64.
@@ -97,7 +97,7 @@ def orbit(views: Views, frames: int, centre: Tensor, up: Tensor | None = None) -
     _check(views, frames)
     places, turns = (torch.from_numpy(values) for values in _poses(views))
     ahead, up = turns[:, :, 2], up_of(views) if up is None else up
-    focus = _looked_at(places, ahead, centre.double())
+    focus = _focus(places, ahead, centre.double())
     time = 2 * math.pi * torch.arange(frames, dtype=torch.float64) / frames
     still = np.zeros(frames)
     if float((((focus - places) * ahead).sum(1) > 0).double().mean()) < 0.7:
@@ -114,21 +114,21 @@ def orbit(views: Views, frames: int, centre: Tensor, up: Tensor | None = None) -
 
 
 def up_of(views: Views) -> Tensor:
-    """Which way is up for people who held these cameras level, (3,) float64 of length 1.
+    """The up direction of cameras that are held level, (3,) float64 of length 1.
 
-    The direction at right angles to their horizontal axes, as nearly as there is one; where these are all alike, the
-    mean of what is up in the pictures.
+    It is the direction most nearly perpendicular to their horizontal axes; where these are all alike, the mean of the
+    cameras' own up directions.
     """
     turns = torch.from_numpy(_poses(views)[1])
     right, up = turns[:, :, 0], -turns[:, :, 1].mean(0)
     sizes, directions = torch.linalg.eigh(right.T @ right / len(right))
-    if float(sizes[1] - sizes[0]) > 0.01:  # less does not tell one axis from the other
+    if float(sizes[1] - sizes[0]) > 0.01:  # a smaller difference does not determine the axis
         up = directions[:, 0] * torch.sign(directions[:, 0] @ up)
     return up / up.norm().clamp_min(1e-300)
 
 
 def fitted(views: Views, width: int, height: int) -> Views:
-    """The same cameras with pictures of another size: as much is seen from top to bottom, more or less at the sides."""
+    """The same cameras with pictures of another size. The vertical field of view stays; the horizontal one changes."""
     factor = height / views.height
     Ks = views.Ks.double() * factor
     Ks[:, 0, 2] = width / 2 + (views.Ks[:, 0, 2].double() - views.width / 2) * factor
@@ -160,7 +160,7 @@ def _viewmats(places: np.ndarray, turns: np.ndarray) -> Tensor:
 
 
 def _posed(views: Views, viewmats: Tensor, place: np.ndarray, knots: list[int] | np.ndarray) -> Views:
-    """Cameras (F, 4, 4) like the views, their intrinsics interpolated at ``place`` (F,) between these."""
+    """Cameras (F, 4, 4) with the views' intrinsics, interpolated at the fractional indices ``place`` (F,)."""
     Ks = views.Ks.double().cpu()
     low = torch.from_numpy(np.floor(place)).long().clamp(0, len(views) - 1)
     share = torch.from_numpy(np.asarray(place) - low.numpy())[:, None, None]
@@ -169,7 +169,7 @@ def _posed(views: Views, viewmats: Tensor, place: np.ndarray, knots: list[int] |
 
 
 def _distances(places: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Distances between views, (C, C): that of positions in units of its mean, plus the angle in radians."""
+    """Distances between views (C, C): distance of positions over its mean, plus the angle in radians."""
     way = np.linalg.norm(places[:, None] - places[None], axis=2)
     trace = np.einsum("aij,bij->ab", turns, turns)
     return way / max(float(way.mean()), 1e-300) + np.arccos(np.clip((trace - 1) / 2, -1, 1))
@@ -183,7 +183,7 @@ def _lengths(places: np.ndarray, turns: np.ndarray) -> np.ndarray:
 
 
 def _knots(lengths: np.ndarray, frames: int) -> np.ndarray:
-    """Which frame each of C views is, (C,) ascending from 0 to ``frames - 1``, by the lengths (C - 1,) between them."""
+    """Frame of each of C views, (C,) ascending from 0 to ``frames - 1``, by the lengths (C - 1,) between them."""
     count = len(lengths) + 1
     done = np.concatenate([[0.0], np.cumsum(lengths)])
     share = done / done[-1] if done[-1] > 0 else np.arange(count) / max(count - 1, 1)
@@ -198,7 +198,7 @@ def _smooth(knots: np.ndarray, values: np.ndarray, frames: int) -> np.ndarray:
 
 
 def _tour(distances: np.ndarray) -> list[int]:
-    """An order of the views (C, C) apart: from the best start always on to the nearest that is left."""
+    """A short order of views by their distances (C, C): from the best start, always to the nearest remaining view."""
 
     def from_start(start: int) -> tuple[float, list[int]]:
         order, total = [start], 0.0
@@ -214,32 +214,32 @@ def _tour(distances: np.ndarray) -> list[int]:
 
 
 def _angles(directions: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
-    """Angles (n,) about ``up`` (3,) and above the level of directions (n, 3), radians."""
+    """Yaw about ``up`` (3,) and pitch of directions (n, 3), radians, (n,) each."""
     right, ahead = level_directions(up, directions.new_tensor([0.0, math.pi / 2]))
     height = (directions @ up) / directions.norm(dim=1).clamp_min(1e-300)
     return torch.atan2(directions @ ahead, directions @ right), torch.asin(height.clamp(-1, 1))
 
 
 def _upright(eyes: Tensor, angles: Tensor, up: Tensor) -> Tensor:
-    """World-to-camera matrices (F, 4, 4) at ``eyes`` (F, 3), by angles (F, 2) as :func:`_angles` gives them."""
+    """World-to-camera matrices (F, 4, 4) at ``eyes`` (F, 3), from yaw and pitch (F, 2) of :func:`_angles`."""
     yaw, pitch = angles.unbind(1)
     directions = pitch.cos()[:, None] * level_directions(up, yaw) + pitch.sin()[:, None] * up
     return look_at(eyes, eyes + directions, up)
 
 
-def _looked_at(places: Tensor, ahead: Tensor, centre: Tensor) -> Tensor:
-    """The point (3,) nearest to the optical axes of cameras, drawn a little to ``centre``."""
+def _focus(places: Tensor, ahead: Tensor, centre: Tensor) -> Tensor:
+    """The point (3,) nearest to the optical axes of cameras, with a small pull to ``centre``."""
     across = torch.eye(3, dtype=torch.float64) - ahead[:, :, None] * ahead[:, None]
-    pull = 0.02 * len(places) * torch.eye(3, dtype=torch.float64)  # decides where all look the same way
+    pull = 0.02 * len(places) * torch.eye(3, dtype=torch.float64)  # decides where all cameras look the same way
     return torch.linalg.solve(across.sum(0) + pull, (across @ places[:, :, None]).sum(0)[:, 0] + pull @ centre)
 
 
 def _swing(sides: Tensor, time: Tensor) -> Tensor:
-    """Angles (F,) at times (F,) from 0 to 2 pi: all around, or to and fro between the sides (n,) there are."""
+    """Angles (F,) at times (F,) from 0 to 2 pi: a full turn, or to and fro over the views' angles ``sides`` (n,)."""
     sides = sides.sort().values
     gaps = torch.cat([sides[1:] - sides[:-1], sides[:1] + 2 * math.pi - sides[-1:]])
     widest = int(gaps.argmax())
-    if float(gaps[widest]) < math.radians(100):  # nobody looked from there: not crossed
+    if float(gaps[widest]) < math.radians(100):  # no views there: not crossed
         return sides[0] + time
     arc = 2 * math.pi - float(gaps[widest])
     return sides[(widest + 1) % len(sides)] + arc * 0.5 * (1 + time.sin())

@@ -1,4 +1,4 @@
-"""Writes pictures one after another: an MP4 video, a folder of PNG files, or one PNG. Nothing is left half-written."""
+"""Writes frames to an MP4 video, a folder of PNG files, or one PNG, completely or not at all."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from pointsplat_ns.io.files import lack_of_room, one_line, replacing
 Kind = Literal["video", "frames", "picture"]
 
 ENCODER = "libx264"
-"""ffmpeg's encoder of H.264; PyAV's wheels have it, builds of one's own may lack it."""
+"""ffmpeg's encoder of H.264. PyAV's wheels have it; other builds may lack it."""
 
 _FRAME = re.compile(r"frame_\d{5,}\.png")
 
 
 def kind_of(output: Path | str) -> Kind:
-    """Kind of output that a path names: a video (.mp4), one picture (.png), or a folder of pictures (no suffix).
+    """Kind of output of a path: a video (.mp4), one picture (.png), or a folder of pictures (no suffix).
 
     Raises:
-        SceneError: if it has another suffix.
+        SceneError: if the path has another suffix.
     """
     path = Path(output)
     kinds: dict[str, Kind] = {".mp4": "video", ".png": "picture", "": "frames"}
@@ -42,10 +42,10 @@ def kind_of(output: Path | str) -> Kind:
 
 
 def check_output(output: Path | str, force: bool) -> Kind:
-    """Kind of output that a path names, checked before the long work.
+    """Kind of output of a path, checked before the long work.
 
     Raises:
-        SceneError: as :func:`kind_of`, or if there is something that must not be overwritten.
+        SceneError: as :func:`kind_of`, or if a file must not be overwritten.
     """
     path, kind = Path(output), kind_of(output)
     if kind == "frames" and path.exists():
@@ -61,13 +61,13 @@ def check_output(output: Path | str, force: bool) -> Kind:
 
 
 def write_frames(frames: Iterable[np.ndarray], output: Path | str, fps: float, force: bool = False) -> int:
-    """Write pictures to what ``output`` names, all or none of them.
+    """Write all frames or none.
 
     Args:
-        frames: (H, W, 3) uint8 each, of one size; of even width and height for a video. One for a picture.
+        frames: (H, W, 3) uint8 each, of one size; of even width and height for a video. One frame for a picture.
         output: a file that ends in .mp4 or .png, or a folder.
-        fps: frames a second, of a video.
-        force: overwrite what is there.
+        fps: frames a second of a video.
+        force: overwrite existing files.
 
     Returns:
         The number of frames.
@@ -103,8 +103,8 @@ def _write_folder(frames: Iterable[np.ndarray], folder: Path) -> int:
 
 @contextmanager
 def _folder_replacing(folder: Path) -> Iterator[Path]:
-    """A temporary folder beside ``folder``, whose files take the place of those in ``folder`` when the block ends
-    without an error; else it is removed."""
+    """A temporary folder beside ``folder``. Its files replace those in ``folder`` if the block ends without an error;
+    else it is removed."""
     part: Path | None = None
     try:
         folder.absolute().parent.mkdir(parents=True, exist_ok=True)
@@ -139,9 +139,11 @@ def _write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
                     if count == 0:
                         stream.height, stream.width = pixels.shape[:2]
                         stream.pix_fmt = "yuv420p"
-                        stream.gop_size = max(round(fps), 1)  # so that players find any second quickly
+                        stream.gop_size = max(round(fps), 1)  # for quick seeking
                         context = stream.codec_context
-                        context.colorspace = context.color_primaries = context.color_trc = 1  # BT.709, said in the file
+                        context.colorspace = context.color_primaries = context.color_trc = (
+                            1  # BT.709, written to the file
+                        )
                         context.color_range = ColorRange.MPEG
                     frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
                     frame = frame.reformat(
@@ -156,6 +158,6 @@ def _write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
                 f"{path}: PyAV {av.__version__} has no {ENCODER}; expected its wheel (pip install --force-reinstall "
                 "--only-binary av av), or write frames: a name without a dot"
             ) from error
-        except av.FFmpegError as error:  # for one, of a full disk
+        except av.FFmpegError as error:  # such as a full disk
             raise OSError(one_line(error)) from error
     return count

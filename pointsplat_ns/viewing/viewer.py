@@ -1,4 +1,4 @@
-"""The viewer: viser's page, with pictures that are drawn here."""
+"""The viewer: viser's page, with pictures by this package's rasterizer."""
 
 from __future__ import annotations
 
@@ -25,61 +25,61 @@ from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.rasterizer import render_depth
 from pointsplat_ns.system.memory import share_freed_memory
 from pointsplat_ns.viewing.camera_path import views_upright
-from pointsplat_ns.viewing.painter import Camera, Painter, Sight
+from pointsplat_ns.viewing.painter import Camera, Painter, PictureRequest
 from pointsplat_ns.viewing.schedule import Step
-from pointsplat_ns.viewing.selection import Selection, ShownScene
+from pointsplat_ns.viewing.selection import ReducedScene, Selection
 from pointsplat_ns.viewing.server import start_server
 from pointsplat_ns.viewing.trajectories import up_of
 from pointsplat_ns.views import RasterizeMode, View, Views
 
 
 @dataclass(frozen=True, eq=False)
-class Exhibit:
-    """A scene to show."""
+class ViewedScene:
+    """A scene for the viewer."""
 
     name: str
     path: Path | None
-    """Where it was read from."""
+    """Path of the scene; None if it was given as Gaussians."""
     scene: Gaussians
     source: ViewSource
-    """Where views of it come from."""
+    """Source of views."""
     mode: RasterizeMode
-    """How it was trained to be drawn."""
+    """Rasterize mode of its training."""
 
 
 class Viewer:
     """Shows one or two scenes in the browser, until it is closed; also the context of a ``with`` block.
 
     Args:
-        exhibits: the scenes; the second is in the same place as the first.
+        scenes: one or two scenes, both in the same frame.
         host: the address to listen on.
-        port: the first port that is tried; 0 takes any that is free.
-        up: (3,) of length 1, which way is up; by default as the views of the first scene have it.
+        port: the first port to try; 0 takes any free port.
+        up: (3,) up direction of length 1; by default from the views of the first scene.
 
     Raises:
-        DataError: if there is no place to look from.
-        PointSplatError: if the port cannot be listened on.
+        DataError: if there are no views.
+        PointSplatError: if no port is free.
     """
 
-    def __init__(self, exhibits: Sequence[Exhibit], host: str, port: int, up: Tensor | None = None):
-        share_freed_memory()  # each page that comes has a thread that draws
-        first = exhibits[0]
-        self._exhibits = exhibits
+    def __init__(self, scenes: Sequence[ViewedScene], host: str, port: int, up: Tensor | None = None):
+        share_freed_memory()  # each page has a drawing thread
+        first = scenes[0]
+        self._scenes = scenes
         self._starts = views_upright(first.scene, first.source, 12, up)
         self.origin = first.source.origin
-        """Text that says where the first view comes from."""
+        """Text on the origin of the first view."""
         self._up = up_of(self._starts) if up is None else up
         self._small = thinned(first.scene, DEFAULTS.probe_count)
         self._painters: dict[int, Painter] = {}
         self._notes: dict[int, Any] = {}
         self._at = 0
         self._closed = False
-        # It logs each page that is closed before it has loaded, with a traceback.
+        # websockets logs a traceback for each page that is closed before it has loaded.
         logging.getLogger("websockets").setLevel(logging.CRITICAL + 1)
         self._server = start_server(host, port, "pointsplat")
         self._selections: list[Selection] = []
-        for exhibit in exhibits:
-            self._selections.append(Selection(exhibit.scene, exhibit.source, self._changed))
+        for viewed in scenes:
+            self._selections.append(Selection(viewed.scene, viewed.source, self._changed))
         self._build()
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._disconnected)
@@ -115,16 +115,16 @@ class Viewer:
     def _build(self) -> None:
         """The panel beside the picture."""
         gui = self._server.gui
-        gui.configure_theme(dark_mode=True, show_logo=False)  # without its share button viser 0.2.7 shows nothing
+        gui.configure_theme(dark_mode=True, show_logo=False)  # viser 0.2.7 needs its share button to work
         self._server.scene.set_up_direction(self._up.numpy())
         self._budgets = []
-        for exhibit, selection in zip(self._exhibits, self._selections, strict=True):
-            gui.add_markdown(f"**{_code(exhibit.name)}**")
-            slider = gui.add_slider("Kept, %", 1, 100, 1, 100, hint="Gaussians that are shown of this scene")
+        for viewed, selection in zip(self._scenes, self._selections, strict=True):
+            gui.add_markdown(f"**{_code(viewed.name)}**")
+            slider = gui.add_slider("Kept, %", 1, 100, 1, 100, hint="share of this scene's Gaussians")
             slider.on_update(_chooser(selection))
             self._budgets.append(gui.add_markdown(""))
-        two = len(self._exhibits) == 2
-        hint = "left of the line the first scene" if two else "left of the line what is kept, right of it all"
+        two = len(self._scenes) == 2
+        hint = "left of the line the first scene" if two else "left of the line the kept Gaussians, right of it all"
         self._line = gui.add_slider("Wipe, %", 0, 100, 1, 50 if two else 100, hint=hint)
         self._line.on_update(lambda _: self._redraw())
         self._side = gui.add_slider("Pixels", 240, 1920, 80, 960, hint="longer side of the picture at rest")
@@ -135,19 +135,19 @@ class Viewer:
         self._describe()
 
     def _describe(self) -> None:
-        """Text on the part of each scene that is shown, with the command that writes it."""
-        for exhibit, selection, note in zip(self._exhibits, self._selections, self._budgets, strict=True):
-            shown, whole = selection.shown, len(selection.scene)
-            lines = [f"{len(shown.scene):,} of {whole:,} Gaussians, {shown.how}"]
-            if selection.news:
-                lines.append(selection.news)
-            elif exhibit.path is not None and selection.percent < 100:
-                command = ["pointsplat", "prune", str(exhibit.path), "--keep", f"{selection.percent}%"]
+        """Write text on the current part of each scene, with the command that makes it."""
+        for viewed, selection, note in zip(self._scenes, self._selections, self._budgets, strict=True):
+            current, whole = selection.current, len(selection.scene)
+            lines = [f"{len(current.scene):,} of {whole:,} Gaussians, {current.how}"]
+            if selection.status:
+                lines.append(selection.status)
+            elif viewed.path is not None and selection.percent < 100:
+                command = ["pointsplat", "prune", str(viewed.path), "--keep", f"{selection.percent}%"]
                 lines.append(_code(shlex.join(command)))
             note.content = "  \n".join(lines)
 
     def _changed(self, picture: bool) -> None:
-        """A selection has changed, or there is news of it. News alone must not begin pictures anew."""
+        """Handle a new scene or status of a selection. A new status alone must not restart pictures."""
         self._describe()
         if picture:
             self._redraw()
@@ -159,14 +159,14 @@ class Viewer:
     def _connected(self, client: Any) -> None:
         self._notes[client.client_id] = client.gui.add_markdown("drawing")
 
-        def show(pixels: np.ndarray, step: Step[Sight], seconds: float) -> None:
-            stands_in = step.moving and not step.whole
-            client.scene.set_background_image(pixels, format="jpeg", jpeg_quality={True: 75, False: 95}[stands_in])
+        def show(pixels: np.ndarray, step: Step[PictureRequest], seconds: float) -> None:
+            preview = step.moving and not step.whole
+            client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=75 if preview else 95)
             size = f"{pixels.shape[1]} x {pixels.shape[0]}"
             share = "" if step.share == 1 else f", {step.share:.0%} of the Gaussians"
-            state = "moving: " if stands_in else ""
+            state = "moving: " if preview else ""
             note = self._notes.get(client.client_id)
-            if note is not None:  # the page has not gone meanwhile
+            if note is not None:  # the page is still open
                 note.content = f"{state}{size}, {1000 * seconds:.0f} ms a frame{share}"
 
         self._painters[client.client_id] = Painter(show)
@@ -178,19 +178,19 @@ class Viewer:
         painter = self._painters.pop(client.client_id, None)
         self._notes.pop(client.client_id, None)
         if painter is not None:
-            painter.schedule.close()  # without waiting, as the server's own thread calls this
+            painter.schedule.close()  # without waiting, because this is the server's thread
         later = threading.Timer(1.0, self._forget_gone)  # s until its socket is closed
         later.daemon = True
         later.start()
 
     def _forget_gone(self) -> None:
-        """Send something to all pages: viser 0.2.7 keeps one that has gone, with its socket, until that fails."""
+        """Send text to all pages: viser 0.2.7 keeps a closed page and its socket until sending fails."""
         with suppress(RuntimeError):  # the server may end meanwhile
             if not self._closed:
                 self._describe()
 
     def _look(self, client: Any) -> None:
-        """Draw what a client's camera sees."""
+        """Request the picture of a client's camera."""
         painter = self._painters.get(client.client_id)
         if painter is None:
             return
@@ -198,14 +198,14 @@ class Viewer:
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, :3] = rotation_matrices(torch.tensor(np.asarray(camera.wxyz, np.float64))[None])[0]
         pose[:3, 3] = torch.tensor(np.asarray(camera.position, np.float64))
-        seen = Camera(
+        drawn = Camera(
             invert_rigid(pose[None])[0], float(camera.fov), float(camera.aspect), start.background, start.near_plane
         )
         first = self._selections[0]
-        second: ShownScene | None = self._selections[1].shown if len(self._selections) == 2 else first.whole
-        modes = self._exhibits[0].mode, self._exhibits[-1].mode
-        sight = Sight(seen, first.shown, second, self._line.value / 100, modes)
-        painter.schedule.submit(sight, int(self._side.value))
+        second: ReducedScene | None = self._selections[1].current if len(self._selections) == 2 else first.whole
+        modes = self._scenes[0].mode, self._scenes[-1].mode
+        request = PictureRequest(drawn, first.current, second, self._line.value / 100, modes)
+        painter.schedule.submit(request, int(self._side.value))
 
     def _next(self, client: Any) -> None:
         self._at = (self._at + 1) % len(self._starts)
@@ -217,7 +217,7 @@ class Viewer:
         self._put(client)
 
     def _put(self, client: Any) -> None:
-        """Put a client's camera at the current view, upright."""
+        """Move a client's camera to the current view, upright."""
         view = self._starts[self._at]
         place, ahead = self._pose(view)
         with client.atomic():
@@ -227,13 +227,14 @@ class Viewer:
             client.camera.look_at = (place + ahead).numpy()
 
     def _pose(self, view: View) -> tuple[Tensor, Tensor]:
-        """The place (3,) of a view, and the way (3,) to what is in its middle, about which the camera will turn."""
+        """The position (3,) of a view, and the vector (3,) to the centre of its content, about which the camera
+        turns."""
         pose = invert_rigid(view.viewmat[None].double())[0]
         one = Views(view.viewmat[None], view.K[None], view.width, view.height, view.background).resized(48)[0]
         depth, alpha = render_depth(self._small, one)
-        seen = depth[alpha > 0.5]
-        far = float(seen.median()) if len(seen) else 1.0
-        return pose[:3, 3], pose[:3, 2] * max(far, 10 * view.near_plane)
+        covered = depth[alpha > 0.5]
+        distance = float(covered.median()) if len(covered) else 1.0
+        return pose[:3, 3], pose[:3, 2] * max(distance, 10 * view.near_plane)
 
 
 def _chooser(selection: Selection) -> Callable[[Any], None]:
@@ -246,5 +247,5 @@ def _chooser(selection: Selection) -> Callable[[Any], None]:
 
 
 def _code(text: str) -> str:
-    """A text as it is: the page would run what stands in braces."""
+    """A text as Markdown code: the page would run text in braces."""
     return "`" + "".join(sign if sign.isprintable() and sign != "`" else "?" for sign in text) + "`"

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from pointsplat_ns.compression.budget_search import QUALITY, needed_sh_degree, smallest_within
+from pointsplat_ns.compression.budget_search import BUDGETS, needed_sh_degree, smallest_within
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.pruning import METHODS, cut_sh, score_of, select
@@ -24,7 +24,9 @@ def test_the_scene_found_is_good_enough_and_a_little_smaller_one_is_not(hollow_b
     assert found.psnr == reference.psnr(found.scene)[0] >= wanted and found.worst <= found.psnr + 1e-9
     count = len(found.scene)
     below = [k for k in calls if k < count]
-    assert found.psnr <= wanted + QUALITY.tolerance or count <= max(max(below) * QUALITY.precision, max(below) + 1)
+    assert found.psnr <= wanted + BUDGETS.psnr.tolerance or count <= max(
+        max(below) * BUDGETS.psnr.precision, max(below) + 1
+    )
     assert all(found.tried[k] < wanted for k in below)
     assert len(calls) == len(set(calls)) <= 8 and all(0 <= share <= 1 for share in shares)
 

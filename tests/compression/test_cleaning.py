@@ -218,7 +218,7 @@ def test_the_lines_count_only_what_went(room, views):
     source = ViewSource(scene, given=views)
     total = sum(map(len, junk_of(scene)))
     assert clean_scene(scene, len(scene), source).notes == (
-        f"clean: nothing removed; {total} could go, but all are asked for",
+        f"clean: nothing removed; {total} could go, but the budget keeps all",
     )
     first, second = clean_scene(scene, len(scene) - 3, source).notes
     assert first.startswith("clean: 2 of ") and second.startswith("clean: 1 of ")

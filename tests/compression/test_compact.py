@@ -14,10 +14,10 @@ from pointsplat_ns.compression import acceptance
 from pointsplat_ns.compression.acceptance import (
     ACCEPTANCE,
     AcceptanceSettings,
-    at_strength,
-    bottom_of_parabola,
     closer_in,
-    helps,
+    improves,
+    interpolate,
+    parabola_minimum,
 )
 from pointsplat_ns.compression.closeness import Closeness, DenseReference
 from pointsplat_ns.compression.compact import Compacted, compact_scene
@@ -144,7 +144,7 @@ def test_a_refiner_that_goes_too_far_is_taken_part_of_the_way(scene, views):
     assert torch.allclose(result.scene.scales, pruned.scales + 0.8 * result.strength)
     assert torch.equal(result.scene.means, pruned.means)
     shares = torch.linspace(0, 1, 21).tolist()
-    best = max(reference.psnr(at_strength(pruned, far(pruned), share))[0] for share in shares)
+    best = max(reference.psnr(interpolate(pruned, far(pruned), share))[0] for share in shares)
     # Most of what there is to gain, not all: the errors are no exact parabola.
     assert result.after.psnr - result.before.psnr > 2 / 3 * (best - result.before.psnr) > 0
 
@@ -163,13 +163,13 @@ def test_a_share_of_the_way_is_linear_in_what_is_stored_and_finite_where_the_sta
     before.opacities[0], before.scales[1, 2] = math.inf, -math.inf
     after = before.map(lambda value: value + 2.0)
     after.opacities[2] = math.inf
-    assert at_strength(before, after, 1) is after and same(at_strength(before, after, 0.0), before)
-    half = at_strength(before, after, 0.5)
+    assert interpolate(before, after, 1) is after and same(interpolate(before, after, 0.0), before)
+    half = interpolate(before, after, 0.5)
     assert torch.allclose(half.means, before.means + 1.0) and bool(half.usable().all())
     assert half.opacities[0] == math.inf and half.scales[1, 2] == -math.inf
     assert half.opacities[2] == before.opacities[2]
     huge = before.replace(means=torch.full_like(before.means, 3e38))
-    mixed = at_strength(huge, huge.replace(means=-huge.means), 0.5)  # their difference overflows
+    mixed = interpolate(huge, huge.replace(means=-huge.means), 0.5)  # their difference overflows
     assert bool(mixed.means.isfinite().all())
 
 
@@ -177,13 +177,13 @@ def test_a_share_of_the_way_is_linear_in_what_is_stored_and_finite_where_the_sta
 def test_the_bottom_of_a_parabola_is_found_whatever_its_scale(scale):
     for bottom in (0.1, 0.3, 0.5, 0.97):
         values = [scale * (3 * (s - bottom) ** 2 + 0.2) for s in (0.0, 0.5, 1.0)]
-        assert bottom_of_parabola(*values) == pytest.approx(bottom, abs=1e-9)
-    assert bottom_of_parabola(*[scale * value for value in (3, 2, 1)]) == 1.0  # a line
-    assert bottom_of_parabola(*[scale * value for value in (1, 2, 3)]) == 0.0
-    assert bottom_of_parabola(*[scale * value for value in (1, 2, 1)]) == 0.0  # bent the other way
-    assert bottom_of_parabola(*[scale * value for value in (5, 2, 1)]) == pytest.approx(1.0)
-    assert bottom_of_parabola(0.0, 0.0, 0.0) == 0.0
-    assert math.isnan(bottom_of_parabola(scale, math.nan, scale)) and math.isnan(bottom_of_parabola(math.inf, 1, 1))
+        assert parabola_minimum(*values) == pytest.approx(bottom, abs=1e-9)
+    assert parabola_minimum(*[scale * value for value in (3, 2, 1)]) == 1.0  # a line
+    assert parabola_minimum(*[scale * value for value in (1, 2, 3)]) == 0.0
+    assert parabola_minimum(*[scale * value for value in (1, 2, 1)]) == 0.0  # bent the other way
+    assert parabola_minimum(*[scale * value for value in (5, 2, 1)]) == pytest.approx(1.0)
+    assert parabola_minimum(0.0, 0.0, 0.0) == 0.0
+    assert math.isnan(parabola_minimum(scale, math.nan, scale)) and math.isnan(parabola_minimum(math.inf, 1, 1))
 
 
 def test_an_untrained_refiner_changes_nothing_and_it_is_said(scene, views):
@@ -336,7 +336,7 @@ def test_a_repair_that_goes_too_far_is_kept_in_part(scene, views, repaired_to):
     made = pruned.replace(scales=pruned.scales + 0.6)
     repaired_to(made)
     result = compacted(scene, trained(tiny_refiner()), views, repair=REPAIRED)
-    assert not helps(result.before, reference.closeness(made))
+    assert not improves(result.before, reference.closeness(made))
     gained = reference.psnr(result.scene)[0] - result.before.psnr
     assert result.repair_accepted and result.psnr == reference.psnr(result.scene)[0] and gained > ACCEPTANCE.min_gain
     share = (result.scene.scales - pruned.scales).mean() / 0.6

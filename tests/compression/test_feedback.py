@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pointsplat_ns.compression.feedback import REPAIR, Feedback
-from pointsplat_ns.compression.optimiser import Adam, AdamSettings, seen_rms
+from pointsplat_ns.compression.optimiser import Adam, AdamSettings, nonzero_rms
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.refiner.feedback import FEATURES, PARAMETERS, FeedbackRefiner
@@ -40,7 +40,7 @@ def test_steps_that_are_not_learned_are_those_of_adam(scene, settings):
         {
             "params": [values[name]],
             "lr": feedback.rates[name],
-            "eps": max(settings.damping * seen_rms(first[name]), 1e-15),
+            "eps": max(settings.damping * nonzero_rms(first[name]), 1e-15),
         }
         for name in PARAMETERS
         if values[name].numel()
@@ -130,7 +130,7 @@ def test_features_are_what_the_network_was_trained_on(scene, steps, shown, degre
             if first.numel() == 0:
                 columns += [0.0, 0.0, 0.0]
                 continue
-            damping = 0.5 * seen_rms(given[0][name])
+            damping = 0.5 * nonzero_rms(given[0][name])
             square = average([first.square(), last.square()], 0.98)
             size, mean = math.sqrt(float(square.mean())), average([first, last], 0.8)
             columns += [
@@ -190,5 +190,5 @@ def test_damping_is_that_of_the_first_step_that_sees_anything(scene):
         mean = sum((1 - beta) * beta ** (2 - i) * each[name] for i, each in enumerate(given)) / (1 - beta**3)
         square = sum((1 - square_beta) * square_beta ** (2 - i) * each[name] ** 2 for i, each in enumerate(given))
         root = (square / (1 - square_beta**3)).sqrt()
-        expected = -feedback.rates[name] * mean / (root + damping * seen_rms(given[1][name]))
+        expected = -feedback.rates[name] * mean / (root + damping * nonzero_rms(given[1][name]))
         torch.testing.assert_close(feedback.moves(1.0)[name], expected, rtol=1e-4, atol=1e-8)

@@ -9,16 +9,20 @@ import pytest
 import torch
 
 from pointsplat_ns.compression import feedback_training
-from pointsplat_ns.compression.feedback_training import TrainingScene, roll_out, train_feedback
+from pointsplat_ns.compression.feedback_training import (
+    FeedbackTrainingSettings,
+    TrainingScene,
+    roll_out,
+    train_feedback,
+)
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, read_feedback_refiner
 
 
 @pytest.fixture
 def small(hollow_ball, monkeypatch) -> TrainingScene:
-    monkeypatch.setattr(feedback_training, "STEPS", (6,))
-    monkeypatch.setattr(feedback_training, "SIDE", 48)
-    return TrainingScene.of("ball", hollow_ball, ["10%", "20%"], times=1)
+    monkeypatch.setattr(feedback_training, "TRAINING", FeedbackTrainingSettings(steps=(6,), side=48))
+    return TrainingScene.of("ball", hollow_ball, ["10%", "20%"], view_batches=1)
 
 
 def test_a_scene_is_merged_to_each_budget_and_has_views(small, hollow_ball):

@@ -14,7 +14,7 @@ import torch
 import pointsplat_ns as ps
 from making import ball, normal_scene, same
 from pointsplat_ns.compression.closeness import DenseReference
-from pointsplat_ns.compression.level_errors import FARTHER, displacement, distance_seen
+from pointsplat_ns.compression.level_errors import FARTHER, displacement, median_depth
 from pointsplat_ns.compression.level_folder import file_names
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.pruning.merging import merge, merge_levels
@@ -290,8 +290,8 @@ def test_a_folder_that_cannot_be_one_is_refused_before_a_scene_is_read(name, mes
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        ([], "no level is asked for"),
-        ("", "no level is asked for"),
+        ([], "no level given"),
+        ("", "no level given"),
         (["half"], "level half: keep is 'half'"),
         (["50%", "auto"], "level auto: expected a ratio"),
         (["auto:35"], "level auto:35: expected a ratio"),
@@ -423,9 +423,9 @@ def test_the_distance_is_that_of_what_is_seen():
     )
     K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]])
     ahead = ps.Views(torch.eye(4)[None], K[None], 64, 48, torch.zeros(3))
-    assert distance_seen(wall, DenseReference(wall, ahead)) == pytest.approx(2.5, abs=1e-4)
+    assert median_depth(wall, DenseReference(wall, ahead)) == pytest.approx(2.5, abs=1e-4)
     behind = ps.Views(torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))[None], K[None], 64, 48, torch.zeros(3))
-    assert distance_seen(wall, DenseReference(wall, behind)) is None
+    assert median_depth(wall, DenseReference(wall, behind)) is None
     assert ps.lod(wall, ["50%"], views=ahead).distance == pytest.approx(2.5, abs=1e-4)
 
 

@@ -12,7 +12,7 @@ import torch
 import pointsplat_ns as ps
 from making import cloud
 from pointsplat_ns.compression import placing
-from pointsplat_ns.compression.placing import Similarity, frame_of
+from pointsplat_ns.compression.placing import Similarity, run_frame
 from pointsplat_ns.errors import PointSplatError, SceneError
 
 SEED = 4
@@ -80,16 +80,16 @@ def test_the_frame_of_a_run_is_undone(tmp_path):
     transform = torch.cat([turn, torch.tensor([[0.5], [-0.25], [1.0]])], dim=1).float()
     run = SimpleNamespace(folder=tmp_path, transform=transform, scale=0.125)
     data = cloud(40, SEED)
-    scene = frame_of(run).apply(data)  # what nerfstudio does to poses
+    scene = run_frame(run).apply(data)  # what nerfstudio does to poses
     expected = 0.125 * (data.means.double() @ transform[:, :3].double().T + transform[:, 3].double())
     assert torch.allclose(scene.means.double(), expected, atol=1e-5)
-    assert torch.allclose(frame_of(run).inverse().apply(scene).means, data.means, atol=1e-5)
+    assert torch.allclose(run_frame(run).inverse().apply(scene).means, data.means, atol=1e-5)
 
 
 def test_a_transform_that_is_no_similarity_is_refused(tmp_path):
     run = SimpleNamespace(folder=tmp_path, transform=torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0]))[:3], scale=1.0)
-    with pytest.raises(SceneError, match="no rotation with one scale"):
-        frame_of(run)
+    with pytest.raises(SceneError, match="not a rotation with one scale"):
+        run_frame(run)
 
 
 @pytest.mark.parametrize("up", ["w", "", "z:", "z:y:x", "north"])

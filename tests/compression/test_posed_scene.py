@@ -11,7 +11,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, run_of
-from pointsplat_ns.compression.posed_scene import LONGEST_SIDE, need_seen, read_posed
+from pointsplat_ns.compression.posed_scene import LONGEST_SIDE, check_views_show, read_posed
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import invert_rigid
 from posing import inria, nerfstudio, written
@@ -91,13 +91,13 @@ def test_large_pictures_are_reduced(scene, views, tmp_path):
 
 def test_half_of_the_cameras_may_see_nothing(scene, views):
     away = moved(views, 1000.0)
-    need_seen(scene, views, "a.json")
+    check_views_show(scene, views, "a.json")
     for seeing in (3, 4):
-        need_seen(
+        check_views_show(
             scene, replace(views, viewmats=torch.cat([views.viewmats[:seeing], away.viewmats[seeing:]])), "a.json"
         )
     with pytest.raises(ps.DataError, match="^a.json: 2 of 6 cameras see anything of the scene; expected at least half"):
-        need_seen(scene, replace(views, viewmats=torch.cat([views.viewmats[:2], away.viewmats[2:]])), "a.json")
+        check_views_show(scene, replace(views, viewmats=torch.cat([views.viewmats[:2], away.viewmats[2:]])), "a.json")
 
 
 def test_a_scene_that_is_a_dot_in_every_picture_is_not_seen(scene, views):
@@ -105,9 +105,9 @@ def test_a_scene_that_is_a_dot_in_every_picture_is_not_seen(scene, views):
     far[:, :3, 3] = -1000 * far[:, :3, 2]  # all look at the middle
     far = replace(views, viewmats=invert_rigid(far))
     with pytest.raises(ps.DataError, match="0 of 6 cameras see anything"):
-        need_seen(scene, far, "a.json")
+        check_views_show(scene, far, "a.json")
     long = torch.tensor([[50.0, 1.0, 1.0], [1.0, 50.0, 1.0], [1.0, 1.0, 1.0]])
-    need_seen(scene, replace(far, Ks=far.Ks * long), "a.json")
+    check_views_show(scene, replace(far, Ks=far.Ks * long), "a.json")
 
 
 def test_floaters_and_what_is_transparent_or_nan_do_not_count(scene, views):
@@ -116,9 +116,9 @@ def test_floaters_and_what_is_transparent_or_nan_do_not_count(scene, views):
     clear = scene.replace(means=scene.means + 1000, opacities=scene.opacities - 20)
     broken = scene.replace(means=scene.means + 1000, scales=scene.scales * torch.nan)
     with pytest.raises(ps.DataError, match="0 of 6 cameras"):
-        need_seen(Gaussians.cat([scene, far, clear, broken]), away, "a.json")
+        check_views_show(Gaussians.cat([scene, far, clear, broken]), away, "a.json")
 
 
 @pytest.mark.parametrize("nothing", [0, 3])
 def test_a_scene_of_which_nothing_is_visible_is_left_to_others(nothing, scene, views):
-    need_seen(scene[:nothing].replace(opacities=scene.opacities[:nothing] * 0 - 30), views, "a.json")
+    check_views_show(scene[:nothing].replace(opacities=scene.opacities[:nothing] * 0 - 30), views, "a.json")

@@ -13,7 +13,7 @@ from making import same
 from pointsplat_ns.api import example_room
 from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.feedback import Feedback
-from pointsplat_ns.compression.optimiser import Adam, AdamSettings, gradients_of, optimised, seen_rms
+from pointsplat_ns.compression.optimiser import Adam, AdamSettings, gradients_of, nonzero_rms, optimised
 from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.looking.sampling import sample_views
@@ -212,5 +212,5 @@ def test_what_is_right_already_hardly_moves_where_steps_are_damped(pruned, ball_
 def test_the_size_of_gradients_is_right_at_the_extremes(size, dtype):
     gradient = torch.zeros(6, 2, dtype=dtype)
     gradient[:3] = torch.tensor([1.0, -2.0, 2.0], dtype=dtype)[:, None] * size
-    assert seen_rms(gradient) == pytest.approx(size * 3**0.5, rel=1e-6)
-    assert seen_rms(gradient[:0]) == 0
+    assert nonzero_rms(gradient) == pytest.approx(size * 3**0.5, rel=1e-6)
+    assert nonzero_rms(gradient[:0]) == 0

@@ -13,7 +13,7 @@ import pytest
 
 from making import cloud, same
 from pointsplat_ns.compression import scene_folder
-from pointsplat_ns.compression.scene_folder import Command, Shard, output_folder, settle_folder
+from pointsplat_ns.compression.scene_folder import Command, Shard, output_folder, run_on_folder
 from pointsplat_ns.compression.scene_task import SceneTask
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io import read_ply, write_ply
@@ -43,7 +43,7 @@ def command_in(place: Path, keep: str = "50%") -> Command:
 def settle(folder: Path, **options):
     """What becomes of the scenes, by name."""
     command = options.pop("command", command_in(folder.parent))
-    results = settle_folder(folder, folder.parent / "small", command, **options)
+    results = run_on_folder(folder, folder.parent / "small", command, **options)
     return {result.name: result for result in results}
 
 
@@ -184,11 +184,11 @@ def test_a_shard_that_is_none_is_refused(text):
 def test_results_among_the_scenes_are_not_taken_for_scenes(folder):
     command = command_in(folder.parent)
     for name in ("small", "small"):
-        results = settle_folder(folder, folder / name, command)
+        results = run_on_folder(folder, folder / name, command)
     assert [result.name for result in results] == ["a", "b", "deep/c"]
-    assert len(settle_folder(folder, folder / "other", command)) == 3
+    assert len(run_on_folder(folder, folder / "other", command)) == 3
     with pytest.raises(SceneError, match="holds the scenes themselves"):
-        settle_folder(folder, folder / "deep" / "..", command)
+        run_on_folder(folder, folder / "deep" / "..", command)
 
 
 def test_a_damaged_record_or_description_is_never_believed(folder):

@@ -24,7 +24,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import read_spz
 from pointsplat_ns.looking.content import in_units
 from pointsplat_ns.looking.poses import look_at
-from pointsplat_ns.pages.flight import Stage
+from pointsplat_ns.pages.flight import FlightFrame
 from sweeps import room_views
 
 pytest.importorskip("selenium", reason="selenium is not installed")
@@ -113,7 +113,7 @@ def test_pictures_are_those_of_the_rasterizer(browser, tmp_path, name):
     scene = make()
     browser.get(ps.write_page(scene, tmp_path / "scene.html", views=views).as_uri())
     shrink(browser)
-    stage = Stage.of(scene, views)
+    stage = FlightFrame.of(scene, views)
     (tmp_path / "scene.spz").write_bytes(base64.b64decode(stage.packed(scene, "scene")["spz"]))
     as_written, as_given = read_spz(tmp_path / "scene.spz"), in_units(scene, stage.centre, stage.size)
     for index in range(min(3, len(stage.views))):
@@ -128,7 +128,7 @@ def test_pictures_are_those_of_the_rasterizer(browser, tmp_path, name):
 
 
 def test_the_room_is_that_of_the_rasterizer_in_its_own_units(opened, rooms):
-    stage = Stage.of(rooms[0], room_views())
+    stage = FlightFrame.of(rooms[0], room_views())
     for wipe, room in ((1, rooms[0]), (0, rooms[1])):
         opened.execute_script("flight.setWipe(arguments[0])", wipe)
         shown = picture(opened)

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.pages.pictures import AMPLIFIED, error_colors, error_map, fit, read_png
+from pointsplat_ns.pages.pictures import ERROR_GAIN, error_colors, error_map, fit, read_png
 
 SEED = 3
 noise = np.random.default_rng(SEED).integers(0, 256, (12, 48, 64, 3), dtype=np.uint8)
@@ -66,7 +66,7 @@ def test_an_error_map_shows_the_mean_of_the_largest_difference_amplified():
     other[:2, :2, 2] += np.array([[2, 2], [2, 2]]) * np.where(picture[:2, :2, 2] < 128, 1, -1)
     shown = error_map(other.astype(np.uint8), picture)
     assert shown.shape == (24, 32, 3)
-    assert np.array_equal(shown[0, 0], error_colors()[round(AMPLIFIED * (8 + 4 + 2 + 2) / 4)])
+    assert np.array_equal(shown[0, 0], error_colors()[round(ERROR_GAIN * (8 + 4 + 2 + 2) / 4)])
     assert not shown[1:].any() and not shown[0, 1:].any()
 
 

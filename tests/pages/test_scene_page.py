@@ -17,7 +17,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import read_spz
 from pointsplat_ns.looking.content import in_units
 from pointsplat_ns.looking.poses import look_at
-from pointsplat_ns.pages.flight import REACH, VIEWS, Stage
+from pointsplat_ns.pages.flight import MAX_COORDINATE, VIEWS, FlightFrame
 from sweeps import room_views
 
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(1)>\"'&</title>"
@@ -57,7 +57,7 @@ def test_page_names_nothing_outside_of_itself_and_lets_only_its_own_scripts_run(
 
 
 def test_page_holds_the_scenes_as_exactly_as_spz_can(written, rooms, tmp_path):
-    stage = Stage.of(rooms[0], room_views())
+    stage = FlightFrame.of(rooms[0], room_views())
     for found, room in zip(scenes_in(written, tmp_path), rooms, strict=True):
         given = in_units(room, stage.centre, stage.size)
         assert len(found) == len(room) and found.sh_degree == room.sh_degree
@@ -143,9 +143,9 @@ def test_what_is_very_far_away_or_has_no_meaning_is_left_out_and_counted(tmp_pat
     means[3], means[7], means[9] = 1e6, math.nan, torch.tensor([0.0, -1e9, 0.0])
     with caplog.at_level(logging.WARNING):
         path = ps.write_page(scene.replace(means=means), tmp_path / "page.html", ["the ball"])
-    assert "the ball: 3 Gaussians, very far away or without meaning, are not in the page" in caplog.text
+    assert "the ball: 3 Gaussians, very far away or not finite, are not in the page" in caplog.text
     [shown] = scenes_in(path, tmp_path)
-    assert len(shown) == 197 and shown.means.abs().max() < REACH
+    assert len(shown) == 197 and shown.means.abs().max() < MAX_COORDINATE
 
 
 def test_flight_begins_where_most_is_seen_and_leads_to_a_few_views():
@@ -155,7 +155,7 @@ def test_flight_begins_where_most_is_seen_and_leads_to_a_few_views():
     targets[7] = 0  # one camera looks at the ball, the others away from it
     K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 20.0], [0.0, 0.0, 1.0]]).repeat(8, 1, 1)
     views = ps.Views(look_at(eyes, targets), K, 64, 40, torch.tensor([1.0, 0.5, 0.0]), "antialiased")
-    stage = Stage.of(scene, views)
+    stage = FlightFrame.of(scene, views)
     data = stage.data([])
     assert len(data["views"]) == VIEWS
     first = data["views"][0]
@@ -169,11 +169,11 @@ def test_flight_begins_where_most_is_seen_and_leads_to_a_few_views():
 
 def test_rooms_are_looked_around_in_and_up_is_where_cameras_have_it():
     room = box_room(0, 400)
-    data = Stage.of(room, ps.sample_views(room, 2, 48, 36)).data([])
+    data = FlightFrame.of(room, ps.sample_views(room, 2, 48, 36)).data([])
     assert data["drag"] == "look"
     upside_down = look_at(torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([0.0, 0.0, -1.0]))
     K = torch.tensor([[[30.0, 0.0, 24.0], [0.0, 30.0, 18.0], [0.0, 0.0, 1.0]]])
-    turned = Stage.of(room, ps.Views(upside_down, K, 48, 36, torch.zeros(3)))
+    turned = FlightFrame.of(room, ps.Views(upside_down, K, 48, 36, torch.zeros(3)))
     assert float(turned.up @ torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)) == pytest.approx(1.0)
 
 
@@ -183,7 +183,7 @@ def test_a_scene_without_a_free_place_is_seen_from_outside(monkeypatch):
 
     monkeypatch.setattr("pointsplat_ns.pages.flight.sample_views", nowhere)
     scene = ball(300)
-    stage = Stage.of(scene)
+    stage = FlightFrame.of(scene)
     picture = ps.render(in_units(scene, stage.centre, stage.size), stage.views[0])
     assert len(stage.views) == 1 and 0.1 < float((picture.amax(2) > 0.05).float().mean()) < 0.9
 

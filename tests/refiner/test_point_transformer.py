@@ -66,7 +66,7 @@ def test_attention_of_one_point_is_its_own_value():
 @pytest.mark.parametrize("n", [5, 20, 47])
 @pytest.mark.parametrize("ordered", [False, True])
 def test_attention_added_in_place_is_the_sum_even_where_the_last_patch_borrows(n, ordered, monkeypatch):
-    monkeypatch.setattr(rows_module, "CELLS", 2**8)  # one patch at a time
+    monkeypatch.setattr(rows_module, "MAX_ELEMENTS", 2**8)  # one patch at a time
     torch.manual_seed(0)
     module, norm = PatchAttention(12, 3, 10).double(), torch.nn.LayerNorm(12).double()
     x, along = torch.randn(n, 12, dtype=torch.float64), torch.randperm(n)

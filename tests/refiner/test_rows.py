@@ -4,14 +4,14 @@ import torch
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.refiner import Refiner, preset
 from pointsplat_ns.refiner import rows as rows_module
-from pointsplat_ns.refiner.rows import CELLS, add_by_rows, by_rows, rows_at_a_time
+from pointsplat_ns.refiner.rows import MAX_ELEMENTS, add_by_rows, by_rows, rows_at_a_time
 
 
-@pytest.mark.parametrize("width,multiple", [(64, 1), (192, 1024), (3 * 512, 1024), (10 * CELLS, 7)])
+@pytest.mark.parametrize("width,multiple", [(64, 1), (192, 1024), (3 * 512, 1024), (10 * MAX_ELEMENTS, 7)])
 def test_rows_fill_the_cells_in_multiples(width, multiple):
     rows = rows_at_a_time(width, multiple)
     assert rows % multiple == 0
-    assert rows * width <= CELLS < (rows + multiple) * width or rows == multiple
+    assert rows * width <= MAX_ELEMENTS < (rows + multiple) * width or rows == multiple
 
 
 @pytest.mark.parametrize("n", [0, 1, 7, 8, 9, 16, 23])
@@ -60,7 +60,7 @@ def test_the_refiner_gives_the_same_scene_and_gradients_whatever_goes_at_once(si
     scene = scene.to(torch.float64)
     scenes, grads = [], []
     for cells in (2**30, 2**13):
-        monkeypatch.setattr(rows_module, "CELLS", cells)
+        monkeypatch.setattr(rows_module, "MAX_ELEMENTS", cells)
         refiner.zero_grad()
         torch.manual_seed(1)
         refined = refiner.train()(scene)

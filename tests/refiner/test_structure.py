@@ -6,7 +6,7 @@ import torch
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.refiner import structure as structure_module
 from pointsplat_ns.refiner.config import FINE_BITS, preset
-from pointsplat_ns.refiner.structure import ADAPTIVE_OCCUPANCY, build_structure, neighbour_pairs
+from pointsplat_ns.refiner.structure import STRUCTURE, StructureSettings, build_structure, neighbour_pairs
 
 
 def scene_at(means: torch.Tensor, seed: int = 0) -> Gaussians:
@@ -73,7 +73,7 @@ def test_an_adapted_grid_is_the_coarsest_that_keeps_most_points_apart(n):
         return len(torch.unique((position * side).floor().clamp(max=side - 1), dim=0))
 
     side = round(structure.cells_per_side)
-    assert occupied(side) >= ADAPTIVE_OCCUPANCY * n > occupied(side // 2)
+    assert occupied(side) >= STRUCTURE.occupancy * n > occupied(side // 2)
 
 
 def test_the_layout_depends_on_the_set_of_gaussians_and_not_on_their_order():
@@ -128,6 +128,6 @@ def test_looking_up_and_searching_find_the_pairs_that_brute_force_finds_in_order
         expected.append(match.nonzero().T.tolist())
     ways = [0, 2**60] if spread <= 100 else [0]  # a table of 2^48 entries fits nowhere
     for entries in ways:
-        monkeypatch.setattr(structure_module, "TABLE_PER_CELL", entries)
-        monkeypatch.setattr(structure_module, "TABLE_LIMIT", 2**31)
+        settings = StructureSettings(table_per_cell=entries, table_limit=2**31)
+        monkeypatch.setattr(structure_module, "STRUCTURE", settings)
         assert [[i.tolist(), j.tolist()] for i, j in neighbour_pairs(cells)] == expected

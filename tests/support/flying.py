@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 import pointsplat_ns as ps
-from pointsplat_ns.pages.flight import Stage
+from pointsplat_ns.pages.flight import FlightFrame
 
 PATIENCE = 60.0
 """Seconds after which a picture that is still changing is a failure. Without a GPU and beside other programs, a frame
@@ -50,7 +50,7 @@ def picture(browser) -> Tensor:
     return torch.from_numpy(np.asarray(pixels.convert("RGB")).copy()).float() / 255
 
 
-def view_on(stage: Stage, index: int, image: Tensor) -> ps.View:
+def view_on(stage: FlightFrame, index: int, image: Tensor) -> ps.View:
     """A view of a stage, in its units, with the size of an image; the field of view is that along the longer side."""
     height, width = image.shape[:2]
     view = stage.views[index]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from pointsplat_ns.tables.cells import OPACITY_BINS, VOLUME_BINS, About, Cell, CellJournal
+from pointsplat_ns.tables.cells import BINS, About, Cell, CellJournal
 from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_CELLS, Way, all_cells, cell_key
 from pointsplat_ns.tradeoff.points import Point, Quality
 
@@ -38,8 +38,8 @@ def cell(name: str, way: Way, share: float, psnr: float, photos: float | None) -
         frame_ms_high=12 * share,
         seconds=1.5,
     )
-    opacities = (*middle, *(0 for _ in range(OPACITY_BINS - 10))) if shown else None
-    volumes = (*middle, *(0 for _ in range(VOLUME_BINS - 10))) if shown else None
+    opacities = (*middle, *(0 for _ in range(BINS.opacity - 10))) if shown else None
+    volumes = (*middle, *(0 for _ in range(BINS.volume - 10))) if shown else None
     return Cell(way.name, point, "", 0, "0.1.0", "0123456789ab", opacities, volumes)
 
 

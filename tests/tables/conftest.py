@@ -79,7 +79,7 @@ def room(tmp_path, room_views, no_lpips, monkeypatch) -> Path:
     none. Tests wait neither for one another nor for anything else on this machine."""
     monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, **options: room_views[:count])
     monkeypatch.setattr(machine, "LOCK", str(tmp_path / "lock"))
-    monkeypatch.setattr(machine, "TURN", 0.0)
+    monkeypatch.setattr(machine, "LOCK_PAUSE", 0.0)
     monkeypatch.setattr(outputs, "plot_figure", lambda groups, path: path.write_text("a figure"))
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     ps.save(box_room(0, 400), tmp_path / "room.ply")

@@ -11,7 +11,7 @@ import torch
 
 from making import ball
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.tables.cells import CELLS, OPACITY_BINS, VOLUME_BINS, CellJournal, distributions
+from pointsplat_ns.tables.cells import BINS, CELLS, CellJournal, distributions
 from pointsplat_ns.tables.means import read_groups
 from pointsplat_ns.tables.ways import DENSE_WAY, MERGE
 from table_cells import IDENTITY, about, cell, write_scene
@@ -77,9 +77,9 @@ def set_point(**changes):
         set_cell(unknown=1),
         set_cell(seed="0"),
         set_cell(way=["merge"]),
-        set_cell(opacities=[1] * (OPACITY_BINS - 1)),
-        set_cell(opacities=[-1] * OPACITY_BINS),
-        set_cell(volumes=["1"] * VOLUME_BINS),
+        set_cell(opacities=[1] * (BINS.opacity - 1)),
+        set_cell(opacities=[-1] * BINS.opacity),
+        set_cell(volumes=["1"] * BINS.volume),
         set_cell(volumes=7),
         set_point(gaussians=True),
         set_point(frame_ms=None),
@@ -113,7 +113,7 @@ def test_distributions_count_every_gaussian_once():
     scene = ball(50)
     opacities, volumes = distributions(scene, "paper", 0.5)
     assert sum(opacities) == sum(volumes) == 50
-    assert opacities[-1] == int((scene.alphas >= 1 - 1 / OPACITY_BINS).sum())
+    assert opacities[-1] == int((scene.alphas >= 1 - 1 / BINS.opacity).sum())
     flat = scene.replace(scales=torch.full_like(scene.scales, -math.inf))
     assert distributions(flat, "paper", 0.5)[1][0] == 50
     assert distributions(scene, "paper", 0.3) == (None, None)

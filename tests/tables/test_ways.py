@@ -10,7 +10,7 @@ from pointsplat_ns.pruning import METHODS
 from pointsplat_ns.tables import paper
 from pointsplat_ns.tables.paper import DATASETS, published
 from pointsplat_ns.tables.ways import (
-    SHARES,
+    PROTOCOL,
     TABLE_1,
     TABLE_3,
     TABLE_4,
@@ -21,7 +21,7 @@ from pointsplat_ns.tables.ways import (
 )
 from pointsplat_ns.tradeoff.points import Quality
 
-CELLS = all_cells(SHARES)
+CELLS = all_cells(PROTOCOL.shares)
 
 
 def test_no_two_cells_have_one_name_and_a_shell_reads_each_as_it_is():
@@ -32,7 +32,7 @@ def test_no_two_cells_have_one_name_and_a_shell_reads_each_as_it_is():
 
 def test_every_row_has_a_cell():
     cells = {(way.name, share) for way, share in CELLS}
-    assert {(way.name, share) for way in TABLE_1 for share in SHARES} <= cells
+    assert {(way.name, share) for way in TABLE_1 for share in PROTOCOL.shares} <= cells
     assert {(way.name, 0.1) for way in (*TABLE_4, *(way for _, way in TABLE_3))} <= cells
 
 

@@ -84,9 +84,9 @@ def test_scenes_are_judged_in_the_views_that_compact_compares_in(
     wanted = ps.compact(room, 0.5, by="opacity", effort="instant", resolution=resolution).views
     judged, begin = [], judging.Judge.__init__
 
-    def watched(self, dense, looked_at, *others):
-        judged.append(looked_at.views)
-        begin(self, dense, looked_at, *others)
+    def watched(self, dense, judged_views, *others):
+        judged.append(judged_views.views)
+        begin(self, dense, judged_views, *others)
 
     monkeypatch.setattr(judging.Judge, "__init__", watched)
     options = {"resolution": resolution, "target_mb": 0.01, "by": "opacity"}

@@ -15,7 +15,7 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.metrics import MOST_PSNR
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.tradeoff import judging
-from pointsplat_ns.tradeoff.judging import Judge, LookedAt
+from pointsplat_ns.tradeoff.judging import Judge, JudgedViews
 from pointsplat_ns.tradeoff.points import picture_path
 
 
@@ -36,18 +36,18 @@ def judged(judge: Judge, scene, key="some", **options):
 @pytest.fixture()
 def judge(dense, room_views, no_lpips):
     """A judge of the room without photos."""
-    return Judge(dense, LookedAt(room_views, None, ""))
+    return Judge(dense, JudgedViews(room_views, None, ""))
 
 
 def test_figures_are_means_over_views(dense, room_views, photos, tmp_path, no_lpips):
     small = ps.prune(dense, 200, by="opacity")
-    got = judged(Judge(dense, LookedAt(room_views, photos, ""), tmp_path), small)
+    got = judged(Judge(dense, JudgedViews(room_views, photos, ""), tmp_path), small)
     renders, wanted = render(small, room_views), render(dense, room_views)
     assert got.against_dense.psnr == pytest.approx(fmean(ps.psnr(renders, wanted).tolist()), abs=1e-4)
     assert got.against_dense.ssim == pytest.approx(fmean(ps.ssim(renders, wanted).tolist()), abs=1e-5)
     assert got.against_photos.psnr == pytest.approx(fmean(ps.psnr(renders, torch.stack(photos)).tolist()), abs=1e-4)
     assert got.against_dense.lpips is got.against_photos.lpips is None
-    again = judged(Judge(dense, LookedAt(room_views, photos, ""), tmp_path), small)
+    again = judged(Judge(dense, JudgedViews(room_views, photos, ""), tmp_path), small)
     assert (again.against_dense, again.against_photos) == (got.against_dense, got.against_photos), "to the bit"
 
 
@@ -98,7 +98,7 @@ def test_each_frame_is_timed_right_after_the_same_one_of_the_dense_scene(dense, 
 
 
 def test_a_reference_that_was_measured_before_is_kept(dense, room_views, no_lpips, clock):
-    got = judged(Judge(dense, LookedAt(room_views, None, ""), None, dense_ms=100.0), dense[:300])
+    got = judged(Judge(dense, JudgedViews(room_views, None, ""), None, dense_ms=100.0), dense[:300])
     assert got.frame_ms == pytest.approx(25.0) and got.clock_ms == pytest.approx(5.0)
 
 
@@ -123,7 +123,7 @@ def test_what_is_not_timed_has_no_times(dense, judge, monkeypatch):
 
 
 def test_pictures_are_what_was_rendered_and_the_photos(dense, room_views, photos, tmp_path, no_lpips):
-    judge = Judge(dense, LookedAt(room_views, photos, ""), tmp_path)
+    judge = Judge(dense, JudgedViews(room_views, photos, ""), tmp_path)
     judged(judge, dense, "dense")
     for view, image in enumerate(render(dense, room_views)):
         for what, wanted in (("dense", image), ("photo", photos[view])):
@@ -135,32 +135,32 @@ def test_pictures_are_what_was_rendered_and_the_photos(dense, room_views, photos
 
 def test_no_more_than_six_views_are_pictured(dense, tmp_path, no_lpips):
     views = ps.sample_views(dense, 8, 16, 12)
-    judge = Judge(dense, LookedAt(views, None, ""), tmp_path)
+    judge = Judge(dense, JudgedViews(views, None, ""), tmp_path)
     judged(judge, dense)
     assert len(list((tmp_path / "pictures").iterdir())) == len(judge.pictures("some")) == 6
 
 
 def test_photos_are_reduced_with_their_views_by_the_mean_of_each_area(room_views):
     photos = [torch.rand(36, 48, 3, generator=torch.Generator().manual_seed(0))] * 3
-    small = LookedAt(room_views, photos, "").resized(24)
+    small = JudgedViews(room_views, photos, "").resized(24)
     assert (small.views.width, small.views.height) == (24, 18)
     wanted = photos[0].reshape(18, 2, 24, 2, 3).mean(dim=(1, 3))
     assert torch.allclose(small.photos[0], wanted, atol=1e-6)
-    assert LookedAt(room_views, photos, "").resized(48).photos is photos
+    assert JudgedViews(room_views, photos, "").resized(48).photos is photos
 
 
 def test_lpips_is_given_where_weights_are_at_hand(dense, room_views, tmp_path, some_lpips):
-    judge = Judge(dense, LookedAt(room_views, None, ""), tmp_path)
+    judge = Judge(dense, JudgedViews(room_views, None, ""), tmp_path)
     quality = judged(judge, ps.prune(dense, 100)).against_dense
     assert (quality.lpips is not None and 0 < quality.lpips < 2) == some_lpips
     assert ("LPIPS is missing" in judge.no_lpips) != some_lpips
 
 
 def test_pictures_too_small_for_lpips_go_without(dense, room_views, tmp_path, some_lpips):
-    judge = Judge(dense, LookedAt(room_views.resized(24), None, ""), tmp_path)
+    judge = Judge(dense, JudgedViews(room_views.resized(24), None, ""), tmp_path)
     assert judged(judge, dense).against_dense.lpips is None and "LPIPS is missing" in judge.no_lpips
 
 
 def test_pictures_too_small_for_ssim_are_refused(dense, room_views, tmp_path):
     with pytest.raises(DataError, match="views are 10 x 36 pixels; expected at least 11 a side"):
-        Judge(dense, LookedAt(replace(room_views, width=10), None, ""), tmp_path)
+        Judge(dense, JudgedViews(replace(room_views, width=10), None, ""), tmp_path)

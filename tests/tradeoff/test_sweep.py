@@ -153,8 +153,8 @@ def test_held_out_photos_are_judged_at_the_middle_size_of_the_resolution(room, r
     dense, large = ps.load(room), replace(room_views[:1], width=800, height=600)
     photos = [torch.zeros(large.height, large.width, 3)]
     subject = measuring.Subject(dense, room, "room", "", list, lambda count: (large, photos), resolution=resolution)
-    looked_at = measuring.Measurer(subject, 1, lambda what, share: None).looked_at
-    assert looked_at.views.width == side and looked_at.photos[0].shape == (looked_at.views.height, side, 3)
+    judged_views = measuring.Measurer(subject, 1, lambda what, share: None).judged_views
+    assert judged_views.views.width == side and judged_views.photos[0].shape == (judged_views.views.height, side, 3)
 
 
 def test_where_photos_cannot_be_had_it_says_why_and_goes_on_without(new_sweep, tmp_path):

@@ -11,7 +11,7 @@ import pytest
 from pointsplat_ns.tradeoff.front import loss_of, psnr_within
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import Setting
-from pointsplat_ns.tradeoff.walk import CLOSE, FLAT, MOST_DRAWINGS, Enough, Plan, drawings, walk
+from pointsplat_ns.tradeoff.walk import WALK, Enough, Plan, drawings, walk
 from trades import Trade
 
 
@@ -78,11 +78,11 @@ def test_when_it_ends_no_gap_is_both_steep_and_wide():
     losses = {s.count: loss_of(p, trade.dense) for s, p in measured.items() if s.repair == "none"}
     losses[trade.count] = 0.0
     for fewer, more in itertools.pairwise(sorted(losses)):
-        assert losses[fewer] - losses[more] < FLAT or more < CLOSE * fewer
+        assert losses[fewer] - losses[more] < WALK.flat or more < WALK.close * fewer
     assert min(losses) == 3_000, "nothing below what was asked for"
 
 
-@pytest.mark.parametrize("within, most, factor", [(0.5, 11, 1.25), (2.0, 11, 1.25), (0.1, 100, CLOSE)])
+@pytest.mark.parametrize("within, most, factor", [(0.5, 11, 1.25), (2.0, 11, 1.25), (0.1, 100, WALK.close)])
 def test_what_will_be_recommended_is_looked_for_first(within, most, factor):
     """With 12 points, the smallest scene within the loss is known to a quarter of its count."""
     trade = Trade(sh_degree=0, gains={})
@@ -131,7 +131,7 @@ def drawn_after(trade: Trade, plan: Plan) -> list[Setting]:
         return trade.measure(setting)
 
     drawings(plan, walked(trade, plan), trade.dense, measure)
-    assert len(found) <= MOST_DRAWINGS and len(set(found)) == len(found)
+    assert len(found) <= WALK.drawings and len(set(found)) == len(found)
     return found
 
 

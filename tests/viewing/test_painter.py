@@ -13,10 +13,10 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball
-from pointsplat_ns.viewing.painter import Camera, Painter, Sight, paint
+from pointsplat_ns.viewing.painter import Camera, Painter, PictureRequest, paint
 from pointsplat_ns.viewing.schedule import Step
-from pointsplat_ns.viewing.selection import ShownScene
-from pointsplat_ns.viewing.split_screen import pixels_of
+from pointsplat_ns.viewing.selection import ReducedScene
+from pointsplat_ns.viewing.split_screen import to_uint8
 
 
 @pytest.fixture(scope="module")
@@ -31,27 +31,29 @@ def camera(scene) -> Camera:
     return Camera(view.viewmat, fov, 4 / 3, view.background, view.near_plane)
 
 
-def sight(camera: Camera, scene: ps.Gaussians, second: ps.Gaussians | None = None, line: float = 1.0) -> Sight:
-    other = None if second is None else ShownScene(second, "all")
-    return Sight(camera, ShownScene(scene, "all"), other, line, ("classic", "classic"))
+def request(
+    camera: Camera, scene: ps.Gaussians, second: ps.Gaussians | None = None, line: float = 1.0
+) -> PictureRequest:
+    other = None if second is None else ReducedScene(second, "all")
+    return PictureRequest(camera, ReducedScene(scene, "all"), other, line, ("classic", "classic"))
 
 
-def step(of: Sight, side: int = 400, moving: bool = False) -> Step[Sight]:
+def step(of: PictureRequest, side: int = 400, moving: bool = False) -> Step[PictureRequest]:
     return Step(of, 1, side, 1.0, moving, whole=not moving)
 
 
 def test_picture_is_the_render_of_its_view(scene, camera):
-    *bands, pixels = paint(step(sight(camera, scene)))
+    *bands, pixels = paint(step(request(camera, scene)))
     assert len(bands) > 3 and all(band is None for band in bands)
     view = ps.sample_views(scene, 1, 400, 300)[0]
-    assert np.abs(pixels - pixels_of(ps.render(scene, view)).astype(int)).max() <= 1
+    assert np.abs(pixels - to_uint8(ps.render(scene, view)).astype(int)).max() <= 1
 
 
 def test_two_scenes_meet_at_the_line(scene, camera):
     second = scene.replace(features_dc=-scene.features_dc)
-    *_, pixels = paint(step(sight(camera, scene, second, 0.25)))
-    *_, first = paint(step(sight(camera, scene)))
-    *_, other = paint(step(sight(camera, second)))
+    *_, pixels = paint(step(request(camera, scene, second, 0.25)))
+    *_, first = paint(step(request(camera, scene)))
+    *_, other = paint(step(request(camera, second)))
     assert np.abs(pixels[:, :97] - first[:, :97].astype(int)).max() <= 1
     assert np.abs(pixels[:, 103:] - other[:, 103:].astype(int)).max() <= 1
     assert (pixels[:, 100] == 255).all()
@@ -65,11 +67,11 @@ def test_picture_has_the_shape_of_the_window(aspect, size, camera):
 
 
 def test_newer_request_ends_a_whole_picture_between_two_bands(scene, camera):
-    shown: queue.Queue[Step[Sight]] = queue.Queue()
+    shown: queue.Queue[Step[PictureRequest]] = queue.Queue()
     in_band, moved = threading.Event(), threading.Event()
     given_up = []
 
-    def slow(of: Step[Sight]) -> Iterator[np.ndarray | None]:
+    def slow(of: Step[PictureRequest]) -> Iterator[np.ndarray | None]:
         if not of.moving and of.number == 1:
             try:
                 while True:
@@ -82,9 +84,9 @@ def test_newer_request_ends_a_whole_picture_between_two_bands(scene, camera):
 
     painter = Painter(lambda pixels, of, seconds: shown.put(of), slow)
     try:
-        painter.schedule.submit(sight(camera, scene))
+        painter.schedule.submit(request(camera, scene))
         assert in_band.wait(30) and shown.get(timeout=30).moving
-        painter.schedule.submit(sight(camera, scene))
+        painter.schedule.submit(request(camera, scene))
         moved.set()
         steps = [shown.get(timeout=30)]
         while steps[-1].moving:
@@ -99,9 +101,9 @@ def test_camera_without_a_place_does_not_end_the_drawing(scene, camera, caplog):
     painter = Painter(lambda pixels, of, seconds: shown.put(pixels))
     nowhere = Camera(torch.full((4, 4), torch.nan, dtype=torch.float64), 1.0, 1.0, torch.zeros(3), 0.01)
     try:
-        painter.schedule.submit(sight(nowhere, scene))
+        painter.schedule.submit(request(nowhere, scene))
         assert shown.get(timeout=30).shape == (1, 1, 3)
-        painter.schedule.submit(sight(camera, scene), 64)
+        painter.schedule.submit(request(camera, scene), 64)
         while (pixels := shown.get(timeout=30)).shape != (48, 64, 3):
             pass
         assert pixels.std() > 10

@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from pointsplat_ns.viewing import schedule as module
-from pointsplat_ns.viewing.schedule import LEAST_SHARE, MOVING_SECONDS, MOVING_SIDE, REST_SECONDS, Schedule, Step
+from pointsplat_ns.viewing.schedule import SCHEDULE, Schedule, ScheduleSettings, Step
 
 
 class Clock:
@@ -28,7 +28,7 @@ def schedule(clock) -> Schedule[str]:
     return Schedule(960, clock)
 
 
-def drawn(schedule: Schedule[str], clock: Clock, seconds: float = MOVING_SECONDS) -> Step[str]:
+def drawn(schedule: Schedule[str], clock: Clock, seconds: float = SCHEDULE.moving_seconds) -> Step[str]:
     """Draw the next step in so many seconds."""
     step = schedule.next(timeout=0)
     assert step is not None
@@ -37,9 +37,9 @@ def drawn(schedule: Schedule[str], clock: Clock, seconds: float = MOVING_SECONDS
     return step
 
 
-def rest(schedule: Schedule[str], clock: Clock, seconds: float = MOVING_SECONDS) -> list[Step[str]]:
+def rest(schedule: Schedule[str], clock: Clock, seconds: float = SCHEDULE.moving_seconds) -> list[Step[str]]:
     """Draw everything that a camera at rest gets."""
-    clock.now += REST_SECONDS
+    clock.now += SCHEDULE.rest_seconds
     steps = []
     while (step := schedule.next(timeout=0)) is not None:
         clock.now += seconds
@@ -76,7 +76,7 @@ def test_requests_that_came_while_drawing_are_skipped_but_for_the_newest(schedul
 def test_newer_camera_cancels_the_whole_picture(schedule, clock):
     schedule.submit("still")
     drawn(schedule, clock)
-    clock.now += REST_SECONDS
+    clock.now += SCHEDULE.rest_seconds
     whole = schedule.next(timeout=0)
     assert not whole.moving and not schedule.outdated(whole)
     schedule.submit("moved")
@@ -108,10 +108,10 @@ def test_time_of_moving_pictures_settles(schedule, clock, whole, fixed):
         step = schedule.next(timeout=0)
         taken.append(seconds(step))
         schedule.done(step, taken[-1])
-    least = whole * (fixed + (1 - fixed) * (MOVING_SIDE / 960) ** 2) * LEAST_SHARE
-    aim = max(MOVING_SECONDS, least)
+    least = whole * (fixed + (1 - fixed) * (SCHEDULE.moving_side / 960) ** 2) * SCHEDULE.least_share
+    aim = max(SCHEDULE.moving_seconds, least)
     assert all(0.6 * aim < some < 1.6 * aim for some in taken[-10:]), taken[-10:]
-    assert MOVING_SIDE <= step.side <= 960 and LEAST_SHARE <= step.share <= 1
+    assert SCHEDULE.moving_side <= step.side <= 960 and SCHEDULE.least_share <= step.share <= 1
 
 
 def test_gaussians_are_left_out_only_of_the_smallest_pictures(schedule, clock):
@@ -119,9 +119,9 @@ def test_gaussians_are_left_out_only_of_the_smallest_pictures(schedule, clock):
     for number in range(40):
         schedule.submit(str(number))
         step = drawn(schedule, clock, 5.0)
-        seen.add((step.side > MOVING_SIDE, step.share < 1))
+        seen.add((step.side > SCHEDULE.moving_side, step.share < 1))
     assert seen == {(True, False), (False, False), (False, True)} or seen == {(True, False), (False, True)}
-    assert step.share == pytest.approx(LEAST_SHARE)
+    assert step.share == pytest.approx(SCHEDULE.least_share)
     steps = rest(schedule, clock)
     assert all(step.share == 1 and not step.moving for step in steps)
     assert [step.side for step in steps] == [960]
@@ -133,7 +133,7 @@ def test_one_picture_comes_between_if_the_whole_is_much_larger(clock):
         schedule.submit("slow")
         drawn(schedule, clock, 5.0)
     sides = [step.side for step in rest(schedule, clock)]
-    assert sides[-1] == 1920 and len(sides) == 2 and MOVING_SIDE < sides[0] < 1920
+    assert sides[-1] == 1920 and len(sides) == 2 and SCHEDULE.moving_side < sides[0] < 1920
 
 
 def test_another_size_is_drawn_from_the_next_request_on(schedule, clock):
@@ -155,7 +155,7 @@ def test_close_wakes_who_waits_and_outdates_what_is_drawn(schedule):
 
 
 def test_who_waits_is_woken_by_a_request_and_by_rest(monkeypatch):
-    monkeypatch.setattr(module, "REST_SECONDS", 0.05)
+    monkeypatch.setattr(module, "SCHEDULE", ScheduleSettings(rest_seconds=0.05))
     schedule: Schedule[str] = Schedule(960)
     found: list[Step[str]] = []
 

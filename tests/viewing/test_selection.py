@@ -56,25 +56,25 @@ def patient(scene, news) -> Iterator[Selection]:
 
 
 def test_all_is_shown_first(patient, scene):
-    assert same(patient.shown.scene, scene) and patient.shown.how == "all"
+    assert same(patient.current.scene, scene) and patient.current.how == "all"
 
 
 @pytest.mark.parametrize("percent", [1, 10, 77, 99])
 def test_budget_acts_at_once_by_coverage(patient, scene, percent):
     patient.choose(percent)
-    assert same(patient.shown.scene, ps.prune(scene, percent / 100, by="coverage"))
-    assert patient.shown.how == "chosen by coverage"
+    assert same(patient.current.scene, ps.prune(scene, percent / 100, by="coverage"))
+    assert patient.current.how == "chosen by coverage"
 
 
 def test_budget_that_stays_is_merged_as_prune_does(selection, scene, news):
     selection.choose(20)
-    news.wait(lambda: selection.shown.how == "merged")
-    assert same(selection.shown.scene, ps.prune(scene, "20%"))
-    assert selection.news == ""
+    news.wait(lambda: selection.current.how == "merged")
+    assert same(selection.current.scene, ps.prune(scene, "20%"))
+    assert selection.status == ""
     selection.choose(100)
-    assert same(selection.shown.scene, scene)
+    assert same(selection.current.scene, scene)
     selection.choose(20)
-    assert selection.shown.how == "merged", "it is kept"
+    assert selection.current.how == "merged", "it is kept"
 
 
 def test_merging_is_stopped_by_another_budget(selection, scene, news, monkeypatch):
@@ -92,12 +92,12 @@ def test_merging_is_stopped_by_another_budget(selection, scene, news, monkeypatc
     monkeypatch.setattr(module, "prune", slow)
     selection.choose(30)
     assert begun.wait(30)
-    news.wait(lambda: selection.news == "merging, 50 %")
+    news.wait(lambda: selection.status == "merging, 50 %")
     monkeypatch.setattr(module, "prune", lambda scene, count, **_: scene[:count])
     selection.choose(10)
     assert stopped.wait(30)
-    news.wait(lambda: selection.shown.how == "merged")
-    assert len(selection.shown.scene) == 40
+    news.wait(lambda: selection.current.how == "merged")
+    assert len(selection.current.scene) == 40
 
 
 def test_failed_merge_leaves_what_was_chosen_and_says_why(selection, news, monkeypatch):
@@ -106,15 +106,15 @@ def test_failed_merge_leaves_what_was_chosen_and_says_why(selection, news, monke
 
     monkeypatch.setattr(module, "prune", fails)
     selection.choose(50)
-    news.wait(lambda: "no such thing" in selection.shown.how)
-    assert len(selection.shown.scene) == 200
+    news.wait(lambda: "no such thing" in selection.current.how)
+    assert len(selection.current.scene) == 200
 
 
 def test_merged_scenes_take_no_more_memory_than_the_scene(selection, news, monkeypatch):
     monkeypatch.setattr(module, "prune", lambda scene, count, **_: scene[:count])
     for percent in (60, 50, 40, 30):
         selection.choose(percent)
-        news.wait(lambda: selection.shown.how == "merged")
+        news.wait(lambda: selection.current.how == "merged")
     assert list(selection._merged) == [40, 30]
 
 
@@ -132,12 +132,12 @@ def test_gaussians_that_cannot_be_drawn_are_left_out(scene, news):
     assert len(made.scene) == 398
 
 
-def test_parts_for_moving_cameras_cover_as_much(scene, news, monkeypatch):
-    monkeypatch.setattr(module, "_SMALLEST_PART", 50)
+def test_parts_for_moving_cameras_cover_as_much(scene, news):
     made = Selection(scene, ViewSource(scene), news)
     made.close()
-    part = made.shown.part(0.3)
-    assert 50 <= len(part) <= 120 and made.shown.part(0.31) is part and made.shown.part(1.0) is made.shown.scene
+    part = made.current.part(0.3, least=50)
+    assert 50 <= len(part) <= 120 and made.current.part(0.31, least=50) is part
+    assert made.current.part(1.0) is made.current.scene
 
     def area(some: ps.Gaussians) -> float:
         return float(some.stds.square().sum())

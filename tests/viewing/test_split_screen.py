@@ -8,8 +8,8 @@ import torch
 
 import pointsplat_ns as ps
 from making import cloud
-from pointsplat_ns.viewing.film import Cast, frame_of
-from pointsplat_ns.viewing.split_screen import Wipe, pixels_of, with_labels, with_line
+from pointsplat_ns.viewing.film import FilmScenes, render_frame
+from pointsplat_ns.viewing.split_screen import Wipe, to_uint8, with_labels, with_line
 
 
 @pytest.fixture(scope="module")
@@ -38,16 +38,16 @@ def test_scene_that_is_not_seen_is_not_drawn(scenes, view):
 
 
 def test_side_by_side_is_both_renders_with_a_line_between(scenes, view):
-    frame = frame_of(Cast(*scenes), view)
-    first, second = (pixels_of(ps.render(scene, view)).astype(int) for scene in scenes)
+    frame = render_frame(FilmScenes(*scenes), view)
+    first, second = (to_uint8(ps.render(scene, view)).astype(int) for scene in scenes)
     assert frame.shape == (44, 140, 3)
     assert np.abs(frame[:, :60] - first[:, :60]).max() <= 1 and np.abs(frame[:, 80:] - second[:, 10:]).max() <= 1
     assert (frame[:, 70] == 255).all()
 
 
 def test_wipe_moves_to_both_sides(scenes, view):
-    cast = Cast(*scenes, split="wipe")
-    lines = [np.flatnonzero((frame_of(cast, view, t) == 255).all((0, 2))).tolist() for t in (0.0, 1.5, 4.5)]
+    film = FilmScenes(*scenes, split="wipe")
+    lines = [np.flatnonzero((render_frame(film, view, t) == 255).all((0, 2))).tolist() for t in (0.0, 1.5, 4.5)]
     assert lines == [[35], [63], [7]]
 
 

@@ -157,8 +157,9 @@ def feedback(file: Path) -> list[torch.Tensor]:
     from making import ball
     from pointsplat_ns.compression import feedback_training
 
-    with mock.patch.multiple(feedback_training, STEPS=(6,), SIDE=32):
-        scene = feedback_training.TrainingScene.of("ball", ball(800), ["30%"], times=1)
+    settings = feedback_training.FeedbackTrainingSettings(steps=(6,), side=32)
+    with mock.patch.object(feedback_training, "TRAINING", settings):
+        scene = feedback_training.TrainingScene.of("ball", ball(800), ["30%"], view_batches=1)
         network = feedback_training.train_feedback([scene], 2, at_once=2, output=file)
     return [value.detach() for value in network.parameters()]
 

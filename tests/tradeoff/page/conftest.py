@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import pointsplat_ns as ps
-from pointsplat_ns.pages.flight import Stage
+from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.tradeoff.flights import keep_flight
 from pointsplat_ns.tradeoff.page import write_page
 from pointsplat_ns.tradeoff.points import Tradeoff, flight_path
@@ -25,7 +25,7 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tradeoff, Path]:
     folder = tmp_path_factory.mktemp("sweep")
     room = ps.example_room()
     measured = measured_room(folder, room)
-    assert keep_flight(Stage.of(room, room_views()), room[::10], "a tenth", flight_path(folder, FLOWN))
+    assert keep_flight(FlightFrame.of(room, room_views()), room[::10], "a tenth", flight_path(folder, FLOWN))
     # The one that opacity chose is slower and worse than the larger one.
     times = [95.0 if p.by == "opacity" else 100 * p.share for p in measured.points]
     timed = [

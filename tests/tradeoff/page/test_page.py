@@ -19,7 +19,7 @@ import pointsplat_ns as ps
 from html_parts import hashed, names_nothing_outside, parts_of, policy_of
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.pages import pictures
-from pointsplat_ns.pages.flight import Stage
+from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.tradeoff import flights
 from pointsplat_ns.tradeoff import page as page_module
 from pointsplat_ns.tradeoff.front import fastest_within
@@ -181,7 +181,7 @@ def test_the_dense_scene_is_beside_the_recommended_one_if_both_fit(sweep, tmp_pa
     measured, folder = sweep
     shutil.copytree(folder, tmp_path / "copy")
     room = ps.example_room()
-    flights.keep_flight(Stage.of(room, room_views()), room[::5], "dense", flight_path(tmp_path / "copy", "dense"))
+    flights.keep_flight(FlightFrame.of(room, room_views()), room[::5], "dense", flight_path(tmp_path / "copy", "dense"))
 
     def names(recommended: str) -> list[str]:
         page = write_page(replace(measured, recommended=recommended), tmp_path / "copy", tmp_path / "page.html")
@@ -204,7 +204,7 @@ def test_what_is_no_scene_to_fly_through_is_left_out(sweep, tmp_path, content):
 
 def test_scenes_that_take_too_much_of_a_page_are_not_kept(tmp_path, monkeypatch):
     room = ps.example_room()[::20]
-    stage, path = Stage.of(room, room_views()), tmp_path / "new" / "scene.json"
+    stage, path = FlightFrame.of(room, room_views()), tmp_path / "new" / "scene.json"
     monkeypatch.setattr(flights, "MAX_BYTES", 15_000)  # its PLY has 330 kB, and its SPZ in base64 80 kB
     assert not flights.keep_flight(stage, room, "room", path) and not path.parent.exists()
     monkeypatch.setattr(flights, "MAX_BYTES", 60_000)
