@@ -354,6 +354,13 @@ def parsed_by_ns_train(command: str):
     return tyro.cli(AnnotatedBaseConfigUnion, args=words)
 
 
+def noisy_pair(*shape: int, dtype: torch.dtype = torch.float32) -> tuple[torch.Tensor, torch.Tensor]:
+    """Images (..., H, W, 3) in [0, 1]: one with noise, and the same without."""
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(*shape, 3, generator=generator, dtype=dtype)
+    return (target + 0.1 * torch.randn(*shape, 3, generator=generator, dtype=dtype)).clamp(0, 1), target
+
+
 def decoded(path: Path) -> list[np.ndarray]:
     """The frames (H, W, 3) uint8 of a video."""
     import av
