@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ast
 import math
+import os
 import shlex
 import shutil
 from collections.abc import Iterator
@@ -23,6 +24,12 @@ LAB = REPOSITORY / "lab"
 
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 """Real captures, splats and weights that tests read in place; they skip where it is absent."""
+
+
+def quick_start() -> dict[str, str]:
+    """The environment, for programs of nerfstudio that need not list the methods of others."""
+    paths = [str(REPOSITORY / "tests" / "support" / "quick_start"), os.environ.get("PYTHONPATH", "")]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
 
 
 def imports_of(path: Path) -> set[str]:
