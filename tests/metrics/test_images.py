@@ -5,13 +5,8 @@ import math
 import pytest
 import torch
 
+from making import noisy_pair as pair
 from pointsplat_ns.metrics import ImageError, psnr, ssim
-
-
-def pair(*shape, seed=0, dtype=torch.float32):
-    generator = torch.Generator().manual_seed(seed)
-    target = torch.rand(*shape, 3, generator=generator, dtype=dtype)
-    return (target + 0.1 * torch.randn(*shape, 3, generator=generator, dtype=dtype)).clamp(0, 1), target
 
 
 def test_psnr_of_a_known_error():

@@ -2,6 +2,7 @@
 
 import math
 import os
+import socket
 import urllib.error
 from io import BytesIO
 
@@ -10,6 +11,7 @@ import pytest
 import torch
 
 from making import SHARED_DATA
+from making import noisy_pair as pair
 from pointsplat_ns.metrics import ImageError
 from pointsplat_ns.metrics.lpips import (
     RETRY_AFTER_S,
@@ -62,12 +64,6 @@ def nowhere(tmp_path, monkeypatch):
 
     monkeypatch.setattr(torch.hub, "urlopen", refuse)
     return asked
-
-
-def pair(*shape, seed=0, dtype=torch.float32):
-    generator = torch.Generator().manual_seed(seed)
-    target = torch.rand(*shape, 3, generator=generator, dtype=dtype)
-    return (target + 0.1 * torch.randn(*shape, 3, generator=generator, dtype=dtype)).clamp(0, 1), target
 
 
 # Values
@@ -170,17 +166,14 @@ def test_a_batch_gives_one_value_an_image(alex):
 
 
 @pytest.mark.parametrize("net", NETS)
-def test_the_smallest_image_works_and_one_below_is_said(net, tmp_path):
+def test_the_smallest_image_works_and_one_below_or_of_another_shape_is_said(net, tmp_path):
     torch.save(random_backbone(net), tmp_path / "b.pth")
     model, least = load_lpips(net, tmp_path / "b.pth"), {"alex": 31, "vgg": 16}[net]
     assert model(*pair(least, least + 5)).isfinite()
     with pytest.raises(ImageError, match=f"images of {least} x {least - 1} pixels are too small for LPIPS with {net}"):
         model(*pair(least - 1, least))
-
-
-def test_shapes_are_checked(alex):
     with pytest.raises(ImageError, match=r"pred has shape \(3, 40, 40\)"):
-        alex(torch.rand(3, 40, 40), torch.rand(3, 40, 40))
+        model(torch.rand(3, 40, 40), torch.rand(3, 40, 40))
 
 
 # As a part of a model
@@ -211,49 +204,33 @@ def clock(monkeypatch):
     return now
 
 
-def test_cached_lpips_is_loaded_once(alex_file, clock, monkeypatch):
+def test_cached_lpips_is_loaded_once_for_each_device_and_gives_what_load_lpips_gives(
+    alex_file, alex, clock, monkeypatch
+):
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
     assert cached_lpips("alex", "cpu") is cached_lpips("alex", torch.device("cpu"))
-
-
-def test_cached_lpips_gives_what_load_lpips_gives(alex_file, alex, clock, monkeypatch):
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
     assert torch.equal(cached_lpips("alex", "cpu")(*pair(40, 40)), alex(*pair(40, 40)))
-
-
-def test_cached_lpips_is_on_the_device_asked_for(alex_file, clock, monkeypatch):
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
     assert {buffer.device.type for buffer in cached_lpips("alex", "meta").buffers()} == {"meta"}
 
 
-def test_a_failed_download_is_not_tried_at_every_call(clock, nowhere):
-    texts = []
-    for _ in range(3):
+def test_a_failed_download_is_tried_again_later_and_not_at_every_call(clock, nowhere):
+    texts = set()
+    for clock[0], times in ((0.0, 1), (1.0, 1), (RETRY_AFTER_S - 1, 1), (RETRY_AFTER_S + 1, 2)):
         with pytest.raises(LpipsUnavailable) as caught:
             cached_lpips("alex", "cpu")
-        texts.append(str(caught.value))
-    assert len(nowhere) == 1 and len(set(texts)) == 1
+        texts.add(str(caught.value))
+        assert len(nowhere) == times and len(texts) == 1
 
 
-def test_a_failed_download_is_tried_again_later(clock, nowhere):
-    for clock[0] in (0.0, RETRY_AFTER_S - 1, RETRY_AFTER_S + 1):
-        with pytest.raises(LpipsUnavailable):
-            cached_lpips("alex", "cpu")
-    assert len(nowhere) == 2
-
-
-def test_weights_that_appear_after_a_failure_are_taken_at_once(alex_file, clock, tmp_path):
+@pytest.mark.parametrize("place", ["hub", "variable"])
+def test_weights_that_appear_after_a_failure_are_taken_at_once(alex_file, clock, tmp_path, monkeypatch, place):
     with pytest.raises(LpipsUnavailable):
         cached_lpips("alex", "cpu")
-    (tmp_path / "hub" / "checkpoints").mkdir(parents=True, exist_ok=True)
-    os.symlink(alex_file, tmp_path / "hub" / "checkpoints" / "alexnet-owt-7be5be79.pth")
-    assert cached_lpips("alex", "cpu").net == "alex"
-
-
-def test_a_variable_that_is_set_after_a_failure_is_followed_at_once(alex_file, clock, monkeypatch):
-    with pytest.raises(LpipsUnavailable):
-        cached_lpips("alex", "cpu")
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
+    if place == "variable":
+        monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
+    else:
+        (tmp_path / "hub" / "checkpoints").mkdir(parents=True, exist_ok=True)
+        os.symlink(alex_file, tmp_path / "hub" / "checkpoints" / "alexnet-owt-7be5be79.pth")
     assert cached_lpips("alex", "cpu").net == "alex"
 
 
@@ -269,38 +246,28 @@ def test_a_damaged_file_that_is_replaced_after_a_failure_is_read_again(alex_file
     assert cached_lpips("alex", "cpu").net == "alex"
 
 
-def test_an_unknown_network_is_said_by_the_cached_one_too(clock):
-    with pytest.raises(LpipsUnavailable, match="no LPIPS network is called 'squeeze'"):
-        cached_lpips("squeeze", "cpu")
-
-
 # In a report
 
 
-def test_a_report_has_the_value_and_no_reason(alex_file, alex, clock, monkeypatch):
+def test_a_report_has_the_value_or_the_reason_why_there_is_none(alex_file, alex, clock, monkeypatch):
+    lpips = ReportedLpips("alex")
+    assert lpips(*pair(40, 40)) is None and "alex backbone cannot be downloaded" in lpips.reason
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
     lpips = ReportedLpips("alex")
     assert torch.equal(lpips(*pair(40, 40)), alex(*pair(40, 40))) and lpips.reason is None
-
-
-def test_a_report_without_weights_has_the_reason_and_no_value(clock):
-    lpips = ReportedLpips("alex")
-    assert lpips(*pair(40, 40)) is None and "alex backbone cannot be downloaded" in lpips.reason
-
-
-def test_a_report_on_an_image_too_small_has_the_reason_and_no_value(alex_file, clock, monkeypatch):
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
-    lpips = ReportedLpips("alex")
     assert lpips(*pair(20, 40)) is None and "40 x 20 pixels are too small" in lpips.reason
 
 
 # Where the weights come from
 
 
-def test_an_explicit_file_alone_is_tried(alex_file, tmp_path, monkeypatch, nowhere):
+def test_a_file_or_folder_that_is_named_alone_is_tried(alex_file, tmp_path, monkeypatch, nowhere):
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
     with pytest.raises(LpipsUnavailable, match=r"none\.pth: no such file"):
         load_lpips("alex", tmp_path / "none.pth")
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "gone"))
+    with pytest.raises(LpipsUnavailable, match=f"gone: no such file or folder, though {WEIGHTS_VARIABLE} names it"):
+        load_lpips()
     assert not nowhere
 
 
@@ -327,12 +294,6 @@ def test_a_file_named_for_one_network_is_not_taken_for_the_other(alex_file, tmp_
     with pytest.raises(LpipsUnavailable, match="cannot be downloaded"):
         load_lpips("vgg")
     assert nowhere == ["https://download.pytorch.org/models/vgg16-397923af.pth"]
-
-
-def test_a_variable_that_names_nothing_is_said(monkeypatch, tmp_path):
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "gone"))
-    with pytest.raises(LpipsUnavailable, match=f"gone: no such file or folder, though {WEIGHTS_VARIABLE} names it"):
-        load_lpips()
 
 
 def test_the_hub_cache_is_used_without_the_network(alex_file, alex, tmp_path, nowhere):
@@ -364,22 +325,18 @@ class Answer(BytesIO):
         return []
 
 
-def test_a_wrong_download_is_refused_and_leaves_no_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(torch.hub, "urlopen", lambda *args, **kwargs: Answer(b"<html>log in first</html>"))
-    with pytest.raises(LpipsUnavailable, match="cannot be downloaded .invalid hash value"):
-        load_lpips("alex")
-    assert not files_below(tmp_path)
+class Cut(Answer):
+    def read(self, size=-1):
+        raise TimeoutError("timed out")
 
 
-def test_a_cut_download_leaves_no_file_and_restores_the_timeout(tmp_path, monkeypatch):
-    import socket
-
-    class Cut(Answer):
-        def read(self, size=-1):
-            raise TimeoutError("timed out")
-
-    monkeypatch.setattr(torch.hub, "urlopen", lambda *args, **kwargs: Cut())
-    with pytest.raises(LpipsUnavailable, match="timed out"):
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [(Answer(b"<html>log in first</html>"), "cannot be downloaded .invalid hash value"), (Cut(), "timed out")],
+)
+def test_a_wrong_or_cut_download_leaves_no_file_and_restores_the_timeout(tmp_path, monkeypatch, answer, message):
+    monkeypatch.setattr(torch.hub, "urlopen", lambda *args, **kwargs: answer)
+    with pytest.raises(LpipsUnavailable, match=message):
         load_lpips("alex")
     assert not files_below(tmp_path) and socket.getdefaulttimeout() is None
 
@@ -408,9 +365,10 @@ def test_files_that_are_no_backbone_are_said(tmp_path, content, message):
     assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
 
 
-def test_an_unknown_network_is_said():
+@pytest.mark.parametrize("load", [load_lpips, lambda net: cached_lpips(net, "cpu")])
+def test_an_unknown_network_is_said(load, clock):
     with pytest.raises(LpipsUnavailable, match="no LPIPS network is called 'squeeze'; expected one of alex, vgg"):
-        load_lpips("squeeze")
+        load("squeeze")
 
 
 def test_a_missing_linear_weight_is_said():

@@ -43,38 +43,20 @@ def test_a_view_sees_a_point_at_the_pixel_where_nerfstudios_ray_to_it_starts(vie
     torch.testing.assert_close(pixel[:2] / pixel[2], at.flip(0), atol=1e-3, rtol=0)
 
 
-def test_views_have_the_size_of_the_cameras(views):
-    assert (len(views), views.width, views.height) == (3, 40, 30)
-
-
-def test_views_are_drawn_over_the_background_given(views):
+def test_views_have_the_size_of_the_cameras_and_are_drawn_as_asked_for(views):
+    assert (len(views), views.width, views.height, views.rasterize_mode) == (3, 40, 30, "antialiased")
     assert torch.equal(views.background, BACKGROUND)
 
 
-def test_views_are_drawn_as_asked_for(views):
-    assert views.rasterize_mode == "antialiased"
-
-
-def test_cameras_of_views_have_the_poses_that_the_views_were_made_of(views):
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_cameras_of_views_are_the_pinhole_cameras_that_the_views_were_made_of_in_float32(views, dtype):
+    views = dataclasses.replace(views, viewmats=views.viewmats.to(dtype), Ks=views.Ks.to(dtype))
+    back = cameras_of_views(views)
     # 1e-6: one inversion of a float32 pose
-    back = cameras_of_views(views).camera_to_worlds
-    torch.testing.assert_close(back, some_cameras().camera_to_worlds, atol=1e-6, rtol=0)
-
-
-def test_cameras_of_views_have_their_intrinsics(views):
-    assert torch.equal(cameras_of_views(views).get_intrinsics_matrices(), some_cameras().get_intrinsics_matrices())
-
-
-def test_cameras_of_views_are_pinhole_cameras_of_their_size(views):
-    cameras = cameras_of_views(views)
-    assert cameras.distortion_params is None
-    assert (cameras.width.unique().tolist(), cameras.height.unique().tolist()) == ([40], [30])
-
-
-def test_cameras_of_views_in_float64_are_float32_as_nerfstudio_needs_them(views):
-    double = Views(views.viewmats.double(), views.Ks.double(), views.width, views.height, BACKGROUND)
-    cameras = cameras_of_views(double)
-    assert (cameras.camera_to_worlds.dtype, cameras.fx.dtype) == (torch.float32, torch.float32)
+    torch.testing.assert_close(back.camera_to_worlds, some_cameras().camera_to_worlds, atol=1e-6, rtol=0)
+    assert torch.equal(back.get_intrinsics_matrices(), some_cameras().get_intrinsics_matrices())
+    assert back.distortion_params is None and (back.width == 40).all() and (back.height == 30).all()
+    assert (back.camera_to_worlds.dtype, back.fx.dtype) == (torch.float32, torch.float32)
 
 
 @pytest.mark.parametrize("near_plane", [NEAR_PLANE, 1e-7, 0.1, 300.0])
@@ -91,20 +73,17 @@ def test_cameras_of_a_dataset_have_gsplats_near_plane(views):
     assert near_plane_of(with_others) == NEAR_PLANE
 
 
-def test_cameras_of_several_near_planes_are_refused(views):
+def test_cameras_of_several_near_planes_or_sizes_are_refused(views):
     cameras = cameras_of_views(views)
     cameras.metadata["near_plane"] = torch.tensor([[0.1], [0.1], [0.2]])
     with pytest.raises(DataError, match="2 near planes; expected one for all views"):
+        views_of_cameras(cameras, BACKGROUND)
+    cameras = some_cameras()
+    cameras.width = torch.tensor([[40], [41], [40]])
+    with pytest.raises(DataError, match="photos of 2 sizes; expected one size for all views"):
         views_of_cameras(cameras, BACKGROUND)
 
 
 def test_rays_of_cameras_of_views_start_as_those_of_any(views):
     rays = [some[:1].generate_rays(0) for some in (cameras_of_views(views), some_cameras())]
     torch.testing.assert_close(rays[0].directions, rays[1].directions, atol=1e-6, rtol=0)
-
-
-def test_cameras_of_several_sizes_are_refused():
-    cameras = some_cameras()
-    cameras.width = torch.tensor([[40], [41], [40]])
-    with pytest.raises(DataError, match="photos of 2 sizes; expected one size for all views"):
-        views_of_cameras(cameras, BACKGROUND)

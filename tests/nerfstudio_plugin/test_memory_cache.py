@@ -20,72 +20,36 @@ class OtherName(CacheKey[list]):
     number: int
 
 
-def test_what_was_put_in_comes_out():
+def test_what_was_put_in_comes_out_and_keys_of_two_kinds_never_meet():
     cache = MemoryCache(10)
     value = ["kept"]
     cache.put(OtherName(1), value, 4)
-    assert cache.get(OtherName(1)) is value
+    assert cache.get(OtherName(1)) is value and cache.get(Name(1)) is None
 
 
-def test_what_was_never_put_in_is_none():
-    assert MemoryCache(10).get(Name(1)) is None
+GET = None
+"""In place of a value and its size: the key is only asked for."""
 
 
-def test_keys_of_two_kinds_never_meet():
-    cache = MemoryCache(10)
-    cache.put(Name(1), "text", 4)
-    assert cache.get(OtherName(1)) is None
-
-
-def test_the_longest_unused_is_dropped_first():
-    cache = MemoryCache(3)
-    for number in (1, 2, 3):
-        cache.put(Name(number), "value", 1)
-    cache.get(Name(1))
-    cache.put(Name(4), "value", 1)
-    assert [number for number in (1, 2, 3, 4) if cache.get(Name(number))] == [1, 3, 4]
-
-
-def test_a_large_value_drops_as_many_as_it_needs():
-    cache = MemoryCache(10)
-    for number in range(5):
-        cache.put(Name(number), "value", 2)
-    cache.put(Name(9), "large", 5)
-    assert [number for number in range(10) if cache.get(Name(number))] == [3, 4, 9]
-
-
-def test_the_size_is_the_sum_of_what_is_kept():
-    cache = MemoryCache(10)
-    cache.put(Name(1), "value", 4)
-    cache.put(Name(2), "value", 3)
-    assert (cache.num_bytes, len(cache)) == (7, 2)
-
-
-def test_a_value_put_in_again_is_counted_once():
-    cache = MemoryCache(10)
-    cache.put(Name(1), "old", 4)
-    cache.put(Name(1), "new", 6)
-    assert (cache.get(Name(1)), cache.num_bytes) == ("new", 6)
-
-
-def test_a_value_larger_than_the_cache_is_not_kept_and_drops_nothing_else():
-    cache = MemoryCache(10)
-    cache.put(Name(1), "small", 4)
-    cache.put(Name(2), "large", 11)
-    assert (cache.get(Name(1)), cache.get(Name(2)), cache.num_bytes) == ("small", None, 4)
-
-
-def test_a_value_that_has_grown_too_large_is_dropped_rather_than_left_old():
-    cache = MemoryCache(10)
-    cache.put(Name(1), "old", 4)
-    cache.put(Name(1), "new", 11)
-    assert (cache.get(Name(1)), cache.num_bytes) == (None, 0)
-
-
-def test_no_room_keeps_nothing():
-    cache = MemoryCache(0)
-    cache.put(Name(1), "value", 1)
-    assert len(cache) == 0
+@pytest.mark.parametrize(
+    ("limit", "steps", "kept", "size"),
+    [
+        (10, [(1, ("a", 4)), (2, ("b", 3))], {1: "a", 2: "b"}, 7),
+        (10, [(1, ("old", 4)), (1, ("new", 6))], {1: "new"}, 6),
+        (3, [(1, ("a", 1)), (2, ("b", 1)), (3, ("c", 1)), (1, GET), (4, ("d", 1))], {1: "a", 3: "c", 4: "d"}, 3),
+        (10, [*((number, ("a", 2)) for number in range(5)), (9, ("large", 5))], {3: "a", 4: "a", 9: "large"}, 9),
+        (10, [(1, ("small", 4)), (2, ("too large", 11))], {1: "small"}, 4),
+        (10, [(1, ("old", 4)), (1, ("grown too large", 11))], {}, 0),
+        (0, [(1, ("a", 1))], {}, 0),
+    ],
+    ids=["sum", "again", "longest unused", "as many as needed", "too large", "grown", "no room"],
+)
+def test_what_is_kept_within_the_limit_and_its_size(limit, steps, kept, size):
+    cache = MemoryCache(limit)
+    for number, step in steps:
+        cache.get(Name(number)) if step is GET else cache.put(Name(number), *step)
+    assert {number: value for number in range(10) if (value := cache.get(Name(number)))} == kept
+    assert (cache.num_bytes, len(cache)) == (size, len(kept))
 
 
 def test_the_bound_holds_while_many_threads_put_and_get():

@@ -15,7 +15,9 @@ from pointsplat_ns.nerfstudio_plugin.registration import load_specification
 FORKED = """
 import importlib, os, sys, traceback, warnings
 warnings.simplefilter("ignore")
-import cv2, torch, torchmetrics, torchvision, viser, wandb, gsplat, nerfacc, sklearn.neighbors  # shared by every case
+# What nerfstudio imports of others takes most of the time; it is imported once for all cases.
+import cv2, torch, torchmetrics, torchvision, viser, wandb, gsplat, nerfacc, sklearn.neighbors, scipy.signal, networkx
+import torch.utils.tensorboard, functorch.compile, tensorly, tyro, jaxtyping, pytorch_msssim, rawpy, pyquaternion
 
 def refuse(*args, **kwargs):
     raise OSError("an import used the network or CUDA")

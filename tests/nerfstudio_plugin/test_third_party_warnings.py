@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from making import quick_start
 from pointsplat_ns.nerfstudio_plugin.third_party_warnings import (
     JIT_SCRIPT,
     NERFSTUDIO,
@@ -62,7 +63,7 @@ def test_the_environment_variable_quiets_one_warning_and_no_other(known, shown):
 
 
 def run_quietly(*command: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    kept = {name: value for name, value in os.environ.items() if name != "PYTHONWARNINGS"}
+    kept = {name: value for name, value in quick_start().items() if name != "PYTHONWARNINGS"}
     words = [str(Path(sys.executable).parent / command[0]), *map(str, command[1:])]
     return subprocess.run(words, env={**kept, **environment}, capture_output=True, text=True, timeout=600)
 

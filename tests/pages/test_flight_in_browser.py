@@ -41,23 +41,10 @@ def browser() -> Iterator:
         yield opened
 
 
-@pytest.fixture(scope="module")
-def rooms() -> list[Gaussians]:
-    """The example room with a tenth of its Gaussians, and with a fiftieth."""
-    return [ps.example_room()[::10], ps.example_room()[::50]]
-
-
-@pytest.fixture(scope="module")
-def path(rooms, tmp_path_factory) -> Path:
-    return ps.write_page(
-        rooms, tmp_path_factory.mktemp("flight") / "room.html", ["dense", "compact"], views=room_views()
-    )
-
-
 @pytest.fixture()
-def opened(browser, path) -> Iterator:
+def opened(browser, written) -> Iterator:
     """The page of both rooms, just opened and small. Nothing may be complained of while a test uses it."""
-    browser.get(path.as_uri())
+    browser.get(written.as_uri())
     shrink(browser)
     yield browser
     assert complaints(browser) == []
@@ -271,7 +258,7 @@ def test_steep_looks_stop_before_up_changes_sides(opened):
         assert np.allclose(np.cross(state["down"], state["ahead"]), state["right"], atol=1e-12)
 
 
-def test_a_browser_without_workers_or_floats_draws_the_same(browser, path, opened):
+def test_a_browser_without_workers_or_floats_draws_the_same(browser, written, opened):
     expected = picture(opened)
     without = """
       Worker = class { constructor() { throw new Error("no worker") } };
@@ -280,7 +267,7 @@ def test_a_browser_without_workers_or_floats_draws_the_same(browser, path, opene
         return name.includes("float") ? null : original.call(this, name);
       };"""
     with before_pages_load(browser, without):
-        browser.get(path.as_uri())
+        browser.get(written.as_uri())
         shrink(browser)
         plain = picture(browser)
         assert browser.execute_script("return flight.drawer.format === flight.drawer.gl.RGBA8")
@@ -289,17 +276,17 @@ def test_a_browser_without_workers_or_floats_draws_the_same(browser, path, opene
     assert ps.psnr(plain, expected) > 35
 
 
-def test_a_browser_without_webgl_says_so(browser, path):
+def test_a_browser_without_webgl_says_so(browser, written):
     with before_pages_load(browser, "HTMLCanvasElement.prototype.getContext = () => null"):
-        browser.get(path.as_uri())
+        browser.get(written.as_uri())
         browser.execute_async_script("flight.ready.then(arguments[0])")
         assert message(browser).startswith("This browser offers no WebGL 2")
     assert complaints(browser) == []
 
 
 @pytest.mark.parametrize("damage", ["cut", "garbled", "another", "no base64"])
-def test_a_damaged_scene_is_one_sentence(browser, path, tmp_path, damage):
-    text = path.read_text("utf-8")
+def test_a_damaged_scene_is_one_sentence(browser, written, tmp_path, damage):
+    text = written.read_text("utf-8")
     [first, *_] = re.findall(r'"spz":"([^"]*)"', text)
     packed = base64.b64decode(first)
     changed = {

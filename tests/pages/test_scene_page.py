@@ -23,16 +23,6 @@ from sweeps import room_views
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(1)>\"'&</title>"
 
 
-@pytest.fixture(scope="module")
-def rooms() -> list[Gaussians]:
-    return [ps.example_room()[::10], ps.example_room()[::50]]
-
-
-@pytest.fixture(scope="module")
-def written(rooms, tmp_path_factory) -> Path:
-    return ps.write_page(rooms, tmp_path_factory.mktemp("page") / "room.html", ["dense", "compact"], views=room_views())
-
-
 def scenes_in(path: Path, folder: Path) -> list[Gaussians]:
     """The scenes of a page, in the units of their content."""
     scenes = []

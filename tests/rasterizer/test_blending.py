@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.autograd.function import once_differentiable
 
-from making import camera_askew
+from making import camera_askew, splats_in_view
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.rasterizer import blending, frame, rasterization
 from pointsplat_ns.rasterizer.constants import BLENDED_AT_ONCE, QUALITIES
@@ -17,15 +17,7 @@ WIDTH, HEIGHT = 70, 45  # neither is a multiple of the tile
 
 
 def make_scene(n=400, seed=0, size=-2.2, dtype=torch.float32):
-    g = torch.Generator().manual_seed(seed)
-    means = torch.randn(n, 3, generator=g, dtype=torch.float64) * torch.tensor([1.2, 1.0, 0.5]) + torch.tensor(
-        [0, 0, 3]
-    )
-    quats = torch.randn(n, 4, generator=g, dtype=torch.float64)
-    stds = torch.exp(torch.randn(n, 3, generator=g, dtype=torch.float64) * 0.7 + size)
-    opacities = torch.rand(n, generator=g, dtype=torch.float64)
-    sh = 0.3 * torch.randn(n, 16, 3, generator=g, dtype=torch.float64)
-    return [t.to(dtype).requires_grad_() for t in (means, quats, stds, opacities, sh)]
+    return [t.requires_grad_() for t in splats_in_view(n, seed, dtype, scale=size, spread=0.7)]
 
 
 def draw(scene, absgrad=False, **options):

@@ -144,10 +144,13 @@ def test_degenerate_gaussians(case, mode):
     # (with axes of 1e20 pixels the reference's xx yy - xy^2 cancels to 0 even in float64)
 
 
+def centre_of(view):
+    return torch.linalg.solve(view[:3, :3], -view[:3, 3])
+
+
 def test_gaussians_at_and_across_the_camera_plane():
-    scene = make_scene(50)
-    view, K = camera_askew()
-    centre = torch.linalg.solve(view[:3, :3], -view[:3, 3])
+    scene, (view, K) = make_scene(50), camera_askew()
+    centre = centre_of(view)
     scene[0][0] = centre  # depth and view vector exactly zero
     scene[0][1:9] = centre + (scene[0][1:9] - centre) * 1e-3
     scene[0][9:18, 2] *= -1
@@ -156,12 +159,65 @@ def test_gaussians_at_and_across_the_camera_plane():
     assert all((g[0] == 0).all() for g in grads)
 
 
-def test_camera_inside_gaussians():
-    scene = make_scene(50)
-    view, K = camera_askew()
+def _around_the_camera(scene, view):
     scene[2][:] = scene[2] / scene[2].amax(-1, keepdim=True) * 20.0
     scene[3][:] = 0.2
-    check(scene, (view, K))
+
+
+def _far_from_the_origin(scene, view):
+    # check() rounds means and view to float32 before anything is drawn: they move by 0.03 units, the arithmetic not
+    shift = torch.tensor([1e6, -7e5, 4e5], dtype=F64)
+    scene[0] = scene[0] * 64 + shift
+    scene[2] = scene[2] * 64
+    view[:3, 3] = view[:3, 3] * 64 - view[:3, :3] @ shift
+
+
+def _farther(times):
+    # as from an aeroplane or a satellite: x and y before the camera are small sums of products of the distance
+    def change(scene, view):
+        view[2, 3] += 3.0 * (times - 1)
+
+    return change
+
+
+def _into_sight(cx, cy):
+    def change(scene, view):
+        scene[2] *= 3
+        scene[0][:, :2] -= (torch.tensor([cx, cy], dtype=F64) - torch.tensor([18.0, 14.0])) / 40.0 * 3.0
+
+    return change
+
+
+def _larger(times):
+    def change(scene, view):
+        scene[2] *= times
+
+    return change
+
+
+VIEWED = {
+    "camera inside Gaussians": (_around_the_camera, {}, (37, 29)),
+    "a million units from the origin": (_far_from_the_origin, {}, (37, 29)),
+    **{f"lens of {focal:g} pixels": (_farther(focal / 40), {"focal": focal}, (37, 29)) for focal in (4e3, 4e5)},
+    "lens of a pixel": (_larger(10), {"focal": 1.0}, (37, 29)),  # a degree and more per pixel
+    **{
+        f"principal point at {cx:g}, {cy:g}": (_into_sight(cx, cy), {"cx": cx, "cy": cy}, (37, 29))
+        for cx, cy in ((-60.0, 13.0), (90.0, 80.0), (20.0, -500.0))
+    },
+    **{
+        f"{w} x {h} pixels": (_larger(4), {"cx": w / 2, "cy": h / 2, "focal": max(20.0, 0.6 * max(w, h))}, (w, h))
+        for w, h in ((1, 1), (1, 4000), (4000, 1), (61, 53))
+    },
+}
+"""What changes scene and view, arguments of the camera, and the size of the image."""
+
+
+@pytest.mark.parametrize("case", VIEWED)
+def test_places_and_lenses_of_the_camera(case):
+    change, lens, size = VIEWED[case]
+    scene, (view, K) = make_scene(50), camera_askew(**lens)
+    change(scene, view)
+    check(scene, (view, K), size)
 
 
 @pytest.mark.parametrize("logit", [-40.0, 40.0, -math.inf, math.inf])
@@ -197,18 +253,6 @@ def test_scenes_of_any_size(factor):
         assert (got - want).norm() <= 1e-3 * want.norm()
 
 
-def test_a_scene_a_million_units_from_the_origin():
-    scene = make_scene(50)
-    view, K = camera_askew()
-    shift = torch.tensor([1e6, -7e5, 4e5], dtype=F64)
-    scene[0] = scene[0] * 64 + shift
-    scene[2] = scene[2] * 64
-    view[:3, 3] = view[:3, 3] * 64 - view[:3, :3] @ shift
-    # check() rounds means and view to float32 before anything is drawn: they move by 0.03 units, the arithmetic does
-    # not
-    check(scene, (view, K))
-
-
 def test_float64_cameras_beside_float32_gaussians_place_the_camera_exactly():
     scene = make_scene(50)
     view, K = camera_askew()
@@ -223,15 +267,6 @@ def test_float64_cameras_beside_float32_gaussians_place_the_camera_exactly():
     assert got.dtype == torch.float32
     assert ((got - want).abs() > 1e-4).double().mean() < 0.01
     assert ((rounded - want).abs() > 1e-4).double().mean() > 0.1
-
-
-@pytest.mark.parametrize("times", [1e2, 1e4])
-def test_a_long_lens_far_away_sees_what_a_short_one_sees_near(times):
-    # as from an aeroplane or a satellite: x and y before the camera are small sums of products of the distance
-    scene = make_scene(50)
-    view, K = camera_askew(focal=40 * times)
-    view[2, 3] += 3.0 * (times - 1)
-    check(scene, (view, K))
 
 
 def test_views_in_float64_place_the_camera_exactly_and_any_unit_of_length_is_drawn():
@@ -259,51 +294,28 @@ def test_views_in_float64_place_the_camera_exactly_and_any_unit_of_length_is_dra
     assert (render_depth(vast, there)[0] / 1e12 - depth).abs().max() < 1e-9
 
 
-@pytest.mark.parametrize("focal", [1.0, 1e5])
-def test_extreme_focal_lengths(focal):
-    scene = make_scene(50)
-    view, K = camera_askew(focal=focal)
-    if focal == 1.0:
-        scene[2] *= 10  # a degree and more per pixel: smaller is below a pixel
-        check(scene, (view, K))
-    else:
-        # the whole image sees 4e-4 rad: draw in there what is a few pixels large. One ulp of a coordinate of 3 units
-        # is 2e-7 units, so 0.01 pixels.
-        centre = torch.linalg.solve(view[:3, :3], -view[:3, 3])
-        rays = torch.rand(50, 2, generator=torch.Generator().manual_seed(2), dtype=F64) * 30 - 15
-        local = torch.cat([rays / focal, torch.ones(50, 1, dtype=F64)], -1) * scene[0][:, 2:].abs()
-        scene[0] = centre + local @ view[:3, :3]
-        scene[2] = scene[2] * 1e-3
-        check(scene, (view, K), tolerance=5e-3, grad_tolerance=2e-3)
+def test_a_long_lens_from_near():
+    scene, (view, K) = make_scene(50), camera_askew(focal=1e5)
+    # the whole image sees 4e-4 rad: draw in there what is a few pixels large. One ulp of a coordinate of 3 units is
+    # 2e-7 units, so 0.01 pixels.
+    rays = torch.rand(50, 2, generator=torch.Generator().manual_seed(2), dtype=F64) * 30 - 15
+    local = torch.cat([rays / 1e5, torch.ones(50, 1, dtype=F64)], -1) * scene[0][:, 2:].abs()
+    scene[0] = centre_of(view) + local @ view[:3, :3]
+    scene[2] = scene[2] * 1e-3
+    check(scene, (view, K), tolerance=5e-3, grad_tolerance=2e-3)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 4000), (4000, 1), (61, 53)])
-def test_any_image_size(size):
-    scene = make_scene(30)
-    w, h = size
-    scene[2] *= 4
-    view, K = camera_askew(cx=w / 2, cy=h / 2, focal=max(20.0, 0.6 * max(size)))
-    check(scene, (view, K), size)
-
-
-@pytest.mark.parametrize("cx,cy", [(-60.0, 13.0), (90.0, 80.0), (20.0, -500.0)])
-def test_principal_point_outside_the_image(cx, cy):
-    scene = make_scene(50)
-    scene[2] *= 3
-    scene[0][:, :2] -= (torch.tensor([cx, cy], dtype=F64) - torch.tensor([18.0, 14.0])) / 40.0 * 3.0
-    check(scene, camera_askew(cx=cx, cy=cy))
-
-
-@pytest.mark.parametrize("n,culled", [(0, False), (1, False), (1, True), (20, True)])
+@pytest.mark.parametrize("n,hidden", [(0, ""), (1, ""), (1, "behind"), (20, "behind"), (7, "transparent")])
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_few_or_no_gaussians(n, culled, dtype):
-    scene = make_scene(max(n, 1))
-    scene = [t[:n] for t in scene]
+def test_few_or_no_gaussians(n, hidden, dtype):
+    scene = [t[:n] for t in make_scene(max(n, 1))]
     scene[3] = 0.5 + 0.5 * scene[3]
     if n:
         scene[0][0] = torch.tensor([0, 0, 3.0], dtype=F64)
-    if culled:
+    if hidden == "behind":
         scene[0][:, 2] = -scene[0][:, 2].abs() - 1
+    if hidden == "transparent":
+        scene[3] *= 1e-4
     view, K = camera_askew()
     leaves = [t.to(dtype).requires_grad_() for t in scene]
     for mode in ("RGB", "RGB+ED"):
@@ -313,11 +325,11 @@ def test_few_or_no_gaussians(n, culled, dtype):
                 sh_degree=2, render_mode=mode, packed=packed, absgrad=True,
             )  # fmt: skip
             assert image.isfinite().all() and meta["skipped"] == 0
-            assert bool(alpha.any()) == (n > 0 and not culled)
+            assert bool(alpha.any()) == bool(image.any()) == (n > 0 and not hidden)
             grads = torch.autograd.grad(image.sum() + alpha.sum(), leaves, allow_unused=True)
             for grad in grads:
                 assert grad is None or grad.isfinite().all()
-                assert not culled or grad is None or not grad.any()
+                assert not hidden or grad is None or not grad.any()
 
 
 def test_twenty_thousand_coincident_gaussians():

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from making import camera_askew
+from making import camera_askew, splats_in_view
 from pointsplat_ns.rasterizer.colors import sh_to_color
 from pointsplat_ns.rasterizer.projection import project
 from pointsplat_ns.rasterizer.spherical_harmonics import unit_rows
@@ -14,18 +14,8 @@ F64 = torch.float64
 
 
 def make_scene(n=60, seed=3, scale=-2.5):
-    g = torch.Generator().manual_seed(seed)
-
-    def randn(*shape):
-        return torch.randn(*shape, generator=g, dtype=F64)
-
-    means = randn(n, 3) * torch.tensor([1.5, 1.2, 0.6], dtype=F64) + torch.tensor([0, 0, 3.0], dtype=F64)
-    return [
-        means,
-        3 * randn(n, 4),
-        torch.exp(0.8 * randn(n, 3) + scale),
-        0.1 + 0.9 * torch.rand(n, generator=g).to(F64),
-    ]
+    means, quats, stds, opacities, _ = splats_in_view(n, seed, scale=scale)
+    return [means * torch.tensor([1.5, 1.2, 1.0], dtype=F64), 3 * quats, stds, 0.1 + 0.9 * opacities]
 
 
 def gsplat_formulas():
@@ -47,7 +37,7 @@ def test_projection_and_its_gradients_are_gsplats(antialiased, cx, cy):
     compared is what ours keeps.
     """
     theirs = gsplat_formulas()
-    scene = [t.requires_grad_() for t in make_scene(scale=-1.0)]
+    scene = [t.requires_grad_() for t in make_scene(100, scale=-1.0)]
     means, quats, scales, opacities = scene
     view, K, w, h = *camera_askew(cx=cx, cy=cy), 37, 29
     view.requires_grad_()

@@ -54,16 +54,9 @@ def test_image_and_gradients_equal_the_reference_in_float64(mode, n, scale, opac
         assert (got - want).abs().max() <= 1e-9 * want.abs().max(), name
 
 
-@pytest.mark.parametrize("cx,cy", [(-30.0, 13.0), (60.0, 40.0)])
-def test_principal_point_outside_the_image_moves_the_frustum_clamp(cx, cy):
-    fast, slow = both(splats_in_view(100, seed=3, scale=-1.5), (*camera_askew(cx=cx, cy=cy), 37, 29))
-    assert slow[1].max() > 0.1
-    assert (fast[0] - slow[0]).abs().max() < 1e-10
-
-
 def test_gradcheck():
-    scene = splats_in_view(4, seed=5, scale=0.3, spread=0.3)
-    scene[3] = 0.3 + 0.5 * scene[3]
+    scene = splats_in_view(3, seed=5, scale=0.3, spread=0.3)
+    scene[3], scene[4] = 0.3 + 0.5 * scene[3], scene[4][:, :9]
     scene = leaves(scene)
     view, K, w, h = *camera_askew(cx=3.0, cy=2.5), 6, 5
     K = K * torch.tensor([[0.15], [0.15], [1.0]], dtype=F64)
@@ -154,24 +147,6 @@ def test_background_shows_where_nothing_is():
     empty = alpha[0, ..., 0] == 0
     assert empty.any()
     torch.testing.assert_close(image[0][empty], background.expand(int(empty.sum()), 3))
-
-
-@pytest.mark.parametrize("case", ["none", "behind", "transparent"])
-def test_nothing_to_draw_gives_black_and_zero_gradients(case):
-    scene = leaves(splats_in_view(0 if case == "none" else 7))
-    means, quats, scales, opacities, sh = scene
-    if case == "behind":
-        means = means * torch.tensor([1, 1, -1.0], dtype=F64)
-    if case == "transparent":
-        opacities = opacities * 1e-4
-    view, K, w, h = *camera_askew(), 37, 29
-    for mode in ("RGB", "RGB+ED"):
-        image, alpha, _ = rasterization(
-            means, quats, scales, opacities, sh, view[None], K[None], w, h, sh_degree=3, render_mode=mode
-        )
-        assert (image == 0).all() and (alpha == 0).all()
-        grads = torch.autograd.grad(image.sum() + alpha.sum(), scene, allow_unused=True, retain_graph=True)
-        assert all(g is None or (g == 0).all() for g in grads)
 
 
 def test_coefficients_in_two_tensors_draw_the_same_picture():

@@ -1,15 +1,14 @@
 import pytest
 import torch
 
-from pointsplat_ns.gaussians import Gaussians
+from making import normal_scene
 from pointsplat_ns.refiner.config import preset
 from pointsplat_ns.refiner.encoder import ConcatEncoder, DualBranchEncoder
 from pointsplat_ns.refiner.normalize import gaussian_features, unit_cube
 
 
 def features(n: int = 30):
-    g = torch.Generator().manual_seed(0)
-    scene = Gaussians(*(torch.randn(n, *t, generator=g) for t in ((3,), (3,), (4,), (1,), (3,), (15, 3))))
+    scene = normal_scene(n)
     return gaussian_features(scene, unit_cube(scene.means), 15, torch.float32)
 
 

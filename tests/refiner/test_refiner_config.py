@@ -48,14 +48,3 @@ def test_unknown_names_are_refused():
         preset("huge")
     with pytest.raises(RefinerConfigError, match="unknown refiner settings color_space"):
         RefinerConfig.from_dict({"color_space": 1})
-
-
-def test_the_ablations_of_table_4_have_fewer_parameters_than_the_whole():
-    def count(**changes):
-        return sum(p.numel() for p in Refiner(preset("tiny", **changes)).encoder.parameters())
-
-    whole = count()
-    assert count(use_position=False) < whole and count(use_appearance=False) < whole
-    assert count(use_appearance=False, use_position=False) < count(use_appearance=False)
-    assert count(encoder="concat") == 0
-    assert preset("tiny", encoder="concat").encoded_dim == 59

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from pointsplat_ns.gaussians import Gaussians
+from making import move_zero_layers, normal_scene
 from pointsplat_ns.refiner import Refiner, preset
 from pointsplat_ns.refiner import rows as rows_module
 from pointsplat_ns.refiner.rows import MAX_ELEMENTS, add_by_rows, by_rows, rows_at_a_time
@@ -50,14 +50,9 @@ def test_rows_are_added_in_place_and_those_beyond_the_stop_left_alone(n, ordered
 
 @pytest.mark.parametrize("size", ["tiny", "small"])
 def test_the_refiner_gives_the_same_scene_and_gradients_whatever_goes_at_once(size, monkeypatch):
-    g = torch.Generator().manual_seed(0)
-    scene = Gaussians(*(torch.randn(700, *tail, generator=g) for tail in ((3,), (3,), (4,), (1,), (3,), (15, 3))))
+    scene = normal_scene(700, dtype=torch.float64)
     torch.manual_seed(0)
-    refiner = Refiner(preset(size, patch=100)).double()
-    with torch.no_grad():
-        for mlp in refiner.heads.mlps.values():
-            mlp[-1].weight.normal_(std=0.1)
-    scene = scene.to(torch.float64)
+    refiner = move_zero_layers(Refiner(preset(size, patch=100)).double())
     scenes, grads = [], []
     for cells in (2**30, 2**13):
         monkeypatch.setattr(rows_module, "MAX_ELEMENTS", cells)

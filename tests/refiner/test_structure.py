@@ -54,15 +54,6 @@ def test_clusters_hold_exactly_the_points_of_a_cell():
         assert len(joint) == len(cluster.unique()) == len(expected.unique())
 
 
-def test_neighbours_are_those_that_brute_force_finds():
-    cells = torch.unique(torch.randint(0, 6, (80, 3), generator=torch.Generator().manual_seed(0)), dim=0)
-    cells = cells[torch.randperm(len(cells), generator=torch.Generator().manual_seed(1))]
-    found = {(int(a), int(b)) for i, j in neighbour_pairs(cells) for a, b in zip(i, j, strict=True)}
-    touch = (cells[:, None] - cells[None]).abs().amax(-1) == 1
-    assert found | {(b, a) for a, b in found} == {(int(a), int(b)) for a, b in touch.nonzero()}
-    assert len(found) == touch.sum() // 2
-
-
 @pytest.mark.parametrize("n", [50, 500, 5000])
 def test_an_adapted_grid_is_the_coarsest_that_keeps_most_points_apart(n):
     means = surface(n)
@@ -96,14 +87,6 @@ def test_strides_beyond_the_finest_code_end_in_one_cell():
     structure = build_structure(scene_at(surface(100)), config)
     assert structure.levels[-1].size == 1
     assert 2**10 * 2**10 > 2**FINE_BITS
-
-
-def test_a_far_outlier_does_not_squeeze_the_rest_into_one_cell():
-    means = surface(1000)
-    alone = build_structure(scene_at(means), preset("full"))
-    means[0] = 1e7
-    with_outlier = build_structure(scene_at(means), preset("full"))
-    assert with_outlier.levels[0].num_cells > 0.9 * alone.levels[0].num_cells
 
 
 def test_moving_to_a_device_keeps_everything():

@@ -14,7 +14,7 @@ from PIL import Image
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_depth, read_photo
-from pointsplat_ns.rooms import capture_path, default_intrinsics, make_room, render_room, write_room
+from pointsplat_ns.rooms import capture_path, default_intrinsics, light, make_room, render_room, write_room
 from pointsplat_ns.rooms.raycast import chart_points, trace
 
 pytestmark = pytest.mark.xdist_group("rooms")  # one worker computes the light of each room for all tests of this file
@@ -23,6 +23,15 @@ WIDTH, HEIGHT = 96, 72
 
 room_of = functools.cache(make_room)
 """The room of a seed. Its light, which takes seconds, is computed once for all tests here."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarser_light():
+    """Light of a tenth of the numbers."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(light, "TEXEL", 4 * light.TEXEL)
+        patch.setattr(light, "LUMEL", 2 * light.LUMEL)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +45,7 @@ def poses(room):
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory):
+def written(tmp_path_factory, coarser_light):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pointsplat_ns.rooms.write.make_room", room_of)
         return write_room(

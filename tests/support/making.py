@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ast
 import math
+import os
 import shlex
 import shutil
 from collections.abc import Iterator
@@ -23,6 +24,12 @@ LAB = REPOSITORY / "lab"
 
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 """Real captures, splats and weights that tests read in place; they skip where it is absent."""
+
+
+def quick_start() -> dict[str, str]:
+    """The environment, for programs of nerfstudio that need not list the methods of others."""
+    paths = [str(REPOSITORY / "tests" / "support" / "quick_start"), os.environ.get("PYTHONPATH", "")]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
 
 
 def imports_of(path: Path) -> set[str]:
@@ -352,6 +359,13 @@ def parsed_by_ns_train(command: str):
     program, *words = shlex.split(command)
     assert program == "ns-train"
     return tyro.cli(AnnotatedBaseConfigUnion, args=words)
+
+
+def noisy_pair(*shape: int, dtype: torch.dtype = torch.float32) -> tuple[torch.Tensor, torch.Tensor]:
+    """Images (..., H, W, 3) in [0, 1]: one with noise, and the same without."""
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(*shape, 3, generator=generator, dtype=dtype)
+    return (target + 0.1 * torch.randn(*shape, 3, generator=generator, dtype=dtype)).clamp(0, 1), target
 
 
 def decoded(path: Path) -> list[np.ndarray]:

@@ -8,9 +8,11 @@ from pathlib import Path
 PEER = """#!{python}
 import re, sys
 if "--version" in sys.argv:
-    print("splat-transform v{version} (0123abc)")
+    print({says!r})
     sys.exit()
 overwrite, device, cpu, source, option, count, target = sys.argv[1:]
+if option == {fails!r}:
+    sys.exit("out of luck")
 assert [overwrite, device, cpu] == ["-w", "-g", "cpu"] and option in {options}, sys.argv
 count = int(count)
 header, found, rows = open(source, "rb").read().partition(b"end_header\\n")
@@ -22,11 +24,19 @@ open(target, "wb").write(header + found + rows)
 """Stands for splat-transform, a Node package: takes its options, and keeps the first or the last Gaussians."""
 
 
-def peer(folder: Path, version: str) -> str:
-    """The path of such a program, written into a folder; from version 3 on it has two modes."""
+def peer(folder: Path, version: str, says: str | None = None, fails: str = "") -> str:
+    """The path of such a program, written into a folder; from version 3 on it has two modes.
+
+    Args:
+        folder: of the program.
+        version: of splat-transform.
+        says: what it prints of its version; by default what splat-transform prints.
+        fails: option of the mode that fails.
+    """
+    says = f"splat-transform v{version} (0123abc)" if says is None else says
     modern = int(version.split(".")[0]) >= 3
     options = ("--decimate", "--decimate-adaptive") if modern else ("--decimate",)
     path = folder / f"peer-{version}"
-    path.write_text(PEER.format(python=sys.executable, version=version, options=options))
+    path.write_text(PEER.format(python=sys.executable, says=says, fails=fails, options=options))
     path.chmod(0o755)
     return str(path)

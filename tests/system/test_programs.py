@@ -42,20 +42,17 @@ def test_cpu_seconds_count_threads_and_processes_that_were_waited_for():
 
 
 @pytest.mark.parametrize(
-    "code, said",
+    "command, said",
     [
-        ("import sys; sys.exit('no such scene')", "ended with status 1: no such scene"),
-        ("import os; os.kill(os.getpid(), 9)", "was killed by signal 9"),
+        (python("import sys; sys.exit('no\\nsuch\\nscene')"), "ended with status 1: no such scene$"),
+        (python("import os; os.kill(os.getpid(), 9)"), "was killed by signal 9"),
+        (["/no/such/program"], "/no/such/program.*FileNotFoundError|No such file"),
     ],
+    ids=["fails", "is killed", "is not there"],
 )
-def test_a_program_that_fails_is_an_error_with_what_it_said(code, said):
+def test_a_program_that_fails_is_an_error_with_what_it_said_in_one_line(command, said):
     with pytest.raises(ProgramFailed, match=said):
-        run_measured(python(code))
-
-
-def test_a_program_that_is_not_there_is_an_error_that_names_it():
-    with pytest.raises(ProgramFailed, match="/no/such/program.*FileNotFoundError|No such file"):
-        run_measured(["/no/such/program"])
+        run_measured(command)
 
 
 def test_a_program_that_takes_too_long_is_ended_with_what_it_started(tmp_path):
@@ -72,9 +69,3 @@ def test_a_program_that_takes_too_long_is_ended_with_what_it_started(tmp_path):
 
 
 WAITS = "import os, sys, time; open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"
-
-
-def test_the_error_of_a_failed_program_is_one_line():
-    with pytest.raises(ProgramFailed) as failed:
-        run_measured(python("import sys; sys.exit('no\\nsuch\\nscene')"))
-    assert str(failed.value).endswith("ended with status 1: no such scene")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import sys
+import functools
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
+import peers
 import pointsplat_ns as ps
 from making import box_room
 from pointsplat_ns.compression import repair
@@ -20,34 +21,11 @@ from pointsplat_ns.tables import measuring, outputs
 from pointsplat_ns.tables.ways import all_cells
 from pointsplat_ns.tradeoff import machine
 
-PEER = """#!{python}
-import re, sys
-if "--version" in sys.argv:
-    print("{says}")
-    sys.exit()
-overwrite, device, cpu, source, option, count, target = sys.argv[1:]
-if "{fails}" == option:
-    sys.exit("out of luck")
-header, found, rows = open(source, "rb").read().partition(b"end_header\\n")
-size, count = 4 * header.count(b"property float"), int(count)
-rows = rows[: count * size] if option == "--decimate" else rows[-count * size :]
-header = re.sub(rb"element vertex \\d+", b"element vertex %d" % count, header)
-open(target, "wb").write(header + found + rows)
-"""
-"""Stands for splat-transform, a Node package: keeps the first or the last Gaussians, or fails in one mode."""
-
 
 @pytest.fixture()
 def peer(tmp_path) -> Callable[..., str]:
-    """A function that writes such a program and gives its path."""
-
-    def write(says: str = "splat-transform v3.7.0 (0123abc)", fails: str = "") -> str:
-        path = tmp_path / "peer"
-        path.write_text(PEER.format(python=sys.executable, says=says, fails=fails))
-        path.chmod(0o755)
-        return str(path)
-
-    return write
+    """A function that writes a program that stands for splat-transform, and gives its path."""
+    return functools.partial(peers.peer, tmp_path, "3.7.0")
 
 
 @pytest.fixture(scope="session")

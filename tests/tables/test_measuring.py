@@ -202,14 +202,11 @@ def test_options_that_mean_nothing_are_refused(measured, options, said):
         measured(**options)
 
 
-def test_two_scenes_of_one_name_are_refused(measured, room, tmp_path):
+def test_two_scenes_of_one_name_and_no_scene_are_refused(measured, room, tmp_path):
     (tmp_path / "other").mkdir()
     ps.save(box_room(1, 300), tmp_path / "other" / "room.ply")
     with pytest.raises(PointSplatError, match="both are called room"):
         measured(room, tmp_path / "other" / "room.ply")
-
-
-def test_no_scene_is_refused(tmp_path):
     with pytest.raises(PointSplatError, match="no scene is named"):
         ps.measure_tables([], tmp_path / "tables")
 

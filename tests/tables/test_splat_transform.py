@@ -32,7 +32,7 @@ def test_each_mode_makes_a_smaller_scene(peer, tmp_path):
     ],
 )
 def test_versions_are_told_apart(peer, says, version, modes):
-    found = SplatTransform(peer(says.replace("\n", "\\n")))
+    found = SplatTransform(peer(says))
     assert found.version == version and len(found.modes) == modes
 
 

@@ -52,16 +52,16 @@ def refusal(capsys, *words: str) -> str:
     return said.out + said.err
 
 
-def test_the_models_options_are_those_that_it_obeys():
-    assert options("--pipeline.model.") == MODEL_OPTIONS
-
-
-def test_the_data_managers_options_are_those_that_it_obeys():
-    assert options("--pipeline.datamanager.") == DATAMANAGER_OPTIONS
-
-
-def test_there_is_no_prompt():
-    assert options("--prompt") == set()
+@pytest.mark.parametrize(
+    ("prefix", "names"),
+    [
+        ("--pipeline.model.", MODEL_OPTIONS),
+        ("--pipeline.datamanager.", DATAMANAGER_OPTIONS),
+        ("--prompt", set()),
+    ],
+)  # fmt: skip
+def test_options_are_those_that_are_obeyed(prefix, names):
+    assert options(prefix) == names
 
 
 def test_every_option_of_the_model_is_read_in_a_training(trained_walls, no_lpips):
@@ -100,6 +100,7 @@ def test_an_option_of_splatfacto_is_refused_by_name(capsys, option, value):
         ({"backend": "gsplat", "quality": "fast"}, "quality fast: has no effect on --pipeline.model.backend gsplat"),
         ({"by": "merge", "opacity_weight": 0.3}, "opacity weight 0.3: merge does not weigh opacity"),
         ({"by": "pup"}, "pup looks at a scene from poses; expected a method that needs none"),
+        ({"encoder": "concat", "use_position": False}, "switches of the encoder 'dual'; encoder 'concat' expects both"),
     ],
 )
 def test_settings_that_contradict_each_other_are_refused_and_leave_no_folder(trained_walls, tmp_path, changes, message):

@@ -17,7 +17,6 @@ from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.io.discovery import find_plys
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views
 from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
@@ -98,17 +97,6 @@ def test_a_scene_is_known_wherever_its_file_lies_and_changes_with_its_content(ro
 
 
 # poses and pictures
-
-
-def test_cameras_of_views_see_what_the_views_see():
-    views = sample_views(box_room(1), 3, 32, 24, seed=5)
-    cameras = cameras_of_views(views)
-    # scene units; float32 of numbers up to 2
-    torch.testing.assert_close(
-        viewmats_from_opengl(cameras.camera_to_worlds).double(), views.viewmats, atol=1e-6, rtol=0
-    )
-    torch.testing.assert_close(cameras.get_intrinsics_matrices().double(), views.Ks, atol=1e-5, rtol=0)
-    assert (int(cameras.width[0]), int(cameras.height[0])) == (32, 24)
 
 
 def test_sampled_poses_are_the_same_each_time_and_none_is_in_both_splits(rooms, monkeypatch):

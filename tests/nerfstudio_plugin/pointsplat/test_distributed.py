@@ -6,14 +6,25 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from unittest import mock
 
 import pytest
 import torch
+import torch.distributed as dist
 from torch import nn
+
+import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
+from broken_steps import broken
+from making import REPOSITORY, ball, box_room, dense_config, quick_start, views_sampled_once
+from pointsplat_ns.compression import feedback_training
+from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.io import write_ply
+from pointsplat_ns.metrics.lpips import LpipsUnavailable
+from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks, synchronise_batch_norm
+from pointsplat_ns.refiner.encoder import BatchNorm
+from pointsplat_ns.system import processes
+from pointsplat_ns.system.processes import average_gradients, gathered
 
 pytestmark = pytest.mark.xdist_group("distributed")  # one worker trains for all tests of this file
 
@@ -23,43 +34,23 @@ BROKEN = {3}, {6}
 """Places of a broken photo, which the second process meets, and of a broken gradient, which the first does."""
 
 
-def write_rooms(folder: Path) -> None:
-    """Three closed boxes of coloured Gaussians as PLY files."""
-    from pointsplat_ns.gaussians import Gaussians
-    from pointsplat_ns.io import write_ply
-
-    generator = torch.Generator().manual_seed(3)
-    for name in ("a", "b", "c"):
-        means = torch.rand(600, 3, generator=generator) * 2 - 1
-        rows, axis = torch.arange(600), torch.arange(600) % 3
-        means[rows, axis] = torch.sign(means[rows, axis])
-        quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(600, 1)
-        colors = torch.sin(2 * means + torch.randn(3, generator=generator))
-        scales, opacities = torch.full((600, 3), -2.0), torch.full((600, 1), 4.0)
-        write_ply(Gaussians(means, scales, quats, opacities, colors, torch.zeros(600, 0, 3)), folder / f"{name}.ply")
-
-
 def config_of(data: Path, output_dir: Path, steps: int):
-    """The method as registered, tiny, without LPIPS, at constant rates, for a schedule counts steps, not scenes."""
-    import method_configs.methods  # noqa: F401  (completes nerfstudio's imports in the order that it can)
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
-
-    config = pointsplat_config()
-    config.machine.device_type, config.experiment_name, config.timestamp = "cpu", "refiner", "now"
-    config.output_dir, config.max_num_iterations, config.steps_per_eval_image = output_dir, steps, 0
-    manager, model = config.pipeline.datamanager, config.pipeline.model
-    manager.data = config.data = data
-    manager.sampled_poses, manager.sampled_size = 5, (32, 24)
-    model.size, model.keep, model.by, model.lpips_weight = "tiny", 0.4, "paper", 0.0
+    """The method at a size for tests, at constant rates, for a schedule counts steps, not scenes."""
+    config = dense_config(data, output_dir, steps)
+    config.timestamp, config.steps_per_eval_image = "now", 0
+    config.pipeline.datamanager.sampled_poses, config.pipeline.datamanager.sampled_size = 5, (32, 24)
     for group in config.optimizers.values():
         group["scheduler"], group["optimizer"].lr = None, 1e-3
     return config
 
 
-def train(config, world_size: int = 1) -> dict:
-    """Losses, gradients of the last update, weights and evaluation of a training."""
-    from pointsplat_ns.metrics.lpips import LpipsUnavailable
+def write_rooms(folder: Path) -> None:
+    for seed, name in enumerate("abc"):
+        write_ply(box_room(seed, 600, smooth=True), folder / f"{name}.ply")
 
+
+def train(config, world_size: int = 1, judged: bool = False) -> dict:
+    """Losses, gradients of the last update, weights and, if asked for, the evaluation of a training."""
     trainer = config.setup(local_rank=0, world_size=world_size)
     trainer.setup()
     losses, quality, iteration = [], [], trainer.train_iteration
@@ -74,7 +65,7 @@ def train(config, world_size: int = 1) -> dict:
     trainer.train()
     refiner = trainer.pipeline.model.refiner
     with mock.patch("pointsplat_ns.metrics.lpips.cached_lpips", side_effect=LpipsUnavailable("not in this test")):
-        report = trainer.pipeline.get_average_eval_image_metrics()
+        report = trainer.pipeline.get_average_eval_image_metrics() if judged else {"scenes": {}}
     return {
         "losses": losses,
         "psnr": quality,
@@ -85,34 +76,6 @@ def train(config, world_size: int = 1) -> dict:
         "skipped": dict(trainer.pipeline.training_state.skipped),
         "files": sorted(p.name for p in config.get_base_dir().rglob("*") if p.is_file() and "events" not in p.name),
     }
-
-
-@contextmanager
-def broken(photos: set[int], gradients: set[int]) -> Iterator[None]:
-    """Within, photos of NaN, and finite losses with a gradient of NaN, at these places in the sequence of scenes."""
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
-
-    next_train, losses_of = ScenesDataManager.next_train, PointSplatPipeline.get_train_loss_dict
-
-    def targets(self, step):
-        scene, frames = next_train(self, step)
-        if self.place(step) in photos:
-            frames = [(camera, {**data, "image": torch.full((24, 32, 3), torch.nan)}) for camera, data in frames]
-        return scene, frames
-
-    def losses(self, step):
-        outputs, parts, metrics = losses_of(self, step)
-        if self.datamanager.place(step) in gradients:
-            weight = self.model.refiner.heads.mlps["scales"][-1].weight
-            parts["l1"] = parts["l1"] + 0 * (0 * weight.sum()).sqrt()  # a root's slope at 0, times 0
-        return outputs, parts, metrics
-
-    with (
-        mock.patch.object(ScenesDataManager, "next_train", targets),
-        mock.patch.object(PointSplatPipeline, "get_train_loss_dict", losses),
-    ):
-        yield
 
 
 def gathering(data: Path, output_dir: Path, steps: int, accumulate: int, norm: str = "scene"):
@@ -133,11 +96,9 @@ def resumed(rooms: Path, folder: Path, name: str, rank: int, norm: str) -> list[
 
 def stopped(rooms: Path, output_dir: Path) -> str:
     """What a training of two processes says when the second one's photos are all broken."""
-    from pointsplat_ns.errors import SceneError
-
     config = config_of(rooms, output_dir, 20)
     config.max_skipped_steps = 2
-    with broken(set(range(1, 40, 2)), set()), pytest.raises(SceneError) as caught:
+    with broken("nan", range(1, 40, 2)), pytest.raises(SceneError) as caught:
         train(config, world_size=2)
     return str(caught.value)
 
@@ -154,9 +115,6 @@ def normalise(norm: nn.Module, x: torch.Tensor, weights: torch.Tensor) -> dict[s
 
 def feedback(file: Path) -> list[torch.Tensor]:
     """What the network that sets the steps of repairs learns in two updates of two repairs."""
-    from making import ball
-    from pointsplat_ns.compression import feedback_training
-
     settings = feedback_training.FeedbackTrainingSettings(steps=(6,), side=32)
     with mock.patch.object(feedback_training, "TRAINING", settings):
         scene = feedback_training.TrainingScene.of("ball", ball(800), ["30%"], view_batches=1)
@@ -173,18 +131,12 @@ def rows() -> tuple[torch.Tensor, torch.Tensor]:
 
 def work(rank: int, folder: Path) -> None:
     """What each of the two processes does."""
-    import torch.distributed as dist
-
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks, synchronise_batch_norm
-    from pointsplat_ns.refiner.encoder import BatchNorm
-    from pointsplat_ns.system.processes import average_gradients, gathered
-
     dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=2)
-    found = train(config_of(folder / "rooms", folder / f"out{rank}", UPDATES), world_size=2)
+    found = train(config_of(folder / "rooms", folder / f"out{rank}", UPDATES), world_size=2, judged=True)
     found["resumed"] = resumed(folder / "rooms", folder, "gathering", rank, "scene")
-    with broken(*BROKEN):
+    with broken("nan", BROKEN[0]), broken("gradient", BROKEN[1]):
         found["skipping"] = resumed(folder / "rooms", folder, "skipping", rank, "scene")
-    with broken({3}, set()):
+    with broken("nan", {3}):
         found["batch norm"] = resumed(folder / "rooms", folder, "batch norm", rank, "batch")
     found["stopped"] = stopped(folder / "rooms", folder / f"stopped{rank}")
     x, weights = rows()
@@ -210,12 +162,16 @@ def together(tmp_path_factory):
     folder = tmp_path_factory.mktemp("parallel")
     (folder / "rooms").mkdir()
     write_rooms(folder / "rooms")
-    pair = subprocess.Popen([sys.executable, __file__, folder], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    pair = subprocess.Popen(
+        [sys.executable, __file__, folder], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (REPOSITORY, REPOSITORY / "tests/support")))},
+    )  # fmt: skip
     try:
         alone = config_of(folder / "rooms", folder / "alone", 2 * UPDATES)
         alone.gradient_accumulation_steps = {"all": 2}
-        alone = train(alone)
-        with broken(BROKEN[0] | {2}, BROKEN[1] | {7}):  # what either of two processes cannot use, both leave out
+        alone = train(alone, judged=True)
+        # What either of two processes cannot use, both leave out.
+        with broken("nan", BROKEN[0] | {2}), broken("gradient", BROKEN[1] | {7}):
             alone["skipping"] = train(gathering(folder / "rooms", folder / "skipping", 8, 4))
         alone["feedback"] = feedback(folder / "feedback.safetensors")
         text = pair.communicate(timeout=600)[0].decode()
@@ -302,8 +258,6 @@ def test_all_processes_stop_at_once_and_name_the_scenes_of_all(together):
 
 
 def test_batch_norm_is_that_of_all_points(together):
-    from pointsplat_ns.refiner.encoder import BatchNorm
-
     found, _ = together
     x, weights = rows()
     # each process's loss is its own; the mean of their gradients is that of the mean loss
@@ -339,8 +293,9 @@ def test_ns_train_under_torchrun_is_one_training(tmp_path):
     ]
     run = ("-m", "torch.distributed.run", "--nproc-per-node", "2", "-m", "nerfstudio.scripts.train", "pointsplat")
     done = subprocess.run(
-        [sys.executable, *run, *map(str, asked)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=600
-    )
+        [sys.executable, *run, *map(str, asked)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=600,
+        env=quick_start(),
+    )  # fmt: skip
     assert done.returncode == 0, done.stdout.decode()
     (folder,) = (tmp_path / "out" / "pair" / "pointsplat").iterdir()
     found = {path.name for path in folder.rglob("*") if "events" not in path.name}
@@ -349,8 +304,6 @@ def test_ns_train_under_torchrun_is_one_training(tmp_path):
 
 
 def test_several_processes_on_a_cpu_are_started_by_torchrun(tmp_path):
-    from pointsplat_ns.errors import PointSplatError
-
     config = config_of(tmp_path, tmp_path, 1)
     config.machine.num_devices = 2
     with pytest.raises(PointSplatError, match="torchrun --nproc-per-node 2 --no-python ns-train pointsplat"):
@@ -358,10 +311,7 @@ def test_several_processes_on_a_cpu_are_started_by_torchrun(tmp_path):
 
 
 def test_a_process_alone_is_left_as_it_is():
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks
-    from pointsplat_ns.system.processes import average_gradients, gathered, rank, world_size
-
-    assert (rank(), world_size(), gathered([1])) == (0, 1, [1])
+    assert (processes.rank(), processes.world_size(), gathered([1])) == (0, 1, [1])
     assert means_over_ranks({"psnr": torch.tensor(3.0)}, ("l1", "psnr")) == {"psnr": torch.tensor(3.0)}
     parameter = nn.Parameter(torch.zeros(2))
     average_gradients([parameter], steps=3)
@@ -369,10 +319,6 @@ def test_a_process_alone_is_left_as_it_is():
 
 
 if __name__ == "__main__":
-    sys.path.append(str(Path(__file__).parents[2] / "support"))
-    import method_configs.methods  # noqa: F401  (what takes seconds to import is imported once, for both)
-    from making import views_sampled_once
-
     child = os.fork()  # nothing has been computed, so there are no threads yet
     with views_sampled_once():
         work(0 if child else 1, Path(sys.argv[1]))

@@ -49,24 +49,23 @@ def test_keep_is_a_ratio_up_to_1_and_a_count_above(trained_walls, keep, kept):
     assert len(scene.pruned) == (kept or scene.dense_count)
 
 
-@pytest.mark.parametrize("keep", [0.0, -0.5, 1.5, math.nan, math.inf])
-def test_a_keep_that_means_nothing_is_refused_before_training(trained_walls, keep):
-    with pytest.raises(BudgetError, match="keep is .*expected a ratio above 0"):
-        pipeline_of(trained_walls, keep=keep)
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        *(({"keep": keep}, BudgetError, "keep is .*expected a ratio above 0") for keep in (0.0, -0.5, 1.5, math.nan)),
+        ({"keep": math.inf}, BudgetError, "keep is .*expected a ratio above 0"),
+        ({"more_keeps": (0.3, 1.5)}, BudgetError, "keep is 1.5"),
+        ({"by": "beauty"}, PointSplatError, "no method is called 'beauty'; expected one of merge"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused_before_anything_is_read(trained_walls, settings, error, message):
+    with pytest.raises(error, match=message):
+        pipeline_of(trained_walls, **settings)
 
 
-def test_what_one_scene_cannot_give_names_the_scene(trained_walls):
-    pipeline = pipeline_of(trained_walls, keep=1e6)
+def test_what_one_scene_cannot_give_is_refused_when_it_is_pruned(trained_walls):
     with pytest.raises(BudgetError, match=r"wall-a.*\.ckpt: keep is 1000000 Gaussians; expected 1 to"):
-        pipeline.model.pruned_scene(0)
-
-
-def test_a_method_that_does_not_exist_is_refused(trained_walls):
-    with pytest.raises(PointSplatError, match="no method is called 'beauty'; expected one of merge"):
-        pipeline_of(trained_walls, by="beauty")
-
-
-def test_an_opacity_weight_out_of_range_is_refused(trained_walls):
+        pipeline_of(trained_walls, keep=1e6).model.pruned_scene(0)
     with pytest.raises(PointSplatError, match="opacity_weight is 1.5; expected 0 to 1"):
         pipeline_of(trained_walls, opacity_weight=1.5).model.pruned_scene(0)
 
@@ -86,12 +85,14 @@ def test_a_scene_is_drawn_as_it_was_trained(trained_walls):
     assert modes == [("classic", 3), ("antialiased", 1)]
 
 
-def test_weights_of_another_network_are_refused(trained, trained_walls):
-    config, _, _ = trained
-    state = torch.load(next(config.get_checkpoint_dir().iterdir()), weights_only=True)["pipeline"]
-    for other in ({"size": "small"}, {"encoder": "concat"}):
-        with pytest.raises(SceneError, match="does not hold a network of size"):
-            pipeline_of(trained_walls, **other).load_pipeline(state, 9)
+OTHERS = ({"size": "small"}, {"encoder": "concat"}, {"use_position": False}, {"norm": "batch"})
+
+
+@pytest.mark.parametrize("other", OTHERS, ids=str)
+def test_weights_of_another_network_are_refused(trained, trained_walls, other):
+    state = torch.load(next(trained[0].get_checkpoint_dir().iterdir()), weights_only=True)["pipeline"]
+    with pytest.raises(SceneError, match="does not hold a network of size .* with encoder .*, use_appearance"):
+        pipeline_of(trained_walls, **other).load_pipeline(state, 9)
 
 
 def test_a_loss_that_is_not_finite_is_shown(trained_walls):

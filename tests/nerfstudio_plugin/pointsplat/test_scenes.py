@@ -15,7 +15,7 @@ from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetppDataParser
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
-from making import without_data
+from making import run_of, without_data
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
@@ -28,11 +28,6 @@ NUM_TRAIN, NUM_HELD_OUT = 9, 2  # of the wall's 11 frames, every tenth held out
 
 def manager_of(folder: Path, **settings):
     return ScenesDataManagerConfig(data=folder, cache_gigabytes=0.01, **settings).setup(test_mode="val")
-
-
-def run_of(folder: Path, name: str) -> Path:
-    (path,) = (folder / name / "splatfacto-cpu").iterdir()
-    return path
 
 
 def make_run(folder: Path, wall_config, scene: Path, change=lambda config: None) -> Path:
@@ -226,7 +221,8 @@ def test_a_step_gets_the_same_whatever_came_before_it(trained_walls):
     forward = [photos_of(first, step) for step in range(12)]
     backward = [photos_of(second, step) for step in reversed(range(12))]
     assert forward == backward[::-1]
-    assert forward != [photos_of(manager_of(trained_walls, seed=1), step) for step in range(12)]
+    other = manager_of(trained_walls, seed=1)
+    assert forward != [photos_of(other, step) for step in range(12)]
 
 
 def test_each_epoch_has_each_scene_once_and_photos_differ(trained_walls):
@@ -240,7 +236,8 @@ def test_each_epoch_has_each_scene_once_and_photos_differ(trained_walls):
 
 
 def test_processes_share_out_what_one_would_see(trained_walls):
-    alone = [photos_of(manager_of(trained_walls), step) for step in range(12)]
+    one = manager_of(trained_walls)
+    alone = [photos_of(one, step) for step in range(12)]
     config = ScenesDataManagerConfig(data=trained_walls, cache_gigabytes=0.01)
     for size in (2, 3):
         shares = [config.setup(test_mode="val", world_size=size, local_rank=rank) for rank in range(size)]

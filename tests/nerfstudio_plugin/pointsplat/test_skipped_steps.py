@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from unittest import mock
 
@@ -13,38 +10,9 @@ import pytest
 import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
+from broken_steps import broken
 from making import dense_config, equal
 from pointsplat_ns.errors import PointSplatError, SceneError
-
-
-@contextmanager
-def broken(kind: str, steps: set[int]) -> Iterator[None]:
-    """Within, these training steps have a photo of NaN or of infinity, or a gradient of NaN with a finite loss."""
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
-
-    next_train, losses_of = ScenesDataManager.next_train, PointSplatPipeline.get_train_loss_dict
-
-    def photos(self, step):
-        scene, frames = next_train(self, step)
-        if step in steps and kind != "gradient":
-            value = {"nan": math.nan, "infinite": math.inf}[kind]
-            frames = [(camera, {**data, "image": torch.full((36, 48, 3), value)}) for camera, data in frames]
-        return scene, frames
-
-    def losses(self, step):
-        outputs, losses, metrics = losses_of(self, step)
-        if step in steps and kind == "gradient":
-            weight = self.model.refiner.heads.mlps["scales"][-1].weight
-            losses["l1"] = losses["l1"] + 0 * (0 * weight.sum()).sqrt()  # a root's slope at 0, times 0
-            assert losses["l1"].isfinite()
-        return outputs, losses, metrics
-
-    with (
-        mock.patch.object(ScenesDataManager, "next_train", photos),
-        mock.patch.object(PointSplatPipeline, "get_train_loss_dict", losses),
-    ):
-        yield
 
 
 def constant(config):
@@ -127,28 +95,6 @@ def test_a_gradient_scaler_deals_with_its_own_overflows_and_changes_nothing_else
     assert trainer.grad_scaler.get_scale() == 512.0 and trainer.pipeline.training_state.skipped.total() == 0
     assert equal(scaled[1][0]["heads.mlps.scales.6.weight"], torch.zeros(3, 64)), "the part that overflowed stays"
     assert not equal(scaled[3][0], scaled[1][0])
-
-
-@pytest.mark.parametrize(("stop", "accumulate"), [(4, 3), (4, 1)])
-def test_an_interrupted_training_skips_as_an_unbroken_one(three_rooms, run_training, tmp_path, stop, accumulate):
-    def config(name, steps):
-        changed = dense_config(three_rooms, tmp_path / name, steps)
-        changed.gradient_accumulation_steps = {"all": accumulate}
-        changed.steps_per_save, changed.save_only_latest_checkpoint = stop, False
-        return changed
-
-    with broken("nan", {1, 4, 6}):  # of three updates over three steps, two are the mean of fewer
-        whole, losses = run_training(config("whole", 8))
-        rest = config("rest", 8 - stop - 1)
-        rest.load_dir, rest.load_step = whole.checkpoint_dir, stop
-        resumed, last_losses = run_training(rest)
-    assert [math.isnan(loss) for loss in losses] == [step in (1, 4, 6) for step in range(8)]
-    assert str(last_losses) == str(losses[stop + 1 :])
-    assert (
-        whole.pipeline.training_state.skipped == resumed.pipeline.training_state.skipped
-        and whole.pipeline.training_state.skipped.total() == 3
-    )
-    assert equal(whole.pipeline.model.refiner.state_dict(), resumed.pipeline.model.refiner.state_dict())
 
 
 def test_after_too_many_skipped_steps_training_stops_and_names_the_scenes(three_rooms, run_training, tmp_path):

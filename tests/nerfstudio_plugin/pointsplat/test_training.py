@@ -81,20 +81,6 @@ def test_an_evaluation_while_training_is_logged(trained):
     assert trainer.pipeline.training and trainer.pipeline.model.training, "training goes on as it was"
 
 
-def test_a_resumed_training_ends_where_an_unbroken_one_does(trained_walls, run_training, tmp_path):
-    config = fast_config(trained_walls, tmp_path / "whole", steps=6)
-    config.steps_per_save, config.save_only_latest_checkpoint = 3, False
-    whole, losses = run_training(config)
-    rest = fast_config(trained_walls, tmp_path / "rest", steps=2)
-    rest.load_dir, rest.load_step = config.get_checkpoint_dir(), 3  # after steps 0 to 3
-    resumed, last_losses = run_training(rest)
-    assert resumed._start_step == 4 and last_losses == losses[4:]
-    for name, value in whole.pipeline.model.refiner.state_dict().items():
-        assert torch.equal(resumed.pipeline.model.refiner.state_dict()[name], value), name
-    rates = [t.optimizers.optimizers["encoder"].param_groups[0]["lr"] for t in (whole, resumed)]
-    assert rates[0] == rates[1]
-
-
 @pytest.mark.parametrize("steps", [1, 2, 3, 2000])
 def test_learning_rates_rise_fall_and_never_rise_again(steps):
     config = fast_config(Path("unused"), Path("unused"), steps=steps)

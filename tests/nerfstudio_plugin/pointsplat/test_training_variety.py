@@ -11,7 +11,7 @@ import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import small_config
-from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
+from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PIXEL_LOSSES
@@ -20,14 +20,10 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_store import read_pruned,
 from pointsplat_ns.pruning import PruneSettings
 
 
-def config_of(data: Path, output_dir: Path, steps: int = 6, **model):
-    return small_config(data, output_dir, steps, **model)
-
-
 def test_one_network_learns_at_several_budgets_and_is_evaluated_at_the_first(
     trained_walls, run_training, tmp_path, no_lpips
 ):
-    trainer, _ = run_training(config_of(trained_walls, tmp_path, steps=12, more_keeps=(0.25, 40.0)))
+    trainer, _ = run_training(small_config(trained_walls, tmp_path, 12, more_keeps=(0.25, 40.0)))
     model = trainer.pipeline.model
     cache = trainer.pipeline.datamanager.cache
     for keep in (0.5, 0.25, 40.0):
@@ -36,34 +32,27 @@ def test_one_network_learns_at_several_budgets_and_is_evaluated_at_the_first(
     assert len(model.refine(0)) == round(0.5 * len(model.scenes[0].read_dense()))
 
 
-def test_a_budget_without_meaning_is_refused_before_anything_is_read(trained_walls, tmp_path):
-    with pytest.raises(BudgetError, match="keep is 1.5"):
-        config_of(trained_walls, tmp_path, more_keeps=(0.3, 1.5)).pipeline.setup(device="cpu")
-
-
-def losses_of(run_training, config) -> list[float]:
-    return run_training(config)[1]
-
-
 def test_transforms_change_what_the_network_sees_and_nothing_else(trained_walls, run_training, tmp_path, no_lpips):
     """Before the first update residuals are zero, so the first loss is the same; from the second on it is not."""
-    plain = losses_of(run_training, config_of(trained_walls, tmp_path / "plain", steps=4))
-    moved = losses_of(run_training, config_of(trained_walls, tmp_path / "moved", steps=4, augment=True))
-    again = losses_of(run_training, config_of(trained_walls, tmp_path / "again", steps=4, augment=True))
+    plain = run_training(small_config(trained_walls, tmp_path / "plain", 2))[1]
+    moved = run_training(small_config(trained_walls, tmp_path / "moved", 2, augment=True))[1]
+    again = run_training(small_config(trained_walls, tmp_path / "again", 2, augment=True))[1]
     assert moved[0] == pytest.approx(plain[0], rel=1e-4)  # undoing a transform rounds: thresholds flip in few pixels
-    assert moved[1:] != plain[1:]
+    assert moved[1] != plain[1]
     assert moved == again, "the same seed draws the same transforms"
 
 
 def test_evaluation_sees_scenes_as_they_are(trained_walls, tmp_path):
-    pipeline = config_of(trained_walls, tmp_path, augment=True).pipeline.setup(device="cpu", test_mode="test").eval()
+    pipeline = (
+        small_config(trained_walls, tmp_path, 1, augment=True).pipeline.setup(device="cpu", test_mode="test").eval()
+    )
     refined, pruned = pipeline.model.refine(0), pipeline.model.pruned_scene(0).pruned
     assert all(torch.equal(a, b) for a, b in zip(refined.tensors(), pruned.tensors(), strict=True))
 
 
 def test_pruned_scenes_are_taken_from_the_folder(trained_walls, tmp_path, monkeypatch):
     def pruned(**changes):
-        config = config_of(trained_walls, tmp_path, pruned_folder=tmp_path / "pruned", **changes)
+        config = small_config(trained_walls, tmp_path, 1, pruned_folder=tmp_path / "pruned", **changes)
         return config.pipeline.setup(device="cpu", test_mode="test").model.pruned_scene(0)
 
     first = pruned()
@@ -94,8 +83,18 @@ def test_files_of_pruned_scenes_that_are_damaged_or_of_another_kind_say_so(tmp_p
         read_pruned(path)
 
 
-def test_a_stored_scene_lies_in_the_folder_whatever_the_scene_is_called(tmp_path):
-    assert stored_path(tmp_path, "../../etc/passwd", "a5" * 32, PruneSettings(0.5)).parent == tmp_path
+def test_a_stored_scene_lies_in_the_folder_and_is_told_apart_by_content_and_settings(tmp_path):
+    usual = ("room", "a5" * 32, PruneSettings(0.5, "paper"))
+    others = [
+        ("../../etc/passwd", *usual[1:]),
+        ("room", "5a" * 32, usual[2]),
+        *(
+            ("room", usual[1], PruneSettings(*settings))
+            for settings in ((0.25, "paper"), (0.5, "merge"), (0.5, "paper", 0.7))
+        ),
+    ]
+    paths = [stored_path(tmp_path, *key) for key in (usual, usual, *others)]
+    assert all(path.parent == tmp_path for path in paths) and paths[0] == paths[1] and len(set(paths)) == 6
 
 
 def trained_anew(run: Path) -> None:
@@ -111,7 +110,7 @@ def test_a_scene_that_is_trained_again_under_the_same_name_is_pruned_anew(traine
     shutil.copytree(trained_walls, tmp_path / "runs")
 
     def pruned():
-        config = config_of(tmp_path / "runs", tmp_path, pruned_folder=tmp_path / "pruned")
+        config = small_config(tmp_path / "runs", tmp_path, 1, pruned_folder=tmp_path / "pruned")
         pipeline = config.pipeline.setup(device="cpu", test_mode="test")
         return pipeline.model.pruned_scene(0).pruned, pipeline.datamanager.scenes[0]
 
@@ -123,29 +122,16 @@ def test_a_scene_that_is_trained_again_under_the_same_name_is_pruned_anew(traine
     torch.testing.assert_close(after.means, before.means + 1.0)
 
 
-def test_stored_scenes_are_told_apart_by_content_and_settings(tmp_path):
-    settings = PruneSettings(0.5, "paper")
-    path = stored_path(tmp_path, "room", "a5" * 32, settings)
-    assert path == stored_path(tmp_path, "room", "a5" * 32, settings)
-    others = [
-        stored_path(tmp_path, "room", "5a" * 32, settings),
-        stored_path(tmp_path, "room", "a5" * 32, PruneSettings(0.25, "paper")),
-        stored_path(tmp_path, "room", "a5" * 32, PruneSettings(0.5, "merge")),
-        stored_path(tmp_path, "room", "a5" * 32, PruneSettings(0.5, "paper", 0.7)),
-    ]
-    assert len({path, *others}) == 5
-
-
 @pytest.mark.parametrize("factor", [0.0, -1.0, math.nan, math.inf])
 def test_a_factor_of_the_rates_that_is_no_positive_number_is_refused(factor, tmp_path):
-    config = config_of(tmp_path, tmp_path)
+    config = small_config(tmp_path, tmp_path, 1)
     config.rate_factor = factor
     with pytest.raises(PointSplatError, match="--rate-factor"):
         config.setup(local_rank=0, world_size=1)
 
 
 def test_the_factor_multiplies_every_rate(trained_walls, tmp_path):
-    config = config_of(trained_walls, tmp_path)
+    config = small_config(trained_walls, tmp_path, 1)
     config.rate_factor = 3.0
     trainer = config.setup(local_rank=0, world_size=1)
     for name, group in trainer.config.optimizers.items():
@@ -169,7 +155,7 @@ def test_pixel_losses_at_extremes(name, scale):
 
 def test_the_pixel_loss_is_the_one_asked_for(trained_walls, run_training, tmp_path, no_lpips):
     losses = {
-        name: losses_of(run_training, config_of(trained_walls, tmp_path / name, steps=1, pixel_loss=name))[0]
+        name: run_training(small_config(trained_walls, tmp_path / name, 1, pixel_loss=name))[1][0]
         for name in PIXEL_LOSSES
     }
     assert losses["rmse"] > losses["l1"] > 0, "a root of mean squares is at least the mean"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pointsplat_ns.rasterizer import binning
 from pointsplat_ns.rasterizer import ellipses as in_torch
 from pointsplat_ns.rasterizer.compiled import tiles as compiled_tiles
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
@@ -72,17 +71,3 @@ def test_nothing_gives_no_pair_and_any_number_of_threads_the_same_bits():
             footprints = Footprints(*given(20_000), engine=compiled_tiles)
             found.append((footprints._ellipses.shapes, footprints.tiles(footprints.whole).gaussians))
     assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
-
-
-@needs_compiler
-@pytest.mark.parametrize(
-    ("dtype", "compiled", "module"),
-    [
-        (torch.float32, None, compiled_tiles),
-        (torch.float32, True, compiled_tiles),
-        (torch.float32, False, in_torch),
-        (torch.float64, True, in_torch),
-    ],
-)
-def test_kernels_are_for_float32_unless_they_are_not_wanted(dtype, compiled, module):
-    assert binning.engine_of(compiled, torch.zeros(1, 2), torch.zeros(1, dtype=dtype)) is module

@@ -1,0 +1,23 @@
+"""A page of two scenes, for all tests of this folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import pointsplat_ns as ps
+from pointsplat_ns.gaussians import Gaussians
+from sweeps import room_views
+
+
+@pytest.fixture(scope="session")
+def rooms() -> list[Gaussians]:
+    """The example room with a tenth of its Gaussians, and with a fiftieth."""
+    return [ps.example_room()[::10], ps.example_room()[::50]]
+
+
+@pytest.fixture(scope="session")
+def written(rooms, tmp_path_factory) -> Path:
+    """The page; shared by all tests, so do not write to it."""
+    return ps.write_page(rooms, tmp_path_factory.mktemp("page") / "room.html", ["dense", "compact"], views=room_views())
