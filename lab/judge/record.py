@@ -201,10 +201,10 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
 LEARNED = ("mujoco_tabletop", "pc_playbot", "pc_statue_st_peter", "lounge")
 """Scenes of the list "judged" that the network of ``compact``'s repairs was trained on (FEEDBACK.md beside it)."""
 
-SCENES = f"""No constant is chosen on scenes of the list "judged". Scenes of no list are "other". Three rules exist
+SCENES = f"""No constant is chosen on scenes of the list "judged". Scenes of no list are "other". Four rules exist
 because a judged scene had shown the need; their constants come from scenes for tuning: repairs hold from nearer places
-(rock), merging holds before a white background (ethiopianHead), repairs take no views that large Gaussians fill
-(apt_kitchen_balcony).
+(rock), merging holds before a white background (ethiopianHead), repairs take no views that large Gaussians fill, and
+views look from enclosed places of what is no room as a whole (both apt_kitchen_balcony).
 [benchmarks.md](../benchmarks.md#scenes) says where the scenes come from.
 The network that sets the steps of `compact` was trained on {", ".join(LEARNED)}."""
 
