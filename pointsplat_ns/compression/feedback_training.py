@@ -27,6 +27,7 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS
+from pointsplat_ns.looking.windows import RESOLUTION, middle_sized
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, save_feedback_refiner
@@ -45,8 +46,8 @@ class FeedbackTrainingSettings:
     """Views of a scene in a batch of the sampler."""
     view_batches: int = 6
     """Batches of views of a scene."""
-    side: int = 400
-    """Longer side of the views, pixels, as in repairs."""
+    side: int | None = None
+    """Longer side of the views, pixels; by default the middle size of sampled views, as in repairs."""
     least_error: float = 1e-5
     """Added to mean squared errors (50 dB), so that nearly correct scenes do not dominate the loss."""
     rate: float = 3e-3
@@ -80,11 +81,11 @@ class TrainingScene:
     def of(cls, name: str, dense: Gaussians, keep: Sequence[str], view_batches: int | None = None) -> TrainingScene:
         """Merge a scene to each budget, and sample views of it."""
         batches = TRAINING.view_batches if view_batches is None else view_batches
-        sampled = [sample_views(dense, TRAINING.batch_views, seed=100 + number) for number in range(batches)]
+        sampled = [sample_views(dense, TRAINING.batch_views, *RESOLUTION, seed=100 + n) for n in range(batches)]
         viewmats, Ks = (torch.cat([getattr(v, field) for v in sampled]) for field in ("viewmats", "Ks"))
         first = sampled[0]
         views = Views(viewmats, Ks, first.width, first.height, first.background, near_plane=first.near_plane)
-        views = views.resized(TRAINING.side)
+        views = middle_sized(views) if TRAINING.side is None else views.resized(TRAINING.side)
         pruned = {budget: prune(dense, budget, "merge") for budget in keep}
         reference = DenseReference(dense, views.spread(COMPARED_VIEWS))
         psnr = {budget: reference.psnr_of_covered(reference.psnr(scene)[0]) for budget, scene in pruned.items()}
