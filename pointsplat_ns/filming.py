@@ -15,6 +15,7 @@ from pointsplat_ns.compression.posed_scene import check_views_show, views_for
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
+from pointsplat_ns.looking.settings import AROUND
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.system.packages import need
@@ -163,8 +164,8 @@ def open_viewer(
 
 def _source(scene: Source, loaded: Gaussians, given: Views | None) -> ViewSource:
     if isinstance(scene, Gaussians):
-        return ViewSource(loaded, given=given)
-    return ViewSource(loaded, given=given, run=scene, dataset_views=dataset_views)
+        return ViewSource(loaded, given=given, settings=AROUND)
+    return ViewSource(loaded, given=given, run=scene, dataset_views=dataset_views, settings=AROUND)
 
 
 def _mode(scene: Source, usual: RasterizeMode) -> RasterizeMode:

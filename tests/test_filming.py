@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from pathlib import Path
 
@@ -40,7 +41,8 @@ def frames_in(folder: Path) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("path", ["walk", "orbit"])
-def test_film_of_a_scene_moves(path, scene, tmp_path):
+def test_film_of_a_scene_moves(path, tmp_path):
+    scene = ball(700, log_size=math.log(0.06))
     assert ps.render_path(scene, tmp_path / "frames", path=path, seconds=0.6, **SMALL) == 6
     frames = frames_in(tmp_path / "frames")
     assert len(frames) == 6 and all(frame.shape == (48, 64, 3) for frame in frames)

@@ -82,11 +82,12 @@ class Search:
         """Candidate views (V, 4, 4), the index (V,) of the place of each, and its gain (V, P) at each point."""
         if self.photos is not None:
             return self._near_photos(self.photos)
-        within = self._views_from(self._inside(), True)
         if self.inside:
-            return within
-        # Parts of a scene that is no room may be enclosed, such as the rooms of a flat without its walls.
+            return self._views_from(self._inside(), True)
         around = self._views_from(self._outside(), False)
+        if not self.settings.enclosed_parts:
+            return around
+        within = self._views_from(self._inside(), True)
         viewmats, owner, gains = (torch.cat(both) for both in zip(around, within, strict=True))
         owner[len(around[1]) :] += self.settings.places
         return viewmats, owner, gains

@@ -7,7 +7,7 @@ of the scene's content, see :data:`~pointsplat_ns.looking.content.UNITS`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -218,6 +218,10 @@ class LookingSettings:
     """Smallest share of the points, relative to those that are visible from outside, that are visible from the enclosed
     places of a room."""
 
+    enclosed_parts: bool = True
+    """Whether views also look from the enclosed places of scenes that are no rooms as a whole, such as a flat without
+    its walls."""
+
     # Places and directions of candidate views (search.py)
 
     places: int = 48
@@ -394,3 +398,6 @@ class LookingSettings:
 
 DEFAULTS = LookingSettings()
 """The settings that scenes are looked at with by default."""
+
+AROUND = replace(DEFAULTS, enclosed_parts=False)
+"""The settings of films and pages: their cameras move around what is no room."""

@@ -28,7 +28,7 @@ from pointsplat_ns.looking.content import (
 )
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.sampling import estimated_up, sample_views
-from pointsplat_ns.looking.settings import DEFAULTS
+from pointsplat_ns.looking.settings import AROUND, DEFAULTS
 from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.system.progress import Progress, silent
@@ -153,7 +153,7 @@ def _sampled(scene: Gaussians, centre: Tensor, size: float, up: Tensor) -> Views
     it."""
     width, height = 960, 600
     try:
-        return sample_views(scene, VIEWS, width, height, up=up)
+        return sample_views(scene, VIEWS, width, height, up=up, settings=AROUND)
     except DataError:
         lift = math.radians(20.0)
         aside = level_directions(up, torch.zeros(1, dtype=torch.float64))[0]
