@@ -50,7 +50,7 @@ def make_room(seed: int) -> Room:
 
     Example:
         >>> [round(metres, 1) for metres in make_room(3).size]
-        [4.9, 4.0, 2.5]
+        [4.5, 4.3, 2.8]
     """
     if seed < 0:
         raise DataError(f"room seed {seed}: expected 0 or more")

@@ -17,7 +17,7 @@ class MergeSettings:
     Example:
         >>> from dataclasses import replace
         >>> replace(DEFAULTS, regrouping_rounds=0).neighbours  # everything as by default, but no regrouping
-        8
+        6
     """
 
     # Viewpoints (viewpoints.py)
