@@ -6,6 +6,7 @@ from __future__ import annotations
 import functools
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -83,7 +84,7 @@ class Compacted:
     @property
     def last(self) -> Stage:
         """The last stage that was kept."""
-        return [stage for stage in self.stages if stage.accepted][-1]
+        return _last_kept(self.stages)
 
     @property
     def scene(self) -> Gaussians:
@@ -199,8 +200,7 @@ def compact_scene(
         uncompared = str(error)
     stages = [Stage("prune", pruned.scene, before)]
     for stage in (_refine, _repair):
-        last = [known for known in stages if known.accepted][-1]
-        made = stage(last, at_work, request, judge, views, progress)
+        made = stage(_last_kept(stages), at_work, request, judge, views, progress)
         stages += [] if made is None else [made]
     notes = pruned.notes
     if views.origin and views.origin not in notes:
@@ -220,6 +220,10 @@ def as_compacted(dense: Gaussians, pruned: Gaussians, views: ViewSource, notes: 
     """
     reference = DenseReference(dense, views.compared())
     return Compacted((Stage("prune", pruned, reference.closeness(pruned)),), notes, reference, 0.0)
+
+
+def _last_kept(stages: Sequence[Stage]) -> Stage:
+    return next(stage for stage in reversed(stages) if stage.accepted)
 
 
 def _refine(
