@@ -48,7 +48,7 @@ class ViewSource:
         resolution: tuple[int, int] | None = None,
         settings: LookingSettings = DEFAULTS,
     ):
-        self._resolution, self._settings = resolution, settings
+        self._resolution, self.settings = resolution, settings
         self._scene, self._given, self._run, self._dataset_views = scene, given, run, dataset_views
         self.origin = ""
         """Text that says where views came from; empty until there are some."""
@@ -104,13 +104,13 @@ class ViewSource:
         """Sampled views, which get the run's rasterize mode."""
         width, height = self.resolution
         views = views_about(
-            self._scene, self._photos, count, width=width, height=height, seed=seed, settings=self._settings
+            self._scene, self._photos, count, width=width, height=height, seed=seed, settings=self.settings
         )
         return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
 
     @cached_property
     def _photos(self) -> PhotoPlaces | None:
-        return photo_places(self._scene, self._settings)
+        return photo_places(self._scene, self.settings)
 
     def known(self, count: int) -> Views | None:
         """At most ``count`` known views: given ones, or those of the dataset's training poses; None if there are
@@ -133,11 +133,11 @@ class ViewSource:
 
     def compared(self) -> Views:
         """The views in which renders are compared, at :func:`~pointsplat_ns.looking.windows.middle_sized` size."""
-        return middle_sized(self._whole, self._settings)
+        return middle_sized(self._whole, self.settings)
 
     def scored(self, count: int) -> Views:
         """At most ``count`` views for scores and for fine-tuning, of the size of :meth:`compared`."""
-        return middle_sized(self.views(count), self._settings)
+        return middle_sized(self.views(count), self.settings)
 
     def others(self, seed: int = 0) -> Iterator[View]:
         """Views to optimise on, without end: none of the :meth:`compared` ones, and of the same size.
@@ -155,13 +155,13 @@ class ViewSource:
         known = self.given if self.given is not None else self._of_dataset
         if known is not None and len(known) > 2 * len(compared):
             left = sorted(set(range(len(known))) - set(spread_indices(len(known), COMPARED_VIEWS)))
-            rest, generator = middle_sized(self._at_resolution(known), self._settings), random.Random(seed)
+            rest, generator = middle_sized(self._at_resolution(known), self.settings), random.Random(seed)
             while True:
                 for index in generator.sample(left, len(left)):
                     yield rest[index]
-        at_once, every = self._settings.sampled_at_once, self._settings.opposite_background_every
+        at_once, every = self.settings.sampled_at_once, self.settings.opposite_background_every
         for batch in counted(1):
-            sampled = middle_sized(self._sampled(at_once, at_once * seed + batch), self._settings)
+            sampled = middle_sized(self._sampled(at_once, at_once * seed + batch), self.settings)
             sampled = dataclasses.replace(
                 sampled, background=compared.background, rasterize_mode=compared.rasterize_mode
             )

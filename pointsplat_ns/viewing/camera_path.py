@@ -12,7 +12,6 @@ from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.settings import AROUND
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.viewing.saved_path import LIMITS, read_path
 from pointsplat_ns.viewing.trajectories import STOPS, along, fitted, orbit, walk
@@ -121,7 +120,7 @@ def views_upright(scene: Gaussians, source: ViewSource, count: int, up: Tensor |
     if up is None or source.known(1) is not None:
         return source.views(count)
     usual = source.views(1)
-    sampled = sample_views(scene, count, up=up, settings=AROUND)
+    sampled = sample_views(scene, count, up=up, settings=source.settings)
     return dataclasses.replace(sampled, rasterize_mode=usual.rasterize_mode)
 
 
