@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -15,8 +14,9 @@ from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.io.camera_files import read_views, transforms_beside
 from pointsplat_ns.io.runs import CONFIG_NAME, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
+from pointsplat_ns.looking.poses import in_pictures
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
-from pointsplat_ns.views import View, Views
+from pointsplat_ns.views import Views
 
 LONGEST_SIDE = 1600
 """Largest longer side of pictures, pixels, as in 3DGS training."""
@@ -91,21 +91,13 @@ def check_views_show(scene: Gaussians, views: Views, poses: Path | str) -> None:
     distances = (invert_rigid(checked.viewmats.double())[:, :3, 3] - 0.5 * (low + high)).norm(dim=1)
     across = checked.Ks[:, 0, 0].double() * (high - low).norm()  # pixels, at a distance of 1
     large = (across >= 0.02 * checked.width * distances) | bool((low == high).all())
-    showing = sum(bool(_in_picture(means, view).any()) for view, wide in zip(checked, large, strict=True) if wide)
+    showing = int((in_pictures(checked, means).any(1) & large).sum())
     if 2 * showing < len(checked):
         raise DataError(
             f"{poses}: {showing} of {len(checked)} cameras see anything of the scene; expected at least half; poses "
             "and scene are probably in different frames: nerfstudio moves and scales scenes, and its run says how in "
             "dataparser_transforms.json; put that file beside the scene"
         )
-
-
-def _in_picture(means: Tensor, view: View) -> Tensor:
-    """Whether positions (N, 3) are in front of a camera and in its picture, (N,) bool."""
-    at = means @ view.viewmat[:3, :3].to(means).T + view.viewmat[:3, 3].to(means)
-    x, y, w = (at @ view.K.to(means).T).unbind(1)
-    # The bounds are multiplied by the depth instead of dividing by it, which may be 0.
-    return (w > 0) & (x >= 0) & (x <= view.width * w) & (y >= 0) & (y <= view.height * w)
 
 
 def _transforms_of(scene: Path) -> Path | None:

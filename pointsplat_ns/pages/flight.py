@@ -26,7 +26,7 @@ from pointsplat_ns.looking.content import (
     positions_in_units,
     views_in_units,
 )
-from pointsplat_ns.looking.poses import look_at
+from pointsplat_ns.looking.poses import in_pictures, look_at
 from pointsplat_ns.looking.sampling import estimated_up, sample_views
 from pointsplat_ns.looking.settings import AROUND, DEFAULTS
 from pointsplat_ns.looking.upright import level_directions
@@ -78,7 +78,8 @@ class FlightFrame:
         if views is None or len(views) == 0:
             views = _sampled(scene, centre, size, up)
         views = views_in_units(views.spread(VIEWS), centre, size)
-        counts = _in_picture(positions_in_units(scene.means, centre, size).cpu(), views)
+        some = positions_in_units(scene.means[:: max(1, len(scene) // 4096)], centre, size).cpu()
+        counts = in_pictures(views, some, views.near_plane).sum(1)
         views = views[counts.argsort(descending=True, stable=True)]
         up = _nearest_axis(-views.viewmats[:, 1, :3].double().mean(0), up)
         half = positions_in_units(high, centre, size).cpu().abs()
@@ -128,16 +129,6 @@ class FlightFrame:
 def _eyes(views: Views) -> Tensor:
     """Positions (C, 3) of cameras."""
     return -(views.viewmats[:, :3, :3].mT @ views.viewmats[:, :3, 3:])[..., 0]
-
-
-def _in_picture(points: Tensor, views: Views) -> Tensor:
-    """Number of points (N, 3) in the picture of each view, (C,); at most a few thousand points are counted."""
-    points = points[:: max(1, len(points) // 4096)]
-    x, y, z = (views.viewmats[:, :3, :3] @ points.T + views.viewmats[:, :3, 3:]).unbind(1)
-    u = x / z * views.Ks[:, 0, :1] + views.Ks[:, 0, 2:]
-    v = y / z * views.Ks[:, 1, 1:2] + views.Ks[:, 1, 2:]
-    inside = (z > views.near_plane) & (u > 0) & (u < views.width) & (v > 0) & (v < views.height)
-    return inside.sum(1)
 
 
 def _nearest_axis(camera_up: Tensor, estimated: Tensor) -> Tensor:
