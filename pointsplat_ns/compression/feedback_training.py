@@ -12,7 +12,7 @@ import math
 import random
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -44,7 +44,7 @@ class FeedbackTrainingSettings:
     """Numbers of steps of the repairs."""
     batch_views: int = 32
     """Views of a scene in a batch of the sampler."""
-    view_batches: int = 6
+    view_batches: int = 3
     """Batches of views of a scene."""
     side: int | None = None
     """Longer side of the views, pixels; by default the middle size of sampled views, as in repairs."""
@@ -76,6 +76,8 @@ class TrainingScene:
     psnr: dict[str, float]
     """PSNR of each pruned scene by budget, over the pixels that the dense scene covers, dB."""
     views: Views
+    _renders: dict[int, Tensor] = field(default_factory=dict)
+    """Renders of the dense scene, 8 bits per channel, by the index of the view."""
 
     @classmethod
     def of(cls, name: str, dense: Gaussians, keep: Sequence[str], view_batches: int | None = None) -> TrainingScene:
@@ -90,6 +92,14 @@ class TrainingScene:
         reference = DenseReference(dense, views.spread(COMPARED_VIEWS))
         psnr = {budget: reference.psnr_of_covered(reference.psnr(scene)[0]) for budget, scene in pruned.items()}
         return cls(name, dense, pruned, psnr, views)
+
+    @torch.no_grad()
+    def target(self, index: int) -> Tensor:
+        """Render of the dense scene in a view, (H, W, 3); drawn once."""
+        if index not in self._renders:
+            image = render(self.dense, self.views[index], backend=TRAINING.backend)
+            self._renders[index] = image.clamp(0, 1).mul(255).round().byte()
+        return self._renders[index] / 255
 
 
 def roll_out(
@@ -114,11 +124,11 @@ def roll_out(
     reached: list[Tensor] = []
     for step in range(steps):
         view = scene.views[chosen[step]]
-        feedback.observe(gradients_of(now.detach(), view, _target(scene, chosen[step]), TRAINING.backend))
+        feedback.observe(gradients_of(now.detach(), view, scene.target(chosen[step]), TRAINING.backend))
         factors = network(feedback.features(now.detach(), step / steps, steps))
         now = feedback.moved(now, factor * rate_factor(step / steps), factors)
         if step + 1 in measured:
-            psnrs = [_decibels(_drawn(now, scene, index), _target(scene, index)) for index in measured[step + 1]]
+            psnrs = [_decibels(_drawn(now, scene, index), scene.target(index)) for index in measured[step + 1]]
             reached.append(torch.stack(psnrs).mean())
     return 0.5 * torch.stack(reached).sum()
 
@@ -203,11 +213,6 @@ def train_feedback(
 
 def _drawn(gaussians: Gaussians, scene: TrainingScene, index: int) -> Tensor:
     return render(gaussians, scene.views[index], backend=TRAINING.backend)
-
-
-@torch.no_grad()
-def _target(scene: TrainingScene, index: int) -> Tensor:
-    return _drawn(scene.dense, scene, index)
 
 
 def _decibels(image: Tensor, target: Tensor) -> Tensor:
