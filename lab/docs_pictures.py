@@ -131,7 +131,7 @@ def budgets(path: Path) -> None:
 
 def sampled(path: Path) -> None:
     """Where the twelve views stand, from above, and what they show."""
-    up = estimated_up(room()).double()
+    up = estimated_up(room()).direction
     right = torch.linalg.cross(up, torch.tensor([0.3, 0.5, 0.8], dtype=torch.float64))
     right = right / right.norm()
     plan = torch.stack([right, torch.linalg.cross(up, right)], 1)  # [3, 2]

@@ -95,6 +95,7 @@ def prune(
     fine_tune: int = 0,
     views: Views | str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
+    up: str | None = None,
     progress: bool | Progress = False,
 ) -> Gaussians:
     """Make a scene smaller: merge neighbours, or keep the most important Gaussians. No photos are needed.
@@ -120,6 +121,7 @@ def prune(
         resolution: width and height of the pictures that people look at, pixels: (1920, 1080) or "1920x1080".
             Decisions by rendering are made at this size. By default the size of the photos or of given views, else
             1920 x 1080.
+        up: the axis that is up in the scene, "z" or "-y", for sampled views; by default it is estimated.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
     Returns:
@@ -138,7 +140,7 @@ def prune(
         (1000, 0.1)
     """
     request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune)
-    _, pruned, _ = prune_source(scene, request, views, resolution, progress)
+    _, pruned, _ = prune_source(scene, request, views, resolution, up, progress)
     return pruned
 
 
@@ -183,6 +185,7 @@ def compact(
     target_format: str = ".ply",
     views: Views | str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
+    up: str | None = None,
     progress: bool | Progress = False,
 ) -> Compacted:
     """Make a scene smaller, repair it, and accept the repair by comparing renders.
@@ -213,6 +216,7 @@ def compact(
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used. The repair uses the others if
             there are more than twice as many; else it samples views in free space.
         resolution: as for :func:`prune`.
+        up: as for :func:`prune`.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
     Returns:
@@ -235,7 +239,7 @@ def compact(
     request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds))
     format_to_write(target_format)
     goal = goal_of(request, keep, target_db, target_ms, target_mb, target_format)
-    _, result = compact_source(scene, request, goal, views, resolution, progress)
+    _, result = compact_source(scene, request, goal, views, resolution, up, progress)
     return result
 
 
@@ -246,6 +250,7 @@ def lod(
     sh: str = "all",
     views: Views | str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
+    up: str | None = None,
     folder: str | Path | None = None,
     force: bool = False,
     progress: bool | Progress = False,
@@ -261,6 +266,7 @@ def lod(
         sh: SH bands of every level, as for :func:`prune`.
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used.
         resolution: as for :func:`prune`.
+        up: as for :func:`prune`.
         folder: output folder for each level as soon as it is made, a manifest and a picture; see :meth:`Levels.save`.
         force: overwrite existing files in ``folder``.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
@@ -285,7 +291,7 @@ def lod(
     PruneRequest(1.0, sh=sh)
     if folder is not None:
         check_folder(Path(folder), len(budgets), force)
-    dense, view_source = read_source(scene, views, resolution)
+    dense, view_source = read_source(scene, views, resolution, up)
     source = None if isinstance(scene, Gaussians) else source_file(scene)
     with progress_bar(progress) as report:
         made = make_levels(dense, levels, sh, view_source, source, folder, force, report)
@@ -299,6 +305,7 @@ def plot_views(
     *,
     views: Views | str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
+    up: str | None = None,
 ) -> str:
     """Draw the views that decide about a scene: a sheet of up to 16 pictures.
 
@@ -307,9 +314,10 @@ def plot_views(
         path: the PNG file to write.
         views: as for :func:`prune`.
         resolution: as for :func:`prune`.
+        up: as for :func:`prune`.
 
     Returns:
-        Text: the origin of the views, the estimated up direction, and the share of visible content in the views.
+        Text: the origin of the views, and the share of visible content in the views.
 
     Raises:
         SceneError: if the scene is not usable, or the file cannot be written.
@@ -323,7 +331,7 @@ def plot_views(
         >>> "of the visible content" in text
         True
     """
-    dense, source = read_source(scene, views, resolution)
+    dense, source = read_source(scene, views, resolution, up)
     return draw_views(dense.detach().to("cpu"), source, path)
 
 

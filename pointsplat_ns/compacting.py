@@ -12,6 +12,7 @@ from pointsplat_ns.compression.requests import CompactRequest, PruneRequest
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.scene import read_scene
+from pointsplat_ns.looking.upright import axis_or_none
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.looking.windows import parse_resolution
 from pointsplat_ns.system.progress import Progress, progress_bar
@@ -50,6 +51,7 @@ def prune_source(
     request: PruneRequest,
     views: ViewsInput = None,
     resolution: Resolution = None,
+    up: str | None = None,
     progress: bool | Progress = False,
 ) -> tuple[Gaussians, Gaussians, float]:
     """Read a scene and prune it; notes are logged. Arguments as of :func:`pointsplat_ns.prune`.
@@ -59,7 +61,7 @@ def prune_source(
     """
     from pointsplat_ns.compression.prune import prune_scene
 
-    dense, source = read_source(scene, views, resolution)
+    dense, source = read_source(scene, views, resolution, up)
     start = time.perf_counter()
     with progress_bar(progress) as report:
         pruned = prune_scene(dense, request, source, report)
@@ -74,6 +76,7 @@ def compact_source(
     goal: Goal | None = None,
     views: ViewsInput = None,
     resolution: Resolution = None,
+    up: str | None = None,
     progress: bool | Progress = False,
 ) -> tuple[Gaussians, Compacted]:
     """Read a scene and compact it; verdicts and notes are logged. Arguments as of :func:`pointsplat_ns.compact`.
@@ -84,12 +87,13 @@ def compact_source(
         goal: the goal of a search; None for no search.
         views: cameras to compare renders in.
         resolution: size of the pictures.
+        up: the axis that is up in the scene.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
     Returns:
         The dense scene and the result.
     """
-    dense, source = read_source(scene, views, resolution)
+    dense, source = read_source(scene, views, resolution, up)
     with progress_bar(progress) as report:
         if goal is None:
             from pointsplat_ns.compression.compact import compact_scene
@@ -101,9 +105,8 @@ def compact_source(
             from pointsplat_ns.tradeoff.settings import repairs_of
 
             given = views if isinstance(views, Views) else source.given
-            subject = subject_of(
-                dense, run_of(scene, views), given, request.refiner, goal.suffix, parse_resolution(resolution)
-            )
+            size, upward = parse_resolution(resolution), axis_or_none(up)
+            subject = subject_of(dense, run_of(scene, views), given, request.refiner, goal.suffix, size, upward)
             result = find_scene(subject, goal.targets, request.prune.by, repairs_of(goal.effort), report)
     log((*result.target.splitlines(), *result.verdict.splitlines(), *result.notes))
     return dense, result
@@ -138,14 +141,17 @@ def goal_of(
     return None if targets is None else Goal(targets, request.repair.effort, suffix)
 
 
-def read_source(scene: Source, views: ViewsInput, resolution: Resolution) -> tuple[Gaussians, ViewSource]:
+def read_source(
+    scene: Source, views: ViewsInput, resolution: Resolution, up: str | None = None
+) -> tuple[Gaussians, ViewSource]:
     """Read the dense scene, and make its source of views. Arguments as of :func:`pointsplat_ns.prune`.
 
     Raises:
         SceneError: if a file is missing or damaged, or the scene is a ``pointsplat`` run, which is pruned already.
         DataError: if a file of cameras is not usable, or most of them see nothing of the scene.
+        PointSplatError: if the resolution or ``up`` is not valid.
     """
-    size = parse_resolution(resolution)
+    size, upward = parse_resolution(resolution), axis_or_none(up)
     if isinstance(views, (str, Path)):
         from pointsplat_ns.io.camera_files import is_camera_file
 
@@ -158,11 +164,12 @@ def read_source(scene: Source, views: ViewsInput, resolution: Resolution) -> tup
             from pointsplat_ns.compression.posed_scene import read_posed
 
             dense, views = read_posed(scene, views)
-            return dense, ViewSource(dense, given=views, resolution=size)
+            return dense, ViewSource(dense, given=views, resolution=size, up=upward)
     dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
     if isinstance(views, Views):
-        return dense, ViewSource(dense, given=views, resolution=size)
-    return dense, ViewSource(dense, run=run_of(scene, views), dataset_views=_dataset_views, resolution=size)
+        return dense, ViewSource(dense, given=views, resolution=size, up=upward)
+    run = run_of(scene, views)
+    return dense, ViewSource(dense, run=run, dataset_views=_dataset_views, resolution=size, up=upward)
 
 
 def run_of(scene: Source, views: ViewsInput) -> Path | None:

@@ -9,13 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from torch import Tensor
+
 from pointsplat_ns.api import Source, load
-from pointsplat_ns.compression.placing import axis_named
 from pointsplat_ns.compression.posed_scene import check_views_show, views_for
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
 from pointsplat_ns.looking.settings import AROUND
+from pointsplat_ns.looking.upright import axis_or_none
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.system.packages import need
@@ -91,7 +93,7 @@ def render_path(
     if split not in ("side-by-side", "wipe"):
         raise PointSplatError(f"split is {split!r}; expected side-by-side or wipe")
     settings = FilmSettings(width, height, fps, seconds)
-    upward = None if up is None else axis_named(up)
+    upward = axis_or_none(up)
     kind = check_output(output, force)
     sources = [scene] if other is None else [scene, other]
     given = views_for(scene, views).resized(LONGEST_SIDE) if isinstance(views, (str, Path)) else views
@@ -101,7 +103,7 @@ def render_path(
     way: str | Path = path if not isinstance(path, Views) else "dataset"
     if given is not None and kind == "frames" and seconds is None and way in ("auto", "dataset"):
         settings = replace(settings, seconds=max(1, len(given)) / (fps or FPS))
-    view_source = _source(scene, loaded[0], path if isinstance(path, Views) else given)
+    view_source = _source(scene, loaded[0], path if isinstance(path, Views) else given, upward)
     chosen = camera_path(loaded[0], view_source, way, settings, kind == "picture", upward)
     modes = [_mode(source, chosen.views.rasterize_mode) for source in sources]
     if labels is None:
@@ -153,19 +155,18 @@ def open_viewer(
     need("viser", "the viewer in the browser")
     from pointsplat_ns.viewing.viewer import ViewedScene, Viewer
 
-    upward, scenes = None if up is None else axis_named(up), []
+    upward, scenes = axis_or_none(up), []
     for index, source in enumerate([scene] if other is None else [scene, other]):
         loaded = source if isinstance(source, Gaussians) else load(source)
         path = None if isinstance(source, Gaussians) else Path(source)
-        views, mode = _source(source, loaded, None), _mode(source, "classic")
+        views, mode = _source(source, loaded, None, upward), _mode(source, "classic")
         scenes.append(ViewedScene(_name(source, index), path, loaded, views, mode))
     return Viewer(scenes, host, port, upward)
 
 
-def _source(scene: Source, loaded: Gaussians, given: Views | None) -> ViewSource:
-    if isinstance(scene, Gaussians):
-        return ViewSource(loaded, given=given, settings=AROUND)
-    return ViewSource(loaded, given=given, run=scene, dataset_views=dataset_views, settings=AROUND)
+def _source(scene: Source, loaded: Gaussians, given: Views | None, up: Tensor | None) -> ViewSource:
+    run = None if isinstance(scene, Gaussians) else scene
+    return ViewSource(loaded, given, run, dataset_views, settings=AROUND, up=up)
 
 
 def _mode(scene: Source, usual: RasterizeMode) -> RasterizeMode:

@@ -15,6 +15,7 @@ from pointsplat_ns.cli.scene_options import (
     Poses,
     Resolution,
     Scene,
+    Up,
     check_output,
     check_outputs,
     check_poses,
@@ -45,6 +46,7 @@ def compact(
     target_mb: float | None = None,
     poses: Poses = None,
     resolution: Resolution = None,
+    up: Up = None,
     picture: Path | None = None,
     html: Path | None = None,
     html_limit: float = 60.0,
@@ -87,6 +89,8 @@ def compact(
             COLMAP model; for one scene.
         resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
             default the size of the photos, if there are any, else 1920x1080.
+        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is
+            estimated. Write --up=-y for a negative axis.
         picture: a .png file for images of some views: dense, before and after the repair, side by side.
         html: an .html file that opens offline in a browser, to fly through the scene before and after, with a wipe
             between them.
@@ -107,7 +111,7 @@ def compact(
     if is_folder_of_scenes(scene):
         with fixed_threads(threads):
             compact_folder(
-                scene, output, poses, picture, html, dry_run, json_output, keep=keep, refiner=refiner, by=by, sh=sh,
+                scene, output, poses, up, picture, html, dry_run, json_output, keep=keep, refiner=refiner, by=by, sh=sh,
                 clean=clean, effort=effort, seconds=seconds, target_db=target_db, target_ms=target_ms,
                 target_mb=target_mb, resolution=resolution, jobs=1 if jobs is None else jobs, shard=shard, force=force,
             )  # fmt: skip
@@ -128,7 +132,7 @@ def compact(
     request = CompactRequest.of(_loaded(refiner), keep, by, sh, clean, RepairBudget(effort, seconds))
     goal = goal_of(request, keep, target_db, target_ms, target_mb, format_to_write(output).budget_suffix)
     with fixed_threads(threads):
-        dense, result = compact_source(scene, request, goal, poses, resolution, progress=True)
+        dense, result = compact_source(scene, request, goal, poses, resolution, up, progress=True)
     if not dry_run:
         ps.save(result.scene, output, progress=True)
         warn_if_larger(keep, output)

@@ -16,6 +16,7 @@ def compact_folder(
     folder: Path,
     output: Path | None,
     poses: Path | None,
+    up: str | None,
     picture: Path | None,
     html: Path | None,
     dry_run: bool,
@@ -27,7 +28,7 @@ def compact_folder(
     Args:
         folder: the folder.
         output: the folder for results.
-        poses, picture, html, dry_run: options that folders do not support.
+        poses, up, picture, html, dry_run: options that folders do not support.
         json_output: print JSON in place of a table.
         options: further ones of :func:`pointsplat_ns.compact_folder`.
 
@@ -39,7 +40,7 @@ def compact_folder(
     from pointsplat_ns.compression.scene_folder import TABLE_NAME, output_folder
     from pointsplat_ns.system.processes import torchrun_rank
 
-    refused = {"--poses": poses, "--picture": picture, "--html": html, "--dry-run": dry_run or None}
+    refused = {"--poses": poses, "--up": up, "--picture": picture, "--html": html, "--dry-run": dry_run or None}
     for name, given in refused.items():
         if given is not None:
             raise ps.SceneError(f"{name} is for one scene; {folder} is a folder of scenes")

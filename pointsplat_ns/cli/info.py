@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Resolution, Scene, check_output
+from pointsplat_ns.cli.scene_options import Resolution, Scene, Up, check_output
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_info import SceneInfo
@@ -16,6 +16,7 @@ def info(
     scene: Scene,
     views: Path | None = None,
     resolution: Resolution = None,
+    up: Up = None,
     force: bool = False,
     json_output: Json = False,
 ) -> None:
@@ -25,6 +26,8 @@ def info(
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
         views: a .png file for a sheet of the views that other commands use without --poses.
         resolution: size of these views, pixels. By default the size of the photos, if there are any, else 1920x1080.
+        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is
+            estimated. Write --up=-y for a negative axis.
         force: overwrite an existing file.
         json_output: print JSON, and nothing else on standard output.
     """
@@ -34,7 +37,7 @@ def info(
     parse_resolution(resolution)
     check_output(views, ".png", force)
     found = ps.info(scene)
-    sheet = None if views is None else ps.plot_views(scene, views, resolution=resolution)
+    sheet = None if views is None else ps.plot_views(scene, views, resolution=resolution, up=up)
     if json_output:
         print_json(found.as_dict())
         return

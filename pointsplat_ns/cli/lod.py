@@ -13,6 +13,7 @@ from pointsplat_ns.cli.scene_options import (
     Poses,
     Resolution,
     Scene,
+    Up,
     check_poses,
     need_one_scene,
     output_beside,
@@ -29,6 +30,7 @@ def lod(
     sh: Bands = "all",
     poses: Poses = None,
     resolution: Resolution = None,
+    up: Up = None,
     force: bool = False,
     threads: int | None = None,
     json_output: Json = False,
@@ -49,6 +51,8 @@ def lod(
         poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model.
         resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
             default the size of the photos, if there are any, else 1920x1080.
+        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is
+            estimated. Write --up=-y for a negative axis.
         force: overwrite existing files.
         threads: number of threads. By default it adapts to the work and to other programs. Another number may
             change results by rounding.
@@ -63,7 +67,7 @@ def lod(
     folder = output or output_beside(scene, "lod").with_suffix("")
     with fixed_threads(threads):
         made = ps.lod(
-            scene, levels, sh=sh, views=poses, resolution=resolution, folder=folder, force=force, progress=True
+            scene, levels, sh=sh, views=poses, resolution=resolution, up=up, folder=folder, force=force, progress=True
         )
     if json_output:
         print_json({"output": folder, **json.loads((folder / MANIFEST).read_text("utf-8"))})

@@ -11,6 +11,7 @@ from pointsplat_ns.cli.scene_options import (
     Poses,
     Resolution,
     Scene,
+    Up,
     check_outputs,
     check_poses,
     in_format_of,
@@ -31,6 +32,7 @@ def prune(
     fine_tune: int = 0,
     poses: Poses = None,
     resolution: Resolution = None,
+    up: Up = None,
     plot: Path | None = None,
     dry_run: bool = False,
     force: bool = False,
@@ -60,6 +62,8 @@ def prune(
             COLMAP model. They must be of this scene.
         resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
             default the size of the photos, if there are any, else 1920x1080.
+        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is
+            estimated. Write --up=-y for a negative axis.
         plot: a .png file for a plot of the distributions of opacity and volume, before and after.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
@@ -79,7 +83,7 @@ def prune(
     keep = in_format_of(keep, output)
     request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune)
     with fixed_threads(threads):
-        dense, small, seconds = prune_source(scene, request, poses, resolution, progress=True)
+        dense, small, seconds = prune_source(scene, request, poses, resolution, up, progress=True)
     if not dry_run:
         ps.save(small, output, progress=True)
         warn_if_larger(keep, output)

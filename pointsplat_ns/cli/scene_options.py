@@ -11,6 +11,7 @@ Scene = tyro.conf.Positional[Path]
 Output = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
 Poses = Path | None
 Resolution = Annotated[str | None, tyro.conf.arg(metavar="WxH")]
+Up = Annotated[str | None, tyro.conf.arg(metavar="AXIS")]
 Bands = Literal["all", "auto", "0", "1", "2", "3"]
 
 

@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING, Literal
 
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Output, Poses, Resolution, Scene, check_poses, output_beside
+from pointsplat_ns.cli.scene_options import Output, Poses, Resolution, Scene, Up, check_poses, output_beside
 
 if TYPE_CHECKING:
     from pointsplat_ns.tradeoff.points import Quality, Tradeoff
@@ -22,6 +22,7 @@ def tradeoff(
     views: int = 12,
     poses: Poses = None,
     resolution: Resolution = None,
+    up: Up = None,
     drawn: tuple[Literal["exact", "fast", "half"], ...] = ("exact", "fast", "half"),
     target_db: float | None = None,
     target_ms: float | None = None,
@@ -51,6 +52,8 @@ def tradeoff(
             no photos are used then.
         resolution: size of the pictures that people look at, pixels. Scenes are made for this size, and judged and
             timed in the pictures of comparisons. By default the size of the photos, if there are any, else 1920x1080.
+        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is
+            estimated. Write --up=-y for a negative axis.
         drawn: qualities of frames: exact for all scenes; fast, and half (fast at half the resolution), for a few.
         target_db: search for the smallest scene with at least this PSNR against the dense scene's renders.
         target_ms: longest time of a frame, milliseconds. Without --target-db, search for the best within the limits.
@@ -69,7 +72,7 @@ def tradeoff(
     with fixed_threads(threads):
         found = ps.measure_tradeoff(
             scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, poses=poses,
-            resolution=resolution, drawn=drawn, target_db=target_db, target_ms=target_ms, target_mb=target_mb,
+            resolution=resolution, up=up, drawn=drawn, target_db=target_db, target_ms=target_ms, target_mb=target_mb,
             force=force, progress=True,
         )  # fmt: skip
     if json_output:

@@ -14,7 +14,6 @@ from pointsplat_ns.compression.compact import Compacted
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.looking.coverage import coverage
-from pointsplat_ns.looking.sampling import estimated_up
 from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.rasterizer import render
@@ -78,7 +77,7 @@ def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
         path: the PNG file to write.
 
     Returns:
-        Text: the origin of the views, the estimated up direction, and the share of visible content in the views.
+        Text: the origin of the views, and the share of visible content in the views.
 
     Raises:
         DataError: if there are no views.
@@ -91,10 +90,9 @@ def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
     rows = [pictures[first : first + columns] for first in range(0, len(pictures), columns)]
     rows[-1] += [torch.ones_like(pictures[0])] * (columns - len(rows[-1]))
     side_by_side(rows, [""] * columns, path)
-    up = ", ".join(f"{value:.2f}" for value in estimated_up(dense).tolist())
     return (
         f"{path}: {len(pictures)} of {len(views)} views of {views.width} x {views.height} pixels; {source.origin}\n"
-        f"up is taken to be {up}; at least two of the views show {share:.0%} of the visible content"
+        f"at least two of the views show {share:.0%} of the visible content"
     )
 
 

@@ -15,6 +15,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.quaternions import quaternions_of
 from pointsplat_ns.io.runs import Run, may_be_run, open_run
 from pointsplat_ns.looking.sampling import estimated_up
+from pointsplat_ns.looking.upright import axis_named, axis_or_none
 from pointsplat_ns.refiner.augmentation import Transform
 
 
@@ -78,7 +79,7 @@ def place(
         scene = _frame_at(original_frame).inverse().apply(scene)
     if directions is not None:
         now, wanted = directions
-        matrix = _turn(estimated_up(scene) if now is None else now, wanted)
+        matrix = _turn(estimated_up(scene).direction if now is None else now, wanted)
         scene = Similarity(matrix, 1.0, torch.zeros(3, dtype=torch.float64)).apply(scene)
     if scale != 1.0:
         scene = Similarity(torch.eye(3, dtype=torch.float64), scale, torch.zeros(3, dtype=torch.float64)).apply(scene)
@@ -116,24 +117,7 @@ def _directions(up: str) -> tuple[Tensor | None, Tensor]:
     match = re.fullmatch(r"(?:([+-]?[xyz]):)?([+-]?[xyz])", up.strip().lower())
     if not match:
         raise PointSplatError(f"up is {up!r}; expected an axis such as z or -y, or two such as -y:z (from -y to z)")
-    return (None if match[1] is None else _axis(match[1])), _axis(match[2])
-
-
-def axis_named(text: str) -> Tensor:
-    """A world axis (3,), float64, by its name, such as "z" or "-y".
-
-    Raises:
-        PointSplatError: if there is no such axis.
-    """
-    if not re.fullmatch(r"[+-]?[xyz]", text.strip().lower()):
-        raise PointSplatError(f"up is {text!r}; expected x, y, z, -x, -y or -z")
-    return _axis(text.strip().lower())
-
-
-def _axis(text: str) -> Tensor:
-    axis = torch.zeros(3, dtype=torch.float64)
-    axis["xyz".index(text[-1])] = -1.0 if text[0] == "-" else 1.0
-    return axis
+    return axis_or_none(match[1]), axis_named(match[2])
 
 
 def _turn(start: Tensor, end: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from pointsplat_ns.looking.search import Search
 from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces, log_widths, photo_places
-from pointsplat_ns.looking.upright import UprightBox, pointing_up, upright_axis
+from pointsplat_ns.looking.upright import Up, UprightBox, pointing_up, upright_axis
 from pointsplat_ns.views import Views
 
 
@@ -102,7 +102,9 @@ def views_about(
         up = up / up.norm()
     centre, diagonal, surface = _content_surface(scene, settings)
     photos = None if photos is None else photos.in_units(centre, diagonal)
-    box, inside = _upright(surface, photos, up)
+    known = None if up is None else Up(up)
+    upright, inside = _upright(surface, photos, known)
+    box = UprightBox.of(surface, upright.direction)
     probe = in_units(thinned(scene, settings.probe_count), centre, diagonal)
     fine, widths = None, None
     if sharp:
@@ -139,15 +141,20 @@ def _alternating(first: Tensor, second: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def estimated_up(scene: Gaussians, settings: LookingSettings = DEFAULTS) -> Tensor:
-    """Direction that is up in a scene, (3,) float64 of length 1, as :func:`sample_views` takes it.
+def estimated_up(scene: Gaussians, settings: LookingSettings = DEFAULTS) -> Up:
+    """The direction that is up in a scene, as :func:`sample_views` takes it.
 
     Raises:
         DataError: if nothing of the scene is visible.
     """
+    return up_about(scene, photo_places(scene, settings), settings)
+
+
+@torch.no_grad()
+def up_about(scene: Gaussians, photos: PhotoPlaces | None, settings: LookingSettings = DEFAULTS) -> Up:
+    """:func:`estimated_up` of a scene whose photo places are known already."""
     centre, diagonal, surface = _content_surface(scene, settings)
-    photos = photo_places(scene, settings)
-    return _upright(surface, None if photos is None else photos.in_units(centre, diagonal))[0].up
+    return _upright(surface, None if photos is None else photos.in_units(centre, diagonal))[0]
 
 
 def _content_surface(scene: Gaussians, settings: LookingSettings) -> tuple[Tensor, float, Surface]:
@@ -156,11 +163,11 @@ def _content_surface(scene: Gaussians, settings: LookingSettings) -> tuple[Tenso
     return centre, diagonal, Surface.of(scene, centre, diagonal, settings)
 
 
-def _upright(surface: Surface, photos: PhotoPlaces | None, up: Tensor | None = None) -> tuple[UprightBox, bool]:
-    """The upright box of a scene, with the direction ``up`` (3,) if it is known, and whether the scene is a room."""
-    axis = upright_axis(surface, photos) if up is None else up
+def _upright(surface: Surface, photos: PhotoPlaces | None, up: Up | None = None) -> tuple[Up, bool]:
+    """Which way is up, unless it is known, and whether the scene is a room."""
+    axis = upright_axis(surface, photos) if up is None else up.direction
     inside = is_room(surface, UprightBox.of(surface, axis))
-    return UprightBox.of(surface, pointing_up(surface, axis, inside) if up is None else up), inside
+    return up or pointing_up(surface, axis, inside), inside
 
 
 def is_room(surface: Surface, box: UprightBox) -> bool:

@@ -9,14 +9,59 @@ about, and hold cameras at about one height.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces
+
+
+@dataclass(frozen=True, eq=False)
+class Up:
+    """The direction that is up in a scene."""
+
+    direction: Tensor
+    """(3,) float64, of length 1."""
+    sure: bool = True
+    """Whether it was named, or the scene has level or vertical surfaces and most of its mass lies low."""
+
+    def __str__(self) -> str:
+        """The name of the axis, or the direction.
+
+        Example:
+            >>> str(Up(torch.tensor([0.0, -1.0, 0.0]), sure=False))
+            '-y (a guess)'
+        """
+        axis = int(self.direction.abs().argmax())
+        if float(self.direction.abs()[axis]) > 1 - 1e-6:
+            text = ("-" if float(self.direction[axis]) < 0 else "") + "xyz"[axis]
+        else:
+            text = " ".join(f"{value:.2f}" for value in self.direction.tolist())
+        return text if self.sure else f"{text} (a guess)"
+
+
+def axis_named(text: str) -> Tensor:
+    """A world axis (3,), float64, by its name, such as "z" or "-y".
+
+    Raises:
+        PointSplatError: if there is no such axis.
+    """
+    name = text.strip().lower()
+    if not re.fullmatch(r"[+-]?[xyz]", name):
+        raise PointSplatError(f"up is {text!r}; expected x, y, z, -x, -y or -z")
+    axis = torch.zeros(3, dtype=torch.float64)
+    axis["xyz".index(name[-1])] = -1.0 if name[0] == "-" else 1.0
+    return axis
+
+
+def axis_or_none(text: str | None) -> Tensor | None:
+    """:func:`axis_named` of an option; None if it is not given."""
+    return None if text is None else axis_named(text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +129,7 @@ def upright_axis(surface: Surface, photos: PhotoPlaces | None = None) -> Tensor:
     return torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) if axis is None else axis
 
 
-def pointing_up(surface: Surface, axis: Tensor, inside: bool) -> Tensor:
+def pointing_up(surface: Surface, axis: Tensor, inside: bool) -> Up:
     """``axis`` (3,) or its opposite, whichever points up.
 
     Mass lies low. Where the centre of mass is about in the middle, z is up, or -y, as in scenes that have the axes of
@@ -95,8 +140,11 @@ def pointing_up(surface: Surface, axis: Tensor, inside: bool) -> Tensor:
         axis: (3,) as :func:`upright_axis` gives it.
         inside: whether the scene is a room that is looked at from inside.
     """
-    usual = surface.settings.usual_direction_weight * _usual(axis)
-    return axis if _lift(_content(surface), axis, inside) + usual >= 0 else -axis
+    content = _content(surface)
+    lift = _lift(content, axis, inside)
+    sign = 1 if lift + surface.settings.usual_direction_weight * _usual(axis) >= 0 else -1
+    evident = float(uprightness(axis[None], content)) >= surface.settings.min_uprightness
+    return Up(sign * axis, evident and sign * lift >= 0)
 
 
 def _content(surface: Surface) -> Surface:

@@ -9,12 +9,15 @@ from functools import cached_property
 from itertools import count as counted
 from pathlib import Path
 
+from torch import Tensor
+
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run
-from pointsplat_ns.looking.sampling import views_about
+from pointsplat_ns.looking.sampling import up_about, views_about
 from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.looking.traces import PhotoPlaces, photo_places
+from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.windows import RESOLUTION, middle_sized
 from pointsplat_ns.views import RasterizeMode, View, Views, spread_indices
 
@@ -37,6 +40,7 @@ class ViewSource:
         resolution: width and height, pixels, of the pictures that people look at. By default given views and photos
             have their own, and sampled views 1920 x 1080.
         settings: tuned numbers, see :mod:`pointsplat_ns.looking.settings`.
+        up: (3,) direction that is up for sampled views, of length 1; by default it is estimated.
     """
 
     def __init__(
@@ -47,8 +51,9 @@ class ViewSource:
         dataset_views: Callable[[Path | str], Views] | None = None,
         resolution: tuple[int, int] | None = None,
         settings: LookingSettings = DEFAULTS,
+        up: Tensor | None = None,
     ):
-        self._resolution, self.settings = resolution, settings
+        self._resolution, self.settings, self._up = resolution, settings, up
         self._scene, self._given, self._run, self._dataset_views = scene, given, run, dataset_views
         self.origin = ""
         """Text that says where views came from; empty until there are some."""
@@ -97,20 +102,28 @@ class ViewSource:
             return self._at_resolution(self._of_dataset.spread(count))
         views = self._sampled(count, 0)
         where = "in free space" if self._photos is None else "in free space, half of them where photos were taken"
-        self.origin = f"poses sampled {where}{self.missing}"
+        self.origin = f"poses sampled {where}, up is {self.up}{self.missing}"
         return views
 
     def _sampled(self, count: int, seed: int) -> Views:
         """Sampled views, which get the run's rasterize mode."""
         width, height = self.resolution
-        views = views_about(
-            self._scene, self._photos, count, width=width, height=height, seed=seed, settings=self.settings
-        )
+        up, settings = self.up.direction, self.settings
+        views = views_about(self._scene, self._photos, count, width, height, seed, up, settings=settings)
         return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
 
     @cached_property
     def _photos(self) -> PhotoPlaces | None:
         return photo_places(self._scene, self.settings)
+
+    @cached_property
+    def up(self) -> Up:
+        """The direction that is up in the scene.
+
+        Raises:
+            DataError: if it has to be estimated, and nothing of the scene is visible.
+        """
+        return up_about(self._scene, self._photos, self.settings) if self._up is None else Up(self._up)
 
     def known(self, count: int) -> Views | None:
         """At most ``count`` known views: given ones, or those of the dataset's training poses; None if there are

@@ -6,6 +6,8 @@ import functools
 from dataclasses import replace
 from pathlib import Path
 
+from torch import Tensor
+
 from pointsplat_ns.compression.posed_scene import read_posed
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import BudgetError
@@ -13,6 +15,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, name_of
 from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.io.source import source_file
+from pointsplat_ns.looking.upright import axis_or_none
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.looking.windows import parse_resolution
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
@@ -35,6 +38,7 @@ def measure_tradeoff(
     views: int = COMPARED_VIEWS,
     poses: str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
+    up: str | None = None,
     drawn: tuple[str, ...] = ("exact", "fast", "half"),
     target_db: float | None = None,
     target_ms: float | None = None,
@@ -61,6 +65,7 @@ def measure_tradeoff(
         poses: a file of cameras to look from, as ``views`` of :func:`pointsplat_ns.prune`; no photos are used then.
         resolution: as for :func:`pointsplat_ns.prune`. Scenes are judged and timed in the pictures that
             :func:`pointsplat_ns.compact` compares in, of 784 x 441 pixels for 1920 x 1080; photos are reduced to them.
+        up: as for :func:`pointsplat_ns.prune`.
         drawn: how frames may be drawn: "exact", of all scenes; "fast" and "half" (so, and at half the resolution), of a
             few where that may pay. A search for targets draws exactly.
         target_db: least PSNR against the dense scene's renders, dB, mean over views.
@@ -91,10 +96,11 @@ def measure_tradeoff(
     """
     options = Options(points, within, tuple(by), tuple(repairs), views, tuple(drawn))
     targets, size = targets_of(target_db, target_ms, target_mb), parse_resolution(resolution)
+    upward = axis_or_none(up)
     path, folder = Path(scene), Path(folder)
     dense, given = (read_scene(path), None) if poses is None else read_posed(path, poses)
     check_folder(folder, force)
-    subject = subject_of(dense, path, given, resolution=size)
+    subject = subject_of(dense, path, given, resolution=size, up=upward)
     file = None if poses is None else Path(poses)
     subject = replace(subject, name=name_of(path), sha256=source_file(path).sha256, poses=file)
     with progress_bar(progress) as report:
@@ -123,6 +129,7 @@ def subject_of(
     refiner: TrainedRefiner | None = None,
     suffix: str = ".ply",
     resolution: tuple[int, int] | None = None,
+    up: Tensor | None = None,
 ) -> Subject:
     """A scene to be measured, with the views that its commands have and its held-out photos.
 
@@ -132,7 +139,7 @@ def subject_of(
         views: given ones, in place of any others; there are no photos of them.
         refiner: what repairs begin with; by default nothing, and the one that ships where it repairs alone.
         suffix: of the format that smaller scenes are written in.
-        resolution: width and height of pictures, pixels, as for :class:`~pointsplat_ns.looking.view_source.ViewSource`.
+        resolution, up: as for :class:`~pointsplat_ns.looking.view_source.ViewSource`.
     """
     has_photos = path is not None and views is None and may_be_run(path)
     return Subject(
@@ -140,7 +147,7 @@ def subject_of(
         path=path or Path("scene.ply"),
         name="scene",
         sha256="",
-        new_views=lambda: ViewSource(dense, given=views, run=path, dataset_views=dataset_views, resolution=resolution),
+        new_views=lambda: ViewSource(dense, views, path, dataset_views, resolution, up=up),
         held_out=functools.partial(dataset_photos, path, "test") if path is not None and has_photos else None,
         refiner=refiner,
         suffix=suffix,

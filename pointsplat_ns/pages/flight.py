@@ -74,7 +74,7 @@ class FlightFrame:
         need_usable(scene)
         low, high = content_box(scene)
         centre, size = content_size(scene, (low, high))
-        up = estimated_up(scene).cpu()
+        up = estimated_up(scene).direction.cpu()
         if views is None or len(views) == 0:
             views = _sampled(scene, centre, size, up)
         views = views_in_units(views.spread(VIEWS), centre, size)

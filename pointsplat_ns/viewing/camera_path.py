@@ -11,7 +11,6 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import content_box
-from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.viewing.saved_path import LIMITS, read_path
 from pointsplat_ns.viewing.trajectories import STOPS, along, fitted, orbit, walk
@@ -76,7 +75,7 @@ def camera_path(
             that nerfstudio's viewer saved.
         settings: size, speed and length.
         one: return the first camera only.
-        up: (3,) up direction of a walk or an orbit, of length 1; by default from the views, or estimated.
+        up: (3,) up direction of a walk or an orbit, of length 1, also of ``source``; by default from the views.
 
     Raises:
         DataError: if there are no views, or the file is not a camera path.
@@ -103,25 +102,12 @@ def camera_path(
         views = along(_sized(known, settings, usual), frames)
         skipped = f", {len(known) - frames} of {len(known)} left out" if frames < len(known) and not one else ""
         return CameraPath(views, fps, f"along the {source.origin}{skipped}")
-    stops = known.spread(2 * STOPS) if known is not None else views_upright(scene, source, STOPS, up)
+    stops = known.spread(2 * STOPS) if known is not None else source.views(STOPS)
     stops = _sized(stops, settings, (960, 540) if known is None else _reduced(known))
     if path == "orbit":
         low, high = content_box(scene)
         return CameraPath(orbit(stops, frames, 0.5 * (low + high).cpu(), up), fps, f"a turn, by {source.origin}")
     return CameraPath(walk(stops, frames, up), fps, f"a walk past {source.origin}")
-
-
-def views_upright(scene: Gaussians, source: ViewSource, count: int, up: Tensor | None) -> Views:
-    """At most ``count`` views of a scene. With an up direction (3,) and without known poses, they are sampled for it.
-
-    Raises:
-        DataError: if there are no views.
-    """
-    if up is None or source.known(1) is not None:
-        return source.views(count)
-    usual = source.views(1)
-    sampled = sample_views(scene, count, up=up, settings=source.settings)
-    return dataclasses.replace(sampled, rasterize_mode=usual.rasterize_mode)
 
 
 def _frames(seconds: float, fps: float) -> int:

@@ -24,7 +24,6 @@ from pointsplat_ns.looking.settings import DEFAULTS
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.rasterizer import render_depth
 from pointsplat_ns.system.memory import share_freed_memory
-from pointsplat_ns.viewing.camera_path import views_upright
 from pointsplat_ns.viewing.painter import Camera, Painter, PictureRequest
 from pointsplat_ns.viewing.schedule import Step
 from pointsplat_ns.viewing.selection import ReducedScene, Selection
@@ -65,7 +64,7 @@ class Viewer:
         share_freed_memory()  # each page has a drawing thread
         first = scenes[0]
         self._scenes = scenes
-        self._starts = views_upright(first.scene, first.source, 12, up)
+        self._starts = first.source.views(12)
         self.origin = first.source.origin
         """Text on the origin of the first view."""
         self._up = up_of(self._starts) if up is None else up

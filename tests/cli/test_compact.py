@@ -75,7 +75,7 @@ def test_refinement_that_helps_is_written_and_shown(ply, helps, tmp_path, capsys
     assert re.search(r"small.ply: kept and refined 75 of 150 Gaussians \(50.0 %\), .* MB, in .* s", said)
     before, after = map(float, re.search(r"(?m)^refinement: ([\d.]+) -> ([\d.]+) dB .* in 12 views", said).groups())
     assert after > before
-    assert "\nposes sampled in free space\n" in said and "SH degree" in said
+    assert "\nposes sampled in free space, up is " in said and "SH degree" in said
     assert "shown.png: dense, pruned, refined, side by side" in said
     height, width, _ = matplotlib.image.imread(tmp_path / "shown.png").shape
     assert width == 1600 and height > 1200  # three columns and rows of 4 to 3, and a line of titles

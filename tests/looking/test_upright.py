@@ -11,10 +11,12 @@ from scipy.spatial.transform import Rotation
 from upright_scenes import TURNS, plates, room, tower, turned
 
 from making import ball, box_room
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.looking.content import content_size
+from pointsplat_ns.looking.settings import DEFAULTS
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces
-from pointsplat_ns.looking.upright import UprightBox, level_directions, levelness, pointing_up, upright_axis
+from pointsplat_ns.looking.upright import UprightBox, axis_named, level_directions, levelness, pointing_up, upright_axis
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 PLACES = torch.linspace(0, 2 * math.pi, 61)[:60]
@@ -34,7 +36,7 @@ ANYWHERE = [turn for turn in TURNS if turn.apply([0.0, 0.0, 1.0])[1] < 0.9][1:]
 def test_up_is_found_however_the_scene_is_turned(make, inside, turn):
     scene = turned(make(), turn)
     surface = Surface.of(scene, *content_size(scene))
-    up = pointing_up(surface, upright_axis(surface), inside)
+    up = pointing_up(surface, upright_axis(surface), inside).direction
     # 3 degrees: directions are refined in steps of half a degree, from points of which some lie across
     assert degrees_between(up, torch.from_numpy(turn.apply(UP.numpy()))) < 3
 
@@ -44,13 +46,13 @@ def test_z_or_minus_y_is_up_where_the_scene_stands_along_it(axis):
     turn, _ = Rotation.align_vectors([axis], [[0, 0, 1]])
     scene = turned(tower(), turn)
     surface = Surface.of(scene, *content_size(scene))
-    assert pointing_up(surface, upright_axis(surface), False).tolist() == list(axis)
+    assert pointing_up(surface, upright_axis(surface), False).direction.tolist() == list(axis)
 
 
 def test_minus_y_is_found_where_a_scene_has_the_axes_of_its_first_camera():
     scene = turned(tower(), Rotation.from_euler("x", 90, degrees=True))
     surface = Surface.of(scene, *content_size(scene))
-    up = pointing_up(surface, upright_axis(surface), False)
+    up = pointing_up(surface, upright_axis(surface), False).direction
     assert torch.equal(up, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
 
 
@@ -59,7 +61,8 @@ def test_up_is_z_without_evidence():
     surface = Surface.of(scene, *content_size(scene))
     cloud = 3 * torch.randn(surface.points.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     shapeless = replace(surface, points=cloud, flatness=torch.zeros_like(surface.flatness))
-    assert torch.equal(pointing_up(shapeless, upright_axis(shapeless), True), UP)
+    up = pointing_up(shapeless, upright_axis(shapeless), True)
+    assert torch.equal(up.direction, UP) and not up.sure
 
 
 @pytest.mark.parametrize("turn", TURNS)
@@ -146,4 +149,20 @@ def test_the_end_with_larger_trace_factors_is_below():
     above = surface.points[:, 2] > 0
     for factor_below, up in ((9.0, UP), (1 / 9, -UP)):
         traced = replace(surface, trace_factors=torch.where(above, 1.0, factor_below))
-        assert torch.equal(pointing_up(traced, UP, True), up)
+        assert torch.equal(pointing_up(traced, UP, True).direction, up)
+
+
+def test_up_is_sure_where_most_of_the_mass_lies_low():
+    convention = replace(DEFAULTS, usual_direction_weight=2.0)  # outweighs any mass
+    surface = replace(Surface.of(tower(), *content_size(tower())), settings=convention)
+    heavy_top = replace(surface, points=surface.points * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
+    for each, sure in ((surface, True), (heavy_top, False)):
+        up = pointing_up(each, UP, False)
+        assert torch.equal(up.direction, UP) and up.sure is sure
+        assert str(up) == ("z" if sure else "z (a guess)")
+
+
+@pytest.mark.parametrize("name", ["w", "", "--z", "zz", "1"])
+def test_other_names_of_axes_are_refused(name):
+    with pytest.raises(PointSplatError, match="expected x, y, z, -x, -y or -z"):
+        axis_named(name)

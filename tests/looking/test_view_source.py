@@ -33,7 +33,7 @@ def run_of(trained_walls: Path, name: str) -> Path:
 def test_a_bare_scene_is_looked_at_from_sampled_poses(scene):
     bare = ViewSource(scene, run="scene.ply", dataset_views=dataset_views)
     assert len(bare.views(2)) == 2
-    assert bare.origin == "poses sampled in free space"
+    assert bare.origin.startswith("poses sampled in free space, up is ")
 
 
 def test_a_run_is_looked_at_from_its_own_poses(scene, trained_walls):
@@ -63,7 +63,7 @@ def test_a_run_whose_data_is_gone_is_looked_at_from_sampled_poses_as_it_rendered
     source = ViewSource(scene, run=run_of(trained_walls, name), dataset_views=data_is_gone)
     views = source.views(2)
     assert len(views) == 2 and views.rasterize_mode == mode
-    assert source.origin == "poses sampled in free space (no dataset: its data is not there)"
+    assert source.origin == f"poses sampled in free space, up is {source.up} (no dataset: its data is not there)"
 
 
 def test_a_run_whose_data_is_gone_and_whose_scene_shows_nothing_has_no_views(scene, trained_walls):
@@ -126,5 +126,15 @@ def test_sampled_poses_near_photo_places_say_so(monkeypatch):
     monkeypatch.setattr(view_source, "photo_places", lambda scene, settings: asked.append(scene) or photos)
     source = ViewSource(box_room(0))
     assert len(source.views(3)) and len(source.compared())
-    assert source.origin == "poses sampled in free space, half of them where photos were taken"
+    assert source.origin.startswith("poses sampled in free space, half of them where photos were taken, up is ")
     assert len(asked) == 1  # the search for photo places takes seconds
+
+
+def test_up_is_as_named_or_estimated():
+    scene = box_room(0, 3000)
+    sideways = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    named, estimated = ViewSource(scene, up=sideways), ViewSource(scene)
+    assert str(named.up) == "x" and named.up.sure
+    rolls = [source.views(3).viewmats[:, 0, :3] @ source.up.direction for source in (named, estimated)]
+    assert all(float(roll.abs().max()) < 1e-6 for roll in rolls)
+    assert named.origin.endswith("up is x") and estimated.origin.endswith(f"up is {estimated.up}")
