@@ -108,8 +108,9 @@ class ViewSource:
     def _sampled(self, count: int, seed: int) -> Views:
         """Sampled views, which get the run's rasterize mode."""
         width, height = self.resolution
+        size = {"width": width, "height": height}
         up, settings = self.up.direction, self.settings
-        views = views_about(self._scene, self._photos, count, width, height, seed, up, settings=settings)
+        views = views_about(self._scene, self._photos, count, **size, seed=seed, up=up, settings=settings)
         return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
 
     @cached_property
