@@ -8,7 +8,6 @@ check that all agree.
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import math
 from pathlib import Path
@@ -80,16 +79,6 @@ def _window(like: Tensor) -> Tensor:
     return weight / weight.sum()
 
 
-class _Similarity(ctypes.Structure):
-    """``struct Similarity`` of the kernel."""
-
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("image", "other", "window")),
-        *((name, ctypes.c_int64) for name in ("planes", "height", "row", "step", "bands")),
-        *((name, ctypes.c_void_p) for name in ("partials", "sums", "grad", "next")),
-    )
-
-
 def _suited(image: Tensor, other: Tensor) -> bool:
     """Whether the kernel can take images of these sizes, and a gradient by one of them at most is asked for."""
     return (
@@ -140,10 +129,12 @@ def _call(
     sums: Tensor | None = None,
     grad: Tensor | None = None,
 ) -> None:
-    window, next_band = _window(image), torch.zeros(1, dtype=torch.int64)
-    optional = (None if tensor is None else tensor.data_ptr() for tensor in (partials, sums, grad))
-    task = _Similarity(image.data_ptr(), other.data_ptr(), window.data_ptr(), *shape, *optional, next_band.data_ptr())
-    on_threads(shape[0] * shape[-1] > 1, KERNELS.library.pointsplat_similarity, ctypes.byref(task))
+    planes, height, row, step, bands = shape
+    task = KERNELS.structs["Similarity"](
+        image=image, other=other, window=_window(image), planes=planes, height=height, row=row, step=step, bands=bands,
+        partials=partials, sums=sums, grad=grad,
+    )  # fmt: skip
+    on_threads(planes * bands > 1, KERNELS.library.pointsplat_similarity, task)
 
 
 def _as_torch() -> bool:
@@ -159,9 +150,4 @@ def _as_torch() -> bool:
     return agreement(found[0], found[1], off=1e-4, share=1e-2)
 
 
-KERNELS = Kernels(
-    "SSIM",
-    Path(__file__).with_name("structural_similarity.cpp"),
-    {"pointsplat_similarity": [ctypes.c_void_p]},
-    _as_torch,
-)
+KERNELS = Kernels("SSIM", Path(__file__).with_name("structural_similarity.cpp"), _as_torch)

@@ -14,4 +14,4 @@ from pointsplat_ns.rasterizer.compiled import tiles as compiled_tiles
 def engine_of(compiled: bool | None, *tensors: Tensor) -> ModuleType:
     """The module with ``ellipses_of`` and ``pairs_of`` for Gaussians of which these are means, covariances and so on;
     ``compiled`` as for :func:`~pointsplat_ns.rasterization`."""
-    return compiled_tiles if compiled_tiles.can_list(compiled, *tensors) else ellipses
+    return compiled_tiles if compiled_tiles.KERNELS.usable_for(compiled, *tensors) else ellipses

@@ -78,7 +78,7 @@ def count_meaningless(
         opacities: (N,)
         compiled: as for :func:`~pointsplat_ns.rasterization`.
     """
-    if compiled_projection.can_project(means, quats, scales, opacities, compiled):
+    if compiled_projection.KERNELS.usable_for(compiled, means, quats, scales, opacities):
         return compiled_projection.count_meaningless(means, quats, scales, opacities)
     # one NaN or infinity spoils a sum, so a clean scene costs four sums and one answer
     total = means.sum() + quats.sum() + scales.sum() + opacities.sum()
@@ -141,6 +141,6 @@ def project(
     if not _close((skew, below, *last), (0.0, 0.0, 0.0, 0.0, 1.0)):
         raise ValueError(f"K is {K.tolist()}; expected no skew: zeros but for fx, fy, cx, cy and the 1 of the last row")
     lens = Lens(fx, fy, cx, cy, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased)
-    suited = compiled_projection.can_project(means, quats, scales, opacities, compiled)
+    suited = compiled_projection.KERNELS.usable_for(compiled, means, quats, scales, opacities)
     function = compiled_projection.CompiledProject if suited else Project
     return Projected(*function.apply(means, quats, scales, opacities, viewmat[:3, :3].double(), centre, lens))

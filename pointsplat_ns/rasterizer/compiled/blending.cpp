@@ -71,7 +71,6 @@ struct Task {
     const float* grad_final;  // as final_
     float* sums;              // [P, MOMENTS + channels (+ 2)] gradient sums of each pair
     int64_t absolute;         // whether sums has two columns more
-    int64_t* next;            // the first tile that no thread has taken
 };
 
 }  // extern "C"
@@ -236,9 +235,9 @@ void differentiate_tile(const Task& task, int64_t tile) {
 }
 
 template <typename Work>
-void each_tile(const Task& task, Work work) {
+void each_tile(const Task& task, int64_t* next, Work work) {
     for (;;) {
-        const int64_t first = __atomic_fetch_add(task.next, GRAB, __ATOMIC_RELAXED);
+        const int64_t first = __atomic_fetch_add(next, GRAB, __ATOMIC_RELAXED);
         if (first >= task.tiles) return;
         for (int64_t tile = first; tile < first + GRAB && tile < task.tiles; ++tile) work(task, tile);
     }
@@ -252,11 +251,11 @@ void each_gaussian(int64_t* next, int64_t count, Work work) {
 }
 
 template <int D>
-void differentiate_all(const Task& task) {
+void differentiate_all(const Task& task, int64_t* next) {
     if (task.absolute)
-        each_tile(task, differentiate_tile<D, true>);
+        each_tile(task, next, differentiate_tile<D, true>);
     else
-        each_tile(task, differentiate_tile<D, false>);
+        each_tile(task, next, differentiate_tile<D, false>);
 }
 
 }  // namespace
@@ -265,21 +264,21 @@ extern "C" {
 
 int pointsplat_chunk() { return CHUNK; }
 
-void pointsplat_blend(const Task* task) {
+void pointsplat_blend(const Task* task, int64_t* next) {
     switch (task->channels) {
-        case 1: return each_tile(*task, blend_tile<1>);
-        case 2: return each_tile(*task, blend_tile<2>);
-        case 3: return each_tile(*task, blend_tile<3>);
-        case 4: return each_tile(*task, blend_tile<4>);
+        case 1: return each_tile(*task, next, blend_tile<1>);
+        case 2: return each_tile(*task, next, blend_tile<2>);
+        case 3: return each_tile(*task, next, blend_tile<3>);
+        case 4: return each_tile(*task, next, blend_tile<4>);
     }
 }
 
-void pointsplat_differentiate(const Task* task) {
+void pointsplat_differentiate(const Task* task, int64_t* next) {
     switch (task->channels) {
-        case 1: return differentiate_all<1>(*task);
-        case 2: return differentiate_all<2>(*task);
-        case 3: return differentiate_all<3>(*task);
-        case 4: return differentiate_all<4>(*task);
+        case 1: return differentiate_all<1>(*task, next);
+        case 2: return differentiate_all<2>(*task, next);
+        case 3: return differentiate_all<3>(*task, next);
+        case 4: return differentiate_all<4>(*task, next);
     }
 }
 

@@ -122,6 +122,7 @@ struct Lanes {
     }
 };
 
+// Calls ``work`` with ranges of ``count`` Gaussians that no other thread has; ``next`` counts those that were taken.
 template <typename Work>
 void each_range(int64_t* next, int64_t count, Work work) {
     for (;;) {

@@ -42,7 +42,6 @@ struct Projection {
     int64_t* ids;
     float *means2d, *depths, *cov2d, *dets, *opacities, *directions, *beyond;
     int32_t* radii;
-    int64_t* next;  // the first range that no thread has taken
 };
 
 struct ProjectionGradient {
@@ -53,7 +52,6 @@ struct ProjectionGradient {
     const float *grad_means2d, *grad_depths, *grad_cov2d, *grad_det, *grad_opacities, *grad_directions;  // null: zeros
     float *means, *quats, *scales, *opacities;  // as those of the scene; null where not wanted
     double* sums;                               // [ranges, 12] of view and centre; null where not wanted
-    int64_t* next;
 };
 
 }  // extern "C"
@@ -285,8 +283,8 @@ int64_t pointsplat_range() { return RANGE; }
 
 int64_t pointsplat_seen() { return sizeof(Seen); }
 
-void pointsplat_project(const Projection* task) {
-    each_range(task->next, task->scene.count, [&](int64_t range, int64_t first, int64_t last) {
+void pointsplat_project(const Projection* task, int64_t* next) {
+    each_range(next, task->scene.count, [&](int64_t range, int64_t first, int64_t last) {
         int64_t candidates[RANGE];
         const int64_t number = find_candidates(*task, first, last, candidates);
         Seen *begin = task->seen + first, *end = begin;
@@ -316,10 +314,10 @@ void pointsplat_count_meaningless(const Scene* scene, int64_t* counts, int64_t* 
 }
 
 // The arrays of what is drawn, from ``seen``.
-void pointsplat_unpack(const Projection* task) {
+void pointsplat_unpack(const Projection* task, int64_t* next) {
     const Projection& t = *task;
     const double nearest = *std::min_element(t.nearest, t.nearest + (t.scene.count + RANGE - 1) / RANGE);
-    each_range(t.next, t.scene.count, [&](int64_t range, int64_t first, int64_t) {
+    each_range(next, t.scene.count, [&](int64_t range, int64_t first, int64_t) {
         for (int64_t i = 0; i < t.counts[range]; ++i) {
             const Seen& seen = t.seen[first + i];
             const int64_t to = t.offsets[range] + i;
@@ -333,12 +331,12 @@ void pointsplat_unpack(const Projection* task) {
     });
 }
 
-void pointsplat_project_backward(const ProjectionGradient* task) {
+void pointsplat_project_backward(const ProjectionGradient* task, int64_t* next) {
     const ProjectionGradient& t = *task;
     const auto clear = [](float* array, int64_t columns, int64_t first, int64_t last) {
         if (array) std::fill(array + first * columns, array + last * columns, 0.0f);
     };
-    each_range(t.next, t.scene.count, [&](int64_t range, int64_t first, int64_t last) {
+    each_range(next, t.scene.count, [&](int64_t range, int64_t first, int64_t last) {
         clear(t.means, 3, first, last), clear(t.quats, 4, first, last);
         clear(t.scales, 3, first, last), clear(t.opacities, 1, first, last);
         double* sums = t.sums ? t.sums + 12 * range : nullptr;
