@@ -239,8 +239,8 @@ class Project(torch.autograd.Function):
         # x / z and y / z: once as the image position, once, where it is not clamped, in the Jacobian
         (low_x, high_x), (low_y, high_y) = lens.clamp_x(), lens.clamp_y()
         gx, gy = grad_means2d.T
-        grad_u = lens.fx * gx - _dot(view[2], grad_a) * ((slopes[0] >= low_x) & (slopes[0] <= high_x))
-        grad_v = lens.fy * gy - _dot(view[2], grad_b) * ((slopes[1] >= low_y) & (slopes[1] <= high_y))
+        grad_u = lens.fx * gx - (view[2] @ grad_a) * ((slopes[0] >= low_x) & (slopes[0] <= high_x))
+        grad_v = lens.fy * gy - (view[2] @ grad_b) * ((slopes[1] >= low_y) & (slopes[1] <= high_y))
         along = slopes[0] * grad_u + slopes[1] * grad_v + grad_log_rz
         grad_points = torch.stack([rz * grad_u, rz * grad_v, grad_depths - rz * along])
         grad_directions = grad_directions + (view.T @ grad_points).T
@@ -270,8 +270,3 @@ class Project(torch.autograd.Function):
             grad_centre,
             None,
         )
-
-
-def _dot(vector: Tensor, rows: Tensor) -> Tensor:
-    """A vector (3,) times rows (3, M)."""
-    return vector @ rows

@@ -68,27 +68,13 @@ class Footprints:
         alpha_min: float = ALPHA_MIN,
         engine: ModuleType = in_torch,  # what finds ellipses and pairs, see binning.engine_of
     ):
-        self.width, self.height = width, height
-        self._grid = Grid(cameras, height, rows=-(-height // TILE), columns=-(-width // TILE))
+        self.cameras, self.width, self.height = cameras, width, height
+        self.rows, self.columns = -(-height // TILE), -(-width // TILE)  # of tiles
+        self._grid = Grid(cameras, height, self.rows, self.columns)
         self._engine = engine
         self._ellipses = engine.ellipses_of(
             means2d, cov2d, det, opacities, _by_depth(depths.contiguous()), camera_ids, self._grid, alpha_min
         )
-
-    @property
-    def cameras(self) -> int:
-        """Number of images."""
-        return self._grid.cameras
-
-    @property
-    def rows(self) -> int:
-        """Rows of tiles of an image."""
-        return self._grid.rows
-
-    @property
-    def columns(self) -> int:
-        """Columns of tiles of an image."""
-        return self._grid.columns
 
     @property
     def whole(self) -> Region:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,6 +37,14 @@ class HistogramBins:
     """Number of equal bins of log10 of the volume."""
     volume_span: tuple[float, float] = (-20.0, 4.0)
     """Range of log10 of the volume, scene units cubed; values outside count in the first or the last bin."""
+
+    @property
+    def opacity_edges(self) -> np.ndarray:
+        return np.linspace(0.0, 1.0, self.opacity + 1)
+
+    @property
+    def volume_edges(self) -> np.ndarray:
+        return np.linspace(*self.volume_span, self.volume + 1)
 
 
 BINS = HistogramBins()
