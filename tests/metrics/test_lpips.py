@@ -93,23 +93,6 @@ def test_lpips_is_torchmetrics(net, real, tmp_path):
     assert torch.allclose(load_lpips(net, path)(a, b), expected, atol=1e-5, rtol=1e-5) and expected.min() > 1e-3
 
 
-@pytest.mark.parametrize("net", NETS)
-def test_real_lpips_ranks_a_shift_of_colour_below_noise_below_another_image(net):
-    if not (WEIGHTS / FILES[net]).is_file():
-        pytest.skip(f"{FILES[net]} is not at hand")
-    model = load_lpips(net, WEIGHTS / FILES[net])
-    y, x = torch.meshgrid(torch.linspace(0, 6, 64), torch.linspace(0, 6, 64), indexing="ij")
-    image = torch.stack([x.sin(), y.cos(), (x + y).sin()], dim=-1) * 0.4 + 0.5
-    noise = 0.2 * torch.randn(64, 64, 3, generator=torch.Generator().manual_seed(0))
-    others = [
-        image + 0.02,
-        (image + noise).clamp(0, 1),
-        torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(1)),
-    ]
-    values = [float(model(other, image)) for other in others]
-    assert 0 < values[0] < values[1] < values[2]
-
-
 def test_identical_images_are_at_distance_0_with_a_zero_gradient(alex):
     for image in (torch.rand(40, 40, 3), torch.zeros(40, 40, 3), torch.ones(40, 40, 3)):
         pred = image.clone().requires_grad_()
@@ -148,13 +131,6 @@ def test_value_and_gradient_in_float32_are_those_of_float64(alex):
 def test_gradient_agrees_with_float64_differences(alex):
     a, b = pair(31, 31, dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda x: alex(x, b), a.requires_grad_(), fast_mode=True, eps=1e-7, atol=1e-6)
-
-
-def test_lpips_is_symmetric_and_grows_with_noise(alex):
-    a, b = pair(2, 40, 44)
-    assert torch.allclose(alex(a, b), alex(b, a), rtol=1e-5)  # float32 sums
-    values = [float(alex((b[0] + s * (a[0] - b[0])), b[0])) for s in (0.1, 0.3, 1.0)]
-    assert 0 < values[0] < values[1] < values[2]
 
 
 def test_a_batch_gives_one_value_an_image(alex):
