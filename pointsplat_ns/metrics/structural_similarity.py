@@ -22,18 +22,6 @@ from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
 SSIM_WINDOW = 11
 """Side of SSIM's Gaussian window in pixels."""
 
-SIGMA = 1.5
-"""Standard deviation of the window, in pixels."""
-
-C1, C2 = 0.01**2, 0.03**2
-"""The two constants of Wang et al. 2004 for a data range of 1."""
-
-_BAND = 48
-"""Number of rows that a thread takes at once, about: ten more are blurred for each."""
-
-_INTERLEAVED = 4
-"""Largest number of channels that may lie together, ``MOST_STEP`` of the kernel."""
-
 
 def mean_ssim(image: Tensor, other: Tensor, compiled: bool | None = None) -> Tensor:
     """Mean structural similarity (Wang et al. 2004, eq. 13) of two images.
@@ -55,9 +43,12 @@ def mean_ssim(image: Tensor, other: Tensor, compiled: bool | None = None) -> Ten
         return CompiledSimilarity.apply(image, other)
     maps = torch.cat([image, other, image * image, other * other, image * other], dim=1)
     mean, other_mean, square, other_square, product = _blur(maps).chunk(5, dim=1)
+    light, detail = 0.01**2, 0.03**2  # the constants of Wang et al. 2004 for a data range of 1
     mean_product, mean_square, other_mean_square = mean * other_mean, mean * mean, other_mean * other_mean
-    contrast = (2 * (product - mean_product) + C2) / (square - mean_square + other_square - other_mean_square + C2)
-    luminance = (2 * mean_product + C1) / (mean_square + other_mean_square + C1)
+    contrast = (2 * (product - mean_product) + detail) / (
+        square - mean_square + other_square - other_mean_square + detail
+    )
+    luminance = (2 * mean_product + light) / (mean_square + other_mean_square + light)
     return (luminance * contrast).mean()
 
 
@@ -75,7 +66,7 @@ def _blur(maps: Tensor) -> Tensor:
 def _window(like: Tensor) -> Tensor:
     """Weights (11,) along one side."""
     offset = torch.arange(SSIM_WINDOW, dtype=like.dtype, device=like.device) - SSIM_WINDOW // 2
-    weight = torch.exp(-offset.square() / (2 * SIGMA**2))
+    weight = torch.exp(-offset.square() / (2 * 1.5**2))  # sigma of 1.5 pixels
     return weight / weight.sum()
 
 
@@ -95,15 +86,15 @@ class CompiledSimilarity(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, image, other):
-        # Where the channels of pixels lie together, as in a render, they are taken so.
-        interleaved = image.shape[1] <= _INTERLEAVED and image.permute(0, 2, 3, 1).is_contiguous()
+        # Where the channels of pixels lie together, as in a render, they are taken so; at most MOST_STEP of the kernel.
+        interleaved = image.shape[1] <= 4 and image.permute(0, 2, 3, 1).is_contiguous()
         order = (0, 2, 3, 1) if interleaved else (0, 1, 2, 3)
         image, other = (tensor.detach().permute(order).contiguous() for tensor in (image, other))
         batch, *_, side = image.shape
         planes, height = (batch, image.shape[1]) if interleaved else (batch * image.shape[1], image.shape[2])
         step, row = (side, image.shape[2] * side) if interleaved else (1, side)
         rows, windows = height - SSIM_WINDOW + 1, row - (SSIM_WINDOW - 1) * step
-        ctx.shape, ctx.interleaved = (planes, height, row, step, math.ceil(rows / _BAND)), interleaved
+        ctx.shape, ctx.interleaved = (planes, height, row, step, math.ceil(rows / 48)), interleaved  # rows of a band
         ctx.count = planes * rows * windows
         partials = image.new_empty(3, planes, rows, windows) if ctx.needs_input_grad[0] else None
         sums = torch.empty(planes * ctx.shape[-1], dtype=torch.float64)

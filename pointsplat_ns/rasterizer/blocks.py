@@ -1,6 +1,6 @@
 """Blending in plain torch: tiles of similar length together, in blocks that fit the cache.
 
-BLENDED_AT_ONCE Gaussians at a time, more where few tiles are left; tiles whose pixels are all saturated are dropped.
+Sixteen Gaussians at a time, more where few tiles are left; tiles whose pixels are all saturated are dropped.
 
 Shapes: P pairs, B tiles of a block, S Gaussians of a chunk, 64 = TILE * TILE pixels, D channels.
 """

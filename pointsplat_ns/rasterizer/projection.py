@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.compiled import projection as compiled_projection
+from pointsplat_ns.rasterizer.constants import EPS2D
 from pointsplat_ns.rasterizer.ewa import Lens, Project
 from pointsplat_ns.views import View
 
@@ -111,7 +112,7 @@ def project(
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     radius_clip: float = 0.0,
-    eps2d: float = 0.3,
+    eps2d: float = EPS2D,
     antialiased: bool = False,
     compiled: bool | None = None,
 ) -> Projected:

@@ -12,7 +12,7 @@ from pointsplat_ns.rasterizer.arguments import check_options, check_tensors
 from pointsplat_ns.rasterizer.backends import use_gsplat
 from pointsplat_ns.rasterizer.blending import blend
 from pointsplat_ns.rasterizer.colors import sh_to_color
-from pointsplat_ns.rasterizer.constants import EPS2D, LARGEST_COLOR, QUALITIES, TILE, Quality
+from pointsplat_ns.rasterizer.constants import EPS2D, QUALITIES, TILE, Quality
 from pointsplat_ns.rasterizer.frame import MEMORY_BUDGET, BlendOptions
 from pointsplat_ns.rasterizer.precision import full_precision
 from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, project
@@ -32,7 +32,8 @@ def finite_colors(seen: Projected, *rest) -> tuple[Projected, Tensor, Tensor]:
     """Projected Gaussians and colours without those whose colour is NaN or too large, and the ids of these."""
     colors = _colors_of(seen, *rest)
     dropped = seen.ids[:0]
-    limit = torch.finfo(colors.dtype).max ** LARGEST_COLOR
+    # 6e30 in float32: gradients, which are sums over pixels of colours times slopes, stay finite
+    limit = torch.finfo(colors.dtype).max ** 0.8
     if colors.numel() and not bool(torch.stack(colors.detach().aminmax()).abs().amax() < limit):  # NaN spoils both
         usable = (colors.detach().abs() < limit).all(-1)
         dropped = seen.ids[~usable]

@@ -15,6 +15,9 @@ import torch
 from pointsplat_ns.system.declarations import Struct, functions_of, structs_of
 from pointsplat_ns.system.native_code import NativeCodeError, load_native
 
+SEVERAL = 4000
+"""Gaussians, or pairs of Gaussian and tile, from which on several threads are faster than one."""
+
 
 class Kernels:
     """Functions of a C++ file that are faster than torch.

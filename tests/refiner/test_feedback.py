@@ -9,7 +9,6 @@ from safetensors.torch import save_file
 from pointsplat_ns.refiner.feedback import (
     FEATURES,
     FORMAT,
-    MAX_LOG_FACTOR,
     PARAMETERS,
     PRETRAINED,
     FeedbackRefiner,
@@ -30,8 +29,8 @@ def trained() -> FeedbackRefiner:
 def test_factors_are_bounded_whatever_comes_in():
     factors = trained()(100 * torch.randn(50, FEATURES))
     assert factors.shape == (50, len(PARAMETERS))
-    assert float(factors.log().abs().max()) <= MAX_LOG_FACTOR + 1e-5
-    assert float(factors.log().abs().max()) > 0.5 * MAX_LOG_FACTOR, "weights of this size use the range"
+    assert float(factors.log().abs().max()) <= FeedbackRefiner.MAX_LOG_FACTOR + 1e-5
+    assert float(factors.log().abs().max()) > 0.5 * FeedbackRefiner.MAX_LOG_FACTOR, "weights of this size use the range"
 
 
 def test_a_file_gives_back_the_network(tmp_path):

@@ -55,9 +55,9 @@ def test_the_middle_lambda_is_the_row_of_table_1():
 
 def test_every_figure_of_the_paper_has_a_row():
     cells = {(way.name, share) for way, share in CELLS}
-    assert {*paper._TABLE_1} <= cells and {*paper._TABLE_3} <= cells
+    assert {*paper._TABLES[1]} <= cells and {*paper._TABLES[3]} <= cells
     assert [way.name for way in TABLE_4] == [*paper._TABLE_4]
-    assert len(paper._TABLE_1) == 1 + 8 * 3 and len(paper._TABLE_3) == 10
+    assert len(paper._TABLES[1]) == 1 + 8 * 3 and len(paper._TABLES[3]) == 10
 
 
 @pytest.mark.parametrize(

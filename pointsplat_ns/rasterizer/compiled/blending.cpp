@@ -17,7 +17,7 @@ constexpr int MOMENTS = 6;   // w, w^2, dv, dv^2, w dv, 1
 constexpr int COLOR = 6;     // first column of the colours in the table
 constexpr float HALF = 0.5f * (TILE - 1);
 constexpr float LN2 = 0.693147180559945f, LOG2E = 1.44269504088896f;
-constexpr float SLACK = 1e-3f;  // log2 alpha: rounding never leaves out a pixel that is drawn
+constexpr float ROUNDING = 1e-3f;  // log2 alpha: no pixel that is drawn is left out
 
 typedef Lane Row;  // of pixels
 static_assert(LANES == TILE, "a row of a tile is one vector");
@@ -103,7 +103,7 @@ struct Chunk {
         }
     }
 
-    bool reaches(int k, int row, float log2_alpha_min) const { return !(bound[k][row] < log2_alpha_min - SLACK); }
+    bool reaches(int k, int row, float log2_alpha_min) const { return !(bound[k][row] < log2_alpha_min - ROUNDING); }
 
     Row w_of(int k, int row) const { return OFFSETS + w[k][row]; }
 

@@ -16,14 +16,11 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer import blocks
 from pointsplat_ns.rasterizer.alpha import CLAMPED
-from pointsplat_ns.rasterizer.constants import ALPHA_MAX, EXACT, Quality
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, Quality
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
 from pointsplat_ns.rasterizer.tiles import Footprints, TileList
 from pointsplat_ns.system.declarations import Struct
-from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
-
-_FEW_PAIRS = 2000
-"""Pairs that one thread blends sooner than several can be asked."""
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
 
 
 class KernelInputs(NamedTuple):
@@ -60,7 +57,7 @@ def inputs_of(
     count, channels = colors.shape
     tensors = [tensor.contiguous() for tensor in (means2d, cov2d, det, opacities, colors)]
     table = colors.new_empty(count, 6 + channels)  # six columns of geometry, then the colours
-    on_threads(count >= _FEW_PAIRS, KERNELS.library.pointsplat_tabulate, *tensors, count, channels, table)
+    on_threads(count >= SEVERAL, KERNELS.library.pointsplat_tabulate, *tensors, count, channels, table)
     return KernelInputs(table, channels, quality)
 
 
@@ -70,7 +67,7 @@ def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list
     cov2d, det, opacities = cov2d.contiguous(), det.contiguous(), opacities.contiguous()
     grads = [det.new_empty(count, 2), torch.empty_like(cov2d), torch.empty_like(det), torch.empty_like(opacities)]
     on_threads(
-        count >= _FEW_PAIRS, KERNELS.library.pointsplat_chain, summed.data_ptr(), summed.stride(0), cov2d, det,
+        count >= SEVERAL, KERNELS.library.pointsplat_chain, summed.data_ptr(), summed.stride(0), cov2d, det,
         opacities, count, *grads,
     )  # fmt: skip
     return grads
@@ -100,7 +97,7 @@ def blend_region(
     task = _task(footprints, tiles, inputs, chunks, final)
     task.image, task.blended = image, blended
     task.before = before if keep_tape and len(before) else None
-    on_threads(tiles.gaussians.numel() >= _FEW_PAIRS, library.pointsplat_blend, task)
+    on_threads(tiles.gaussians.numel() >= SEVERAL, library.pointsplat_blend, task)
     return KernelTape(before, blended, chunks) if keep_tape else None
 
 
@@ -123,16 +120,14 @@ def differentiate_region(
     task.before, task.blended = tape.before, tape.blended
     task.grad_image, task.grad_final = grad_image.contiguous(), grad_final.contiguous()
     task.sums, task.absolute = sums, int(absgrad)
-    on_threads(pairs >= _FEW_PAIRS, library.pointsplat_differentiate, task)
+    on_threads(pairs >= SEVERAL, library.pointsplat_differentiate, task)
 
     # sums of pairs, one after the other for each Gaussian
     by_gaussian = torch.empty_like(tiles.places)
     by_gaussian.index_copy_(0, tiles.places, torch.arange(pairs))
     starts = torch.zeros(count + 1, dtype=torch.int64)
     torch.cumsum(tiles.counts, 0, out=starts[1:])
-    on_threads(
-        pairs >= _FEW_PAIRS, library.pointsplat_gather, sums, by_gaussian, starts, tiles.order, count, columns, out
-    )
+    on_threads(pairs >= SEVERAL, library.pointsplat_gather, sums, by_gaussian, starts, tiles.order, count, columns, out)
     return out
 
 
@@ -156,7 +151,7 @@ def _as_torch() -> bool:
     tiles = footprints.tiles(footprints.whole)
     for engine in (blocks, sys.modules[__name__]):
         image, final = torch.empty(number, 3, PIXELS), torch.empty(number, PIXELS)
-        inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, EXACT)
+        inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, Quality())
         tape = engine.blend_region(footprints, tiles, inputs, image, final, True)
         summed = engine.differentiate_region(footprints, tiles, inputs, tape, final, *grads, True)
         drawn.append((image, final, summed, *engine.chain(summed[:, :MOMENTS], cov2d, det, opacities)))

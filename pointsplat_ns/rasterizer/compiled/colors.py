@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.rasterizer.spherical_harmonics import Color
 from pointsplat_ns.system.declarations import Struct
-from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
 
 
 class CompiledColor(torch.autograd.Function):
@@ -80,7 +80,7 @@ def _task(
 
 
 def _call(task: Struct) -> None:
-    on_threads(task.count >= 4000, KERNELS.library.pointsplat_color, task)  # fewer are drawn sooner by one thread
+    on_threads(task.count >= SEVERAL, KERNELS.library.pointsplat_color, task)
 
 
 def _as_torch() -> bool:

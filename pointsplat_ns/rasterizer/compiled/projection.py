@@ -16,10 +16,7 @@ from pointsplat_ns.rasterizer import ewa
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, COMPENSATION_MIN
 from pointsplat_ns.rasterizer.ewa import Lens
 from pointsplat_ns.system.declarations import Struct
-from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
-
-_SEVERAL = 4
-"""Ranges of Gaussians from which on more than one thread is asked."""
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
 
 
 def _camera(view: Tensor, centre: Tensor, lens: Lens) -> Struct:
@@ -46,7 +43,7 @@ def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: T
     tensors = [tensor.contiguous() for tensor in (means, quats, scales, opacities)]
     ranges = -(-len(means) // library.pointsplat_range())
     counts = torch.empty(ranges, dtype=torch.int64)
-    on_threads(ranges >= _SEVERAL, library.pointsplat_count_meaningless, _scene(*tensors), counts)
+    on_threads(len(means) >= SEVERAL, library.pointsplat_count_meaningless, _scene(*tensors), counts)
     return int(counts.sum())
 
 
@@ -65,7 +62,7 @@ class CompiledProject(torch.autograd.Function):
         task = KERNELS.structs["Projection"](
             camera=camera, scene=_scene(*scene), seen=seen, counts=counts, nearest=nearest
         )
-        on_threads(ranges >= _SEVERAL, library.pointsplat_project, task)
+        on_threads(count >= SEVERAL, library.pointsplat_project, task)
 
         offsets = torch.zeros(ranges + 1, dtype=torch.int64)
         torch.cumsum(counts, 0, out=offsets[1:])
@@ -78,7 +75,7 @@ class CompiledProject(torch.autograd.Function):
         task.means2d, task.depths, task.cov2d, task.dets = means2d, depths, cov2d, det
         task.opacities, task.directions, task.beyond = alphas, directions, beyond
         if kept:
-            on_threads(ranges >= _SEVERAL, library.pointsplat_unpack, task)
+            on_threads(count >= SEVERAL, library.pointsplat_unpack, task)
         if any(ctx.needs_input_grad):
             ctx.camera = camera
             ctx.save_for_backward(ids, *scene)
@@ -101,7 +98,7 @@ class CompiledProject(torch.autograd.Function):
         task = KERNELS.structs["ProjectionGradient"](
             camera=ctx.camera, scene=_scene(*scene), ids=ids, seen=len(ids), sums=sums, **grads, **out
         )
-        on_threads(ranges >= _SEVERAL, library.pointsplat_project_backward, task)
+        on_threads(len(scene[0]) >= SEVERAL, library.pointsplat_project_backward, task)
         grad_view = grad_centre = None
         if sums is not None:
             # by NumPy: on one thread, so that it is rounded alike on any number of them

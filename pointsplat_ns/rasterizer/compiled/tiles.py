@@ -15,10 +15,7 @@ from pointsplat_ns.rasterizer import ellipses as in_torch
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, SLACK
 from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, Pairs, Region
 from pointsplat_ns.system.declarations import Struct
-from pointsplat_ns.system.kernels import Kernels, on_threads
-
-_FEW = 4000
-"""Gaussians that one thread lists sooner than several can be asked."""
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 
 
 def _grid(grid: Grid) -> Struct:
@@ -46,7 +43,7 @@ def ellipses_of(
         grid=_grid(grid), ellipses=_ellipses(found), means2d=means2d.contiguous(), cov2d=cov2d.contiguous(),
         det=det.contiguous(), opacities=opacities.contiguous(), cameras=cameras.contiguous(), alpha_min=alpha_min,
     )  # fmt: skip
-    on_threads(len(order) >= _FEW, KERNELS.library.pointsplat_ellipses, task)
+    on_threads(len(order) >= SEVERAL, KERNELS.library.pointsplat_ellipses, task)
     return found
 
 
@@ -63,7 +60,7 @@ def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> Pairs:
         grid=_grid(grid), ellipses=_ellipses(ellipses), **region._asdict(), tiles=tiles, starts=starts, strips=strips,
         counts=counts, offsets=offsets,
     )  # fmt: skip
-    on_threads(count >= _FEW, library.pointsplat_strips, task)
+    on_threads(count >= SEVERAL, library.pointsplat_strips, task)
     library.pointsplat_count(task)
     offsets = torch.cumsum(offsets, 0)
     gaussians, places = (offsets.new_empty(int(offsets[-1])) for _ in range(2))
