@@ -7,6 +7,7 @@ arrays, pointers and earlier structs.
 from __future__ import annotations
 
 import ctypes
+import math
 import re
 from collections.abc import Iterator
 from typing import Any, ClassVar
@@ -38,9 +39,10 @@ class Pointer:
         Raises:
             TypeError: if the tensor has another dtype or device, or is not contiguous.
         """
-        if not isinstance(value, torch.Tensor):
+        if value is None or not isinstance(value, torch.Tensor):
             return value
-        if self.dtype not in (None, value.dtype) or value.device.type != "cpu" or not value.is_contiguous():
+        fits = self.dtype is None or value.dtype is self.dtype
+        if not (fits and value.is_cpu and value.is_contiguous()):
             raise TypeError(
                 f"tensor of {value.dtype} on {value.device} with strides {value.stride()}; expected {self.dtype} on "
                 "the CPU, contiguous"
@@ -55,31 +57,28 @@ class Pointer:
 
 
 class Struct(ctypes.Structure):
-    """A struct of a C++ file. Its pointers take what :class:`Pointer` takes; it keeps tensors alive."""
+    """A struct of a C++ file. :meth:`fill` sets pointers to what :class:`Pointer` takes, and keeps tensors alive."""
 
+    __slots__ = ("kept",)
     members: ClassVar[dict[str, Pointer | None]] = {}
     """The type of each field that is a pointer, None for others."""
 
     def __init__(self, **values: Any):
-        super().__init__()
-        for name, value in values.items():
-            setattr(self, name, value)
+        self.kept: dict[str, Any] = {}
+        self.fill(**values)
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Set a field.
+    def fill(self, **values: Any) -> None:
+        """Set fields.
 
         Raises:
             AttributeError: if the struct has no such field.
-            TypeError: if the value does not fit its type.
+            TypeError: if a value does not fit its type.
         """
-        pointer = self.members.get(name)
-        if pointer is None:
-            if name not in self.members:
-                raise AttributeError(f"struct {type(self).__name__} has no field {name}")
-            super().__setattr__(name, value)
-        else:
-            super().__setattr__(name, pointer.address(value))
-        self.__dict__[name] = value
+        self.kept.update(values)
+        members = self.members
+        for name, value in values.items():
+            pointer = members.get(name)
+            setattr(self, name, value if pointer is None else pointer.address(value))
 
 
 def structs_of(text: str) -> dict[str, type[Struct]]:
@@ -98,7 +97,7 @@ def structs_of(text: str) -> dict[str, type[Struct]]:
             for field, kind in _declared(statement, found):
                 members[field] = kind if isinstance(kind, Pointer) else None
                 fields.append((field, ctypes.c_void_p if isinstance(kind, Pointer) else kind))
-        found[name] = type(name, (Struct,), {"members": members, "_fields_": fields})
+        found[name] = type(name, (Struct,), {"__slots__": (), "members": members, "_fields_": fields})
     return found
 
 
@@ -127,7 +126,7 @@ def _shared(text: str) -> str:
 
 
 def _declared(statement: str, structs: dict[str, type[Struct]]) -> Iterator[tuple[str, Any]]:
-    """Names and types that a statement such as ``const float *a, b[3]`` declares."""
+    """Names and types that a statement such as ``const float *a, b[3]`` declares; arrays are flat."""
     matched = re.fullmatch(r"(?:const )?(\w+)\b(.*)", " ".join(statement.split()))
     for declarator in matched[2].split(",") if matched else [""]:
         parts = re.fullmatch(r" ?(\*?) ?(\w+)((?:\[\d+\])*)", declarator)
@@ -135,6 +134,6 @@ def _declared(statement: str, structs: dict[str, type[Struct]]) -> Iterator[tupl
         if not parts or not base:
             raise ValueError(f"{statement!r}: not a declaration of numbers, arrays, pointers or structs")
         kind: Any = Pointer(base[1]) if parts[1] else base[0]
-        for size in reversed(re.findall(r"\d+", parts[3])):
-            kind = kind * int(size)
+        if parts[3]:  # of several dimensions: all numbers in a row
+            kind = kind * math.prod(map(int, re.findall(r"\d+", parts[3])))
         yield parts[2], kind

@@ -64,7 +64,7 @@ def test_structs_are_laid_out_as_the_compiler_lays_them_out(source, tmp_path):
 def test_what_is_shared_is_declared_with_its_types():
     structs = structs_of(SHARED)
     assert [*structs] == ["Inner", "Task"]
-    assert structs["Inner"]._fields_ == [("number", ctypes.c_int32), ("values", ctypes.c_double * 3 * 2)]
+    assert structs["Inner"]._fields_ == [("number", ctypes.c_int32), ("values", ctypes.c_double * 6)]
     fields = [("inner", structs["Inner"]), ("a", ctypes.c_void_p), ("b", ctypes.c_void_p), ("count", ctypes.c_int64)]
     assert structs["Task"]._fields_ == fields and structs["Task"].members["a"].dtype == torch.float32
     functions = functions_of(SHARED, structs)
@@ -77,8 +77,8 @@ def test_tensors_are_passed_by_address_and_kept_alive():
     given = torch.arange(3.0)
     structs = structs_of(SHARED)
     task = structs["Task"](a=given, count=3, inner=structs["Inner"](number=1))
-    assert task.inner.number == 1 and task.a == given.data_ptr() and task.b is None and task.__dict__["a"] is given
-    task.b = task.a + 4
+    assert task.inner.number == 1 and task.a == given.data_ptr() and task.b is None and task.kept["a"] is given
+    task.fill(b=task.a + 4)
     assert task.b == given.data_ptr() + 4
 
 

@@ -95,8 +95,7 @@ def blend_region(
     before = image.new_empty(int(chunks[-1]) if keep_tape else 0, PIXELS)
     blended = torch.empty_like(tiles.offsets[1:])
     task = _task(footprints, tiles, inputs, chunks, final)
-    task.image, task.blended = image, blended
-    task.before = before if keep_tape and len(before) else None
+    task.fill(image=image, blended=blended, before=before if keep_tape and len(before) else None)
     on_threads(tiles.gaussians.numel() >= SEVERAL, library.pointsplat_blend, task)
     return KernelTape(before, blended, chunks) if keep_tape else None
 
@@ -117,9 +116,10 @@ def differentiate_region(
     columns = MOMENTS + inputs.channels + (2 if absgrad else 0)
     sums, out = grad_image.new_empty(pairs, columns), grad_image.new_empty(count, columns)
     task = _task(footprints, tiles, inputs, tape.chunks, final)
-    task.before, task.blended = tape.before, tape.blended
-    task.grad_image, task.grad_final = grad_image.contiguous(), grad_final.contiguous()
-    task.sums, task.absolute = sums, int(absgrad)
+    task.fill(
+        before=tape.before, blended=tape.blended, grad_image=grad_image.contiguous(),
+        grad_final=grad_final.contiguous(), sums=sums, absolute=int(absgrad),
+    )  # fmt: skip
     on_threads(pairs >= SEVERAL, library.pointsplat_differentiate, task)
 
     # sums of pairs, one after the other for each Gaussian

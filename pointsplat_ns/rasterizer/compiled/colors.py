@@ -40,18 +40,18 @@ class CompiledColor(torch.autograd.Function):
     def backward(ctx, grad):
         directions, coefficients, rest, ids, colors = ctx.saved_tensors
         task = _task(directions, coefficients, rest, ids, ctx.degree, colors)
-        task.grad_colors = grad.contiguous()
         grad_directions = grad_coefficients = grad_rest = None
         if ctx.needs_input_grad[0] and ctx.degree:  # a constant has no direction
             grad_directions = torch.empty_like(directions)
-            task.grad_directions = grad_directions
         if ctx.needs_input_grad[1]:
             grad_coefficients = _zeros_like(coefficients)
-            task.grad_first, after = _pointers(grad_coefficients, None)
-            task.grad_rest = after if rest is None else None
         if ctx.needs_input_grad[2]:
             grad_rest = _zeros_like(rest)
-            task.grad_rest = grad_rest
+        first, others = (None, None) if grad_coefficients is None else _pointers(grad_coefficients, None)
+        task.fill(
+            grad_colors=grad.contiguous(), grad_directions=grad_directions, grad_first=first,
+            grad_rest=others if rest is None else grad_rest,
+        )  # fmt: skip
         _call(task)
         return grad_directions, grad_coefficients, grad_rest, None, None
 

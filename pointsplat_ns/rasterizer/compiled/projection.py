@@ -21,7 +21,7 @@ from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
 
 def _camera(view: Tensor, centre: Tensor, lens: Lens) -> Struct:
     """The kernels' camera, from a rotation (3, 3) and a centre (3,), both float64."""
-    rotation, steepness = tuple(map(tuple, view.tolist())), lens.steepness()
+    rotation, steepness = tuple(view.flatten().tolist()), lens.steepness()
     (low_x, high_x), (low_y, high_y) = lens.clamp_x(), lens.clamp_y()
     return KERNELS.structs["Camera"](
         view=rotation, centre=tuple(centre.tolist()), near_view=rotation,
@@ -71,9 +71,10 @@ class CompiledProject(torch.autograd.Function):
         means2d, cov2d, directions = (means.new_empty(kept, columns) for columns in (2, 3, 3))
         depths, det, alphas, beyond = (means.new_empty(kept) for _ in range(4))
         radii = torch.empty(kept, dtype=torch.int32)
-        task.offsets, task.ids, task.radii = offsets, ids, radii
-        task.means2d, task.depths, task.cov2d, task.dets = means2d, depths, cov2d, det
-        task.opacities, task.directions, task.beyond = alphas, directions, beyond
+        task.fill(
+            offsets=offsets, ids=ids, radii=radii, means2d=means2d, depths=depths, cov2d=cov2d, dets=det,
+            opacities=alphas, directions=directions, beyond=beyond,
+        )  # fmt: skip
         if kept:
             on_threads(count >= SEVERAL, library.pointsplat_unpack, task)
         if any(ctx.needs_input_grad):

@@ -64,7 +64,7 @@ def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> Pairs:
     library.pointsplat_count(task)
     offsets = torch.cumsum(offsets, 0)
     gaussians, places = (offsets.new_empty(int(offsets[-1])) for _ in range(2))
-    task.offsets, task.gaussians, task.places = offsets, gaussians, places
+    task.fill(offsets=offsets, gaussians=gaussians, places=places)
     library.pointsplat_list(task)
     return Pairs(gaussians, offsets, places, counts)
 
