@@ -247,20 +247,25 @@ def test_a_file_or_folder_that_is_named_alone_is_tried(alex_file, tmp_path, monk
     assert not nowhere
 
 
-@pytest.mark.parametrize("name", ["alexnet_features.pth", "alexnet-owt-7be5be79.pth"])
-def test_the_variable_may_name_a_folder(alex_file, alex, tmp_path, monkeypatch, name):
-    (tmp_path / "w").mkdir()
-    os.symlink(alex_file, tmp_path / "w" / name)
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "w"))
-    assert torch.equal(load_lpips("alex").features[0].weight, alex.features[0].weight)
-    with pytest.raises(LpipsUnavailable, match="vgg backbone cannot be downloaded"):
-        load_lpips("vgg")
-
-
-def test_the_variable_may_name_a_file(alex_file, alex, monkeypatch):
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
-    assert torch.equal(load_lpips("alex").features[0].weight, alex.features[0].weight)
-    with pytest.raises(LpipsUnavailable, match=r"mine\.pth: not the weights of LPIPS's vgg backbone; .*has shape"):
+@pytest.mark.parametrize(
+    ("place", "named"),
+    [
+        ("folder/alexnet_features.pth", "folder"),
+        ("folder/alexnet-owt-7be5be79.pth", "folder"),
+        ("any.pth", "any.pth"),
+        ("hub/checkpoints/alexnet-owt-7be5be79.pth", None),
+    ],
+)
+def test_weights_are_found_by_the_variable_or_in_the_hub_cache(
+    alex_file, alex, tmp_path, monkeypatch, nowhere, place, named
+):
+    (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+    os.symlink(alex_file, tmp_path / place)
+    if named:
+        monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / named))
+    assert torch.equal(load_lpips("alex").features[0].weight, alex.features[0].weight) and not nowhere
+    wrong = "any.pth: not the weights of LPIPS's vgg backbone; .*has shape" if named == "any.pth" else "cannot be downl"
+    with pytest.raises(LpipsUnavailable, match=wrong):
         load_lpips("vgg")
 
 
@@ -270,12 +275,6 @@ def test_a_file_named_for_one_network_is_not_taken_for_the_other(alex_file, tmp_
     with pytest.raises(LpipsUnavailable, match="cannot be downloaded"):
         load_lpips("vgg")
     assert nowhere == ["https://download.pytorch.org/models/vgg16-397923af.pth"]
-
-
-def test_the_hub_cache_is_used_without_the_network(alex_file, alex, tmp_path, nowhere):
-    (tmp_path / "hub" / "checkpoints").mkdir(parents=True)
-    os.symlink(alex_file, tmp_path / "hub" / "checkpoints" / "alexnet-owt-7be5be79.pth")
-    assert torch.equal(load_lpips("alex").features[0].weight, alex.features[0].weight) and not nowhere
 
 
 def files_below(folder):
