@@ -258,7 +258,7 @@ def _torchvision_models() -> ModuleType:
 
 
 def _local_file(net: Net) -> Path | None:
-    """The backbone's file on this machine: what the environment variable names, or torch hub's copy.
+    """The backbone's file on this machine: the one that the environment variable names, or torch hub's copy.
 
     Raises:
         LpipsUnavailable: if the variable names nothing that exists.

@@ -21,10 +21,10 @@ from torch import Tensor
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX
 
 CLAMPED = ALPHA_MAX * (1 - 1e-6)
-"""From here on alpha is held at ALPHA_MAX: room for the rounding of that to float32."""
+"""Alphas of at least this count as clamped; the margin covers the rounding of ALPHA_MAX to float32."""
 
 STEP_BY_STEP = 64
-"""Longer chunks are scanned in fewer, larger operations."""
+"""Largest chunk that is scanned one Gaussian at a time; longer chunks take fewer, larger operations."""
 
 
 def alphas_(log2_alpha: Tensor, alpha_min: float, may_clamp: bool = True) -> Tensor:
@@ -47,8 +47,8 @@ def is_clamped(alpha: Tensor) -> Tensor:
 
 
 def is_drawn(after: Tensor, transmittance_min: float, out: Tensor | None = None) -> Tensor:
-    """Where the pixel is not finished, from the transmittance that a Gaussian would leave; written to ``out`` as 0 and
-    1 if that is given."""
+    """Mask of the pixels that a Gaussian does not finish, from the transmittance behind it; as 0 and 1 in ``out`` if
+    that is given."""
     return torch.gt(after, transmittance_min, out=out)
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from pointsplat_ns.rasterizer import eager
 from pointsplat_ns.rasterizer.frame import Chunk, Frame, Inputs, Tiles
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS, gather, mean_slopes, moments
-from pointsplat_ns.rasterizer.quadratics import chain as chain  # what an engine of blending offers
+from pointsplat_ns.rasterizer.quadratics import chain as chain  # part of this module's interface
 from pointsplat_ns.rasterizer.tiles import Footprints, TileList
 
 inputs_of = Inputs.of
@@ -98,7 +98,7 @@ def _blend_block_backward(
     channels = inputs.channels
     whole = chunks[0].tiles.ids
     block_pixels = grad_image.index_select(0, whole)  # [B, D, 64]
-    # what lies behind: sum over later Gaussians of weight * (color . grad), and the background
+    # sum over later Gaussians of weight * (color . grad), and the background
     behind = grad_final.index_select(0, whole) * final.index_select(0, whole)
     done = 0
     for tiles, rows, first, s, before in reversed(chunks):

@@ -23,7 +23,7 @@ class Drawing:
     Args:
         scene: N Gaussians, on any device.
         view: the camera.
-        quality: what to give up for speed, as for :func:`~pointsplat_ns.rasterization`.
+        quality: thresholds that trade accuracy for speed, as for :func:`~pointsplat_ns.rasterization`.
 
     Raises:
         ValueError: if the camera is not finite or has no focal length.

@@ -1,4 +1,4 @@
-"""What one region of an image is blended from: its tiles, the Gaussians listed for each, and their quadratics.
+"""Input of blending one region of an image: its tiles, the Gaussians of each tile, and their quadratics.
 
 Shapes: B tiles of a block, S Gaussians of a chunk, 64 = TILE * TILE pixels, D channels.
 """
@@ -68,8 +68,8 @@ class Frame:
         self.sorted = Tiles(ids, x, y, tiles.offsets[ids], tiles.offsets[ids + 1])
         self.pairs_count = tiles.gaussians.numel()
         self.gaussians = F.pad(tiles.gaussians, (0, 1), value=tiles.order.numel())  # the last pair is padding
-        # Pairs at once: on a CPU 2 MB a work array in float32. They do not depend on the number of threads: how
-        # lists are cut decides how sums are rounded.
+        # Pairs in a work array: on a CPU 2 MB in float32. The size does not depend on the number of threads, because
+        # sums are rounded by how lists are cut.
         pairs = 2**18 if lengths.is_cuda else 2**13
         self.block = max(1, min(pairs // self.STEP, self.occupied))  # tiles
         self.capacity = pairs

@@ -28,7 +28,7 @@ class Projected:
     opacities: Tensor  # [M] in (0, 1], compensation included
     directions: Tensor  # [M, 3] from the camera centre, world space
     radii: Tensor  # [M] int32, pixels, 3 standard deviations of the longest axis
-    beyond: Tensor  # [M] how much farther than the nearest, along the optical axis: what they are sorted by
+    beyond: Tensor  # [M] depth minus that of the nearest; the key of the drawing order
 
     @property
     def conics(self) -> Tensor:
@@ -120,7 +120,7 @@ def project(
 
     Left out are Gaussians with a non-finite parameter or a negative scale, nearer than ``near_plane`` or
     farther than ``far_plane``, fainter than 1/255, or whose 1/255 ellipse misses every pixel centre.
-    Differentiable in means, quats, scales, opacities and viewmat. What is gsplat's and what is not:
+    Differentiable in means, quats, scales, opacities and viewmat. Differences from gsplat:
 
     - The Jacobian is evaluated inside 1.3 times the field of view, counted from the image's edges, which
       follow the principal point (gsplat #305).
@@ -132,7 +132,7 @@ def project(
     :func:`~pointsplat_ns.rasterization`.
 
     Raises:
-        ValueError: if a focal length is zero, or the camera is not finite, has skew or is no motion.
+        ValueError: if a focal length is zero, or the camera is not finite, has skew or is not a rigid motion.
     """
     # R (m - c) and not R m + t: far from the origin the first rounds alike for all Gaussians
     centre = camera_centre(viewmat)

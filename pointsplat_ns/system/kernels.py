@@ -52,7 +52,7 @@ class Kernels:
 
     @functools.cached_property
     def why_missing(self) -> str:
-        """Why this machine has none that can be used; empty if it has. They are built if need be, and tried."""
+        """The reason why this machine cannot use them; empty if it can. They are built if need be, and tried."""
         try:
             _ = self.library
         except NativeCodeError as error:
@@ -70,7 +70,7 @@ class Kernels:
         if wanted is False:
             return False
         if self.why_missing and wanted:
-            # from here, so that a text that several have in common is shown once
+            # stacklevel 1: warnings of several kernels with one text are shown once
             text = f"{self.what} could not be compiled and stays with torch: {self.why_missing}"
             warnings.warn(text, stacklevel=1)
         return not self.why_missing

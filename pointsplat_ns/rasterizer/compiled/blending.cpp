@@ -1,7 +1,6 @@
-// The inner loops of blending for float32 on a CPU: which Gaussian touches which tile, a tile's Gaussians front to back,
-// and their gradients.
+// The inner loops of blending for float32 on a CPU: the Gaussians of a tile front to back, and their gradients.
 //
-// blending.py compiles this file where there is a C++ compiler and calls it; tiles.py and blocks.py do the same in torch.
+// blending.py compiles this file where there is a C++ compiler and calls it; blocks.py does the same in torch.
 // Both follow the rule of alpha.py and the algebra of quadratics.py, whose names are used here. A tile has 8 x 8 pixels; a
 // row of them is one vector. Each tile is drawn by one thread from front to back, so that the number of threads changes
 // nothing.
@@ -55,7 +54,7 @@ inline Row exp2_of(Row x) {
 
 extern "C" {
 
-// What is blended, and where to. Tiles are those of a region of one or several images of equal size, row by row.
+// Input and output of blending. Tiles are those of a region of one or several images of equal size, row by row.
 struct Task {
     const float* table;        // [M, COLOR + channels], of pointsplat_tabulate
     const int64_t* gaussians;  // [P] rows of the table, by tile and front to back
@@ -170,7 +169,7 @@ void blend_tile(const Task& task, int64_t tile) {
     }
 }
 
-// The gradient sums of one Gaussian of a chunk on a tile, and what lies behind the Gaussian in front of it.
+// Writes the gradient sums of one Gaussian of a chunk on a tile, and adds its part to ``behind``.
 template <int D, bool ABSOLUTE>
 void pass_back(const Task& task, const Chunk<D>& chunk, int k, const Row (&alphas)[TILE], const Row (&weights)[TILE],
                const Row (&pixels)[TILE][D], Row (&behind)[TILE], float* out) {
@@ -293,7 +292,7 @@ void pointsplat_gather(const float* sums, const int64_t* pairs, const int64_t* s
     });
 }
 
-// What a tile reads of a Gaussian: x, y (pixels), r, a, d (log2 per pixels^2), log2 opacity, the colour; as
+// Row of the table for each Gaussian: x, y (pixels), r, a, d (log2 per pixels^2), log2 opacity, the colour; as
 // quadratics.table_of.
 void pointsplat_tabulate(const float* means2d, const float* cov2d, const float* det, const float* opacities,
                          const float* colors, int64_t count, int64_t channels, float* table, int64_t* next) {

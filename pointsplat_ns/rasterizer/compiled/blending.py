@@ -1,7 +1,7 @@
-"""Blending by compiled kernels (``blending.cpp``): what :mod:`~pointsplat_ns.rasterizer.blocks` does in torch.
+"""Blending by compiled kernels (``blending.cpp``), as :mod:`~pointsplat_ns.rasterizer.blocks` does it in torch.
 
-For float32 on a CPU, where the machine has a C++ compiler. Without a compiler, or if what it made does not draw as
-torch does, blending stays with torch.
+For float32 on a CPU, where the machine has a C++ compiler. Without a compiler, or if the compiled code does not
+agree with torch, torch blends.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def differentiate_region(
     )  # fmt: skip
     on_threads(pairs >= SEVERAL, library.pointsplat_differentiate, task)
 
-    # sums of pairs, one after the other for each Gaussian
+    # the sum of each Gaussian's pairs, in the order of its tiles
     by_gaussian = torch.empty_like(tiles.places)
     by_gaussian.index_copy_(0, tiles.places, torch.arange(pairs))
     starts = torch.zeros(count + 1, dtype=torch.int64)

@@ -78,7 +78,7 @@ void basis_backward(const Lane (&unit)[3], const Lane* grad, Lane (&out)[3]) {
     out[0] = gx, out[1] = gy, out[2] = gz;
 }
 
-// Has the coefficients of some Gaussians brought to the cache: they lie apart, so that nothing else foresees it.
+// Prefetches the coefficients of some Gaussians: they are scattered in memory, where no processor predicts them.
 template <int USED>
 void fetch(const Colors& task, const Lanes& rows) {
     for (int64_t row : rows.rows) {

@@ -1,4 +1,4 @@
-"""Projection by compiled kernels (``projection.cpp``): what :mod:`~pointsplat_ns.rasterizer.ewa` does in torch.
+"""Projection by compiled kernels (``projection.cpp``), as :mod:`~pointsplat_ns.rasterizer.ewa` does it in torch.
 
 For float32 on a CPU, where the machine has a C++ compiler.
 """
@@ -92,7 +92,7 @@ class CompiledProject(torch.autograd.Function):
         wanted = zip(("means", "quats", "scales", "opacities"), scene, ctx.needs_input_grad, strict=False)
         out = {name: torch.empty_like(tensor) if needed else None for name, tensor, needed in wanted}
         ranges = -(-scene[0].shape[0] // library.pointsplat_range())
-        # of the camera's rotation by rows, then of its centre
+        # gradients of the camera's rotation by rows, then of its centre
         sums = torch.empty(ranges, 12, dtype=torch.float64) if any(ctx.needs_input_grad[4:6]) else None
         names = ("grad_means2d", "grad_depths", "grad_cov2d", "grad_det", "grad_opacities", "grad_directions")
         grads = {name: grad if grad is None else grad.contiguous() for name, grad in zip(names, given, strict=False)}
@@ -102,7 +102,7 @@ class CompiledProject(torch.autograd.Function):
         on_threads(len(scene[0]) >= SEVERAL, library.pointsplat_project_backward, task)
         grad_view = grad_centre = None
         if sums is not None:
-            # by NumPy: on one thread, so that it is rounded alike on any number of them
+            # NumPy sums on one thread, so the rounding does not depend on their number
             total = torch.from_numpy(sums.numpy().sum(0))
             grad_view, grad_centre = total[:9].view(3, 3), total[9:]
         return *out.values(), grad_view, grad_centre, None

@@ -1,4 +1,4 @@
-// Which Gaussian touches which tile, for float32 on a CPU.
+// The tiles that each Gaussian touches, for float32 on a CPU.
 //
 // compiled/tiles.py compiles this file where there is a C++ compiler and calls it; ellipses.py does the same in torch,
 // says where the formulas are from, and has the names that are used here.
@@ -9,7 +9,7 @@
 
 namespace {
 
-constexpr int64_t AHEAD = 24;  // Gaussians that are brought to the cache before they are read: they lie apart
+constexpr int64_t AHEAD = 24;  // Gaussians between the one that is prefetched and the one that is read
 
 // First tile with a pixel centre at or after a position.
 inline int64_t tile_from(float position, int64_t tiles) {

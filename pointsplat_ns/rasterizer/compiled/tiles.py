@@ -1,5 +1,5 @@
-"""Which Gaussian touches which tile, by compiled kernels (``tiles.cpp``), as :mod:`~pointsplat_ns.rasterizer.ellipses`
-finds it.
+"""The tiles that each Gaussian touches, by compiled kernels (``tiles.cpp``), as
+:mod:`~pointsplat_ns.rasterizer.ellipses` finds them.
 
 For float32 on a CPU, where the machine has a C++ compiler.
 """
