@@ -12,6 +12,15 @@ from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tile
 from pointsplat_ns.system.kernels import Kernels
 
 MODULES = (blending, projection, colors, tiles, structural_similarity)
+
+
+@pytest.mark.skipif(not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="there is no C++ compiler")
+@pytest.mark.parametrize("module", MODULES, ids=lambda module: module.__name__.rpartition(".")[2])
+def test_where_there_is_a_compiler_kernels_do_as_torch_does(module):
+    """Other tests of kernels skip where they cannot be used."""
+    assert module.KERNELS.why_missing == ""
+
+
 missing = next((module.KERNELS.why_missing for module in MODULES if module.KERNELS.why_missing), "")
 
 
