@@ -31,8 +31,7 @@ constexpr float C3[5] = {0.5900435899266435f, 2.890611442640554f, 0.457045799464
                          1.445305721320277f};
 
 inline const float* coefficient(const Colors& task, int64_t row, int k) {
-    const int64_t id = task.ids[row];
-    return k ? task.rest + id * task.rest_row + 3 * (k - 1) : task.first + id * task.first_row;
+    return k ? task.rest + task.ids[row] * task.rest_row + 3 * (k - 1) : task.first + task.ids[row] * task.first_row;
 }
 
 template <int DEGREE>
