@@ -29,7 +29,7 @@ def render(
         scene: N Gaussians, on any device; the picture is rendered there.
         views: a :class:`~pointsplat_ns.View`, or :class:`~pointsplat_ns.Views`, whose pictures are then drawn one after
             the other.
-        quality: accuracy for speed: "exact", "balanced" or "fast", as for :func:`pointsplat_ns.rasterization`.
+        quality: "exact", or faster and less accurate, "balanced" or "fast", as for :func:`pointsplat_ns.rasterization`.
         reduced: draw this factor fewer pixels a side, and enlarge the picture (bicubic): faster, and blurred.
         backend: "torch", or gsplat where it can be used ("auto"), as for :func:`pointsplat_ns.rasterization`. gsplat
             leaves out tests of what it is given.
