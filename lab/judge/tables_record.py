@@ -20,7 +20,7 @@ from pointsplat_ns.tables.cells import About, Cell
 from pointsplat_ns.tables.figure import medians, plot_figure
 from pointsplat_ns.tables.layout import Layout, Table, figure_medians
 from pointsplat_ns.tables.means import Group, SceneCells
-from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_4, OURS
+from pointsplat_ns.tables.ways import OURS
 from pointsplat_ns.tables.writing import markdown_table
 from pointsplat_ns.tradeoff.journal import restored_point
 
@@ -88,7 +88,7 @@ def tables_of(group: Group) -> list[Table]:
         if table.number in TABLES
     ]
     if known := medians(group):
-        found.append(figure_medians(group, (DENSE_WAY, *FIGURE_4), known))
+        found.append(figure_medians(group, known))
     return found
 
 

@@ -31,15 +31,9 @@ Net = Literal["alex", "vgg"]
 WEIGHTS_VARIABLE = "POINTSPLAT_LPIPS_WEIGHTS"
 """Environment variable: a folder with backbones under one of their usual names, or one file."""
 
-DOWNLOAD_TIMEOUT_S = 15.0
-"""Seconds without an answer after which a download is given up."""
-
 RETRY_AFTER_S = 600.0
 """Seconds for which :func:`cached_lpips` remembers a failure: a download that times out at every evaluation step would
 take longer than the step."""
-
-_NORM_EPS = 1e-8
-"""Added inside the square root of a feature's length, as in torchmetrics: keeps the gradient finite at 0."""
 
 
 class LpipsUnavailable(PointSplatError):
@@ -150,7 +144,8 @@ class Lpips(nn.Module):
             # In the type of the images, so that float64 ones are compared in float64.
             x = functional_call(layer, {name: value.to(x.dtype) for name, value in layer.named_buffers()}, x)
             if index in self._backbone.taps:
-                maps.append(x / torch.sqrt(x.square().sum(dim=1, keepdim=True) + _NORM_EPS))
+                # 1e-8, as in torchmetrics: keeps the gradient finite where all features are 0
+                maps.append(x / torch.sqrt(x.square().sum(dim=1, keepdim=True) + 1e-8))
         return maps
 
 
@@ -263,7 +258,7 @@ def _torchvision_models() -> ModuleType:
 
 
 def _local_file(net: Net) -> Path | None:
-    """The backbone's file on this machine: what the environment variable names, or torch hub's copy.
+    """The backbone's file on this machine: the one that the environment variable names, or torch hub's copy.
 
     Raises:
         LpipsUnavailable: if the variable names nothing that exists.
@@ -323,7 +318,7 @@ def _download(net: Net, target: Path, allowed: bool) -> None:
     if not allowed:
         raise LpipsUnavailable(f"{target}: LPIPS's {net} backbone is not there; {remedy}")
     timeout = socket.getdefaulttimeout()
-    socket.setdefaulttimeout(DOWNLOAD_TIMEOUT_S)
+    socket.setdefaulttimeout(15.0)  # seconds without an answer
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         torch.hub.download_url_to_file(

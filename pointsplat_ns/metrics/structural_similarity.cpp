@@ -21,7 +21,6 @@ struct Similarity {
     float* partials;
     double* sums;  // [planes * bands] of the similarities
     float* grad;   // as image, by the sum of all similarities; null forward
-    int64_t* next;
 };
 
 }  // extern "C"
@@ -152,11 +151,11 @@ void backward_block(const Similarity& task, int64_t plane, int64_t first, int64_
 extern "C" {
 
 // Sums of similarities and their derivatives, or the gradient if ``grad`` is there.
-void pointsplat_similarity(const Similarity* task) {
+void pointsplat_similarity(const Similarity* task, int64_t* next) {
     const int64_t rows = task->grad ? task->height : task->height - REACH;
     const int64_t columns = task->grad ? task->row : task->row - REACH * task->step;
     for (;;) {
-        const int64_t number = __atomic_fetch_add(task->next, 1, __ATOMIC_RELAXED);
+        const int64_t number = __atomic_fetch_add(next, 1, __ATOMIC_RELAXED);
         if (number >= task->planes * task->bands) return;
         const int64_t plane = number / task->bands, band = number % task->bands;
         const int64_t first = rows * band / task->bands, last = rows * (band + 1) / task->bands;

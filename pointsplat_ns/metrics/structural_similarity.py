@@ -8,7 +8,6 @@ check that all agree.
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import math
 from pathlib import Path
@@ -22,18 +21,6 @@ from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
 
 SSIM_WINDOW = 11
 """Side of SSIM's Gaussian window in pixels."""
-
-SIGMA = 1.5
-"""Standard deviation of the window, in pixels."""
-
-C1, C2 = 0.01**2, 0.03**2
-"""The two constants of Wang et al. 2004 for a data range of 1."""
-
-_BAND = 48
-"""Number of rows that a thread takes at once, about: ten more are blurred for each."""
-
-_INTERLEAVED = 4
-"""Largest number of channels that may lie together, ``MOST_STEP`` of the kernel."""
 
 
 def mean_ssim(image: Tensor, other: Tensor, compiled: bool | None = None) -> Tensor:
@@ -56,9 +43,12 @@ def mean_ssim(image: Tensor, other: Tensor, compiled: bool | None = None) -> Ten
         return CompiledSimilarity.apply(image, other)
     maps = torch.cat([image, other, image * image, other * other, image * other], dim=1)
     mean, other_mean, square, other_square, product = _blur(maps).chunk(5, dim=1)
+    light, detail = 0.01**2, 0.03**2  # the constants of Wang et al. 2004 for a data range of 1
     mean_product, mean_square, other_mean_square = mean * other_mean, mean * mean, other_mean * other_mean
-    contrast = (2 * (product - mean_product) + C2) / (square - mean_square + other_square - other_mean_square + C2)
-    luminance = (2 * mean_product + C1) / (mean_square + other_mean_square + C1)
+    contrast = (2 * (product - mean_product) + detail) / (
+        square - mean_square + other_square - other_mean_square + detail
+    )
+    luminance = (2 * mean_product + light) / (mean_square + other_mean_square + light)
     return (luminance * contrast).mean()
 
 
@@ -76,18 +66,8 @@ def _blur(maps: Tensor) -> Tensor:
 def _window(like: Tensor) -> Tensor:
     """Weights (11,) along one side."""
     offset = torch.arange(SSIM_WINDOW, dtype=like.dtype, device=like.device) - SSIM_WINDOW // 2
-    weight = torch.exp(-offset.square() / (2 * SIGMA**2))
+    weight = torch.exp(-offset.square() / (2 * 1.5**2))  # sigma of 1.5 pixels
     return weight / weight.sum()
-
-
-class _Similarity(ctypes.Structure):
-    """``struct Similarity`` of the kernel."""
-
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("image", "other", "window")),
-        *((name, ctypes.c_int64) for name in ("planes", "height", "row", "step", "bands")),
-        *((name, ctypes.c_void_p) for name in ("partials", "sums", "grad", "next")),
-    )
 
 
 def _suited(image: Tensor, other: Tensor) -> bool:
@@ -106,15 +86,15 @@ class CompiledSimilarity(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, image, other):
-        # Where the channels of pixels lie together, as in a render, they are taken so.
-        interleaved = image.shape[1] <= _INTERLEAVED and image.permute(0, 2, 3, 1).is_contiguous()
+        # Where the channels of pixels lie together, as in a render, they are taken so; at most MOST_STEP of the kernel.
+        interleaved = image.shape[1] <= 4 and image.permute(0, 2, 3, 1).is_contiguous()
         order = (0, 2, 3, 1) if interleaved else (0, 1, 2, 3)
         image, other = (tensor.detach().permute(order).contiguous() for tensor in (image, other))
         batch, *_, side = image.shape
         planes, height = (batch, image.shape[1]) if interleaved else (batch * image.shape[1], image.shape[2])
         step, row = (side, image.shape[2] * side) if interleaved else (1, side)
         rows, windows = height - SSIM_WINDOW + 1, row - (SSIM_WINDOW - 1) * step
-        ctx.shape, ctx.interleaved = (planes, height, row, step, math.ceil(rows / _BAND)), interleaved
+        ctx.shape, ctx.interleaved = (planes, height, row, step, math.ceil(rows / 48)), interleaved  # rows of a band
         ctx.count = planes * rows * windows
         partials = image.new_empty(3, planes, rows, windows) if ctx.needs_input_grad[0] else None
         sums = torch.empty(planes * ctx.shape[-1], dtype=torch.float64)
@@ -140,10 +120,12 @@ def _call(
     sums: Tensor | None = None,
     grad: Tensor | None = None,
 ) -> None:
-    window, next_band = _window(image), torch.zeros(1, dtype=torch.int64)
-    optional = (None if tensor is None else tensor.data_ptr() for tensor in (partials, sums, grad))
-    task = _Similarity(image.data_ptr(), other.data_ptr(), window.data_ptr(), *shape, *optional, next_band.data_ptr())
-    on_threads(shape[0] * shape[-1] > 1, KERNELS.library.pointsplat_similarity, ctypes.byref(task))
+    planes, height, row, step, bands = shape
+    task = KERNELS.structs["Similarity"](
+        image=image, other=other, window=_window(image), planes=planes, height=height, row=row, step=step, bands=bands,
+        partials=partials, sums=sums, grad=grad,
+    )  # fmt: skip
+    on_threads(planes * bands > 1, KERNELS.library.pointsplat_similarity, task)
 
 
 def _as_torch() -> bool:
@@ -159,9 +141,4 @@ def _as_torch() -> bool:
     return agreement(found[0], found[1], off=1e-4, share=1e-2)
 
 
-KERNELS = Kernels(
-    "SSIM",
-    Path(__file__).with_name("structural_similarity.cpp"),
-    {"pointsplat_similarity": [ctypes.c_void_p]},
-    _as_torch,
-)
+KERNELS = Kernels("SSIM", Path(__file__).with_name("structural_similarity.cpp"), _as_torch)

@@ -21,13 +21,10 @@ from torch import Tensor
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX
 
 CLAMPED = ALPHA_MAX * (1 - 1e-6)
-"""From here on alpha is held at ALPHA_MAX: room for the rounding of that to float32."""
+"""Alphas of at least this count as clamped; the margin covers the rounding of ALPHA_MAX to float32."""
 
 STEP_BY_STEP = 64
-"""Longer chunks are scanned in fewer, larger operations."""
-
-_GROUP = 16
-"""Gaussians of one of these operations."""
+"""Largest chunk that is scanned one Gaussian at a time; longer chunks take fewer, larger operations."""
 
 
 def alphas_(log2_alpha: Tensor, alpha_min: float, may_clamp: bool = True) -> Tensor:
@@ -50,8 +47,8 @@ def is_clamped(alpha: Tensor) -> Tensor:
 
 
 def is_drawn(after: Tensor, transmittance_min: float, out: Tensor | None = None) -> Tensor:
-    """Where the pixel is not finished, from the transmittance that a Gaussian would leave; written to ``out`` as 0 and
-    1 if that is given."""
+    """Mask of the pixels that a Gaussian does not finish, from the transmittance behind it; as 0 and 1 in ``out`` if
+    that is given."""
     return torch.gt(after, transmittance_min, out=out)
 
 
@@ -64,15 +61,16 @@ def transmittances(passing: Tensor, before: Tensor, out: Tensor) -> Tensor:
         out: (B, S + 1, 64), written and returned.
     """
     out[:, 0] = before
-    if passing.shape[1] <= STEP_BY_STEP or passing.shape[1] % _GROUP:
+    size = 16  # Gaussians of a group
+    if passing.shape[1] <= STEP_BY_STEP or passing.shape[1] % size:
         steps = out.unbind(1)
         for k, factor in enumerate(passing.unbind(1)):
             torch.mul(steps[k], factor, out=steps[k + 1])
         return out
-    groups = out[:, 1:].unflatten(1, (-1, _GROUP))  # products of each group at once, then group by group
-    steps, factors = groups.unbind(2), passing.unflatten(1, (-1, _GROUP)).unbind(2)
+    groups = out[:, 1:].unflatten(1, (-1, size))  # products of each group at once, then group by group
+    steps, factors = groups.unbind(2), passing.unflatten(1, (-1, size)).unbind(2)
     steps[0].copy_(factors[0])
-    for k in range(1, _GROUP):
+    for k in range(1, size):
         torch.mul(steps[k - 1], factors[k], out=steps[k])
     for group in groups.unbind(1):
         group.mul_(before[:, None])

@@ -1,4 +1,4 @@
-"""Whether gsplat can draw in our place."""
+"""Tells whether gsplat can render instead of this package."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def gsplat_works() -> bool:
         return False
     try:
         from gsplat.cuda._backend import _C
-    except Exception:  # a failed compilation raises what the compiler's wrapper likes
+    except Exception:  # a failed compilation raises errors of many types
         return False
     return _C is not None
 

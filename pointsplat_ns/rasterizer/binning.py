@@ -1,4 +1,4 @@
-"""What finds the tiles that Gaussians touch: torch (:mod:`~pointsplat_ns.rasterizer.ellipses`), or compiled kernels
+"""Chooses the code that finds the tiles of Gaussians: torch (:mod:`~pointsplat_ns.rasterizer.ellipses`), or kernels
 where there is a compiler (:mod:`~pointsplat_ns.rasterizer.compiled.tiles`)."""
 
 from __future__ import annotations
@@ -12,6 +12,6 @@ from pointsplat_ns.rasterizer.compiled import tiles as compiled_tiles
 
 
 def engine_of(compiled: bool | None, *tensors: Tensor) -> ModuleType:
-    """The module with ``ellipses_of`` and ``pairs_of`` for Gaussians of which these are means, covariances and so on;
-    ``compiled`` as for :func:`~pointsplat_ns.rasterization`."""
-    return compiled_tiles if compiled_tiles.can_list(compiled, *tensors) else ellipses
+    """The module with ``ellipses_of`` and ``pairs_of`` for these tensors of projected Gaussians; ``compiled`` as for
+    :func:`~pointsplat_ns.rasterization`."""
+    return compiled_tiles if compiled_tiles.KERNELS.usable_for(compiled, *tensors) else ellipses

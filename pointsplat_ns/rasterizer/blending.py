@@ -11,7 +11,6 @@ Shapes: M Gaussians, 64 = TILE * TILE pixels, D channels.
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import ModuleType
 
 import torch
 from torch import Tensor
@@ -33,10 +32,10 @@ def bytes_per_pair(colors: Tensor) -> int:
     return 192 * size // 4 + (colors.shape[1] - 3) * size
 
 
-def engine_of(colors: Tensor, compiled: bool | None) -> ModuleType:
-    """The module that blends colours (M, D), with ``inputs_of``, ``blend_region``, ``differentiate_region`` and
-    ``chain``."""
-    return compiled_blending if compiled_blending.can_blend(colors, compiled) else blocks
+def untiled(values: Tensor, region: Region, cameras: int = 1) -> Tensor:
+    """Pixels (C, H, W, D) of a region's tiles (C * rows * columns, [D,] 64)."""
+    tiles = values.view(cameras, region.rows, region.columns, -1, TILE, TILE)
+    return tiles.permute(0, 1, 4, 2, 5, 3).reshape(cameras, region.rows * TILE, region.columns * TILE, -1)
 
 
 class Blend(torch.autograd.Function):
@@ -45,7 +44,7 @@ class Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means2d, cov2d, det, opacities, colors, footprints, region, keep_lists, options, absgrad_of):
         """The lists are kept for the backward pass only if ``keep_lists``."""
-        engine = engine_of(colors, options.compiled)
+        engine = compiled_blending if compiled_blending.can_blend(colors, options.compiled) else blocks
         tiles = footprints.tiles(region)
         image = colors.new_empty(tiles.offsets.numel() - 1, colors.shape[1], PIXELS)
         final = colors.new_empty(tiles.offsets.numel() - 1, PIXELS)
@@ -109,16 +108,11 @@ def blend(
     if absgrad_of is not None and len(regions) > 1:
         absgrad_of = _Summed(absgrad_of, len(regions))
 
-    def untile(values: Tensor, region: Region) -> Tensor:
-        rows, columns = region.rows, region.columns
-        values = values.view(cameras, rows, columns, -1, TILE, TILE).permute(0, 1, 4, 2, 5, 3)
-        return values.reshape(cameras, rows * TILE, columns * TILE, -1)
-
     def assemble(parts: list[Tensor]) -> Tensor:
         """Regions run through rows of tiles, or through the columns of one row."""
         bands, row = [], []
         for part, region in zip(parts, regions, strict=True):
-            row.append(untile(part, region))
+            row.append(untiled(part, region, cameras))
             if region.right == footprints.columns:
                 bands.append(torch.cat(row, dim=2) if len(row) > 1 else row[0])
                 row = []

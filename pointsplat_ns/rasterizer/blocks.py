@@ -1,6 +1,6 @@
 """Blending in plain torch: tiles of similar length together, in blocks that fit the cache.
 
-BLENDED_AT_ONCE Gaussians at a time, more where few tiles are left; tiles whose pixels are all saturated are dropped.
+Sixteen Gaussians at a time, more where few tiles are left; tiles whose pixels are all saturated are dropped.
 
 Shapes: P pairs, B tiles of a block, S Gaussians of a chunk, 64 = TILE * TILE pixels, D channels.
 """
@@ -16,7 +16,7 @@ from torch import Tensor
 from pointsplat_ns.rasterizer import eager
 from pointsplat_ns.rasterizer.frame import Chunk, Frame, Inputs, Tiles
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS, gather, mean_slopes, moments
-from pointsplat_ns.rasterizer.quadratics import chain as chain  # what an engine of blending offers
+from pointsplat_ns.rasterizer.quadratics import chain as chain  # part of this module's interface
 from pointsplat_ns.rasterizer.tiles import Footprints, TileList
 
 inputs_of = Inputs.of
@@ -98,7 +98,7 @@ def _blend_block_backward(
     channels = inputs.channels
     whole = chunks[0].tiles.ids
     block_pixels = grad_image.index_select(0, whole)  # [B, D, 64]
-    # what lies behind: sum over later Gaussians of weight * (color . grad), and the background
+    # sum over later Gaussians of weight * (color . grad), and the background
     behind = grad_final.index_select(0, whole) * final.index_select(0, whole)
     done = 0
     for tiles, rows, first, s, before in reversed(chunks):

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import SH_C0
-from pointsplat_ns.rasterizer.compiled.colors import CompiledColor, can_color
+from pointsplat_ns.rasterizer.compiled import colors as compiled_colors
 from pointsplat_ns.rasterizer.spherical_harmonics import Color, check_degree, offset
 
 
@@ -42,9 +42,11 @@ def sh_to_color(
         raise ValueError(f"{stored} SH coefficients given; degree {degree} needs {used}")
     if ids is None:
         ids = torch.arange(first.shape[0], device=first.device)
-    if can_color(compiled, directions, first, *([] if rest is None else [rest])):
+    if compiled_colors.KERNELS.usable_for(compiled, directions, first, *([] if rest is None else [rest])):
         # a constant has no direction
-        return CompiledColor.apply(directions if degree else directions.detach(), first, rest, ids, degree)
+        return compiled_colors.CompiledColor.apply(
+            directions if degree else directions.detach(), first, rest, ids, degree
+        )
     if degree == 0:
         return offset(SH_C0 * (first[..., 0, :] if rest is None else first).index_select(0, ids)).clamp_min(0.0)
     return Color.apply(directions, first if rest is None else torch.cat([first[:, None], rest], 1), ids, degree)

@@ -21,18 +21,11 @@ its extent (0.3 makes the 1.3 x field of view of 3DGS)."""
 COMPENSATION_MIN = 0.005
 """Lower bound of the antialiasing compensation factor."""
 
-LARGEST_COLOR = 0.8
-"""Exponent of the largest number of the precision, above which a colour counts as infinite: 6e30 in float32. Gradients,
-sums over pixels of colours times slopes, then stay finite."""
-
 TILE = 8
 """Tile edge in pixels. 8 was measured faster than 16: fewer pixels evaluated for nothing."""
 
 SLACK = 1e-3
 """Pixels added around each ellipse, so that rounding never drops a pixel that is drawn."""
-
-BLENDED_AT_ONCE = 16
-"""Gaussians blended at once for each tile, before the saturated tiles are dropped."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +38,7 @@ class Quality:
     """A pixel is finished before the Gaussian that would bring its transmittance to this or less."""
 
 
-EXACT = Quality()
-
-QUALITIES = {"exact": EXACT, "balanced": Quality(alpha_min=2 / 255), "fast": Quality(alpha_min=8 / 255)}
+QUALITIES = {"exact": Quality(), "balanced": Quality(alpha_min=2 / 255), "fast": Quality(alpha_min=8 / 255)}
 """Thresholds by name; what they gain and lose is measured by lab/speed/rasterizer.py. Only the lowest alpha pays.
 
 A higher stop threshold skips the opaque Gaussian that would have finished a pixel, and is wrong by up to 0.5 where it

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer import binning
-from pointsplat_ns.rasterizer.blending import Blend
+from pointsplat_ns.rasterizer.blending import Blend, untiled
 from pointsplat_ns.rasterizer.constants import QUALITIES, TILE
 from pointsplat_ns.rasterizer.frame import BlendOptions
 from pointsplat_ns.rasterizer.projection import project_scene
@@ -23,7 +23,7 @@ class Drawing:
     Args:
         scene: N Gaussians, on any device.
         view: the camera.
-        quality: what to give up for speed, as for :func:`~pointsplat_ns.rasterization`.
+        quality: thresholds that trade accuracy for speed, as for :func:`~pointsplat_ns.rasterization`.
 
     Raises:
         ValueError: if the camera is not finite or has no focal length.
@@ -47,18 +47,10 @@ class Drawing:
             view.width, view.height, level.alpha_min,
             binning.engine_of(None, seen.means2d, seen.cov2d, seen.det, seen.opacities),
         )  # fmt: skip
+        self.rows, self.columns = self._footprints.rows, self._footprints.columns
+        """Number of tiles of 8 pixels along each side."""
         self._width, self._height = view.width, view.height
         self._background = view.background.to(self._colors)
-
-    @property
-    def rows(self) -> int:
-        """Rows of tiles of 8 pixels."""
-        return self._footprints.rows
-
-    @property
-    def columns(self) -> int:
-        """Columns of tiles of 8 pixels."""
-        return self._footprints.columns
 
     @torch.no_grad()
     def draw(self, region: Region) -> Tensor:
@@ -74,11 +66,5 @@ class Drawing:
         )  # fmt: skip
         height = min(region.bottom * TILE, self._height) - region.top * TILE
         width = min(region.right * TILE, self._width) - region.left * TILE
-        color, left = (self._untiled(values, region)[:height, :width] for values in (image, through))
+        color, left = (untiled(values, region)[0, :height, :width] for values in (image, through))
         return (color + left * self._background).clamp_(0, 1)
-
-    @staticmethod
-    def _untiled(values: Tensor, region: Region) -> Tensor:
-        """Pixels (H, W, D) of tiles (tiles, [D,] 64)."""
-        tiles = values.view(region.rows, region.columns, -1, TILE, TILE)
-        return tiles.permute(0, 3, 1, 4, 2).reshape(region.rows * TILE, region.columns * TILE, -1)

@@ -1,4 +1,4 @@
-"""The arithmetic of EWA splatting with its hand-derived gradient: what :func:`projection.project` runs in torch.
+"""EWA splatting with its hand-derived gradient: :func:`projection.project` in torch.
 
 Everything is held component by component, (components, M), so that each operation runs over contiguous
 memory; no matrices are built per Gaussian. With ``W`` the camera's rotation, ``R`` that of the Gaussian,
@@ -27,7 +27,7 @@ from pointsplat_ns.rasterizer.spherical_harmonics import unit_rows
 
 
 class Lens(NamedTuple):
-    """Intrinsics and what one camera draws."""
+    """Intrinsics of a camera and limits of what it draws."""
 
     fx: float  # pixels
     fy: float
@@ -58,8 +58,8 @@ class Lens(NamedTuple):
 
 
 def longest_axis(dtype: torch.dtype) -> float:
-    """Bound of standard deviations in the image, pixels, 1e9 in float32: of longer ones the determinant would overflow,
-    and over any image they are as flat."""
+    """Largest standard deviation in the image, pixels, 1e9 in float32: the determinant of a longer one would overflow,
+    and both are flat over any image."""
     return torch.finfo(dtype).max ** 0.25 / 4
 
 
@@ -99,7 +99,7 @@ def _times(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def _candidates(points: Tensor, scales: Tensor, opacities: Tensor, lens: Lens) -> Tensor:
-    """Rows that may touch the image, by a bound on their extent that needs no covariance."""
+    """Rows of Gaussians that may touch the image, by a bound on their extent that needs no covariance."""
     x, y, z = points
     max_std = torch.maximum(torch.maximum(scales[:, 0], scales[:, 1]), scales[:, 2])  # NaN stays
     seen = (z > lens.near) & (z < lens.far) & (opacities >= ALPHA_MIN) & (max_std < torch.inf)
@@ -112,7 +112,7 @@ def _candidates(points: Tensor, scales: Tensor, opacities: Tensor, lens: Lens) -
 
 
 class _Shape(NamedTuple):
-    """The projected covariance and what it comes from, all (..., M)."""
+    """The projected covariance and its intermediate values, all (..., M)."""
 
     a: Tensor  # [3, M]
     b: Tensor  # [3, M]
@@ -146,8 +146,8 @@ class Project(torch.autograd.Function):
         points = torch.addmm(-(view @ remainder)[:, None], view, (means - near_centre).T)  # (3, N)
         ids = _candidates(points, scales, opacities, lens)
 
-        # What may be seen, in float64: of what is far from the camera, x and y are small sums of large products, and
-        # depths differ by little.
+        # The candidates, in float64: far from the camera, x and y are small sums of large products, and depths differ
+        # by little.
         directions = means.index_select(0, ids).double() - centre
         exact = wide @ directions.T
         points = exact.to(means.dtype)
@@ -239,8 +239,8 @@ class Project(torch.autograd.Function):
         # x / z and y / z: once as the image position, once, where it is not clamped, in the Jacobian
         (low_x, high_x), (low_y, high_y) = lens.clamp_x(), lens.clamp_y()
         gx, gy = grad_means2d.T
-        grad_u = lens.fx * gx - _dot(view[2], grad_a) * ((slopes[0] >= low_x) & (slopes[0] <= high_x))
-        grad_v = lens.fy * gy - _dot(view[2], grad_b) * ((slopes[1] >= low_y) & (slopes[1] <= high_y))
+        grad_u = lens.fx * gx - (view[2] @ grad_a) * ((slopes[0] >= low_x) & (slopes[0] <= high_x))
+        grad_v = lens.fy * gy - (view[2] @ grad_b) * ((slopes[1] >= low_y) & (slopes[1] <= high_y))
         along = slopes[0] * grad_u + slopes[1] * grad_v + grad_log_rz
         grad_points = torch.stack([rz * grad_u, rz * grad_v, grad_depths - rz * along])
         grad_directions = grad_directions + (view.T @ grad_points).T
@@ -270,8 +270,3 @@ class Project(torch.autograd.Function):
             grad_centre,
             None,
         )
-
-
-def _dot(vector: Tensor, rows: Tensor) -> Tensor:
-    """A vector (3,) times rows (3, M)."""
-    return vector @ rows

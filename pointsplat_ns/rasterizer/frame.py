@@ -1,4 +1,4 @@
-"""What one region of an image is blended from: its tiles, the Gaussians listed for each, and their quadratics.
+"""Input of blending one region of an image: its tiles, the Gaussians of each tile, and their quadratics.
 
 Shapes: B tiles of a block, S Gaussians of a chunk, 64 = TILE * TILE pixels, D channels.
 """
@@ -11,11 +11,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.constants import ALPHA_MAX, BLENDED_AT_ONCE, EXACT, TILE, Quality
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, TILE, Quality
 from pointsplat_ns.rasterizer.quadratics import PIXELS, basis_of, table_of
 from pointsplat_ns.rasterizer.tiles import Footprints, TileList
-
-_LONGEST_CHUNK = 1024
 
 MEMORY_BUDGET = 2**31
 """Bytes that the lists of pairs of one image may take before it is drawn in several regions."""
@@ -24,7 +22,7 @@ MEMORY_BUDGET = 2**31
 class BlendOptions(NamedTuple):
     """Options of blending."""
 
-    quality: Quality = EXACT
+    quality: Quality = Quality()
     compiled: bool | None = None
     """Use compiled kernels (float32, CPU): None where there are some, True with a warning where there are none."""
     memory_budget: int = MEMORY_BUDGET
@@ -56,6 +54,11 @@ class Chunk(NamedTuple):
 class Frame:
     """The tiles of one region, longest list first, and their pairs."""
 
+    STEP = 16
+    """Gaussians blended at once for each tile, before the saturated tiles are dropped; chunks are multiples of it."""
+    LONGEST = 1024
+    """Largest number of Gaussians in a chunk."""
+
     def __init__(self, footprints: Footprints, tiles: TileList, dtype: torch.dtype):
         lengths = tiles.offsets[1:] - tiles.offsets[:-1]
         self.width, self.height, self.tiles = footprints.width, footprints.height, lengths.numel()
@@ -65,16 +68,16 @@ class Frame:
         self.sorted = Tiles(ids, x, y, tiles.offsets[ids], tiles.offsets[ids + 1])
         self.pairs_count = tiles.gaussians.numel()
         self.gaussians = F.pad(tiles.gaussians, (0, 1), value=tiles.order.numel())  # the last pair is padding
-        # Pairs at once: on a CPU 2 MB a work array in float32. They do not depend on the number of threads: how
-        # lists are cut decides how sums are rounded.
+        # Pairs in a work array: on a CPU 2 MB in float32. The size does not depend on the number of threads, because
+        # sums are rounded by how lists are cut.
         pairs = 2**18 if lengths.is_cuda else 2**13
-        self.block = max(1, min(pairs // BLENDED_AT_ONCE, self.occupied))  # tiles
+        self.block = max(1, min(pairs // self.STEP, self.occupied))  # tiles
         self.capacity = pairs
 
     def chunk_size(self, tiles: int, longest: int) -> int:
         """Gaussians to blend at once: more where few tiles are left, no more than their lists hold."""
-        size = min(self.capacity // max(tiles, 1), longest + BLENDED_AT_ONCE - 1, _LONGEST_CHUNK)
-        return max(size // BLENDED_AT_ONCE, 1) * BLENDED_AT_ONCE
+        size = min(self.capacity // max(tiles, 1), longest + self.STEP - 1, self.LONGEST)
+        return max(size // self.STEP, 1) * self.STEP
 
     def inside(self, tiles: Tiles) -> Tensor:
         """1 for the pixels of tiles (B,) that are in the image, (B, 64)."""

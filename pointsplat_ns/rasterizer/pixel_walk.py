@@ -1,9 +1,9 @@
-"""Sums over the pixels of a view, one row a Gaussian, of what a picture alone does not tell.
+"""Sums over the pixels of a view, for each Gaussian, that no gradient of the picture gives.
 
 The rasterizer's own gradients give sums over pixels that are linear in the picture. How many pixels a
-Gaussian is drawn on, or the sum of squares of the gradients of each pixel, are not. Here what a view
-sees, as the rasterizer projects it, is walked front to back tile by tile, by the rasterizer's rules, and
-every pair of Gaussian and pixel is handed to a function.
+Gaussian is drawn on, or the sum of squares of the gradients of each pixel, are not. This module walks the
+projected Gaussians of a view front to back, tile by tile, by the rasterizer's rules, and hands every pair of
+Gaussian and pixel to a function.
 
 Shapes: M Gaussians seen, B tiles of a block, L Gaussians in the longest list of the block, 64 pixels a tile.
 """
@@ -25,8 +25,8 @@ from pointsplat_ns.rasterizer.tiles import Footprints
 
 
 class PixelBlock(NamedTuple):
-    """Every Gaussian of a block of tiles on every pixel, front to back along L. Where ``alpha`` is zero it is not
-    drawn, and ``before`` means nothing."""
+    """Every Gaussian of a block of tiles on every pixel, front to back along L. Where ``alpha`` is zero the Gaussian is
+    not drawn, and ``before`` is undefined."""
 
     ids: Tensor  # [B, L] rows of the projected Gaussians
     alpha: Tensor  # [B, L, 64]
@@ -43,7 +43,7 @@ def sum_over_pixels(
     """Sum a function of every pair of Gaussian and pixel over the pixels of one view.
 
     Args:
-        seen: what the view sees, M Gaussians.
+        seen: M Gaussians, projected to the view.
         width, height: pixels.
         columns: F, numbers a Gaussian.
         values: gives (B, L, F) of a block of pairs: sums over the 64 pixels of each tile.

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.compiled import projection as compiled_projection
+from pointsplat_ns.rasterizer.constants import EPS2D
 from pointsplat_ns.rasterizer.ewa import Lens, Project
 from pointsplat_ns.views import View
 
@@ -27,7 +28,7 @@ class Projected:
     opacities: Tensor  # [M] in (0, 1], compensation included
     directions: Tensor  # [M, 3] from the camera centre, world space
     radii: Tensor  # [M] int32, pixels, 3 standard deviations of the longest axis
-    beyond: Tensor  # [M] how much farther than the nearest, along the optical axis: what they are sorted by
+    beyond: Tensor  # [M] depth minus that of the nearest; the key of the drawing order
 
     @property
     def conics(self) -> Tensor:
@@ -78,7 +79,7 @@ def count_meaningless(
         opacities: (N,)
         compiled: as for :func:`~pointsplat_ns.rasterization`.
     """
-    if compiled_projection.can_project(means, quats, scales, opacities, compiled):
+    if compiled_projection.KERNELS.usable_for(compiled, means, quats, scales, opacities):
         return compiled_projection.count_meaningless(means, quats, scales, opacities)
     # one NaN or infinity spoils a sum, so a clean scene costs four sums and one answer
     total = means.sum() + quats.sum() + scales.sum() + opacities.sum()
@@ -111,7 +112,7 @@ def project(
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     radius_clip: float = 0.0,
-    eps2d: float = 0.3,
+    eps2d: float = EPS2D,
     antialiased: bool = False,
     compiled: bool | None = None,
 ) -> Projected:
@@ -119,7 +120,7 @@ def project(
 
     Left out are Gaussians with a non-finite parameter or a negative scale, nearer than ``near_plane`` or
     farther than ``far_plane``, fainter than 1/255, or whose 1/255 ellipse misses every pixel centre.
-    Differentiable in means, quats, scales, opacities and viewmat. What is gsplat's and what is not:
+    Differentiable in means, quats, scales, opacities and viewmat. Differences from gsplat:
 
     - The Jacobian is evaluated inside 1.3 times the field of view, counted from the image's edges, which
       follow the principal point (gsplat #305).
@@ -131,7 +132,7 @@ def project(
     :func:`~pointsplat_ns.rasterization`.
 
     Raises:
-        ValueError: if a focal length is zero, or the camera is not finite, has skew or is no motion.
+        ValueError: if a focal length is zero, or the camera is not finite, has skew or is not a rigid motion.
     """
     # R (m - c) and not R m + t: far from the origin the first rounds alike for all Gaussians
     centre = camera_centre(viewmat)
@@ -141,6 +142,6 @@ def project(
     if not _close((skew, below, *last), (0.0, 0.0, 0.0, 0.0, 1.0)):
         raise ValueError(f"K is {K.tolist()}; expected no skew: zeros but for fx, fy, cx, cy and the 1 of the last row")
     lens = Lens(fx, fy, cx, cy, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased)
-    suited = compiled_projection.can_project(means, quats, scales, opacities, compiled)
+    suited = compiled_projection.KERNELS.usable_for(compiled, means, quats, scales, opacities)
     function = compiled_projection.CompiledProject if suited else Project
     return Projected(*function.apply(means, quats, scales, opacities, viewmat[:3, :3].double(), centre, lens))

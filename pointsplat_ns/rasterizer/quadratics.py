@@ -29,8 +29,6 @@ MOMENTS = 6
 """Sums over pixels that are kept of each pair: of g times w, w^2, dv, dv^2, w dv and 1."""
 
 LOG2E = 1.0 / math.log(2.0)
-QUADRATIC, COLOR = 5, 11
-"""First columns of the coefficients and of the colours."""
 
 
 def basis_of(like: Tensor) -> Tensor:
@@ -52,7 +50,7 @@ def table_of(means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, col
     zero = torch.zeros_like(a)
     columns = [*means2d.unbind(-1), r, a, d, opacities.log2(), zero, zero, -0.5 * a, ar, -0.5 * (ar * r + d)]
     table = F.pad(torch.cat([torch.stack(columns, dim=-1), colors], dim=-1), (0, 0, 0, 1))
-    table[-1, QUADRATIC] = -1e4  # log2 alpha of the padding
+    table[-1, 5] = -1e4  # log2 alpha of the padding
     return table
 
 
@@ -69,18 +67,18 @@ class Quadratics(NamedTuple):
 
 def gather(table: Tensor, ids: Tensor, x: Tensor, y: Tensor) -> Quadratics:
     """The quadratics and colours of the pairs ``ids`` (B * S,) of tiles centred at x, y (B,)."""
-    rows = table.index_select(0, ids)
+    rows = table.index_select(0, ids)  # columns: 5 of geometry, 6 coefficients, the colour
     size = ids.numel() // x.numel()
-    mx, my, r, a, d = rows[:, :QUADRATIC].unbind(1)
+    mx, my, r, a, d = rows[:, :5].unbind(1)
     ey = (y[:, None] - my.view(-1, size)).view(-1)
     s = (x[:, None] - mx.view(-1, size)).view(-1).addcmul_(r, ey, value=-1.0)
     a_s, d_ey = a * s, d * ey
-    quadratic = rows[:, QUADRATIC:COLOR]
+    quadratic = rows[:, 5:11]
     quadratic[:, 0].addcmul_(a_s, s, value=-0.5).addcmul_(d_ey, ey, value=-0.5)
     torch.neg(a_s, out=quadratic[:, 1])
     torch.sub(a_s.mul_(r), d_ey, out=quadratic[:, 2])
     rows = rows.view(-1, size, rows.shape[1])
-    return Quadratics(s, ey, r, quadratic, rows[..., COLOR:], rows)
+    return Quadratics(s, ey, r, quadratic, rows[..., 11:], rows)
 
 
 def moments(pairs: Quadratics, sums: Tensor, out: Tensor) -> None:

@@ -12,7 +12,7 @@ from pointsplat_ns.rasterizer.arguments import check_options, check_tensors
 from pointsplat_ns.rasterizer.backends import use_gsplat
 from pointsplat_ns.rasterizer.blending import blend
 from pointsplat_ns.rasterizer.colors import sh_to_color
-from pointsplat_ns.rasterizer.constants import EPS2D, LARGEST_COLOR, QUALITIES, TILE, Quality
+from pointsplat_ns.rasterizer.constants import EPS2D, QUALITIES, TILE, Quality
 from pointsplat_ns.rasterizer.frame import MEMORY_BUDGET, BlendOptions
 from pointsplat_ns.rasterizer.precision import full_precision
 from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, project
@@ -32,7 +32,8 @@ def finite_colors(seen: Projected, *rest) -> tuple[Projected, Tensor, Tensor]:
     """Projected Gaussians and colours without those whose colour is NaN or too large, and the ids of these."""
     colors = _colors_of(seen, *rest)
     dropped = seen.ids[:0]
-    limit = torch.finfo(colors.dtype).max ** LARGEST_COLOR
+    # 6e30 in float32: gradients, which are sums over pixels of colours times slopes, stay finite
+    limit = torch.finfo(colors.dtype).max ** 0.8
     if colors.numel() and not bool(torch.stack(colors.detach().aminmax()).abs().amax() < limit):  # NaN spoils both
         usable = (colors.detach().abs() < limit).all(-1)
         dropped = seen.ids[~usable]
@@ -88,10 +89,10 @@ def rasterization(
     they are, lower precisions in float32, also under autocast. float64 viewmats beside float32 Gaussians
     place the camera exactly, however far from the origin.
 
-    Degenerate input that has a meaning keeps it: the zero quaternion is the identity, a scale of 0 a
-    flat Gaussian, an opacity of 1 opaque. What has none (NaN, infinities, a negative scale or opacity, a
-    colour above 6e30, whose gradients float32 could not hold) is not drawn, gets a zero gradient and is
-    counted in ``meta["skipped"]``.
+    Degenerate input is drawn: the zero quaternion is the identity, a scale of 0 a flat Gaussian, an opacity
+    of 1 opaque. Gaussians with invalid values (NaN, infinities, a negative scale or opacity, a colour above
+    6e30, whose gradients float32 could not hold) are not drawn, get a zero gradient and are counted in
+    ``meta["skipped"]``.
 
     The same input gives the same bits, forward and backward, on the same machine and number of threads. One thread and
     two give the same image, and by compiled kernels the same gradients. Otherwise another number rounds in another way,
@@ -119,9 +120,9 @@ def rasterization(
         absgrad: after the backward pass ``meta["means2d"].absgrad`` holds the sum over pixels of
             the absolute gradient (AbsGS, arXiv 2404.10484).
         rasterize_mode: ``antialiased`` scales opacities by the compensation of Mip-Splatting.
-        backend: what draws. "gsplat" hands everything to gsplat itself, which needs CUDA; "auto" does so
-            where it can. What follows has no effect on gsplat.
-        quality: what to give up for speed, by name or as thresholds; see ``QUALITIES``.
+        backend: renderer. "gsplat" calls gsplat itself, which needs CUDA; "auto" does so where it can. The arguments
+            below have no effect on gsplat.
+        quality: thresholds that trade accuracy for speed, or their name; see ``QUALITIES``.
         compiled: project and blend with compiled kernels, several times as fast as torch (CPU, float32; blending at
             most four channels): None where the machine has a C++ compiler, which takes four seconds once; True warns
             where it has none; False never.
@@ -132,11 +133,11 @@ def rasterization(
     Returns:
         Renders (C, H, W, channels), alphas (C, H, W, 1), and ``meta`` with means2d, radii, depths,
         conics, opacities (all (C, N, ...), or (M, ...) if packed), camera_ids and gaussian_ids
-        (None unless packed), skipped (the number of Gaussians without meaning; colours are looked at only where
-        they would be seen), width, height, n_cameras, tile_size, tile_width and tile_height.
+        (None unless packed), skipped (the number of Gaussians with invalid values; only colours of visible
+        Gaussians are checked), width, height, n_cameras, tile_size, tile_width and tile_height.
 
     Raises:
-        ValueError: if a shape or option does not fit, or a camera has skew or is no motion; the text names the
+        ValueError: if a shape or option does not fit, or a camera has skew or is not a rigid motion; the text names the
             argument.
         PointSplatError: if gsplat is asked for and cannot be used.
 

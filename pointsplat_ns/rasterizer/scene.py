@@ -29,7 +29,7 @@ def render(
         scene: N Gaussians, on any device; the picture is rendered there.
         views: a :class:`~pointsplat_ns.View`, or :class:`~pointsplat_ns.Views`, whose pictures are then drawn one after
             the other.
-        quality: what to give up for speed: "exact", "balanced" or "fast", as for :func:`pointsplat_ns.rasterization`.
+        quality: "exact", or faster and less accurate, "balanced" or "fast", as for :func:`pointsplat_ns.rasterization`.
         reduced: draw this factor fewer pixels a side, and enlarge the picture (bicubic): faster, and blurred.
         backend: "torch", or gsplat where it can be used ("auto"), as for :func:`pointsplat_ns.rasterization`. gsplat
             leaves out tests of what it is given.
@@ -124,8 +124,8 @@ def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
 
 
 def pixels_of(scene: Gaussians, view: View) -> Tensor:
-    """Pixels that each Gaussian has in a picture: the sum over all of them of its alpha times the transmittance in
-    front of it, by which its colour is weighted there. It is the gradient of the sum of the picture by colours.
+    """Visible pixels of each Gaussian: the sum over the pixels of a picture of its blending weight, which is its alpha
+    times the transmittance in front of it. It is the gradient of the sum of the picture by the colour.
 
     Args:
         scene: N Gaussians, on any device.

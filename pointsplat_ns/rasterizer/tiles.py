@@ -1,4 +1,4 @@
-"""Which Gaussian touches which tile, exactly, in drawing order.
+"""The tiles that each Gaussian touches, exactly, in drawing order.
 
 A Gaussian is paired with a tile only if its own 1/255 ellipse meets the box of the tile's pixel
 centres: for each row of tiles the ellipse's extent in x over that row is known in closed form, and
@@ -19,7 +19,7 @@ from torch import Tensor
 from pointsplat_ns.rasterizer import ellipses as in_torch
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, TILE
 from pointsplat_ns.rasterizer.ellipses import Grid
-from pointsplat_ns.rasterizer.ellipses import Region as Region  # what users of tiles name a part of an image by
+from pointsplat_ns.rasterizer.ellipses import Region as Region  # part of this module's interface
 
 
 @dataclass
@@ -45,7 +45,7 @@ class TileList:
 def _by_depth(depths: Tensor) -> Tensor:
     """Rows in ascending order of depth, equal depths in the order of the input."""
     bits = depths.view(torch.int32 if depths.dtype == torch.float32 else torch.int64)
-    # as integers floats keep their order, negative ones reversed; integers go through a radix sort
+    # integers, which are radix-sorted, with the order of the floats; bits of negative floats are in reverse order
     bits = torch.where(bits < 0, bits ^ torch.iinfo(bits.dtype).max, bits)
     return torch.sort(bits, stable=True).indices
 
@@ -66,29 +66,15 @@ class Footprints:
         width: int,
         height: int,
         alpha_min: float = ALPHA_MIN,
-        engine: ModuleType = in_torch,  # what finds ellipses and pairs, see binning.engine_of
+        engine: ModuleType = in_torch,  # from binning.engine_of
     ):
-        self.width, self.height = width, height
-        self._grid = Grid(cameras, height, rows=-(-height // TILE), columns=-(-width // TILE))
+        self.cameras, self.width, self.height = cameras, width, height
+        self.rows, self.columns = -(-height // TILE), -(-width // TILE)  # of tiles
+        self._grid = Grid(cameras, height, self.rows, self.columns)
         self._engine = engine
         self._ellipses = engine.ellipses_of(
             means2d, cov2d, det, opacities, _by_depth(depths.contiguous()), camera_ids, self._grid, alpha_min
         )
-
-    @property
-    def cameras(self) -> int:
-        """Number of images."""
-        return self._grid.cameras
-
-    @property
-    def rows(self) -> int:
-        """Rows of tiles of an image."""
-        return self._grid.rows
-
-    @property
-    def columns(self) -> int:
-        """Columns of tiles of an image."""
-        return self._grid.columns
 
     @property
     def whole(self) -> Region:

@@ -26,9 +26,6 @@ PARAMETERS = ("means", "scales", "quats", "opacities", "features_dc", "features_
 FEATURES = 39
 """Number of features of a Gaussian, see :mod:`pointsplat_ns.compression.feedback`."""
 
-MAX_LOG_FACTOR = 2.0
-"""Bound of the factors' logarithms: factors are from 1/7 to 7."""
-
 FORMAT = "pointsplat-feedback/2"
 
 PRETRAINED = Path(__file__).parent / "pretrained" / "feedback.safetensors"
@@ -42,6 +39,9 @@ class FeedbackRefiner(nn.Module):
         >>> FeedbackRefiner()(torch.zeros(5, FEATURES)).unique().tolist()
         [1.0]
     """
+
+    MAX_LOG_FACTOR = 2.0
+    """Bound of the factors' logarithms: factors are from 1/7 to 7."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -61,7 +61,8 @@ class FeedbackRefiner(nn.Module):
         Args:
             features: (N, :data:`FEATURES`).
         """
-        return (MAX_LOG_FACTOR * torch.tanh(self.mlp(features) / MAX_LOG_FACTOR)).exp()
+        bound = self.MAX_LOG_FACTOR
+        return (bound * torch.tanh(self.mlp(features) / bound)).exp()
 
 
 def save_feedback_refiner(network: FeedbackRefiner, path: Path | str, metadata: dict[str, Any] | None = None) -> None:

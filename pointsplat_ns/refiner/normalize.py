@@ -55,9 +55,6 @@ class UnitCube:
         """Log-scales in units of the cube, in float64. # [N, 3]"""
         return scales.double() - self.extent.log()
 
-    def to(self, device: torch.device | str) -> UnitCube:
-        return UnitCube(self.centre.to(device), self.extent.to(device))
-
 
 def unit_cube(means: Tensor) -> UnitCube:
     """The unit cube of a scene.

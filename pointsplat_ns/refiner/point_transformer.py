@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from pointsplat_ns.refiner.config import RefinerConfig
 from pointsplat_ns.refiner.encoder import make_norm
-from pointsplat_ns.refiner.patches import Order, add_by_patches, by_patches
+from pointsplat_ns.refiner.patches import Order, by_patches
 from pointsplat_ns.refiner.rows import by_rows, rows_at_a_time
 from pointsplat_ns.refiner.sparse_ops import segment_max, segment_mean, submanifold_conv
 from pointsplat_ns.refiner.structure import GridLevel, Structure
@@ -85,23 +85,11 @@ class Block(nn.Module):
     def forward(self, x: Tensor, level: GridLevel, order: Order | None) -> Tensor:
         """``[M, C] -> [M, C]``; ``order`` along the curve that the patches follow, None for memory order."""
         x = self.conv(x, level, then=self.conv_out).add_(x)
-        x = self._add(x, lambda part: self.attention(self.norm1(part)), 3 * x.shape[1], self.attention.patch, order)
-        x = self._add(x, lambda part: self.mlp(self.norm2(part)), self.hidden)
-        return x
-
-    def _add(
-        self,
-        x: Tensor,
-        branch: Callable[[Tensor], Tensor],
-        width: int,
-        patch: int = 1,
-        order: Order | None = None,
-    ) -> Tensor:
-        """``x + drop(branch(x))``, in place if neither gradients nor dropping need ``x``. ``width`` is the width of the
-        branch's widest layer; ``patch`` and ``order`` define the patches."""
-        if torch.is_grad_enabled() or self.training:
-            return self._drop(by_patches(branch, x, width, patch, order)).add_(x)
-        return add_by_patches(branch, x, width, patch, order)
+        attended = by_patches(
+            lambda part: self.attention(self.norm1(part)), x, 3 * x.shape[1], self.attention.patch, order
+        )
+        x = self._drop(attended).add_(x)
+        return self._drop(by_patches(lambda part: self.mlp(self.norm2(part)), x, self.hidden)).add_(x)
 
     def _drop(self, x: Tensor) -> Tensor:
         """In training, random rows are set to zero and the others scaled up, so that the expected value is kept."""

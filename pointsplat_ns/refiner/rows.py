@@ -36,36 +36,3 @@ def by_rows(
     for start in range(rows, len(x), rows):
         out[start : start + rows] = function(x[start : start + rows])
     return out
-
-
-def add_by_rows(
-    function: Callable[[Tensor], Tensor],  # [R, C] -> [R, C]
-    x: Tensor,  # [N, C]
-    rows: int,
-    order: Tensor | None = None,  # [N] a permutation that groups the rows; None: consecutive rows
-    stop: int | None = None,
-) -> Tensor:
-    """``x + function(x)`` in place of ``x``, without gradients; on a CPU ``rows`` rows at a time.
-
-    No second tensor of the size of ``x`` is allocated. Rows along ``order`` from ``stop`` on do not change. # [N, C]
-    """
-    stop = len(x) if stop is None else stop
-    step = rows if x.device.type == "cpu" else max(1, stop)
-    for start in range(0, stop, step):
-        end = min(start + step, stop)
-        part = x[start:end] if order is None else x.index_select(0, order[start:end])
-        add_rows(x, function(part), order, start)
-    return x
-
-
-def add_rows(
-    x: Tensor,  # [N, C]
-    part: Tensor,  # [R, C]
-    order: Tensor | None,  # [N] a permutation, or None
-    start: int,
-) -> None:
-    """Add ``part`` in place to R rows of ``x``, from ``start`` on along ``order``."""
-    if order is None:
-        x[start : start + len(part)] += part
-    else:
-        x.index_add_(0, order[start : start + len(part)], part.to(x.dtype))

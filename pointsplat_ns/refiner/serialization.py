@@ -15,9 +15,6 @@ from torch import Tensor
 
 from pointsplat_ns.geometry.morton import interleave, spread_bits
 
-LEVELS_AT_ONCE = 4
-"""Levels of the Hilbert curve per table look-up: the table has 48 x 8^4 entries, which fit into the cache."""
-
 
 def curve_codes(coords: Tensor, bits: int, curves: Sequence[str]) -> list[Tensor]:
     """Codes along named curves.
@@ -50,9 +47,10 @@ def curve_codes(coords: Tensor, bits: int, curves: Sequence[str]) -> list[Tensor
 
 def _hilbert_from_z(code: Tensor, bits: int) -> Tensor:
     """Hilbert code of each z-order code: octants from the coarsest on, a few levels at a time. # [N] int64"""
+    at_once = 4  # levels per look-up: the table has 48 x 8^4 entries, which fit into the cache
     out, state = torch.zeros_like(code), None
     while bits:
-        levels = bits % LEVELS_AT_ONCE or LEVELS_AT_ONCE
+        levels = bits % at_once or at_once
         bits -= levels
         table = _hilbert_table(levels, code.device)
         place = code >> 3 * bits
@@ -63,8 +61,7 @@ def _hilbert_from_z(code: Tensor, bits: int) -> Tensor:
         digits = entry & (8**levels - 1)
         out <<= 3 * levels
         out |= digits
-        # What follows is always LEVELS_AT_ONCE wide.
-        state = (entry >> 3 * levels) << 3 * LEVELS_AT_ONCE
+        state = (entry >> 3 * levels) << 3 * at_once  # all later look-ups are of so many
     return out
 
 

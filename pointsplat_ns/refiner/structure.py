@@ -6,7 +6,6 @@ level, and neighbours are close in memory.
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -66,7 +65,6 @@ class Structure:
     order: Tensor  # [N] scene index of the point at each place in memory
     inverse: Tensor  # [N] place in memory of each Gaussian of the scene
     levels: list[GridLevel]
-    cells_per_side: float  # of the first level, along the unit cube
     built_for: tuple  # :func:`structure_key` of its configuration
     usable: Tensor | None = None  # [T] mask of the N Gaussians in the structure; None: all
 
@@ -74,20 +72,6 @@ class Structure:
     def total(self) -> int:
         """Number of Gaussians of the scene, with undrawable ones."""
         return len(self.order if self.usable is None else self.usable)
-
-    def to(self, device: torch.device | str) -> Structure:
-        """The same structure on another device."""
-
-        def move(value):
-            if isinstance(value, (Tensor, UnitCube)):
-                return value.to(device)
-            if isinstance(value, GridLevel):
-                return GridLevel(**{f.name: move(getattr(value, f.name)) for f in dataclasses.fields(value)})
-            if isinstance(value, (list, tuple)):
-                return type(value)(move(item) for item in value)
-            return value
-
-        return Structure(**{f.name: move(getattr(self, f.name)) for f in dataclasses.fields(self)})
 
 
 def structure_key(config: RefinerConfig) -> tuple:
@@ -112,7 +96,6 @@ def build_structure(scene: Gaussians, config: RefinerConfig) -> Structure:
     codes = curve_codes(fine, FINE_BITS, config.curves)
     order, depths = _canonical_order(scene, codes[0])
     shift = STRUCTURE.fixed_grid_bits if config.grid is not None else _adaptive_shift(depths)
-    cells_per_side = units / 2**shift
 
     levels = []
     shifts = [min(shift + _log2_product(config.strides[:i]), FINE_BITS) for i in range(len(config.strides) + 1)]
@@ -135,7 +118,7 @@ def build_structure(scene: Gaussians, config: RefinerConfig) -> Structure:
         if cluster is not None and next_first is not None:
             first, depths = first.index_select(0, next_first), depths.index_select(0, next_first)
             orders = [_coarser_pair(along, cluster, len(first)) for along, _ in orders]
-    return Structure(cube, order, _invert(order), levels, cells_per_side, structure_key(config))
+    return Structure(cube, order, _invert(order), levels, structure_key(config))
 
 
 def neighbour_pairs(cells: Tensor) -> list[tuple[Tensor, Tensor]]:

@@ -1,4 +1,4 @@
-"""Functions of a C++ file of this package: built and tried when first asked for, and called on several threads."""
+"""Functions of a C++ file of this package: built and tried when first used, and called on several threads."""
 
 from __future__ import annotations
 
@@ -6,29 +6,36 @@ import ctypes
 import functools
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import torch
 
+from pointsplat_ns.system.declarations import Struct, functions_of, structs_of
 from pointsplat_ns.system.native_code import NativeCodeError, load_native
+
+SEVERAL = 4000
+"""Gaussians, or pairs of Gaussian and tile, from which on several threads are faster than one."""
 
 
 class Kernels:
     """Functions of a C++ file that are faster than torch.
 
     Args:
-        what: a name of it, for warnings.
-        source: the file.
-        functions: types of the arguments by name of the function, for those that return nothing.
+        what: name of the feature, for warnings.
+        source: the file. What it declares is what Python calls, see :mod:`~pointsplat_ns.system.declarations`.
         agree: whether the functions do what torch does, on a small input, so that no miscompilation passes; it may call
             them.
     """
 
-    def __init__(self, what: str, source: Path, functions: Mapping[str, Sequence[Any]], agree: Callable[[], bool]):
-        self.what, self.source, self.functions, self.agree = what, source, functions, agree
+    def __init__(self, what: str, source: Path, agree: Callable[[], bool]):
+        self.what, self.source, self.agree = what, source, agree
+
+    @functools.cached_property
+    def structs(self) -> dict[str, type[Struct]]:
+        """The structs that the functions take, by name."""
+        return structs_of(self.source.read_text("utf-8"))
 
     @functools.cached_property
     def library(self) -> ctypes.CDLL:
@@ -38,14 +45,14 @@ class Kernels:
             NativeCodeError: if this machine cannot build them.
         """
         library = load_native(self.source)
-        for name, types in self.functions.items():
+        for name, (result, parameters) in functions_of(self.source.read_text("utf-8"), self.structs).items():
             function = getattr(library, name)
-            function.argtypes, function.restype = list(types), None
+            function.restype, function.argtypes = result, parameters
         return library
 
     @functools.cached_property
     def why_missing(self) -> str:
-        """Why this machine has none that can be used; empty if it has. They are built if need be, and tried."""
+        """The reason why this machine cannot use them; empty if it can. They are built if need be, and tried."""
         try:
             _ = self.library
         except NativeCodeError as error:
@@ -63,7 +70,7 @@ class Kernels:
         if wanted is False:
             return False
         if self.why_missing and wanted:
-            # from here, so that a text that several have in common is shown once
+            # stacklevel 1: warnings of several kernels with one text are shown once
             text = f"{self.what} could not be compiled and stays with torch: {self.why_missing}"
             warnings.warn(text, stacklevel=1)
         return not self.why_missing
@@ -83,11 +90,14 @@ def _pool(process: int) -> ThreadPoolExecutor:
 def on_threads(worth_it: bool, function: Callable[..., object], *arguments: object) -> None:
     """Call a function of a C++ file in as many threads as torch uses, or in one if more are not worth it.
 
-    They share the work by what the arguments point to; ctypes lets go of Python meanwhile.
+    The last parameter of the function points to the number of pieces of work that threads have taken. ctypes lets go of
+    Python during the call.
     """
+    taken = ctypes.c_int64(0)
+    call = functools.partial(function, *arguments, ctypes.byref(taken))
     threads = torch.get_num_threads() if worth_it else 1
-    others = [_pool(os.getpid()).submit(function, *arguments) for _ in range(threads - 1)]
-    function(*arguments)
+    others = [_pool(os.getpid()).submit(call) for _ in range(threads - 1)]
+    call()
     for other in others:
         other.result()
 

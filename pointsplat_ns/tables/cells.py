@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,7 +18,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import one_line
 from pointsplat_ns.pruning.scores import log_volume
 from pointsplat_ns.tables.scene import TableOptions, TableScene
-from pointsplat_ns.tables.ways import FIGURE_CELLS
+from pointsplat_ns.tables.ways import FIGURE_4
 from pointsplat_ns.tradeoff.journal import Form, check_types, restored_point
 from pointsplat_ns.tradeoff.points import Point
 
@@ -36,6 +37,14 @@ class HistogramBins:
     """Number of equal bins of log10 of the volume."""
     volume_span: tuple[float, float] = (-20.0, 4.0)
     """Range of log10 of the volume, scene units cubed; values outside count in the first or the last bin."""
+
+    @property
+    def opacity_edges(self) -> np.ndarray:
+        return np.linspace(0.0, 1.0, self.opacity + 1)
+
+    @property
+    def volume_edges(self) -> np.ndarray:
+        return np.linspace(*self.volume_span, self.volume + 1)
 
 
 BINS = HistogramBins()
@@ -149,7 +158,7 @@ class CellJournal:
 
 def distributions(scene: Gaussians, way: str, share: float) -> tuple[tuple[int, ...] | None, tuple[int, ...] | None]:
     """Numbers of Gaussians in the bins of opacity and of volume, for cells of Figure 4; else None twice."""
-    if (way, share) not in FIGURE_CELLS:
+    if (way, share) not in {(shown.name, kept) for shown, kept in FIGURE_4}:
         return None, None
     usable = scene[scene.usable()]
     volumes = (log_volume(usable) / math.log(10)).clamp(*BINS.volume_span)

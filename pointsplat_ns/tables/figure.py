@@ -11,28 +11,20 @@ import numpy as np
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.tables.cells import BINS
 from pointsplat_ns.tables.means import Group
-from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_4, PROTOCOL
+from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_4, PROTOCOL, Way
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-
-def _opacity_edges() -> np.ndarray:
-    return np.linspace(0.0, 1.0, BINS.opacity + 1)
-
-
-def _volume_edges() -> np.ndarray:
-    return np.linspace(*BINS.volume_span, BINS.volume + 1)
 
 
 def medians(group: Group) -> dict[str, tuple[float, float]]:
     """Medians of opacity and of log10 of the volume (scene units cubed), by way, interpolated within bins. All scenes
     have the same weight. Ways without measurements are left out."""
     found = {}
-    for way, share in _cells_of_figure():
-        both = densities(group, way, share)
+    for way, share in FIGURE_4:
+        both = densities(group, way.name, share)
         if both is not None:
-            found[way] = (_median(both[0], _opacity_edges()), _median(both[1], _volume_edges()))
+            found[way.name] = (_median(both[0], BINS.opacity_edges), _median(both[1], BINS.volume_edges))
     return found
 
 
@@ -57,11 +49,11 @@ def plot_figure(groups: Sequence[Group], path: Path) -> None:
 
     figure = Figure(figsize=(11, 3.6 * len(groups)), layout="constrained")
     for group, (left, right) in zip(groups, figure.subplots(len(groups), 2, squeeze=False), strict=True):
-        for way, share in _cells_of_figure():
-            both = densities(group, way, share)
+        for way, share in FIGURE_4:
+            both = densities(group, way.name, share)
             if both is not None:
-                _stairs(left, both[0], _opacity_edges(), way)
-                _stairs(right, both[1], _volume_edges(), way)
+                _stairs(left, both[0], BINS.opacity_edges, way)
+                _stairs(right, both[1], BINS.volume_edges, way)
         right.set_xlim(*_extent(group))
         left.set_xlabel("opacity")
         right.set_xlabel("log10 of the volume, scene units cubed")
@@ -74,29 +66,20 @@ def plot_figure(groups: Sequence[Group], path: Path) -> None:
         figure.savefig(part, dpi=110, format="png")
 
 
-def _cells_of_figure() -> list[tuple[str, float]]:
-    """Ways and shares of Figure 4, the dense scene first."""
-    return [(DENSE_WAY.name, 1.0), *((way.name, PROTOCOL.figure_share) for way in FIGURE_4)]
-
-
 def _extent(group: Group) -> tuple[float, float]:
     """Range of log10 of the volume over the bins with more than 0.1 % of the Gaussians."""
-    found = [both[1] for way, share in _cells_of_figure() if (both := densities(group, way, share)) is not None]
+    found = [both[1] for way, share in FIGURE_4 if (both := densities(group, way.name, share)) is not None]
     filled: np.ndarray = np.flatnonzero(np.max(found, axis=0) > 1e-3) if found else np.empty(0, int)
-    edges = _volume_edges()
+    edges = BINS.volume_edges
     return (edges[filled[0]], edges[filled[-1] + 1]) if len(filled) else BINS.volume_span
 
 
-def _stairs(axis: Axes, shares: np.ndarray, edges: np.ndarray, way: str) -> None:
-    labels = {known.name: known.label for known in (DENSE_WAY, *FIGURE_4)}
+def _stairs(axis: Axes, shares: np.ndarray, edges: np.ndarray, way: Way) -> None:
     colors = {"lightgaussian": "tab:orange", "pup": "gray", "paper": "tab:blue", "merge": "tab:green", "dense": "black"}
-    style = "--" if way == DENSE_WAY.name else "-"
-    axis.stairs(100 * shares, edges, color=colors[way], linestyle=style, label=labels[way], linewidth=1.4)
+    style = "--" if way == DENSE_WAY else "-"
+    axis.stairs(100 * shares, edges, color=colors[way.name], linestyle=style, label=way.label, linewidth=1.4)
 
 
 def _median(shares: np.ndarray, edges: np.ndarray) -> float:
-    total = np.concatenate([[0.0], np.cumsum(shares)])
-    index = int(np.searchsorted(total, 0.5 * total[-1], side="right")) - 1
-    index = min(index, len(shares) - 1)
-    inside = (0.5 * total[-1] - total[index]) / shares[index] if shares[index] > 0 else 0.5
-    return float(edges[index] + inside * (edges[index + 1] - edges[index]))
+    below = np.concatenate([[0.0], np.cumsum(shares)])  # share of the Gaussians below each edge
+    return float(np.interp(0.5 * below[-1], below, edges))

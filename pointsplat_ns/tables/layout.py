@@ -10,6 +10,7 @@ from pointsplat_ns.tables.means import Group, Mean
 from pointsplat_ns.tables.paper import published
 from pointsplat_ns.tables.ways import (
     DENSE_WAY,
+    FIGURE_4,
     IMAGE_DRIVEN,
     OURS,
     PEERS,
@@ -151,16 +152,17 @@ class Layout:
         return tuple(notes)
 
 
-def figure_medians(group: Group, ways: Sequence[Way], medians: Mapping[str, tuple[float, float]]) -> Table:
+def figure_medians(group: Group, medians: Mapping[str, tuple[float, float]]) -> Table:
     """The medians of Figure 4 as a table.
 
     Args:
         group: the scenes.
-        ways: the rows.
         medians: medians of opacity and of log10 of the volume, by name of the way.
     """
     rows = tuple(
-        (way.label, f"{medians[way.name][0]:.2f}", f"{medians[way.name][1]:.1f}") for way in ways if way.name in medians
+        (way.label, f"{medians[way.name][0]:.2f}", f"{medians[way.name][1]:.1f}")
+        for way, _ in FIGURE_4
+        if way.name in medians
     )
     title = f"Medians of Figure 4: {group.name}, {_percent(PROTOCOL.figure_share)} kept"
     return Table(0, title, ("method", "opacity", "log10 of the volume"), (rows,))

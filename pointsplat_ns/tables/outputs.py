@@ -12,7 +12,7 @@ from pointsplat_ns.tables.figure import medians, plot_figure
 from pointsplat_ns.tables.layout import Layout, Table, figure_medians
 from pointsplat_ns.tables.means import Group, read_groups
 from pointsplat_ns.tables.paper import published
-from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_4
+from pointsplat_ns.tables.ways import DENSE_WAY
 from pointsplat_ns.tables.writing import latex_document, markdown_table, markdown_text
 from pointsplat_ns.tradeoff.machine import is_busy
 
@@ -45,7 +45,7 @@ def write_tables(folder: Path, shares: Sequence[float], missing: Mapping[str, st
     tables = {group.name: Layout(group, shares, missing).tables() for group in groups}
     for group in groups:
         if found := medians(group):
-            tables[group.name].append(figure_medians(group, (DENSE_WAY, *FIGURE_4), found))
+            tables[group.name].append(figure_medians(group, found))
     write_json(_content(groups, missing), folder / "tables.json")
     with replacing(folder / "tables.md") as part:
         part.write_text(_markdown(groups, tables), encoding="utf-8")

@@ -138,11 +138,11 @@ TABLE_4 = (
 )
 """Rows I to V."""
 
-FIGURE_4 = (IMAGE_DRIVEN[0], IMAGE_DRIVEN[2], PAPER, MERGE)
-"""Ways in Figure 4: the paper's three, and the default of this package."""
-
-FIGURE_CELLS = {(DENSE, 1.0), *((way.name, PROTOCOL.figure_share) for way in FIGURE_4)}
-"""Ways and shares with distributions for Figure 4."""
+FIGURE_4 = (
+    (DENSE_WAY, 1.0),
+    *((way, PROTOCOL.figure_share) for way in (IMAGE_DRIVEN[0], IMAGE_DRIVEN[2], PAPER, MERGE)),
+)
+"""Ways and shares in Figure 4: the dense scene, the paper's three, and the default of this package."""
 
 
 def all_cells(shares: Sequence[float]) -> list[tuple[Way, float]]:

@@ -40,13 +40,6 @@ def test_ssim_is_torchmetrics_away_from_the_border(shape):
     assert torch.allclose(ssim(a, b), expected, atol=1e-6)  # windows summed in another order
 
 
-def test_ssim_is_what_nerfstudio_computes():
-    pytorch_msssim = pytest.importorskip("pytorch_msssim")
-    a, b = pair(24, 37)
-    expected = pytorch_msssim.ssim(*(x[None].permute(0, 3, 1, 2) for x in (a, b)), data_range=1.0)
-    assert float(ssim(a, b)) == pytest.approx(float(expected), abs=1e-5)  # float32 windows
-
-
 @pytest.mark.parametrize("value", [0.0, 1e-4, 0.5, 1.0])
 def test_ssim_of_identical_flat_images_is_1(value):
     image = torch.full((16, 16, 3), value)
@@ -69,15 +62,6 @@ def test_a_batch_gives_one_value_an_image(metric):
     for i in range(3):
         assert metric(a[i], b[i]).shape == ()
         assert float(values[i]) == pytest.approx(float(metric(a[i], b[i])), rel=1e-5)  # float32 sums
-
-
-@pytest.mark.parametrize("metric", [psnr, ssim])
-def test_metrics_are_symmetric_and_fall_with_noise(metric):
-    a, b = pair(16, 20)
-    assert float(metric(a, b)) == pytest.approx(float(metric(b, a)), rel=1e-5)  # float32 sums
-    noise = torch.randn(16, 20, 3, generator=torch.Generator().manual_seed(1))
-    values = [float(metric(b + s * noise, b)) for s in (0.01, 0.03, 0.1)]
-    assert values[0] > values[1] > values[2]
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim])

@@ -8,9 +8,9 @@ import pytest
 import torch
 from pytorch_msssim import SSIM
 
+from making import assert_same_on_any_threads
 from pointsplat_ns.metrics import ssim
 from pointsplat_ns.metrics.structural_similarity import KERNELS, mean_ssim
-from pointsplat_ns.system.threads import fixed_threads
 
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 
@@ -61,11 +61,6 @@ def test_flat_images_in_float32_match_float64_in_value_and_gradient(level, compi
     assert (result[torch.float32][1] - result[torch.float64][1]).abs().max() < 1e-3
 
 
-def test_identical_images_give_1():
-    image, _ = images(1, 3, 16, 16)
-    assert mean_ssim(image, image.detach()).item() == pytest.approx(1.0, abs=1e-12)
-
-
 def found(image, other, dtype, compiled, first=True):
     """SSIM of two images, and its gradient by one of them, as float64."""
     leaf = (image if first else other).detach().to(dtype, copy=True).requires_grad_()
@@ -92,11 +87,7 @@ def test_compiled_it_is_torchs_and_as_near_to_float64(shape, together, first):
 @needs_compiler
 def test_any_number_of_threads_gives_the_same_bits():
     image, other = images(1, 3, 200, 40)
-    results = []
-    for threads in (1, 2, 5):
-        with fixed_threads(threads):
-            results.append(found(image, other, torch.float32, True))
-    assert all(torch.equal(a, b) for result in results for a, b in zip(result, results[0], strict=True))
+    assert_same_on_any_threads(lambda: found(image, other, torch.float32, True))
 
 
 @needs_compiler

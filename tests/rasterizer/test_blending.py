@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 from making import camera_askew, splats_in_view
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.rasterizer import blending, frame, rasterization
-from pointsplat_ns.rasterizer.constants import BLENDED_AT_ONCE, QUALITIES
+from pointsplat_ns.rasterizer.constants import QUALITIES
 from pointsplat_ns.rasterizer.tiles import Footprints
 
 WIDTH, HEIGHT = 70, 45  # neither is a multiple of the tile
@@ -95,7 +95,7 @@ def test_regions_cover_every_tile_once_and_keep_within_the_budget_where_tiles_al
 def test_long_chunks_of_few_tiles_equal_short_ones(n, size, monkeypatch):
     scene = make_scene(n=n, size=size, seed=n, dtype=torch.float64)
     long = draw(scene)
-    monkeypatch.setattr(frame, "_LONGEST_CHUNK", BLENDED_AT_ONCE)
+    monkeypatch.setattr(frame.Frame, "LONGEST", frame.Frame.STEP)
     assert_same(long, draw(scene), 1e-12)  # products and sums in another order
 
 

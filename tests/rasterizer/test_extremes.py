@@ -220,25 +220,6 @@ def test_places_and_lenses_of_the_camera(case):
     check(scene, (view, K), size)
 
 
-@pytest.mark.parametrize("logit", [-40.0, 40.0, -math.inf, math.inf])
-def test_extreme_opacity_logits_through_the_sigmoid(logit):
-    scene = make_scene(50)
-    logits = torch.logit(scene[3])
-    logits[::3] = logit
-    scene[3] = torch.sigmoid(logits)
-    if logit > 0:
-        assert (scene[3][::3] == 1).all()
-    check(scene, camera_askew())
-    single = logits.float().requires_grad_()
-    view, K = camera_askew()
-    rest = [t.float() for t in scene]
-    image, _, _ = rasterization(
-        *rest[:3], torch.sigmoid(single), rest[4], view[None].float(), K[None].float(), 37, 29, sh_degree=1
-    )
-    (grad,) = torch.autograd.grad(image.sum(), single)
-    assert grad.isfinite().all() and (grad[::3] == 0).all() and grad.any()
-
-
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
 def test_scenes_of_any_size(factor):
     scene = make_scene(50)
@@ -251,22 +232,6 @@ def test_scenes_of_any_size(factor):
     assert ((single - plain)[..., :4].abs() > 1e-4).double().mean() < 0.01
     for got, want in zip(relative_change(scaled, grads), relative_change(scene, plain_grads), strict=True):
         assert (got - want).norm() <= 1e-3 * want.norm()
-
-
-def test_float64_cameras_beside_float32_gaussians_place_the_camera_exactly():
-    scene = make_scene(50)
-    view, K = camera_askew()
-    shift = torch.tensor([1e6, -7e5, 4e5], dtype=F64)
-    scene[0] = (scene[0] * 64 + shift).float().double()
-    scene[2] = scene[2] * 64
-    view[:3, 3] = view[:3, 3] * 64 - view[:3, :3] @ shift
-    want, _, _ = rasterization(*scene, view[None], K[None], 37, 29, sh_degree=0)
-    single = [t.float() for t in scene]
-    got, _, _ = rasterization(*single, view[None], K[None], 37, 29, sh_degree=0)
-    rounded, _, _ = rasterization(*single, view[None].float(), K[None], 37, 29, sh_degree=0)
-    assert got.dtype == torch.float32
-    assert ((got - want).abs() > 1e-4).double().mean() < 0.01
-    assert ((rounded - want).abs() > 1e-4).double().mean() > 0.1
 
 
 def test_views_in_float64_place_the_camera_exactly_and_any_unit_of_length_is_drawn():
@@ -330,25 +295,3 @@ def test_few_or_no_gaussians(n, hidden, dtype):
             for grad in grads:
                 assert grad is None or grad.isfinite().all()
                 assert not hidden or grad is None or not grad.any()
-
-
-def test_twenty_thousand_coincident_gaussians():
-    # all at one place, each 10 pixels large: the picture of the first few, the rest is behind them
-    scene = [t[:1].expand(20_000, *t.shape[1:]).float() for t in make_scene(50)]
-    scene[0] = torch.tensor([0, 0, 3.0]).expand(20_000, 3)
-    scene[3] = torch.full((20_000,), 0.5)
-    view, K = (t.float()[None] for t in camera_askew())
-
-    def run(n):
-        leaves = [t[:n].clone().requires_grad_() for t in scene]
-        image, alpha, _ = rasterization(*leaves, view, K, 37, 29, sh_degree=3)
-        return image, alpha, torch.autograd.grad(image.sum(), leaves)
-
-    image, alpha, grads = run(20_000)
-    assert image.isfinite().all() and alpha.max() > 0.999
-    assert all(g.isfinite().all() for g in grads)
-    middle = (slice(None), slice(11, 15), slice(18, 22))
-    few, _, _ = run(30)
-    assert (image[middle] - few[middle]).abs().max() < 1e-6  # half of the light stops at each: 13 suffice for 1e-4
-    # at the rim each stops 1/255: ln(1e4) x 255 = 2349 of them end the pixel, and the rest is seen nowhere
-    assert not any(g[2400:].any() for g in grads) and grads[3][1000:].any()

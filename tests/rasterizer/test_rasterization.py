@@ -139,26 +139,6 @@ def test_render_modes_agree():
     assert (render("ED")[0][inside] > 0.5).all()
 
 
-def test_background_shows_where_nothing_is():
-    scene = splats_in_view(5, scale=-4.0)
-    view, K, w, h = *camera_askew(), 37, 29
-    background = torch.tensor([[0.2, 0.5, 0.9]], dtype=F64)
-    image, alpha, _ = rasterization(*scene, view[None], K[None], w, h, sh_degree=0, backgrounds=background)
-    empty = alpha[0, ..., 0] == 0
-    assert empty.any()
-    torch.testing.assert_close(image[0][empty], background.expand(int(empty.sum()), 3))
-
-
-def test_coefficients_in_two_tensors_draw_the_same_picture():
-    means, quats, scales, opacities, sh = leaves(splats_in_view(40))
-    view, K, w, h = *camera_askew(), 37, 29
-    drawn = []
-    for colors in (sh, (sh[:, 0], sh[:, 1:])):
-        image, _, _ = rasterization(means, quats, scales, opacities, colors, view[None], K[None], w, h, sh_degree=3)
-        drawn.append((image, *torch.autograd.grad(image.square().sum(), (sh, means))))
-    assert all(torch.equal(a, b) for a, b in zip(*drawn, strict=True)) and drawn[0][1].any()
-
-
 def test_tiles_hold_every_pair_that_draws_and_few_others():
     scene = splats_in_view(200, seed=9, scale=-2.5, spread=1.5)
     view, K, w, h = *camera_askew(cx=30.0, cy=20.0), 61, 43

@@ -5,25 +5,16 @@ import math
 import pytest
 import torch
 
-from pointsplat_ns.gaussians import Gaussians
+from making import normal_scene
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.refiner.augmentation import Transform, random_transform, sh_matrix
 
 
 def a_scene(n=40, sh_degree=3, dtype=torch.float64, seed=0):
-    g = torch.Generator().manual_seed(seed)
-
-    def r(*shape):
-        return torch.randn(*shape, generator=g, dtype=dtype)
-
-    return Gaussians(
-        means=r(n, 3),
-        scales=r(n, 3) * 0.5 - 2,
-        quats=r(n, 4),
-        opacities=r(n, 1),
-        features_dc=0.3 * r(n, 3),
-        features_rest=0.1 * r(n, (sh_degree + 1) ** 2 - 1, 3),
+    scene = normal_scene(n, sh_degree, seed, dtype)
+    return scene.replace(
+        scales=0.5 * scene.scales - 2, features_dc=0.3 * scene.features_dc, features_rest=0.1 * scene.features_rest
     )
 
 

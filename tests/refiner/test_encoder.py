@@ -37,20 +37,6 @@ def test_without_appearance_and_position_only_geometry_is_left():
     assert torch.equal(placed(f), placed.geometry(f_p) + placed.position(f.positions))
 
 
-def test_layers_have_the_published_widths():
-    shapes = {name: tuple(p.shape) for name, p in DualBranchEncoder(preset("full")).named_parameters() if p.dim() == 2}
-    assert shapes == {
-        "geometry.0.weight": (32, 10),
-        "geometry.3.weight": (32, 32),
-        "position.0.weight": (32, 3),
-        "position.2.weight": (32, 32),
-        "color.0.weight": (32, 45),
-        "color.2.weight": (8, 32),
-        "appearance.0.weight": (32, 12),
-        "appearance.3.weight": (32, 32),
-    }
-
-
 def test_the_concatenating_baseline_holds_every_number_once():
     f = features()
     out = ConcatEncoder()(f)

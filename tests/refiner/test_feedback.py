@@ -9,7 +9,6 @@ from safetensors.torch import save_file
 from pointsplat_ns.refiner.feedback import (
     FEATURES,
     FORMAT,
-    MAX_LOG_FACTOR,
     PARAMETERS,
     PRETRAINED,
     FeedbackRefiner,
@@ -30,8 +29,8 @@ def trained() -> FeedbackRefiner:
 def test_factors_are_bounded_whatever_comes_in():
     factors = trained()(100 * torch.randn(50, FEATURES))
     assert factors.shape == (50, len(PARAMETERS))
-    assert float(factors.log().abs().max()) <= MAX_LOG_FACTOR + 1e-5
-    assert float(factors.log().abs().max()) > 0.5 * MAX_LOG_FACTOR, "weights of this size use the range"
+    assert float(factors.log().abs().max()) <= FeedbackRefiner.MAX_LOG_FACTOR + 1e-5
+    assert float(factors.log().abs().max()) > 0.5 * FeedbackRefiner.MAX_LOG_FACTOR, "weights of this size use the range"
 
 
 def test_a_file_gives_back_the_network(tmp_path):
@@ -53,10 +52,9 @@ def test_the_network_that_ships_is_there_and_trained():
     [
         (torch.zeros(0), "another", "not a feedback refiner"),
         (None, FORMAT, "expected"),
-        (torch.zeros(3), FORMAT, "expected"),
         (torch.nan, FORMAT, "NaN or Inf"),
     ],
-    ids=["format", "missing", "shape", "nan"],
+    ids=["format", "missing", "nan"],
 )
 def test_a_file_of_another_kind_is_refused(tmp_path, bias, form, message):
     state = trained().state_dict()
@@ -65,14 +63,5 @@ def test_a_file_of_another_kind_is_refused(tmp_path, bias, form, message):
     else:
         state["mlp.0.bias"] = bias if isinstance(bias, torch.Tensor) else torch.full_like(state["mlp.0.bias"], bias)
     save_file(state, tmp_path / "a.safetensors", metadata={"format": form})
-    with pytest.raises(WeightsError, match=message):
-        read_feedback_refiner(tmp_path / "a.safetensors")
-
-
-@pytest.mark.parametrize(("content", "message"), [(b"half", "not a readable"), (None, "no such file")])
-def test_a_damaged_or_missing_file_is_refused(tmp_path, content, message):
-    if content:
-        save_feedback_refiner(trained(), tmp_path / "a.safetensors")
-        (tmp_path / "a.safetensors").write_bytes((tmp_path / "a.safetensors").read_bytes()[:1000])
     with pytest.raises(WeightsError, match=message):
         read_feedback_refiner(tmp_path / "a.safetensors")

@@ -93,10 +93,6 @@ def test_each_size_trains_on_hard_scenes_with_finite_gradients(size, changes, en
         assert_finite(refiner, scene, name)
 
 
-def test_a_scene_of_no_gaussians_comes_back():
-    assert len(small_refiner()(Gaussians.empty(sh_degree=2))) == 0
-
-
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
 @pytest.mark.parametrize("name", ["means", "scales", "quats", "features_dc", "features_rest"])
 def test_unusable_gaussians_come_back_unchanged_and_the_others_as_if_those_were_not_there(name, bad):

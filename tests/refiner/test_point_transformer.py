@@ -3,10 +3,8 @@ import torch
 import torch.nn.functional as F
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.refiner import rows as rows_module
 from pointsplat_ns.refiner.config import preset
 from pointsplat_ns.refiner.encoder import BatchNorm, SceneNorm
-from pointsplat_ns.refiner.patches import add_by_patches
 from pointsplat_ns.refiner.point_transformer import Block, PatchAttention, PointTransformer, SubmanifoldConv
 from pointsplat_ns.refiner.structure import build_structure
 
@@ -29,12 +27,12 @@ def plain_attention(module: PatchAttention, x: torch.Tensor) -> torch.Tensor:
     return module.proj((weight @ v).transpose(0, 1).reshape(m, c))
 
 
-@pytest.mark.parametrize("patch", [20, 64])
-def test_attention_with_one_patch_is_plain_attention_whatever_the_order(patch):
+@pytest.mark.parametrize(("n", "patch"), [(1, 6), (20, 20), (20, 64)])
+def test_attention_with_one_patch_is_plain_attention_whatever_the_order(n, patch):
     torch.manual_seed(0)
     module = PatchAttention(12, 3, patch).double()
-    x = torch.randn(20, 12, dtype=torch.float64)
-    order = torch.randperm(20)
+    x = torch.randn(n, 12, dtype=torch.float64)
+    order = torch.randperm(n)
     expected = plain_attention(module, x)
     assert torch.allclose(module(x, None), expected, atol=1e-12)
     assert torch.allclose(module(x, (order, order.argsort())), expected, atol=1e-12)
@@ -54,27 +52,6 @@ def test_patches_attend_within_themselves_and_the_last_borrows_from_before():
         ]
     )
     assert torch.allclose(module(x, (order, order.argsort()))[order], expected, atol=1e-12)
-
-
-def test_attention_of_one_point_is_its_own_value():
-    torch.manual_seed(0)
-    module = PatchAttention(8, 2, 6)
-    x = torch.randn(1, 8)
-    assert torch.allclose(module(x, None), module.proj(module.qkv(x)[:, 16:]), atol=1e-6)
-
-
-@pytest.mark.parametrize("n", [5, 20, 47])
-@pytest.mark.parametrize("ordered", [False, True])
-def test_attention_added_in_place_is_the_sum_even_where_the_last_patch_borrows(n, ordered, monkeypatch):
-    monkeypatch.setattr(rows_module, "MAX_ELEMENTS", 2**8)  # one patch at a time
-    torch.manual_seed(0)
-    module, norm = PatchAttention(12, 3, 10).double(), torch.nn.LayerNorm(12).double()
-    x, along = torch.randn(n, 12, dtype=torch.float64), torch.randperm(n)
-    order = (along, along.argsort()) if ordered else None
-    with torch.no_grad():
-        expected = x + module(norm(x), order)
-        added = add_by_patches(lambda part: module(norm(part)), x.clone(), module.qkv.out_features, 10, order)
-    assert torch.allclose(added, expected, atol=1e-12)
 
 
 def test_convolution_gives_points_of_one_cell_the_convolution_of_their_mean():

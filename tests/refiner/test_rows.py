@@ -4,7 +4,7 @@ import torch
 from making import move_zero_layers, normal_scene
 from pointsplat_ns.refiner import Refiner, preset
 from pointsplat_ns.refiner import rows as rows_module
-from pointsplat_ns.refiner.rows import MAX_ELEMENTS, add_by_rows, by_rows, rows_at_a_time
+from pointsplat_ns.refiner.rows import MAX_ELEMENTS, by_rows, rows_at_a_time
 
 
 @pytest.mark.parametrize("width,multiple", [(64, 1), (192, 1024), (3 * 512, 1024), (10 * MAX_ELEMENTS, 7)])
@@ -28,24 +28,6 @@ def test_parts_make_the_whole(n, grad):
         out = by_rows(function, x, 8)
     assert torch.equal(out, (x * 2).sum(dim=1, keepdim=True))
     assert sum(taken) == n and max(taken) <= 8
-
-
-def test_gradients_pass_through_parts():
-    x = torch.randn(11, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
-    assert torch.autograd.gradcheck(lambda a: by_rows(torch.tanh, a, 4), (x,))
-
-
-@pytest.mark.parametrize("n", [0, 1, 8, 23])
-@pytest.mark.parametrize("ordered", [False, True])
-def test_rows_are_added_in_place_and_those_beyond_the_stop_left_alone(n, ordered):
-    g = torch.Generator().manual_seed(0)
-    x, order = torch.randn(n, 3, dtype=torch.float64, generator=g), torch.randperm(n, generator=g)
-    stop = n * 2 // 3
-    expected = x + x.square()
-    kept = (order if ordered else torch.arange(n))[stop:]
-    assert torch.equal(add_by_rows(torch.square, x.clone(), 8, order if ordered else None), expected)
-    expected[kept] = x[kept]
-    assert torch.equal(add_by_rows(torch.square, x, 8, order if ordered else None, stop), expected)
 
 
 @pytest.mark.parametrize("size", ["tiny", "small"])

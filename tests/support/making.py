@@ -8,7 +8,7 @@ import math
 import os
 import shlex
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from unittest import mock
@@ -18,6 +18,7 @@ import torch
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.system.kernels import on_threads
+from pointsplat_ns.system.threads import fixed_threads
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 LAB = REPOSITORY / "lab"
@@ -58,6 +59,15 @@ def equal(a: object, b: object) -> bool:
     if isinstance(a, dict) and isinstance(b, dict):
         return a.keys() == b.keys() and all(equal(a[name], b[name]) for name in a)
     return torch.equal(a, b) if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor) else a == b
+
+
+def assert_same_on_any_threads(function: Callable[[], Sequence[torch.Tensor]]) -> None:
+    """Fail unless the tensors that a function gives have the same bits on one thread, two and five."""
+    results = []
+    for threads in (1, 2, 5):
+        with fixed_threads(threads):
+            results.append(function())
+    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
 
 
 def record_kernels(monkeypatch, *modules) -> list:

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from pointsplat_ns.tables.cells import BINS, About, Cell, CellJournal
-from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_CELLS, Way, all_cells, cell_key
+from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_4, Way, all_cells, cell_key
 from pointsplat_ns.tradeoff.points import Point, Quality
 
 IDENTITY = {"file": "abc", "machine": "a machine", "most views": 3}
@@ -19,7 +19,7 @@ def about(name: str, group: str = "scenes", dataset: str = "") -> About:
 
 def cell(name: str, way: Way, share: float, psnr: float, photos: float | None) -> Cell:
     """A cell of a scene of 1,000 Gaussians, of a PSNR against renders and, if there are any, photos."""
-    shown = (way.name, share) in FIGURE_CELLS
+    shown = (way, share) in FIGURE_4
     middle = (*(0 for _ in range(9)), 7)
     point = Point(
         key=cell_key(name, way, share),

@@ -12,7 +12,7 @@ from making import box_room
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.tables import making
 from pointsplat_ns.tables.cells import CELLS
-from pointsplat_ns.tables.ways import FIGURE_CELLS, Network, all_cells
+from pointsplat_ns.tables.ways import FIGURE_4, Network, all_cells
 from pointsplat_ns.tradeoff.judging import Judge
 
 
@@ -52,7 +52,7 @@ def test_every_cell_can_be_measured_and_says_by_what(measured, all_weights, peer
         assert cell.point.command.startswith("pointsplat tables ") and f"--only {cell.point.key}" in cell.point.command
         assert cell.version == ps.__version__ and cell.seed == 0
         assert cell.point.against_photos is None and (cell.point.against_dense.psnr < 100 or cell.point == dense)
-        assert (cell.opacities is not None) == ((way, share) in FIGURE_CELLS)
+        assert (cell.opacities is not None) == ((way, share) in {(shown.name, kept) for shown, kept in FIGURE_4})
     psnr = {way: cell.point.against_dense.psnr for (way, share), cell in cells.items() if share == 0.3}
     assert psnr["lightgaussian-tuned"] != psnr["lightgaussian"] and psnr["pointsplat"] != psnr["paper"]
     assert psnr["splat-transform"] != psnr["splat-transform-adaptive"]

@@ -1,7 +1,6 @@
-// The inner loops of blending for float32 on a CPU: which Gaussian touches which tile, a tile's Gaussians front to back,
-// and their gradients.
+// The inner loops of blending for float32 on a CPU: the Gaussians of a tile front to back, and their gradients.
 //
-// blending.py compiles this file where there is a C++ compiler and calls it; tiles.py and blocks.py do the same in torch.
+// blending.py compiles this file where there is a C++ compiler and calls it; blocks.py does the same in torch.
 // Both follow the rule of alpha.py and the algebra of quadratics.py, whose names are used here. A tile has 8 x 8 pixels; a
 // row of them is one vector. Each tile is drawn by one thread from front to back, so that the number of threads changes
 // nothing.
@@ -17,7 +16,7 @@ constexpr int MOMENTS = 6;   // w, w^2, dv, dv^2, w dv, 1
 constexpr int COLOR = 6;     // first column of the colours in the table
 constexpr float HALF = 0.5f * (TILE - 1);
 constexpr float LN2 = 0.693147180559945f, LOG2E = 1.44269504088896f;
-constexpr float SLACK = 1e-3f;  // log2 alpha: rounding never leaves out a pixel that is drawn
+constexpr float ROUNDING = 1e-3f;  // log2 alpha: no pixel that is drawn is left out
 
 typedef Lane Row;  // of pixels
 static_assert(LANES == TILE, "a row of a tile is one vector");
@@ -55,7 +54,7 @@ inline Row exp2_of(Row x) {
 
 extern "C" {
 
-// What is blended, and where to. Tiles are those of a region of one or several images of equal size, row by row.
+// Input and output of blending. Tiles are those of a region of one or several images of equal size, row by row.
 struct Task {
     const float* table;        // [M, COLOR + channels], of pointsplat_tabulate
     const int64_t* gaussians;  // [P] rows of the table, by tile and front to back
@@ -71,7 +70,6 @@ struct Task {
     const float* grad_final;  // as final_
     float* sums;              // [P, MOMENTS + channels (+ 2)] gradient sums of each pair
     int64_t absolute;         // whether sums has two columns more
-    int64_t* next;            // the first tile that no thread has taken
 };
 
 }  // extern "C"
@@ -104,7 +102,7 @@ struct Chunk {
         }
     }
 
-    bool reaches(int k, int row, float log2_alpha_min) const { return !(bound[k][row] < log2_alpha_min - SLACK); }
+    bool reaches(int k, int row, float log2_alpha_min) const { return !(bound[k][row] < log2_alpha_min - ROUNDING); }
 
     Row w_of(int k, int row) const { return OFFSETS + w[k][row]; }
 
@@ -171,7 +169,7 @@ void blend_tile(const Task& task, int64_t tile) {
     }
 }
 
-// The gradient sums of one Gaussian of a chunk on a tile, and what lies behind the Gaussian in front of it.
+// Writes the gradient sums of one Gaussian of a chunk on a tile, and adds its part to ``behind``.
 template <int D, bool ABSOLUTE>
 void pass_back(const Task& task, const Chunk<D>& chunk, int k, const Row (&alphas)[TILE], const Row (&weights)[TILE],
                const Row (&pixels)[TILE][D], Row (&behind)[TILE], float* out) {
@@ -236,9 +234,9 @@ void differentiate_tile(const Task& task, int64_t tile) {
 }
 
 template <typename Work>
-void each_tile(const Task& task, Work work) {
+void each_tile(const Task& task, int64_t* next, Work work) {
     for (;;) {
-        const int64_t first = __atomic_fetch_add(task.next, GRAB, __ATOMIC_RELAXED);
+        const int64_t first = __atomic_fetch_add(next, GRAB, __ATOMIC_RELAXED);
         if (first >= task.tiles) return;
         for (int64_t tile = first; tile < first + GRAB && tile < task.tiles; ++tile) work(task, tile);
     }
@@ -252,11 +250,11 @@ void each_gaussian(int64_t* next, int64_t count, Work work) {
 }
 
 template <int D>
-void differentiate_all(const Task& task) {
+void differentiate_all(const Task& task, int64_t* next) {
     if (task.absolute)
-        each_tile(task, differentiate_tile<D, true>);
+        each_tile(task, next, differentiate_tile<D, true>);
     else
-        each_tile(task, differentiate_tile<D, false>);
+        each_tile(task, next, differentiate_tile<D, false>);
 }
 
 }  // namespace
@@ -265,21 +263,21 @@ extern "C" {
 
 int pointsplat_chunk() { return CHUNK; }
 
-void pointsplat_blend(const Task* task) {
+void pointsplat_blend(const Task* task, int64_t* next) {
     switch (task->channels) {
-        case 1: return each_tile(*task, blend_tile<1>);
-        case 2: return each_tile(*task, blend_tile<2>);
-        case 3: return each_tile(*task, blend_tile<3>);
-        case 4: return each_tile(*task, blend_tile<4>);
+        case 1: return each_tile(*task, next, blend_tile<1>);
+        case 2: return each_tile(*task, next, blend_tile<2>);
+        case 3: return each_tile(*task, next, blend_tile<3>);
+        case 4: return each_tile(*task, next, blend_tile<4>);
     }
 }
 
-void pointsplat_differentiate(const Task* task) {
+void pointsplat_differentiate(const Task* task, int64_t* next) {
     switch (task->channels) {
-        case 1: return differentiate_all<1>(*task);
-        case 2: return differentiate_all<2>(*task);
-        case 3: return differentiate_all<3>(*task);
-        case 4: return differentiate_all<4>(*task);
+        case 1: return differentiate_all<1>(*task, next);
+        case 2: return differentiate_all<2>(*task, next);
+        case 3: return differentiate_all<3>(*task, next);
+        case 4: return differentiate_all<4>(*task, next);
     }
 }
 
@@ -294,7 +292,7 @@ void pointsplat_gather(const float* sums, const int64_t* pairs, const int64_t* s
     });
 }
 
-// What a tile reads of a Gaussian: x, y (pixels), r, a, d (log2 per pixels^2), log2 opacity, the colour; as
+// Row of the table for each Gaussian: x, y (pixels), r, a, d (log2 per pixels^2), log2 opacity, the colour; as
 // quadratics.table_of.
 void pointsplat_tabulate(const float* means2d, const float* cov2d, const float* det, const float* opacities,
                          const float* colors, int64_t count, int64_t channels, float* table, int64_t* next) {

@@ -1,12 +1,11 @@
-"""Blending by compiled kernels (``blending.cpp``): what :mod:`~pointsplat_ns.rasterizer.blocks` does in torch.
+"""Blending by compiled kernels (``blending.cpp``), as :mod:`~pointsplat_ns.rasterizer.blocks` does it in torch.
 
-For float32 on a CPU, where the machine has a C++ compiler. Without a compiler, or if what it made does not draw as
-torch does, blending stays with torch.
+For float32 on a CPU, where the machine has a C++ compiler. Without a compiler, or if the compiled code does not
+agree with torch, torch blends.
 """
 
 from __future__ import annotations
 
-import ctypes
 import math
 import sys
 from pathlib import Path
@@ -17,33 +16,11 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer import blocks
 from pointsplat_ns.rasterizer.alpha import CLAMPED
-from pointsplat_ns.rasterizer.constants import ALPHA_MAX, EXACT, Quality
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, Quality
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
 from pointsplat_ns.rasterizer.tiles import Footprints, TileList
-from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
-
-_FEW_PAIRS = 2000
-"""Pairs that one thread blends sooner than several can be asked."""
-
-
-class _Task(ctypes.Structure):
-    """``struct Task`` of the kernels."""
-
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("table", "gaussians", "offsets", "chunks")),
-        *(
-            (name, ctypes.c_int64)
-            for name in ("tiles", "rows", "columns", "top", "left", "width", "height", "channels")
-        ),
-        *(
-            (name, ctypes.c_float)
-            for name in ("log2_alpha_min", "alpha_min", "alpha_max", "clamped_from", "transmittance_min")
-        ),
-        *((name, ctypes.c_void_p) for name in ("image", "final", "before", "blended")),
-        *((name, ctypes.c_void_p) for name in ("grad_image", "grad_final", "sums")),
-        ("absolute", ctypes.c_int64),
-        ("next", ctypes.c_void_p),
-    )
+from pointsplat_ns.system.declarations import Struct
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
 
 
 class KernelInputs(NamedTuple):
@@ -79,36 +56,31 @@ def inputs_of(
     """As :meth:`~pointsplat_ns.rasterizer.frame.Inputs.of`, without what only torch needs."""
     count, channels = colors.shape
     tensors = [tensor.contiguous() for tensor in (means2d, cov2d, det, opacities, colors)]
-    # Six columns of geometry, then the colours.
-    table, next_row = colors.new_empty(count, 6 + channels), torch.zeros(1, dtype=torch.int64)
-    on_threads(
-        count >= _FEW_PAIRS, KERNELS.library.pointsplat_tabulate, *(tensor.data_ptr() for tensor in tensors), count,
-        channels, table.data_ptr(), next_row.data_ptr(),
-    )  # fmt: skip
+    table = colors.new_empty(count, 6 + channels)  # six columns of geometry, then the colours
+    on_threads(count >= SEVERAL, KERNELS.library.pointsplat_tabulate, *tensors, count, channels, table)
     return KernelInputs(table, channels, quality)
 
 
 def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list[Tensor]:
     """As :func:`~pointsplat_ns.rasterizer.quadratics.chain`."""
-    count, next_row = len(summed), torch.zeros(1, dtype=torch.int64)
+    count = len(summed)
     cov2d, det, opacities = cov2d.contiguous(), det.contiguous(), opacities.contiguous()
     grads = [det.new_empty(count, 2), torch.empty_like(cov2d), torch.empty_like(det), torch.empty_like(opacities)]
     on_threads(
-        count >= _FEW_PAIRS, KERNELS.library.pointsplat_chain, summed.data_ptr(), summed.stride(0), cov2d.data_ptr(),
-        det.data_ptr(), opacities.data_ptr(), count, *(grad.data_ptr() for grad in grads), next_row.data_ptr(),
+        count >= SEVERAL, KERNELS.library.pointsplat_chain, summed.data_ptr(), summed.stride(0), cov2d, det,
+        opacities, count, *grads,
     )  # fmt: skip
     return grads
 
 
-def _task(footprints: Footprints, tiles: TileList, inputs: KernelInputs, chunks: Tensor, next_tile: Tensor) -> _Task:
-    """A task without its outputs. It keeps none of the tensors alive."""
+def _task(footprints: Footprints, tiles: TileList, inputs: KernelInputs, chunks: Tensor, final: Tensor) -> Struct:
     region, quality = tiles.region, inputs.quality
-    return _Task(
-        table=inputs.table.data_ptr(), gaussians=tiles.gaussians.data_ptr(), offsets=tiles.offsets.data_ptr(),
-        chunks=chunks.data_ptr(), tiles=tiles.offsets.numel() - 1, rows=region.rows, columns=region.columns,
-        top=region.top, left=region.left, width=footprints.width, height=footprints.height, channels=inputs.channels,
+    return KERNELS.structs["Task"](
+        table=inputs.table, gaussians=tiles.gaussians, offsets=tiles.offsets, chunks=chunks,
+        tiles=tiles.offsets.numel() - 1, rows=region.rows, columns=region.columns, top=region.top, left=region.left,
+        width=footprints.width, height=footprints.height, channels=inputs.channels,
         log2_alpha_min=math.log2(quality.alpha_min), alpha_min=quality.alpha_min, alpha_max=ALPHA_MAX,
-        clamped_from=CLAMPED, transmittance_min=quality.transmittance_min, next=next_tile.data_ptr(),
+        clamped_from=CLAMPED, transmittance_min=quality.transmittance_min, final_=final,
     )  # fmt: skip
 
 
@@ -121,11 +93,10 @@ def blend_region(
     chunks = torch.zeros_like(tiles.offsets)
     torch.cumsum((tiles.offsets.diff() + (size - 1)).div_(size, rounding_mode="floor"), 0, out=chunks[1:])
     before = image.new_empty(int(chunks[-1]) if keep_tape else 0, PIXELS)
-    blended, next_tile = torch.empty_like(tiles.offsets[1:]), torch.zeros_like(tiles.offsets[:1])
-    task = _task(footprints, tiles, inputs, chunks, next_tile)
-    task.image, task.final, task.blended = image.data_ptr(), final.data_ptr(), blended.data_ptr()
-    task.before = before.data_ptr() if keep_tape and len(before) else None
-    on_threads(tiles.gaussians.numel() >= _FEW_PAIRS, library.pointsplat_blend, ctypes.byref(task))
+    blended = torch.empty_like(tiles.offsets[1:])
+    task = _task(footprints, tiles, inputs, chunks, final)
+    task.fill(image=image, blended=blended, before=before if keep_tape and len(before) else None)
+    on_threads(tiles.gaussians.numel() >= SEVERAL, library.pointsplat_blend, task)
     return KernelTape(before, blended, chunks) if keep_tape else None
 
 
@@ -144,24 +115,19 @@ def differentiate_region(
     pairs, count = tiles.gaussians.numel(), tiles.order.numel()
     columns = MOMENTS + inputs.channels + (2 if absgrad else 0)
     sums, out = grad_image.new_empty(pairs, columns), grad_image.new_empty(count, columns)
-    grad_image, grad_final = grad_image.contiguous(), grad_final.contiguous()
-    next_tile = torch.zeros_like(tiles.offsets[:1])
-    task = _task(footprints, tiles, inputs, tape.chunks, next_tile)
-    task.final, task.before, task.blended = final.data_ptr(), tape.before.data_ptr(), tape.blended.data_ptr()
-    task.grad_image, task.grad_final = grad_image.data_ptr(), grad_final.data_ptr()
-    task.sums, task.absolute = sums.data_ptr(), int(absgrad)
-    on_threads(pairs >= _FEW_PAIRS, library.pointsplat_differentiate, ctypes.byref(task))
+    task = _task(footprints, tiles, inputs, tape.chunks, final)
+    task.fill(
+        before=tape.before, blended=tape.blended, grad_image=grad_image.contiguous(),
+        grad_final=grad_final.contiguous(), sums=sums, absolute=int(absgrad),
+    )  # fmt: skip
+    on_threads(pairs >= SEVERAL, library.pointsplat_differentiate, task)
 
-    # sums of pairs, one after the other for each Gaussian
+    # the sum of each Gaussian's pairs, in the order of its tiles
     by_gaussian = torch.empty_like(tiles.places)
     by_gaussian.index_copy_(0, tiles.places, torch.arange(pairs))
     starts = torch.zeros(count + 1, dtype=torch.int64)
     torch.cumsum(tiles.counts, 0, out=starts[1:])
-    next_tile.zero_()
-    on_threads(
-        pairs >= _FEW_PAIRS, library.pointsplat_gather, sums.data_ptr(), by_gaussian.data_ptr(), starts.data_ptr(),
-        tiles.order.data_ptr(), count, columns, out.data_ptr(), next_tile.data_ptr(),
-    )  # fmt: skip
+    on_threads(pairs >= SEVERAL, library.pointsplat_gather, sums, by_gaussian, starts, tiles.order, count, columns, out)
     return out
 
 
@@ -185,7 +151,7 @@ def _as_torch() -> bool:
     tiles = footprints.tiles(footprints.whole)
     for engine in (blocks, sys.modules[__name__]):
         image, final = torch.empty(number, 3, PIXELS), torch.empty(number, PIXELS)
-        inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, EXACT)
+        inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, Quality())
         tape = engine.blend_region(footprints, tiles, inputs, image, final, True)
         summed = engine.differentiate_region(footprints, tiles, inputs, tape, final, *grads, True)
         drawn.append((image, final, summed, *engine.chain(summed[:, :MOMENTS], cov2d, det, opacities)))
@@ -193,20 +159,4 @@ def _as_torch() -> bool:
     return agreement(ours, torchs, off=1e-3, share=1e-2)  # a pixel at a threshold may fall either way
 
 
-KERNELS = Kernels(
-    "the rasterizer",
-    Path(__file__).with_name("blending.cpp"),
-    {
-        **dict.fromkeys(("pointsplat_blend", "pointsplat_differentiate"), [ctypes.c_void_p]),
-        "pointsplat_gather": [ctypes.c_void_p] * 4 + [ctypes.c_int64] * 2 + [ctypes.c_void_p] * 2,
-        "pointsplat_tabulate": [ctypes.c_void_p] * 5 + [ctypes.c_int64] * 2 + [ctypes.c_void_p] * 2,
-        "pointsplat_chain": [
-            ctypes.c_void_p,
-            ctypes.c_int64,
-            *[ctypes.c_void_p] * 3,
-            ctypes.c_int64,
-            *[ctypes.c_void_p] * 5,
-        ],
-    },
-    _as_torch,
-)
+KERNELS = Kernels("the rasterizer", Path(__file__).with_name("blending.cpp"), _as_torch)

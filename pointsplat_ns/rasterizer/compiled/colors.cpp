@@ -19,11 +19,6 @@ struct Colors {
     const float* grad_colors;                // as colors; null forward
     float* grad_directions;                  // as directions; or null
     float *grad_first, *grad_rest;           // as the coefficients, zeros before; or null
-    int64_t* next;
-
-    const float* coefficient(int64_t row, int k) const {
-        return k ? rest + ids[row] * rest_row + 3 * (k - 1) : first + ids[row] * first_row;
-    }
 };
 
 }  // extern "C"
@@ -34,6 +29,10 @@ constexpr float C0 = 0.28209479177387814f, C1 = 0.4886025119029199f;
 constexpr float C2[3] = {1.0925484305920792f, 0.31539156525252005f, 0.5462742152960396f};
 constexpr float C3[5] = {0.5900435899266435f, 2.890611442640554f, 0.4570457994644658f, 0.3731763325901154f,
                          1.445305721320277f};
+
+inline const float* coefficient(const Colors& task, int64_t row, int k) {
+    return k ? task.rest + task.ids[row] * task.rest_row + 3 * (k - 1) : task.first + task.ids[row] * task.first_row;
+}
 
 template <int DEGREE>
 void basis_of(const Lane (&unit)[3], Lane* out) {
@@ -78,13 +77,13 @@ void basis_backward(const Lane (&unit)[3], const Lane* grad, Lane (&out)[3]) {
     out[0] = gx, out[1] = gy, out[2] = gz;
 }
 
-// Has the coefficients of some Gaussians brought to the cache: they lie apart, so that nothing else foresees it.
+// Prefetches the coefficients of some Gaussians: they are scattered in memory, where no processor predicts them.
 template <int USED>
 void fetch(const Colors& task, const Lanes& rows) {
     for (int64_t row : rows.rows) {
-        __builtin_prefetch(task.coefficient(row, 0));
+        __builtin_prefetch(coefficient(task, row, 0));
         if (USED == 1) continue;
-        const float* rest = task.coefficient(row, 1);
+        const float* rest = coefficient(task, row, 1);
         for (int at = 0; at < 3 * (USED - 1); at += 16) __builtin_prefetch(rest + at);
     }
 }
@@ -100,7 +99,7 @@ void color_lanes(const Colors& task, const Lanes& rows) {
     float basis[USED][LANES];
     std::memcpy(basis, lanes, sizeof(lanes));
     for (int lane = 0; lane < rows.count; ++lane) {
-        const float *first = task.coefficient(rows.rows[lane], 0), *rest = task.coefficient(rows.rows[lane], 1);
+        const float *first = coefficient(task, rows.rows[lane], 0), *rest = coefficient(task, rows.rows[lane], 1);
         float sum[3];
         for (int c = 0; c < 3; ++c) sum[c] = basis[0][lane] * first[c];
         for (int k = 1; k < USED; ++k)
@@ -128,7 +127,7 @@ void color_backward_lanes(const Colors& task, const Lanes& rows) {
         for (int c = 0; c < 3; ++c) grad[c] = task.colors[3 * row + c] > 0.0f ? task.grad_colors[3 * row + c] : 0.0f;
         if (task.grad_directions) {
             for (int k = 0; k < USED; ++k) {
-                const float* sh = task.coefficient(row, k);
+                const float* sh = coefficient(task, row, k);
                 grad_basis[k][lane] = sh[0] * grad[0] + sh[1] * grad[1] + sh[2] * grad[2];
             }
         }
@@ -152,9 +151,9 @@ void color_backward_lanes(const Colors& task, const Lanes& rows) {
 }
 
 template <int DEGREE>
-void color_all(const Colors& task) {
+void color_all(const Colors& task, int64_t* next) {
     const auto work = task.grad_colors ? color_backward_lanes<DEGREE> : color_lanes<DEGREE>;
-    each_range(task.next, task.count, [&](int64_t, int64_t first, int64_t last) {
+    each_range(next, task.count, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t at = first; at < last; at += LANES) work(task, Lanes(at, last - at));
     });
 }
@@ -164,12 +163,12 @@ void color_all(const Colors& task) {
 extern "C" {
 
 // Colours, or their gradients if ``grad_colors`` is there.
-void pointsplat_color(const Colors* task) {
+void pointsplat_color(const Colors* task, int64_t* next) {
     switch (task->degree) {
-        case 0: return color_all<0>(*task);
-        case 1: return color_all<1>(*task);
-        case 2: return color_all<2>(*task);
-        case 3: return color_all<3>(*task);
+        case 0: return color_all<0>(*task, next);
+        case 1: return color_all<1>(*task, next);
+        case 2: return color_all<2>(*task, next);
+        case 3: return color_all<3>(*task, next);
     }
 }
 

@@ -5,7 +5,6 @@ For float32 on a CPU, where the machine has a C++ compiler.
 
 from __future__ import annotations
 
-import ctypes
 from pathlib import Path
 
 import numpy as np
@@ -14,30 +13,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.rasterizer.spherical_harmonics import Color
-from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
-
-
-class _Colors(ctypes.Structure):
-    """``struct Colors`` of the kernels."""
-
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("directions", "first", "rest")),
-        *((name, ctypes.c_int64) for name in ("first_row", "rest_row")),
-        ("ids", ctypes.c_void_p),
-        *((name, ctypes.c_int64) for name in ("count", "degree")),
-        *((name, ctypes.c_void_p) for name in ("colors", "grad_colors", "grad_directions", "grad_first", "grad_rest")),
-        ("next", ctypes.c_void_p),
-    )
-
-
-def can_color(wanted: bool | None, *tensors: Tensor) -> bool:
-    """Whether the kernels compute colours from these directions and coefficients.
-
-    Args:
-        wanted: None where a machine without a compiler is no reason for a warning.
-        tensors: directions and coefficients.
-    """
-    return KERNELS.usable_for(wanted, *tensors)
+from pointsplat_ns.system.declarations import Struct
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
 
 
 class CompiledColor(torch.autograd.Function):
@@ -62,20 +39,19 @@ class CompiledColor(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad):
         directions, coefficients, rest, ids, colors = ctx.saved_tensors
-        grad = grad.contiguous()
         task = _task(directions, coefficients, rest, ids, ctx.degree, colors)
-        task.grad_colors = grad.data_ptr()
         grad_directions = grad_coefficients = grad_rest = None
         if ctx.needs_input_grad[0] and ctx.degree:  # a constant has no direction
             grad_directions = torch.empty_like(directions)
-            task.grad_directions = grad_directions.data_ptr()
         if ctx.needs_input_grad[1]:
             grad_coefficients = _zeros_like(coefficients)
-            task.grad_first, after = _pointers(grad_coefficients, None)
-            task.grad_rest = after if rest is None else None
         if ctx.needs_input_grad[2]:
             grad_rest = _zeros_like(rest)
-            task.grad_rest = grad_rest.data_ptr()
+        first, others = (None, None) if grad_coefficients is None else _pointers(grad_coefficients, None)
+        task.fill(
+            grad_colors=grad.contiguous(), grad_directions=grad_directions, grad_first=first,
+            grad_rest=others if rest is None else grad_rest,
+        )  # fmt: skip
         _call(task)
         return grad_directions, grad_coefficients, grad_rest, None, None
 
@@ -93,21 +69,18 @@ def _pointers(coefficients: Tensor, rest: Tensor | None) -> tuple[int, int]:
 
 def _task(
     directions: Tensor, coefficients: Tensor, rest: Tensor | None, ids: Tensor, degree: int, colors: Tensor
-) -> _Colors:
-    """A task without its gradients. It keeps none of the tensors alive."""
+) -> Struct:
+    """A task without its gradients."""
     first, others = _pointers(coefficients, rest)
-    return _Colors(
-        directions=directions.data_ptr(), first=first, rest=others, first_row=coefficients[:1].numel(),
-        rest_row=(coefficients if rest is None else rest)[:1].numel(), ids=ids.data_ptr(), count=len(ids),
-        degree=degree, colors=colors.data_ptr(),
+    return KERNELS.structs["Colors"](
+        directions=directions, first=first, rest=others, first_row=coefficients[:1].numel(),
+        rest_row=(coefficients if rest is None else rest)[:1].numel(), ids=ids, count=len(ids), degree=degree,
+        colors=colors,
     )  # fmt: skip
 
 
-def _call(task: _Colors) -> None:
-    next_range = torch.zeros(1, dtype=torch.int64)
-    task.next = next_range.data_ptr()
-    # Fewer are drawn sooner by one thread.
-    on_threads(task.count >= 4000, KERNELS.library.pointsplat_color, ctypes.byref(task))
+def _call(task: Struct) -> None:
+    on_threads(task.count >= SEVERAL, KERNELS.library.pointsplat_color, task)
 
 
 def _as_torch() -> bool:
@@ -135,9 +108,4 @@ def _as_torch() -> bool:
     return True
 
 
-KERNELS = Kernels(
-    "the rasterizer",
-    Path(__file__).with_name("colors.cpp"),
-    {"pointsplat_color": [ctypes.c_void_p]},
-    _as_torch,
-)
+KERNELS = Kernels("the rasterizer", Path(__file__).with_name("colors.cpp"), _as_torch)

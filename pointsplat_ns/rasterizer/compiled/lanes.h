@@ -1,5 +1,5 @@
-// What the kernels share: eight numbers at once, of as many Gaussians or of a tile's row of pixels, one in each lane of a
-// vector, and ranges of Gaussians for threads.
+// Shared by the kernels: vectors of eight numbers, of eight Gaussians or of the pixels in a row of a tile, and ranges of
+// Gaussians for threads.
 
 #pragma once
 
@@ -54,7 +54,7 @@ inline Lane dot(const Lane (&a)[D], const Lane (&b)[D]) {
     return sum;
 }
 
-// Each component is of two columns, so that of a needle's is exact.
+// Each component needs two columns only, so it is exact for a needle.
 inline void cross(const Lane (&p)[3], const Lane (&q)[3], Lane (&out)[3]) {
     out[0] = p[1] * q[2] - p[2] * q[1];
     out[1] = p[2] * q[0] - p[0] * q[2];
@@ -74,7 +74,7 @@ inline Lane normalise(Lane (&vector)[D]) {
     return inverse * shrink;
 }
 
-// Rows of up to eight Gaussians. What stands in the lanes behind the last is computed as well, and not written.
+// Rows of up to eight Gaussians. Lanes after the last Gaussian repeat it, and are not stored.
 struct Lanes {
     int64_t rows[LANES];
     int count;
@@ -122,6 +122,7 @@ struct Lanes {
     }
 };
 
+// Calls ``work`` with ranges of ``count`` Gaussians that no other thread has; ``next`` counts those that were taken.
 template <typename Work>
 void each_range(int64_t* next, int64_t count, Work work) {
     for (;;) {

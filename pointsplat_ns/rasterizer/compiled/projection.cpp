@@ -8,7 +8,7 @@
 
 extern "C" {
 
-// A camera and what is drawn of what it sees: ewa.Lens, and the numbers that follow from it.
+// A camera: ewa.Lens, and numbers derived from it.
 struct Camera {
     double view[3][3], centre[3];
     float near_view[3][3];  // view in float32
@@ -42,7 +42,6 @@ struct Projection {
     int64_t* ids;
     float *means2d, *depths, *cov2d, *dets, *opacities, *directions, *beyond;
     int32_t* radii;
-    int64_t* next;  // the first range that no thread has taken
 };
 
 struct ProjectionGradient {
@@ -53,7 +52,6 @@ struct ProjectionGradient {
     const float *grad_means2d, *grad_depths, *grad_cov2d, *grad_det, *grad_opacities, *grad_directions;  // null: zeros
     float *means, *quats, *scales, *opacities;  // as those of the scene; null where not wanted
     double* sums;                               // [ranges, 12] of view and centre; null where not wanted
-    int64_t* next;
 };
 
 }  // extern "C"
@@ -80,7 +78,7 @@ struct Position {
     }
 };
 
-// The projected covariance and what it comes from.
+// The projected covariance and its intermediate values.
 struct Shape {
     Lane tx, ty, unit[4], inverse_length, std[3], rotation[3][3];
     Lane a[3], b[3], turned_a[3], turned_b[3], p1[3], p2[3], normal[3];
@@ -122,7 +120,8 @@ struct Shape {
     Lane compensation(const Camera& camera) const { return root(larger(ratio, ZERO + camera.least_ratio)); }
 };
 
-// Rows that may touch the image, by a bound on their extent that needs no covariance; how many.
+// Writes the rows of Gaussians that may touch the image, by a bound on their extent that needs no covariance. Returns
+// their number.
 int64_t find_candidates(const Projection& task, int64_t first, int64_t last, int64_t* out) {
     const Camera& camera = task.camera;
     int64_t* end = out;
@@ -231,7 +230,7 @@ void sum_camera(const Lanes& lanes, const Position& at, const Shape& s, const La
     }
 }
 
-// The gradients of up to eight Gaussians: ``lanes`` are their rows in the scene, ``rows`` those of what was projected.
+// The gradients of up to eight Gaussians: ``lanes`` are their rows in the scene, ``rows`` in the output of the projection.
 void differentiate_lanes(const ProjectionGradient& task, const Lanes& lanes, const Lanes& rows, double* sums) {
     const Camera& camera = task.camera;
     const Position at(camera, lanes, task.scene.means);
@@ -285,8 +284,8 @@ int64_t pointsplat_range() { return RANGE; }
 
 int64_t pointsplat_seen() { return sizeof(Seen); }
 
-void pointsplat_project(const Projection* task) {
-    each_range(task->next, task->scene.count, [&](int64_t range, int64_t first, int64_t last) {
+void pointsplat_project(const Projection* task, int64_t* next) {
+    each_range(next, task->scene.count, [&](int64_t range, int64_t first, int64_t last) {
         int64_t candidates[RANGE];
         const int64_t number = find_candidates(*task, first, last, candidates);
         Seen *begin = task->seen + first, *end = begin;
@@ -298,7 +297,7 @@ void pointsplat_project(const Projection* task) {
     });
 }
 
-// How many Gaussians of each range no camera can draw: a number that is not finite, a negative scale or opacity.
+// Number of Gaussians in each range that no camera can draw: a number is not finite, or a scale or opacity negative.
 void pointsplat_count_meaningless(const Scene* scene, int64_t* counts, int64_t* next) {
     each_range(next, scene->count, [&](int64_t range, int64_t first, int64_t last) {
         int64_t count = 0;
@@ -315,11 +314,11 @@ void pointsplat_count_meaningless(const Scene* scene, int64_t* counts, int64_t* 
     });
 }
 
-// The arrays of what is drawn, from ``seen``.
-void pointsplat_unpack(const Projection* task) {
+// Copies ``seen`` into the arrays of the output.
+void pointsplat_unpack(const Projection* task, int64_t* next) {
     const Projection& t = *task;
     const double nearest = *std::min_element(t.nearest, t.nearest + (t.scene.count + RANGE - 1) / RANGE);
-    each_range(t.next, t.scene.count, [&](int64_t range, int64_t first, int64_t) {
+    each_range(next, t.scene.count, [&](int64_t range, int64_t first, int64_t) {
         for (int64_t i = 0; i < t.counts[range]; ++i) {
             const Seen& seen = t.seen[first + i];
             const int64_t to = t.offsets[range] + i;
@@ -333,12 +332,12 @@ void pointsplat_unpack(const Projection* task) {
     });
 }
 
-void pointsplat_project_backward(const ProjectionGradient* task) {
+void pointsplat_project_backward(const ProjectionGradient* task, int64_t* next) {
     const ProjectionGradient& t = *task;
     const auto clear = [](float* array, int64_t columns, int64_t first, int64_t last) {
         if (array) std::fill(array + first * columns, array + last * columns, 0.0f);
     };
-    each_range(t.next, t.scene.count, [&](int64_t range, int64_t first, int64_t last) {
+    each_range(next, t.scene.count, [&](int64_t range, int64_t first, int64_t last) {
         clear(t.means, 3, first, last), clear(t.quats, 4, first, last);
         clear(t.scales, 3, first, last), clear(t.opacities, 1, first, last);
         double* sums = t.sums ? t.sums + 12 * range : nullptr;

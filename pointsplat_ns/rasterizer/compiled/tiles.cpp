@@ -1,4 +1,4 @@
-// Which Gaussian touches which tile, for float32 on a CPU.
+// The tiles that each Gaussian touches, for float32 on a CPU.
 //
 // compiled/tiles.py compiles this file where there is a C++ compiler and calls it; ellipses.py does the same in torch,
 // says where the formulas are from, and has the names that are used here.
@@ -9,7 +9,7 @@
 
 namespace {
 
-constexpr int64_t AHEAD = 24;  // Gaussians that are brought to the cache before they are read: they lie apart
+constexpr int64_t AHEAD = 24;  // Gaussians between the one that is prefetched and the one that is read
 
 // First tile with a pixel centre at or after a position.
 inline int64_t tile_from(float position, int64_t tiles) {
@@ -46,14 +46,13 @@ struct Footprints {
     const float *means2d, *cov2d, *det, *opacities;  // of the projected Gaussians, in their own order
     const int64_t* cameras;
     float alpha_min;
-    int64_t* next;
 };
 
-void pointsplat_ellipses(const Footprints* task) {
+void pointsplat_ellipses(const Footprints* task, int64_t* next) {
     const Footprints& f = *task;
     const Ellipses& e = f.ellipses;
     const float slack = f.grid.slack;
-    each_range(f.next, e.count, [&](int64_t, int64_t first, int64_t last) {
+    each_range(next, e.count, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t at = first; at < last; ++at) {
             const int64_t ahead = e.order[std::min(at + AHEAD, e.count - 1)], i = e.order[at];
             __builtin_prefetch(f.means2d + 2 * ahead), __builtin_prefetch(f.cov2d + 3 * ahead);
@@ -90,21 +89,20 @@ struct Listing {
     int64_t* counts;              // [M] pairs of each Gaussian
     int64_t* offsets;             // [tiles + 1] counts, then where each tile's pairs start
     int64_t *gaussians, *places;  // [P] by tile, front to back; and where each pair stands by Gaussian
-    int64_t* next;
-
-    int64_t first_row(int64_t i) const { return std::max(ellipses.row0[i], top); }
 };
 
 }  // extern "C"
 
 namespace {
 
+inline int64_t first_row(const Listing& l, int64_t i) { return std::max(l.ellipses.row0[i], l.top); }
+
 // Calls ``visit`` with each Gaussian and tile that touch, by Gaussian.
 template <typename Visit>
 void each_pair(const Listing& l, Visit visit) {
     const int64_t columns = l.right - l.left, rows = l.bottom - l.top;
     for (int64_t i = 0; i < l.ellipses.count; ++i) {
-        int64_t base = (l.ellipses.cameras[i] * rows + l.first_row(i) - l.top) * columns;
+        int64_t base = (l.ellipses.cameras[i] * rows + first_row(l, i) - l.top) * columns;
         for (int64_t at = l.starts[i]; at < l.starts[i + 1]; ++at, base += columns)
             for (int64_t tile = base + l.strips[at].from; tile <= base + l.strips[at].to; ++tile) visit(i, tile);
     }
@@ -114,13 +112,13 @@ void each_pair(const Listing& l, Visit visit) {
 
 extern "C" {
 
-void pointsplat_strips(const Listing* listing) {
+void pointsplat_strips(const Listing* listing, int64_t* next) {
     const Listing& l = *listing;
     const float slack = l.grid.slack;
-    each_range(l.next, l.ellipses.count, [&](int64_t, int64_t first, int64_t last) {
+    each_range(next, l.ellipses.count, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i) {
             const float *s = l.ellipses.shapes + 7 * i, x = s[0], y = s[1], level = s[2], inverse_yy = s[3], peak = s[4];
-            int64_t row = l.first_row(i);
+            int64_t row = first_row(l, i);
             for (int64_t at = l.starts[i]; at < l.starts[i + 1]; ++at, ++row) {
                 const float top = row * TILE + (0.5f - slack) - y;
                 const float bottom = std::min(row * TILE + (TILE - 0.5f), l.grid.height - 0.5f) + slack - y;
@@ -144,10 +142,10 @@ void pointsplat_count(const Listing* listing) {
 
 void pointsplat_list(const Listing* listing) {
     const Listing& l = *listing;
-    std::vector<int64_t> next(l.offsets, l.offsets + l.tiles);
+    std::vector<int64_t> free(l.offsets, l.offsets + l.tiles);  // where the next pair of each tile goes
     int64_t pair = 0;
     each_pair(l, [&](int64_t i, int64_t tile) {
-        const int64_t place = next[tile]++;
+        const int64_t place = free[tile]++;
         l.gaussians[place] = l.ellipses.order[i], l.places[place] = pair++;
     });
 }

@@ -1,12 +1,11 @@
-"""Which Gaussian touches which tile, by compiled kernels (``tiles.cpp``), as :mod:`~pointsplat_ns.rasterizer.ellipses`
-finds it.
+"""The tiles that each Gaussian touches, by compiled kernels (``tiles.cpp``), as
+:mod:`~pointsplat_ns.rasterizer.ellipses` finds them.
 
 For float32 on a CPU, where the machine has a C++ compiler.
 """
 
 from __future__ import annotations
 
-import ctypes
 from pathlib import Path
 
 import torch
@@ -15,63 +14,16 @@ from torch import Tensor
 from pointsplat_ns.rasterizer import ellipses as in_torch
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, SLACK
 from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, Pairs, Region
-from pointsplat_ns.system.kernels import Kernels, on_threads
+from pointsplat_ns.system.declarations import Struct
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 
 
-class _Grid(ctypes.Structure):
-    """``struct Grid`` of the kernels."""
-
-    _fields_ = (*((name, ctypes.c_int64) for name in ("height", "rows", "columns")), ("slack", ctypes.c_float))
-
-    @classmethod
-    def of(cls, grid: Grid) -> _Grid:
-        return cls(grid.height, grid.rows, grid.columns, SLACK)
+def _grid(grid: Grid) -> Struct:
+    return KERNELS.structs["Grid"](height=grid.height, rows=grid.rows, columns=grid.columns, slack=SLACK)
 
 
-class _Ellipses(ctypes.Structure):
-    """``struct Ellipses`` of the kernels. It keeps none of the tensors alive."""
-
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in Ellipses._fields),
-        ("count", ctypes.c_int64),
-    )
-
-    @classmethod
-    def of(cls, ellipses: Ellipses) -> _Ellipses:
-        return cls(*(tensor.data_ptr() for tensor in ellipses), len(ellipses.order))
-
-
-class _Footprints(ctypes.Structure):
-    """``struct Footprints`` of the kernels."""
-
-    _fields_ = (
-        ("grid", _Grid),
-        ("ellipses", _Ellipses),
-        *((name, ctypes.c_void_p) for name in ("means2d", "cov2d", "det", "opacities", "cameras")),
-        ("alpha_min", ctypes.c_float),
-        ("next", ctypes.c_void_p),
-    )
-
-
-class _Listing(ctypes.Structure):
-    """``struct Listing`` of the kernels."""
-
-    _fields_ = (
-        ("grid", _Grid),
-        ("ellipses", _Ellipses),
-        *((name, ctypes.c_int64) for name in ("top", "bottom", "left", "right", "tiles")),
-        *((name, ctypes.c_void_p) for name in ("starts", "strips", "counts", "offsets", "gaussians", "places", "next")),
-    )
-
-
-def can_list(wanted: bool | None, *tensors: Tensor) -> bool:
-    """Whether the kernels find the tiles of Gaussians of which these are means, covariances and so on.
-
-    Args:
-        wanted: None where a machine without a compiler is no reason for a warning.
-        tensors: floating point.
-    """
-    return KERNELS.usable_for(wanted, *tensors)
+def _ellipses(ellipses: Ellipses) -> Struct:
+    return KERNELS.structs["Ellipses"](**ellipses._asdict(), count=len(ellipses.order))
 
 
 def ellipses_of(
@@ -85,16 +37,13 @@ def ellipses_of(
     alpha_min: float,
 ) -> Ellipses:
     """As :func:`pointsplat_ns.rasterizer.ellipses.ellipses_of`."""
-    given = [tensor.contiguous() for tensor in (means2d, cov2d, det, opacities, cameras)]
     numbers = [torch.empty_like(order) for _ in range(5)]
     found = Ellipses(order, numbers[0], means2d.new_empty(len(order), 7), *numbers[1:])
-    next_range = torch.zeros(1, dtype=torch.int64)
-    task = _Footprints(
-        _Grid.of(grid), _Ellipses.of(found), *(tensor.data_ptr() for tensor in given), alpha_min,
-        next_range.data_ptr(),
+    task = KERNELS.structs["Footprints"](
+        grid=_grid(grid), ellipses=_ellipses(found), means2d=means2d.contiguous(), cov2d=cov2d.contiguous(),
+        det=det.contiguous(), opacities=opacities.contiguous(), cameras=cameras.contiguous(), alpha_min=alpha_min,
     )  # fmt: skip
-    # Fewer are done sooner by one thread.
-    on_threads(len(order) >= 4000, KERNELS.library.pointsplat_ellipses, ctypes.byref(task))
+    on_threads(len(order) >= SEVERAL, KERNELS.library.pointsplat_ellipses, task)
     return found
 
 
@@ -106,17 +55,17 @@ def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> Pairs:
     torch.cumsum(heights, 0, out=starts[1:])
     strips, counts = torch.empty(int(starts[-1]), 2, dtype=torch.int32), torch.zeros_like(ellipses.order)
     tiles = grid.cameras * region.rows * region.columns
-    offsets, next_range = torch.zeros(tiles + 1, dtype=torch.int64), torch.zeros(1, dtype=torch.int64)
-    task = _Listing(
-        _Grid.of(grid), _Ellipses.of(ellipses), *region, tiles, starts.data_ptr(), strips.data_ptr(),
-        counts.data_ptr(), offsets.data_ptr(), next=next_range.data_ptr(),
+    offsets = torch.zeros(tiles + 1, dtype=torch.int64)
+    task = KERNELS.structs["Listing"](
+        grid=_grid(grid), ellipses=_ellipses(ellipses), **region._asdict(), tiles=tiles, starts=starts, strips=strips,
+        counts=counts, offsets=offsets,
     )  # fmt: skip
-    on_threads(count >= 4000, library.pointsplat_strips, ctypes.byref(task))  # fewer are done sooner by one thread
-    library.pointsplat_count(ctypes.byref(task))
+    on_threads(count >= SEVERAL, library.pointsplat_strips, task)
+    library.pointsplat_count(task)
     offsets = torch.cumsum(offsets, 0)
     gaussians, places = (offsets.new_empty(int(offsets[-1])) for _ in range(2))
-    task.offsets, task.gaussians, task.places = offsets.data_ptr(), gaussians.data_ptr(), places.data_ptr()
-    library.pointsplat_list(ctypes.byref(task))
+    task.fill(offsets=offsets, gaussians=gaussians, places=places)
+    library.pointsplat_list(task)
     return Pairs(gaussians, offsets, places, counts)
 
 
@@ -141,9 +90,4 @@ def _as_torch() -> bool:
     return all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 
 
-KERNELS = Kernels(
-    "the rasterizer",
-    Path(__file__).with_name("tiles.cpp"),
-    {f"pointsplat_{name}": [ctypes.c_void_p] for name in ("ellipses", "strips", "count", "list")},
-    _as_torch,
-)
+KERNELS = Kernels("the rasterizer", Path(__file__).with_name("tiles.cpp"), _as_torch)

@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
+from making import assert_same_on_any_threads
 from pointsplat_ns.rasterizer.colors import sh_to_color
 from pointsplat_ns.rasterizer.compiled import colors as compiled_colors
-from pointsplat_ns.system.threads import fixed_threads
 
 F32, F64 = torch.float32, torch.float64
 
@@ -100,8 +100,5 @@ def test_no_direction_gives_no_colour_and_rows_that_are_not_there_are_refused():
 
 @needs_compiler
 def test_any_number_of_threads_gives_the_same_bits():
-    given, results = inputs(stored=16, n=9000, m=6000), []
-    for threads in (1, 2, 5):
-        with fixed_threads(threads):
-            results.append(colored(*given, 3, F32, True))
-    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+    given = inputs(stored=16, n=9000, m=6000)
+    assert_same_on_any_threads(lambda: colored(*given, 3, F32, True))

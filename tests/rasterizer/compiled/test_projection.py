@@ -7,11 +7,10 @@ import math
 import pytest
 import torch
 
-from making import camera_askew, record_kernels, splats_in_view
+from making import assert_same_on_any_threads, camera_askew, record_kernels, splats_in_view
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
 from pointsplat_ns.rasterizer.projection import count_meaningless, project
-from pointsplat_ns.system.threads import fixed_threads
 
 WIDTH, HEIGHT = 37, 29
 F32, F64 = torch.float32, torch.float64
@@ -244,13 +243,14 @@ def test_one_gradient_alone_from_some_outputs_and_inputs_in_any_layout(wanted):
 
 @needs_compiler
 def test_any_number_of_threads_projects_the_same_bits():
-    scene, results = scene_of(9000), []
-    for threads in (1, 2, 5):
-        with fixed_threads(threads):
-            leaves, seen = projected(scene, {"antialiased": True}, F32, True)
-            values, grads = values_and_gradients(leaves, seen, seen.ids)
-        results.append([seen.ids, seen.beyond, seen.radii, *values, *grads])
-    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+    scene = scene_of(9000)
+
+    def results():
+        leaves, seen = projected(scene, {"antialiased": True}, F32, True)
+        values, grads = values_and_gradients(leaves, seen, seen.ids)
+        return [seen.ids, seen.beyond, seen.radii, *values, *grads]
+
+    assert_same_on_any_threads(results)
 
 
 ALL_KERNELS = {

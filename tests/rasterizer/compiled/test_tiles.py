@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
+from making import assert_same_on_any_threads
 from pointsplat_ns.rasterizer import ellipses as in_torch
 from pointsplat_ns.rasterizer.compiled import tiles as compiled_tiles
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, Region
 from pointsplat_ns.rasterizer.tiles import Footprints
-from pointsplat_ns.system.threads import fixed_threads
 
 missing = compiled_tiles.KERNELS.why_missing
 needs_compiler = pytest.mark.skipif(bool(missing), reason=missing)
@@ -65,9 +65,9 @@ def test_nothing_gives_no_pair_and_any_number_of_threads_the_same_bits():
     empty = Footprints(*(v[:0] if isinstance(v, torch.Tensor) else v for v in given()), engine=compiled_tiles)
     tiles = empty.tiles(empty.whole)
     assert len(tiles.gaussians) == len(tiles.counts) == 0 and not tiles.offsets.any()
-    found = []
-    for threads in (1, 2, 5):
-        with fixed_threads(threads):
-            footprints = Footprints(*given(20_000), engine=compiled_tiles)
-            found.append((footprints._ellipses.shapes, footprints.tiles(footprints.whole).gaussians))
-    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
+
+    def found():
+        footprints = Footprints(*given(20_000), engine=compiled_tiles)
+        return footprints._ellipses.shapes, footprints.tiles(footprints.whole).gaussians
+
+    assert_same_on_any_threads(found)

@@ -1,0 +1,110 @@
+"""Python calls C++ by what the C++ file declares."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+
+import pytest
+import torch
+
+from pointsplat_ns.metrics import structural_similarity
+from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
+from pointsplat_ns.system.declarations import Pointer, functions_of, structs_of
+
+SHARED = """
+struct Hidden {
+    bool not_shared;
+};
+
+extern "C" {
+
+// A comment; with a semicolon.
+struct Inner {
+    int32_t number;  // four bytes, then padding
+    double values[2][3];
+};
+
+struct Task {
+    Inner inner;
+    const float *a, *b;
+    int64_t count;
+};
+
+int pointsplat_size() { return 3; }
+
+void pointsplat_run(const Task* task, const int64_t* rows,
+                    int64_t count) {
+    if (task) return;
+}
+
+}  // extern "C"
+"""
+SOURCES = [module.KERNELS.source for module in (blending, colors, projection, tiles, structural_similarity)]
+COMPILER = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
+
+
+@pytest.mark.skipif(COMPILER is None, reason="there is no C++ compiler")
+@pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.stem)
+def test_structs_are_laid_out_as_the_compiler_lays_them_out(source, tmp_path):
+    structs = structs_of(source.read_text("utf-8"))
+    assert structs
+    lines = ["#include <cstddef>", f'#include "{source}"']
+    for name, struct in structs.items():
+        lines.append(f"static_assert(sizeof({name}) == {ctypes.sizeof(struct)});")
+        lines += [
+            f"static_assert(offsetof({name}, {field}) == {getattr(struct, field).offset});" for field in struct.members
+        ]
+    check = tmp_path / "check.cpp"
+    check.write_text("\n".join(lines) + "\n", "utf-8")
+    subprocess.run([COMPILER, "-std=c++17", "-fsyntax-only", str(check)], check=True)
+
+
+def test_what_is_shared_is_declared_with_its_types():
+    structs = structs_of(SHARED)
+    assert [*structs] == ["Inner", "Task"]
+    assert structs["Inner"]._fields_ == [("number", ctypes.c_int32), ("values", ctypes.c_double * 6)]
+    fields = [("inner", structs["Inner"]), ("a", ctypes.c_void_p), ("b", ctypes.c_void_p), ("count", ctypes.c_int64)]
+    assert structs["Task"]._fields_ == fields and structs["Task"].members["a"].dtype == torch.float32
+    functions = functions_of(SHARED, structs)
+    assert functions["pointsplat_size"] == (ctypes.c_int, [])
+    result, (task, rows, count) = functions["pointsplat_run"]
+    assert result is None and task.dtype is None and rows.dtype == torch.int64 and count is ctypes.c_int64
+
+
+def test_tensors_are_passed_by_address_and_kept_alive():
+    given = torch.arange(3.0)
+    structs = structs_of(SHARED)
+    task = structs["Task"](a=given, count=3, inner=structs["Inner"](number=1))
+    assert task.inner.number == 1 and task.a == given.data_ptr() and task.b is None and task.kept["a"] is given
+    task.fill(b=task.a + 4)
+    assert task.b == given.data_ptr() + 4
+
+
+@pytest.mark.parametrize(
+    ("values", "error"),
+    [
+        ({"c": 1}, AttributeError),
+        ({"count": torch.zeros(1)}, TypeError),
+        ({"a": torch.zeros(3, dtype=torch.float64)}, TypeError),
+        ({"a": torch.zeros(3, 3).T}, TypeError),
+        ({"a": torch.zeros(3, device="meta")}, TypeError),
+    ],
+    ids=["no such field", "no pointer", "dtype", "strides", "device"],
+)
+def test_a_value_that_does_not_fit_a_struct_is_an_error(values, error):
+    with pytest.raises(error):
+        structs_of(SHARED)["Task"](**values)
+
+
+def test_an_argument_of_another_dtype_is_an_error():
+    with pytest.raises(TypeError, match=r"tensor of torch\.float32 .* expected torch\.int64 on the CPU, contiguous"):
+        Pointer(torch.int64).from_param(torch.zeros(2))
+
+
+@pytest.mark.parametrize("wrong", ["int64_t count", "Unknown* task", "float** a"])
+def test_a_declaration_that_is_not_understood_is_an_error(wrong):
+    text = SHARED.replace("int64_t count;", f"{wrong.replace('int64_t', 'size_t')};")
+    with pytest.raises(ValueError, match="not a declaration of numbers, arrays, pointers or structs"):
+        structs_of(text)
