@@ -16,7 +16,6 @@ from pointsplat_ns.compression.posed_scene import check_views_show, views_for
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
-from pointsplat_ns.looking.settings import AROUND
 from pointsplat_ns.looking.upright import axis_or_none
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
@@ -166,7 +165,7 @@ def open_viewer(
 
 def _source(scene: Source, loaded: Gaussians, given: Views | None, up: Tensor | None) -> ViewSource:
     run = None if isinstance(scene, Gaussians) else scene
-    return ViewSource(loaded, given, run, dataset_views, settings=AROUND, up=up)
+    return ViewSource(loaded, given, run, dataset_views, up=up)
 
 
 def _mode(scene: Source, usual: RasterizeMode) -> RasterizeMode:

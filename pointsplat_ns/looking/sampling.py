@@ -181,7 +181,12 @@ def content_surface(scene: Gaussians, settings: LookingSettings) -> tuple[Tensor
 
 
 def which_way_up(
-    scene: Gaussians, centre: Tensor, diagonal: float, surface: Surface, photos: PhotoPlaces | None, up: Up | None = None
+    scene: Gaussians,
+    centre: Tensor,
+    diagonal: float,
+    surface: Surface,
+    photos: PhotoPlaces | None,
+    up: Up | None = None,
 ) -> tuple[Up, bool]:
     """Which way is up, unless it is known, and whether the scene is a room."""
     axis = upright_axis(surface, photos) if up is None else up.direction

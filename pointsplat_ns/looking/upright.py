@@ -28,7 +28,8 @@ class Up:
     direction: Tensor
     """(3,) float64, of length 1."""
     sure: bool = True
-    """Whether it was named, or the scene has level or vertical surfaces, and more of it is seen from above or lies low."""
+    """Whether it was named, or the scene has level or vertical surfaces, and what is seen of it from above and where its
+    mass lies agree with it."""
 
     def __str__(self) -> str:
         """The name of the axis, or the direction.

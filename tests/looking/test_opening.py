@@ -23,7 +23,8 @@ def statue() -> Gaussians:
     """A figure of 1 x 2.4 units on a block; its face, at x = 0.05, has many more Gaussians than its back."""
     fine = plates(((0.05, 0, 2.2), (0, 0.5, 1.2)), density=300)
     fine = fine.replace(scales=fine.scales - 0.7)
-    coarse = plates(((-0.05, 0, 2.2), (0, 0.5, 1.2)), *(((0, 0, z), (0.5, 0.5, 0)) for z in (0.8, 0.9, 1.0)), density=60)
+    block = [((0, 0, z), (0.5, 0.5, 0)) for z in (0.8, 0.9, 1.0)]
+    coarse = plates(((-0.05, 0, 2.2), (0, 0.5, 1.2)), *block, density=60)
     return Gaussians(*(torch.cat(both) for both in zip(fine.tensors(), coarse.tensors(), strict=True)))
 
 
