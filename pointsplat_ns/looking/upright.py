@@ -28,8 +28,8 @@ class Up:
     direction: Tensor
     """(3,) float64, of length 1."""
     sure: bool = True
-    """Whether it was named, or the scene has level or vertical surfaces, and what is seen of it from above and where its
-    mass lies agree with it."""
+    """Whether it was named, or the scene has level or vertical surfaces, and its mass and the side from which more is
+    seen agree with it."""
 
     def __str__(self) -> str:
         """The name of the axis, or the direction.
