@@ -107,6 +107,7 @@ class FlightFrame:
                     _eyes(self.views).tolist(), fov.tolist(), self.views.viewmats[:, :3, :3].tolist(), strict=True
                 )
             ],
+            "aspect": self.views.width / self.views.height,
             "up": self.up.direction.tolist(),
             "sure": self.up.sure,
             "near": self.views.near_plane,

@@ -91,10 +91,9 @@ def write_page(
         missing = ""
         while True:
             flight = frame.data(included)
-            values = {"title": title, "rows": rows, "notes": notes, "missing": missing, "flight": flight}
-            text = page(
-                "scene.html", (*SCRIPTS, "scene.js"), with_workers=True, **values, data={"flight": flight}
-            ).encode("utf-8")  # fmt: skip
+            values: dict[str, Any] = {"title": title, "rows": rows, "notes": notes, "missing": missing}
+            values |= {"flight": flight, "data": {"flight": flight}}
+            text = page("scene.html", (*SCRIPTS, "scene.js"), with_workers=True, **values).encode("utf-8")
             if len(text) <= 1e6 * limit_mb:
                 break
             included, missing = _without_the_largest(included, path, len(text), limit_mb)

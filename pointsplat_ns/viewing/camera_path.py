@@ -12,6 +12,7 @@ from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.opening import opening_views
+from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.viewing.saved_path import LIMITS, read_path
 from pointsplat_ns.viewing.trajectories import STOPS, along, fitted, orbit, walk
@@ -101,7 +102,7 @@ def camera_path(
             frames = max(frames, len(known))
         usual = (known.width, known.height) if source.given is not None else _reduced(known)
         if one and path == "auto":
-            known = opening_views(scene, up=up, known=known.spread(4 * STOPS)).views
+            known = opening_views(scene, up=None if up is None else Up(up), known=known.spread(4 * STOPS)).views
         views = along(_sized(known, settings, usual), frames)
         skipped = f", {len(known) - frames} of {len(known)} left out" if frames < len(known) and not one else ""
         return CameraPath(views, fps, f"along the {source.origin}{skipped}")
