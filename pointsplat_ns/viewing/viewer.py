@@ -110,7 +110,8 @@ class _Stage:
         first = self.selections[0]
         two = len(self.selections) == 2
         second = self.selections[1].current if two else first.whole
-        line = min(max(float(wanted["wipe"]), 0.0), 1.0) if two or first.percent < 100 else 1.0
+        wipe = min(max(float(wanted["wipe"]), 0.0), 1.0)
+        line = wipe if two or first.percent < 100 else 1.0
         modes = self.scenes[0].mode, self.scenes[-1].mode
         return PictureRequest(drawn, first.current, second, line, modes), max(width, height)
 
@@ -272,9 +273,12 @@ class Viewer:
         with self._dropping, tempfile.TemporaryDirectory(prefix="pointsplat-drop-") as folder:
             try:
                 path, name = received(request, Path(folder))
-                self._show([self._read(path, name)])
+                try:
+                    self._show([self._read(path, name)])
+                except PointSplatError as error:
+                    return _refused(str(error).replace(str(path), name))
             except PointSplatError as error:
-                return _refused(str(error).replace(f"{folder}/", ""))
+                return _refused(str(error))
             except (OSError, MemoryError) as error:
                 return _refused(f"the file cannot be read here ({one_line(error)})")
         return Answer(status=HTTPStatus.NO_CONTENT)
