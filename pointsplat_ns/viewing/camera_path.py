@@ -109,7 +109,7 @@ def camera_path(
     if known is None:
         opening = opening_views(scene, 1 if one else STOPS, *_shape(settings, (960, 540)), source.up)
         stops = dataclasses.replace(opening.views, rasterize_mode=source.rasterize_mode)
-        up, origin = opening.up.direction, f"views that show most, up is {opening.up}"
+        up, origin = opening.up.direction, f"views that show most, up is {opening.up}{source.missing}"
     else:
         stops, origin = _sized(known.spread(2 * STOPS), settings, _reduced(known)), source.origin
     if path == "orbit":

@@ -38,6 +38,9 @@ MOST_PAGES = 8
 WAIT_SECONDS = 20.0
 """Longest wait of a page's request for the next picture."""
 
+END_SECONDS = 5.0
+"""Longest wait for each thing that is being drawn, merged or read when the viewer is closed."""
+
 LARGEST_SIDE = 4096
 """Largest longer side of a picture, pixels."""
 
@@ -70,7 +73,8 @@ class _Stage:
         first = scenes[0]
         known = first.source.known(KNOWN_VIEWS)
         self.frame = FlightFrame.of(first.scene, known, first.source.up if up is None and known is None else up)
-        self.origin = first.source.origin if known is not None else f"the view that shows most, up is {self.frame.up}"
+        found = f"the view that shows most, up is {self.frame.up}{first.source.missing}"
+        self.origin = found if known is None else first.source.origin
         self._tell = changed
         self.selections = [Selection(viewed.scene, viewed.source, self._changed) for viewed in scenes]
         pair = [{"name": viewed.name, "amount": ""} for viewed in scenes]
@@ -129,9 +133,10 @@ class _Stage:
             found.append({"amount": amount, "command": command})
         return found
 
-    def close(self) -> None:
+    def close(self, timeout: float) -> None:
+        """Stop merging, and wait for it at most ``timeout`` seconds."""
         for selection in self.selections:
-            selection.close(0.0)
+            selection.close(timeout)
 
 
 class Viewer:
@@ -161,7 +166,7 @@ class Viewer:
         share_freed_memory()  # each page has a drawing thread
         self._up, self._read = up, read
         self._watchers: dict[str, Watcher] = {}
-        self._lock, self._dropping = threading.Lock(), threading.Lock()
+        self._lock, self._looking, self._dropping = threading.Lock(), threading.Lock(), threading.Lock()
         self._stage: _Stage | None = None
         self._drop_page = b""
         routes = {
@@ -192,12 +197,13 @@ class Viewer:
         if self._server.fileno() < 0:
             return
         self._server.close()
-        with self._lock:
-            for watcher in self._watchers.values():
-                watcher.close()
-            self._watchers.clear()
-            if self._stage is not None:
-                self._stage.close()
+        # Threads that are in torch when the program ends abort it: they are waited for, and these locks are kept.
+        for lock in (self._looking, self._dropping):
+            lock.acquire(timeout=END_SECONDS)
+        for watcher in list(self._watchers.values()):
+            watcher.close(END_SECONDS)
+        if self._stage is not None:
+            self._stage.close(END_SECONDS)
 
     def __enter__(self) -> Viewer:
         return self
@@ -211,7 +217,7 @@ class Viewer:
         with self._lock:
             before, self._stage = self._stage, stage
         if before is not None:
-            before.close()
+            before.close(0.0)
 
     def _changed(self) -> None:
         """Tell pages that a selection has a new text, or another part of its scene."""
@@ -228,8 +234,9 @@ class Viewer:
         stage = self._stage
         if stage is None or wanted["stage"] != stage.number:
             return Answer(status=HTTPStatus.CONFLICT)
-        watcher = self._watcher(str(wanted["client"]))
-        watcher.look(*stage.request(wanted), int(wanted["look"]))
+        with self._looking:
+            watcher = self._watcher(str(wanted["client"]))
+            watcher.look(*stage.request(wanted), int(wanted["look"]))
         return Answer(status=HTTPStatus.NO_CONTENT)
 
     def _picture(self, request: Request) -> Answer:

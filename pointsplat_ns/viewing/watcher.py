@@ -62,12 +62,12 @@ class Watcher:
             self._texts += 1
             self._changed.notify_all()
 
-    def close(self) -> None:
-        """Stop drawing, without waiting for it."""
+    def close(self, timeout: float = 0.0) -> None:
+        """Stop drawing, and wait for it at most ``timeout`` seconds."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        self._painter.close(0.0)
+        self._painter.close(timeout)
 
     def _show(self, pixels: np.ndarray, step: Step[PictureRequest], seconds: float) -> None:
         from PIL import Image

@@ -92,9 +92,10 @@ class View extends Flight {
         const { number, texts } = this.state, answer = await this.post("/picture", { number, texts });
         const state = JSON.parse(answer.headers.get("X-State"));
         if (answer.status === 200) {
-          this.picture?.close();
+          const before = this.picture;
           this.picture = await createImageBitmap(await answer.blob());
           this.put();
+          before?.close();
           this.say("");
         }
         if (gone || state.made !== this.state.made) this.request();
