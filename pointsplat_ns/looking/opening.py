@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.content import UNITS, in_units, thinned, views_in_units
+from pointsplat_ns.looking.content import UNITS, views_in_units
 from pointsplat_ns.looking.poses import in_pictures, look_at, views_of
 from pointsplat_ns.looking.sampling import content_surface, views_in_scene_units, which_way_up
 from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces, photo_places
 from pointsplat_ns.looking.upright import Up, UprightBox, level_directions
-from pointsplat_ns.looking.whole import around, shown, whole_views
+from pointsplat_ns.looking.whole import around, few_in_units, shown, whole_views
 from pointsplat_ns.views import Views
 
 
@@ -70,15 +70,15 @@ def opening_views(
     box = UprightBox.of(surface, up.direction)
     if known is not None:
         width, height = known.width, known.height
-    few = in_units(thinned(scene, settings.opening_count), centre, diagonal)
+    few = few_in_units(scene, settings.opening_count, centre, diagonal)
     turns = around(settings.opening_turns_outside)
     outside = whole_views(surface, box.up, turns, settings.opening_elevation, width, height)
-    of_outside = shown(few, outside, settings.opening_side, width, height)
+    of_outside = shown(few, outside, settings.opening_side)
     if known is None:
         inside = _inside(surface, box, photos, width, height)
     else:
-        inside = views_in_units(known, centre, diagonal).viewmats
-    of_inside = shown(few, inside, settings.opening_side, width, height)
+        inside = views_in_units(known, centre, diagonal)
+    of_inside = shown(few, inside, settings.opening_side)
     most_outside, most_inside = (int(rows.sum(1).max()) if len(rows) else 0 for rows in (of_outside, of_inside))
     ratio = most_inside / max(most_outside, 1)
     whole = most_inside == 0 or not (room or ratio > settings.opening_inside)
@@ -86,14 +86,14 @@ def opening_views(
         taken = _completing(of_inside, count)
         if known is not None:
             return Opening(known[taken], up, False)
-        chosen = inside[taken]
+        chosen = inside[taken].viewmats
     elif known is not None or ratio > settings.opening_beside:
         first = int(of_outside.sum(1).argmax())
         others = _completing(of_inside & ~of_outside[first], count - 1)
-        chosen = torch.cat([outside[[first]], inside[others]])
+        chosen = torch.cat([outside[[first]].viewmats, inside[others].viewmats])
     else:
         sides = turns[of_outside.sum(1).argmax()] + around(count)
-        chosen = whole_views(surface, box.up, sides, settings.opening_elevation, width, height)
+        chosen = whole_views(surface, box.up, sides, settings.opening_elevation, width, height).viewmats
     views = views_in_scene_units(chosen, width, height, centre, diagonal, settings)
     if known is not None:
         Ks = torch.cat([views.Ks[:1], known.Ks[others].to(views.Ks)])
@@ -102,8 +102,8 @@ def opening_views(
     return Opening(views, up, whole)
 
 
-def _inside(surface: Surface, box: UprightBox, photos: PhotoPlaces | None, width: int, height: int) -> Tensor:
-    """Views (n, 4, 4) from enclosed places and from photo places, of all those that show most of the surface."""
+def _inside(surface: Surface, box: UprightBox, photos: PhotoPlaces | None, width: int, height: int) -> Views:
+    """Views from enclosed places and from photo places, of all those that show most of the surface."""
     settings, up = surface.settings, box.up
     generator = torch.Generator().manual_seed(0)
     places = box.places(settings.box_draws * settings.places, generator, settings)
@@ -121,12 +121,12 @@ def _inside(surface: Surface, box: UprightBox, photos: PhotoPlaces | None, width
     pitch = math.radians(settings.opening_pitch)
     eyes = places.repeat_interleave(count, dim=0)
     targets = eyes + math.cos(pitch) * level_directions(up, turn.to(up)) + math.sin(pitch) * up
-    viewmats = look_at(eyes, targets, up)
+    views = views_of(look_at(eyes, targets, up), width, height, UNITS, settings)
     some = settings.gain_points
-    pictured = in_pictures(views_of(viewmats, width, height, UNITS), surface.points[:some])
+    pictured = in_pictures(views, surface.points[:some])
     counts = (pictured & visible[:, :some].repeat_interleave(count, dim=0)).sum(1).view(-1, count)
     best = counts.argmax(1) + count * torch.arange(len(counts))  # one view a place
-    return viewmats[best[counts.amax(1).topk(min(settings.opening_candidates, len(best))).indices]]
+    return views[best[counts.amax(1).topk(min(settings.opening_candidates, len(best))).indices]]
 
 
 def _completing(inside: Tensor, count: int) -> list[int]:

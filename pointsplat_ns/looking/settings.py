@@ -277,10 +277,6 @@ class LookingSettings:
     """Smallest share of the points, relative to those that are visible from outside, that are visible from the enclosed
     places of a room."""
 
-    enclosed_parts: bool = True
-    """Whether views also look from the enclosed places of scenes that are no rooms as a whole, such as a flat without
-    its walls."""
-
     # Places and directions of candidate views (search.py)
 
     places: int = 48

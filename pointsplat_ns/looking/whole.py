@@ -17,23 +17,24 @@ from pointsplat_ns.looking.settings import DEFAULTS
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.rasterizer import pixels_of
+from pointsplat_ns.views import Views
 
 
 def whole_views(
     surface: Surface, up: Tensor, turns: Tensor, elevation: float, width: int = 960, height: int = 600
-) -> Tensor:
-    """World-to-camera matrices of cameras around the content, each as near as the whole of it allows.
+) -> Views:
+    """Views from around the content, each as near as the whole of it allows.
 
     Args:
         surface: points of the scene.
         up: (3,) direction that is up, of length 1.
         turns: (n,) angles of the cameras around it, radians.
         elevation: of the cameras above the content, degrees; below 0 they look up at it.
-        width: of the pictures, pixels; only the ratio to the height counts.
+        width: of the pictures, pixels.
         height: of the pictures, pixels.
 
     Returns:
-        (n, 4, 4), float64, units.
+        n views, float64, units.
     """
     settings, points = surface.settings, surface.points
     level = torch.stack([*level_directions(up, up.new_tensor([0.0, math.pi / 2])), up])  # [3, 3] rows
@@ -47,23 +48,26 @@ def whole_views(
     across, along = settings.whole_shares
     needed = torch.maximum(x.abs() / (across * width * reach), y.abs() / (along * height * reach)) - z
     distances = needed.quantile(quantiles[1], dim=1).clamp_min(0.1)
-    return look_at(middle + distances[:, None] * sides, middle.expand_as(sides), up)
+    viewmats = look_at(middle + distances[:, None] * sides, middle.expand_as(sides), up)
+    return views_of(viewmats, width, height, UNITS, settings)
 
 
-def shown(few: Gaussians, viewmats: Tensor, side: int, width: int = 960, height: int = 600) -> Tensor:
-    """Which Gaussians each camera shows, (C, N) bool: they are in its picture, large enough, and not hidden.
+def few_in_units(scene: Gaussians, count: int, centre: Tensor, diagonal: float) -> Gaussians:
+    """At most about ``count`` of the Gaussians, enlarged to cover as much as all, in units, on the CPU."""
+    return in_units(thinned(scene.detach(), count).to("cpu"), centre.cpu(), diagonal)
+
+
+def shown(few: Gaussians, views: Views, side: int) -> Tensor:
+    """Which Gaussians each view shows, (C, N) bool: they are in its picture, large enough, and not hidden.
 
     Gaussians are many where photos showed detail. So their number says how much of interest a picture holds.
 
     Args:
-        few: N Gaussians of a scene, enlarged to cover as much as all, in units.
-        viewmats: (C, 4, 4), units.
+        few: N Gaussians of a scene, enlarged to cover as much as all, on the CPU.
+        views: C views of them.
         side: longer side of the pictures, pixels.
-        width: of the pictures; only the ratio to the height counts.
-        height: of the pictures.
     """
-    views = views_of(viewmats, width, height, UNITS).resized(side)
-    rows = [pixels_of(few, view) > DEFAULTS.min_shown_pixels for view in views]
+    rows = [pixels_of(few, view) > DEFAULTS.min_shown_pixels for view in views.resized(side)]
     return torch.stack(rows) if rows else torch.zeros(0, len(few), dtype=torch.bool)
 
 
@@ -79,11 +83,11 @@ def seen_from_above(scene: Gaussians, centre: Tensor, diagonal: float, surface: 
         axis: (3,) of length 1.
     """
     settings, turns = surface.settings, around(surface.settings.seen_from_above_turns)
-    few = in_units(thinned(scene.detach(), settings.seen_from_above_count), centre, diagonal)
+    few = few_in_units(scene, settings.seen_from_above_count, centre, diagonal)
 
     def most(up: Tensor) -> int:
-        viewmats = whole_views(surface, up, turns, settings.seen_from_above_elevation)
-        return int(shown(few, viewmats, settings.seen_from_above_side).sum(1).max())
+        views = whole_views(surface, up, turns, settings.seen_from_above_elevation)
+        return int(shown(few, views, settings.seen_from_above_side).sum(1).max())
 
     return math.log((most(axis) + 1) / (most(-axis) + 1))
 

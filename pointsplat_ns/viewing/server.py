@@ -171,7 +171,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer(self) -> Answer:
         server = cast(Server, self.server)
-        refused = refusal(self.command, dict(self.headers), server.hosts)
+        refused = refusal(self.command, {name.title(): value for name, value in self.headers.items()}, server.hosts)
         if refused is not None:
             return Answer(status=refused)
         try:
