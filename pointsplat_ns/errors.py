@@ -68,7 +68,7 @@ class BudgetError(PointSplatError, ValueError):
 
 
 class MissingPackageError(PointSplatError):
-    """A package that not every installation has, and that what was asked for needs: nerfstudio, or viser.
+    """A package that not every installation has, and that what was asked for needs: nerfstudio.
 
     Example:
         >>> raise MissingPackageError("training needs nerfstudio, which is not installed")

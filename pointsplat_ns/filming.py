@@ -16,11 +16,9 @@ from pointsplat_ns.compression.posed_scene import check_views_show, views_for
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
-from pointsplat_ns.looking.settings import AROUND
-from pointsplat_ns.looking.upright import axis_or_none
+from pointsplat_ns.looking.upright import Up, axis_or_none
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.system.packages import need
 from pointsplat_ns.system.progress import Progress, tracked
 from pointsplat_ns.viewing.camera_path import FPS, LONGEST_SIDE, FilmSettings, camera_path
 from pointsplat_ns.viewing.film import FilmScenes, Split, render_frames
@@ -117,7 +115,7 @@ def render_path(
 
 
 def open_viewer(
-    scene: Source,
+    scene: Source | None = None,
     other: Source | None = None,
     *,
     up: str | None = None,
@@ -127,10 +125,10 @@ def open_viewer(
     """Show a scene, or two scenes with the same camera, in the browser. This machine's processor draws; no GPU is
     needed.
 
-    It opens upright: at the first of the dataset's poses if there are any, else at a sampled view.
+    It opens upright, at the view that shows most of the scene, or the whole of an object.
 
     Args:
-        scene: N Gaussians, or the path of a scene.
+        scene: N Gaussians, or the path of a scene; by default the page takes a file that is dropped on it.
         other: a second scene in the same frame, to compare with; by default the first is compared with all of itself.
         up: the axis that is up in the scene ("z", "-y"); by default it is estimated.
         host: the address to listen on; by default only this machine has access. With another address, every machine
@@ -142,8 +140,7 @@ def open_viewer(
 
     Raises:
         SceneError: if a scene is not usable.
-        DataError: if there are no views.
-        MissingPackageError: if viser is not installed.
+        DataError: if no Gaussian of the first scene is visible.
         PointSplatError: if no port is free.
 
     Example:
@@ -152,21 +149,26 @@ def open_viewer(
         ...     viewer.url.startswith("http://127.0.0.1:")
         True
     """
-    need("viser", "the viewer in the browser")
     from pointsplat_ns.viewing.viewer import ViewedScene, Viewer
 
-    upward, scenes = axis_or_none(up), []
-    for index, source in enumerate([scene] if other is None else [scene, other]):
+    upward = axis_or_none(up)
+
+    def read(path: Path, name: str) -> ViewedScene:
+        loaded = load(path)
+        return ViewedScene(name, None, loaded, _source(loaded, loaded, None, upward), "classic")
+
+    scenes = []
+    for index, source in enumerate(source for source in (scene, other) if source is not None):
         loaded = source if isinstance(source, Gaussians) else load(source)
         path = None if isinstance(source, Gaussians) else Path(source)
         views, mode = _source(source, loaded, None, upward), _mode(source, "classic")
         scenes.append(ViewedScene(_name(source, index), path, loaded, views, mode))
-    return Viewer(scenes, host, port, upward)
+    return Viewer(scenes, host, port, None if upward is None else Up(upward), None if scenes else read)
 
 
 def _source(scene: Source, loaded: Gaussians, given: Views | None, up: Tensor | None) -> ViewSource:
     run = None if isinstance(scene, Gaussians) else scene
-    return ViewSource(loaded, given, run, dataset_views, settings=AROUND, up=up)
+    return ViewSource(loaded, given, run, dataset_views, up=up)
 
 
 def _mode(scene: Source, usual: RasterizeMode) -> RasterizeMode:

@@ -16,6 +16,8 @@ import pointsplat_ns as ps
 from making import ball, decoded, run_of
 from pointsplat_ns.cli import main
 from pointsplat_ns.geometry.cameras import viewmats_to_opengl
+from pointsplat_ns.looking.content import views_in_units
+from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.viewing.split_screen import to_uint8
 from posing import inria, written
 
@@ -133,11 +135,17 @@ def test_command_writes_a_video_beside_the_scene_and_overwrites_nothing(files, t
     assert "ball.mp4: exists already" in capsys.readouterr().err
 
 
-def test_picture_is_the_first_frame(scene, tmp_path):
+def test_picture_is_the_view_that_shows_most(scene, tmp_path):
     ps.render_path(scene, tmp_path / "one.png", **SMALL)
     shown = np.asarray(Image.open(tmp_path / "one.png"))
-    best = ps.sample_views(scene, 12, 64, 48)[0]
+    best = opening_views(scene, 1, 64, 48).views[0]
     assert np.abs(shown - to_uint8(ps.render(scene, best)).astype(int)).max() <= 2
+
+
+def test_walk_past_an_object_begins_with_all_of_it(scene, tmp_path):
+    ps.render_path(scene, tmp_path / "frames", path="walk", seconds=0.3, **SMALL)
+    first = to_uint8(ps.render(scene, opening_views(scene, 12, 64, 48).views[0])).astype(int)
+    assert np.abs(frames_in(tmp_path / "frames")[0] - first).max() <= 2
 
 
 def test_up_may_be_said(scene, tmp_path):
@@ -148,15 +156,18 @@ def test_up_may_be_said(scene, tmp_path):
     with pytest.raises(ps.PointSplatError, match="up is 'w'; expected x, y, z, -x, -y or -z"):
         ps.render_path(scene, tmp_path / "none.png", up="w")
     with ps.open_viewer(scene, up="-y", port=0) as viewer:
-        assert viewer._up.tolist() == [0, -1, 0]
+        assert str(viewer._stage.frame.up) == "-y"
 
 
 def test_viewer_begins_with_the_poses_of_a_run(trained_walls):
     run = run_of(trained_walls, "wall-b")
     with ps.open_viewer(run, port=0) as viewer:
         assert viewer.origin == "poses of the dataset"
-        assert torch.equal(viewer._starts[0].viewmat, ps.dataset_views(run)[0].viewmat)
-        assert viewer._scenes[0].mode == "antialiased" and viewer._scenes[0].name == "wall-b"
+        frame, [viewed] = viewer._stage.frame, viewer._stage.scenes
+        shown = views_in_units(ps.dataset_views(run), frame.centre, frame.size).viewmats
+        opened = frame.views.viewmats[1:] if frame.whole else frame.views.viewmats
+        assert len(opened) > 1 and all(any(torch.allclose(one, p, atol=1e-5) for p in shown) for one in opened)
+        assert viewed.mode == "antialiased" and viewed.name == "wall-b"
 
 
 def test_address_that_cannot_be_listened_on_ends_the_command_in_one_line(files, capsys):
@@ -172,14 +183,13 @@ def test_given_views_keep_their_size_and_photos_are_reduced(scene, tmp_path):
     assert Image.open(tmp_path / "narrow.png").size == (80, 4)
 
 
-def test_news_of_merging_does_not_begin_pictures_anew(scene, monkeypatch):
+def test_news_of_merging_does_not_begin_pictures_anew(scene):
     with ps.open_viewer(scene, port=0) as viewer:
-        begun = []
-        monkeypatch.setattr(viewer, "_redraw", lambda: begun.append(viewer))
-        viewer._changed(False)
-        assert not begun
-        viewer._changed(True)
-        assert begun == [viewer]
+        stage = viewer._stage
+        stage._changed(False)
+        assert stage.made == 0
+        stage._changed(True)
+        assert stage.made == 1
 
 
 def test_a_folder_gets_a_frame_for_each_pose_of_a_file(scene, files, tmp_path):

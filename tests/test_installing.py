@@ -30,7 +30,7 @@ from pointsplat_ns.system.packages import need
 
 CORE, NERFSTUDIO = (REPOSITORY / "requirements" / name for name in ("core.txt", "nerfstudio.txt"))
 
-WITH_ANOTHER = {"gsplat": "nerfstudio", "websockets": "viser"}
+WITH_ANOTHER = {"gsplat": "nerfstudio"}
 """Packages that are imported where the one that brings them is."""
 
 BY_NAME = {"open3d"}
@@ -72,7 +72,6 @@ RUNS = {
 """Commands that nothing is missing for, and what they print."""
 
 FAILS = {
-    "view room.ply": "the viewer in the browser needs viser, which is not installed; pip install viser==0.2.7 adds it",
     "make-refiner -o made": "training needs nerfstudio, which is not installed; pip install pointsplat-ns adds it",
     "render run -o run.mp4 --path dataset": "needs nerfstudio, which is not installed; pip install pointsplat-ns",
 }
@@ -162,9 +161,8 @@ def test_no_command_asks_for_a_network(outcomes):
     assert not [line for line, done in outcomes.items() if done["tried"]]
 
 
-def test_all_but_the_plugin_and_the_viewer_can_be_imported_on_a_bare_machine(outcomes):
+def test_all_but_the_plugin_can_be_imported_on_a_bare_machine(outcomes):
     lacking = json.loads(outcomes[MODULES]["out"])
-    assert lacking.pop("pointsplat_ns.viewing.server") == lacking.pop("pointsplat_ns.viewing.viewer") == "viser"
     assert lacking and all(name.startswith("pointsplat_ns.nerfstudio_plugin.") for name in lacking)
     assert set(lacking.values()) <= {"nerfstudio", "gsplat", "cv2"}
 
@@ -177,7 +175,7 @@ def test_requirements_are_what_is_imported():
         imported = {name.split(".")[0] for name in imports_of(path)} - {"pointsplat_ns", "method_configs", "_typeshed"}
         inside = path.is_relative_to(package / "nerfstudio_plugin") or not path.is_relative_to(package)
         (plugin if inside else rest).update(imported - set(sys.stdlib_module_names))
-    assert _distributions(rest - {"viser"} - WITH_ANOTHER.keys()) <= core
+    assert _distributions(rest - WITH_ANOTHER.keys()) <= core
     assert _distributions((plugin | rest) - WITH_ANOTHER.keys()) == (core | more) - BY_NAME
 
 
@@ -219,12 +217,12 @@ def test_what_the_package_itself_lacks_is_one_line_too(monkeypatch, capsys):
 
 
 def test_a_package_that_is_there_but_broken_keeps_its_error(monkeypatch, tmp_path):
-    (tmp_path / "viser").mkdir()
-    (tmp_path / "viser" / "__init__.py").write_text("import liblzfse_that_is_missing")
-    monkeypatch.delitem(sys.modules, "viser", raising=False)
+    (tmp_path / "nerfstudio").mkdir()
+    (tmp_path / "nerfstudio" / "__init__.py").write_text("import liblzfse_that_is_missing")
+    monkeypatch.delitem(sys.modules, "nerfstudio", raising=False)
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ModuleNotFoundError, match="liblzfse_that_is_missing"):
-        need("viser", "the viewer")
+        need("nerfstudio", "training")
 
 
 @pytest.mark.parametrize("said", [ImportError("No module"), RuntimeError("operator torchvision::nms does not exist")])

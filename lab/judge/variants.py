@@ -107,6 +107,7 @@ LOOKING = {
     ),
     "no_photo_level": variant(photo_level_weight=0.0),
     "no_usual_direction": variant(usual_direction_weight=0.0),
+    "no_seen_from_above": variant(seen_from_above_weight=0.0),
     "no_lift_traces": variant(lift_trace_exponent=0.0),
     "no_min_box": variant(min_box_half_side=0.0),
     "never_a_room": variant("No scene counts as a room.", min_enclosed_places=2.0),

@@ -11,6 +11,7 @@ last quarter of the time, without a tenth at the beginning.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -19,9 +20,11 @@ import sys
 import tempfile
 import threading
 import time
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from email.message import Message
 from pathlib import Path
 from statistics import median
 from typing import Literal
@@ -135,7 +138,7 @@ def started(what: What, folder: Path, side: int) -> Iterator[Watched]:
         watched = Watched([sys.executable, "-c", RENDER, str(room)], r"^(\d+)$")
     else:
         watched = Watched(_console(["pointsplat", "view", str(room), "--port", PORT]), None)
-        threading.Thread(target=_move, args=(watched, f"ws://127.0.0.1:{PORT}", stop), daemon=True).start()
+        threading.Thread(target=_move, args=(watched, f"http://127.0.0.1:{PORT}", stop), daemon=True).start()
     try:
         yield watched
     finally:
@@ -155,30 +158,34 @@ def _console(words: list[str]) -> list[str]:
 
 def _move(watched: Watched, url: str, stop: threading.Event) -> None:
     """A page's part: moves a camera twice a second, counts the pictures that come, goes and comes again."""
-    import msgspec
-    from viser._messages import ViewerCameraMessage
-    from websockets.exceptions import WebSocketException
-    from websockets.sync.client import connect
-
     step = 0
     while not stop.is_set():
+        client, look, number = f"soak {time.monotonic_ns():020}", 0, 0
         try:
-            with connect(url, max_size=None) as socket:
-                for _ in range(60):
-                    if stop.is_set():
-                        return
-                    step += 1
-                    place = (0.3 * (step % 7), 0.2 * (step % 5), 1.2)
-                    message = ViewerCameraMessage((1.0, 0, 0, 0), place, 1.0, 4 / 3, (0.0, 0, 0), (0.0, 0, 1))
-                    socket.send(msgspec.msgpack.encode(message.as_serializable_dict()))
-                    end = time.monotonic() + 0.5
-                    while (left := end - time.monotonic()) > 0:
-                        try:
-                            watched.done += str(socket.recv(timeout=left)).count("BackgroundImageMessage")
-                        except TimeoutError:
-                            break
-        except (OSError, WebSocketException):
+            for look in range(60):
+                step += 1
+                eye = [0.3 * (step % 7), 0.2 * (step % 5), 1.2]
+                camera = {"eye": eye, "right": [1, 0, 0], "down": [0, 0, -1], "ahead": [0, 1, 0], "fov": 1.2}
+                window = {"width": 960, "height": 720, "wipe": 1, "kept": [100]}
+                _post(url, "/look", {"client": client, "stage": 1, "camera": camera, "look": look, **window})
+                end = time.monotonic() + 0.5
+                while time.monotonic() < end and not stop.is_set():
+                    waits = {"client": client, "stage": 1, "number": number, "texts": 0}
+                    state = json.loads(_post(url, "/picture", waits)["X-State"])
+                    watched.done += state["number"] != number
+                    number = state["number"]
+                    if state["look"] == look:
+                        time.sleep(max(end - time.monotonic(), 0))
+        except OSError:
             time.sleep(1)  # it has not started yet
+
+
+def _post(url: str, path: str, values: dict) -> Message:
+    """Send a request as the viewer's page does; the headers of the answer."""
+    request = urllib.request.Request(url + path, json.dumps(values).encode(), {"Origin": url})
+    with urllib.request.urlopen(request, timeout=60) as answer:
+        answer.read()
+        return answer.headers
 
 
 def main(

@@ -138,7 +138,7 @@ def compact(
         warn_if_larger(keep, output)
     shown = None if picture is None else ps.plot_comparison(dense, result, picture)
     if html is not None:
-        _write_page(scene, dense, result, html, html_limit)
+        _write_page(scene, dense, result, html, html_limit, up)
     written = None if dry_run else output
     if json_output:
         made = {
@@ -168,7 +168,7 @@ def _loaded(refiner: Path | None) -> TrainedRefiner | None:
     return refiner_at(refiner)
 
 
-def _write_page(path: Path, dense: Gaussians, result: Compacted, html: Path, limit_mb: float) -> None:
+def _write_page(path: Path, dense: Gaussians, result: Compacted, html: Path, limit_mb: float, up: str | None) -> None:
     """The page to fly through the scene before and after."""
     import pointsplat_ns as ps
     from pointsplat_ns.io.runs import name_of
@@ -178,5 +178,5 @@ def _write_page(path: Path, dense: Gaussians, result: Compacted, html: Path, lim
         notes.append(f"The compact scene has {result.psnr:.2f} dB PSNR against the dense scene's renders.")
     ps.write_page(
         [dense, result.scene], html, ["dense", "compact"], title=name_of(path), notes=notes, views=result.views,
-        limit_mb=limit_mb, progress=True,
+        up=up, limit_mb=limit_mb, progress=True,
     )  # fmt: skip

@@ -6,11 +6,9 @@ from pathlib import Path
 
 import tyro
 
-from pointsplat_ns.cli.scene_options import Scene
-
 
 def view(
-    scene: Scene,
+    scene: tyro.conf.Positional[Path | None] = None,
     other: tyro.conf.Positional[Path | None] = None,
     up: str | None = None,
     host: str = "127.0.0.1",
@@ -20,7 +18,8 @@ def view(
     is needed: small while the camera moves, whole once it is still. Ctrl-C ends it.
 
     Args:
-        scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
+        scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml); by default the page
+            takes a file that is dropped on it.
         other: a second scene in the same frame, to compare with; by default the first is compared with all of itself.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z; by default it is estimated. Write --up=-y for a
             negative axis.
@@ -32,7 +31,7 @@ def view(
 
     with ps.open_viewer(scene, other, up=up, host=host, port=port) as viewer:
         print(f"{viewer.url}: open it in a browser; Ctrl-C ends it")
-        print(f"it begins at {viewer.origin}", flush=True)
+        print(f"it begins at {viewer.origin}" if viewer.origin else "drop a scene on the page", flush=True)
         try:
             viewer.wait()
         except KeyboardInterrupt:

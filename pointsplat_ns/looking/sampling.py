@@ -19,6 +19,7 @@ from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces, log_widths, photo_places
 from pointsplat_ns.looking.upright import Up, UprightBox, pointing_up, upright_axis
+from pointsplat_ns.looking.whole import seen_from_above
 from pointsplat_ns.views import Views
 
 
@@ -95,15 +96,11 @@ def views_about(
         raise DataError(f"{count} views asked for; expected at least 1")
     if min(width, height) < 1:
         raise DataError(f"views of {width} x {height} pixels asked for; expected at least 1 x 1")
-    if up is not None:
-        up = torch.as_tensor(up).detach().double().cpu()
-        if up.shape != (3,) or not 0 < float(up.norm()) < math.inf:
-            raise DataError(f"up is {up.tolist()}; expected three numbers, not all 0")
-        up = up / up.norm()
-    centre, diagonal, surface = _content_surface(scene, settings)
+    up = None if up is None else unit_direction(up)
+    centre, diagonal, surface = content_surface(scene, settings)
     photos = None if photos is None else photos.in_units(centre, diagonal)
     known = None if up is None else Up(up)
-    upright, inside = _upright(surface, photos, known)
+    upright, inside = which_way_up(scene, centre, diagonal, surface, photos, known)
     box = UprightBox.of(surface, upright.direction)
     probe = in_units(thinned(scene, settings.probe_count), centre, diagonal)
     fine, widths = None, None
@@ -128,10 +125,29 @@ def views_about(
         raise DataError(
             "no free place to look at the scene from was found; give a run whose data is at hand, which has poses"
         )
-    rotation, translation = taken[:, :3, :3], taken[:, :3, 3]
-    viewmats = taken.clone()
-    viewmats[:, :3, 3] = translation * (diagonal / UNITS) - rotation @ centre
-    return views_of(viewmats, width, height, diagonal, settings)
+    return views_in_scene_units(taken, width, height, centre, diagonal, settings)
+
+
+def unit_direction(up: Tensor) -> Tensor:
+    """A direction (3,) of any length, at a length of 1, float64, on the CPU.
+
+    Raises:
+        DataError: if it is not a direction.
+    """
+    up = torch.as_tensor(up).detach().double().cpu()
+    if up.shape != (3,) or not 0 < float(up.norm()) < math.inf:
+        raise DataError(f"up is {up.tolist()}; expected three numbers, not all 0")
+    return up / up.norm()
+
+
+def views_in_scene_units(
+    viewmats: Tensor, width: int, height: int, centre: Tensor, diagonal: float, settings: LookingSettings
+) -> Views:
+    """Views of a scene from world-to-camera matrices (C, 4, 4) in units of its content, which has this centre (3,) and
+    diagonal, scene units."""
+    moved = viewmats.clone()
+    moved[:, :3, 3] = viewmats[:, :3, 3] * (diagonal / UNITS) - viewmats[:, :3, :3] @ centre
+    return views_of(moved, width, height, diagonal, settings)
 
 
 def _alternating(first: Tensor, second: Tensor) -> Tensor:
@@ -153,21 +169,33 @@ def estimated_up(scene: Gaussians, settings: LookingSettings = DEFAULTS) -> Up:
 @torch.no_grad()
 def up_about(scene: Gaussians, photos: PhotoPlaces | None, settings: LookingSettings = DEFAULTS) -> Up:
     """:func:`estimated_up` of a scene whose photo places are known already."""
-    centre, diagonal, surface = _content_surface(scene, settings)
-    return _upright(surface, None if photos is None else photos.in_units(centre, diagonal))[0]
+    centre, diagonal, surface = content_surface(scene, settings)
+    photos = None if photos is None else photos.in_units(centre, diagonal)
+    return which_way_up(scene, centre, diagonal, surface, photos)[0]
 
 
-def _content_surface(scene: Gaussians, settings: LookingSettings) -> tuple[Tensor, float, Surface]:
+def content_surface(scene: Gaussians, settings: LookingSettings) -> tuple[Tensor, float, Surface]:
     """Centre (3,) and diagonal of the content, scene units, and its surface."""
     centre, diagonal = content_size(scene, content_box(scene, settings))
     return centre, diagonal, Surface.of(scene, centre, diagonal, settings)
 
 
-def _upright(surface: Surface, photos: PhotoPlaces | None, up: Up | None = None) -> tuple[Up, bool]:
+def which_way_up(
+    scene: Gaussians,
+    centre: Tensor,
+    diagonal: float,
+    surface: Surface,
+    photos: PhotoPlaces | None,
+    up: Up | None = None,
+) -> tuple[Up, bool]:
     """Which way is up, unless it is known, and whether the scene is a room."""
     axis = upright_axis(surface, photos) if up is None else up.direction
     inside = is_room(surface, UprightBox.of(surface, axis))
-    return up or pointing_up(surface, axis, inside), inside
+    if up is not None:
+        return up, inside
+    weighted = surface.settings.seen_from_above_weight > 0
+    from_above = seen_from_above(scene, centre, diagonal, surface, axis) if weighted else 0.0
+    return pointing_up(surface, axis, inside, from_above), inside
 
 
 def is_room(surface: Surface, box: UprightBox) -> bool:

@@ -85,8 +85,6 @@ class Search:
         if self.inside:
             return self._views_from(self._inside(), True)
         around = self._views_from(self._outside(), False)
-        if not self.settings.enclosed_parts:
-            return around
         within = self._views_from(self._inside(), True)
         viewmats, owner, gains = (torch.cat(both) for both in zip(around, within, strict=True))
         owner[len(around[1]) :] += self.settings.places

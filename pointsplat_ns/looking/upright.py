@@ -28,7 +28,8 @@ class Up:
     direction: Tensor
     """(3,) float64, of length 1."""
     sure: bool = True
-    """Whether it was named, or the scene has level or vertical surfaces and most of its mass lies low."""
+    """Whether it was named, or the scene has level or vertical surfaces, and its mass and the side from which more is
+    seen agree with it."""
 
     def __str__(self) -> str:
         """The name of the axis, or the direction.
@@ -129,22 +130,23 @@ def upright_axis(surface: Surface, photos: PhotoPlaces | None = None) -> Tensor:
     return torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) if axis is None else axis
 
 
-def pointing_up(surface: Surface, axis: Tensor, inside: bool) -> Up:
+def pointing_up(surface: Surface, axis: Tensor, inside: bool, from_above: float = 0.0) -> Up:
     """``axis`` (3,) or its opposite, whichever points up.
 
-    Mass lies low. Where the centre of mass is about in the middle, z is up, or -y, as in scenes that have the axes of
-    their first camera.
+    More is seen from above than from below, and mass lies low. Where both say little, z is up, or -y, as in scenes that
+    have the axes of their first camera.
 
     Args:
         surface: points of the scene, and the settings.
         axis: (3,) as :func:`upright_axis` gives it.
         inside: whether the scene is a room that is looked at from inside.
+        from_above: as :func:`~pointsplat_ns.looking.whole.seen_from_above` gives it for ``axis``; 0 says nothing.
     """
-    content = _content(surface)
-    lift = _lift(content, axis, inside)
-    sign = 1 if lift + surface.settings.usual_direction_weight * _usual(axis) >= 0 else -1
-    evident = float(uprightness(axis[None], content)) >= surface.settings.min_uprightness
-    return Up(sign * axis, evident and sign * lift >= 0)
+    content, settings = _content(surface), surface.settings
+    evidence = _lift(content, axis, inside) + settings.seen_from_above_weight * from_above
+    sign = 1 if evidence + settings.usual_direction_weight * _usual(axis) >= 0 else -1
+    evident = float(uprightness(axis[None], content)) >= settings.min_uprightness
+    return Up(sign * axis, evident and sign * evidence >= 0)
 
 
 def _content(surface: Surface) -> Surface:

@@ -71,6 +71,12 @@ class ViewSource:
         """The views that were given, if any."""
         return self._given if self._given is not None and len(self._given) else None
 
+    @property
+    def rasterize_mode(self) -> RasterizeMode:
+        """Rasterize mode of the run's training; "classic" for other scenes."""
+        self.known(1)  # reads the run
+        return self._rasterize_mode
+
     @cached_property
     def _of_dataset(self) -> Views | None:
         if self._run is None or self._dataset_views is None or not may_be_run(self._run):

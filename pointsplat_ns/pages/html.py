@@ -29,7 +29,9 @@ def _environment() -> Environment:
     return environment
 
 
-def page(template: str, scripts: tuple[str, ...] = (), *, with_workers: bool = False, **values: Any) -> str:
+def page(
+    template: str, scripts: tuple[str, ...] = (), *, with_workers: bool = False, connects: bool = False, **values: Any
+) -> str:
     """One HTML page with its style, scripts and data in it.
 
     Its content security policy allows the script and style with the page's hashes and embedded pictures, and no other
@@ -39,6 +41,7 @@ def page(template: str, scripts: tuple[str, ...] = (), *, with_workers: bool = F
         template: name of a template that extends ``base.html``.
         scripts: names of the scripts, in their order in the page.
         with_workers: allow workers, whose programs are parts of the scripts.
+        connects: allow requests to the server that the page comes from.
         values: variables of the template. Texts are escaped; undecodable bytes of file names become "?".
 
     Raises:
@@ -54,6 +57,7 @@ def page(template: str, scripts: tuple[str, ...] = (), *, with_workers: bool = F
         f"style-src '{_hash(style)}'",
         f"script-src '{_hash(script)}'" if script else "script-src 'none'",
         *(("worker-src blob:",) if with_workers else ()),
+        *(("connect-src 'self'",) if connects else ()),
         "base-uri 'none'",
         "form-action 'none'",
     )

@@ -9,6 +9,7 @@ from typing import Any
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger, replacing
+from pointsplat_ns.looking.upright import Up, axis_named
 from pointsplat_ns.pages.flight import SCRIPTS, FlightFrame
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.pruning import need_usable, ply_bytes
@@ -24,6 +25,7 @@ def write_page(
     title: str | None = None,
     notes: Sequence[str] = (),
     views: Views | None = None,
+    up: str | None = None,
     limit_mb: float = 60.0,
     progress: bool | Progress = False,
 ) -> Path:
@@ -40,8 +42,10 @@ def write_page(
         names: a name for each scene; by default the title, or "left" and "right".
         title: title of the page; by default the name of the file.
         notes: lines of text for the reader.
-        views: views of the page's buttons; by default sampled from the first scene. The page opens at the view with
-            most Gaussians in its picture. Background and rasterize mode of the views apply to all scenes.
+        views: known views for the page's buttons; by default found from the first scene. The page opens at the one
+            that shows most, or at one that shows the whole subject. Background and rasterize mode of the views apply
+            to all scenes.
+        up: the axis that is up in the scene ("z", "-y"); by default that of the views, or estimated.
         limit_mb: maximum size of the file, in units of 10^6 bytes.
         progress: True shows a bar; a function is called with the name of the task and its share done.
 
@@ -72,12 +76,13 @@ def write_page(
     if len(names) != len(scenes):
         raise PointSplatError(f"{len(names)} names for {len(scenes)} scenes; expected one for each")
     check_limit(limit_mb)
+    upward = None if up is None else Up(axis_named(up))
     for scene in scenes:
         need_usable(scene)
     rows = [_row(name, scene) for name, scene in zip(names, scenes, strict=True)]
     with progress_bar(progress) as report:
         report("looking for views", 0.0)
-        frame = FlightFrame.of(scenes[0], views)
+        frame = FlightFrame.of(scenes[0], views, upward)
 
         def packed(name: str, scene: Gaussians) -> dict[str, str]:
             return frame.packed(scene, name, lambda _, share: report(f"compressing {name}", share))
@@ -86,10 +91,9 @@ def write_page(
         missing = ""
         while True:
             flight = frame.data(included)
-            values = {"title": title, "rows": rows, "notes": notes, "missing": missing, "flight": flight}
-            text = page(
-                "scene.html", (*SCRIPTS, "scene.js"), with_workers=True, **values, data={"flight": flight}
-            ).encode("utf-8")  # fmt: skip
+            values: dict[str, Any] = {"title": title, "rows": rows, "notes": notes, "missing": missing}
+            values |= {"flight": flight, "data": {"flight": flight}}
+            text = page("scene.html", (*SCRIPTS, "scene.js"), with_workers=True, **values).encode("utf-8")
             if len(text) <= 1e6 * limit_mb:
                 break
             included, missing = _without_the_largest(included, path, len(text), limit_mb)

@@ -7,14 +7,8 @@ from typing import Literal
 
 from pointsplat_ns.errors import MissingPackageError
 
-_REMEDIES = {
-    # pip adds what an installed package asks for and lacks.
-    "nerfstudio": "pip install pointsplat-ns adds it",
-    "viser": "pip install viser==0.2.7 adds it",
-}
 
-
-def need(package: Literal["nerfstudio", "viser"], what: str) -> None:
+def need(package: Literal["nerfstudio"], what: str) -> None:
     """Check that a package is installed, by importing it.
 
     Args:
@@ -29,4 +23,6 @@ def need(package: Literal["nerfstudio", "viser"], what: str) -> None:
     except ModuleNotFoundError as error:
         if error.name != package:  # it is there, and something that it needs is not
             raise
-        raise MissingPackageError(f"{what} needs {package}, which is not installed; {_REMEDIES[package]}") from None
+        # pip adds what an installed package asks for and lacks.
+        remedy = "pip install pointsplat-ns adds it"
+        raise MissingPackageError(f"{what} needs {package}, which is not installed; {remedy}") from None

@@ -62,7 +62,7 @@ def _read(path: Path) -> dict[str, Any] | None:
         flight = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    keys = {"scenes", "views", "up", "near", "background", "antialiased", "drag"}
+    keys = {"scenes", "views", "aspect", "up", "sure", "near", "background", "antialiased", "drag"}
     scenes = flight["scenes"] if isinstance(flight, dict) and flight.keys() == keys else None
     known = (
         isinstance(scenes, list) and scenes and all(isinstance(s, dict) and type(s.get("spz")) is str for s in scenes)

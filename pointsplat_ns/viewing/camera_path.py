@@ -11,6 +11,8 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import content_box
+from pointsplat_ns.looking.opening import opening_views
+from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.viewing.saved_path import LIMITS, read_path
 from pointsplat_ns.viewing.trajectories import STOPS, along, fitted, orbit, walk
@@ -74,7 +76,7 @@ def camera_path(
             their common content; "auto" is "dataset" if there is one, else "walk". Any other text is the path of a file
             that nerfstudio's viewer saved.
         settings: size, speed and length.
-        one: return the first camera only.
+        one: return one camera only: the one that shows most, unless the path says which.
         up: (3,) up direction of a walk or an orbit, of length 1, also of ``source``; by default from the views.
 
     Raises:
@@ -99,15 +101,21 @@ def camera_path(
         if settings.seconds is None and not one:
             frames = max(frames, len(known))
         usual = (known.width, known.height) if source.given is not None else _reduced(known)
+        if one and path == "auto":
+            known = opening_views(scene, up=None if up is None else Up(up), known=known.spread(4 * STOPS)).views
         views = along(_sized(known, settings, usual), frames)
         skipped = f", {len(known) - frames} of {len(known)} left out" if frames < len(known) and not one else ""
         return CameraPath(views, fps, f"along the {source.origin}{skipped}")
-    stops = known.spread(2 * STOPS) if known is not None else source.views(STOPS)
-    stops = _sized(stops, settings, (960, 540) if known is None else _reduced(known))
+    if known is None:
+        opening = opening_views(scene, 1 if one else STOPS, *_shape(settings, (960, 540)), source.up)
+        stops = dataclasses.replace(opening.views, rasterize_mode=source.rasterize_mode)
+        up, origin = opening.up.direction, f"views that show most, up is {opening.up}{source.missing}"
+    else:
+        stops, origin = _sized(known.spread(2 * STOPS), settings, _reduced(known)), source.origin
     if path == "orbit":
         low, high = content_box(scene)
-        return CameraPath(orbit(stops, frames, 0.5 * (low + high).cpu(), up), fps, f"a turn, by {source.origin}")
-    return CameraPath(walk(stops, frames, up), fps, f"a walk past {source.origin}")
+        return CameraPath(orbit(stops, frames, 0.5 * (low + high).cpu(), up), fps, f"a turn, by {origin}")
+    return CameraPath(walk(stops, frames, up, from_first=known is None), fps, f"a walk past {origin}")
 
 
 def _frames(seconds: float, fps: float) -> int:
@@ -121,11 +129,16 @@ def _reduced(views: Views) -> tuple[int, int]:
 
 
 def _sized(views: Views, settings: FilmSettings, usual: tuple[int, int]) -> Views:
-    """The views at the size of the settings, or at the usual width and height; even numbers, as videos need."""
+    """The views at the size of :func:`_shape`."""
+    width, height = _shape(settings, usual)
+    return views if (width, height) == (views.width, views.height) else fitted(views, width, height)
+
+
+def _shape(settings: FilmSettings, usual: tuple[int, int]) -> tuple[int, int]:
+    """Width and height of the settings, or the usual ones; even numbers, as videos need."""
     width, height = settings.width, settings.height
     if width is None:
         width = usual[0] if height is None else round(usual[0] * height / usual[1])
     if height is None:
         height = usual[1] if settings.width is None else round(usual[1] * width / usual[0])
-    width, height = (max(side - side % 2, 2) for side in (width, height))
-    return views if (width, height) == (views.width, views.height) else fitted(views, width, height)
+    return max(width - width % 2, 2), max(height - height % 2, 2)

@@ -1,122 +1,219 @@
-"""viser's web server with its security holes closed.
+"""The web server of the viewer: fixed routes, for pages that it served itself.
 
-viser 0.2.7 serves any file for a path with ``..``, accepts connections from any page of the same browser, gives every
-client a public address on request, reports each visit to a statistics service, and hangs where it cannot listen.
+Nothing of a request is a path. Pages of other sites, and names that resolve to this machine, are refused.
 """
 
 from __future__ import annotations
 
-import contextlib
 import http
 import io
 import socket
-from collections.abc import Iterator, Mapping
-from importlib.metadata import version
-from typing import Any
-
-import viser
-import websockets.server as websockets_server
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import BinaryIO, cast
+from urllib.parse import parse_qsl, urlsplit
 
 from pointsplat_ns.errors import PointSplatError
 
-_SERVER: Any = websockets_server
-"""The module whose ``serve`` viser calls."""
+LOCAL = ("localhost", "127.0.0.1", "::1")
+"""Names of this machine."""
 
-POLICY = (
-    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
-    "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob:; worker-src 'self' blob:; "
-    "frame-ancestors 'none'"
-)
-"""Content security policy: the page loads from this server alone."""
+IDLE_SECONDS = 30
+"""Time without a byte from a client after which its connection is closed."""
 
 
-class Server(viser.ViserServer):
-    """viser's server without public addresses."""
+@dataclass(frozen=True)
+class Request:
+    """A request to a route."""
 
-    def request_share_url(self, verbose: bool = True) -> None:
-        """Tell clients that there is no public address."""
-        for client in self.get_clients().values():
-            client.add_notification("Not shared", "This viewer has no public address; see its option --host.")
-
-
-def start_server(host: str, port: int, label: str) -> Server:
-    """Serve on the first free port from ``port`` on; 0 takes any.
-
-    Raises:
-        PointSplatError: if no port is free, or viser cannot be guarded.
-    """
-    port = free_port(host, port)
-    local = ("localhost", "127.0.0.1", "::1")
-    hosts = (*local, host) if host in local else None
-    with _guarded(hosts) as served, contextlib.redirect_stdout(io.StringIO()):  # viser prints its own lines
-        server = Server(host=host, port=port, label=label, verbose=False)
-    if not served:
-        server.stop()
-        raise PointSplatError(f"viser {version('viser')} cannot be made safe; expected viser 0.2.7")
-    return server
+    options: Mapping[str, str]
+    """What follows "?" in its address."""
+    length: int
+    """Size of its body, bytes."""
+    body: BinaryIO
 
 
-def free_port(host: str, port: int) -> int:
-    """The first free port from ``port`` on.
+@dataclass(frozen=True)
+class Answer:
+    """What a route answers."""
+
+    body: bytes = b""
+    kind: str = "text/plain; charset=utf-8"
+    status: http.HTTPStatus = http.HTTPStatus.OK
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Route:
+    """A path of the server."""
+
+    answer: Callable[[Request], Answer]
+    largest: int = 0
+    """Largest body, bytes; 0 for requests without one, which get pages."""
+
+
+class Server(ThreadingHTTPServer):
+    """Answers requests to routes, on threads of its own, until it is closed.
+
+    Args:
+        host: the address to listen on.
+        port: the first port to try; 0 takes any free port.
+        routes: by their paths.
 
     Raises:
         PointSplatError: if no port is free, or the host is not an address of this machine.
     """
+
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, host: str, port: int, routes: Mapping[str, Route]):
+        self.routes = routes
+        self.hosts = (*LOCAL, host) if host in LOCAL else None
+        """Accepted names of the server; None for any."""
+        self.address_family, address = _free_address(host, port)
+        super().__init__(address, _Handler)
+        self.url = f"http://{_named(host)}:{self.server_port}"
+        """Address of the page."""
+        threading.Thread(target=self.serve_forever, name="serving", daemon=True).start()
+
+    def close(self) -> None:
+        """Stop to listen."""
+        self.shutdown()
+        self.server_close()
+
+    def server_bind(self) -> None:
+        """Bind without a look-up of the machine's name, which may take seconds."""
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self.socket.bind(self.server_address)
+        self.server_address = self.socket.getsockname()
+        self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Say nothing of a client that has gone."""
+
+
+def _named(host: str) -> str:
+    host = "127.0.0.1" if host in ("", "0.0.0.0") else host
+    return f"[{host}]" if ":" in host else host
+
+
+def _free_address(host: str, port: int) -> tuple[socket.AddressFamily, tuple[str, int]]:
+    """The family of a host, and its address with the first free port from ``port`` on."""
     if not 0 <= port < 65536:
         raise PointSplatError(f"port {port}; expected 0 to 65535")
     last = min(port + 20, 65536) if port else 1  # number of ports to try
     failed = ""
     for candidate in range(port, last):
         try:
-            kind, *_, address = socket.getaddrinfo(host, candidate, type=socket.SOCK_STREAM)[0]
-            with socket.socket(kind, socket.SOCK_STREAM) as found:
+            family, *_, address = socket.getaddrinfo(host, candidate, type=socket.SOCK_STREAM)[0]
+            with socket.socket(family, socket.SOCK_STREAM) as found:
                 found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 found.bind(address)
-                return found.getsockname()[1]
+                return family, found.getsockname()[:2]
         except OSError as error:
             failed = error.strerror or str(error)
     raise PointSplatError(f"cannot listen on {host}, port {port} to {last - 1} ({failed}); expected another --port")
 
 
-def refusal(path: str, headers: Mapping[str, str], hosts: tuple[str, ...] | None) -> http.HTTPStatus | None:
-    """The status of a refused request; None if it is served.
+def refusal(method: str, headers: Mapping[str, str], hosts: tuple[str, ...] | None) -> http.HTTPStatus | None:
+    """The status of a request that is refused for its sender; None if it is served.
 
     Args:
-        path: path of the request.
+        method: GET or POST. Browsers name the origin of each POST.
         headers: headers of the request.
         hosts: accepted names of the server; None for any.
     """
-    target = path.partition("?")[0]
-    parts = target.split("/")
-    if parts[0] or ".." in parts or "" in parts[1:-1] or any(sign in target for sign in "\\:\0"):
-        return http.HTTPStatus.NOT_FOUND
     asked, origin = headers.get("Host", ""), headers.get("Origin")
     name = asked[1 : asked.find("]")] if asked.startswith("[") else asked.partition(":")[0]
     if hosts is not None and name not in hosts:  # a foreign page whose name resolves to this server
         return http.HTTPStatus.FORBIDDEN
-    if origin is not None and origin.partition("://")[2] != asked:  # a foreign page
+    if origin != f"http://{asked}" and not (origin is None and method == "GET"):  # a foreign page
         return http.HTTPStatus.FORBIDDEN
     return None
 
 
-@contextlib.contextmanager
-def _guarded(hosts: tuple[str, ...] | None) -> Iterator[list[bool]]:
-    """Make servers that start in this context refuse requests by :func:`refusal`. The list gets an entry for each."""
-    plain, served = _SERVER.serve, []
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    timeout = IDLE_SECONDS
+    server_version, sys_version = "pointsplat", ""
 
-    def serve(handler: Any, host: str, port: int, *, process_request: Any, **options: Any) -> Any:
-        async def guarded(path: str, headers: Any) -> Any:
-            status = refusal(path, headers, hosts)
-            if status is not None:
-                return status, {}, b""
-            answer = await process_request(path, headers)
-            return answer and (answer[0], {**answer[1], "Content-Security-Policy": POLICY}, answer[2])
+    def do_GET(self) -> None:
+        self._serve()
 
-        served.append(True)
-        return plain(handler, host, port, process_request=guarded, **options)
+    def do_POST(self) -> None:
+        self._serve()
 
-    _SERVER.serve = serve
-    try:
-        yield served
-    finally:
-        _SERVER.serve = plain
+    def log_message(self, *_: object) -> None:
+        """Requests are not logged."""
+
+    def _serve(self) -> None:
+        self.close_connection = True  # unless the whole body is read
+        answer = self._answer()
+        self.send_response(answer.status)
+        headers = {
+            "Content-Type": answer.kind,
+            "Content-Length": str(len(answer.body)),
+            "Cache-Control": "no-store",
+            "X-Content-Type-Options": "nosniff",
+            "X-Frame-Options": "DENY",
+            "Cross-Origin-Resource-Policy": "same-origin",
+            "Referrer-Policy": "no-referrer",
+            **answer.headers,
+            **({"Connection": "close"} if self.close_connection else {}),
+        }
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(answer.body)
+
+    def _answer(self) -> Answer:
+        server = cast(Server, self.server)
+        refused = refusal(self.command, {name.title(): value for name, value in self.headers.items()}, server.hosts)
+        if refused is not None:
+            return Answer(status=refused)
+        try:
+            asked = urlsplit(self.path)
+            options = dict(parse_qsl(asked.query, max_num_fields=8))
+        except ValueError:
+            return Answer(status=http.HTTPStatus.BAD_REQUEST)
+        route = server.routes.get(asked.path)
+        if route is None:
+            return Answer(status=http.HTTPStatus.NOT_FOUND)
+        if (route.largest > 0) != (self.command == "POST"):
+            return Answer(status=http.HTTPStatus.METHOD_NOT_ALLOWED)
+        length = self.headers.get("Content-Length", "" if route.largest else "0")
+        if not length.isascii() or not length.isdigit() or "Transfer-Encoding" in self.headers:
+            return Answer(status=http.HTTPStatus.LENGTH_REQUIRED)
+        if int(length) > route.largest:
+            text = f"{int(length):,} bytes; expected at most {route.largest:,}"
+            return Answer(text.encode(), status=http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+        body = _Body(self.rfile, int(length))
+        try:
+            answer = route.answer(Request(options, int(length), cast(BinaryIO, body)))
+        except (ValueError, TypeError, KeyError):  # a body that no page of this server sends
+            answer = Answer(status=http.HTTPStatus.BAD_REQUEST)
+        self.close_connection = body.left > 0
+        return answer
+
+
+class _Body(io.RawIOBase):
+    """A body of known size, read from a connection."""
+
+    def __init__(self, stream: io.BufferedIOBase, length: int):
+        self._stream, self.left = stream, length
+
+    def read(self, size: int = -1) -> bytes:
+        """At most ``size`` bytes; empty at the end.
+
+        Raises:
+            ValueError: if the client sends less than it said.
+        """
+        wanted = self.left if size < 0 else min(size, self.left)
+        data = self._stream.read(wanted)
+        if len(data) < wanted:
+            raise ValueError("the body is cut off")
+        self.left -= len(data)
+        return data

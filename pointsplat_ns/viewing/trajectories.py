@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -48,13 +49,14 @@ def along(views: Views, frames: int) -> Views:
     return _posed(views, viewmats, np.interp(np.arange(frames), knots, range(len(knots))), knots)
 
 
-def walk(views: Views, frames: int, up: Tensor | None = None) -> Views:
+def walk(views: Views, frames: int, up: Tensor | None = None, from_first: bool = False) -> Views:
     """A smooth, upright walk past some views of a scene, in a short order. Cameras do not roll.
 
     Args:
         views: C cameras; at most 12 of them, evenly spread, are used.
         frames: number of frames, at least 1.
         up: (3,) up direction of length 1; by default from the views.
+        from_first: begin at the first of the views, not where the walk is shortest.
 
     Returns:
         ``frames`` cameras, float64.
@@ -64,7 +66,7 @@ def walk(views: Views, frames: int, up: Tensor | None = None) -> Views:
     """
     views = _spread(views.spread(STOPS), frames)
     places, turns = _poses(views)
-    order = _tour(_distances(places, turns))
+    order = _tour(_distances(places, turns), [0] if from_first else range(len(views)))
     views, places, turns = views[order], places[order], turns[order]
     knots = _knots(_lengths(places, turns), frames)
     up = up_of(views) if up is None else up
@@ -197,8 +199,9 @@ def _smooth(knots: np.ndarray, values: np.ndarray, frames: int) -> np.ndarray:
     return PchipInterpolator(knots, values)(np.arange(frames))
 
 
-def _tour(distances: np.ndarray) -> list[int]:
-    """A short order of views by their distances (C, C): from the best start, always to the nearest remaining view."""
+def _tour(distances: np.ndarray, starts: Iterable[int]) -> list[int]:
+    """A short order of views by their distances (C, C): from the best of ``starts``, always to the nearest remaining
+    view."""
 
     def from_start(start: int) -> tuple[float, list[int]]:
         order, total = [start], 0.0
@@ -210,7 +213,7 @@ def _tour(distances: np.ndarray) -> list[int]:
             order.append(nearest)
         return total, order
 
-    return min(from_start(start) for start in range(len(distances)))[1]
+    return min(from_start(start) for start in starts)[1]
 
 
 def _angles(directions: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:

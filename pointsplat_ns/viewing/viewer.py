@@ -1,35 +1,50 @@
-"""The viewer: viser's page, with pictures by this package's rasterizer."""
+"""The viewer: a page in the browser, with pictures by this package's rasterizer."""
 
 from __future__ import annotations
 
-import logging
+import json
 import math
 import shlex
+import tempfile
 import threading
+import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.cameras import invert_rigid
-from pointsplat_ns.geometry.quaternions import rotation_matrices
-from pointsplat_ns.looking.content import thinned
-from pointsplat_ns.looking.settings import DEFAULTS
+from pointsplat_ns.io.files import one_line
+from pointsplat_ns.looking.content import UNITS
+from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.rasterizer import render_depth
+from pointsplat_ns.pages.flight import KNOWN_VIEWS, FlightFrame
+from pointsplat_ns.pages.html import page
 from pointsplat_ns.system.memory import share_freed_memory
-from pointsplat_ns.viewing.painter import Camera, Painter, PictureRequest
-from pointsplat_ns.viewing.schedule import Step
-from pointsplat_ns.viewing.selection import ReducedScene, Selection
-from pointsplat_ns.viewing.server import start_server
-from pointsplat_ns.viewing.trajectories import up_of
-from pointsplat_ns.views import RasterizeMode, View, Views
+from pointsplat_ns.viewing.dropped import LARGEST, READABLE_NAMES, received
+from pointsplat_ns.viewing.painter import Camera, PictureRequest
+from pointsplat_ns.viewing.selection import Selection
+from pointsplat_ns.viewing.server import Answer, Request, Route, Server
+from pointsplat_ns.viewing.watcher import Watcher
+from pointsplat_ns.views import RasterizeMode
+
+MOST_PAGES = 8
+"""Largest number of open pages; the one that was heard of least recently gives way."""
+
+WAIT_SECONDS = 20.0
+"""Longest wait of a page's request for the next picture."""
+
+END_SECONDS = 5.0
+"""Longest wait for each thing that is being drawn, merged or read when the viewer is closed."""
+
+LARGEST_SIDE = 4096
+"""Largest longer side of a picture, pixels."""
+
+HTML = "text/html; charset=utf-8"
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +53,7 @@ class ViewedScene:
 
     name: str
     path: Path | None
-    """Path of the scene; None if it was given as Gaussians."""
+    """Path of the scene; None if it has none."""
     scene: Gaussians
     source: ViewSource
     """Source of views."""
@@ -46,49 +61,132 @@ class ViewedScene:
     """Rasterize mode of its training."""
 
 
+class _Stage:
+    """The scenes that are shown, from where, and at which budgets."""
+
+    def __init__(
+        self, scenes: Sequence[ViewedScene], up: Up | None, number: int, changed: Callable[[], None], drops: bool
+    ):
+        self.scenes, self.number = scenes, number
+        self.made = 0
+        """Number of times that another part of a scene was chosen or made, which pages then ask to see."""
+        first = scenes[0]
+        known = first.source.known(KNOWN_VIEWS)
+        self.frame = FlightFrame.of(first.scene, known, first.source.up if up is None and known is None else up)
+        found = f"the view that shows most, up is {self.frame.up}{first.source.missing}"
+        self.origin = found if known is None else first.source.origin
+        self._tell = changed
+        self.selections = [Selection(viewed.scene, viewed.source, self._changed) for viewed in scenes]
+        pair = [{"name": viewed.name, "amount": ""} for viewed in scenes]
+        if len(scenes) == 1:
+            pair.append({"name": "all of it", "amount": ""})
+        data = {**self.frame.data(pair), "stage": number, "kept": [100] * len(scenes)}
+        title, scripts = " and ".join(viewed.name for viewed in scenes), ("camera.js", "flight.js", "view.js")
+        html = page("view.html", scripts, connects=True, title=title, flight=data, drops=drops, data={"flight": data})
+        self.html = html.encode("utf-8")
+
+    def _changed(self, picture: bool) -> None:
+        self.made += picture
+        self._tell()
+
+    def request(self, wanted: dict[str, Any]) -> tuple[PictureRequest, int]:
+        """What a page asked for, and the longer side of the picture, pixels.
+
+        Raises:
+            ValueError, TypeError, KeyError: if it is not what the page of this server sends.
+        """
+        camera, views = wanted["camera"], self.frame.views
+        width, height = (min(max(int(wanted[name]), 1), LARGEST_SIDE) for name in ("width", "height"))
+        eye, right, down, ahead = (_vector(camera[name]) for name in ("eye", "right", "down", "ahead"))
+        turn = torch.stack([right, down, ahead])
+        if not bool(((turn @ turn.T - torch.eye(3, dtype=torch.float64)).abs() < 1e-3).all()):
+            raise ValueError("no rotation")
+        place = eye * (self.frame.size / UNITS) + self.frame.centre
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, :3], viewmat[:3, 3] = turn, -turn @ place
+        share = math.tan(0.5 * min(max(float(camera["fov"]), 0.01), 3.1)) * height / max(width, height)
+        near = views.near_plane * self.frame.size / UNITS
+        drawn = Camera(viewmat, 2 * math.atan(share), width / height, views.background, near)
+        kept = wanted["kept"]
+        for selection, percent in zip(self.selections, kept, strict=True):
+            if int(percent) != selection.percent:
+                selection.choose(int(percent))
+        first = self.selections[0]
+        two = len(self.selections) == 2
+        second = self.selections[1].current if two else first.whole
+        wipe = min(max(float(wanted["wipe"]), 0.0), 1.0)
+        line = wipe if two or first.percent < 100 else 1.0
+        modes = self.scenes[0].mode, self.scenes[-1].mode
+        return PictureRequest(drawn, first.current, second, line, modes), max(width, height)
+
+    def texts(self) -> list[dict[str, str]]:
+        """Text on the current part of each scene, with the command that makes it."""
+        found = []
+        for viewed, selection in zip(self.scenes, self.selections, strict=True):
+            current, whole = selection.current, len(selection.scene)
+            amount = f"{whole:,} Gaussians"
+            if selection.percent < 100:
+                amount = f"{len(current.scene):,} of {whole:,} Gaussians, {selection.status or current.how}"
+            command = ""
+            if viewed.path is not None and selection.percent < 100:
+                command = shlex.join(["pointsplat", "prune", str(viewed.path), "--keep", f"{selection.percent}%"])
+            found.append({"amount": amount, "command": command})
+        return found
+
+    def close(self, timeout: float) -> None:
+        """Stop merging, and wait for it at most ``timeout`` seconds."""
+        for selection in self.selections:
+            selection.close(timeout)
+
+
 class Viewer:
     """Shows one or two scenes in the browser, until it is closed; also the context of a ``with`` block.
 
     Args:
-        scenes: one or two scenes, both in the same frame.
+        scenes: one or two scenes, both in the same frame; none for a page to drop a scene on.
         host: the address to listen on.
         port: the first port to try; 0 takes any free port.
-        up: (3,) up direction of length 1; by default from the views of the first scene.
+        up: which way is up; by default that of the first scene's known views, or estimated.
+        read: reads a dropped file, which has this name; only without scenes.
 
     Raises:
-        DataError: if there are no views.
+        SceneError: if no Gaussian of a scene can be drawn.
+        DataError: if no Gaussian of the first scene is visible.
         PointSplatError: if no port is free.
     """
 
-    def __init__(self, scenes: Sequence[ViewedScene], host: str, port: int, up: Tensor | None = None):
+    def __init__(
+        self,
+        scenes: Sequence[ViewedScene],
+        host: str,
+        port: int,
+        up: Up | None = None,
+        read: Callable[[Path, str], ViewedScene] | None = None,
+    ):
         share_freed_memory()  # each page has a drawing thread
-        first = scenes[0]
-        self._scenes = scenes
-        self._starts = first.source.views(12)
-        self.origin = first.source.origin
-        """Text on the origin of the first view."""
-        self._up = up_of(self._starts) if up is None else up
-        self._small = thinned(first.scene, DEFAULTS.probe_count)
-        self._painters: dict[int, Painter] = {}
-        self._notes: dict[int, Any] = {}
-        self._at = 0
-        self._closed = False
-        # websockets logs a traceback for each page that is closed before it has loaded.
-        logging.getLogger("websockets").setLevel(logging.CRITICAL + 1)
-        self._server = start_server(host, port, "pointsplat")
-        self._selections: list[Selection] = []
-        for viewed in scenes:
-            self._selections.append(Selection(viewed.scene, viewed.source, self._changed))
-        self._build()
-        self._server.on_client_connect(self._connected)
-        self._server.on_client_disconnect(self._disconnected)
+        self._up, self._read = up, read
+        self._watchers: dict[str, Watcher] = {}
+        self._lock, self._looking, self._dropping = threading.Lock(), threading.Lock(), threading.Lock()
+        self._stage: _Stage | None = None
+        self._drop_page = b""
+        routes = {
+            "/": Route(self._page),
+            "/look": Route(self._look, 65_536),
+            "/picture": Route(self._picture, 1_024),
+        }
+        if read is not None:
+            self._drop_page = page("drop.html", ("drop.js",), connects=True, suffixes=READABLE_NAMES).encode("utf-8")
+            routes |= {"/drop": Route(self._drop, LARGEST), "/other": Route(lambda _: Answer(self._drop_page, HTML))}
+        if scenes:
+            self._show(scenes)
+        self._server = Server(host, port, routes)
+        self.url = self._server.url
+        """Address of the page."""
 
     @property
-    def url(self) -> str:
-        """Address of the page."""
-        host = self._server.get_host()
-        host = "127.0.0.1" if host in ("", "0.0.0.0") else host
-        return f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
+    def origin(self) -> str:
+        """Text on the origin of the first view; empty without a scene."""
+        return "" if self._stage is None else self._stage.origin
 
     def wait(self) -> None:
         """Wait until Ctrl-C."""
@@ -96,14 +194,16 @@ class Viewer:
 
     def close(self) -> None:
         """End the server and all drawing. A second call does nothing."""
-        if self._closed:
+        if self._server.fileno() < 0:
             return
-        self._closed = True
-        for painter in list(self._painters.values()):
-            painter.close()
-        for selection in self._selections:
-            selection.close()
-        self._server.stop()
+        self._server.close()
+        # Threads that are in torch when the program ends abort it: they are waited for, and these locks are kept.
+        for lock in (self._looking, self._dropping):
+            lock.acquire(timeout=END_SECONDS)
+        for watcher in list(self._watchers.values()):
+            watcher.close(END_SECONDS)
+        if self._stage is not None:
+            self._stage.close(END_SECONDS)
 
     def __enter__(self) -> Viewer:
         return self
@@ -111,140 +211,93 @@ class Viewer:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _build(self) -> None:
-        """The panel beside the picture."""
-        gui = self._server.gui
-        gui.configure_theme(dark_mode=True, show_logo=False)  # viser 0.2.7 needs its share button to work
-        self._server.scene.set_up_direction(self._up.numpy())
-        self._budgets = []
-        for viewed, selection in zip(self._scenes, self._selections, strict=True):
-            gui.add_markdown(f"**{_code(viewed.name)}**")
-            slider = gui.add_slider("Kept, %", 1, 100, 1, 100, hint="share of this scene's Gaussians")
-            slider.on_update(_chooser(selection))
-            self._budgets.append(gui.add_markdown(""))
-        two = len(self._scenes) == 2
-        hint = "left of the line the first scene" if two else "left of the line the kept Gaussians, right of it all"
-        self._line = gui.add_slider("Wipe, %", 0, 100, 1, 50 if two else 100, hint=hint)
-        self._line.on_update(lambda _: self._redraw())
-        self._side = gui.add_slider("Pixels", 240, 1920, 80, 960, hint="longer side of the picture at rest")
-        self._side.on_update(lambda _: self._redraw())
-        gui.add_button("Next view").on_click(lambda event: self._next(event.client))
-        gui.add_button("This view, level").on_click(lambda event: self._put(event.client))
-        gui.add_button("Turn over", hint="if the scene is upside down").on_click(lambda event: self._turn(event.client))
-        self._describe()
+    def _show(self, scenes: Sequence[ViewedScene]) -> None:
+        number = 1 if self._stage is None else self._stage.number + 1
+        stage = _Stage(scenes, self._up, number, self._changed, self._read is not None)
+        with self._lock:
+            before, self._stage = self._stage, stage
+        if before is not None:
+            before.close(0.0)
 
-    def _describe(self) -> None:
-        """Write text on the current part of each scene, with the command that makes it."""
-        for viewed, selection, note in zip(self._scenes, self._selections, self._budgets, strict=True):
-            current, whole = selection.current, len(selection.scene)
-            lines = [f"{len(current.scene):,} of {whole:,} Gaussians, {current.how}"]
-            if selection.status:
-                lines.append(selection.status)
-            elif viewed.path is not None and selection.percent < 100:
-                command = ["pointsplat", "prune", str(viewed.path), "--keep", f"{selection.percent}%"]
-                lines.append(_code(shlex.join(command)))
-            note.content = "  \n".join(lines)
+    def _changed(self) -> None:
+        """Tell pages that a selection has a new text, or another part of its scene."""
+        with self._lock:
+            for watcher in self._watchers.values():
+                watcher.tell()
 
-    def _changed(self, picture: bool) -> None:
-        """Handle a new scene or status of a selection. A new status alone must not restart pictures."""
-        self._describe()
-        if picture:
-            self._redraw()
+    def _page(self, request: Request) -> Answer:
+        return Answer(self._drop_page if self._stage is None else self._stage.html, HTML)
 
-    def _redraw(self) -> None:
-        for client in self._server.get_clients().values():
-            self._look(client)
+    def _look(self, request: Request) -> Answer:
+        """Take the camera, window and budgets of a page."""
+        wanted = json.loads(request.body.read(request.length))
+        stage = self._stage
+        if stage is None or wanted["stage"] != stage.number:
+            return Answer(status=HTTPStatus.CONFLICT)
+        with self._looking:
+            watcher = self._watcher(str(wanted["client"]))
+            watcher.look(*stage.request(wanted), int(wanted["look"]))
+        return Answer(status=HTTPStatus.NO_CONTENT)
 
-    def _connected(self, client: Any) -> None:
-        self._notes[client.client_id] = client.gui.add_markdown("drawing")
+    def _picture(self, request: Request) -> Answer:
+        """Wait for the next picture, or the next text."""
+        wanted = json.loads(request.body.read(request.length))
+        stage = self._stage
+        if stage is None or wanted["stage"] != stage.number:
+            return Answer(status=HTTPStatus.CONFLICT)
+        watcher = self._watcher(str(wanted["client"]))
+        number = int(wanted["number"])
+        shown, texts = watcher.next(number, int(wanted["texts"]), WAIT_SECONDS)
+        state = {
+            "number": shown.number,
+            "look": shown.look,
+            "texts": texts,
+            "made": stage.made,
+            "scenes": stage.texts(),
+        }
+        headers = {"X-State": json.dumps(state)}
+        if shown.number == number:
+            return Answer(status=HTTPStatus.NO_CONTENT, headers=headers)
+        return Answer(shown.jpeg, "image/jpeg", headers=headers)
 
-        def show(pixels: np.ndarray, step: Step[PictureRequest], seconds: float) -> None:
-            preview = step.moving and not step.whole
-            client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=75 if preview else 95)
-            size = f"{pixels.shape[1]} x {pixels.shape[0]}"
-            share = "" if step.share == 1 else f", {step.share:.0%} of the Gaussians"
-            state = "moving: " if preview else ""
-            note = self._notes.get(client.client_id)
-            if note is not None:  # the page is still open
-                note.content = f"{state}{size}, {1000 * seconds:.0f} ms a frame{share}"
+    def _watcher(self, client: str) -> Watcher:
+        """What draws for a page, by the page's own name."""
+        if not 16 <= len(client) <= 64:
+            raise ValueError("no name of a page")
+        with self._lock:
+            if client not in self._watchers:
+                while len(self._watchers) >= MOST_PAGES:
+                    oldest = min(self._watchers, key=lambda name: self._watchers[name].seen)
+                    self._watchers.pop(oldest).close()
+                self._watchers[client] = Watcher()
+            watcher = self._watchers[client]
+            watcher.seen = time.monotonic()
+            return watcher
 
-        self._painters[client.client_id] = Painter(show)
-        self._put(client)
-        client.camera.on_update(lambda _: self._look(client))
-        self._look(client)
-
-    def _disconnected(self, client: Any) -> None:
-        painter = self._painters.pop(client.client_id, None)
-        self._notes.pop(client.client_id, None)
-        if painter is not None:
-            painter.schedule.close()  # without waiting, because this is the server's thread
-        later = threading.Timer(1.0, self._forget_gone)  # s until its socket is closed
-        later.daemon = True
-        later.start()
-
-    def _forget_gone(self) -> None:
-        """Send text to all pages: viser 0.2.7 keeps a closed page and its socket until sending fails."""
-        with suppress(RuntimeError):  # the server may end meanwhile
-            if not self._closed:
-                self._describe()
-
-    def _look(self, client: Any) -> None:
-        """Request the picture of a client's camera."""
-        painter = self._painters.get(client.client_id)
-        if painter is None:
-            return
-        start, camera = self._starts[self._at], client.camera
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[:3, :3] = rotation_matrices(torch.tensor(np.asarray(camera.wxyz, np.float64))[None])[0]
-        pose[:3, 3] = torch.tensor(np.asarray(camera.position, np.float64))
-        drawn = Camera(
-            invert_rigid(pose[None])[0], float(camera.fov), float(camera.aspect), start.background, start.near_plane
-        )
-        first = self._selections[0]
-        second: ReducedScene | None = self._selections[1].current if len(self._selections) == 2 else first.whole
-        modes = self._scenes[0].mode, self._scenes[-1].mode
-        request = PictureRequest(drawn, first.current, second, self._line.value / 100, modes)
-        painter.schedule.submit(request, int(self._side.value))
-
-    def _next(self, client: Any) -> None:
-        self._at = (self._at + 1) % len(self._starts)
-        self._put(client)
-
-    def _turn(self, client: Any) -> None:
-        self._up = -self._up
-        self._server.scene.set_up_direction(self._up.numpy())
-        self._put(client)
-
-    def _put(self, client: Any) -> None:
-        """Move a client's camera to the current view, upright."""
-        view = self._starts[self._at]
-        place, ahead = self._pose(view)
-        with client.atomic():
-            client.camera.fov = 2 * math.atan(0.5 * view.height / float(view.K[1, 1]))
-            client.camera.up_direction = self._up.numpy()
-            client.camera.position = place.numpy()
-            client.camera.look_at = (place + ahead).numpy()
-
-    def _pose(self, view: View) -> tuple[Tensor, Tensor]:
-        """The position (3,) of a view, and the vector (3,) to the centre of its content, about which the camera
-        turns."""
-        pose = invert_rigid(view.viewmat[None].double())[0]
-        one = Views(view.viewmat[None], view.K[None], view.width, view.height, view.background).resized(48)[0]
-        depth, alpha = render_depth(self._small, one)
-        covered = depth[alpha > 0.5]
-        distance = float(covered.median()) if len(covered) else 1.0
-        return pose[:3, 3], pose[:3, 2] * max(distance, 10 * view.near_plane)
+    def _drop(self, request: Request) -> Answer:
+        """Take a dropped file, and show its scene."""
+        assert self._read is not None
+        with self._dropping, tempfile.TemporaryDirectory(prefix="pointsplat-drop-") as folder:
+            try:
+                path, name = received(request, Path(folder))
+                try:
+                    self._show([self._read(path, name)])
+                except PointSplatError as error:
+                    return _refused(str(error).replace(str(path), name))
+            except PointSplatError as error:
+                return _refused(str(error))
+            except (OSError, MemoryError) as error:
+                return _refused(f"the file cannot be read here ({one_line(error)})")
+        return Answer(status=HTTPStatus.NO_CONTENT)
 
 
-def _chooser(selection: Selection) -> Callable[[Any], None]:
-    """Callback of a budget's slider."""
-
-    def choose(event: Any) -> None:
-        selection.choose(event.target.value)
-
-    return choose
+def _refused(text: str) -> Answer:
+    return Answer(text.encode("utf-8", "replace"), status=HTTPStatus.UNPROCESSABLE_ENTITY)
 
 
-def _code(text: str) -> str:
-    """A text as Markdown code: the page would run text in braces."""
-    return "`" + "".join(sign if sign.isprintable() and sign != "`" else "?" for sign in text) + "`"
+def _vector(values: Any) -> torch.Tensor:
+    """A vector (3,) of finite numbers, float64."""
+    vector = torch.tensor([float(value) for value in values], dtype=torch.float64)
+    if vector.shape != (3,) or not bool(vector.isfinite().all()):
+        raise ValueError("no vector")
+    return vector

@@ -11,9 +11,9 @@ import torch
 
 import pointsplat_ns as ps
 from making import cloud
-from pointsplat_ns.compression import placing
 from pointsplat_ns.compression.placing import Similarity, run_frame
 from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.looking.upright import axis_named
 
 SEED = 4
 
@@ -57,7 +57,7 @@ def test_up_is_turned_to_where_it_is_wanted():
     scene = cloud(20, SEED)
     for start, end in (("z", "y"), ("-y", "z"), ("x", "-x"), ("z", "z")):
         turned = ps.place(scene, up=f"{start}:{end}")
-        now, wanted = (placing._axis(text) for text in (start, end))
+        now, wanted = (axis_named(text) for text in (start, end))
         assert torch.allclose(scene.means.double() @ now, turned.means.double() @ wanted, atol=1e-6)
 
 

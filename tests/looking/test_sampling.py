@@ -184,6 +184,7 @@ ALL_OFF = dataclasses.replace(
     usual_axis_factors_with_photos=(0.0, 0.0),
     photo_level_weight=0.0,
     usual_direction_weight=0.0,
+    seen_from_above_weight=0.0,
     lift_trace_exponent=0.0,
     min_box_half_side=0.0,
     eye_heights=(0.0, 1.0),

@@ -16,8 +16,9 @@ from making import ball, box_room
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import read_spz
 from pointsplat_ns.looking.content import in_units
-from pointsplat_ns.looking.poses import look_at
-from pointsplat_ns.pages.flight import MAX_COORDINATE, VIEWS, FlightFrame
+from pointsplat_ns.looking.poses import in_pictures, look_at
+from pointsplat_ns.looking.upright import Up
+from pointsplat_ns.pages.flight import MAX_COORDINATE, FlightFrame
 from sweeps import room_views
 
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(1)>\"'&</title>"
@@ -66,7 +67,7 @@ def test_page_says_how_much_each_scene_is(written, rooms):
     for name, room in zip(("dense", "compact"), rooms, strict=True):
         ply = (104 * len(room) + 1e3) / 1e6  # 26 numbers each, and a header of some hundred bytes
         assert f'<th scope="row">{name}</th><td>{len(room):,}</td><td>1</td><td>{ply:.2f}</td>' in text
-        assert f"<strong>{name}</strong> {len(room):,} Gaussians, {ply:.2f} MB as .ply" in text
+        assert f"<strong>{name}</strong> <span>{len(room):,} Gaussians, {ply:.2f} MB as .ply" in text
 
 
 def test_texts_of_strangers_are_shown_and_never_run(tmp_path):
@@ -80,7 +81,7 @@ def test_texts_of_strangers_are_shown_and_never_run(tmp_path):
 
 def test_one_scene_has_the_name_of_the_file_and_no_wipe(tmp_path):
     text = ps.write_page(ball(50), tmp_path / "my ball.html").read_text("utf-8")
-    assert "<h1>my ball</h1>" in text and "<strong>my ball</strong> 50 Gaussians" in text
+    assert "<h1>my ball</h1>" in text and "<strong>my ball</strong> <span>50 Gaussians" in text
     assert 'data-flight="wipe"' not in text and "<kbd>[</kbd>" not in text
 
 
@@ -138,44 +139,61 @@ def test_what_is_very_far_away_or_has_no_meaning_is_left_out_and_counted(tmp_pat
     assert len(shown) == 197 and shown.means.abs().max() < MAX_COORDINATE
 
 
-def test_flight_begins_where_most_is_seen_and_leads_to_a_few_views():
+def ball_seen_from(eyes: list[list[float]], targets: list[list[float]]) -> ps.Views:
+    """Views over orange of 64 x 40 pixels, antialiased."""
+    K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 20.0], [0.0, 0.0, 1.0]]).repeat(len(eyes), 1, 1)
+    viewmats = look_at(torch.tensor(eyes), torch.tensor(targets))
+    return ps.Views(viewmats, K, 64, 40, torch.tensor([1.0, 0.5, 0.0]), "antialiased")
+
+
+def test_flight_begins_with_the_whole_and_leads_to_the_views_that_were_given():
     scene = ball(300)
-    eyes = torch.tensor([[6.0, 0.0, 0.0]]).repeat(8, 1)
-    targets = torch.tensor([[12.0, 0.0, 0.0]]).repeat(8, 1)
-    targets[7] = 0  # one camera looks at the ball, the others away from it
-    K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 20.0], [0.0, 0.0, 1.0]]).repeat(8, 1, 1)
-    views = ps.Views(look_at(eyes, targets), K, 64, 40, torch.tensor([1.0, 0.5, 0.0]), "antialiased")
+    views = ball_seen_from([[6.0, 0.0, 0.0], [2.0, 0.0, 0.0]], [[12.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     stage = FlightFrame.of(scene, views)
     data = stage.data([])
-    assert len(data["views"]) == VIEWS
-    first = data["views"][0]
-    assert torch.allclose(torch.tensor(first["ahead"]), torch.tensor([-1.0, 0.0, 0.0]))
-    expected = (torch.tensor([6.0, 0.0, 0.0]) - stage.centre) * 10 / stage.size
-    assert torch.allclose(torch.tensor(first["eye"]), expected.float(), atol=1e-4)
-    assert first["fov"] == pytest.approx(2 * math.atan(32 / 60), rel=1e-6)
-    assert data["antialiased"] is True and data["background"] == [1.0, 0.5, 0.0] and data["drag"] == "orbit"
+    assert data["drag"] == "orbit" and len(data["views"]) == 3
+    whole = in_units(scene, stage.centre, stage.size).means.double()
+    assert in_pictures(stage.views[:1], whole).float().mean() > 0.98, "all but stray points"
+    near = data["views"][1]
+    assert torch.allclose(torch.tensor(near["ahead"]), torch.tensor([-1.0, 0.0, 0.0]))
+    expected = (torch.tensor([2.0, 0.0, 0.0]) - stage.centre) * 10 / stage.size
+    assert torch.allclose(torch.tensor(near["eye"]), expected.float(), atol=1e-4)
+    assert near["fov"] == pytest.approx(2 * math.atan(32 / 60), rel=1e-6) and data["aspect"] == 1.6
+    assert data["antialiased"] is True and data["background"] == [1.0, 0.5, 0.0]
     assert data["near"] == pytest.approx(0.01 * 10 / stage.size)
 
 
 def test_rooms_are_looked_around_in_and_up_is_where_cameras_have_it():
     room = box_room(0, 400)
     data = FlightFrame.of(room, ps.sample_views(room, 2, 48, 36)).data([])
-    assert data["drag"] == "look"
-    upside_down = look_at(torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([0.0, 0.0, -1.0]))
+    assert data["drag"] == "look" and len(data["views"]) == 2
+    upside_down = look_at(torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.1]]), torch.tensor([0.0, 0.0, -1.0]))
     K = torch.tensor([[[30.0, 0.0, 24.0], [0.0, 30.0, 18.0], [0.0, 0.0, 1.0]]])
     turned = FlightFrame.of(room, ps.Views(upside_down, K, 48, 36, torch.zeros(3)))
-    assert float(turned.up @ torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)) == pytest.approx(1.0)
+    assert turned.up.direction.tolist() == [0.0, 0.0, -1.0]
 
 
-def test_a_scene_without_a_free_place_is_seen_from_outside(monkeypatch):
-    def nowhere(*args, **kwargs):
-        raise ps.DataError("no free place")
+@pytest.mark.parametrize(
+    ("up", "rolled", "sure"), [(None, None, False), ("z", None, True), (None, 0.0, False), (None, 0.05, True)]
+)
+def test_page_says_where_up_is_a_guess_and_how_to_turn_the_scene(up, rolled, sure, tmp_path, monkeypatch):
+    """Cameras that people held are not exactly level, and tell what is up."""
+    guess = Up(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), sure=False)
+    monkeypatch.setattr("pointsplat_ns.looking.opening.which_way_up", lambda *given: (given[-1] or guess, False))
+    monkeypatch.setattr("pointsplat_ns.pages.flight.estimated_up", lambda scene: guess)
+    views = None
+    if rolled is not None:
+        views = ball_seen_from([[3.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
+        roll = torch.tensor([[math.cos(rolled), -math.sin(rolled)], [math.sin(rolled), math.cos(rolled)]])
+        views.viewmats[:, :2] = roll @ views.viewmats[:, :2]
+    text = ps.write_page(ball(50), tmp_path / "page.html", views=views, up=up).read_text("utf-8")
+    assert ("Which way is up is a guess." in text and "--up=-y" in text) is not sure
+    assert parts_of(tmp_path / "page.html").data["flight"]["sure"] is sure
 
-    monkeypatch.setattr("pointsplat_ns.pages.flight.sample_views", nowhere)
-    scene = ball(300)
-    stage = FlightFrame.of(scene)
-    picture = ps.render(in_units(scene, stage.centre, stage.size), stage.views[0])
-    assert len(stage.views) == 1 and 0.1 < float((picture.amax(2) > 0.05).float().mean()) < 0.9
+
+def test_an_up_that_is_no_axis_is_refused(tmp_path):
+    with pytest.raises(ps.PointSplatError, match="expected x, y, z, -x, -y or -z"):
+        ps.write_page(ball(50), tmp_path / "page.html", up="down")
 
 
 def test_the_same_scenes_give_the_same_page(written, rooms, tmp_path):

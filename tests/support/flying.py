@@ -51,10 +51,10 @@ def picture(browser) -> Tensor:
 
 
 def view_on(stage: FlightFrame, index: int, image: Tensor) -> ps.View:
-    """A view of a stage, in its units, with the size of an image; the field of view is that along the longer side."""
+    """A view of a stage, in its units, whose picture is as large as an image of this size holds."""
     height, width = image.shape[:2]
     view = stage.views[index]
-    focal = float(view.K[0, 0]) * max(width, height) / max(view.width, view.height)
+    focal = float(view.K[0, 0]) * min(width / view.width, height / view.height)
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     return ps.View(view.viewmat.float(), K, width, height, view.background, view.rasterize_mode, view.near_plane)
 

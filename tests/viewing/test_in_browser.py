@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import os
 import re
@@ -13,15 +14,16 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import pointsplat_ns as ps
-from browser import chromium, complaints
+from browser import chromium, complaints, phone_and_colours
 from making import REPOSITORY
+from pointsplat_ns.looking.upright import Up
 
 pytest.importorskip("selenium", reason="selenium is not installed")
 from selenium.webdriver.common.by import By  # noqa: E402
-from selenium.webdriver.common.keys import Keys  # noqa: E402
 
 pytestmark = pytest.mark.xdist_group("browser")  # one process starts Chromium for all tests of this file
 
@@ -78,76 +80,139 @@ def page(browser, program):
     found = re.match(r"(http://127\.0\.0\.1:\d+): open it in a browser", line)
     assert found, line
     browser.get(found[1])
-    waited(lambda: "ms a frame" in text_of(browser), "a picture")
+    waited(lambda: still(browser), "a picture")
     return browser
 
 
 def text_of(browser) -> str:
-    return browser.find_element(By.TAG_NAME, "body").text
+    return browser.execute_script("return document.body?.innerText ?? ''")
+
+
+def still(browser) -> bool:
+    """Whether the full picture of what the page looks at is shown."""
+    return browser.execute_script("return typeof flight !== 'undefined' && flight.still")
 
 
 def picture(browser) -> np.ndarray:
-    """What is seen left of the panel."""
-    shot = np.asarray(Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB"))
-    return shot[:, :800].astype(float)
+    """What is on the stage, once it is still."""
+    waited(lambda: still(browser), "the full picture")
+    uri = browser.execute_script("return flight.canvas.toDataURL('image/png')")
+    shown = Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2]))).convert("RGB")
+    return np.asarray(shown).astype(float)
 
 
-def set_slider(browser, label: str, value: int) -> None:
-    """Write into the field beside a slider."""
-    field = browser.find_element(By.XPATH, f"(//label[text()='{label}']/following::input[not(@type='hidden')])[1]")
-    field.send_keys(Keys.CONTROL, "a")
-    field.send_keys(str(value), Keys.ENTER)
+def keep(browser, index: int, percent: int) -> None:
+    """Move the slider of a scene."""
+    script = "arguments[0].value = arguments[1]; arguments[0].dispatchEvent(new Event('input'))"
+    browser.execute_script(script, browser.find_elements(By.CSS_SELECTOR, "[data-kept]")[index], percent)
 
 
-def whole(browser) -> bool:
-    return bool(re.search(r"^960 x \d+, \d+ ms a frame$", text_of(browser), re.MULTILINE))
+def test_picture_fills_the_stage_with_as_many_pixels_as_the_window_has(page):
+    fits = """const { canvas } = flight, { width, height } = canvas.getBoundingClientRect();
+      return canvas.width === Math.round(width) && canvas.height === Math.round(height)"""
+    for width, height in ((1200, 900), (1500, 1000)):
+        page.set_window_size(width, height)
+        waited(lambda: page.execute_script(fits), "its size")
+        shown = picture(page)
+        drawn = page.execute_script("return [flight.picture.width, flight.picture.height]")
+        assert drawn == [shown.shape[1], shown.shape[0]] and drawn[0] > 0.85 * width, "nothing is enlarged"
+        assert shown.std() > 10 and len(np.unique(shown.reshape(-1, 3), axis=0)) > 1000
+        assert "sharpening" not in text_of(page)
 
 
-def test_picture_of_the_scene_arrives_and_becomes_whole(page):
-    waited(lambda: whole(page), "the whole picture")
-    waited(lambda: picture(page).std() > 10, "a picture")
-    assert len(np.unique(picture(page).astype(int).reshape(-1, 3), axis=0)) > 1000
-    names = text_of(page)
-    assert "{1+1}<b>.ply" in names and "dark.spz" in names
-    assert names.count("of 3,143 Gaussians, all") == 2
+def test_scenes_are_named_as_they_are(page):
+    names = [name.text for name in page.find_elements(By.CSS_SELECTOR, ".flight-name strong")]
+    assert names == ["{1+1}<b>.ply", "dark.spz"] and text_of(page).count("3,143 Gaussians") == 2
+
+
+def test_picture_is_not_done_while_the_camera_moves_and_the_full_one_follows(page):
+    before = picture(page)
+    for _ in range(10):
+        page.execute_script("flight.camera.turn(0.05, 0); flight.change()")
+        assert not still(page)
+    after = picture(page)
+    assert after.shape == before.shape and np.abs(after - before).mean() > 5
 
 
 def test_wipe_moves_from_one_scene_to_the_other(page):
-    def brightness(first: int, last: int) -> float:
-        return picture(page)[:, first:last].mean()
-
-    waited(lambda: whole(page), "the whole picture, whose line is at column 600")
-    left, right = brightness(40, 560), brightness(640, 800)
-    set_slider(page, "Wipe, %", 100)
-    waited(lambda: brightness(640, 800) > 2 * right, "the first scene, which is brighter by far, on the right")
-    set_slider(page, "Wipe, %", 0)
-    waited(lambda: brightness(40, 560) < 0.5 * left, "the second scene on the left")
-    set_slider(page, "Wipe, %", 50)
+    page.execute_script("flight.reset()")
+    brightness = []
+    for share in (1, 0):
+        page.execute_script("flight.setWipe(arguments[0])", share)
+        brightness.append(picture(page).mean())
+    assert brightness[0] > 2 * brightness[1], "the first scene is brighter by far"
+    page.execute_script("flight.setWipe(0.5)")
+    shown = picture(page)
+    middle = shown.shape[1] // 2
+    assert shown[:, : middle - 4].mean() > 1.5 * shown[:, middle + 4 :].mean()
 
 
 def test_budget_changes_the_count_at_once_and_is_merged(page):
-    set_slider(page, "Kept, %", 20)
+    keep(page, 0, 20)
     waited(lambda: "629 of 3,143 Gaussians" in text_of(page), "the count")
     waited(lambda: "629 of 3,143 Gaussians, merged" in text_of(page), "the merged scene")
     assert re.search(r"pointsplat prune .* --keep 20%", text_of(page))
-    assert "of 3,143 Gaussians, all" in text_of(page), "the other scene is as it was"
+    assert "\n3,143 Gaussians" in text_of(page), "the other scene is as it was"
+    keep(page, 0, 100)
 
 
-def test_next_view_is_another_one(page):
-    waited(lambda: whole(page), "the whole picture")
+def test_other_views_are_other_pictures_and_turning_over_turns_the_picture(page):
+    first = picture(page)
+    page.find_element(By.XPATH, "//button[.='2']").click()
+    second = picture(page)
+    assert np.abs(second - first).mean() > 5
+    page.execute_script("flight.setWipe(1)")
     before = picture(page)
-    page.find_element(By.XPATH, "//button[.='Next view']").click()
-    waited(lambda: np.abs(picture(page) - before).mean() > 5, "another view")
+    page.find_element(By.XPATH, "//button[.='Turn over']").click()
+    assert np.abs(picture(page)[::-1, ::-1] - before).mean() < 3, "8 bits of JPEG"
+    page.find_element(By.XPATH, "//button[.='Turn over']").click()
 
 
-def test_page_asked_nobody_else(page):
-    spoken = complaints(page)
-    assert any("googletagmanager" in line and "blocked" in line for line in spoken)
-    assert not [line for line in spoken if "Uncaught" in line or "ERR_NAME_NOT_RESOLVED" in line]
+def test_page_fits_a_phone_and_follows_the_colours_of_the_reader(page):
+    assert phone_and_colours(page) == (360, ["rgb(247, 247, 245)", "rgb(18, 21, 24)"])
 
 
-def test_ctrl_c_ends_it_without_a_traceback(page, program):
+def test_page_complains_of_nothing(page):
+    assert complaints(page) == []
+
+
+def test_ctrl_c_ends_it_without_a_traceback_and_the_page_says_so(page, program):
     program.send_signal(signal.SIGINT)
     output, errors = program.communicate(timeout=SECONDS)
     assert program.returncode == 0 and output.rstrip().endswith("ended")
     assert errors == ""
+    waited(lambda: "Has pointsplat view ended?" in text_of(page), "what happened")
+
+
+def test_scene_is_chosen_or_dropped_and_shown(browser, tmp_path):
+    ps.save(ps.example_room()[::20], tmp_path / "a room.spz")
+    (tmp_path / "no scene.ply").write_text("nothing")
+    drop = """
+      const transfer = new DataTransfer(), bytes = Uint8Array.from(atob(arguments[0]), (sign) => sign.charCodeAt(0));
+      transfer.items.add(new File([bytes], "dropped.spz"));
+      document.dispatchEvent(new DragEvent("drop", { dataTransfer: transfer, cancelable: true }));"""
+    with ps.open_viewer(port=0) as viewer:
+        browser.get(viewer.url)
+        complaints(browser)  # that the program of the tests above has ended
+        assert phone_and_colours(browser)[0] == 360
+        browser.find_element(By.ID, "file").send_keys(str(tmp_path / "no scene.ply"))
+        waited(lambda: "no scene.ply: " in text_of(browser), "why it is refused")
+        browser.find_element(By.ID, "file").send_keys(str(tmp_path / "a room.spz"))
+        waited(lambda: "Open another scene" in text_of(browser) and still(browser), "a picture")
+        assert "a room.spz" in text_of(browser) and picture(browser).std() > 10
+        browser.find_element(By.LINK_TEXT, "Open another scene").click()
+        browser.execute_script(drop, base64.b64encode((tmp_path / "a room.spz").read_bytes()).decode())
+        waited(lambda: "dropped.spz" in text_of(browser) and still(browser), "the dropped scene")
+        said = [line for line in complaints(browser) if "422" not in line]
+        assert said == []
+
+
+def test_up_that_is_a_guess_is_called_one(browser):
+    guess = Up(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), sure=False)
+    for up, words in ((None, True), ("z", False)):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("pointsplat_ns.looking.view_source.up_about", lambda *_: guess)
+            with ps.open_viewer(ps.example_room()[::20], port=0, up=up) as viewer:
+                browser.get(viewer.url)
+                assert ("Which way is up is a guess." in text_of(browser)) is words
+                assert ("--up=-y" in text_of(browser)) is words

@@ -1,30 +1,32 @@
-"""The viewer answers who it is for, and nobody else."""
+"""The viewer answers its own pages, and nobody else."""
 
 from __future__ import annotations
 
-import asyncio
+import html
 import http.client
+import json
 import socket
+import struct
+import threading
 import time
 from collections.abc import Iterator
-from types import SimpleNamespace
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
-import msgspec
 import numpy as np
 import pytest
-from viser._messages import ViewerCameraMessage
-from websockets.sync.client import connect
+from PIL import Image
 
 import pointsplat_ns as ps
 from making import ball
-from pointsplat_ns.viewing.schedule import Step
-from pointsplat_ns.viewing.server import free_port, refusal
-from pointsplat_ns.viewing.viewer import Viewer
+from pointsplat_ns.viewing import dropped
+from pointsplat_ns.viewing import viewer as viewing
+from pointsplat_ns.viewing.server import LOCAL, refusal
+from pointsplat_ns.viewing.viewer import MOST_PAGES, Viewer
 
-SECONDS = 60
-"""How long a test waits for what shall come; it takes a fraction of one."""
-
-HOSTS = ("localhost", "127.0.0.1", "::1")
+CLIENT = "a page of the tests"
 
 
 @pytest.fixture(scope="module")
@@ -33,69 +35,208 @@ def viewer() -> Iterator[Viewer]:
         yield opened
 
 
-def answer(viewer: Viewer, path: str, **headers: str) -> tuple[int, bytes, dict[str, str]]:
-    """What the server says to a request that no browser would send."""
+@pytest.fixture()
+def empty() -> Iterator[Viewer]:
+    with ps.open_viewer(port=0) as opened:
+        yield opened
+
+
+def answer(viewer: Viewer, method: str, path: str, body: bytes | None = None, **headers: str):
+    """What the server says to a request that any program may send: status, body and headers."""
     host = viewer.url.removeprefix("http://")
     connection = http.client.HTTPConnection(host, timeout=30)
-    connection.putrequest("GET", path, skip_host="Host" in headers)
-    for name, value in headers.items():
-        connection.putheader(name, value)
-    connection.endheaders()
+    connection.putrequest(method, path, skip_host="Host" in headers)
+    length = {} if body is None or "Content_Length" in headers else {"Content-Length": str(len(body))}
+    for name, value in {**length, **headers}.items():
+        connection.putheader(name.replace("_", "-"), value)
+    connection.endheaders(body)
     response = connection.getresponse()
     return response.status, response.read(), dict(response.getheaders())
 
 
+def post(viewer: Viewer, path: str, body: bytes, **headers: str):
+    """A request as the viewer's own page sends it."""
+    return answer(viewer, "POST", path, body, **{"Origin": viewer.url, **headers})
+
+
+def said(viewer: Viewer, path: str, **values: Any):
+    return post(viewer, path, json.dumps({"client": CLIENT, "stage": 1, **values}).encode())
+
+
+def looked(**changes: Any) -> dict[str, Any]:
+    """What a page says of its camera, which is 20 units in front of the content."""
+    camera = {"eye": [0, -20, 0], "right": [1, 0, 0], "down": [0, 0, -1], "ahead": [0, 1, 0], "fov": 0.8}
+    return {"camera": camera, "width": 64, "height": 48, "wipe": 0.5, "kept": [100], "look": 1, **changes}
+
+
+def whole_picture(viewer: Viewer, look: int, **values: Any) -> tuple[np.ndarray, dict[str, Any]]:
+    """The full picture of a look, and what is said with it."""
+    number = texts = 0
+    for _ in range(30):
+        status, body, headers = said(viewer, "/picture", number=number, texts=texts, **values)
+        state = json.loads(headers["X-State"])
+        if status == 200 and state["look"] == look:
+            return np.asarray(Image.open(BytesIO(body))), state
+        number, texts = state["number"], state["texts"]
+    pytest.fail("no full picture")
+
+
 def test_page_is_served_and_asks_nobody_else(viewer):
-    status, body, headers = answer(viewer, "/")
-    assert status == 200 and b"<html" in body
-    policy = headers["Content-Security-Policy"]
-    assert "default-src 'self'" in policy and "http" not in policy and "*" not in policy
+    status, body, headers = answer(viewer, "GET", "/")
+    policy = html.unescape(body.decode())
+    assert "default-src 'none'" in policy
+    assert status == 200 and b"<html" in body and "connect-src 'self'" in policy
+    assert b"http://" not in body and b"https://" not in body
+    assert headers["X-Frame-Options"] == "DENY" and headers["Cross-Origin-Resource-Policy"] == "same-origin"
+
+
+@pytest.mark.parametrize("path", ["/../__init__.py", "/drop", "/other", "/etc/passwd", "/%2e%2e/x", "/?/../../x"])
+def test_only_the_routes_are_served(path, viewer):
+    status, body, _ = answer(viewer, "GET", path)
+    assert status == (200 if path.startswith("/?") else 404) and b"root:" not in body
 
 
 @pytest.mark.parametrize(
-    "path", ["/../__init__.py", "/assets/../../../_viser.py", "/../../../../../../../../etc/passwd"]
-)
-def test_no_other_files_are_served(path, viewer):
-    status, body, _ = answer(viewer, path)
-    assert status == 404 and body == b""
-
-
-def test_pages_elsewhere_are_refused(viewer):
-    here = viewer.url.removeprefix("http://")
-    socket_of = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
-    key = {"Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="}
-    assert answer(viewer, "/", Origin="http://evil.example", **socket_of, **key)[0] == 403
-    assert answer(viewer, "/", Host="evil.example:80")[0] == 403
-    assert answer(viewer, "/", Origin=viewer.url, Host=here)[0] == 200
-
-
-@pytest.mark.parametrize(
-    ("path", "headers", "refused"),
+    ("method", "headers", "refused"),
     [
-        ("/", {"Host": "localhost:7007"}, None),
-        ("/assets/index.js?a=..:", {"Host": "[::1]:7007"}, None),
-        ("/", {"Host": "127.0.0.1:7007", "Origin": "http://127.0.0.1:7007"}, None),
-        ("/", {"Host": "127.0.0.1:7007", "Origin": "http://127.0.0.1:8000"}, 403),
-        ("/", {"Host": "127.0.0.1:7007", "Origin": "null"}, 403),
-        ("/", {"Host": "rebound.example:7007", "Origin": "http://rebound.example:7007"}, 403),
-        ("/", {}, 403),
-        ("//etc/passwd", {"Host": "localhost"}, 404),
-        ("etc/passwd", {"Host": "localhost"}, 404),
-        ("/..\\..\\secret", {"Host": "localhost"}, 404),
-        ("/C:/secret", {"Host": "localhost"}, 404),
+        ("GET", {"Host": "localhost:7007"}, None),
+        ("GET", {"Host": "[::1]:7007"}, None),
+        ("POST", {"Host": "127.0.0.1:7007", "Origin": "http://127.0.0.1:7007"}, None),
+        ("POST", {"Host": "127.0.0.1:7007", "Origin": "http://127.0.0.1:8000"}, 403),
+        ("POST", {"Host": "127.0.0.1:7007", "Origin": "null"}, 403),
+        ("POST", {"Host": "127.0.0.1:7007"}, 403),
+        ("GET", {"Host": "127.0.0.1:7007", "Origin": "http://evil.example"}, 403),
+        ("GET", {"Host": "rebound.example:7007", "Origin": "http://rebound.example:7007"}, 403),
+        ("GET", {}, 403),
     ],
 )
-def test_who_is_refused(path, headers, refused):
-    assert refusal(path, headers, HOSTS) == refused
+def test_who_is_refused(method, headers, refused):
+    assert refusal(method, headers, LOCAL) == refused
 
 
 def test_server_for_a_network_may_be_called_by_any_name():
-    assert refusal("/", {"Host": "studio.example:7007"}, None) is None
-    assert refusal("/", {"Host": "studio.example:7007", "Origin": "http://other.example"}, None) == 403
+    assert refusal("GET", {"Host": "studio.example:7007"}, None) is None
+    assert refusal("POST", {"Host": "studio.example:7007", "Origin": "http://other.example"}, None) == 403
 
 
-def test_nobody_gets_a_public_address(viewer):
-    assert viewer._server.request_share_url() is None and viewer._server._share_tunnel is None
+def test_pages_elsewhere_move_no_camera_and_drop_no_scene(viewer, empty):
+    for opened, path in ((viewer, "/look"), (viewer, "/picture"), (empty, "/drop?name=a.ply")):
+        for origin in ({"Origin": "http://evil.example"}, {}):
+            assert answer(opened, "POST", path, b"{}", **origin)[0] == 403
+        assert answer(opened, "GET", path)[0] == 405
+
+
+def test_picture_is_what_the_camera_sees_at_the_size_of_the_window(viewer):
+    assert said(viewer, "/look", **looked(width=210, height=130, look=5))[0] == 204
+    picture, state = whole_picture(viewer, 5)
+    assert picture.shape == (130, 210, 3) and picture.std() > 10
+    assert state["scenes"] == [{"amount": "300 Gaussians", "command": ""}]
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"", b"[]", b"{", b"\xff", json.dumps({"client": CLIENT}).encode(),
+        *(
+            json.dumps({"client": CLIENT, "stage": 1, **looked(**changes)}).encode()
+            for changes in (
+                {"camera": {}}, {"client": "x"}, {"client": "x" * 99}, {"kept": []}, {"width": "wide"}, {"look": None},
+                {"camera": {**looked()["camera"], "eye": [0, 0]}}, {"wipe": []},
+                {"camera": {**looked()["camera"], "eye": [0, 0, float("nan")]}},
+                {"camera": {**looked()["camera"], "right": [0, 1, 0]}},
+            )
+        ),
+    ],
+)  # fmt: skip
+def test_what_no_page_sends_is_refused_and_harms_nothing(body, viewer):
+    assert post(viewer, "/look", body)[0] == 400
+    assert said(viewer, "/look", **looked(look=9))[0] == 204
+
+
+def test_bodies_have_a_size_that_is_said_and_not_too_large(viewer):
+    assert post(viewer, "/look", b"x" * 70_000)[0] == 413
+    assert answer(viewer, "POST", "/look", None, Origin=viewer.url)[0] == 411
+    assert post(viewer, "/look", b"x", Content_Length="-1")[0] == 411
+    assert post(viewer, "/look", b"x", Transfer_Encoding="chunked")[0] == 411
+
+
+def test_pages_are_few_and_the_oldest_gives_way(viewer):
+    for index in range(MOST_PAGES + 2):
+        assert said(viewer, "/look", **looked(client=f"page number {index:06}"))[0] == 204
+    assert len(viewer._watchers) == MOST_PAGES and "page number 000000" not in viewer._watchers
+    painting = [thread for thread in threading.enumerate() if thread.name == "painting"]
+    end = time.monotonic() + 30
+    while len(painting) > MOST_PAGES and time.monotonic() < end:
+        time.sleep(0.05)
+        painting = [thread for thread in threading.enumerate() if thread.name == "painting"]
+    assert len(painting) <= MOST_PAGES
+
+
+@pytest.mark.parametrize("suffix", [name for name in dropped.READABLE_NAMES if name not in (".ckpt", ".ksplat")])
+def test_a_dropped_scene_of_any_format_is_shown(suffix, empty, tmp_path):
+    assert b"Drop a file here" in answer(empty, "GET", "/")[1]
+    ps.save(ball(300), tmp_path / f"a{suffix}")
+    name = quote(f"my ball{suffix}")
+    assert post(empty, f"/drop?name={name}", (tmp_path / f"a{suffix}").read_bytes())[:2] == (204, b"")
+    assert f"<strong>my ball{suffix}</strong>".encode() in answer(empty, "GET", "/")[1]
+    assert said(empty, "/look", **looked())[0] == 204
+    assert whole_picture(empty, 1)[0].std() > 10
+
+
+def test_another_dropped_scene_replaces_the_first_and_old_pages_are_told(empty, tmp_path):
+    ps.save(ball(300), tmp_path / "a.ply")
+    for _ in range(2):
+        assert post(empty, "/drop?name=a.ply", (tmp_path / "a.ply").read_bytes())[0] == 204
+    assert said(empty, "/look", **looked())[0] == 409
+    assert said(empty, "/look", **looked(stage=2))[0] == 204
+
+
+HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 999999999\nproperty float x\nend_header\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [
+        ("a.txt", b"text", "a.txt: not a scene; expected a file of .compressed.ply, .ply"),
+        ("../../../etc/passwd", b"x", "passwd: not a scene"),
+        ("/etc/cron.d/a.ply", b"x", "a.ply: "),
+        ("a\x1b]0;pwned\x07<b>.bad", b"x", "a?]0;pwned?<b>.bad: not a scene"),
+        ("a.ply", b"", "a.ply: an empty file"),
+        ("a.ply", HEADER, "a.ply: "),
+        ("a.spz", b"\x1f\x8b" + bytes(50), "a.spz: "),
+        ("a.sog", b"PK\x03\x04" + bytes(50), "a.sog: "),
+        ("a.ckpt", b"cos\nsystem\n(S'touch pwned'\ntR.", "a.ckpt: "),
+        ("a.splat", struct.pack("<8f", *[float("nan")] * 8), "nothing of the scene can be seen"),
+        ("config.yml", b"!!python/object/apply:os.system [touch pwned]", "not a scene"),
+    ],
+)
+def test_hostile_files_are_one_line_and_nothing_stays(name, data, words, empty, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    status, body, headers = post(empty, f"/drop?name={quote(name)}", data)
+    assert status == 422 and headers["Content-Type"].startswith("text/plain")
+    assert words in body.decode() and "\n" not in body.decode() and str(tmp_path) not in body.decode()
+    assert list(tmp_path.iterdir()) == [], "no file is left, and none was made"
+    assert b"Drop a file here" in answer(empty, "GET", "/")[1]
+
+
+def test_too_large_and_cut_off_files_are_refused(empty, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    status, body, _ = post(empty, "/drop?name=a.ply", b"x", Content_Length=str(dropped.LARGEST + 1))
+    assert status == 413 and b"expected at most 4,000,000,000" in body
+    host, port = empty.url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=30) as client:
+        request = f"POST /drop?name=a.ply HTTP/1.1\r\nHost: {host}:{port}\r\nOrigin: {empty.url}\r\n"
+        client.sendall(request.encode() + b"Content-Length: 100\r\n\r\nhalf")
+        client.shutdown(socket.SHUT_WR)
+        assert b" 400 " in client.recv(1000).partition(b"\r\n")[0] + b" "
+    monkeypatch.setattr(dropped.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 10}))
+    assert b"the disk here has less room" in post(empty, "/drop?name=a.ply", b"x" * 20)[1]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_viewer_of_a_scene_takes_no_other(viewer):
+    assert post(viewer, "/drop?name=a.ply", b"ply\n")[0] == 404
 
 
 def test_next_free_port_is_taken():
@@ -103,77 +244,41 @@ def test_next_free_port_is_taken():
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        assert port < free_port("127.0.0.1", port) < port + 20
         with ps.open_viewer(ball(300), port=port) as viewer:
-            assert int(viewer.url.rpartition(":")[2]) > port and answer(viewer, "/")[0] == 200
+            assert port < int(viewer.url.rpartition(":")[2]) < port + 20 and answer(viewer, "GET", "/")[0] == 200
 
 
 @pytest.mark.parametrize(("host", "port"), [("192.0.2.1", 7007), ("no such host", 7007), ("127.0.0.1", 70000)])
 def test_places_that_cannot_be_listened_on_are_refused_in_one_line(host, port):
     with pytest.raises(ps.PointSplatError, match="expected") as raised:
-        free_port(host, port)
+        ps.open_viewer(host=host, port=port)
     assert "\n" not in str(raised.value)
 
 
-def test_a_page_that_has_gone_is_not_kept(viewer):
-    server = viewer._server._websock_server
-    loop = server._broadcast_buffer.event_loop
-
-    async def sending() -> int:
-        return sum("_message_producer" in str(task.get_coro()) for task in asyncio.all_tasks())
-
-    def waiting() -> int:
-        return asyncio.run_coroutine_threadsafe(sending(), loop).result(SECONDS)
-
-    before = waiting()
-    for _ in range(3):
-        with connect(viewer.url.replace("http", "ws"), max_size=None) as page:
-            camera = ViewerCameraMessage((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -4.0), 1.0, 1.0, (0.0,) * 3, (0.0, 0.0, 1.0))
-            page.send(msgspec.msgpack.encode(camera.as_serializable_dict()))  # before it, viser tells of no page
-            while b"BackgroundImageMessage" not in page.recv(timeout=SECONDS):
-                pass
-            assert waiting() > before
-    end = time.monotonic() + SECONDS
-    while waiting() > before and time.monotonic() < end:
-        time.sleep(0.05)
-    assert waiting() == before
+def test_closing_twice_frees_the_port_and_ends_waiting_pages(tmp_path):
+    viewer = ps.open_viewer(ball(300), port=0)
+    waiting = threading.Thread(target=said, args=(viewer, "/picture"), kwargs={"number": 0, "texts": 0})
+    waiting.start()
+    while not viewer._watchers:
+        time.sleep(0.01)
+    viewer.close()
+    viewer.close()
+    waiting.join(5.0)  # s; a page would wait for WAIT_SECONDS
+    assert viewing.WAIT_SECONDS > 5.0 and not waiting.is_alive()
+    with socket.socket() as again:
+        again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        again.bind(("127.0.0.1", int(viewer.url.rpartition(":")[2])))
 
 
-@pytest.fixture()
-def painted(viewer):
-    """A page that is looked at, and what paints on it: gives the function that shows a picture, and what was shown."""
-    shown, made = [], {}
-
-    class Page:
-        client_id = 77
-        camera = scene = gui = SimpleNamespace(
-            add_markdown=lambda text: SimpleNamespace(content=text), on_update=lambda look: None,
-            set_background_image=lambda *_, jpeg_quality, **__: shown.append(jpeg_quality),
-        )  # fmt: skip
-
-    page = Page()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pointsplat_ns.viewing.viewer.Painter", lambda show: made.setdefault("show", show))
-        patch.setattr(viewer, "_put", lambda client: None)
-        patch.setattr(viewer, "_look", lambda client: None)
-        viewer._connected(page)
-    viewer._painters.pop(page.client_id)
-    yield page, made["show"], shown
-    viewer._notes.pop(page.client_id, None)
-
-
-def test_a_picture_that_is_done_when_its_page_has_gone_goes_nowhere(viewer, painted):
-    page, show, shown = painted
-    viewer._disconnected(page)
-    show(np.zeros((2, 2, 3), np.uint8), Step(None, 1, 2, 1.0, False, True), 0.1)
-    assert len(shown) == 1 and page.client_id not in viewer._notes
-
-
-def test_a_whole_picture_of_a_moving_camera_is_sent_and_named_as_a_whole_one(viewer, painted):
-    page, show, shown = painted
-    said = []
-    for moving, whole in ((True, False), (True, True), (False, True)):
-        show(np.zeros((2, 2, 3), np.uint8), Step(None, 1, 2, 1.0, moving, whole), 0.1)
-        said.append(viewer._notes[page.client_id].content)
-    assert said == ["moving: 2 x 2, 100 ms a frame", *["2 x 2, 100 ms a frame"] * 2]
-    assert shown[0] < shown[1] == shown[2]
+def test_kept_share_is_shown_at_once_then_merged_with_its_command(tmp_path):
+    path = Path(tmp_path / "a room.ply")
+    ps.save(ps.example_room()[::20], path)
+    with ps.open_viewer(path, port=0) as viewer:
+        assert said(viewer, "/look", **looked(kept=[20]))[0] == 204
+        _, state = whole_picture(viewer, 1)
+        assert state["scenes"][0]["amount"].startswith("629 of 3,143 Gaussians, ")
+        assert state["scenes"][0]["command"] == f"pointsplat prune '{path}' --keep 20%"
+        end = time.monotonic() + 60
+        while "merged" not in state["scenes"][0]["amount"] and time.monotonic() < end:
+            state = json.loads(said(viewer, "/picture", number=0, texts=state["texts"])[2]["X-State"])
+        assert state["scenes"][0]["amount"] == "629 of 3,143 Gaussians, merged"

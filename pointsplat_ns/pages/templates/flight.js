@@ -12,10 +12,11 @@ class Flight {
     this.part = Object.fromEntries([...root.querySelectorAll("[data-flight]")].map((part) => [part.dataset.flight, part]));
     this.canvas = this.part.canvas;
     this.camera = new Camera();
-    this.camera.goTo(data.views[0], data.up);
+    this.over = false;
+    this.place(0);
     this.controls = new Controls(this.canvas, this.camera, () => this.change());
     this.scenes = [];
-    this.opened = this.over = false;
+    this.opened = false;
     this.wipe = 0.5;
     this.detail = 1; // share of the pixels each way while it moves
     this.times = []; // of the last frames of a movement
@@ -112,9 +113,23 @@ class Flight {
   }
 
   goTo(index) {
-    this.camera.goTo(this.data.views[index], this.data.up);
-    if (this.over) this.camera.turnOver();
+    this.place(index);
     this.change();
+  }
+
+  place(index) {
+    this.at = index;
+    this.camera.goTo(this.data.views[index], this.data.up);
+    this.camera.fov = this.fitted(index);
+    if (this.over) this.camera.turnOver();
+  }
+
+  // The field of view along the longer side of the stage, in which all of a view's picture is seen.
+  fitted(index) {
+    const { aspect, views } = this.data, reach = Math.tan(0.5 * views[index].fov);
+    const wide = this.canvas.clientWidth / this.canvas.clientHeight || aspect;
+    const height = Math.max(reach * Math.min(1, 1 / aspect), (reach * Math.min(1, aspect)) / wide);
+    return 2 * Math.atan(height * Math.max(1, wide));
   }
 
   // Which way is up was estimated, and may be wrong.
@@ -140,7 +155,8 @@ class Flight {
     const [width, height] = [clientWidth, clientHeight].map((side) => Math.max(1, Math.round(side * scale)));
     if (width === this.canvas.width && height === this.canvas.height) return;
     [this.canvas.width, this.canvas.height] = [width, height];
-    this.request();
+    this.camera.fov = this.fitted(this.at);
+    this.change();
   }
 
   // The camera is another one: sort anew, and count frames until it stands still.

@@ -1,0 +1,97 @@
+"""The views in which a scene is shown first: the subject whole and upright, or most of a room."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from upright_scenes import TURNS, plates, room, turned
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.opening import opening_views
+from pointsplat_ns.looking.poses import in_pictures, look_at, views_of
+from pointsplat_ns.looking.sampling import estimated_up
+from pointsplat_ns.looking.settings import DEFAULTS
+from pointsplat_ns.looking.upright import Up
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def statue() -> Gaussians:
+    """A figure of 1 x 2.4 units on a block; its face, at x = 0.05, has many more Gaussians than its back."""
+    fine = plates(((0.05, 0, 2.2), (0, 0.5, 1.2)), density=300)
+    fine = fine.replace(scales=fine.scales - 0.7)
+    block = [((0, 0, z), (0.5, 0.5, 0)) for z in (0.8, 0.9, 1.0)]
+    coarse = plates(((-0.05, 0, 2.2), (0, 0.5, 1.2)), *block, density=60)
+    return Gaussians(*(torch.cat(both) for both in zip(fine.tensors(), coarse.tensors(), strict=True)))
+
+
+def corner() -> Gaussians:
+    """Two walls, a floor, and a table of which photos showed the top."""
+    table = plates(((0.3, 0.3, 0.9), (0.8, 0.8, 0)), density=300)
+    walls = plates(((-2, 0, 1.2), (0, 2, 1.2)), ((0, -2, 1.2), (2, 0, 1.2)), ((0, 0, 0), (2, 2, 0)), density=40)
+    walls = walls.replace(scales=walls.scales + torch.tensor([0.5, 0.5, 0.5]))
+    return Gaussians(*(torch.cat(both) for both in zip(table.tensors(), walls.tensors(), strict=True)))
+
+
+@pytest.mark.parametrize(("width", "height"), [(960, 600), (400, 500)])
+@pytest.mark.parametrize("turn", TURNS[:2])
+def test_an_object_is_whole_and_upright_from_every_side(turn, width, height):
+    scene, up = turned(statue(), turn), torch.from_numpy(turn.apply(UP.numpy()))
+    found = opening_views(scene, 3, width, height, Up(up))
+    assert found.whole and len(found.views) == 3
+    assert bool(in_pictures(found.views, scene.means.double()).all()), "nothing is cut off"
+    down = found.views.viewmats[:, 1, :3]
+    assert bool((down @ up < -0.9).all()) and float((found.views.viewmats[:, 0, :3] @ up).abs().max()) < 1e-9
+    eyes = torch.linalg.inv(found.views.viewmats)[:, :3, 3]
+    assert float(torch.cdist(eyes, eyes).fill_diagonal_(9.0).min()) > 1.0, "the views are from different sides"
+
+
+def test_an_object_is_first_seen_from_where_most_gaussians_are_seen():
+    first = opening_views(statue(), up=Up(UP)).views
+    ahead = first.viewmats[0, 2, :3]
+    assert float(ahead[0]) < -0.7, "towards the face"
+
+
+@pytest.mark.parametrize("axis", [(0, 0, 1), (0, -1, 0), (0, 1, 0)])
+def test_up_is_the_side_from_which_more_is_seen(axis):
+    """Also where -y is usual, and mass says little."""
+    turn, _ = Rotation.align_vectors([axis], [[0, 0, 1]])
+    scene = turned(corner(), turn)
+    assert estimated_up(scene).direction.tolist() == list(map(float, axis))
+    without = replace(DEFAULTS, seen_from_above_weight=0.0, usual_direction_weight=0.25)
+    if axis == (0, 1, 0):
+        assert estimated_up(scene, without).direction.tolist() == [0.0, -1.0, 0.0]
+
+
+def test_a_room_is_first_seen_from_inside_and_then_from_other_sides():
+    scene = room()
+    found = opening_views(scene, 4, up=Up(UP))
+    assert not found.whole and len(found.views) == 4
+    eyes = torch.linalg.inv(found.views.viewmats)[:, :3, 3]
+    assert bool((eyes.abs() < torch.tensor([2.0, 1.5, 1.2])).all()), "inside"
+    counts = in_pictures(found.views, scene.means.double()).sum(1)
+    assert float(counts[0]) > 0.25 * len(scene)
+    shown = in_pictures(found.views, scene.means.double()).any(0).double().mean()
+    assert float(shown) > float(counts[0]) / len(scene) + 0.2, "the others show what the first does not"
+
+
+def test_photos_of_a_room_come_before_a_view_from_outside_and_keep_their_background():
+    scene = room()
+    eyes = torch.tensor([[-1.5, -1.0, 0.3], [1.5, 1.0, 0.3], [0.0, 0.0, 0.2]], dtype=torch.float64)
+    targets = torch.tensor([[1.5, 1.0, -0.5], [-1.5, -1.0, -0.5], [0.0, 0.0, 1.2]], dtype=torch.float64)
+    photos = replace(views_of(look_at(eyes, targets, UP), 64, 40, 5.0), background=torch.tensor([0.1, 0.2, 0.3]))
+    found = opening_views(scene, 2, known=photos)
+    assert not found.whole and found.views.background.tolist() == pytest.approx([0.1, 0.2, 0.3])
+    assert all(any(torch.equal(view, photo) for photo in photos.viewmats) for view in found.views.viewmats)
+    assert not torch.equal(found.views.viewmats[0], photos.viewmats[2]), "the ceiling shows least"
+
+
+def test_photos_that_cut_an_object_off_come_after_it_whole():
+    scene = statue()
+    near = look_at(torch.tensor([[1.0, 0.0, 1.6]]).double(), torch.tensor([[0.0, 0.0, 1.6]]).double(), UP)
+    photos = replace(views_of(near, 64, 40, 5.0), rasterize_mode="antialiased")
+    found = opening_views(scene, 1, known=photos)
+    assert found.whole and found.views.rasterize_mode == "antialiased"
