@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from functools import cached_property
 from itertools import count as counted
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
@@ -114,9 +115,8 @@ class ViewSource:
     def _sampled(self, count: int, seed: int) -> Views:
         """Sampled views, which get the run's rasterize mode."""
         width, height = self.resolution
-        size = {"width": width, "height": height}
-        up, settings = self.up.direction, self.settings
-        views = views_about(self._scene, self._photos, count, **size, seed=seed, up=up, settings=settings)
+        options: dict[str, Any] = {"seed": seed, "up": self.up.direction, "settings": self.settings}
+        views = views_about(self._scene, self._photos, count, width=width, height=height, **options)
         return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
 
     @cached_property
