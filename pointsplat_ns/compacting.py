@@ -12,7 +12,7 @@ from pointsplat_ns.compression.requests import CompactRequest, PruneRequest
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.scene import read_scene
-from pointsplat_ns.looking.upright import axis_or_none
+from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.looking.windows import parse_resolution
 from pointsplat_ns.system.progress import Progress, progress_bar
@@ -105,7 +105,7 @@ def compact_source(
             from pointsplat_ns.tradeoff.settings import repairs_of
 
             given = views if isinstance(views, Views) else source.given
-            size, upward = parse_resolution(resolution), axis_or_none(up)
+            size, upward = parse_resolution(resolution), up_named(up)
             subject = subject_of(dense, run_of(scene, views), given, request.refiner, goal.suffix, size, upward)
             result = find_scene(subject, goal.targets, request.prune.by, repairs_of(goal.effort), report)
     log((*result.target.splitlines(), *result.verdict.splitlines(), *result.notes))
@@ -151,7 +151,7 @@ def read_source(
         DataError: if a file of cameras is not usable, or most of them see nothing of the scene.
         PointSplatError: if the resolution or ``up`` is not valid.
     """
-    size, upward = parse_resolution(resolution), axis_or_none(up)
+    size, upward = parse_resolution(resolution), up_named(up)
     if isinstance(views, (str, Path)):
         from pointsplat_ns.io.camera_files import is_camera_file
 

@@ -9,14 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torch import Tensor
-
 from pointsplat_ns.api import Source, load
 from pointsplat_ns.compression.posed_scene import check_views_show, views_for
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
-from pointsplat_ns.looking.upright import Up, axis_or_none
+from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.system.progress import Progress, tracked
@@ -91,7 +89,7 @@ def render_path(
     if split not in ("side-by-side", "wipe"):
         raise PointSplatError(f"split is {split!r}; expected side-by-side or wipe")
     settings = FilmSettings(width, height, fps, seconds)
-    upward = axis_or_none(up)
+    upward = up_named(up)
     kind = check_output(output, force)
     sources = [scene] if other is None else [scene, other]
     given = views_for(scene, views).resized(LONGEST_SIDE) if isinstance(views, (str, Path)) else views
@@ -101,7 +99,7 @@ def render_path(
     way: str | Path = path if not isinstance(path, Views) else "dataset"
     if given is not None and kind == "frames" and seconds is None and way in ("auto", "dataset"):
         settings = replace(settings, seconds=max(1, len(given)) / (fps or FPS))
-    view_source = _source(scene, loaded[0], path if isinstance(path, Views) else given, upward)
+    view_source = _source(scene, loaded[0], path if isinstance(path, Views) else given)
     chosen = camera_path(loaded[0], view_source, way, settings, kind == "picture", upward)
     modes = [_mode(source, chosen.views.rasterize_mode) for source in sources]
     if labels is None:
@@ -151,24 +149,24 @@ def open_viewer(
     """
     from pointsplat_ns.viewing.viewer import ViewedScene, Viewer
 
-    upward = axis_or_none(up)
+    upward = up_named(up)
 
     def read(path: Path, name: str) -> ViewedScene:
         loaded = load(path)
-        return ViewedScene(name, None, loaded, _source(loaded, loaded, None, upward), "classic")
+        return ViewedScene(name, None, loaded, _source(loaded, loaded, None), "classic")
 
     scenes = []
     for index, source in enumerate(source for source in (scene, other) if source is not None):
         loaded = source if isinstance(source, Gaussians) else load(source)
         path = None if isinstance(source, Gaussians) else Path(source)
-        views, mode = _source(source, loaded, None, upward), _mode(source, "classic")
+        views, mode = _source(source, loaded, None), _mode(source, "classic")
         scenes.append(ViewedScene(_name(source, index), path, loaded, views, mode))
-    return Viewer(scenes, host, port, None if upward is None else Up(upward), None if scenes else read)
+    return Viewer(scenes, host, port, upward, None if scenes else read)
 
 
-def _source(scene: Source, loaded: Gaussians, given: Views | None, up: Tensor | None) -> ViewSource:
+def _source(scene: Source, loaded: Gaussians, given: Views | None) -> ViewSource:
     run = None if isinstance(scene, Gaussians) else scene
-    return ViewSource(loaded, given, run, dataset_views, up=up)
+    return ViewSource(loaded, given, run, dataset_views)
 
 
 def _mode(scene: Source, usual: RasterizeMode) -> RasterizeMode:

@@ -97,8 +97,7 @@ class TrainingScene:
     def target(self, index: int) -> Tensor:
         """Render of the dense scene in a view, (H, W, 3); drawn once."""
         if index not in self._renders:
-            image = render(self.dense, self.views[index], backend=TRAINING.backend)
-            self._renders[index] = image.clamp(0, 1).mul(255).round().byte()
+            self._renders[index] = _drawn(self.dense, self, index).clamp(0, 1).mul(255).round().byte()
         return self._renders[index] / 255
 
 

@@ -15,7 +15,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.quaternions import quaternions_of
 from pointsplat_ns.io.runs import Run, may_be_run, open_run
 from pointsplat_ns.looking.sampling import estimated_up
-from pointsplat_ns.looking.upright import axis_named, axis_or_none
+from pointsplat_ns.looking.upright import axis_named
 from pointsplat_ns.refiner.augmentation import Transform
 
 
@@ -117,7 +117,7 @@ def _directions(up: str) -> tuple[Tensor | None, Tensor]:
     match = re.fullmatch(r"(?:([+-]?[xyz]):)?([+-]?[xyz])", up.strip().lower())
     if not match:
         raise PointSplatError(f"up is {up!r}; expected an axis such as z or -y, or two such as -y:z (from -y to z)")
-    return axis_or_none(match[1]), axis_named(match[2])
+    return (None if match[1] is None else axis_named(match[1])), axis_named(match[2])
 
 
 def _turn(start: Tensor, end: Tensor) -> Tensor:

@@ -106,10 +106,7 @@ def _inside(surface: Surface, box: UprightBox, photos: PhotoPlaces | None, width
     """Views from enclosed places and from photo places, of all those that show most of the surface."""
     settings, up = surface.settings, box.up
     generator = torch.Generator().manual_seed(0)
-    places = box.places(settings.box_draws * settings.places, generator, settings)
-    heights = box.heights(places)
-    low, high = settings.eye_heights
-    places = places[(heights > low) & (heights < high)]
+    places = box.places_at_eyes(generator, settings)
     if photos is not None:
         best = photos.shares.topk(min(settings.places // 3, len(photos.shares))).indices
         places = torch.cat([photos.places[best], places])

@@ -83,9 +83,9 @@ class Search:
         if self.photos is not None:
             return self._near_photos(self.photos)
         if self.inside:
-            return self._views_from(self._inside(), True)
+            return self._views_from(self.box.places_at_eyes(self.generator, self.settings), True)
         around = self._views_from(self._outside(), False)
-        within = self._views_from(self._inside(), True)
+        within = self._views_from(self.box.places_at_eyes(self.generator, self.settings), True)
         viewmats, owner, gains = (torch.cat(both) for both in zip(around, within, strict=True))
         owner[len(around[1]) :] += self.settings.places
         return viewmats, owner, gains
@@ -116,7 +116,7 @@ class Search:
         offsets = torch.randn(len(drawn), 3, generator=self.generator).double()
         places = photos.places[drawn] + settings.photo_place_deviation * offsets
         if self.inside:
-            places = torch.cat([places, self._inside()[:count]])
+            places = torch.cat([places, self.box.places_at_eyes(self.generator, self.settings)[:count]])
         places = places[self.surface.clearance(places) > settings.min_clearance_photos]
         visible = self.surface.visible_from(places)[0][:, : settings.gain_points]
         evidence = torch.ones(visible.shape)  # relative to the smallest of a photo place
@@ -139,13 +139,6 @@ class Search:
         good = mean_values.quantile(settings.good_view_quantile) if len(owner) else 0.0
         kept = mean_values >= settings.min_photo_value * good
         return viewmats[kept], owner[kept], valued[kept]
-
-    def _inside(self) -> Tensor:
-        """Places (P, 3) in the upright box at the height of eyes."""
-        low, high = self.settings.eye_heights
-        places = self.box.places(self.settings.box_draws * self.settings.places, self.generator, self.settings)
-        heights = self.box.heights(places)
-        return places[(heights > low) & (heights < high)]
 
     def _outside(self) -> Tensor:
         """Places (P, 3) around the content, above the ground."""

@@ -60,9 +60,13 @@ def axis_named(text: str) -> Tensor:
     return axis
 
 
-def axis_or_none(text: str | None) -> Tensor | None:
-    """:func:`axis_named` of an option; None if it is not given."""
-    return None if text is None else axis_named(text)
+def up_named(text: str | None) -> Up | None:
+    """The up direction of an option, which names an axis; None if it is not given.
+
+    Raises:
+        PointSplatError: if there is no such axis.
+    """
+    return None if text is None else Up(axis_named(text))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +101,13 @@ class UprightBox:
         middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low).clamp_min(settings.min_box_half_side)
         share = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
         return (middle + share * half) @ self.frame
+
+    def places_at_eyes(self, generator: torch.Generator, settings: LookingSettings = DEFAULTS) -> Tensor:
+        """Positions (P, 3), units, at the height of eyes."""
+        low, high = settings.eye_heights
+        places = self.places(settings.box_draws * settings.places, generator, settings)
+        heights = self.heights(places)
+        return places[(heights > low) & (heights < high)]
 
     def heights(self, places: Tensor) -> Tensor:
         """Heights of places (P, 3): 0 at the bottom of the box, 1 at its top."""

@@ -8,9 +8,6 @@ from collections.abc import Callable, Iterator
 from functools import cached_property
 from itertools import count as counted
 from pathlib import Path
-from typing import Any
-
-from torch import Tensor
 
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -41,7 +38,7 @@ class ViewSource:
         resolution: width and height, pixels, of the pictures that people look at. By default given views and photos
             have their own, and sampled views 1920 x 1080.
         settings: tuned numbers, see :mod:`pointsplat_ns.looking.settings`.
-        up: (3,) direction that is up for sampled views, of length 1; by default it is estimated.
+        up: which way is up, for sampled views; by default it is estimated.
     """
 
     def __init__(
@@ -52,9 +49,9 @@ class ViewSource:
         dataset_views: Callable[[Path | str], Views] | None = None,
         resolution: tuple[int, int] | None = None,
         settings: LookingSettings = DEFAULTS,
-        up: Tensor | None = None,
+        up: Up | None = None,
     ):
-        self._resolution, self.settings, self._up = resolution, settings, up
+        self._resolution, self._settings, self._up = resolution, settings, up
         self._scene, self._given, self._run, self._dataset_views = scene, given, run, dataset_views
         self.origin = ""
         """Text that says where views came from; empty until there are some."""
@@ -115,22 +112,24 @@ class ViewSource:
     def _sampled(self, count: int, seed: int) -> Views:
         """Sampled views, which get the run's rasterize mode."""
         width, height = self.resolution
-        options: dict[str, Any] = {"seed": seed, "up": self.up.direction, "settings": self.settings}
-        views = views_about(self._scene, self._photos, count, width=width, height=height, **options)
+        views = views_about(
+            self._scene, self._photos, count, width=width, height=height, seed=seed, up=self.up.direction,
+            settings=self._settings,
+        )  # fmt: skip
         return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
 
     @cached_property
     def _photos(self) -> PhotoPlaces | None:
-        return photo_places(self._scene, self.settings)
+        return photo_places(self._scene, self._settings)
 
     @cached_property
     def up(self) -> Up:
-        """The direction that is up in the scene.
+        """Which way is up in the scene.
 
         Raises:
             DataError: if it has to be estimated, and nothing of the scene is visible.
         """
-        return up_about(self._scene, self._photos, self.settings) if self._up is None else Up(self._up)
+        return self._up or up_about(self._scene, self._photos, self._settings)
 
     def known(self, count: int) -> Views | None:
         """At most ``count`` known views: given ones, or those of the dataset's training poses; None if there are
@@ -153,11 +152,11 @@ class ViewSource:
 
     def compared(self) -> Views:
         """The views in which renders are compared, at :func:`~pointsplat_ns.looking.windows.middle_sized` size."""
-        return middle_sized(self._whole, self.settings)
+        return middle_sized(self._whole, self._settings)
 
     def scored(self, count: int) -> Views:
         """At most ``count`` views for scores and for fine-tuning, of the size of :meth:`compared`."""
-        return middle_sized(self.views(count), self.settings)
+        return middle_sized(self.views(count), self._settings)
 
     def others(self, seed: int = 0) -> Iterator[View]:
         """Views to optimise on, without end: none of the :meth:`compared` ones, and of the same size.
@@ -175,13 +174,13 @@ class ViewSource:
         known = self.given if self.given is not None else self._of_dataset
         if known is not None and len(known) > 2 * len(compared):
             left = sorted(set(range(len(known))) - set(spread_indices(len(known), COMPARED_VIEWS)))
-            rest, generator = middle_sized(self._at_resolution(known), self.settings), random.Random(seed)
+            rest, generator = middle_sized(self._at_resolution(known), self._settings), random.Random(seed)
             while True:
                 for index in generator.sample(left, len(left)):
                     yield rest[index]
-        at_once, every = self.settings.sampled_at_once, self.settings.opposite_background_every
+        at_once, every = self._settings.sampled_at_once, self._settings.opposite_background_every
         for batch in counted(1):
-            sampled = middle_sized(self._sampled(at_once, at_once * seed + batch), self.settings)
+            sampled = middle_sized(self._sampled(at_once, at_once * seed + batch), self._settings)
             sampled = dataclasses.replace(
                 sampled, background=compared.background, rasterize_mode=compared.rasterize_mode
             )

@@ -6,8 +6,6 @@ import functools
 from dataclasses import replace
 from pathlib import Path
 
-from torch import Tensor
-
 from pointsplat_ns.compression.posed_scene import read_posed
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import BudgetError
@@ -15,7 +13,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, name_of
 from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.io.source import source_file
-from pointsplat_ns.looking.upright import axis_or_none
+from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.looking.windows import parse_resolution
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
@@ -96,7 +94,7 @@ def measure_tradeoff(
     """
     options = Options(points, within, tuple(by), tuple(repairs), views, tuple(drawn))
     targets, size = targets_of(target_db, target_ms, target_mb), parse_resolution(resolution)
-    upward = axis_or_none(up)
+    upward = up_named(up)
     path, folder = Path(scene), Path(folder)
     dense, given = (read_scene(path), None) if poses is None else read_posed(path, poses)
     check_folder(folder, force)
@@ -129,7 +127,7 @@ def subject_of(
     refiner: TrainedRefiner | None = None,
     suffix: str = ".ply",
     resolution: tuple[int, int] | None = None,
-    up: Tensor | None = None,
+    up: Up | None = None,
 ) -> Subject:
     """A scene to be measured, with the views that its commands have and its held-out photos.
 

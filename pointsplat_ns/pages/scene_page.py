@@ -9,7 +9,7 @@ from typing import Any
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger, replacing
-from pointsplat_ns.looking.upright import Up, axis_named
+from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.pages.flight import SCRIPTS, FlightFrame
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.pruning import need_usable, ply_bytes
@@ -76,7 +76,7 @@ def write_page(
     if len(names) != len(scenes):
         raise PointSplatError(f"{len(names)} names for {len(scenes)} scenes; expected one for each")
     check_limit(limit_mb)
-    upward = None if up is None else Up(axis_named(up))
+    upward = up_named(up)
     for scene in scenes:
         need_usable(scene)
     rows = [_row(name, scene) for name, scene in zip(names, scenes, strict=True)]

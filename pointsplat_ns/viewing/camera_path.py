@@ -6,8 +6,6 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from torch import Tensor
-
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import content_box
@@ -65,7 +63,7 @@ def camera_path(
     path: str | Path,
     settings: FilmSettings,
     one: bool = False,
-    up: Tensor | None = None,
+    up: Up | None = None,
 ) -> CameraPath:
     """Choose the cameras of a film of a scene.
 
@@ -77,7 +75,7 @@ def camera_path(
             that nerfstudio's viewer saved.
         settings: size, speed and length.
         one: return one camera only: the one that shows most, unless the path says which.
-        up: (3,) up direction of a walk or an orbit, of length 1, also of ``source``; by default from the views.
+        up: which way is up, for a walk or an orbit; by default that of known views, or estimated.
 
     Raises:
         DataError: if there are no views, or the file is not a camera path.
@@ -102,20 +100,21 @@ def camera_path(
             frames = max(frames, len(known))
         usual = (known.width, known.height) if source.given is not None else _reduced(known)
         if one and path == "auto":
-            known = opening_views(scene, up=None if up is None else Up(up), known=known.spread(4 * STOPS)).views
+            known = opening_views(scene, up=up, known=known.spread(4 * STOPS)).views
         views = along(_sized(known, settings, usual), frames)
         skipped = f", {len(known) - frames} of {len(known)} left out" if frames < len(known) and not one else ""
         return CameraPath(views, fps, f"along the {source.origin}{skipped}")
     if known is None:
-        opening = opening_views(scene, 1 if one else STOPS, *_shape(settings, (960, 540)), source.up)
+        opening = opening_views(scene, 1 if one else STOPS, *_shape(settings, (960, 540)), up)
         stops = dataclasses.replace(opening.views, rasterize_mode=source.rasterize_mode)
-        up, origin = opening.up.direction, f"views that show most, up is {opening.up}{source.missing}"
+        up, origin = opening.up, f"views that show most, up is {opening.up}{source.missing}"
     else:
         stops, origin = _sized(known.spread(2 * STOPS), settings, _reduced(known)), source.origin
+    upward = None if up is None else up.direction
     if path == "orbit":
         low, high = content_box(scene)
-        return CameraPath(orbit(stops, frames, 0.5 * (low + high).cpu(), up), fps, f"a turn, by {origin}")
-    return CameraPath(walk(stops, frames, up, from_first=known is None), fps, f"a walk past {origin}")
+        return CameraPath(orbit(stops, frames, 0.5 * (low + high).cpu(), upward), fps, f"a turn, by {origin}")
+    return CameraPath(walk(stops, frames, upward, from_first=known is None), fps, f"a walk past {origin}")
 
 
 def _frames(seconds: float, fps: float) -> int:

@@ -14,6 +14,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.traces import PhotoPlaces
+from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.looking.windows import sides_of
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
@@ -133,7 +134,7 @@ def test_sampled_poses_near_photo_places_say_so(monkeypatch):
 def test_up_is_as_named_or_estimated():
     scene = box_room(0, 3000)
     sideways = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
-    named, estimated = ViewSource(scene, up=sideways), ViewSource(scene)
+    named, estimated = ViewSource(scene, up=Up(sideways)), ViewSource(scene)
     assert str(named.up) == "x" and named.up.sure
     rolls = [source.views(3).viewmats[:, 0, :3] @ source.up.direction for source in (named, estimated)]
     assert all(float(roll.abs().max()) < 1e-6 for roll in rolls)
