@@ -6,6 +6,17 @@ exits with status 1.
 """
 
 
+def printable(text: str) -> str:
+    """Text in one line that cannot steer a terminal: every character that is not printable becomes its escape, as in
+    Python's ``repr``.
+
+    Example:
+        >>> print(printable("a name\x1b]0;with orders\x07\n"))
+        a name\\x1b]0;with orders\\x07\\n
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
 class PointSplatError(Exception):
     """Base of all errors caused by input rather than by a bug.
 
@@ -21,10 +32,7 @@ area, random, lightgaussian, pup
 
     def __str__(self) -> str:
         """The text in one line: what a file put into it can neither break the line nor steer a terminal."""
-        text = super().__str__()
-        if text.isprintable():
-            return text
-        return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+        return printable(super().__str__())
 
 
 class SceneError(PointSplatError):

@@ -137,7 +137,7 @@ def _compacted(
     dense = read_scene(path)
     source = ViewSource(dense, run=path, dataset_views=dataset_views, resolution=resolution)
     result = compact_scene(dense, replace(request, refiner=_refiner_on(refiner, device)), source)
-    if result.repaired is not None and result.repaired.interrupted:
+    if result.interrupted:
         raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the repair of one scene
     return SmallerScene(result.scene, len(dense), result.psnr)
 

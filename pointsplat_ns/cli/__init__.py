@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import inspect
 import logging
-import os
 import re
 import signal
 import sys
@@ -14,6 +13,8 @@ import types
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+
+from pointsplat_ns.errors import PointSplatError, printable
 
 COMMANDS = (
     *(
@@ -40,7 +41,7 @@ class _PrintHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         is_warning = record.levelno >= logging.WARNING
-        print(self.format(record), file=sys.stderr if is_warning else sys.stdout)
+        print(printable(self.format(record)), file=sys.stderr if is_warning else sys.stdout)
 
 
 @contextmanager
@@ -81,6 +82,8 @@ def _what_failed(error: Exception) -> str:
     """An error of the system in one line."""
     from pointsplat_ns.io.files import one_line
 
+    if isinstance(error, ModuleNotFoundError):
+        return f"{error.name} is not installed; pip install pointsplat-ns adds what is missing"
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     if isinstance(error, RecursionError):
@@ -90,11 +93,16 @@ def _what_failed(error: Exception) -> str:
     return one_line(error)
 
 
-def _is_lack_of_memory(error: RuntimeError) -> bool:
-    """Whether torch could not allocate a tensor. On a CPU this has no exception type of its own."""
+def _is_bug(error: Exception) -> bool:
+    """Whether an error is none of the input or of the machine: a module of ours that is missing, or a RuntimeError
+    other than of torch's memory, which has no type of its own on a CPU."""
+    if isinstance(error, ModuleNotFoundError):
+        return error.name is None or error.name.startswith(__package__.partition(".")[0])
+    if not isinstance(error, RuntimeError) or isinstance(error, RecursionError):
+        return False
     import torch
 
-    return isinstance(error, torch.cuda.OutOfMemoryError) or "can't allocate memory" in str(error)
+    return not isinstance(error, torch.cuda.OutOfMemoryError) and "can't allocate memory" not in str(error)
 
 
 def _command(name: str) -> Callable[..., None]:
@@ -145,17 +153,39 @@ def main(args: list[str] | None = None) -> None:
     and exit status 1; Ctrl-C ends it with 130, another signal with 128 plus its number
     (:data:`pointsplat_ns.cli.help.STATUSES`). With ``--json``, standard output has one JSON value and nothing else.
     """
-    import tyro
+    from pointsplat_ns.cli.streams import any_text_printable, discard_output
 
-    from pointsplat_ns import __version__
-    from pointsplat_ns.cli.help import after_help
-    from pointsplat_ns.cli.printing import only_json
-    from pointsplat_ns.errors import PointSplatError
-    from pointsplat_ns.system.memory import keep_freed_memory
+    with any_text_printable():
+        try:
+            _run(sys.argv[1:] if args is None else args)
+        except PointSplatError as error:
+            text, status = f"error: {error}", 1
+        except BrokenPipeError:  # of `pointsplat ... | head`
+            discard_output()
+            sys.exit(1)
+        except (ModuleNotFoundError, OSError, MemoryError, RuntimeError) as error:
+            if _is_bug(error):
+                raise
+            text, status = f"error: {printable(_what_failed(error))}", 1
+        except KeyboardInterrupt:
+            text, status = "interrupted", 130
+        else:
+            return
+        print(text, file=sys.stderr)
+        sys.exit(status)
 
-    keep_freed_memory()
-    args = sys.argv[1:] if args is None else args
+
+def _run(args: list[str]) -> None:
+    """Run one subcommand. What it printed is with the reader when this returns or raises."""
     try:
+        import tyro
+
+        from pointsplat_ns import __version__
+        from pointsplat_ns.cli.help import after_help
+        from pointsplat_ns.cli.printing import only_json
+        from pointsplat_ns.system.memory import keep_freed_memory
+
+        keep_freed_memory()
         with _log_printed(), _ended_by_signals(), only_json(args):
             if args == ["--version"]:
                 print(f"pointsplat-ns {__version__}")
@@ -165,27 +195,9 @@ def main(args: list[str] | None = None) -> None:
                 about = "Makes trained 3D Gaussian Splatting scenes smaller, and looks at them."
                 about += " `--version` prints the version."
                 tyro.extras.subcommand_cli_from_dict(_all(args), prog="pointsplat", description=about, args=args)
-            sys.stdout.flush()  # so that a full disk or a closed pipe is noticed here
-    except PointSplatError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(1)
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.startswith(__package__.partition(".")[0]):
-            raise
-        print(f"error: {error.name} is not installed; pip install pointsplat-ns adds what is missing", file=sys.stderr)
-        sys.exit(1)
-    except BrokenPipeError:  # of `pointsplat ... | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python fails again when it ends
-        sys.exit(1)
-    except (OSError, MemoryError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and not (isinstance(error, RecursionError) or _is_lack_of_memory(error)):
-            raise
-        print(f"error: {_what_failed(error)}", file=sys.stderr)
-        sys.exit(1)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(130)
     except SystemExit as end:
         if not end.code and (text := after_help(args)):
             print(f"\n{text}")
         raise
+    finally:
+        sys.stdout.flush()  # a full disk or a closed pipe is noticed here

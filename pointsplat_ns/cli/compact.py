@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from pointsplat_ns.cli.folders import compact_folder
-from pointsplat_ns.cli.printing import Json, print_distributions, print_json, print_result, scene_result
+from pointsplat_ns.cli.printing import (
+    Json,
+    end_if_interrupted,
+    print_distributions,
+    print_json,
+    print_result,
+    scene_result,
+)
 from pointsplat_ns.cli.scene_options import (
     Bands,
     Output,
@@ -80,7 +87,8 @@ def compact(
         sh: SH bands to keep, as for prune: all, up to a degree, or auto.
         clean: as for prune: first remove Gaussians that cannot be drawn or seen.
         effort: length of the repair: no steps (instant), 48 (quick, about as long as merging takes), or 400 (thorough).
-        seconds: duration of the repair, in place of --effort. Ctrl-C ends it earlier and keeps the scene so far.
+        seconds: duration of the repair, in place of --effort. Ctrl-C ends it earlier and writes the scene so
+            far.
         target_db: search for the smallest file of at least this PSNR against renders of the dense scene. The search
             chooses count, SH degree and repair, in place of --keep and --sh.
         target_ms: longest time of a frame, milliseconds. Without --target-db, search for the best within the limits.
@@ -149,7 +157,7 @@ def compact(
             "html": html,
         }
         print_json({**scene_result(len(dense), result.scene, result.seconds, written), **made})
-        return
+        return end_if_interrupted(result.interrupted)
     what = "kept" + (" and refined" if result.accepted else "") + (" and repaired" if result.repair_accepted else "")
     print_result(what, len(dense), result.scene, result.seconds, written)
     print_distributions(dense, result.scene)
@@ -157,6 +165,7 @@ def compact(
         print(shown)
     if html is not None:
         print(f"{html}: {file_bytes(html) / 1e6:.2f} MB, to fly through in a browser")
+    end_if_interrupted(result.interrupted)
 
 
 def _loaded(refiner: Path | None) -> TrainedRefiner | None:

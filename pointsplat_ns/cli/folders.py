@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.cli.printing import print_json
+from pointsplat_ns.errors import printable
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_task import SceneResult
@@ -73,5 +74,5 @@ def _print_table(results: list[SceneResult]) -> None:
         numbers = (result.before, result.after, result.megabytes, result.psnr, result.seconds)
         cells = ("-" if value is None else f"{value:{form}}" for value, form in zip(numbers, forms, strict=True))
         what = f"{result.status}: {result.error}" if result.error else result.status
-        table.add_row(escape(result.name), *cells, escape(what))
+        table.add_row(escape(printable(result.name)), *cells, escape(printable(what)))
     Console().print(table)

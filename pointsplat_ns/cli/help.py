@@ -69,7 +69,7 @@ STATUSES = {
     1: "an error, in one line on standard error; with a traceback, a bug of ours",
     2: "a command line that is not understood",
     129: "the terminal was lost (SIGHUP)",
-    130: "Ctrl-C (SIGINT)",
+    130: "interrupted by Ctrl-C (SIGINT)",
     143: "asked to end (SIGTERM)",
 }
 """Meanings of exit statuses."""

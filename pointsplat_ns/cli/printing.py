@@ -43,6 +43,19 @@ def print_json(content: Any) -> None:
     print(json_text(content), file=_OUTPUT.get(), flush=True)
 
 
+def end_if_interrupted(interrupted: bool) -> None:
+    """End a command as Ctrl-C does, once the best result so far is written and printed.
+
+    Args:
+        interrupted: whether Ctrl-C ended the work early.
+
+    Raises:
+        KeyboardInterrupt: if so.
+    """
+    if interrupted:
+        raise KeyboardInterrupt
+
+
 def scene_result(before: int | None, scene: Gaussians, seconds: float, where: Path | None) -> dict[str, Any]:
     """The JSON values of a result.
 

@@ -32,7 +32,4 @@ def view(
     with ps.open_viewer(scene, other, up=up, host=host, port=port) as viewer:
         print(f"{viewer.url}: open it in a browser; Ctrl-C ends it")
         print(f"it begins at {viewer.origin}" if viewer.origin else "drop a scene on the page", flush=True)
-        try:
-            viewer.wait()
-        except KeyboardInterrupt:
-            print("ended")
+        viewer.wait()

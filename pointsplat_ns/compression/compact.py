@@ -76,7 +76,7 @@ class Compacted:
     """Text on the search for targets: the cost, and the target that the next cheaper scene misses; empty if there was
     no search."""
     interrupted: bool = False
-    """Whether the search for targets was interrupted."""
+    """Whether Ctrl-C ended the repair or the search for targets early."""
 
     def _stage(self, name: str) -> Stage | None:
         return next((stage for stage in self.stages if stage.name == name), None)
@@ -206,7 +206,9 @@ def compact_scene(
     if views.origin and views.origin not in notes:
         notes = (*notes, views.origin)
     reference = None if judge is None else judge.reference
-    return Compacted(tuple(stages), notes, reference, time.perf_counter() - start, uncompared)
+    interrupted = any(stage.interrupted for stage in stages)
+    seconds = time.perf_counter() - start
+    return Compacted(tuple(stages), notes, reference, seconds, uncompared, interrupted=interrupted)
 
 
 def as_compacted(dense: Gaussians, pruned: Gaussians, views: ViewSource, notes: tuple[str, ...]) -> Compacted:

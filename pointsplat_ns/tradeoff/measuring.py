@@ -106,7 +106,7 @@ def make(
         budget = RepairBudget(EFFORTS[setting.repair])
         request = CompactRequest.of(refiner, setting.count, setting.by, sh, repair=budget)
         compacted = compact_scene(dense, request, new_views(), progress)
-        if compacted.repaired is not None and compacted.repaired.interrupted:
+        if compacted.interrupted:
             raise KeyboardInterrupt
         scene, notes = compacted.scene, compacted.notes
     return MadeScene(scene.to(dense.device), time.perf_counter() - start, peak.bytes(), notes, compacted)

@@ -14,6 +14,7 @@ import pytest
 import pointsplat_ns as ps
 from making import ball
 from pointsplat_ns.cli import main
+from pointsplat_ns.compression import repair
 
 HEEDED = """
 import signal
@@ -146,6 +147,24 @@ def test_what_is_interrupted_while_it_is_written_is_not_there_and_what_was_there
     else:
         assert Path(name).read_text() == "from before"
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.parametrize("options", [(), ("--json",)], ids=["text", "json"])
+def test_a_repair_that_is_interrupted_is_written_and_the_status_says_so(options, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    ps.save(ball(150, log_size=-1.0, opacity=1.0, bright=1.0), "room.ply")
+    steps = repair.optimised
+
+    def interrupted(*arguments):
+        yield next(steps(*arguments))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(repair, "optimised", interrupted)
+    with pytest.raises(SystemExit) as end:
+        main(["compact", "room.ply", "--keep", "50%", "--by", "opacity", "--seconds", "60", *options])
+    out, err = capsys.readouterr()
+    assert end.value.code == 130 and err.endswith("interrupted\n")
+    assert "room_compact.ply" in out and len(ps.load("room_compact.ply")) == 75
 
 
 @pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])

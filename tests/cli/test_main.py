@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
+import re
+import shlex
 import subprocess
 import sys
 import threading
@@ -81,3 +85,58 @@ def test_output_that_nobody_can_take_ends_without_a_traceback(where):
     os.close(output)
     assert ended.returncode == 1
     assert ended.stderr == ("error: No space left on device\n" if where == "full" else "")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="closes file descriptors as a POSIX shell does")
+def test_streams_that_are_closed_go_nowhere_and_no_file_gets_their_numbers(tmp_path):
+    script = "from pointsplat_ns.cli import main; main(['--version']); assert open('file', 'w').fileno() > 2"
+    line = f"{shlex.quote(sys.executable)} -c {shlex.quote(script)} <&- >&- 2>&-"
+    subprocess.run(["sh", "-c", line], cwd=tmp_path, check=True)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_characters_that_standard_output_lacks_are_replaced(encoding, monkeypatch):
+    output = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+    monkeypatch.setattr(sys, "stdout", output)
+    with pytest.raises(SystemExit) as end:
+        main(["--help"])
+    assert not end.value.code and output.errors == "strict" and sys.stdout is output
+    said = output.buffer.getvalue().decode(encoding)
+    assert "? prune" in said.replace(" " * 3, " ") and "exit status:" in said
+
+
+ORDERS = "\x1b]0;pwned\x07\x9b31m\x08\x1b[2J"
+"""Sets the title of a terminal, colours and deletes."""
+
+
+def commanding(folder: Path) -> None:
+    """Scenes whose names and properties hold :data:`ORDERS`."""
+    properties = b"x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+    names = [*properties, b"odd" + ORDERS.encode("latin-1")]
+    header = [b"ply", b"format ascii 1.0", b"element vertex 1", *(b"property float " + name for name in names)]
+    (folder / f"{ORDERS}.ply").write_bytes(b"\n".join([*header, b"end_header", b"1 " * len(names)]))
+    (folder / f"bad{ORDERS}.spz").touch()
+
+
+@pytest.mark.parametrize(
+    "words, shown",
+    [
+        (
+            ("info", f"{ORDERS}.ply"),
+            r"\x1b]0;pwned\x07\x9b31m\x08\x1b[2J.ply: not read: the vertex properties odd\x1b]0;pwned\x07",
+        ),
+        (("info", f"bad{ORDERS}.spz"), r"error: bad\x1b]0;pwned\x07"),
+        (("info", "new\nline.ply"), r"error: new\nline.ply: no such file"),
+        (("convert", f"{ORDERS}.ply", f"made{ORDERS}.ply"), r"made\x1b]0;pwned\x07\x9b31m\x08"),
+        (("compact", ".", "-o", f"out{ORDERS}", "--keep", "1", "--effort", "instant"), r"out\x1b]0;pwned\x07"),
+        (("nonsense" + ORDERS,), r"nonsense\x1b]0;pwned"),
+    ],
+)
+def test_no_name_steers_the_terminal(words, shown, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    commanding(tmp_path)
+    with contextlib.suppress(SystemExit):
+        main([*words])
+    out, err = capsys.readouterr()
+    assert shown in out + err
+    assert not re.search(r"[^\n\x20-\x7e\xa0-\U0010ffff]", out + err)
