@@ -65,6 +65,7 @@ def tradeoff(
     """
     import pointsplat_ns as ps
     from pointsplat_ns.system.threads import fixed_threads
+    from pointsplat_ns.tradeoff.front import next_best
     from pointsplat_ns.tradeoff.outputs import JSON
 
     check_poses(poses)
@@ -82,9 +83,10 @@ def tradeoff(
     for note in found.notes:
         print(f"note: {note}")
     print(found.why)
-    command = found.point(found.recommended).command
-    if command:
-        print(f"$ {command}")
+    best = found.point(found.recommended)
+    best = next_best(found.points) or best if best is found.points[0] else best  # the dense scene needs no command
+    if best.command:
+        print(f"$ {best.command}")
     print(f"{folder}: tables, plots and pictures; open {folder / 'tradeoff.html'}")
 
 

@@ -108,8 +108,14 @@ def loss_of(point: Point, dense: Point) -> float:
     return expected_loss(point.against_dense.psnr)
 
 
+def next_best(points: Sequence[Point]) -> Point | None:
+    """The point with the least loss after the dense scene, which is the first; None if there is no other."""
+    return min(points[1:], key=lambda point: (loss_of(point, points[0]), point.gaussians), default=None)
+
+
 def recommend(points: Sequence[Point], within: float, trusted: bool = True) -> tuple[Point, str]:
-    """The fastest point within a loss, and a line of text on it.
+    """The fastest point within a loss, and a line of text on it. If it is the dense scene, the text has the figures of
+    the next best too.
 
     Args:
         points: the dense scene, then others.
@@ -126,9 +132,19 @@ def recommend(points: Sequence[Point], within: float, trusted: bool = True) -> t
             f"against photos that it meets with {PHOTO_PSNR:g} dB"
         )
     what = "fastest point" if trusted else "point with the fewest Gaussians"
-    if best is dense:
-        return dense, f"the {what} {limit} is the dense scene itself"
-    figures = f"{best.gaussians:,} Gaussians, {best.bytes / 1e6:.2f} MB"
-    if trusted:
-        figures += f", {speed_of(best, dense)}: {best.frame_ms:.3g} ms a frame in place of {dense.frame_ms:.3g}"
-    return best, f"the {what} {limit}: {best.label}, {figures}"
+    if best is not dense:
+        return best, f"the {what} {limit}: {best.label}, {_figures(best, dense, trusted)}"
+    why, other = f"the {what} {limit} is the dense scene itself", next_best(points)
+    if other is not None:
+        loss = f"{loss_of(other, dense):.2f} dB{'' if dense.against_photos else ' (estimated)'}"
+        why += f"; the next best, {other.label}, loses {loss}: {_figures(other, dense, trusted)}, made in "
+        why += f"{other.seconds:.0f} s"
+    return dense, why
+
+
+def _figures(point: Point, dense: Point, trusted: bool) -> str:
+    """Count, size, and where times are trusted the time of a frame."""
+    figures = f"{point.gaussians:,} Gaussians, {point.bytes / 1e6:.2f} MB in place of {dense.bytes / 1e6:.2f}"
+    if not trusted:
+        return figures
+    return f"{figures}, {speed_of(point, dense)}: {point.frame_ms:.3g} ms a frame in place of {dense.frame_ms:.3g}"

@@ -66,15 +66,20 @@ def test_a_sweep_is_written_beside_the_scene_and_printed(ply, capsys):
     assert content["why"] in said and str(folder / "tradeoff.html") in said
 
 
-def test_the_recommended_point_is_printed_with_a_command_that_makes_it(ply, capsys, monkeypatch):
-    run("tradeoff", ply, "--points", "3", "--within", "30", *FEW)  # so much that anything will do
+@pytest.mark.parametrize("within, next_best", [("30", False), ("1e-9", True)])  # anything will do, or nothing
+def test_the_recommended_point_or_the_next_best_is_printed_with_a_command(ply, capsys, monkeypatch, within, next_best):
+    run("tradeoff", ply, "--points", "3", "--within", within, *FEW)
     [command] = [line[2:] for line in capsys.readouterr().out.splitlines() if line.startswith("$ ")]
     monkeypatch.chdir(ply.parent)
     program, *words = shlex.split(command)
     run(*words)
-    recommended = json.loads((ply.parent / "room_tradeoff" / "tradeoff.json").read_text())["recommended"]
-    assert program == "pointsplat" and f"room_{recommended}.ply" in words
-    assert len(ps.load(f"room_{recommended}.ply")) < 400
+    content = json.loads((ply.parent / "room_tradeoff" / "tradeoff.json").read_text())
+    key = content["recommended"]
+    if next_best:
+        assert key == "dense"
+        key = max(content["points"][1:], key=lambda point: point["against_dense"]["psnr"])["key"]
+    assert program == "pointsplat" and f"room_{key}.ply" in words
+    assert len(ps.load(f"room_{key}.ply")) < 400
 
 
 def test_the_same_command_goes_on_and_says_nothing_of_what_it_had(ply, capsys):

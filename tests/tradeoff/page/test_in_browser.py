@@ -9,7 +9,7 @@ import pytest
 
 from browser import chromium, complaints, phone_and_colours
 from flying import message, picture, shrink
-from pointsplat_ns.tradeoff.front import fastest_above, fastest_within, pareto_front
+from pointsplat_ns.tradeoff.front import fastest_above, fastest_within, next_best, pareto_front
 
 pytest.importorskip("selenium", reason="selenium is not installed")
 from selenium.webdriver.common.action_chains import ActionChains  # noqa: E402
@@ -139,9 +139,12 @@ def test_chart_is_used_with_the_keyboard(opened, sweep):
 @pytest.mark.parametrize("db", [0, 0.5, 5, 14])
 def test_recommended_within_some_db_is_the_one_that_python_finds(opened, sweep, db):
     write(opened, "#within", str(db))
-    expected = fastest_within(sweep[0].points, db)
-    assert one(opened, "#recommended-command code").get_attribute("textContent") == expected.command
-    assert expected.label in one(opened, "#recommended-name").text
+    expected, dense = fastest_within(sweep[0].points, db), sweep[0].points[0]
+    name = one(opened, "#recommended-name").text
+    assert expected.label in name
+    expected = next_best(sweep[0].points) if expected is dense else expected
+    assert expected.label in name
+    assert one(opened, "#recommended-command code").get_attribute("textContent") == expected.command != ""
     one(opened, "#recommended-show").click()
     assert shown(opened)["name"].startswith(expected.label)
 
@@ -150,8 +153,9 @@ def test_recommended_within_some_db_is_the_one_that_python_finds(opened, sweep, 
 def test_recommended_by_renders_is_the_one_that_python_finds(opened, sweep, db):
     choose(opened, "reference", "renders")
     write(opened, "#above", str(db))
-    expected = fastest_above(sweep[0].points, db)
-    assert one(opened, "#recommended-command code").get_attribute("textContent") == expected.command
+    expected, (dense, *others) = fastest_above(sweep[0].points, db), sweep[0].points
+    expected = max(others, key=lambda point: point.against_dense.psnr) if expected is dense else expected
+    assert one(opened, "#recommended-command code").get_attribute("textContent") == expected.command != ""
     assert not one(opened, "#within").is_displayed()
 
 
