@@ -208,8 +208,8 @@ def compact(
         clean: as for :func:`prune`.
         effort: "instant" takes no steps; "quick" and "thorough" take 48 and 400.
         seconds: duration of the repair, in place of ``effort``; Ctrl-C ends it earlier and keeps the scene so far.
-        target_db: least PSNR against the given scene's renders, dB, mean over views; views of held-out photos if the
-            run has any.
+        target_db: least PSNR against the given scene's renders, over the pixels that it covers, dB; in the views of
+            held-out photos if the run has any.
         target_ms: longest time of a frame, milliseconds, drawn by this package in these views.
         target_mb: largest file, in units of 10^6 bytes.
         target_format: format of the file whose size counts: ".ply", ".spz", ".sog", ...

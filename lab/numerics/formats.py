@@ -23,10 +23,10 @@ from lab.common.printing import markdown, number, start
 from lab.common.results import Row, grouped, write_json
 from lab.common.scenes import name_of
 from lab.common.timing import seconds_of
-from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.geometry.quaternions import zero_as_identity
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.spz import SH_BITS, write_spz
+from pointsplat_ns.looking.closeness import DenseReference
 
 VIEWS, SEED = 12, 1
 SPZ_4 = {"v4.spz": SH_BITS, "coarse.spz": (5, 4), "fine.spz": (8, 8)}

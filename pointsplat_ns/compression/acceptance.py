@@ -16,8 +16,8 @@ from enum import Enum, auto
 
 import torch
 
-from pointsplat_ns.compression.closeness import Closeness, DenseReference
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.closeness import Closeness, DenseReference
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.looking.windows import WindowRenders, sides_of
 from pointsplat_ns.pruning.merging.finishing import top_of_parabola

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import torch
 
-from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.count_search import SearchSettings, find_count
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import Format
+from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.pruning.sh_bands import cut_sh
 from pointsplat_ns.system.progress import silent
 from pointsplat_ns.views import Views
@@ -45,7 +45,7 @@ class FoundQuality:
 
     scene: Gaussians
     psnr: float
-    """PSNR of ``scene`` over all pixels of all views, dB; inf if nothing differs."""
+    """PSNR of ``scene`` over the pixels that the dense scene covers, dB; inf if nothing differs."""
     worst: float
     """PSNR of the worst view, dB."""
     tried: dict[int, float]
@@ -72,8 +72,9 @@ def smallest_within(
 ) -> FoundQuality:
     """Search for the smallest scene of a method whose renders reach ``psnr`` against those of the dense scene.
 
-    The PSNR is that of the mean squared error over all pixels of all views, so bad views count more. The result was
-    rendered and reaches ``psnr``. A smaller such scene may exist where PSNR does not always rise with the count.
+    The PSNR is that of the mean squared error of all views, so bad views count more, over the pixels that the dense
+    scene covers. The result was rendered and reaches ``psnr``. A smaller such scene may exist where PSNR does not
+    always rise with the count.
 
     Args:
         dense: N Gaussians.

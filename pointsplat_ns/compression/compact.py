@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pointsplat_ns.compression.acceptance import Comparison, Reason, accept_change
-from pointsplat_ns.compression.closeness import Closeness, DenseReference
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import repair
 from pointsplat_ns.compression.requests import CompactRequest
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.closeness import Closeness, DenseReference
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import need_usable
 from pointsplat_ns.system.progress import Progress, silent
@@ -145,8 +145,8 @@ class Compacted:
 
     @property
     def psnr(self) -> float | None:
-        """PSNR of ``scene`` against the dense scene's renders, over all pixels of all views, dB; None if nothing was
-        compared."""
+        """PSNR of ``scene`` against the dense scene's renders over the pixels that the dense scene covers, dB; None if
+        nothing was compared."""
         return None if self.closeness is None else self.closeness.psnr
 
     @property
@@ -271,9 +271,8 @@ def _repair(
     if judge is None or last.after is None or request.repair.empty or last.after.psnr == math.inf:
         return None
     progress("repairing", 0.0)
-    psnr = judge.reference.psnr_of_covered(last.after.psnr)
     report = functools.partial(progress, "repairing")
-    repaired = repair(last.scene.to(dense.device), dense, views, request.repair, report, psnr=psnr)
+    repaired = repair(last.scene.to(dense.device), dense, views, request.repair, report, psnr=last.after.psnr)
     change = accept_change(judge, last.after, last.scene, repaired.scene)
     scene = change.scene if change.reason is None else repaired.scene.to(last.scene.device)
     figures = (repaired.steps, repaired.seconds, repaired.interrupted)

@@ -19,12 +19,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.feedback import REPAIR, Feedback
 from pointsplat_ns.compression.optimiser import gradients_of
 from pointsplat_ns.compression.repair import initial_rate_factor, rate_factor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS
 from pointsplat_ns.looking.windows import RESOLUTION, middle_sized
@@ -90,7 +90,7 @@ class TrainingScene:
         views = middle_sized(views) if TRAINING.side is None else views.resized(TRAINING.side)
         pruned = {budget: prune(dense, budget, "merge") for budget in keep}
         reference = DenseReference(dense, views.spread(COMPARED_VIEWS))
-        psnr = {budget: reference.psnr_of_covered(reference.psnr(scene)[0]) for budget, scene in pruned.items()}
+        psnr = {budget: reference.psnr(scene)[0] for budget, scene in pruned.items()}
         return cls(name, dense, pruned, psnr, views)
 
     @torch.no_grad()

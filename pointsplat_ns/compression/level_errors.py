@@ -9,37 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.closeness import Closeness, DenseReference
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.rasterizer import render, render_depth
-from pointsplat_ns.views import Views
+from pointsplat_ns.looking.closeness import Closeness, Reference
+from pointsplat_ns.rasterizer import render_depth
 
 FARTHER = (2, 4, 8)
 """Factors on the distance of the compared views, at which errors are measured too."""
-
-
-@dataclass(frozen=True, eq=False)
-class FarReference:
-    """Target images at a multiple of the distance of the compared views. The scene covers a smaller part of the picture
-    there, so a target is a near render with each square of ``times`` x ``times`` pixels averaged."""
-
-    times: int
-    """The multiple."""
-    views: Views
-    """The compared views with width and height divided by ``times``."""
-    targets: list[Tensor]
-    """The averaged renders of the dense scene."""
-
-    @torch.no_grad()
-    def psnr(self, scene: Gaussians) -> float:
-        """PSNR of a scene's renders over all pixels of all views, dB.
-
-        The dense scene itself does not reach inf: the rasterizer draws Gaussians no thinner than a pixel, so its
-        distant renders are coarser than the targets. A level can be closer to the targets than the dense scene.
-        """
-        pairs = zip(self.views, self.targets, strict=True)
-        errors = [float((render(scene, view).double() - target).square().mean()) for view, target in pairs]
-        return Closeness(tuple(errors), None).psnr
 
 
 @dataclass(frozen=True)
@@ -49,11 +24,7 @@ class RenderErrors:
     near: Closeness
     """In the compared views."""
     farther: dict[int, float]
-    """PSNR in dB by multiple of the distance, see :class:`FarReference`."""
-
-    def view_psnr(self, index: int) -> float:
-        """PSNR of one compared view, dB."""
-        return Closeness((self.near.errors[index],), None).psnr
+    """PSNR in dB by multiple of the distance, see :func:`far_references`."""
 
 
 @dataclass(frozen=True)
@@ -67,17 +38,23 @@ class Displacement:
     """The 95th percentile."""
 
 
-def far_references(reference: DenseReference) -> list[FarReference]:
-    """The targets at each of :data:`FARTHER`, as far as the compared views have enough pixels."""
-    views = reference.views
-    found = []
+def far_references(reference: Reference) -> dict[int, Reference]:
+    """Target images at each multiple of the distance in :data:`FARTHER`, as far as the compared views have enough
+    pixels.
+
+    The scene covers a smaller part of the picture there, so a target is a near render with each square of ``times`` x
+    ``times`` pixels averaged. The dense scene itself does not reach inf: the rasterizer draws Gaussians no thinner than
+    a pixel, so its distant renders are coarser than the targets. A level can be closer to the targets than the dense
+    scene.
+    """
+    views, found = reference.views, {}
     for times in FARTHER:
         if times > min(views.width, views.height):
             continue
         shrink = views.Ks.new_tensor([[1 / times], [1 / times], [1.0]])
         smaller = replace(views, Ks=views.Ks * shrink, width=views.width // times, height=views.height // times)
         targets = [_averaged(image, times) for image in reference.renders]
-        found.append(FarReference(times, smaller, targets))
+        found[times] = Reference(smaller, targets, reference.covered)
     return found
 
 
@@ -103,7 +80,7 @@ def displacement(dense: Gaussians, level: Gaussians, assignment: Tensor) -> Disp
 
 
 @torch.no_grad()
-def median_depth(dense: Gaussians, reference: DenseReference) -> float | None:
+def median_depth(dense: Gaussians, reference: Reference) -> float | None:
     """The median depth over the covered pixels of the compared views, scene units; None if no pixel is covered."""
     depths = []
     for view in replace(reference.views, rasterize_mode="classic").resized(100):

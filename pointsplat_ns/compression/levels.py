@@ -18,11 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.distributions import size_quantiles
 from pointsplat_ns.compression.level_errors import (
     Displacement,
-    FarReference,
     RenderErrors,
     displacement,
     far_references,
@@ -35,6 +33,7 @@ from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable
 from pointsplat_ns.io.source import SourceFile
+from pointsplat_ns.looking.closeness import DenseReference, Reference
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, found_by_trying, need_usable, parse_keep, resolve_keep
@@ -201,7 +200,7 @@ class Levels:
             assert level.errors is not None
             images.append(render(level.scene, views[index_of_view]))
             share = f"{100 * len(level.scene) / len(self.dense):.3g} %"
-            psnr = level.errors.view_psnr(index_of_view)
+            psnr = level.errors.near.psnr_of_view(index_of_view)
             captions.append(f"level {index}: {len(level.scene):,} ({share}), {psnr:.1f} dB")
         return images, captions
 
@@ -299,7 +298,7 @@ def make_levels(
     cut = prune_scene(dense, PruneRequest(1.0, sh=sh), views)
     counts = level_counts(budgets, len(dense), cut.scene.sh_degree)
     notes, reference, distance = cut.notes, None, None
-    afar: list[FarReference] = []
+    afar: dict[int, Reference] = {}
     try:
         reference = DenseReference(dense, views.compared())
         afar = far_references(reference)
@@ -308,7 +307,7 @@ def make_levels(
         notes = (*notes, f"the levels' errors are not measured: {error}")
     if views.origin and views.origin not in notes:
         notes = (*notes, views.origin)
-    farther = {far.times: far.psnr(dense) for far in afar}
+    farther = {times: far.psnr(dense)[0] for times, far in afar.items()}
     made: list[Level] = []
 
     def so_far() -> Levels:
@@ -326,7 +325,7 @@ def make_levels(
         if reference is not None:
             what = f"measuring level {len(made)} of {len(counts) - 1}"
             near = reference.closeness(merged.scene, functools.partial(progress, what))
-            errors = RenderErrors(near, {far.times: far.psnr(merged.scene) for far in afar})
+            errors = RenderErrors(near, {times: far.psnr(merged.scene)[0] for times, far in afar.items()})
         made.append(
             Level(
                 scene=merged.scene,

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from pointsplat_ns.compression.closeness import Closeness
 from pointsplat_ns.compression.compact import Compacted
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import replacing
+from pointsplat_ns.looking.closeness import Closeness
 from pointsplat_ns.looking.coverage import coverage
 from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.pruning import ply_bytes

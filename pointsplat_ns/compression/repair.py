@@ -58,8 +58,7 @@ def repair(
         budget: length of the repair.
         progress: called with the share done, in [0, 1].
         network: on the scene's device; by default the shipped one, None for plain Adam.
-        psnr: PSNR of ``scene`` over the pixels that the dense scene covers, dB
-            (:meth:`~pointsplat_ns.compression.closeness.DenseReference.psnr_of_covered`). Above
+        psnr: PSNR of ``scene`` over the pixels that the dense scene covers, dB. Above
             ``REPAIR.nearly_right`` the steps are smaller.
 
     Raises:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.compression.acceptance import ACCEPTANCE, Reason, closer_in
-from pointsplat_ns.compression.closeness import Closeness
+from pointsplat_ns.looking.closeness import Closeness
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.compact import Compacted, Stage

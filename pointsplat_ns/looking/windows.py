@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,8 +17,10 @@ from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
+from pointsplat_ns.metrics import MOST_PSNR
 from pointsplat_ns.rasterizer import render_with_alpha
 from pointsplat_ns.views import View, Views
 
@@ -35,12 +37,8 @@ class Windows:
 
     sides: tuple[int, ...]
     """Longer sides of the whole pictures, pixels, ascending."""
-    views: tuple[tuple[View, ...], ...]
+    views: tuple[Views, ...]
     """Windows for each side, one of each view."""
-
-    def flat(self) -> list[View]:
-        """All windows, one size after the other."""
-        return [view for views in self.views for view in views]
 
 
 def parse_resolution(text: str | tuple[int, int] | None) -> tuple[int, int] | None:
@@ -127,16 +125,14 @@ def windows_of(
     """
     generator = random.Random(seed)
     sides = tuple(sides or sides_of(views.width, views.height, settings))
-    return Windows(
-        sides,
-        tuple(
-            tuple(
-                window(view, side, _drawn_position(alpha, generator), settings)
-                for view, alpha in zip(views, alphas, strict=True)
-            )
-            for side in sides
-        ),
-    )
+
+    def of_side(side: int) -> Views:
+        positions = (_drawn_position(alpha, generator) for alpha in alphas)
+        found = [window(view, side, at, settings) for view, at in zip(views, positions, strict=True)]
+        Ks = torch.stack([view.K for view in found])
+        return replace(views, Ks=Ks, width=found[0].width, height=found[0].height)
+
+    return Windows(sides, tuple(map(of_side, sides)))
 
 
 def _drawn_position(alpha: Tensor, generator: random.Random) -> tuple[float, float]:
@@ -150,17 +146,14 @@ def _drawn_position(alpha: Tensor, generator: random.Random) -> tuple[float, flo
 
 
 class WindowRenders:
-    """Renders of a dense scene in windows, with which renders of other scenes are compared.
-
-    Errors are means over two backgrounds, the views' own and its opposite (white for black): nobody knows before which
-    one a scene is shown, and a scene that fits one may be too transparent or too opaque for the other.
+    """Renders of a dense scene in windows, with which renders of other scenes are compared before two backgrounds.
 
     Args:
         dense: N Gaussians.
         views: C views of the scene.
         sides: as for :func:`windows_of`.
         seed: seed of the positions of the windows.
-        settings: those of windows, and ``max_count_at_once``.
+        settings: those of windows.
     """
 
     @torch.no_grad()
@@ -172,64 +165,17 @@ class WindowRenders:
         seed: int = 0,
         settings: LookingSettings = DEFAULTS,
     ):
-        self._settings = settings
-        small = self._rendered(dense, list(views.resized(settings.window_alpha_side)))
-        self.windows = windows_of(views, [alpha[..., 0] for _, alpha in small], sides, seed, settings)
-        self.renders = list(self._rendered(dense, self.windows.flat()))
-        self._other = (1 - 2 * views.background).to(dense.means)  # from a background to its opposite
-        per_side = len(views)
-        self.covered = [
-            covered_share([alpha for _, alpha in self.renders[i * per_side : (i + 1) * per_side]])
-            for i in range(len(self.windows.sides))
-        ]
-        """Share of the pixels that the dense scene covers, for each side, in [0, 1]."""
-
-    @torch.no_grad()
-    def errors(self, scene: Gaussians) -> list[list[float]]:
-        """Mean squared error of each window, for each side."""
-        pictures = self._rendered(scene, self.windows.flat())
-        errors = []
-        for (image, alpha), (target, covered) in zip(pictures, self.renders, strict=True):
-            apart = image.double() - target.double()
-            over_other = apart - (alpha - covered).double() * self._other
-            errors.append(0.5 * (mean_square(apart) + mean_square(over_other)))
-        count = len(self.windows.views[0])
-        return [errors[i : i + count] for i in range(0, len(errors), count)]
-
-    def _rendered(self, scene: Gaussians, views: Sequence[View]) -> Iterator[tuple[Tensor, Tensor]]:
-        """Image (H, W, 3) and alpha (H, W, 1) of each view."""
-        return each_view(views, len(scene), lambda view: render_with_alpha(scene, view), self._settings)
+        small = list(views.resized(settings.window_alpha_side))
+        alphas = list(each_view(small, len(dense), lambda view: render_with_alpha(dense, view)[1][..., 0], settings))
+        windows = windows_of(views, alphas, sides, seed, settings)
+        self.references = [DenseReference(dense, of_side, both_backgrounds=True) for of_side in windows.views]
+        """Renders of the dense scene, for each side."""
 
     def psnrs(self, scene: Gaussians) -> list[float]:
-        """PSNR over the pixels that the dense scene covers, for each side, dB; at most 100."""
-        return [
-            psnr_of(sum(errors) / len(errors), covered)
-            for errors, covered in zip(self.errors(scene), self.covered, strict=True)
-        ]
+        """PSNR for each side, dB; at most :data:`~pointsplat_ns.metrics.MOST_PSNR`."""
+        return [min(reference.psnr(scene)[0], MOST_PSNR) for reference in self.references]
 
     def psnr(self, scene: Gaussians) -> float:
         """Mean of :meth:`psnrs` over the sides, dB."""
         found = self.psnrs(scene)
         return sum(found) / len(found)
-
-
-def mean_square(differences: Tensor) -> float:
-    """Mean squared error, float64, of the differences between two pictures."""
-    return float(differences.double().square().mean())
-
-
-def covered_share(alphas: Sequence[Tensor]) -> float:
-    """Share of the pixels that a scene covers, in [0, 1]: the mean of its ``alphas`` (H, W, 1), all of one size."""
-    return sum(float(alpha.double().mean()) for alpha in alphas) / len(alphas)
-
-
-def psnr_of(error: float, covered: float = 1.0) -> float:
-    """PSNR over the pixels that the dense scene covers, dB, at most 100: empty background does not make it better.
-
-    Args:
-        error: mean squared error over all pixels.
-        covered: share of the pixels that the dense scene covers, in [0, 1].
-    """
-    if not error > 1e-10 * (covered or 1.0):
-        return math.nan if error != error else 100.0
-    return -10 * math.log10(error / (covered or 1.0))

@@ -6,6 +6,8 @@ Images are (H, W, 3) or (B, H, W, 3), in [0, 1]; values are not clamped. Each me
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -62,6 +64,26 @@ def psnr(pred: Tensor, target: Tensor) -> Tensor:
     """
     a, b = as_nchw(pred, target)
     return per_image(-10 * torch.log10((a - b).square().mean(dim=(1, 2, 3))), pred)
+
+
+def psnr_of(error: float, covered: float = 1.0) -> float:
+    """PSNR over the pixels that a scene covers, dB: all squared error, halos beside the scene included, divided by the
+    share of the pixels that it covers. Empty background does not make it better.
+
+    Args:
+        error: mean squared error over all pixels, data range 1.
+        covered: share of the pixels that the dense scene covers, in [0, 1]; where it is 0, all pixels count.
+
+    Returns:
+        inf for no error, NaN for NaN.
+
+    Example:
+        >>> psnr_of(0.001), psnr_of(0.001, covered=0.1)
+        (30.0, 20.0)
+    """
+    if error == 0:
+        return math.inf
+    return -10 * (math.log10(error) - math.log10(covered or 1.0)) if error > 0 else math.nan
 
 
 MOST_PSNR = 100.0

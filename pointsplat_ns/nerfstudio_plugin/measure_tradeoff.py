@@ -66,7 +66,7 @@ def measure_tradeoff(
         up: as for :func:`pointsplat_ns.prune`.
         drawn: how frames may be drawn: "exact", of all scenes; "fast" and "half" (so, and at half the resolution), of a
             few where that may pay. A search for targets draws exactly.
-        target_db: least PSNR against the dense scene's renders, dB, mean over views.
+        target_db: least PSNR against the dense scene's renders, over the pixels that it covers, dB.
         target_ms: longest time of a frame, milliseconds.
         target_mb: largest file, in units of 10^6 bytes.
         force: start over, and overwrite results in the folder.

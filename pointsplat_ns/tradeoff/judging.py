@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -20,10 +20,10 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.pictures import write_picture
+from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
-from pointsplat_ns.metrics import SSIM_WINDOW, ImageError, finite_psnr, ssim
+from pointsplat_ns.metrics import MOST_PSNR, SSIM_WINDOW, ImageError, finite_psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
-from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.threads import fixed_threads
 from pointsplat_ns.tradeoff.machine import OtherPrograms
 from pointsplat_ns.tradeoff.points import Quality, picture_path
@@ -105,8 +105,8 @@ class Judge:
             raise DataError(
                 f"views are {self.views.width} x {self.views.height} pixels; expected at least {SSIM_WINDOW} a side"
             )
-        self.renders = [render(dense, view) for view in self.views]
-        self.lpips, self.no_lpips = _lpips(self.renders[0])
+        self.reference = DenseReference(dense, self.views)
+        self.lpips, self.no_lpips = _lpips(self.reference.renders[0])
         self.pictured = spread_indices(len(self.views), 6)
         if self.photos is not None:
             self._write([self.photos[i] for i in self.pictured], "photo")
@@ -130,10 +130,17 @@ class Judge:
             images.append(draw(scene, view, drawn))
             progress(len(images) / (passes * len(self.views)))
         self._write([images[i] for i in self.pictured], key)
-        photos = None if self.photos is None else self._quality(images, self.photos)
+        photos = None
+        if self.photos is not None:
+            pairs = [(image, photo.to(image)) for image, photo in zip(images, self.photos, strict=True)]
+            similarity = fmean(float(ssim(*pair)) for pair in pairs)
+            photos = Quality(fmean(finite_psnr(*pair) for pair in pairs), similarity, self._perceived(pairs))
         times = self._time(scene, drawn) if timed else {}
         progress(1.0)
-        return Judged(self._quality(images, self.renders), photos, **times)
+        close = self.reference.closeness_of(images)
+        assert close.ssim is not None
+        perceived = self._perceived(zip(images, self.reference.renders, strict=True))
+        return Judged(Quality(min(close.psnr, MOST_PSNR), close.ssim, perceived), photos, **times)
 
     def _time(self, scene: Gaussians, drawn: Drawn) -> dict[str, float]:
         """The times of :class:`Judged`: ``dense_ms`` times the measured ratio of frames."""
@@ -156,10 +163,8 @@ class Judge:
 
     @torch.no_grad()
     def psnr(self, scene: Gaussians) -> float:
-        """Mean PSNR of a scene against the dense scene's renders, dB."""
-        return fmean(
-            finite_psnr(render(scene, view), target) for view, target in zip(self.views, self.renders, strict=True)
-        )
+        """PSNR of a scene against the dense scene's renders, over the pixels that the dense scene covers, dB."""
+        return min(self.reference.psnr(scene)[0], MOST_PSNR)
 
     def pictures(self, key: str) -> list[Path]:
         """Paths of the pictures of a point; empty without a folder."""
@@ -167,14 +172,9 @@ class Judge:
             return []
         return [picture_path(self.folder, number, key) for number in range(len(self.pictured))]
 
-    def _quality(self, images: list[Tensor], targets: list[Tensor]) -> Quality:
-        """Means over the views."""
-        pairs = [(image, target.to(image)) for image, target in zip(images, targets, strict=True)]
-        return Quality(
-            fmean(finite_psnr(*pair) for pair in pairs),
-            fmean(float(ssim(*pair)) for pair in pairs),
-            None if self.lpips is None else fmean(float(self.lpips(*pair)) for pair in pairs),
-        )
+    def _perceived(self, pairs: Iterable[tuple[Tensor, Tensor]]) -> float | None:
+        """Mean LPIPS over pairs of pictures; None without its weights."""
+        return None if self.lpips is None else fmean(float(self.lpips(*pair)) for pair in pairs)
 
     def _write(self, images: list[Tensor], key: str) -> None:
         if self.folder is not None:

@@ -37,7 +37,8 @@ class Point:
     bytes: int
     """Size of the file."""
     against_dense: Quality
-    """Quality against renders of the dense scene. The PSNR of the dense scene itself is infinite."""
+    """Quality against renders of the dense scene. The PSNR is that of the mean squared error of all views, over the
+    pixels that the dense scene covers; the dense scene's own is infinite."""
     against_photos: Quality | None
     """Quality against held-out photos; None where there are none."""
     frame_ms: float

@@ -37,7 +37,7 @@ class Targets:
     """
 
     db: float | None = None
-    """Least PSNR against the dense scene's renders, dB, the mean over views."""
+    """Least PSNR against the dense scene's renders, over the pixels that it covers, dB."""
     ms: float | None = None
     """Longest time of a frame, milliseconds."""
     mb: float | None = None

@@ -16,10 +16,10 @@ import torch
 import pointsplat_ns as ps
 from making import ball, box_room, normal_scene, same
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.trained_refiner import open_refiner_run, scenes_of_run
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.io.camera_files import read_views
+from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views

@@ -19,7 +19,6 @@ from pointsplat_ns.compression.acceptance import (
     interpolate,
     parabola_minimum,
 )
-from pointsplat_ns.compression.closeness import Closeness, DenseReference
 from pointsplat_ns.compression.compact import Compacted, compact_scene
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import Repaired
@@ -27,6 +26,7 @@ from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, Rep
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import BudgetError, DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.closeness import Closeness, DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import PruneSettings, WithinPsnr, prune
@@ -328,8 +328,9 @@ def test_a_repair_knows_how_close_the_scene_is_where_there_is_anything(scene, vi
 
     monkeypatch.setattr(compact_module, "repair", repair)
     result = compacted(scene, trained(tiny_refiner()), views, repair=REPAIRED)
-    assert result.reference.covered < 0.97  # so the PSNR over covered pixels is another
-    assert told == [pytest.approx(result.before.psnr + 10 * math.log10(result.reference.covered))]
+    covered = sum(result.reference.covered) / len(views)
+    assert covered < 0.97  # so the PSNR over all pixels is another
+    assert told == [result.before.psnr] == [pytest.approx(-10 * math.log10(result.before.error / covered))]
 
 
 def test_a_repair_that_goes_too_far_is_kept_in_part(scene, views, repaired_to):
@@ -358,7 +359,7 @@ def test_what_most_views_pay_for_is_left_out(scene, views, monkeypatch, repaired
     repaired_to(pruned.replace(scales=pruned.scales + 0.1))
 
     def closeness(self, scene, progress=None):
-        return Closeness((0.9, 0.2, 0.2) if same(scene, pruned) else (0.1, 0.21, 0.21), None)
+        return Closeness((0.9, 0.2, 0.2) if same(scene, pruned) else (0.1, 0.21, 0.21), self.covered)
 
     monkeypatch.setattr(DenseReference, "closeness", closeness)
     result = compacted(scene, trained(tiny_refiner("scales", 0.1)), views, repair=REPAIRED)

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.fine_tune import fine_tune
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.pruning import METHODS, score_of, select
 
 

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from making import ball, same
-from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.distributions import opacity_quantiles, plot_distributions, size_quantiles
 from pointsplat_ns.compression.prune import Pruned, prune_scene
 from pointsplat_ns.compression.requests import SH_CHOICES, PruneRequest
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import METHODS, Keep, Megabytes, WithinPsnr, cut_sh, ply_bytes, prune, select

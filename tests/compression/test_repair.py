@@ -11,11 +11,11 @@ import torch
 import pointsplat_ns.compression.repair as repair_module
 from making import same
 from pointsplat_ns.api import example_room
-from pointsplat_ns.compression.closeness import DenseReference
 from pointsplat_ns.compression.feedback import Feedback
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings, gradients_of, nonzero_rms, optimised
 from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.pruning import prune

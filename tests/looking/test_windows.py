@@ -15,7 +15,6 @@ from pointsplat_ns.looking.windows import (
     WindowRenders,
     middle_sized,
     parse_resolution,
-    psnr_of,
     sides_of,
     window,
     windows_of,
@@ -102,18 +101,6 @@ def test_an_error_of_opacity_alone_counts_before_the_background_that_shows_it(sc
     black = scene.replace(features_dc=torch.full_like(scene.features_dc, -10.0), features_rest=scene.features_rest * 0)
     renders = WindowRenders(black, views)
     assert renders.psnr(black.replace(opacities=black.opacities - 1)) < 50
-
-
-@pytest.mark.parametrize("covered", [1.0, 0.25])
-@pytest.mark.parametrize("error", [1e-300, 1e-12, 1e-4, 1.0, 1e6, 1e300])
-def test_psnr_is_that_of_covered_pixels_at_all_extremes(error, covered):
-    found = psnr_of(error, covered)
-    assert found == pytest.approx(min(100.0, -10 * math.log10(error / covered)))
-
-
-def test_psnr_of_no_error_is_100_and_of_nan_nan():
-    assert psnr_of(0.0) == psnr_of(0.0, 0.0) == 100.0
-    assert math.isnan(psnr_of(math.nan))
 
 
 @pytest.mark.parametrize("text", ["", "1920", "0x5", "1920x1080x3", "-3x4", "axb", "99999x10", "1.5x2", (3,), (0, 4)])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from making import noisy_pair as pair
-from pointsplat_ns.metrics import ImageError, psnr, ssim
+from pointsplat_ns.metrics import ImageError, psnr, psnr_of, ssim
 
 
 def test_psnr_of_a_known_error():
@@ -17,6 +17,14 @@ def test_psnr_of_a_known_error():
 
 def test_psnr_of_identical_images_is_infinite():
     assert float(psnr(*[torch.rand(4, 4, 3)] * 2)) == math.inf
+
+
+@pytest.mark.parametrize("covered", [1.0, 0.25, 1e-300])
+@pytest.mark.parametrize("error", [5e-324, 1e-12, 1e-4, 1.0, 1e6, 1e300])
+def test_psnr_of_covered_pixels_at_all_extremes(error, covered):
+    assert psnr_of(error, covered) == pytest.approx(-10 * (math.log10(error) - math.log10(covered)))
+    assert psnr_of(0.0, covered) == psnr_of(0.0, 0.0) == math.inf and psnr_of(error, 0.0) == psnr_of(error)
+    assert math.isnan(psnr_of(math.nan, covered))
 
 
 def test_psnr_is_torchmetrics():

@@ -1,0 +1,139 @@
+"""Compares renders of a smaller scene with renders of the dense scene. No photos are needed.
+
+Every PSNR against the dense scene counts all squared error, halos included, over the pixels that the dense scene covers
+(:func:`~pointsplat_ns.metrics.psnr_of`), so that empty background does not make it better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.each_view import each_view
+from pointsplat_ns.metrics import SSIM_WINDOW, psnr_of, ssim
+from pointsplat_ns.rasterizer import render_with_alpha
+from pointsplat_ns.views import Views
+
+
+@dataclass(frozen=True)
+class Closeness:
+    """Errors of a scene's renders against those of the dense scene."""
+
+    errors: tuple[float, ...]
+    """Mean squared error over all pixels of each view."""
+    covered: tuple[float, ...]
+    """Share of the pixels of each view that the dense scene covers, in [0, 1]."""
+    ssim: float | None = None
+    """Mean over views; None if it was not computed, or views are smaller than SSIM's window."""
+    width: int | None = None
+    """Width of the pictures, pixels; None if it is not known."""
+
+    @property
+    def where(self) -> str:
+        """Text: the number of views, and their width."""
+        return views_text(len(self.errors)) + ("" if self.width is None else f" of {self.width} pixels")
+
+    @property
+    def error(self) -> float:
+        """Mean squared error over all pixels of all views."""
+        return sum(self.errors) / len(self.errors)
+
+    @property
+    def psnr(self) -> float:
+        """PSNR over the pixels that the dense scene covers in all views, dB; inf if nothing differs."""
+        return psnr_of(self.error, sum(self.covered) / len(self.covered))
+
+    @property
+    def worst(self) -> float:
+        """PSNR of the worst view, dB."""
+        return min(map(self.psnr_of_view, range(len(self.errors))))
+
+    def psnr_of_view(self, index: int) -> float:
+        """PSNR of one view, dB."""
+        return psnr_of(self.errors[index], self.covered[index])
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Pictures of the dense scene, with which renders of other scenes are compared."""
+
+    views: Views
+    """C views."""
+    renders: list[Tensor]
+    """C pictures (H, W, 3)."""
+    covered: tuple[float, ...]
+    """Share of the pixels of each view that the dense scene covers, in [0, 1]."""
+    alphas: list[Tensor] | None = None
+    """C alpha pictures (H, W, 1), for errors before two backgrounds; None for errors before the views' own."""
+
+    def errors(self, scene: Gaussians) -> list[float]:
+        """Mean squared error over all pixels of each view."""
+        return list(self._errors(_drawn(scene, self.views)))
+
+    def psnr(self, scene: Gaussians) -> tuple[float, float]:
+        """PSNR over all views, and of the worst view, dB; see :class:`Closeness`."""
+        close = Closeness(tuple(self.errors(scene)), self.covered)
+        return close.psnr, close.worst
+
+    def closeness(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> Closeness:
+        """Errors and SSIM of a scene; ``progress`` is called with the share of the views done."""
+        return self.closeness_of((image for image, _ in _drawn(scene, self.views)), progress)
+
+    @torch.no_grad()
+    def closeness_of(self, images: Iterable[Tensor], progress: Callable[[float], None] | None = None) -> Closeness:
+        """Errors and SSIM of C pictures (H, W, 3)."""
+        height, width = self.renders[0].shape[:2]
+        errors, similarities = [], []
+        for image, target in zip(images, self.renders, strict=True):
+            errors.append(float((image.double() - target.double()).square().mean()))
+            if min(height, width) >= SSIM_WINDOW:
+                similarities.append(float(ssim(image, target.to(image))))
+            if progress is not None:
+                progress(len(errors) / len(self.renders))
+        similarity = sum(similarities) / len(similarities) if similarities else None
+        return Closeness(tuple(errors), self.covered, similarity, width)
+
+    @torch.no_grad()
+    def _errors(self, pictures: Iterable[tuple[Tensor, Tensor]]) -> Iterator[float]:
+        for index, (image, alpha) in enumerate(pictures):
+            apart = image.double() - self.renders[index].double()
+            error = float(apart.square().mean())
+            if self.alphas is not None:
+                other = (1 - 2 * self.views.background).to(apart)  # from a background to its opposite
+                over_other = apart - (alpha - self.alphas[index]).double() * other
+                error = 0.5 * (error + float(over_other.square().mean()))
+            yield error
+
+
+class DenseReference(Reference):
+    """Renders of the dense scene.
+
+    Args:
+        dense: N Gaussians.
+        views: C views.
+        both_backgrounds: errors are means over two backgrounds, the views' own and its opposite (white for black):
+            nobody knows before which one a scene is shown, and a scene that fits one may be too transparent or too
+            opaque for the other.
+    """
+
+    @torch.no_grad()
+    def __init__(self, dense: Gaussians, views: Views, both_backgrounds: bool = False):
+        drawn = list(_drawn(dense, views))
+        covered = tuple(float(alpha.double().mean()) for _, alpha in drawn)
+        alphas = [alpha for _, alpha in drawn] if both_backgrounds else None
+        super().__init__(views, [image for image, _ in drawn], covered, alphas)
+
+
+def _drawn(scene: Gaussians, views: Views) -> Iterator[tuple[Tensor, Tensor]]:
+    """Image (H, W, 3) and alpha (H, W, 1) of each view."""
+    return each_view(list(views), len(scene), partial(render_with_alpha, scene))
+
+
+def views_text(count: int) -> str:
+    """A number of views in words: "1 view", "3 views"."""
+    return f"{count} view{'s' if count != 1 else ''}"
