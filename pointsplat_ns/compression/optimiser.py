@@ -130,10 +130,11 @@ def optimised(
 
 
 def extent(scene: Gaussians) -> float:
-    """The 90 % quantile of the distances from the mean position, scene units; 1 if all Gaussians are in one place."""
+    """The 90 % quantile of the distances from the median position along each axis, scene units; 1 if all Gaussians are
+    in one place. One distant Gaussian does not change it, as it would change a mean."""
+    means = scene.means.detach().double()
     with one_thread():
-        centred = scene.means.detach().double() - scene.means.detach().double().mean(0)
-        return float(centred.norm(dim=1).quantile(0.9)) or 1.0
+        return float((means - means.median(0).values).norm(dim=1).quantile(0.9)) or 1.0
 
 
 def gradients_of(

@@ -15,6 +15,7 @@ from pointsplat_ns.compression.feedback import Feedback
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings, gradients_of, nonzero_rms, optimised
 from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
@@ -109,6 +110,19 @@ def test_what_is_nearly_right_takes_steps_in_proportion_to_its_error(hollow_ball
         shifts.append(float((after.features_dc - pruned.features_dc).abs().max()))
     assert shifts[0] == shifts[1] > 0 == shifts[3]
     assert shifts[2] == pytest.approx(0.1 * shifts[0], rel=1e-3)
+
+
+@pytest.mark.parametrize("far", [1e6, 1e30, 3e38])
+def test_one_distant_gaussian_does_not_change_the_steps_of_the_others(hollow_ball, pruned, monkeypatch, far):
+    monkeypatch.setitem(STEPS, "quick", 3)
+    lone = pruned[:1].replace(means=torch.tensor([[far, 0.0, -far]]))
+    joined = Gaussians(*(torch.cat(pair) for pair in zip(pruned.tensors(), lone.tensors(), strict=True)))
+    alone, beside = (repair(s, hollow_ball, Few(hollow_ball), RepairBudget("quick")).scene for s in (pruned, joined))
+    assert bool(beside.usable().all())
+    for name, value in alone.items():
+        moved = (value - getattr(pruned, name)).norm()
+        # 5 %: medians and the share that is kept change a little with one more Gaussian
+        assert float((getattr(beside, name)[:-1] - value).norm()) < 0.05 * float(moved) + 1e-9, name
 
 
 def test_an_interruption_loses_nothing(hollow_ball, pruned):
