@@ -18,6 +18,7 @@ import pointsplat_ns as ps
 from pointsplat_ns.geometry.cameras import invert_rigid, viewmats_to_opengl
 from pointsplat_ns.geometry.quaternions import rotation_matrices
 from pointsplat_ns.io.camera_files import cameras, is_camera_file, read_views, registry, transforms_beside
+from pointsplat_ns.io.camera_files.cameras import Limits
 from posing import (
     inria,
     name_of,
@@ -291,13 +292,13 @@ def inria_with(**changes) -> list:
         (inria_with(position=[1, 2]), "camera 1 has no pose"),
         (inria_with(rotation=[[1, 0], [0, 1]]), "camera 1 has no pose"),
         (inria_with(rotation=[1, 2, 3]), "camera 1 has no pose"),
-        (inria_with(position=[math.nan, 0, 0]), "the pose of camera 1 is no rigid motion"),
-        (inria_with(position=["1", 0, 0]), "the pose of camera 1 is no rigid motion"),
-        (inria_with(position=[10**400, 0, 0]), "the pose of camera 1 is no rigid motion"),
+        (inria_with(position=[math.nan, 0, 0]), r"the pose of camera 1 (.*)?is no rigid motion"),
+        (inria_with(position=["1", 0, 0]), r"the pose of camera 1 (.*)?is no rigid motion"),
+        (inria_with(position=[10**400, 0, 0]), r"the pose of camera 1 (.*)?is no rigid motion"),
         (inria_with(position=[1e10, 0, 0]), r"camera 1 \(frame_0.png\) is too far away"),
-        (inria_with(rotation=[[2, 0, 0], [0, 2, 0], [0, 0, 2]]), "the pose of camera 1 is no rigid motion"),
-        (inria_with(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]), "the pose of camera 1 is no rigid motion"),
-        (inria_with(rotation=[[0, 0, 0]] * 3), "the pose of camera 1 is no rigid motion"),
+        (inria_with(rotation=[[2, 0, 0], [0, 2, 0], [0, 0, 2]]), r"the pose of camera 1 (.*)?is no rigid motion"),
+        (inria_with(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]), r"the pose of camera 1 (.*)?is no rigid motion"),
+        (inria_with(rotation=[[0, 0, 0]] * 3), r"the pose of camera 1 (.*)?is no rigid motion"),
         (inria_with(fx="50"), "camera 1 has no intrinsics"),
         (inria_with(fx=math.inf), "camera 1 has no intrinsics"),
         (inria_with(fx=0), "camera 1 .* has no usable focal length"),
@@ -309,10 +310,10 @@ def inria_with(**changes) -> list:
         ({"fl_x": 5, "w": 4, "h": 4, "frames": [3]}, "camera 0 is no frame"),
         (framed(transform_matrix=None), "camera 0 has no pose"),
         (framed(transform_matrix=[[1, 2, 3]] * 4), "camera 0 has no pose"),
-        (turned(0, 3, math.inf), "the pose of camera 0 is no rigid motion"),
-        (turned(0, 0, 1.1), "the pose of camera 0 is no rigid motion"),
-        (turned(1, 1, 1e200), "the pose of camera 0 is no rigid motion"),
-        (turned(3, 3, 2.0), "the pose of camera 0 is no rigid motion"),
+        (turned(0, 3, math.inf), r"the pose of camera 0 (.*)?is no rigid motion"),
+        (turned(0, 0, 1.1), r"the pose of camera 0 (.*)?is no rigid motion"),
+        (turned(1, 1, 1e200), r"the pose of camera 0 (.*)?is no rigid motion"),
+        (turned(3, 3, 2.0), r"the pose of camera 0 (.*)?is no rigid motion"),
         (framed(fl_x=0), "camera 0 has no focal length"),
         (framed(cx=1e9), "camera 0 .* has its principal point far outside"),
         (framed(camera_model="EQUIRECTANGULAR"), "camera 0 is 'EQUIRECTANGULAR'; expected one of SIMPLE_PINHOLE"),
@@ -437,10 +438,10 @@ def test_missing_and_huge_files_and_other_folders_are_refused(tmp_path, monkeypa
     with pytest.raises(ps.DataError, match="cameras.bin: no such file; expected a COLMAP model"):
         read_views(folder)
     path = written(nerfstudio(some_views()), tmp_path / "transforms.json")
-    monkeypatch.setattr(cameras, "MOST_CAMERAS", 3)
+    monkeypatch.setattr(cameras, "LIMITS", Limits(cameras=3))
     with pytest.raises(ps.DataError, match="12 cameras; expected 1 to 3"):
         read_views(path)
-    monkeypatch.setattr(registry, "MOST_BYTES", 10)
+    monkeypatch.setattr(registry, "LIMITS", Limits(file_bytes=10))
     with pytest.raises(ps.DataError, match="expected cameras of at most"):
         read_views(path)
 

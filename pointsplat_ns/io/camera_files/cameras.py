@@ -17,15 +17,23 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.views import Views
 
-MOST_CAMERAS = 100_000
-MOST_PIXELS = 100_000
-"""Maximum of a photo's width and height."""
 
-_RIGID = 1e-3
-"""Largest deviation of a rotation; text of four digits has less."""
+@dataclass(frozen=True)
+class Limits:
+    """Limits of files of cameras."""
 
-_FARTHEST = 1e9
-"""Largest coordinate of a camera: squares of it are numbers in float32."""
+    file_bytes: int = 64_000_000
+    """Maximum size of JSON: 100,000 frames have about as much."""
+    cameras: int = 100_000
+    pixels: int = 100_000
+    """Maximum of a photo's width and height."""
+    coordinate: float = 1e9
+    """Largest coordinate of a camera: squares of it are numbers in float32."""
+    deviation: float = 1e-3
+    """Largest deviation of a rotation; text of four digits has less."""
+
+
+LIMITS = Limits()
 
 
 class Camera(NamedTuple):
@@ -87,25 +95,36 @@ def finite(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def rigid(values: Tensor, whose: str) -> Tensor:
-    """Poses or transforms (C, 3 or 4, 4) float64 whose rotations are exactly that, rounding taken out.
+def matrix(values: Any, rows: tuple[int, ...], columns: int) -> list[list[float]] | None:
+    """A matrix of JSON, as a list of rows. Numbers that are not finite are NaN; None if it has another shape."""
+    if not isinstance(values, list) or len(values) not in rows:
+        return None
+    if not all(isinstance(row, list) and len(row) == columns for row in values):
+        return None
+    numbers = [[finite(value) for value in row] for row in values]
+    return [[math.nan if number is None else number for number in row] for row in numbers]
+
+
+def rigid(values: Tensor, whose: str, names: Sequence[str] = ()) -> Tensor:
+    """Rigid motions (C, 3 or 4, 4) float64, with rotations that are orthonormal up to the last bit.
 
     Args:
         values: as they were read.
-        whose: text that an error begins with; ``{}`` in it stands for the index of the first wrong one.
+        whose: the text that an error begins with.
+        names: of the photos, if these are poses of cameras; an error then names the first wrong one.
 
     Raises:
         DataError: if a number is not finite, or a matrix is no rigid motion.
     """
     turn = values[:, :3, :3]
     off = (turn @ turn.transpose(1, 2) - torch.eye(3, dtype=values.dtype)).abs().amax((1, 2))
-    good = values.isfinite().all(2).all(1) & (off <= _RIGID) & (torch.linalg.det(turn) > 0)  # NaN fails too
+    good = values.isfinite().all(2).all(1) & (off <= LIMITS.deviation) & (torch.linalg.det(turn) > 0)  # NaN fails too
     if values.shape[1] == 4:
-        good &= ((values[:, 3] - values.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() <= _RIGID).all(1)
+        good &= ((values[:, 3] - values.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() <= LIMITS.deviation).all(1)
     if not bool(good.all()):
-        index = int((~good).nonzero()[0])
+        camera = f" of camera {_first_bad(good, names)}" if names else ""
         raise DataError(
-            f"{whose.format(index)} is no rigid motion; expected a rotation (no scale, no mirror) and a position, all "
+            f"{whose}{camera} is no rigid motion; expected a rotation (no scale, no mirror) and a position, all "
             "finite; correct it or leave it out"
         )
     u, _, vh = torch.linalg.svd(turn)
@@ -132,53 +151,45 @@ def views_of(path: Path, cameras: Sequence[Camera], motion: Motion | None = None
         DataError: if there is no camera, there are too many, or one is none; the text has its index in the file.
     """
     need_count(path, len(cameras))
-    poses = rigid(
-        torch.tensor([camera.pose for camera in cameras], dtype=torch.float64).view(-1, 4, 4),
-        f"{path}: the pose of camera {{}}",
-    )
+    names = [camera.name for camera in cameras]
+    poses = torch.tensor([camera.pose for camera in cameras], dtype=torch.float64).view(-1, 4, 4)
+    poses = rigid(poses, f"{path}: the pose", names)
     if motion is not None:
         poses = motion.of(poses)
     sizes, focals, centres = (
         torch.tensor([camera[field] for camera in cameras], dtype=torch.float64).view(-1, 2) for field in (2, 3, 4)
     )
-    _need(path, cameras, poses[:, :3, 3].abs().amax(1) <= _FARTHEST, "is too far away", f"at most {_FARTHEST:g} units")
-    whole = (sizes == sizes.floor()) & (sizes >= 1) & (sizes <= MOST_PIXELS)
-    _need(path, cameras, whole.all(1), "has a picture of no usable size", f"1 to {MOST_PIXELS} pixels a side")
-    long = (focals >= 1e-3 * sizes) & (focals <= 1e5 * sizes)  # fields of view of 179.9 and 0.0006 degrees
-    _need(path, cameras, long.all(1), "has no usable focal length", "a positive number of pixels")
-    # Principal points at most 100 sides of the picture away from its corner.
-    near = (centres.abs() <= 100.0 * sizes).all(1)
-    _need(path, cameras, near, "has its principal point far outside of the picture", "one in or near it")
+    reached = poses[:, :3, 3].abs().amax(1) <= LIMITS.coordinate
+    whole = ((sizes == sizes.floor()) & (sizes >= 1) & (sizes <= LIMITS.pixels)).all(1)
+    long = ((focals >= 1e-3 * sizes) & (focals <= 1e5 * sizes)).all(1)  # fields of view of 179.9 and 0.0006 degrees
+    near = (centres.abs() <= 100.0 * sizes).all(1)  # at most 100 sides of the picture away from its corner
+    for good, what, expected in (
+        (reached, "is too far away", f"at most {LIMITS.coordinate:g} units"),
+        (whole, "has a picture of no usable size", f"1 to {LIMITS.pixels} pixels a side"),
+        (long, "has no usable focal length", "a positive number of pixels"),
+        (near, "has its principal point far outside of the picture", "one in or near it"),
+    ):
+        if not bool(good.all()):
+            camera = _first_bad(good, names)
+            raise DataError(f"{path}: camera {camera} {what}; expected {expected}; correct it or leave it out")
     counts = Counter((int(width), int(height)) for width, height in sizes.tolist())
     width, height = max(counts, key=lambda size: (counts[size], size[0] * size[1]))
     stretch = sizes.new_tensor([width, height]) / sizes
     Ks = torch.eye(3, dtype=torch.float64).repeat(len(cameras), 1, 1)
     Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2] = focals * stretch, centres * stretch
     order = list(range(len(cameras)))
-    if all(camera.name for camera in cameras):
-        order.sort(key=lambda index: _in_order(cameras[index].name))
+    if all(names):  # digits count as numbers
+        order.sort(key=lambda index: re.sub(r"\d+", lambda digits: digits[0].zfill(20), names[index]))
     return Views(invert_rigid(poses)[order], Ks[order], width, height, torch.zeros(3))
 
 
 def need_count(path: Path, count: int) -> None:
-    """Refuse a file of no camera, or of too many.
-
-    Raises:
-        DataError: if it is one.
-    """
-    if not 0 < count <= MOST_CAMERAS:
-        raise DataError(f"{path}: {count} cameras; expected 1 to {MOST_CAMERAS}")
+    """Raise a DataError for a file of no camera, or of too many."""
+    if not 0 < count <= LIMITS.cameras:
+        raise DataError(f"{path}: {count} cameras; expected 1 to {LIMITS.cameras}")
 
 
-def _need(path: Path, cameras: Sequence[Camera], good: Tensor, what: str, expected: str) -> None:
-    """Refuse cameras that are not ``good`` (C,); the error names the first."""
-    if bool(good.all()):
-        return
+def _first_bad(good: Tensor, names: Sequence[str]) -> str:
+    """Index of the first camera that is not ``good`` (C,), with the name of its photo if it has one."""
     index = int((~good).nonzero()[0])
-    name = f" ({cameras[index].name[:60]})" if cameras[index].name else ""
-    raise DataError(f"{path}: camera {index}{name} {what}; expected {expected}; correct it or leave it out")
-
-
-def _in_order(name: str) -> str:
-    """A key to sort names by that takes digits for numbers."""
-    return re.sub(r"\d+", lambda digits: digits[0].zfill(20), name)
+    return f"{index} ({names[index][:60]})" if names[index] else f"{index}"

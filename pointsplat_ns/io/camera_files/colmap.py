@@ -19,7 +19,7 @@ import torch
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.cameras import invert_rigid
 from pointsplat_ns.geometry.quaternions import rotation_matrices
-from pointsplat_ns.io.camera_files.cameras import MOST_CAMERAS, Camera, CameraFile, Motion, need_count
+from pointsplat_ns.io.camera_files.cameras import LIMITS, Camera, CameraFile, Motion, need_count
 from pointsplat_ns.io.files import logger, one_line
 
 MODELS = {
@@ -32,13 +32,8 @@ MODELS = {
 """Number in binary files, number of focal lengths, and number of parameters of COLMAP's camera models. The principal
 point follows the focal lengths, and the distortion that."""
 
-FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
-
 _LONGEST_LINE = 4096
 """Of a camera or an image, bytes; also of the name of a photo. Lines of points are longer, and skipped in pieces."""
-
-_POINT_BYTES = 24
-"""Of a point in an image, in binary: x, y and the number of its 3D point."""
 
 
 class _Lens(NamedTuple):
@@ -61,7 +56,8 @@ class _Image(NamedTuple):
 def is_model(path: Path) -> bool:
     """Whether a path is a COLMAP model: its folder, or one of the two files in it."""
     folder = path if path.is_dir() else path.parent
-    return (path.is_dir() or path.name in FILES) and any((folder / name).is_file() for name in FILES)
+    files = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
+    return (path.is_dir() or path.name in files) and any((folder / name).is_file() for name in files)
 
 
 def colmap_cameras(path: Path) -> CameraFile:
@@ -78,17 +74,12 @@ def colmap_cameras(path: Path) -> CameraFile:
             raise DataError(
                 f"{needed}: no such file; expected a COLMAP model: cameras.bin and images.bin, or both as .txt"
             )
+    read_lenses, read_images = (_binary_lenses, _binary_images) if kind == "bin" else (_text_lenses, _text_images)
     try:
-        if kind == "bin":
-            with cameras_path.open("rb") as stream:
-                lenses = _binary_lenses(stream, cameras_path)
-            with images_path.open("rb") as stream:
-                images = list(_binary_images(stream, images_path))
-        else:
-            with cameras_path.open("rb") as stream:
-                lenses = _text_lenses(stream, cameras_path)
-            with images_path.open("rb") as stream:
-                images = list(_text_images(stream, images_path))
+        with cameras_path.open("rb") as stream:
+            lenses = read_lenses(stream, cameras_path)
+        with images_path.open("rb") as stream:
+            images = list(read_images(stream, images_path))
     except OSError as error:
         raise DataError(f"{folder}: cannot be read ({error.strerror or one_line(error)})") from error
     need_count(images_path, len(images))
@@ -101,26 +92,16 @@ def colmap_cameras(path: Path) -> CameraFile:
     bent = sum(lenses[image.camera].bent for image in images)
     if bent:
         logger.info("%s: the lens distortion of %d of %d cameras is ignored", folder, bent, len(images))
-    return CameraFile(_posed(images, lenses, images_path), Motion(torch.eye(4, dtype=torch.float64)[:3]))
-
-
-def _posed(images: list[_Image], lenses: dict[int, _Lens], path: Path) -> list[Camera]:
-    """Images as cameras, their poses inverted."""
     poses = torch.tensor([image.pose for image in images], dtype=torch.float64)
-    # The length of a quaternion is free, within what can be squared.
-    lengths = poses[:, :4].norm(dim=1)
-    bad = (~(poses.isfinite().all(1) & (lengths > 1e-6) & (lengths < 1e6))).nonzero()
-    if len(bad):
-        index = int(bad[0])
-        raise DataError(
-            f"{path}: the pose of camera {index} ({images[index].name[:60]}) is no rigid motion; expected a quaternion "
-            "and a translation, all finite; correct it or leave it out"
-        )
     matrices = invert_rigid(torch.cat([rotation_matrices(poses[:, :4]), poses[:, 4:, None]], dim=2))
-    return [
+    # The length of a quaternion is free, within what can be squared. Others become NaN, which is refused with its name.
+    lengths = poses[:, :4].norm(dim=1)
+    matrices[~((lengths > 1e-6) & (lengths < 1e6))] = torch.nan
+    cameras = [
         Camera(image.name, pose, *lenses[image.camera][:3])
         for image, pose in zip(images, matrices.flatten(1).tolist(), strict=True)
     ]
+    return CameraFile(cameras, Motion(torch.eye(4, dtype=torch.float64)[:3]))
 
 
 def _lens(name: str, size: tuple[float, float], params: tuple[float, ...]) -> _Lens:
@@ -207,11 +188,12 @@ def _binary_images(stream: BinaryIO, path: Path) -> Iterator[_Image]:
             raise DataError(f"{path}: no end of an image's name within {_LONGEST_LINE} bytes; expected a COLMAP model")
         stream.seek(start + len(name) + 1)
         (points,) = struct.unpack("<Q", _exactly(stream, 8, path))
-        if points * _POINT_BYTES > total - stream.tell():
+        size = 24 * points  # of each x, y and the number of its 3D point
+        if size > total - stream.tell():
             raise DataError(
                 f"{path}: an image with {points} points, for which the file has no room; it is damaged or incomplete"
             )
-        stream.seek(points * _POINT_BYTES, os.SEEK_CUR)
+        stream.seek(size, os.SEEK_CUR)
         yield _Image(name.decode("utf-8", "replace"), tuple(pose), camera)
 
 
@@ -219,9 +201,9 @@ def _count(stream: BinaryIO, path: Path, least: int) -> int:
     """The count that a binary file begins with, checked against its size; ``least`` bytes follow for each."""
     (count,) = struct.unpack("<Q", _exactly(stream, 8, path))
     room = (os.fstat(stream.fileno()).st_size - 8) // least
-    if not 0 < count <= min(room, MOST_CAMERAS):
+    if not 0 < count <= min(room, LIMITS.cameras):
         raise DataError(
-            f"{path}: says that it has {count} entries and has room for {room}; expected 1 to {MOST_CAMERAS}, as "
+            f"{path}: says that it has {count} entries and has room for {room}; expected 1 to {LIMITS.cameras}, as "
             "COLMAP writes them"
         )
     return count

@@ -6,31 +6,22 @@ to world, OpenCV axes), ``fx`` and ``fy``. The principal point is the picture's 
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.camera_files.cameras import Camera, CameraFile, finite, need_count
+from pointsplat_ns.io.camera_files.cameras import Camera, CameraFile, finite, matrix, need_count
 
 
 def inria_cameras(content: list[Any], path: Path) -> CameraFile:
-    """The cameras of a ``cameras.json``.
-
-    Args:
-        content: of the JSON.
-        path: of the file, for errors.
-
-    Raises:
-        DataError: if an entry is no camera.
-    """
+    """The cameras in the JSON of a ``cameras.json``; a DataError if an entry is no camera."""
     need_count(path, len(content))
     return CameraFile([_camera(entry, index, path) for index, entry in enumerate(content)])
 
 
 def _camera(entry: Any, index: int, path: Path) -> Camera:
     entry = entry if isinstance(entry, dict) else {}
-    rotation, position = _numbers(entry.get("rotation"), 3, 3), _numbers([entry.get("position")], 1, 3)
+    rotation, position = matrix(entry.get("rotation"), (3,), 3), matrix([entry.get("position")], (1,), 3)
     if rotation is None or position is None:
         raise DataError(
             f"{path}: camera {index} has no pose; expected 'rotation', 3 x 3 numbers, and 'position', 3 numbers, as "
@@ -48,13 +39,3 @@ def _camera(entry: Any, index: int, path: Path) -> Camera:
         (fx, fy),
         (0.5 * width, 0.5 * height),
     )
-
-
-def _numbers(values: Any, rows: int, columns: int) -> list[list[float]] | None:
-    """A list of lists of numbers; those that are not finite are NaN. None if it has another shape."""
-    if not isinstance(values, list) or len(values) != rows:
-        return None
-    if not all(isinstance(row, list) and len(row) == columns for row in values):
-        return None
-    numbers = [[finite(value) for value in row] for row in values]
-    return [[math.nan if number is None else number for number in row] for row in numbers]

@@ -16,21 +16,12 @@ from typing import Any
 import torch
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.camera_files.cameras import Camera, CameraFile, Motion, finite, need_count, rigid
+from pointsplat_ns.io.camera_files.cameras import Camera, CameraFile, Motion, finite, matrix, need_count, rigid
 from pointsplat_ns.io.files import logger
-
-_LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FISHEYE")
-"""Kinds of cameras that have a focal length."""
-
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def nerfstudio_cameras(content: dict[str, Any], path: Path) -> CameraFile:
-    """The cameras of a ``transforms.json``.
-
-    Args:
-        content: of the JSON.
-        path: of the file, for errors, and to look up the size of the photos if the file has none.
+    """The cameras in the JSON of a ``transforms.json``. The size of the photos is looked up if the file has none.
 
     Raises:
         DataError: if a frame has no usable pose or intrinsics, or a camera has no focal length (a panorama).
@@ -38,27 +29,27 @@ def nerfstudio_cameras(content: dict[str, Any], path: Path) -> CameraFile:
     frames = content["frames"]
     need_count(path, len(frames))
     size = functools.cache(lambda: _size_of_photos(frames[0], path))
+    distortion = ("k1", "k2", "k3", "k4", "p1", "p2")
+    names = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "camera_model", *distortion)
     found = []
     bent = 0
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise DataError(f"{path}: camera {index} is no frame; expected an object with 'transform_matrix'")
         # A frame may have none of these, or hundreds of others.
-        said = {name: frame.get(name, content.get(name)) for name in _NAMES}
+        said = {name: frame.get(name, content.get(name)) for name in names}
         found.append(_camera(frame, said, index, path, size))
-        bent += said["camera_model"] in ("OPENCV_FISHEYE", "FISHEYE") or any(finite(said[k]) for k in _DISTORTION)
+        bent += said["camera_model"] in ("OPENCV_FISHEYE", "FISHEYE") or any(finite(said[k]) for k in distortion)
     if bent:
         logger.info("%s: the lens distortion of %d of %d cameras is ignored", path, bent, len(found))
     return CameraFile(found, _saved_motion(content, path))
 
 
-_NAMES = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "camera_model", *_DISTORTION)
-
-
 def _camera(frame: dict[str, Any], said: dict[str, Any], index: int, path: Path, size: Any) -> Camera:
     kind = said["camera_model"]
-    if kind is not None and kind not in _LENSES:
-        raise DataError(f"{path}: camera {index} is {str(kind)[:40]!r}; expected one of {', '.join(_LENSES)}")
+    lenses = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FISHEYE")
+    if kind is not None and kind not in lenses:  # one without a focal length
+        raise DataError(f"{path}: camera {index} is {str(kind)[:40]!r}; expected one of {', '.join(lenses)}")
     width, height = finite(said["w"]), finite(said["h"])
     if width is None or height is None:
         width, height = size()
@@ -67,27 +58,18 @@ def _camera(frame: dict[str, Any], said: dict[str, Any], index: int, path: Path,
     if fx is None or fy is None:
         raise DataError(f"{path}: camera {index} has no focal length; expected a number 'fl_x' or 'camera_angle_x'")
     cx, cy = finite(said["cx"]), finite(said["cy"])
+    rows = matrix(frame.get("transform_matrix"), (3, 4), 4)
+    if rows is None:
+        raise DataError(f"{path}: camera {index} has no pose; expected 'transform_matrix', 4 x 4 numbers")
+    pose = [number for x, y, z, w in rows for number in (x, -y, -z, w)]  # OpenGL's axes to OpenCV's
     name = frame.get("file_path")
     return Camera(
         name if isinstance(name, str) else "",
-        _pose(frame.get("transform_matrix"), index, path),
+        pose if len(rows) == 4 else [*pose, 0.0, 0.0, 0.0, 1.0],
         (width, height),
         (fx, fy),
         (0.5 * width if cx is None else cx, 0.5 * height if cy is None else cy),
     )
-
-
-def _pose(rows: Any, index: int, path: Path) -> list[float]:
-    """16 numbers of a pose with OpenCV axes; NaN where a number is not finite."""
-    if not (isinstance(rows, list) and len(rows) in (3, 4) and all(isinstance(r, list) and len(r) == 4 for r in rows)):
-        raise DataError(f"{path}: camera {index} has no pose; expected 'transform_matrix', 4 x 4 numbers")
-    numbers = [[finite(value) for value in row] for row in rows]
-    flat = [
-        math.nan if number is None else sign * number
-        for row in numbers
-        for number, sign in zip(row, (1.0, -1.0, -1.0, 1.0), strict=True)  # OpenGL's axes to OpenCV's
-    ]
-    return flat if len(rows) == 4 else [*flat, 0.0, 0.0, 0.0, 1.0]
 
 
 def _focal(side: float, angle: float | None) -> float | None:

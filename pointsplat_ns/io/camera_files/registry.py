@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.camera_files.cameras import CameraFile, Motion, rigid, views_of
+from pointsplat_ns.io.camera_files.cameras import LIMITS, CameraFile, Motion, rigid, views_of
 from pointsplat_ns.io.camera_files.colmap import colmap_cameras, is_model
 from pointsplat_ns.io.camera_files.inria import inria_cameras
 from pointsplat_ns.io.camera_files.nerfstudio import nerfstudio_cameras
@@ -16,9 +16,6 @@ from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, TRANSFORMS_NAME, re
 from pointsplat_ns.views import Views
 
 ACCEPTED = "cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model"
-
-MOST_BYTES = 64_000_000
-"""Maximum size of JSON: 100,000 frames have about as much."""
 
 
 def is_camera_file(path: Path | str) -> bool:
@@ -83,8 +80,8 @@ def _json_cameras(path: Path) -> CameraFile:
         raise DataError(f"{path}: a folder without cameras.bin or cameras.txt; expected {ACCEPTED}")
     path = require_file(path, ACCEPTED)
     size = path.stat().st_size
-    if size > MOST_BYTES:
-        raise DataError(f"{path}: {size / 1e6:.0f} MB; expected cameras of at most {MOST_BYTES / 1e6:.0f} MB")
+    if size > LIMITS.file_bytes:
+        raise DataError(f"{path}: {size / 1e6:.0f} MB; expected cameras of at most {LIMITS.file_bytes / 1e6:.0f} MB")
     require_memory(path, 24 * size)  # most memory that a byte of JSON takes: empty lists are the worst
     try:
         content = json.loads(path.read_bytes())
