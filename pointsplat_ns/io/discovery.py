@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -35,16 +35,8 @@ class FoundScene:
 
 
 def find_scenes(folder: Path | str) -> list[FoundScene]:
-    """Every scene below a folder: files that hold Gaussians, and the newest trained run of each experiment.
-
-    Files in the folders of runs, hidden folders, what was made of many scenes (:data:`RESULTS_NAME`), and files and
-    runs without Gaussians are passed over.
-
-    Args:
-        folder: a folder that is no run itself.
-
-    Returns:
-        The scenes, sorted by name. A run has the name of its experiment's folder.
+    """Every scene below a folder, sorted by name: files that hold Gaussians, and the newest trained run of each
+    experiment, which has the name of the experiment's folder.
 
     Raises:
         SceneError: if there is no such folder, it is a run, or there is no scene below it.
@@ -52,7 +44,8 @@ def find_scenes(folder: Path | str) -> list[FoundScene]:
     folder = Path(folder)
     if not is_folder_of_scenes(folder):
         raise SceneError(f"{folder}: expected a folder with scenes below it")
-    named = [(path.relative_to(folder).with_suffix("").as_posix(), path) for path in _scene_files(folder)]
+    files = _files_with_gaussians(folder, is_scene_file)
+    named = [(path.relative_to(folder).with_suffix("").as_posix(), path) for path in files]
     if _run_folders(folder):
         try:
             runs = find_runs(folder, need_data=False)
@@ -69,14 +62,12 @@ def find_scenes(folder: Path | str) -> list[FoundScene]:
 def find_runs_and_plys(
     folder: Path, supervision: Supervision
 ) -> tuple[dict[str, Run], dict[str, Path], SceneError | None]:
-    """The runs and PLY files at or below ``folder`` that a training uses, by their scene names.
+    """The runs and PLY files at or below ``folder`` that a training uses, by their scene names, and the error if no run
+    was found. The data of runs is not looked for.
 
     Args:
         folder: a run, a PLY file, or any folder above several.
         supervision: ``photos`` takes runs, ``dense`` takes both, ``auto`` takes runs, or PLY files if there is no run.
-
-    Returns:
-        Runs, whose data is not looked for; PLY files; and the error if no run was found.
     """
     runs: list[Run] = []
     why_no_run: SceneError | None = None
@@ -85,16 +76,14 @@ def find_runs_and_plys(
             runs = find_runs(folder, need_data=False)
     except SceneError as error:
         why_no_run = error
-    named = dict(zip(scene_names(runs), runs, strict=True))
+    named = dict(zip(distinct(map(scene_name, runs)), runs, strict=True))
     plys = find_plys(folder) if supervision == "dense" or (supervision == "auto" and not runs) else []
     return named, {f"{name}.ply" if name in named else name: path for name, path in plys}, why_no_run
 
 
 def find_runs(folder: Path | str, need_data: bool = True) -> list[Run]:
-    """Every Gaussian scene trained below ``folder``: the newest run of each experiment that has a
-    complete checkpoint, sorted by experiment name.
-
-    Below a folder, runs of other methods and runs without a complete checkpoint are skipped.
+    """The newest run of each experiment below ``folder``, sorted by the experiment's name. Runs of other methods and
+    runs without a complete checkpoint are skipped.
 
     Args:
         folder: a run, or any folder above several.
@@ -139,29 +128,10 @@ def find_runs(folder: Path | str, need_data: bool = True) -> list[Run]:
 
 
 def find_plys(folder: Path) -> list[tuple[str, Path]]:
-    """Name and path of every 3DGS PLY at or below ``folder``, sorted by path.
-
-    Files in the folder of a nerfstudio run and PLY files without Gaussians are skipped.
-    """
-    if folder.is_file():
-        paths = [folder] if folder.suffix.lower() == ".ply" else []
-        root = folder.parent
-    else:
-        paths, root = [], folder
-        for place, inner, files in os.walk(folder):
-            if CONFIG_NAME in files:
-                inner.clear()
-                continue
-            inner[:] = sorted(name for name in inner if not name.startswith("."))
-            paths += [Path(place) / name for name in files if name.lower().endswith(".ply")]
-    plys, names = [], []
-    for path in sorted(paths):
-        if not _holds_gaussians(path):
-            logger.warning("passed over %s: no Gaussians in it", path)
-            continue
-        parts = path.relative_to(root).with_suffix("").parts
-        names.append(file_stem("-".join(parts)))
-        plys.append(path)
+    """Name and path of every 3DGS PLY at or below ``folder``, sorted by path."""
+    plys = _files_with_gaussians(folder, lambda name: name.lower().endswith(".ply"))
+    root = folder.parent if folder.is_file() else folder
+    names = [file_stem("-".join(path.relative_to(root).with_suffix("").parts)) for path in plys]
     return list(zip(distinct(names), plys, strict=True))
 
 
@@ -177,26 +147,25 @@ def distinct(names: Iterable[str]) -> list[str]:
     return unique
 
 
-def scene_names(runs: list[Run]) -> list[str]:
-    """:func:`scene_name` of each run, made distinct."""
-    return distinct(scene_name(run) for run in runs)
-
-
 def shown_scene(names: list[str], eval_scenes: Iterable[str]) -> str:
     """The scene that the viewer and the exporters get: the first one held out of training, or else the first."""
     held_out = set(eval_scenes)
     return next((name for name in names if name in held_out), names[0])
 
 
-def _scene_files(folder: Path) -> list[Path]:
-    """Files below ``folder`` that hold a scene, sorted. A PLY may also hold points or a mesh, and is looked into."""
-    paths = []
-    for place, inner, files in os.walk(folder):
-        if CONFIG_NAME in files or (RESULTS_NAME in files and Path(place) != folder):
+def _files_with_gaussians(root: Path, wanted: Callable[[str], bool]) -> list[Path]:
+    """Files at or below a path that hold a scene and whose names are ``wanted``, sorted.
+
+    Folders of runs, hidden folders and :data:`RESULTS_NAME`'s are not searched. A PLY may also hold points or a mesh,
+    so its header is read.
+    """
+    paths = [root] if root.is_file() and wanted(root.name) else []
+    for place, inner, files in os.walk(root):
+        if CONFIG_NAME in files or (RESULTS_NAME in files and Path(place) != root):
             inner.clear()
             continue
         inner[:] = sorted(name for name in inner if not name.startswith("."))
-        paths += [Path(place) / name for name in files if is_scene_file(name) and not name.startswith(".")]
+        paths += [Path(place) / name for name in files if wanted(name) and not name.startswith(".")]
     scenes = []
     for path in sorted(paths):
         if path.suffix.lower() != ".ply" or _holds_gaussians(path):

@@ -27,15 +27,7 @@ logger = logging.getLogger("pointsplat_ns")
 
 
 def require_file(path: Path | str, what: str) -> Path:
-    """``path`` as a Path, if it names a regular file.
-
-    Args:
-        path: the file.
-        what: the expected kind of file, for the error ("a 3DGS PLY file").
-
-    Raises:
-        SceneError: if there is no file at ``path``, or a folder or a pipe.
-    """
+    """``path`` as a Path. A SceneError if it is no regular file, which says that ``what`` was expected."""
     path = Path(path)
     if not path.exists():
         raise SceneError(f"{path}: no such file; expected {what}")
@@ -45,15 +37,8 @@ def require_file(path: Path | str, what: str) -> Path:
 
 
 def require_memory(path: Path | str, size: int) -> None:
-    """Refuse a file that would take more memory than is free, such as a sparse one whose zeros take no disk space.
-
-    Args:
-        path: the file, for the error.
-        size: bytes that its content takes.
-
-    Raises:
-        SceneError: if they are not free.
-    """
+    """Raise a SceneError if ``size`` bytes, which a file's content takes, are not free. A sparse file, whose zeros take
+    no disk space, may claim any size."""
     import psutil
 
     free = psutil.virtual_memory().available
@@ -64,10 +49,7 @@ def require_memory(path: Path | str, size: int) -> None:
 
 
 def content_hash(path: Path | str) -> str:
-    """SHA-256 of a file's bytes, as 64 hexadecimal digits.
-
-    Args:
-        path: the file; it is read in pieces, so that it need not fit into memory.
+    """SHA-256 of a file's bytes, as 64 hexadecimal digits. The file is read in pieces: it need not fit into memory.
 
     Raises:
         SceneError: if there is no such file, or it cannot be read.
@@ -138,11 +120,7 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None) -> It
 
 
 def _require_space(path: Path, folder: Path, size: int) -> None:
-    """Refuse to write a file that the disk has no room for. A file that it replaces stays until the end.
-
-    Raises:
-        SceneError: if there is less than ``size`` bytes.
-    """
+    """Raise a SceneError if the disk has less than ``size`` bytes. A file that is replaced stays until the end."""
     disk = shutil.disk_usage(folder)
     if disk.total and size > disk.free:  # some network file systems tell nothing
         raise SceneError(
@@ -152,12 +130,7 @@ def _require_space(path: Path, folder: Path, size: int) -> None:
 
 
 def lack_of_room(error: OSError, part: Path | None) -> str:
-    """Hint for an error of a file or a folder if the disk has no room for it; else an empty text.
-
-    Args:
-        error: of writing it.
-        part: the unfinished file or folder.
-    """
+    """Hint for an error of writing an unfinished file or folder, if the disk has no room for it; else an empty text."""
     if part is None or error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return ""
     try:
@@ -179,11 +152,7 @@ def _megabytes(size: int) -> str:
 
 
 def _mode_of(path: Path) -> int | None:
-    """Permission bits of a file that is to be replaced; None if there is none.
-
-    Raises:
-        SceneError: if it is a device, a pipe or a link that leads nowhere.
-    """
+    """Permission bits of a file that is to be replaced; None if there is none. A SceneError if it is not regular."""
     try:
         status = path.lstat()
     except FileNotFoundError:
@@ -214,11 +183,7 @@ def json_text(content: Any) -> str:
 
 
 def write_json(content: Any, path: Path | str) -> None:
-    """Write JSON as :func:`json_text` has it.
-
-    Raises:
-        SceneError: if it cannot be written.
-    """
+    """Write JSON as :func:`json_text` has it, as :func:`replacing` does."""
     with replacing(path) as part:
         part.write_text(json_text(content) + "\n", encoding="utf-8")
 
@@ -232,16 +197,7 @@ def _without_infinities(value: Any) -> Any:
 
 
 def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: dict[str, str]) -> None:
-    """Write a safetensors file, as :func:`replacing` does.
-
-    Args:
-        path: the file; its folder is created if missing.
-        tensors: on any device.
-        header: the file's metadata.
-
-    Raises:
-        SceneError: if ``path`` cannot be written.
-    """
+    """Write tensors of any device and a header of metadata to a safetensors file, as :func:`replacing` does."""
     from safetensors import SafetensorError
     from safetensors.torch import save_file
 
@@ -253,17 +209,17 @@ def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: dict[
             raise OSError(one_line(error)) from error
 
 
-_EVERYTHING: ContextVar[bool] = ContextVar("everything", default=False)
+_everything: ContextVar[bool] = ContextVar("everything", default=False)
 
 
 @contextmanager
 def unusable_kept() -> Iterator[None]:
     """Let readers keep Gaussians that cannot be drawn, for those who count them."""
-    token = _EVERYTHING.set(True)
+    token = _everything.set(True)
     try:
         yield
     finally:
-        _EVERYTHING.reset(token)
+        _everything.reset(token)
 
 
 def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:
@@ -272,7 +228,7 @@ def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:
     Opacity logits of +-Inf and log-scales of -Inf are valid (see
     :meth:`~pointsplat_ns.gaussians.Gaussians.usable`).
     """
-    if _EVERYTHING.get():
+    if _everything.get():
         return scene
     usable = scene.usable()
     dropped = len(scene) - int(usable.sum())

@@ -16,13 +16,6 @@ import yaml
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import one_line, require_file
 
-MAX_BYTES = 1 << 18
-"""A nerfstudio configuration has about 10 kB."""
-
-MAX_VALUES = 1 << 16
-"""Values that a file may stand for, those that aliases repeat counted each time; nerfstudio's has some hundreds. As
-text or as a key, a value is as long as all that it holds."""
-
 
 @dataclass(frozen=True)
 class Tagged:
@@ -60,9 +53,9 @@ def read_config(path: Path | str) -> Tagged:
         SceneError: if it is not YAML, too big, too deep, or has no Python object at its root.
     """
     path = require_file(path, "nerfstudio's config.yml")
-    size = path.stat().st_size
-    if size > MAX_BYTES:
-        raise SceneError(f"{path}: {size} bytes; expected a nerfstudio config.yml of at most {MAX_BYTES}")
+    size, most = path.stat().st_size, 1 << 18  # one has about 10 kB
+    if size > most:
+        raise SceneError(f"{path}: {size} bytes; expected a nerfstudio config.yml of at most {most}")
     try:
         loader = _Loader(path.read_text("utf-8"))
         try:
@@ -82,15 +75,12 @@ def read_config(path: Path | str) -> Tagged:
     return root
 
 
-def _count(node: yaml.Node, known: dict[int, int]) -> int:
-    """The number of values that a node stands for, as often as aliases repeat them.
+def _count(node: yaml.Node, known: dict[int, int], most: int = 1 << 16) -> int:
+    """The number of values that a node stands for, those that aliases repeat counted each time; a ValueError if there
+    are more than ``most``, or the node holds itself. nerfstudio's file has some hundreds. As text or as a key, a value
+    is as long as all that it holds.
 
-    Args:
-        node: of the file.
-        known: numbers by the identity of nodes; 0 marks those that are being counted.
-
-    Raises:
-        ValueError: if there are too many, or a node holds itself.
+    ``known`` has the numbers by the identity of nodes; 0 marks those that are being counted.
     """
     if id(node) in known:
         if not known[id(node)]:
@@ -101,8 +91,8 @@ def _count(node: yaml.Node, known: dict[int, int]) -> int:
     if isinstance(node, yaml.MappingNode):
         parts = [part for pair in node.value for part in pair]
     count = 1 + sum(_count(part, known) for part in parts)
-    if count > MAX_VALUES:
-        raise ValueError(f"more than {MAX_VALUES} values")
+    if count > most:
+        raise ValueError(f"more than {most} values")
     known[id(node)] = count
     return count
 
@@ -117,7 +107,8 @@ def _python(loader: _Loader, suffix: str, node: yaml.Node) -> Any:
         return tuple(value)
     if kind in ("list", "dict", "none", "bool", "int", "long", "float") and not name:
         return value
-    if kind.startswith("object/") and name.startswith("pathlib") and _all_text(value):
+    of_text = isinstance(value, list) and all(isinstance(part, str) for part in value)
+    if kind.startswith("object/") and name.startswith("pathlib") and of_text:
         parts = [PureWindowsPath(part).as_posix() for part in value] if "Windows" in name else value
         return Path(*parts)
     return Tagged(name or kind, None if kind == "name" else value)
@@ -131,10 +122,6 @@ def _plain(loader: _Loader, node: yaml.Node) -> Any:
     return loader.construct_object(
         yaml.ScalarNode(loader.resolve(yaml.ScalarNode, node.value, (True, False)), node.value)
     )
-
-
-def _all_text(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(part, str) for part in value)
 
 
 _Loader.add_multi_constructor("tag:yaml.org,2002:python/", _python)

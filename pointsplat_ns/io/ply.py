@@ -19,9 +19,6 @@ from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
 from pointsplat_ns.io.files import keep_usable, logger, one_line, replacing, require_file, require_memory
 from pointsplat_ns.io.ply_header import Element, Header, read_header, warn_render_mode
 
-CHUNK_ROWS = 16384
-"""Rows copied at a time, about 4 MB: small enough for the processor's cache."""
-
 _COLUMNS = {
     "means": ["x", "y", "z"],
     "normals": ["nx", "ny", "nz"],
@@ -43,12 +40,6 @@ def read_ply(path: Path | str) -> Gaussians:
     properties and elements, and bytes after the last element, are not read; a warning says so. Gaussians that cannot be
     drawn (NaN, or Inf where it is not valid) are dropped, and their number is logged; all-zero rows are kept (a zero
     quaternion is the identity).
-
-    Args:
-        path: the file.
-
-    Returns:
-        The scene, float32 on the CPU.
 
     Raises:
         SceneError: if the file is not a PLY, is truncated, or lacks a property.
@@ -111,14 +102,11 @@ def ply_bytes(count: int, sh_degree: int) -> int:
     return sum(len(line) + 1 for line in lines) + 4 * len(names) * count
 
 
-def _rest_names(count: int) -> list[str]:
-    return [f"f_rest_{i}" for i in range(count)]
-
-
 def _column_names(rest: int) -> list[str]:
     """All vertex properties in the order of files, with so many of SH beyond the constant one."""
-    names = [*_COLUMNS["means"], *_COLUMNS["normals"], *_COLUMNS["features_dc"], *_rest_names(rest)]
-    return [*names, *_COLUMNS["opacities"], *_COLUMNS["scales"], *_COLUMNS["quats"]]
+    first = [*_COLUMNS["means"], *_COLUMNS["normals"], *_COLUMNS["features_dc"]]
+    last = [*_COLUMNS["opacities"], *_COLUMNS["scales"], *_COLUMNS["quats"]]
+    return [*first, *(f"f_rest_{i}" for i in range(rest)), *last]
 
 
 class _GaussiansAlone(io.FileIO):
@@ -189,11 +177,9 @@ def _num_rest(vertex: Element, path: Path) -> int:
             f"{path}: lacks the vertex property 'scale_2', as 2D Gaussians (2DGS) do; expected 3D Gaussians"
         )
     rest = sorted(int(name[7:]) for name in present if re.fullmatch(r"f_rest_(0|[1-9]\d{0,5})", name))
-    required = [name for attribute, names in _COLUMNS.items() if attribute != "normals" for name in names]
     counts = [3 * ((degree + 1) ** 2 - 1) for degree in _FILE_DEGREES]
-    if rest and rest[-1] + 1 in counts:
-        required += _rest_names(rest[-1] + 1)
-    missing = [name for name in required if name not in present]
+    required = _column_names(rest[-1] + 1 if rest and rest[-1] + 1 in counts else 0)
+    missing = [name for name in required if name not in present and name not in _COLUMNS["normals"]]
     if missing:
         others = f" and {len(missing) - 1} more ({', '.join(missing[1:4])}...)" if len(missing) > 1 else ""
         raise SceneError(f"{path}: lacks the vertex property {missing[0]!r}{others}; expected a 3DGS PLY")
@@ -216,10 +202,11 @@ def _scene(rows: np.ndarray, k: int, in_file: int) -> Gaussians:
         "features_rest": [f"f_rest_{channel * in_file + i}" for i in range(k) for channel in range(3)],
     }
     tables = {name: np.empty((len(rows), len(fields)), np.float32) for name, fields in columns.items()}
+    at_once = 16_384  # rows, about 4 MB: they fit into the processor's cache
     # A double beyond float32 becomes Inf and is dropped with the others.
     with np.errstate(over="ignore"):
-        for start in range(0, len(rows), CHUNK_ROWS):
-            chunk = slice(start, start + CHUNK_ROWS)
+        for start in range(0, len(rows), at_once):
+            chunk = slice(start, start + at_once)
             for name, fields in columns.items():
                 if fields:
                     tables[name][chunk] = structured_to_unstructured(rows[chunk][fields], np.float32)

@@ -7,6 +7,7 @@ without an end) does no harm. :mod:`~pointsplat_ns.io.ply` checks its counts aga
 from __future__ import annotations
 
 import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -148,8 +149,6 @@ def _header_text(stream: BinaryIO, path: Path) -> tuple[list[str], int]:
 
 
 def _reject_duplicates(names: list[str], what: str, path: Path) -> None:
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
-            raise SceneError(f"{path}: PLY header declares {what} {name!r} twice")
-        seen.add(name)
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise SceneError(f"{path}: PLY header declares {what} {twice[0]!r} twice")

@@ -15,10 +15,6 @@ from pointsplat_ns.gaussians import SH_C0, Gaussians
 from pointsplat_ns.io.files import keep_usable, one_line, require_file, require_memory
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 
-PREFIXES = ("_model.gauss_params.", "_model.module.gauss_params.", "_model.", "_model.module.")
-"""Prefixes of the parameters' keys in ``pipeline``: current, then those before nerfstudio 1.0, each also with the
-wrapper of distributed training."""
-
 NAMES = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
 """Names of the parameters of Gaussians, in checkpoints and in Splatfacto's optimisers."""
 
@@ -26,12 +22,9 @@ NAMES = ("means", "scales", "quats", "opacities", "features_dc", "features_rest"
 def read_checkpoint(path: Path | str) -> Gaussians:
     """Read the scene of a Splatfacto checkpoint.
 
-    Loads with ``weights_only=True``: a checkpoint cannot run code. At SH degree 0, where Splatfacto
-    stores colours as logits, they are converted to SH coefficients of the same colour. Gaussians
-    that cannot be drawn (NaN, or Inf where it is not valid) are dropped, and their number is logged.
-
-    Args:
-        path: a ``.ckpt`` file.
+    Loads with ``weights_only=True``: a checkpoint cannot run code. At SH degree 0, where Splatfacto stores colours as
+    logits, they are converted to SH coefficients of the same colour. Gaussians that cannot be drawn (NaN, or Inf where
+    it is not valid) are dropped, and their number is logged.
 
     Returns:
         The scene, float32 on the CPU, in the frame of the run's dataparser.
@@ -41,13 +34,15 @@ def read_checkpoint(path: Path | str) -> Gaussians:
     """
     path = require_file(path, "a Splatfacto checkpoint")
     state = _pipeline_state(_load(path), path)
-    prefix = next((p for p in PREFIXES if f"{p}means" in state), None)
+    # Of current versions, and of those before nerfstudio 1.0, each also with the wrapper of distributed training.
+    prefixes = ("_model.gauss_params.", "_model.module.gauss_params.", "_model.", "_model.module.")
+    prefix = next((p for p in prefixes if f"{p}means" in state), None)
     if prefix is None:
         keys = sorted(str(key) for key in state)
         shown = ", ".join(keys[:4]) + (f" and {len(keys) - 4} more" if len(keys) > 4 else "")
         raise SceneError(
             f"{path}: a checkpoint of another method; found the keys {shown or 'none'}; "
-            f"expected {PREFIXES[0]}means, as Splatfacto saves"
+            f"expected {prefixes[0]}means, as Splatfacto saves"
         )
     limit = path.stat().st_size
     held = (state.get(prefix + name) for name in NAMES)

@@ -12,7 +12,7 @@ import torch
 from making import normal_scene, same
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import find_runs, open_run, read_scene, save, scene_name
-from pointsplat_ns.io.discovery import scene_names
+from pointsplat_ns.io.discovery import find_runs_and_plys
 from pointsplat_ns.io.inert_yaml import Tagged
 
 
@@ -190,8 +190,8 @@ def test_other_methods_are_passed_over_and_said_where_nothing_is_left(make_run, 
 def test_flat_copies_of_runs_are_all_found_and_named_apart(make_run, tmp_path):
     for name in ("one", "two"):
         shutil.copytree(make_run(outputs=f"outputs-{name}"), tmp_path / "flat" / name / "copy")
-    runs = find_runs(tmp_path / "flat")
-    assert len(runs) == 2 and scene_names(runs) == ["kitchen", "kitchen-2"]
+    runs, _, _ = find_runs_and_plys(tmp_path / "flat", "photos")
+    assert list(runs) == ["kitchen", "kitchen-2"]
 
 
 def test_missing_data_of_one_run_among_many_is_an_error(make_run, tmp_path):

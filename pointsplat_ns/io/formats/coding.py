@@ -26,12 +26,6 @@ SATURATED = 0.25
 """Opacity bytes 0 and 255 are read as 0.25 and 254.75: in the middle of what is written as these bytes, and with a
 logit that is finite. A logit of infinity would be dropped by some programs."""
 
-_OF_DECODERS = (
-    ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError, SyntaxError, EOFError,
-    NotImplementedError, RuntimeError, struct.error, zlib.error, lzma.LZMAError, zipfile.BadZipFile,
-)  # fmt: skip
-"""What Python's and our decoders raise where bytes are not what they should be."""
-
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 Array = NDArray[Any]
@@ -39,12 +33,11 @@ Array = NDArray[Any]
 
 @contextmanager
 def damage_named(path: Path, kind: str) -> Iterator[None]:
-    """Turn what a damaged file causes in its decoder into a :class:`SceneError` that names the file.
-
-    Args:
-        path: the file that is read.
-        kind: of the file, for the error, such as "SPZ".
-    """
+    """Turn errors of decoders into a :class:`SceneError` that names the file and its kind, such as "SPZ"."""
+    of_decoders = (
+        ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError, SyntaxError, EOFError,
+        NotImplementedError, RuntimeError, struct.error, zlib.error, lzma.LZMAError, zipfile.BadZipFile,
+    )  # fmt: skip
     try:
         # Bits that mean NaN or Inf are no reason for numpy to warn: such Gaussians are dropped, and counted.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -54,35 +47,21 @@ def damage_named(path: Path, kind: str) -> Iterator[None]:
     except OSError as error:
         why = error.strerror or one_line(error)
         raise SceneError(f"{path}: cannot be read as {kind} ({why})") from error
-    except _OF_DECODERS as error:
+    except of_decoders as error:
         why = f"lacks {error}" if isinstance(error, KeyError) else one_line(error)
         raise SceneError(f"{path}: damaged {kind} file ({why})") from error
 
 
 def load_bytes(path: Path) -> bytes:
-    """The whole content of a file.
-
-    Raises:
-        SceneError: if it does not fit into memory.
-    """
+    """The whole content of a file; a SceneError if it does not fit into memory."""
     require_memory(path, path.stat().st_size)
     return path.read_bytes()
 
 
 def require_plausible(path: Path, unpacked: int, packed: int, count: int, rest: int) -> None:
-    """Refuse, before memory is taken, a compressed file that would decompress to more than its size can hold, or that
-    holds more Gaussians than fit into memory.
-
-    Args:
-        path: the file, for the error.
-        unpacked: bytes of its content by its header.
-        packed: bytes of the file.
-        count: number of Gaussians by its header.
-        rest: SH coefficients per channel beyond the constant one.
-
-    Raises:
-        SceneError: if so.
-    """
+    """Raise a SceneError, before memory is taken, if the header of a compressed file declares more bytes than
+    ``packed`` can hold, or more Gaussians (with ``rest`` SH coefficients per channel beyond the constant one) than fit
+    into memory."""
     # From a file of any size 4 MB, 200,000 equal Gaussians; beyond that, deflate's own largest ratio.
     if unpacked > max(1 << 22, 1032 * packed):
         raise SceneError(
@@ -93,23 +72,13 @@ def require_plausible(path: Path, unpacked: int, packed: int, count: int, rest: 
 
 
 class Blocks:
-    """Arrays that follow one another in bytes.
-
-    Args:
-        data: the bytes.
-        path: the file that they are from, for the error.
-        start: where the first array begins.
-    """
+    """Arrays that follow one another in the bytes of a file, from ``start`` on."""
 
     def __init__(self, data: bytes | memoryview, path: Path, start: int = 0):
         self._data, self._path, self.position = data, path, start
 
     def take(self, dtype: str | np.dtype, *shape: int) -> NDArray:
-        """The next array, not copied.
-
-        Raises:
-            SceneError: if the bytes end before it does.
-        """
+        """The next array, not copied; a SceneError if the bytes end before it does."""
         kind = np.dtype(dtype)
         count = int(np.prod([int(side) for side in shape], dtype=object))
         left = len(self._data) - self.position
@@ -125,16 +94,8 @@ class Blocks:
 def scene_of(
     means: ArrayLike, scales: ArrayLike, quats: ArrayLike, opacities: ArrayLike, dc: ArrayLike, rest: ArrayLike
 ) -> Gaussians:
-    """The scene of decoded arrays, as float32.
-
-    Args:
-        means: (N, 3).
-        scales: (N, 3) logarithms.
-        quats: (N, 4) wxyz.
-        opacities: (N,) logits.
-        dc: (N, 3).
-        rest: (N, K, 3).
-    """
+    """The scene, float32, of decoded arrays: means (N, 3), log-scales (N, 3), quaternions (N, 4) wxyz, opacity logits
+    (N,), and SH coefficients (N, 3) and (N, K, 3)."""
     columns = (means, scales, quats, np.reshape(opacities, (-1, 1)), dc, rest)
     return Gaussians(*(torch.from_numpy(np.array(column, np.float32, order="C")) for column in columns))
 
@@ -183,14 +144,8 @@ def unit_quats(scene: Gaussians) -> Array:
 
 
 def smallest_three(unit: Array) -> tuple[Array, Array]:
-    """Quaternions without their largest component, which is made positive.
-
-    Args:
-        unit: (N, 4) of length 1.
-
-    Returns:
-        The index of the largest component (N,), and the others in order, (N, 3), within +-1/sqrt(2).
-    """
+    """Quaternions (N, 4) of length 1 without their largest component, which is made positive: its index (N,), and the
+    others in order, (N, 3), within +-1/sqrt(2)."""
     largest = np.abs(unit).argmax(axis=1)
     rows = np.arange(len(unit))
     signed = unit * np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]

@@ -34,9 +34,6 @@ from pointsplat_ns.system.progress import Progress, silent
 CHUNK_GAUSSIANS = 256
 """Gaussians that share bounds."""
 
-LOG_SCALES = (-20.0, 20.0)
-"""Log-scales beyond these are written as these."""
-
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _BOUNDS = tuple(
     f"{end}_{name}"
@@ -55,13 +52,7 @@ def is_compressed(header: Header) -> bool:
 
 
 def read_compressed_ply(path: Path | str) -> Gaussians:
-    """Read a compressed PLY, of any SH degree up to 3.
-
-    Args:
-        path: the file.
-
-    Returns:
-        The scene, float32 on the CPU. Gaussians that cannot be drawn are dropped, and their number is logged.
+    """Read a compressed PLY, of any SH degree up to 3, as :func:`~pointsplat_ns.io.read_scene` does.
 
     Raises:
         SceneError: if the file is no compressed PLY, is truncated, or does not fit into memory.
@@ -91,15 +82,12 @@ def compressed_ply_bytes(count: int, sh_degree: int) -> int:
 
 
 def encode_compressed_ply(scene: Gaussians, progress: Progress = silent) -> bytes:
-    """The bytes of a compressed PLY. Gaussians are reordered, so that those of a chunk are near each other.
-
-    Args:
-        scene: N Gaussians, float32 on the CPU.
-        progress: not called.
-    """
+    """The bytes of a compressed PLY of a scene, float32 on the CPU. Gaussians are reordered, so that those of a chunk
+    are near each other. ``progress`` is not called."""
     n = len(scene)
     scene = scene[morton_order(scene)]
-    parts = (scene.means.double().numpy(), _finite_scales(scene), shares_of_dc(scene))
+    scales = scene.scales.double().clamp(-20.0, 20.0).numpy()  # the bounds must be finite
+    parts = (scene.means.double().numpy(), scales, shares_of_dc(scene))
     bounds = [_bounds(part) for part in parts]
     chunks = np.concatenate([side for low_high in bounds for side in low_high], axis=1).astype("<f4")
     shares = [_shares(part, chunks[:, 6 * i : 6 * i + 6]) for i, part in enumerate(parts)]
@@ -116,10 +104,6 @@ def encode_compressed_ply(scene: Gaussians, progress: Progress = silent) -> byte
     sh = np.clip(np.floor((rest / _SH_RANGE + 0.5) * _SH_STEPS), 0, _SH_STEPS - 1).astype(np.uint8)
     packed = np.stack(words, axis=1).astype("<u4")
     return b"".join((_header_text(n, rest.shape[1]), chunks.tobytes(), packed.tobytes(), sh.tobytes()))
-
-
-def _finite_scales(scene: Gaussians) -> Array:
-    return scene.scales.double().clamp(*LOG_SCALES).numpy()
 
 
 def _header_text(count: int, rest: int) -> bytes:

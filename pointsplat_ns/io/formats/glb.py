@@ -19,7 +19,6 @@ JSON_BYTES = 8192
 """The description is filled up with spaces to this size, so that a file's size follows from the number of Gaussians."""
 
 _EXTENSION = "KHR_gaussian_splatting"
-_FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
 
 
 def glb_bytes(count: int, sh_degree: int) -> int:
@@ -29,21 +28,18 @@ def glb_bytes(count: int, sh_degree: int) -> int:
 
 
 def encode_glb(scene: Gaussians, progress: Progress = silent) -> bytes:
-    """The bytes of a ``.glb`` with one mesh of points. The axes stay those of the scene; glTF's own have y up.
-
-    Args:
-        scene: N Gaussians, float32 on the CPU.
-        progress: not called.
-    """
+    """The bytes of a ``.glb`` with one mesh of points, of a scene, float32 on the CPU. The axes stay those of the
+    scene; glTF's own have y up. ``progress`` is not called."""
     arrays = _attributes(scene)
+    as_float, as_byte, array_buffer, points = 5126, 5121, 34962, 0  # glTF's numbers
     views: list[dict[str, object]] = []
     accessors: list[dict[str, object]] = []
     offset = 0
     for name, array in arrays.items():
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": _ARRAY_BUFFER})
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": array_buffer})
         accessor = {
             "bufferView": len(accessors),
-            "componentType": _BYTE if array.dtype == np.uint8 else _FLOAT,
+            "componentType": as_byte if array.dtype == np.uint8 else as_float,
             "count": len(array),
             "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[array.shape[1]],
         }
@@ -61,7 +57,7 @@ def encode_glb(scene: Gaussians, progress: Progress = silent) -> bytes:
     }
     primitive = {
         "attributes": {name: index for index, name in enumerate(arrays)},
-        "mode": _POINTS,
+        "mode": points,
         "extensions": {_EXTENSION: ellipse},
     }
     content = {

@@ -52,14 +52,8 @@ class _Section:
 
 
 def read_ksplat(path: Path | str) -> Gaussians:
-    """Read a ``.ksplat`` file of any compression, 0 to 2, and SH degree, 0 to 2.
-
-    Args:
-        path: the file.
-
-    Returns:
-        The scene, float32 on the CPU. Sections of fewer SH get zeros. Gaussians that cannot be drawn are dropped, and
-        their number is logged.
+    """Read a ``.ksplat`` file of any compression, 0 to 2, and SH degree, 0 to 2, as
+    :func:`~pointsplat_ns.io.read_scene` does. Sections of fewer SH get zeros.
 
     Raises:
         SceneError: if the file is of another kind, is truncated, or declares more than it can hold.
@@ -126,10 +120,11 @@ def _decode(
     rows = blocks.take(row, section.capacity)[: section.count]
     means = rows["means"].astype(np.float64)
     if compression and section.count:
-        of = np.repeat(
-            np.arange(section.buckets),
-            np.concatenate([np.full(section.full, section.bucket_size, np.int64), _filled(section, lengths, path)]),
-        )
+        left, partial = section.count - section.full * section.bucket_size, lengths.astype(np.int64)
+        if int(partial.sum()) != left:
+            raise SceneError(f"{path}: {int(partial.sum())} Gaussians in partly filled buckets; expected {left}")
+        filled = np.concatenate([np.full(section.full, section.bucket_size, np.int64), partial])
+        of = np.repeat(np.arange(section.buckets), filled)
         centres = stored.copy().view("<f4")
         means = (means - section.steps) * (section.block_size / 2 / section.steps) + centres[of]
     sh = rows["sh"].astype(np.float64)
@@ -143,15 +138,6 @@ def _decode(
         dc_of_shares(rows["rgba"][:, :3].astype(np.float32) / 255),
         _coefficients(sh, section.degree, rest),
     )
-
-
-def _filled(section: _Section, lengths: Array, path: Path) -> Array:
-    """Number of Gaussians in each partly filled bucket, checked to make up the rest of the section."""
-    left = section.count - section.full * section.bucket_size
-    filled = lengths.astype(np.int64)
-    if int(filled.sum()) != left:
-        raise SceneError(f"{path}: {int(filled.sum())} Gaussians in partly filled buckets; expected {left}")
-    return filled
 
 
 def _coefficients(sh: Array, degree: int, rest: int) -> Array:

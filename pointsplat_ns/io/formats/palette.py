@@ -13,18 +13,10 @@ LEVELS = 256
 _SAMPLE = 1 << 17
 """Numbers that a codebook is made from, and rows that the first split of a palette is made from."""
 
-_BRANCH, _DEPTH = 64, 6  # clusters that rows are split into, and how often
-
 
 def codebook(values: Tensor) -> tuple[Tensor, Tensor]:
-    """256 numbers that stand for many, by Lloyd's algorithm (k-means in one dimension).
-
-    Args:
-        values: float32 of any shape, finite.
-
-    Returns:
-        The codebook (256,), ascending, and the index of the nearest entry for each value, uint8 of the same shape.
-    """
+    """256 numbers that stand for finite float32 values of any shape, by Lloyd's algorithm (k-means in one dimension):
+    the codebook (256,), ascending, and the index of the nearest entry for each value, uint8 of the same shape."""
     flat = values.flatten()
     if not flat.numel():
         return torch.zeros(LEVELS), torch.zeros(values.shape, dtype=torch.uint8)
@@ -74,17 +66,15 @@ def palette_size(count: int) -> int:
 
 
 def palette(rows: Tensor, progress: Callable[[float], None]) -> tuple[Tensor, Tensor]:
-    """Rows that stand for many, by k-means in levels: rows are split into clusters, each gets its share of the palette,
-    and is split in turn. That takes a small part of the time of k-means with as many clusters at once.
-
-    Args:
-        rows: (N, D) float32, finite.
-        progress: called with the share done.
+    """Rows that stand for finite float32 rows (N, D), by k-means in levels: rows are split into clusters, each gets its
+    share of the palette, and is split in turn. That takes a small part of the time of k-means with as many clusters at
+    once. ``progress`` is called with the share done.
 
     Returns:
         The palette (P, D), P a multiple of 64, and the index (N,) of the entry for each row.
     """
     n, size = len(rows), palette_size(len(rows))
+    branches, deepest = 64, 6  # clusters that rows are split into, and how often
     if n <= size:
         return torch.cat([rows, rows.new_zeros(size - n, rows.shape[1])]), torch.arange(n)
     generator = torch.Generator().manual_seed(0)  # the same input gives the same bits
@@ -94,17 +84,23 @@ def palette(rows: Tensor, progress: Callable[[float], None]) -> tuple[Tensor, Te
     while waiting:
         members, k, depth = waiting.pop()
         part = rows[members]
-        if k > _BRANCH and depth < _DEPTH:
+        if k > branches and depth < deepest:
             sample = part[torch.randperm(len(part), generator=generator)[:_SAMPLE]]
-            of = _assign(part, _means(sample, _BRANCH, generator))
-            counts = torch.bincount(of, minlength=_BRANCH)
+            of = _assign(part, _means(sample, branches, generator))
+            counts = torch.bincount(of, minlength=branches)
             groups = members[of.argsort(stable=True)].split(counts.tolist())
             share = _apportion(counts, k).tolist()
             waiting += [(group, own, depth + 1) for group, own in zip(groups, share, strict=True) if own]
             continue
         # Rows that clusters do not tell apart, as where nearly all are equal, are cut into pieces of one size.
-        centres = _means(part, k, generator) if k <= _BRANCH else _pieces(part, k)
-        index[members] = used + (_assign(part, centres) if k <= _BRANCH else _piece_of(part, k))
+        if k <= branches:
+            centres = _means(part, k, generator)
+            of = _assign(part, centres)
+        else:
+            of = _piece_of(part, k)
+            centres = part.new_zeros(k, part.shape[1]).index_add_(0, of, part)
+            centres /= torch.bincount(of, minlength=k)[:, None].clamp_min(1)
+        index[members] = used + of
         book[used : used + len(centres)] = centres
         used, done = used + len(centres), done + len(members)
         progress(done / n)
@@ -117,13 +113,6 @@ def _piece_of(rows: Tensor, k: int) -> Tensor:
     pieces = torch.empty(len(rows), dtype=torch.int64)
     pieces[order] = torch.arange(len(rows)) * k // len(rows)
     return pieces
-
-
-def _pieces(rows: Tensor, k: int) -> Tensor:
-    """Means (k, D) of these pieces."""
-    of = _piece_of(rows, k)
-    total = rows.new_zeros(k, rows.shape[1]).index_add_(0, of, rows)
-    return total / torch.bincount(of, minlength=k)[:, None].clamp_min(1)
 
 
 def _apportion(counts: Tensor, size: int) -> Tensor:

@@ -128,11 +128,7 @@ def format_to_read(path: Path) -> Format | None:
 
 
 def format_to_write(path: Path | str) -> Format:
-    """The format that a name asks for.
-
-    Raises:
-        SceneError: if no format that is written has such a name.
-    """
+    """The format that a name asks for; a SceneError if no format that is written has such a name."""
     path = Path(path)
     kind = format_named(path.name)
     if kind is None or kind.write is None:

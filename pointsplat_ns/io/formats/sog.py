@@ -47,13 +47,8 @@ _LARGEST = 252  # alpha of a quaternion's pixel is this plus the index of its la
 
 
 def read_sog(path: Path | str) -> Gaussians:
-    """Read a SOG file, or a folder of its parts, of version 2 or of the first, which has no number.
-
-    Args:
-        path: a ``.sog`` file, a folder, or the ``meta.json`` in one.
-
-    Returns:
-        The scene, float32 on the CPU. Gaussians that cannot be drawn are dropped, and their number is logged.
+    """Read a ``.sog`` file, or a folder of its parts or the ``meta.json`` in one, of version 2 or of the first, which
+    has no number, as :func:`~pointsplat_ns.io.read_scene` does.
 
     Raises:
         SceneError: if a part is missing or damaged, or declares more than it can hold.
@@ -65,11 +60,8 @@ def read_sog(path: Path | str) -> Gaussians:
 
 
 def encode_sog(scene: Gaussians, progress: Progress = silent) -> bytes:
-    """The bytes of a ``.sog`` file. Gaussians are reordered, so that neighbours in the images are neighbours in space.
-
-    Args:
-        scene: N Gaussians, float32 on the CPU.
-        progress: called with the share done.
+    """The bytes of a ``.sog`` file of a scene, float32 on the CPU. Gaussians are reordered, so that neighbours in the
+    images are neighbours in space.
 
     Raises:
         SceneError: if there are more Gaussians than the images can hold.
@@ -86,10 +78,7 @@ def write_sog_folder(scene: Gaussians, path: Path, progress: Progress = silent) 
     """Write the parts of a SOG file into the folder of ``path``, which is called ``meta.json``.
 
     All parts are written beside before the first replaces an older one. Meanwhile there is no ``meta.json``, so that a
-    folder with it is whole.
-
-    Raises:
-        SceneError: if there are more Gaussians than the images can hold, or a part cannot be written.
+    folder with it is whole. Errors are those of :func:`encode_sog` and :func:`~pointsplat_ns.io.files.replacing`.
     """
     parts = _parts(scene, progress)
     with ExitStack() as stack:

@@ -22,14 +22,7 @@ PARTS = tuple(
 
 
 class Images:
-    """The parts of one SOG file.
-
-    Args:
-        path: a zip archive, a folder, or the ``meta.json`` in one.
-
-    Raises:
-        SceneError: if it is none of these.
-    """
+    """The parts of one SOG file: a zip archive, a folder, or the ``meta.json`` in one; others are a SceneError."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -65,15 +58,12 @@ class Images:
         return content
 
     def pixels(self, name: Any, least: int, width: int | None = None) -> Array:
-        """The pixels of one image.
+        """The pixels of one image, (height, width, 4) uint8, RGBA.
 
         Args:
             name: its file name, as ``meta.json`` gives it.
             least: the number of pixels that are needed.
             width: of the image, pixels, if it matters.
-
-        Returns:
-            (height, width, 4) uint8, RGBA; at least ``least`` pixels.
 
         Raises:
             SceneError: if the image is missing, is no WebP, or has too few pixels or far too many.
@@ -117,11 +107,7 @@ class Images:
 
 
 def webp_size(data: bytes) -> tuple[int, int]:
-    """Width and height of a WebP image in pixels, as its header says (RFC 9649).
-
-    Raises:
-        ValueError: if it is none.
-    """
+    """Width and height of a WebP image in pixels, as its header says (RFC 9649); a ValueError if it is none."""
     kind, head = data[12:16], data[20:30]
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(head) == 10:
         if kind == b"VP8X":
@@ -135,13 +121,7 @@ def webp_size(data: bytes) -> tuple[int, int]:
 
 
 def webp(pixels: Array, width: int, height: int) -> bytes:
-    """A lossless WebP image.
-
-    Args:
-        pixels: (up to width * height, 3 or 4) uint8; the rest is filled with zeros.
-        width: pixels.
-        height: pixels.
-    """
+    """A lossless WebP image of pixels (up to width * height, 3 or 4), uint8; the rest is filled with zeros."""
     from PIL import Image
 
     full = np.zeros((height * width, pixels.shape[1]), np.uint8)

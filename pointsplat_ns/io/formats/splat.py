@@ -32,14 +32,7 @@ _ROW = np.dtype([("means", "<f4", 3), ("stds", "<f4", 3), ("rgba", "u1", 4), ("q
 
 
 def read_splat(path: Path | str) -> Gaussians:
-    """Read a ``.splat`` file.
-
-    Args:
-        path: the file.
-
-    Returns:
-        The scene, of SH degree 0, float32 on the CPU. Gaussians that cannot be drawn are dropped, and their number is
-        logged.
+    """Read a ``.splat`` file, as :func:`~pointsplat_ns.io.read_scene` does; the SH degree is 0.
 
     Raises:
         SceneError: if its size is not a multiple of 32 bytes, or it does not fit into memory.
@@ -76,13 +69,10 @@ def drawing_order(scene: Gaussians) -> Tensor:
 
 
 def encode_splat(scene: Gaussians, progress: Progress = silent) -> bytes:
-    """The bytes of a ``.splat`` file, in :func:`drawing_order`.
+    """The bytes of a ``.splat`` file of a scene, float32 on the CPU, in :func:`drawing_order`.
 
-    SH beyond the constant coefficient have no place in it; that they are left out is logged.
-
-    Args:
-        scene: N Gaussians, float32 on the CPU.
-        progress: not called.
+    SH beyond the constant coefficient have no place in it; that they are left out is logged. ``progress`` is not
+    called.
     """
     if scene.sh_degree:
         logger.warning(

@@ -16,7 +16,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
@@ -70,14 +69,8 @@ class _Head:
 
 
 def read_spz(path: Path | str) -> Gaussians:
-    """Read an SPZ file of version 2, 3 or 4. Of SH degree 4, the highest band is left out, which is logged.
-
-    Args:
-        path: the file.
-
-    Returns:
-        The scene, float32 on the CPU, with the axes of the file. Gaussians that cannot be drawn are dropped, and their
-        number is logged.
+    """Read an SPZ file of version 2, 3 or 4, as :func:`~pointsplat_ns.io.read_scene` does. The axes stay those of the
+    file. Of SH degree 4, the highest band is left out, which is logged.
 
     Raises:
         SceneError: if the file is of another kind or version, is truncated, or declares more than it can hold.
@@ -241,7 +234,8 @@ def _decode(head: _Head, parts: list[bytes | memoryview]) -> Gaussians:
 
 def _encode(scene: Gaussians, bits: int, sh_bits: tuple[int, int]) -> list[bytes]:
     """The attributes in the file's order."""
-    first, other = (_coarse(rest.numpy(), kept) for rest, kept in zip(_bands(scene), sh_bits, strict=True))
+    bands = scene.features_rest[:, :3], scene.features_rest[:, 3:]  # degree 1, and those above
+    first, other = (_coarse(rest.numpy(), kept) for rest, kept in zip(bands, sh_bits, strict=True))
     fixed = np.rint(np.ldexp(scene.means.double().numpy(), bits)).astype("<i4")
     largest, others = smallest_three(unit_quats(scene)[:, _XYZW])
     magnitudes = np.rint(np.abs(others) * 2**0.5 * 511).astype(np.uint32) | (others < 0).astype(np.uint32) << 9
@@ -254,11 +248,6 @@ def _encode(scene: Gaussians, bits: int, sh_bits: tuple[int, int]) -> list[bytes
         words.astype("<u4").tobytes(),
         np.concatenate([first, other], axis=1).tobytes(),
     ]
-
-
-def _bands(scene: Gaussians) -> tuple[Tensor, Tensor]:
-    """SH coefficients of degree 1, and those above."""
-    return scene.features_rest[:, :3], scene.features_rest[:, 3:]
 
 
 def _coarse(coefficients: Array, bits: int) -> Array:
