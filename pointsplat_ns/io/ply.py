@@ -29,9 +29,6 @@ _COLUMNS = {
 }
 """Vertex properties of the attributes; normals are written as zeros and not read."""
 
-_FILE_DEGREES = (0, 1, 2, 3, 4)
-"""SH degrees that files have. Of degree 4, the highest band is not read."""
-
 
 def read_ply(path: Path | str) -> Gaussians:
     """Read a 3DGS PLY: binary of either byte order, or ASCII; properties in any order and of any type.
@@ -56,7 +53,7 @@ def read_ply(path: Path | str) -> Gaussians:
         require_memory(path, vertex.count * 4 * (14 + 3 * k))  # float32 numbers
         _report_unread(header, vertex, path)
         if in_file > k:
-            logger.warning("%s: SH degree %d, read up to degree %d", path, _FILE_DEGREES[-1], MAX_SH_DEGREE)
+            logger.warning("%s: SH degree 4, read up to degree %d", path, MAX_SH_DEGREE)
         warn_render_mode(header, path)
         with _GaussiansAlone(path, header) as stream:
             # Binary rows are mapped, not read: only the Gaussians below take memory.
@@ -177,7 +174,7 @@ def _num_rest(vertex: Element, path: Path) -> int:
             f"{path}: lacks the vertex property 'scale_2', as 2D Gaussians (2DGS) do; expected 3D Gaussians"
         )
     rest = sorted(int(name[7:]) for name in present if re.fullmatch(r"f_rest_(0|[1-9]\d{0,5})", name))
-    counts = [3 * ((degree + 1) ** 2 - 1) for degree in _FILE_DEGREES]
+    counts = [3 * ((degree + 1) ** 2 - 1) for degree in range(5)]
     required = _column_names(rest[-1] + 1 if rest and rest[-1] + 1 in counts else 0)
     missing = [name for name in required if name not in present and name not in _COLUMNS["normals"]]
     if missing:
@@ -186,7 +183,7 @@ def _num_rest(vertex: Element, path: Path) -> int:
     if len(rest) not in counts:
         raise SceneError(
             f"{path}: has {len(rest)} f_rest properties; expected {', '.join(map(str, counts[:-1]))} or {counts[-1]} "
-            f"(SH degree 0 to {_FILE_DEGREES[-1]})"
+            "(SH degree 0 to 4)"
         )
     return len(rest) // 3
 

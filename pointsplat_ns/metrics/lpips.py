@@ -31,10 +31,6 @@ Net = Literal["alex", "vgg"]
 WEIGHTS_VARIABLE = "POINTSPLAT_LPIPS_WEIGHTS"
 """Environment variable: a folder with backbones under one of their usual names, or one file."""
 
-RETRY_AFTER_S = 600.0
-"""Seconds for which :func:`cached_lpips` remembers a failure: a download that times out at every evaluation step would
-take longer than the step."""
-
 
 class LpipsUnavailable(PointSplatError):
     """The weights of LPIPS, or torchvision, are not available; the message says why, in one line."""
@@ -48,7 +44,6 @@ class _Backbone:
     channels: tuple[int, ...]  # of those outputs
     minimum: int  # image side below which the last of them is empty
     files: tuple[str, ...]  # usual file names; the last is torchvision's own
-    url: str = "https://download.pytorch.org/models/"
 
 
 _BACKBONES: dict[str, _Backbone] = {
@@ -76,16 +71,13 @@ def empty_features(net: Net) -> nn.Sequential:
 
 
 class Lpips(nn.Module):
-    """The LPIPS network. It is frozen: its weights are non-persistent buffers, which move to a device
-    with a parent module but are neither among its parameters nor in its checkpoints.
+    """The LPIPS network. It is frozen: its weights are non-persistent buffers, which move to a device with a parent
+    module but are neither among its parameters nor in its checkpoints.
 
     Args:
         net: which backbone.
         backbone: its state dict, with keys ``features.N.weight`` and ``.bias``; others are ignored.
         linear: the state dict of the linear weights, with keys ``linN.model.1.weight`` (1, C, 1, 1).
-
-    Raises:
-        LpipsUnavailable: if a tensor is missing or of the wrong shape.
     """
 
     shift: Tensor
@@ -184,19 +176,12 @@ def load_lpips(net: Net = "alex", backbone: Path | str | None = None, download: 
 
 
 def cached_lpips(net: Net, device: torch.device | str) -> Lpips:
-    """LPIPS on a device, loaded at the first call and the same object afterwards.
+    """LPIPS on a device, loaded at the first call and the same object afterwards. Arguments and errors are those of
+    :func:`load_lpips`.
 
-    A failure is remembered as well, for ``RETRY_AFTER_S`` seconds or until another file is found or the environment
-    variable changes. So a download that timed out is not tried again at every step, and weights that appear are used at
-    the next call. A caller whose result must not change over time, such as a training loss, has to remember a failure
-    itself.
-
-    Args:
-        net: as for :func:`load_lpips`, which says where the weights come from.
-        device: device of the images.
-
-    Raises:
-        LpipsUnavailable: if the weights are not available.
+    A failure is remembered as well, for ten minutes or until another file is found or the environment variable changes.
+    So a download that timed out is not tried again at every step, and weights that appear are used at the next call. A
+    caller whose result must not change over time, such as a training loss, has to remember a failure itself.
     """
     place = (net, str(torch.device(device)), os.environ.get(WEIGHTS_VARIABLE), torch.hub.get_dir())
     with _cache_lock:
@@ -216,13 +201,8 @@ def cached_lpips(net: Net, device: torch.device | str) -> Lpips:
 
 
 class ReportedLpips:
-    """LPIPS for reports, which returns None instead of raising if LPIPS is not available.
-
-    Not a module, so that checkpoints of a model do not hold its weights.
-
-    Args:
-        net: as for :func:`load_lpips`.
-    """
+    """LPIPS for reports, which returns None instead of raising if LPIPS is not available. Not a module, so that
+    checkpoints of a model do not hold its weights."""
 
     def __init__(self, net: Net = "alex"):
         self.net = net
@@ -239,16 +219,12 @@ class ReportedLpips:
 
 
 _loaded: LRUCache[Hashable, Lpips] = LRUCache(maxsize=4)  # 10 MB for alex, 59 MB for vgg
-_failures: TTLCache[Hashable, str] = TTLCache(maxsize=16, ttl=RETRY_AFTER_S)
+_failures: TTLCache[Hashable, str] = TTLCache(maxsize=16, ttl=600.0)  # s
 _cache_lock = threading.Lock()
 
 
 def _torchvision_models() -> ModuleType:
-    """torchvision's networks.
-
-    Raises:
-        LpipsUnavailable: if torchvision is not installed, or was built for another torch.
-    """
+    """torchvision's networks; LpipsUnavailable if torchvision is not installed, or was built for another torch."""
     try:
         from torchvision import models
     except (ImportError, RuntimeError) as error:
@@ -259,10 +235,7 @@ def _torchvision_models() -> ModuleType:
 
 def _local_file(net: Net) -> Path | None:
     """The backbone's file on this machine: the one that the environment variable names, or torch hub's copy.
-
-    Raises:
-        LpipsUnavailable: if the variable names nothing that exists.
-    """
+    LpipsUnavailable if the variable names nothing that exists."""
     named = os.environ.get(WEIGHTS_VARIABLE)
     if named:
         place = Path(named).expanduser()
@@ -321,9 +294,8 @@ def _download(net: Net, target: Path, allowed: bool) -> None:
     socket.setdefaulttimeout(15.0)  # seconds without an answer
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        torch.hub.download_url_to_file(
-            _BACKBONES[net].url + target.name, str(target), target.stem.split("-")[-1], progress=False
-        )
+        url = f"https://download.pytorch.org/models/{target.name}"
+        torch.hub.download_url_to_file(url, str(target), target.stem.split("-")[-1], progress=False)
     except Exception as error:  # no route, no name, a proxy's page, a full disk: all mean no LPIPS
         reason = getattr(error, "reason", None) or getattr(error, "strerror", None) or error
         why = (str(reason).splitlines() or [type(error).__name__])[0][:100]

@@ -12,9 +12,6 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl, viewmats_to_opengl
 from pointsplat_ns.views import NEAR_PLANE, RasterizeMode, Views
 
-_NEAR_PLANE = "near_plane"
-"""Under this name the cameras' metadata hold the near planes (C, 1) in scene units, float64."""
-
 
 def cameras_of_views(views: Views) -> Cameras:
     """Views as nerfstudio cameras (C,), float32 on the CPU. Their poses are camera-to-world, in OpenGL axes.
@@ -24,18 +21,15 @@ def cameras_of_views(views: Views) -> Cameras:
     """
     poses, Ks = viewmats_to_opengl(views.viewmats.double().cpu()).float(), views.Ks.float().cpu()
     fx, fy, cx, cy = (Ks[:, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    metadata = {_NEAR_PLANE: torch.full((len(views), 1), views.near_plane, dtype=torch.float64)}
+    metadata = {"near_plane": torch.full((len(views), 1), views.near_plane, dtype=torch.float64)}
     kind = CameraType.PERSPECTIVE
     return Cameras(poses, fx, fy, cx, cy, views.width, views.height, camera_type=kind, metadata=metadata)
 
 
 def near_plane_of(cameras: Cameras) -> float:
-    """Near plane of cameras (C,), scene units; gsplat's if they do not come from :func:`cameras_of_views`.
-
-    Raises:
-        DataError: if they have several.
-    """
-    carried = (cameras.metadata or {}).get(_NEAR_PLANE)
+    """Near plane of cameras (C,), scene units; gsplat's if they do not come from :func:`cameras_of_views`. A DataError
+    if they have several."""
+    carried = (cameras.metadata or {}).get("near_plane")
     if carried is None or carried.numel() == 0:
         return NEAR_PLANE
     depths = carried.unique().tolist()
@@ -45,14 +39,11 @@ def near_plane_of(cameras: Cameras) -> float:
 
 
 def need_pinhole(camera: Cameras) -> None:
-    """Refuse to draw what a camera (1,) with a lens would see: a pinhole's picture is not that.
+    """Raise a DataError if a camera (1,) has a lens: a pinhole's picture is not what it sees.
 
     Datasets have none (:mod:`~pointsplat_ns.nerfstudio_plugin.undistorted`); camera paths of the viewer may. The viewer
     itself draws in a thread, which an error would end: there such a camera is previewed as a pinhole, as nerfstudio's
     Splatfacto does.
-
-    Raises:
-        DataError: if the camera is no pinhole.
     """
     kind = CameraType(int(camera.camera_type))
     if kind != CameraType.PERSPECTIVE and threading.current_thread() is threading.main_thread():
@@ -63,11 +54,8 @@ def need_pinhole(camera: Cameras) -> None:
 
 
 def views_of_cameras(cameras: Cameras, background: Tensor, rasterize_mode: RasterizeMode = "classic") -> Views:
-    """nerfstudio cameras (C,) as pinhole views on their device. Lens distortion is ignored.
-
-    Raises:
-        DataError: if the cameras have images of several sizes, or several near planes.
-    """
+    """nerfstudio cameras (C,) as pinhole views on their device. Lens distortion is ignored. A DataError if the cameras
+    have images of several sizes, or several near planes."""
     sizes = {(int(w), int(h)) for w, h in zip(cameras.width, cameras.height, strict=True)}
     if len(sizes) != 1:
         raise DataError(f"photos of {len(sizes)} sizes; expected one size for all views")

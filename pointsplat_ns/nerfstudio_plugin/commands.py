@@ -19,17 +19,9 @@ Options = Mapping[str, Any]
 def train_scene_command(
     data: Path, output: Path, name: str, steps: int, timestamp: str, seed_points: int, options: Options | None = None
 ) -> str:
-    """The command that trains a Splatfacto scene from a folder in the Replica layout.
-
-    Args:
-        data: the folder with photos, depth images and poses.
-        output: folder for all runs; this one goes to NAME/splatfacto-cpu/TIMESTAMP, see :func:`run_folder`.
-        name: name of the scene.
-        steps: training steps.
-        timestamp: name of the run's folder.
-        seed_points: number of points, taken from the depth images, that the scene starts from.
-        options: further options of ``ns-train splatfacto-cpu``.
-    """
+    """The command that trains a Splatfacto scene from a folder in the Replica layout. The run goes to
+    :func:`run_folder`. The scene starts from ``seed_points`` points of the depth images; ``options`` are further ones
+    of the method."""
     words = _train_words(SCENE_METHOD, output, name, steps, timestamp, options)
     return shlex.join([*words, "--data", str(data), "replica-data", "--num-seed-points", str(seed_points)])
 
@@ -43,30 +35,16 @@ def train_refiner_command(
     eval_scenes: tuple[str, ...] = (),
     options: Options | None = None,
 ) -> str:
-    """The command that trains a refiner on all scenes below a folder.
-
-    Args:
-        scenes: folder that contains the trained scenes.
-        output: folder for all runs; this one goes to NAME/pointsplat/TIMESTAMP, see :func:`run_folder`.
-        name: name of the training.
-        steps: training steps.
-        timestamp: name of the run's folder.
-        eval_scenes: names of scenes never to train on.
-        options: further options of ``ns-train pointsplat``.
-    """
+    """The command that trains a refiner on all scenes below the folder ``scenes``, but for those named in
+    ``eval_scenes``. The run goes to :func:`run_folder`; ``options`` are further ones of the method."""
     held_out = {"pipeline.datamanager.eval-scenes": eval_scenes} if eval_scenes else {}
     options = {"data": scenes, **held_out, **(options or {})}
     return shlex.join(_train_words(REFINER_METHOD, output, name, steps, timestamp, options))
 
 
 def evaluate_command(run: Path, evaluation: Path, pictures: Path) -> str:
-    """The command that evaluates a run on the held-out views of its scenes.
-
-    Args:
-        run: folder of the run.
-        evaluation: JSON file to write.
-        pictures: folder for images of all views.
-    """
+    """The command that evaluates a run on the held-out views of its scenes: the JSON file to write, and a folder for
+    images."""
     words = ["ns-eval", "--load-config", str(run / "config.yml"), "--output-path", str(evaluation)]
     return shlex.join([*words, "--render-output-path", str(pictures)])
 

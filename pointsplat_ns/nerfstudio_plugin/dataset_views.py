@@ -52,20 +52,9 @@ expected a nerfstudio run
 
 
 def dataset_photos(path: Path | str, split: Split, count: int) -> tuple[Views, list[Tensor]]:
-    """At most ``count`` photos of a run's dataset, evenly spread, and the views that they show once undistorted.
-
-    Args:
-        path: as for :func:`dataset_views`.
-        split: as for :func:`dataset_views`.
-        count: largest number of photos.
-
-    Returns:
-        C views on the CPU, and one photo (H, W, 3) in [0, 1] for each.
-
-    Raises:
-        SceneError: if ``path`` is not a run, or the run's data is missing.
-        DataError: if the poses or a photo are not usable, the split has none, or nerfstudio is not installed.
-    """
+    """At most ``count`` photos (H, W, 3) in [0, 1] of a run's dataset, evenly spread, and the views on the CPU that
+    they show once undistorted. Arguments and errors are those of :func:`dataset_views`; a photo that cannot be used is
+    a DataError."""
     scene, frames = _open(path, split)
     poses = _views_of(scene, frames, split)
     shown = [frames[index] for index in spread_indices(len(frames), count)]

@@ -40,18 +40,10 @@ class Frames:
     """The posed photos of one split of a dataset.
 
     ``frames[i]`` is ``(camera, data)``: a nerfstudio camera of shape (1,) without lens distortion, and a fresh
-    dictionary with ``image`` (H, W, 3 or 4; uint8 or float32 in [0, 1]), ``mask`` (H, W, 1) bool where the dataset
-    has masks, and ``image_idx``. So training and evaluation see the same pinhole camera whatever the lens. The tensors
-    are shared with the cache: do not write to them.
-
-    Args:
-        dataset: its cameras are read and never changed.
-        image_type: as nerfstudio's ``cache_images_type``.
-        cache: where decoded photos are kept; by default a cache of a quarter of the free memory.
-        max_workers: number of threads that decode ahead.
-
-    Raises:
-        DataError: when a photo or mask cannot be used, as the dataset says.
+    dictionary with ``image`` (H, W, 3 or 4; uint8 or float32 in [0, 1]), ``mask`` (H, W, 1) bool where the dataset has
+    masks, and ``image_idx``. So training and evaluation see the same pinhole camera whatever the lens. The tensors are
+    shared with the cache, which by default takes a quarter of the free memory: do not write to them. ``max_workers``
+    threads decode ahead. A photo or mask that cannot be used is a DataError.
     """
 
     def __init__(

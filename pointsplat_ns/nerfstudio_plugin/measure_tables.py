@@ -26,9 +26,6 @@ from pointsplat_ns.tables.scene import OpenedScene, TableOptions, TableScene
 from pointsplat_ns.tables.ways import PROTOCOL
 from pointsplat_ns.tradeoff.judging import JudgedViews
 
-TRAINING_PHOTOS = 60
-"""Largest number of photos that fine-tuning sees. All of them are in memory, at first in their full size."""
-
 
 def measure_tables(
     scenes: Sequence[str | Path],
@@ -114,11 +111,8 @@ def measure_tables(
 
 
 def _check_folder(folder: Path, scenes: Sequence[TableScene], force: bool) -> None:
-    """Check that tables may be written to a folder; with ``force``, remove older cells of the scenes.
-
-    Raises:
-        SceneError: if it is a file, or holds tables without the cells that they are of.
-    """
+    """Raise a SceneError if tables may not be written to a folder: it is a file, or holds tables without the cells that
+    they are of. With ``force``, older cells of the scenes are removed."""
     if folder.exists() and not folder.is_dir():
         raise SceneError(f"{folder}: is a file; expected the name of a folder")
     if force:
@@ -134,11 +128,8 @@ def _check_folder(folder: Path, scenes: Sequence[TableScene], force: bool) -> No
 
 
 def _grouped(scenes: Sequence[TableScene], groups: Sequence[str]) -> list[TableScene]:
-    """Scenes with the groups that the user wants.
-
-    Raises:
-        PointSplatError: if a group is not understood, or names an unknown scene.
-    """
+    """Scenes with the groups that the user wants; a PointSplatError if a group is not understood, or names an unknown
+    scene."""
     wanted: dict[str, str] = {}
     for text in groups:
         name, equals, members = text.partition("=")
@@ -183,8 +174,7 @@ def _looked_at(path: Path, options: TableOptions) -> tuple[JudgedViews, JudgedVi
         return None
     try:
         held_out = JudgedViews(*dataset_photos(path, "test", options.views), "held-out photos")
-        count = max(TRAINING_PHOTOS, options.scoring_views)
-        return held_out, JudgedViews(*dataset_photos(path, "train", count), "training photos")
+        return held_out, JudgedViews(*dataset_photos(path, "train", options.training_views), "training photos")
     except (SceneError, DataError) as error:
         logger.warning("%s: no photos to compare with: %s", path, error)
         return None
@@ -193,5 +183,4 @@ def _looked_at(path: Path, options: TableOptions) -> tuple[JudgedViews, JudgedVi
 def _sampled(source: ViewSource, options: TableOptions) -> tuple[JudgedViews, JudgedViews]:
     """Views alone, to judge in and to train on."""
     held_out = JudgedViews.compared(source, options.views)
-    training = source.views(max(TRAINING_PHOTOS, options.scoring_views))
-    return held_out, JudgedViews(training, None, source.origin)
+    return held_out, JudgedViews(source.views(options.training_views), None, source.origin)

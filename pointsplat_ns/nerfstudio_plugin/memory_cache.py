@@ -21,15 +21,8 @@ def free_memory_share(share: float = 0.25) -> int:
 
 
 class CacheKey(Generic[Value]):
-    """Base class of the keys of a :class:`MemoryCache`; its parameter is the type of the value.
-
-    Each kind of value has a key class of its own, a frozen dataclass, so that two kinds cannot be confused::
-
-        @dataclass(frozen=True)
-        class PhotoKey(CacheKey[Photo]):
-            dataset: str
-            index: int
-    """
+    """Base class of the keys of a :class:`MemoryCache`; its parameter is the type of the value. Each kind of value has
+    a key class of its own, a frozen dataclass, so that two kinds cannot be confused."""
 
 
 class _Entry(NamedTuple):
@@ -38,13 +31,8 @@ class _Entry(NamedTuple):
 
 
 class MemoryCache:
-    """A least-recently-used cache, bounded in bytes, for values of several kinds.
-
-    Safe to share among threads. Values are not copied: do not write to them.
-
-    Args:
-        max_bytes: bound on the total size of the values; 0 keeps nothing.
-    """
+    """A least-recently-used cache for values of several kinds, bounded in bytes; a bound of 0 keeps nothing. Safe to
+    share among threads. Values are not copied: do not write to them."""
 
     def __init__(self, max_bytes: int):
         self.max_bytes = max_bytes
@@ -63,13 +51,8 @@ class MemoryCache:
         return None if entry is None else entry.value
 
     def put(self, key: CacheKey[Value], value: Value, num_bytes: int) -> None:
-        """Store a value, and drop the least recently used ones until the bound holds.
-
-        Args:
-            key: key of the value; an earlier value of the same key is replaced.
-            value: not None.
-            num_bytes: size of the value. A value larger than the whole cache is not stored.
-        """
+        """Store a value, not None, and drop the least recently used ones until the bound holds. An earlier value of the
+        same key is replaced. A value larger than the whole cache is not stored."""
         with self._lock:
             self._entries.pop(key, None)
             if num_bytes <= self.max_bytes:

@@ -7,14 +7,11 @@ from typing import Any
 
 
 def load_specification(name: str, build: Callable[[], Any]) -> Any:
-    """A specification for nerfstudio's registry, or one line that says why there is none.
+    """What ``build`` returns for nerfstudio's registry, or one line that says why a method or dataparser could not be
+    loaded.
 
     nerfstudio does not guard the loading of entry points: one failing import would end every ``ns-*`` command. It does
     skip whatever is not a specification, and prints it in a warning.
-
-    Args:
-        name: name of the method or dataparser, as the user types it.
-        build: imports what the specification needs and returns it.
     """
     try:
         return build()

@@ -15,26 +15,14 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.nerfstudio_plugin.third_party_warnings import PYTHONWARNINGS
 
-SHORT_SPIN = {"GOMP_SPINCOUNT": "20000"}
-"""Lets waiting OpenMP threads spin for some microseconds, then sleep. By default they keep spinning, which on a busy
-machine slows the thread that they wait for. Threads that sleep at once (OMP_WAIT_POLICY=PASSIVE) wake too late."""
-
 
 class StoppedError(Exception):
     """Work in a thread that was stopped because the whole program is."""
 
 
 def finished(run: Path, steps: int, instead: str = "name another --output") -> bool:
-    """Whether the training in a run's folder has finished. Nothing is changed.
-
-    Args:
-        run: the folder, which need not exist.
-        steps: number of training steps that are wanted.
-        instead: advice to the user if a training of another number of steps has finished there.
-
-    Raises:
-        SceneError: if a training of another number of steps has finished there.
-    """
+    """Whether the training in a run's folder, which need not exist, has finished. A SceneError, with the advice
+    ``instead``, if a training of another number of steps has finished there."""
     done = _steps_if_finished(run)
     if done is not None and done != steps:
         wanted = f"expected one of {steps} or none"
@@ -44,11 +32,7 @@ def finished(run: Path, steps: int, instead: str = "name another --output") -> b
 
 def remove_interrupted(run: Path) -> None:
     """Remove the folder of an interrupted training, if there is one: the next training would leave its old checkpoints
-    beside the new ones.
-
-    Raises:
-        SceneError: if the training there has finished.
-    """
+    beside the new ones. A SceneError if the training there has finished."""
     if _steps_if_finished(run) is not None:
         raise SceneError(f"{run}: holds a finished training; expected an interrupted one or none; remove it yourself")
     shutil.rmtree(run, ignore_errors=True)
@@ -62,16 +46,14 @@ def _steps_if_finished(run: Path) -> int | None:
 
 
 def run(command: str, log: Path | None = None, threads: int | None = None, stop: threading.Event | None = None) -> None:
-    """Print a command and run it, with the program from this Python's environment.
-
-    If this is interrupted, the command is ended first.
+    """Print a command and run it, with the program from this Python's environment. If this is interrupted, the command
+    is ended first.
 
     Args:
         command: the command line.
         log: file for the command's output; by default the output is shown here.
         threads: number of threads that torch may use in it; by default torch decides.
-        stop: ends the command when it is set. Only the main thread is interrupted by Ctrl-C; it can stop commands that
-            run in other threads by this.
+        stop: ends the command when it is set, as Ctrl-C does in the main thread.
 
     Raises:
         PointSplatError: if the command fails.
@@ -80,7 +62,9 @@ def run(command: str, log: Path | None = None, threads: int | None = None, stop:
     print(f"\n$ {command}", flush=True)
     program, *arguments = shlex.split(command)
     beside = Path(sys.executable).parent / program
-    environment = {**SHORT_SPIN, "PYTHONWARNINGS": PYTHONWARNINGS, **os.environ}
+    # Waiting OpenMP threads spin for some microseconds, then sleep. By default they keep spinning, which on a busy
+    # machine slows the thread that they wait for. Threads that sleep at once (OMP_WAIT_POLICY=PASSIVE) wake too late.
+    environment = {"GOMP_SPINCOUNT": "20000", "PYTHONWARNINGS": PYTHONWARNINGS, **os.environ}
     if threads is not None:
         environment["OMP_NUM_THREADS"] = str(threads)
     words = [str(beside) if beside.exists() else program, *arguments]

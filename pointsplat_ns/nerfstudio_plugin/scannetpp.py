@@ -42,14 +42,8 @@ class SeededScanNetpp(ScanNetpp):
     config: SeededScanNetppDataParserConfig
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:  # type: ignore[override]
-        """See the base class.
-
-        Args:
-            split: "train" for ``frames``, "val" or "test" for ``test_frames``.
-
-        Raises:
-            DataError: if ``transforms.json`` or COLMAP's files cannot be used.
-        """
+        """See the base class. ``split`` is "train" for ``frames``, "val" or "test" for ``test_frames``. A DataError if
+        ``transforms.json`` or COLMAP's files cannot be used."""
         frames = self._frames()
         outputs = super()._generate_dataparser_outputs(split)
         if self.config.skip_bad:
@@ -113,12 +107,8 @@ class SeededScanNetpp(ScanNetpp):
 def _frame_of(folder: Path, poses: dict[str, np.ndarray]) -> np.ndarray:
     """The rigid motion (4, 4) from COLMAP's frame to that of poses, found from the photos that both know.
 
-    Args:
-        folder: COLMAP's.
-        poses: name of the photo -> camera-to-world (4, 4) in OpenGL axes.
-
-    Raises:
-        DataError: if they know no photo in common, or no motion takes all poses of the one to the other.
+    ``poses`` are camera-to-world (4, 4) in OpenGL axes by the name of the photo. A DataError if they know no photo in
+    common, or no motion takes all poses of the one to the other.
     """
     from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 
@@ -146,11 +136,7 @@ def _frame_of(folder: Path, poses: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _read(folder: Path, name: str) -> dict[int, Any]:
-    """One of COLMAP's files, by nerfstudio's readers.
-
-    Raises:
-        DataError: if it is missing or broken.
-    """
+    """One of COLMAP's files, by nerfstudio's readers; a DataError if it is missing or broken."""
     from nerfstudio.data.utils import colmap_parsing_utils as colmap
 
     readers = {

@@ -31,11 +31,7 @@ class SpiralSource(_Base):
 
     @cached_property  # one that the viewer, which reads every property of a datamanager, leaves alone
     def eval_dataloader(self) -> FixedIndicesEvalDataloader:
-        """Held-out cameras and photos, one at a time.
-
-        Raises:
-            DataError: if no frame is held out.
-        """
+        """Held-out cameras and photos, one at a time; a DataError if no frame is held out."""
         if not self.eval_dataset:
             raise DataError(
                 f"{self.get_datapath()}: no frame is held out, so there is no camera to start from; expected at least "

@@ -79,12 +79,8 @@ class StoppableTrainer(Trainer):
     """Whether it was stopped where a checkpoint can be saved."""
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """As nerfstudio's.
-
-        Raises:
-            PointSplatError: if the data cannot be used. The run folder, which then holds only the config, is removed
-                first.
-        """
+        """As nerfstudio's. If the data cannot be used, the run folder, which then holds only the config, is removed
+        before the PointSplatError."""
         if torch.device(self.device).type == "cpu":
             keep_freed_memory()
         try:
@@ -108,12 +104,7 @@ class StoppableTrainer(Trainer):
 
     def train(self) -> None:
         """As nerfstudio's, but Ctrl-C saves a checkpoint and ends ``ns-train`` with status 130. nerfstudio saves none
-        and ends with 0, as if it had finished.
-
-        Raises:
-            SystemExit: if it is interrupted.
-            PointSplatError: if the number of threads is below 1.
-        """
+        and ends with 0, as if it had finished. A PointSplatError if the number of threads is below 1."""
         with fixed_threads(self.config.threads), self._signals_noted():
             try:
                 super().train()
@@ -144,11 +135,8 @@ class StoppableTrainer(Trainer):
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """As nerfstudio's, but a checkpoint is whole before it is there, and holds :meth:`state_to_resume`.
-
-        Raises:
-            SceneError: if it cannot be written, as on a full disk; older ones are left alone.
-        """
+        """As nerfstudio's, but a checkpoint is whole before it is there, and holds :meth:`state_to_resume`. If it
+        cannot be written, as on a full disk, older ones are left alone, and a SceneError says so."""
         pipeline = getattr(self.pipeline, "module", self.pipeline)
         content: dict[str, Any] = {
             "step": step,

@@ -29,10 +29,6 @@ class UndistortedDataset(InputDataset):
     ``cameras`` (C,) are pinholes. They differ in size and intrinsics from ``lens_cameras``, which took the photos,
     where these have a lens.
 
-    Args:
-        dataparser_outputs: as nerfstudio's.
-        scale_factor: as nerfstudio's: the resolution, times this.
-
     Raises:
         DataError: if a pose or an intrinsic is NaN or infinite, or a lens cannot be undone; when a photo is read that
             is missing, broken, not the size that its camera says, or not of 8 bits a channel, or whose mask is.
@@ -45,12 +41,8 @@ class UndistortedDataset(InputDataset):
         self.cameras = self._pinholes()
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """As nerfstudio's: ``image`` (H, W, 3 or 4), uint8 or float32 in [0, 1], ``mask`` (H, W, 1) bool where the
-        dataset has masks, and ``image_idx``; of the pinhole camera.
-
-        Raises:
-            DataError: as the class says.
-        """
+        """As nerfstudio's, of the pinhole camera: ``image`` (H, W, 3 or 4), uint8 or float32 in [0, 1], ``mask`` (H, W,
+        1) bool where the dataset has masks, and ``image_idx``."""
         path = self.image_filenames[image_idx]
         try:
             _need_eight_bits(path)
@@ -122,17 +114,8 @@ def _has_lens(cameras: Cameras) -> Tensor:
 def _undistorted(
     camera: Cameras, path: Path, image: np.ndarray, data: dict[str, Any]
 ) -> tuple[np.ndarray, np.ndarray, Tensor | None]:
-    """Intrinsics (3, 3), photo and mask of the pinhole camera that is left of a camera (1,) and its photo.
-
-    Args:
-        camera: with a lens.
-        path: the photo's.
-        image: (H, W) or (H, W, 3 or 4).
-        data: what nerfstudio has of the photo; only its mask is read.
-
-    Raises:
-        DataError: if the lens cannot be undone.
-    """
+    """Intrinsics (3, 3), photo and mask of the pinhole camera that is left of a camera (1,) with a lens and its photo
+    (H, W) or (H, W, 3 or 4). Of ``data`` only the mask is read. A DataError if the lens cannot be undone."""
     single = camera.reshape(())
     distortion = np.zeros(6, np.float32) if single.distortion_params is None else single.distortion_params.numpy()
     try:

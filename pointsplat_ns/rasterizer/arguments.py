@@ -20,11 +20,8 @@ def check_tensors(
     sh_degree: int | None,
     backgrounds: Tensor | None,
 ) -> None:
-    """Check shapes. Values are left alone: looking at them would have to wait for the device.
-
-    Raises:
-        ValueError: if a shape does not fit; the text names the argument.
-    """
+    """Raise a ValueError that names the argument if a shape does not fit. Values are left alone: looking at them would
+    have to wait for the device."""
     n, c = (tensor.shape[0] if tensor.dim() else 0 for tensor in (means, viewmats))
     wanted = {
         "means": (means, (n, 3)),
@@ -89,11 +86,7 @@ def check_options(
     quality: str | Quality,
     memory_budget: int,
 ) -> None:
-    """Check numbers and names.
-
-    Raises:
-        ValueError: if one has no meaning; the text names the argument.
-    """
+    """Raise a ValueError that names the argument if a number or name has no meaning."""
     if not (hasattr(width, "__index__") and hasattr(height, "__index__") and width >= 1 and height >= 1):
         raise ValueError(f"image is {width} x {height} pixels; expected whole numbers, at least 1 x 1")
     if not 0 <= near_plane < far_plane:  # NaN fails too, here and below

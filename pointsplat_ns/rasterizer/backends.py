@@ -22,12 +22,8 @@ def gsplat_works() -> bool:
 
 
 def use_gsplat(backend: str, device: torch.device) -> bool:
-    """Whether ``backend`` ("gsplat" or "auto") means gsplat for tensors on ``device``.
-
-    Raises:
-        ValueError: if there is no such backend.
-        PointSplatError: if gsplat is asked for and cannot be used.
-    """
+    """Whether ``backend`` ("gsplat" or "auto"; others are a ValueError) means gsplat for tensors on ``device``. A
+    PointSplatError if gsplat is asked for and cannot be used."""
     if backend not in ("gsplat", "auto"):
         raise ValueError(f"backend is {backend!r}; expected torch, gsplat or auto")
     usable = device.type == "cuda" and gsplat_works()

@@ -54,11 +54,8 @@ class Drawing:
 
     @torch.no_grad()
     def draw(self, region: Region) -> Tensor:
-        """The pixels of some tiles, colours in [0, 1] over the view's background: (h, w, 3), cut at the image's edge.
-
-        Args:
-            region: rectangle of tiles in the image, not empty.
-        """
+        """The pixels of a rectangle of tiles, not empty, colours in [0, 1] over the view's background: (h, w, 3), cut
+        at the image's edge."""
         seen = self._seen
         image, through = Blend.apply(
             seen.means2d, seen.cov2d, seen.det, seen.opacities, self._colors, self._footprints, region, False,

@@ -108,15 +108,8 @@ def _enlarged(picture: Tensor, view: View) -> Tensor:
 
 
 def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
-    """Depth and alpha of each pixel of a view.
-
-    Args:
-        scene: N Gaussians, on any device; the images are rendered there.
-        view: the camera.
-
-    Returns:
-        Expected depth (H, W) along the camera's z axis, scene units, and alpha (H, W) in [0, 1].
-    """
+    """Expected depth (H, W) along the camera's z axis, scene units, and alpha (H, W) in [0, 1], of each pixel of a
+    view. The images are rendered on the scene's device."""
     with suitable_threads(scene.device):
         colors = scene.means  # any: only depths are rendered
         depth, alpha = _rasterized(scene, view, colors, render_mode="ED")
@@ -124,16 +117,9 @@ def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
 
 
 def pixels_of(scene: Gaussians, view: View) -> Tensor:
-    """Visible pixels of each Gaussian: the sum over the pixels of a picture of its blending weight, which is its alpha
-    times the transmittance in front of it. It is the gradient of the sum of the picture by the colour.
-
-    Args:
-        scene: N Gaussians, on any device.
-        view: the camera.
-
-    Returns:
-        (N,), at least float32; 0 where the view does not show it.
-    """
+    """Visible pixels of each Gaussian, (N,), at least float32: the sum over the pixels of a picture of its blending
+    weight, which is its alpha times the transmittance in front of it. It is the gradient of the sum of the picture by
+    the colour, and 0 where the view does not show the Gaussian."""
     scene = scene.detach().to(torch.promote_types(scene.dtype, torch.float32))
     colors = torch.zeros_like(scene.means[:, :1]).requires_grad_()
     with suitable_threads(scene.device), torch.enable_grad():

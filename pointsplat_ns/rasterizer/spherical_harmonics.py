@@ -141,17 +141,6 @@ class Color(torch.autograd.Function):
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Basis values for unit directions.
-
-    Args:
-        directions: (M, 3) unit vectors, world space.
-        degree: 0 to 3.
-
-    Returns:
-        (M, (degree + 1)^2)
-
-    Raises:
-        ValueError: if the degree is not 0 to 3.
-    """
+    """Basis values (M, (degree + 1)^2) for unit directions (M, 3), world space, and a degree of 0 to 3."""
     check_degree(degree)
     return torch.stack(_basis_rows(directions.movedim(-1, 0), degree), dim=-1)

@@ -79,11 +79,7 @@ class Transform:
 
 def random_transform(generator: torch.Generator | None = None) -> Transform:
     """A random transform: a rotation (half of the time about z, as most scenes have z up), a reflection or none, gains
-    and order of the colour channels.
-
-    Args:
-        generator: on the CPU; torch's own by default.
-    """
+    and order of the colour channels."""
     upright, mirrored = (torch.rand(2, generator=generator) < torch.tensor([0.5, 0.5])).tolist()
     quat = torch.randn(4, generator=generator, dtype=torch.float64)
     if upright:
@@ -102,17 +98,11 @@ def _directions() -> tuple[Tensor, Tensor]:
 
 
 def sh_matrix(matrix: Tensor, degree: int) -> Tensor:
-    """The matrix that rotates the coefficients of one SH band, for a rotation of directions by ``matrix``.
+    """The matrix (2 degree + 1, 2 degree + 1), float64, that rotates the coefficients of one SH band of degree 1 to 3,
+    for a rotation of directions by an orthogonal ``matrix`` (3, 3), float64.
 
     The coefficients ``c'`` of the rotated function satisfy ``Y(d) c' = Y(matrix^T d) c`` for every direction ``d``.
     They are found by least squares over fixed directions; the solution is exact, as rotations preserve bands.
-
-    Args:
-        matrix: (3, 3) float64, orthogonal.
-        degree: degree of the band, 1 to 3.
-
-    Returns:
-        (2 degree + 1, 2 degree + 1) float64, orthogonal.
     """
     directions, basis = _directions()
     band = slice(degree**2, (degree + 1) ** 2)

@@ -14,9 +14,6 @@ from typing import Any, Literal
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE
 
-CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
-"""Space-filling curves for the serialization of points."""
-
 FINE_BITS = 16
 """Bits per axis of the finest position code. Every grid of the network is coarser."""
 
@@ -112,10 +109,9 @@ class RefinerConfig:
                 _require(c % h == 0, f"{part}: {c} channels do not divide into {h} heads")
         for s in self.strides:
             _require(s & (s - 1) == 0, f"strides holds {s}; expected powers of two")
-        unknown = [c for c in self.curves if c not in CURVES]
-        _require(
-            bool(self.curves) and not unknown, f"curves is {self.curves}; expected names out of {', '.join(CURVES)}"
-        )
+        curves = ("z", "z-trans", "hilbert", "hilbert-trans")
+        known = bool(self.curves) and all(curve in curves for curve in self.curves)
+        _require(known, f"curves is {self.curves}; expected names out of {', '.join(curves)}")
         _require(0 <= self.sh_degree <= MAX_SH_DEGREE, f"sh_degree is {self.sh_degree}; expected 0 to {MAX_SH_DEGREE}")
         _require(self.encoder in ("dual", "concat"), f"encoder is {self.encoder!r}; expected 'dual' or 'concat'")
         _require(

@@ -56,32 +56,19 @@ class FeedbackRefiner(nn.Module):
         self.mlp = nn.Sequential(*layers, last)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Factors of the steps, (N, 6), above 0, in the order of :data:`PARAMETERS`.
-
-        Args:
-            features: (N, :data:`FEATURES`).
-        """
+        """Factors of the steps, (N, 6), above 0, in the order of :data:`PARAMETERS`, from features (N,
+        :data:`FEATURES`)."""
         bound = self.MAX_LOG_FACTOR
         return (bound * torch.tanh(self.mlp(features) / bound)).exp()
 
 
 def save_feedback_refiner(network: FeedbackRefiner, path: Path | str, metadata: dict[str, Any] | None = None) -> None:
-    """Write a network.
-
-    Args:
-        network: on any device.
-        path: the .safetensors file to write or replace; its folder is created if missing.
-        metadata: anything JSON can hold: data, command, steps, results.
-    """
+    """Write a network, with metadata, which may be anything that JSON can hold: data, command, steps, results."""
     write_tensors(path, network.state_dict(), {"format": FORMAT, "metadata": json.dumps(metadata or {})})
 
 
 def read_feedback_refiner(path: Path | str = PRETRAINED, device: torch.device | str = "cpu") -> FeedbackRefiner:
-    """Read a network, in evaluation mode; by default the shipped one.
-
-    Raises:
-        WeightsError: if the file is missing, damaged or of another kind.
-    """
+    """Read a network, in evaluation mode; by default the shipped one. A WeightsError if the file is none."""
     path, network = Path(path), FeedbackRefiner()
     with opened_weights(path, FORMAT, "a feedback refiner") as (file, _):
         state = checked_tensors(file, network.state_dict(), path)

@@ -57,15 +57,12 @@ class UnitCube:
 
 
 def unit_cube(means: Tensor) -> UnitCube:
-    """The unit cube of a scene.
+    """The unit cube of at least one finite position (N, 3), scene units.
 
     The core of the scene is the box of its positions without the outermost 1 % at each end of each axis (at least one
     position, from 8 positions on). The box of all positions is cut to the core plus half of the core's longest side in
     each direction. A scene without outliers keeps its full extent; an outlier at most doubles it. The cube has the
     centre and the longest side of the cut box, or side 1 where that is zero.
-
-    Args:
-        means: finite positions, at least one.  # [N, 3] scene units
     """
     axes = means.detach().T.contiguous()  # [3, N]
     n = axes.shape[1]
@@ -122,18 +119,12 @@ def gaussian_features(scene: Gaussians, cube: UnitCube, num_rest: int, dtype: to
 
 
 def canonical_quats(quats: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit quaternions of one sign, and their signed lengths.
+    """Unit quaternions (N, 4) of one sign, and their signed lengths (N, 1), of finite wxyz of any length.
 
     A quaternion and its negative are the same rotation; the first non-zero component of the result is positive.
     Quaternions shorter than :data:`~pointsplat_ns.geometry.quaternions.SHORTEST` become the identity, with a length of
     1. Components are divided by the largest before squaring, so that 1e-30 does not underflow and 1e30 does not
     overflow.
-
-    Args:
-        quats: finite wxyz of any length.  # [N, 4]
-
-    Returns:
-        unit quaternions [N, 4] and signed lengths [N, 1], with ``quats = unit * length`` for nonzero ones.
     """
     quats = zero_as_identity(quats)
     largest = quats.abs().amax(dim=1, keepdim=True).detach()

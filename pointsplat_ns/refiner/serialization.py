@@ -17,20 +17,14 @@ from pointsplat_ns.geometry.morton import interleave, spread_bits
 
 
 def curve_codes(coords: Tensor, bits: int, curves: Sequence[str]) -> list[Tensor]:
-    """Codes along named curves.
+    """Codes (N,) in ``[0, 8**bits)`` along each named curve, int64.
 
     Args:
         coords: integer coordinates, each at least 0 and below ``2**bits``.  # [N, 3] int64
         bits: bits per axis, at most 20.
         curves: ``z`` for the z-order (Morton) curve, which interleaves the bits of the three axes; ``hilbert`` for the
             Hilbert curve, whose consecutive cells always share a face; or either with ``-trans``: the same curve with x
-            and y exchanged.
-
-    Returns:
-        per curve, codes in ``[0, 8**bits)``.  # [N] int64
-
-    Raises:
-        ValueError: if there is no such curve.
+            and y exchanged. Others are a ValueError.
     """
     if not 1 <= bits <= 20:
         raise ValueError(f"{bits} bits per axis; expected 1 to 20, so that a code fits an int64")

@@ -122,10 +122,8 @@ def build_structure(scene: Gaussians, config: RefinerConfig) -> Structure:
 
 
 def neighbour_pairs(cells: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Existing neighbours of distinct cells in the 3x3x3 kernel.
-
-    Args:
-        cells: distinct integer coordinates from 0 to 2^20, at least one.  # [M, 3] int64
+    """Existing neighbours of distinct cells in the 3x3x3 kernel, of integer coordinates (M, 3) from 0 to 2^20, at least
+    one.
 
     Returns:
         per offset of :data:`HALF_KERNEL`, the indices ``i`` and ``j`` of all pairs with

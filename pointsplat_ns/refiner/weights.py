@@ -26,13 +26,8 @@ class WeightsError(PointSplatError):
 
 
 def save_refiner(refiner: Refiner, path: str | Path, metadata: dict[str, Any] | None = None) -> None:
-    """Write a refiner's configuration, parameters and running statistics.
-
-    Args:
-        refiner: on any device, of any floating type.
-        path: file to write or replace; its folder is created if missing.
-        metadata: anything JSON can hold: data, command, steps, results.
-    """
+    """Write a refiner's configuration, parameters and running statistics, with metadata, which may be anything that
+    JSON can hold: data, command, steps, results."""
     header = {
         "format": FORMAT,
         "config": json.dumps(refiner.config.to_dict()),
@@ -60,11 +55,7 @@ def read_refiner(path: str | Path, device: torch.device | str = "cpu") -> Refine
 
 def checked_tensors(file: Any, expected: dict[str, torch.Tensor], path: Path) -> dict[str, torch.Tensor]:
     """The tensors of an opened file. Their names, shapes and kinds of numbers are compared with ``expected`` before
-    memory is allocated.
-
-    Raises:
-        WeightsError: if they do not fit, or are not finite.
-    """
+    memory is allocated. A WeightsError if they do not fit, or are not finite."""
     names = sorted(file.keys())
     found = {name: file.get_slice(name) for name in names}
     wrong = [name for name in sorted({*expected, *found}) if _shape(expected, name) != _shape(found, name)]
@@ -85,11 +76,7 @@ def checked_tensors(file: Any, expected: dict[str, torch.Tensor], path: Path) ->
 
 
 def read_metadata(path: str | Path) -> dict[str, Any]:
-    """The metadata of a file written by :func:`save_refiner`.
-
-    Raises:
-        WeightsError: if the file is missing, damaged or of another kind.
-    """
+    """The metadata of a file written by :func:`save_refiner`. Errors are those of :func:`read_refiner`."""
     path = Path(path)
     with opened_weights(path, FORMAT, "refiner weights") as (_, header):
         return _json(header, "metadata", path)
@@ -97,18 +84,11 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
 
 @contextmanager
 def opened_weights(path: Path, expected_format: str, what: str) -> Iterator[tuple[Any, dict[str, str]]]:
-    """Open a file of weights, and read its header only.
-
-    Args:
-        path: the .safetensors file.
-        expected_format: expected text of the header's entry "format".
-        what: noun for the content, for errors.
-
-    Yields:
-        The opened file and the texts of its header.
+    """Open a file of weights, and read its header only: the opened file, and the texts of its header. ``what`` is the
+    noun for its content in errors.
 
     Raises:
-        WeightsError: if the file is missing, damaged or of another kind.
+        WeightsError: if the file is missing, damaged or of another kind than ``expected_format``.
     """
     from safetensors import SafetensorError, safe_open
 

@@ -10,18 +10,12 @@ from pointsplat_ns.rooms.room import Room
 
 
 def capture_path(room: Room, frames: int, seed: int) -> Tensor:
-    """Camera poses on a walk of two rounds through a room: the first looks across it, the second to both sides.
+    """Camera poses (F, 4, 4) on a walk of two rounds through a room: the first looks across it, the second to both
+    sides. float32, camera-to-world, OpenCV axes, z of the world up, metres.
 
-    Height and pitch vary on the way. Positions keep at least 0.3 m from all surfaces: 1.05 m from walls, which is more
-    than furniture as high as the camera is deep, and above all that stands in the middle.
-
-    Args:
-        room: the room.
-        frames: number of poses, F.
-        seed: decides the start of the walk, its direction and the phases of height and pitch.
-
-    Returns:
-        (F, 4, 4) float32 camera-to-world, OpenCV axes, z of the world up, metres.
+    Height and pitch vary on the way; the seed decides where the walk starts, which way it goes, and how they vary.
+    Positions keep at least 0.3 m from all surfaces: 1.05 m from walls, which is more than furniture as high as the
+    camera is deep, and above all that stands in the middle.
 
     Example:
         >>> from pointsplat_ns.rooms import make_room

@@ -15,8 +15,6 @@ from pointsplat_ns.rooms.render import default_intrinsics, render_room
 from pointsplat_ns.rooms.room import make_room
 from pointsplat_ns.system.progress import Progress, tracked
 
-DEPTH_SCALE = 6553.5  # raw counts per metre, as in Replica's files: 10 m fill 16 bits
-
 
 def is_written(folder: Path, frames: int, width: int, height: int) -> bool:
     """Whether a folder holds a room of such photos. As rooms get their names when they are complete, it then is."""
@@ -74,10 +72,11 @@ def write_room(
         room = make_room(seed)
         poses = capture_path(room, frames, seed)
         K = default_intrinsics(width, height)
+        counts = 6553.5  # of depth a metre, as in Replica's files: 10 m fill 16 bits
         for number in tracked(range(frames), f"Room {seed}", frames, progress):
             rgb, depth = render_room(room, poses[number], K, width, height)
             pixels = (rgb * 255).round().to(torch.uint8).numpy()
-            raw = (depth * DEPTH_SCALE).round().clamp(0, 65534).numpy().astype(np.uint16)
+            raw = (depth * counts).round().clamp(0, 65534).numpy().astype(np.uint16)
             # Without chroma subsampling: coloured edges stay sharp.
             Image.fromarray(pixels).save(partial / "results" / f"frame{number:06d}.jpg", quality=97, subsampling=0)
             Image.fromarray(raw).save(partial / "results" / f"depth{number:06d}.png", compress_level=1)
@@ -91,7 +90,7 @@ def write_room(
             "fy": float(K[1, 1]),
             "cx": width / 2 - 0.5,
             "cy": height / 2 - 0.5,
-            "scale": DEPTH_SCALE,
+            "scale": counts,
         }
         (partial / "cam_params.json").write_text(json.dumps({"camera": camera}, indent=1) + "\n", encoding="utf-8")
         os.replace(partial, folder)

@@ -100,15 +100,8 @@ def identity(scene: TableScene, options: TableOptions, machine: str) -> dict[str
 
 
 class CellJournal:
-    """The cells of one scene, written as soon as they are measured.
-
-    Args:
-        folder: folder of all tables; the scene has a folder in it.
-        name: name of the scene.
-
-    Raises:
-        SceneError: if the scene's journal cannot be read.
-    """
+    """The cells of one scene, in its folder in the folder of all tables, written as soon as they are measured. A
+    SceneError if the scene's journal cannot be read."""
 
     def __init__(self, folder: Path, name: str):
         self.path = folder / name / CELLS
@@ -122,34 +115,19 @@ class CellJournal:
             self.cells = {(cell.way, cell.point.share): cell for cell in cells}
 
     def check(self, wanted: Mapping[str, str | int]) -> None:
-        """Check that new cells of an identity are comparable with the existing ones.
-
-        Raises:
-            SceneError: if those are of another scene, other views or another machine.
-        """
+        """Raise a SceneError if existing cells are of another scene, other views or another machine than ``wanted``."""
         if self._of:
             FORM.check(self.path, self._of, wanted)
 
     def add(self, cell: Cell, about: About, of: Mapping[str, str | int]) -> None:
-        """Add a cell, or replace an older one, and write all cells.
-
-        Args:
-            cell: the cell.
-            about, of: facts on the scene for the reader, and its identity.
-
-        Raises:
-            SceneError: if they cannot be written.
-        """
+        """Add a cell, or replace an older one, and write all cells, with facts on the scene for the reader and its
+        identity."""
         self.about, self._of = about, {**of, **vars(about)}
         self.cells[(cell.way, cell.point.share)] = cell
         FORM.write(self.path, self._of, list(self.cells.values()))
 
     def regroup(self, group: str) -> None:
-        """Move a scene with cells to another group.
-
-        Raises:
-            SceneError: if the journal cannot be written.
-        """
+        """Move a scene with cells to another group."""
         if self.about is not None and self.about.group != group:
             self.about = dataclasses.replace(self.about, group=group)
             self._of |= vars(self.about)
@@ -171,11 +149,8 @@ def _counts(values: Tensor, bins: int, span: tuple[float, float]) -> tuple[int, 
 
 
 def _cell(values: dict[str, Any]) -> Cell:
-    """The inverse of :func:`dataclasses.asdict` for a cell.
-
-    Raises:
-        ValueError, TypeError, KeyError: if the values are not those of a cell.
-    """
+    """The inverse of :func:`dataclasses.asdict` for a cell. Errors are those of Python if the values are not those of a
+    cell."""
     bins = {name: None if values[name] is None else tuple(values[name]) for name in ("opacities", "volumes")}
     cell = Cell(**{**values, **bins, "point": restored_point(values["point"])})
     check_types(cell)

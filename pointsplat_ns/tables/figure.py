@@ -40,11 +40,7 @@ def densities(group: Group, way: str, share: float) -> tuple[np.ndarray, np.ndar
 
 
 def plot_figure(groups: Sequence[Group], path: Path) -> None:
-    """Draw Figure 4, a row for each group.
-
-    Raises:
-        SceneError: if the file cannot be written.
-    """
+    """Draw Figure 4, a row for each group."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 3.6 * len(groups)), layout="constrained")

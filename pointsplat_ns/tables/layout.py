@@ -44,13 +44,8 @@ class Table:
 
 
 class Layout:
-    """Makes the tables of a group.
-
-    Args:
-        group: the scenes.
-        shares: shares in Tables 1 and 2; the shares of measured cells are added.
-        missing: reasons for missing cells, by key.
-    """
+    """Makes the tables of a group. ``shares`` are those in Tables 1 and 2, to which the shares of measured cells are
+    added; ``missing`` has the reasons for missing cells, by key."""
 
     def __init__(self, group: Group, shares: Sequence[float], missing: Mapping[str, str]):
         self.group, self.missing = group, missing
@@ -153,12 +148,7 @@ class Layout:
 
 
 def figure_medians(group: Group, medians: Mapping[str, tuple[float, float]]) -> Table:
-    """The medians of Figure 4 as a table.
-
-    Args:
-        group: the scenes.
-        medians: medians of opacity and of log10 of the volume, by name of the way.
-    """
+    """The medians of Figure 4, of opacity and of log10 of the volume by name of the way, as a table."""
     rows = tuple(
         (way.label, f"{medians[way.name][0]:.2f}", f"{medians[way.name][1]:.1f}")
         for way, _ in FIGURE_4

@@ -23,13 +23,8 @@ from pointsplat_ns.tradeoff.settings import DENSE, EFFORTS, Setting
 
 
 class Tools:
-    """The tools of cells besides the package: weights and splat-transform, searched for when first needed.
-
-    Args:
-        options: options of the measurement.
-        refiners: weights to choose from.
-        program: splat-transform's path; by default npx searches it.
-    """
+    """The tools of cells besides the package: weights, and splat-transform, which npx searches by default, when first
+    needed."""
 
     def __init__(self, options: TableOptions, refiners: Refiners, program: str | None = None):
         self.options, self.refiners, self.program = options, refiners, program
@@ -40,12 +35,7 @@ class Tools:
         return SplatTransform(self.program)
 
     def missing(self, way: Way, share: float, scene: str) -> str:
-        """The reason why a cell cannot be measured; empty if it can.
-
-        Args:
-            way, share: the cell.
-            scene: name of the scene.
-        """
+        """The reason why a cell, of a way, a share and a scene's name, cannot be measured; empty if it can."""
         if way.mode is not None:
             if self.peer.missing:
                 return f"splat-transform cannot be run ({self.peer.missing})"
@@ -78,13 +68,7 @@ class Tools:
 
 
 class Maker:
-    """Makes the scenes of one scene's cells. Scores are computed once for all budgets, which changes no result.
-
-    Args:
-        scene: the opened scene.
-        name: name of the scene.
-        tools: weights and programs.
-    """
+    """Makes the scenes of one scene's cells. Scores are computed once for all budgets, which changes no result."""
 
     def __init__(self, scene: OpenedScene, name: str, tools: Tools):
         self.scene, self.name, self.tools = scene, name, tools

@@ -28,18 +28,10 @@ READING = (
 
 
 def write_tables(folder: Path, shares: Sequence[float], missing: Mapping[str, str]) -> list[Group]:
-    """Write the tables of all scenes with cells in a folder.
+    """Write the tables of all scenes with cells in a folder, which has a folder for each; returns the scenes in groups.
 
-    Args:
-        folder: has a folder for each scene.
-        shares: shares of Table 1, for rows without measurements.
-        missing: reasons for missing cells, by key.
-
-    Returns:
-        The scenes in groups.
-
-    Raises:
-        SceneError: if a journal cannot be read, there is no journal, or a file cannot be written.
+    ``shares`` are those of Table 1, for rows without measurements; ``missing`` has reasons for missing cells, by key. A
+    SceneError if a journal cannot be read, there is none, or a file cannot be written.
     """
     groups = read_groups(folder)
     tables = {group.name: Layout(group, shares, missing).tables() for group in groups}

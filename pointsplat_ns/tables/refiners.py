@@ -48,29 +48,15 @@ class Weights:
 
 
 class Refiners:
-    """Weights to choose from.
-
-    Args:
-        paths: as for :func:`pointsplat_ns.load_refiner`.
-
-    Raises:
-        WeightsError, SceneError: if a path has no refiner.
-    """
+    """Weights to choose from; paths and errors are those of :func:`pointsplat_ns.load_refiner`."""
 
     def __init__(self, paths: Sequence[Path]):
         self.all = tuple(map(_read, paths))
 
     def find(self, network: Network, share: float, scene: str) -> tuple[Weights | None, str]:
-        """The weights for a row, or the reason for none.
-
-        Of several, the weights with the training budget nearest to ``share`` are taken, by ratio. Weights trained on
-        the scene itself are excluded.
-
-        Args:
-            network: the needed network.
-            share: share of the Gaussians kept.
-            scene: name of the scene.
-        """
+        """The weights for a row (the needed network, a share of the Gaussians, the name of a scene), or the reason for
+        none. Of several, those with the training budget nearest to ``share`` are taken, by ratio. Weights trained on
+        the scene itself are excluded."""
         fitting = [weights for weights in self.all if weights.network == network]
         unseen = [weights for weights in fitting if scene not in weights.trained_on]
         if unseen:

@@ -64,6 +64,11 @@ class TableOptions:
                 raise PointSplatError(f"{name.replace('_', ' ')}: {getattr(self, name)}; expected at least 1")
 
     @property
+    def training_views(self) -> int:
+        """Largest number of views for fine-tuning and scoring. Their photos are in memory, at first in full size."""
+        return max(60, self.scoring_views)
+
+    @property
     def words(self) -> list[str]:
         """The options that are not defaults, as words of the command."""
         usual = vars(TableOptions())

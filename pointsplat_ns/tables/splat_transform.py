@@ -26,18 +26,11 @@ class Reducer:
     """The command line for a PLY to read, a number of Gaussians, and a PLY to write."""
 
     def reduce(self, source: Path, count: int, timeout: float | None = None) -> tuple[Gaussians, Usage]:
-        """Run the program on a PLY.
-
-        Args:
-            source: the PLY; no file is left beside it.
-            count: number of Gaussians to keep.
-            timeout: time limit of the program, seconds.
-
-        Returns:
-            The smaller scene, and the cost with reading and writing.
+        """Run the program on a PLY, to keep ``count`` Gaussians: the smaller scene, and the cost with reading and
+        writing. No file is left beside the PLY.
 
         Raises:
-            ProgramFailed: if the program fails, takes too long or writes no file.
+            ProgramFailed: if the program fails, takes longer than ``timeout`` seconds or writes no file.
             SceneError: if its file cannot be read.
         """
         with tempfile.TemporaryDirectory(dir=source.parent) as folder:

@@ -146,11 +146,8 @@ FIGURE_4 = (
 
 
 def all_cells(shares: Sequence[float]) -> list[tuple[Way, float]]:
-    """Every way and share of all tables, each once, in the order of measurement: quick ones first.
-
-    Args:
-        shares: shares of Table 1.
-    """
+    """Every way and share of all tables, those of Table 1 given, each once, in the order of measurement: quick ones
+    first."""
     ablations = dict.fromkeys([*(way for _, way in TABLE_3), *TABLE_4])
     cells = [(DENSE_WAY, 1.0), *((way, PROTOCOL.ablation_share) for way in ablations)]
     cells += [(way, share) for way in (*GEOMETRY_DRIVEN, *OURS, *IMAGE_DRIVEN, *PEERS) for share in shares]

@@ -61,11 +61,6 @@ def _latex_line(row: Row) -> str:
 
 
 def latex_document(tables: Sequence[Table], about: Sequence[str]) -> str:
-    """All tables, for ``\\input``.
-
-    Args:
-        tables: in their order.
-        about: lines of text for comments at the beginning.
-    """
+    """All tables, for ``\\input``, with lines of text as comments at the beginning."""
     head = [f"% {' '.join(line.split())}" for line in about]
     return "\n".join([*head, r"% needs \usepackage{booktabs}", "", *map(latex_table, tables)])

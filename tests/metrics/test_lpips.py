@@ -12,9 +12,8 @@ import torch
 
 from making import SHARED_DATA
 from making import noisy_pair as pair
-from pointsplat_ns.metrics import ImageError
+from pointsplat_ns.metrics import ImageError, lpips
 from pointsplat_ns.metrics.lpips import (
-    RETRY_AFTER_S,
     WEIGHTS_VARIABLE,
     Lpips,
     LpipsUnavailable,
@@ -174,7 +173,7 @@ def test_a_parent_model_neither_trains_it_nor_saves_it(alex):
 def clock(monkeypatch):
     """Empty caches, and the time that failures are remembered by, in a list of one number."""
     now = [0.0]
-    failures = cachetools.TTLCache(16, ttl=RETRY_AFTER_S, timer=lambda: now[0])
+    failures = cachetools.TTLCache(16, ttl=lpips._failures.ttl, timer=lambda: now[0])
     monkeypatch.setattr("pointsplat_ns.metrics.lpips._failures", failures)
     monkeypatch.setattr("pointsplat_ns.metrics.lpips._loaded", cachetools.LRUCache(4))
     return now
@@ -191,7 +190,7 @@ def test_cached_lpips_is_loaded_once_for_each_device_and_gives_what_load_lpips_g
 
 def test_a_failed_download_is_tried_again_later_and_not_at_every_call(clock, nowhere):
     texts = set()
-    for clock[0], times in ((0.0, 1), (1.0, 1), (RETRY_AFTER_S - 1, 1), (RETRY_AFTER_S + 1, 2)):
+    for clock[0], times in ((0.0, 1), (1.0, 1), (599.0, 1), (601.0, 2)):
         with pytest.raises(LpipsUnavailable) as caught:
             cached_lpips("alex", "cpu")
         texts.add(str(caught.value))

@@ -3,8 +3,9 @@ import itertools
 import pytest
 import torch
 
-from pointsplat_ns.refiner.config import CURVES
 from pointsplat_ns.refiner.serialization import curve_codes
+
+CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
 
 
 def full_grid(side: int) -> torch.Tensor:

@@ -42,8 +42,7 @@ _BOUNDS = tuple(
     for name in names
 )
 _BITS_3 = ((21, 11), (11, 10), (0, 11))  # shift and number of bits of each of three numbers in a word
-_BITS_4 = ((24, 8), (16, 8), (8, 8), (0, 8))
-_SH_STEPS, _SH_RANGE = 256, 8.0
+_BITS_4 = ((24, 8), (16, 8), (8, 8))  # of four numbers; the last is opacity
 
 
 def is_compressed(header: Header) -> bool:
@@ -98,10 +97,10 @@ def encode_compressed_ply(scene: Gaussians, progress: Progress = silent) -> byte
         _pack(shares[0], _BITS_3),
         rotation,
         _pack(shares[1], _BITS_3),
-        _pack(shares[2], _BITS_4[:3]) | opacity,
+        _pack(shares[2], _BITS_4) | opacity,
     )
     rest = scene.features_rest.transpose(1, 2).flatten(1).double().numpy()
-    sh = np.clip(np.floor((rest / _SH_RANGE + 0.5) * _SH_STEPS), 0, _SH_STEPS - 1).astype(np.uint8)
+    sh = np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)  # of [-4, 4]
     packed = np.stack(words, axis=1).astype("<u4")
     return b"".join((_header_text(n, rest.shape[1]), chunks.tobytes(), packed.tobytes(), sh.tobytes()))
 
@@ -173,14 +172,14 @@ def _decode(chunk: Array, vertex: Array, sh: Array | None, rest: int) -> Gaussia
     for i in range(3 * rest if sh is not None else 0):
         assert sh is not None
         level = sh[f"f_rest_{i}"].astype(np.float32)
-        share = np.where(level == 0, 0.0, np.where(level == 255, 1.0, (level + 0.5) / _SH_STEPS))
-        coefficients[:, i % rest, i // rest] = (share - 0.5) * _SH_RANGE
+        share = np.where(level == 0, 0.0, np.where(level == 255, 1.0, (level + 0.5) / 256))
+        coefficients[:, i % rest, i // rest] = (share - 0.5) * 8
     return scene_of(
         between(position, _BITS_3, _BOUNDS[:6]),
         between(scale, _BITS_3, _BOUNDS[6:12]),
         from_smallest_three(tops, others),
         logits_of_bytes(color & 255),
-        dc_of_shares(between(color, _BITS_4[:3], _BOUNDS[12:])),
+        dc_of_shares(between(color, _BITS_4, _BOUNDS[12:])),
         coefficients,
     )
 

@@ -62,10 +62,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
 
     def set_timestamp(self) -> None:
         """As nerfstudio's; of processes that ``torchrun`` started, which are connected here, all take the first one's.
-
-        Raises:
-            PointSplatError: if nerfstudio is to start several processes on a CPU, which it cannot.
-        """
+        A PointSplatError if nerfstudio is to start several processes on a CPU, which it cannot."""
         kind, number = self.machine.device_type, self.machine.num_devices
         if kind != "cuda" and number > 1:
             raise PointSplatError(
@@ -91,9 +88,6 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
 
         A resumed run, and its schedules, end ``max_num_iterations`` after the step that it resumes from: a run stopped
         at 500 of 2,000 steps and resumed for 1,500 continues exactly as if it had not been stopped.
-
-        Raises:
-            PointSplatError: if ``rate_factor`` is not a finite number above 0.
         """
         if not 0 < self.rate_factor < math.inf:  # NaN fails too
             raise PointSplatError(f"--rate-factor {self.rate_factor:g}: expected a finite number above 0")

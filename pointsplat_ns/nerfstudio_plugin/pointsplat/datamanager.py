@@ -71,11 +71,9 @@ class ScenesDataManager(SpiralSource):
     """Hands out, at each step, one scene and some of its training photos.
 
     The scene and photos of a step depend only on the seed and the step, so that a resumed training continues as if it
-    had not been stopped. Of W processes, process R takes the places R, W + R, 2 W + R... of one sequence: together
-    they see what one process sees in W times the steps.
-
-    Raises:
-        SceneError: if ``data`` holds no trained run, or ``eval_scenes`` names one that is not there.
+    had not been stopped. Of W processes, process R takes the places R, W + R, 2 W + R... of one sequence: together they
+    see what one process sees in W times the steps. A SceneError if ``data`` holds no trained run, or ``eval_scenes``
+    names one that is not there.
     """
 
     config: ScenesDataManagerConfig
@@ -135,11 +133,8 @@ class ScenesDataManager(SpiralSource):
 
     @cached_property  # one that the viewer, which reads every property of a datamanager, leaves alone
     def train_dataparser_outputs(self) -> DataparserOutputs:
-        """File names of the training photos of the shown scene, or of its renders, for ``ns-render dataset``.
-
-        Raises:
-            AttributeError: in a training, whose trainer would save the transform of this one scene as that of the run.
-        """
+        """File names of the training photos of the shown scene, or of its renders, for ``ns-render dataset``. In a
+        training there is none: its trainer would save the transform of this one scene as that of the run."""
         if self.test_mode != "test":
             raise AttributeError("train_dataparser_outputs")
         return self.training_frames(self.shown).dataset._dataparser_outputs

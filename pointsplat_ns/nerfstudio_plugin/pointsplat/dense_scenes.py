@@ -32,9 +32,6 @@ from pointsplat_ns.views import RasterizeMode
 
 Split = Literal["train", "test"]
 
-_FINGERPRINT_BYTES = 1 << 16
-"""Bytes read at each end of a PLY file for its fingerprint."""
-
 
 @dataclass(frozen=True)
 class DenseKey(CacheKey[Gaussians]):
@@ -124,11 +121,8 @@ class DenseScene:
         return dense
 
     def cameras(self, split: Split) -> Cameras:
-        """Pinhole cameras (C,) sampled in free space, different ones for each split.
-
-        Raises:
-            DataError: if nothing of the scene is visible, or no free position is found.
-        """
+        """Pinhole cameras (C,) sampled in free space, different ones for each split. A DataError if nothing of the
+        scene is visible, or no free position is found."""
         poses = self._poses
         seed = random.Random(f"{poses.seed} poses {split}").getrandbits(31)
         count = poses.train if split == "train" else poses.test
@@ -174,24 +168,18 @@ class PlyScene(DenseScene):
     @cached_property
     def identity(self) -> str:
         """The name, and a fingerprint of the file's size and of the bytes at both ends."""
-        size = self.source.stat().st_size
+        size, read = self.source.stat().st_size, 1 << 16
         with self.source.open("rb") as stream:
-            content = stream.read(_FINGERPRINT_BYTES)
-            stream.seek(max(0, size - _FINGERPRINT_BYTES))
+            content = stream.read(read)
+            stream.seek(max(0, size - read))
             content += stream.read()
         return f"{self.name}/ply {hashlib.sha256(content + str(size).encode()).hexdigest()[:16]}"
 
 
 class RenderedFrames(Sequence[tuple[Cameras, dict[str, Any]]]):
-    """Renders of a dense scene, computed when they are needed and kept while the cache has room.
-
-    ``frames[i]`` is ``(camera, data)`` as in :class:`~pointsplat_ns.nerfstudio_plugin.frames.Frames`.
-
-    Args:
-        scene: the scene to render.
-        split: the split whose cameras are used.
-        image_type: images rounded to integers in [0, 255], or floats in [0, 1].
-    """
+    """Renders of a dense scene from the cameras of a split, computed when they are needed and kept while the cache has
+    room: integers in [0, 255], or floats in [0, 1]. ``frames[i]`` is ``(camera, data)`` as in
+    :class:`~pointsplat_ns.nerfstudio_plugin.frames.Frames`."""
 
     def __init__(self, scene: DenseScene, split: Split, image_type: Literal["uint8", "float32"]):
         self._scene, self._split, self.image_type = scene, split, image_type

@@ -13,15 +13,8 @@ from pointsplat_ns.system.processes import world_size
 
 
 def means_over_ranks(values: dict[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
-    """Mean of each named scalar over the processes that have it, without gradient.
-
-    Args:
-        values: this process's scalars by name, on its device. Only those in ``names`` are used.
-        names: the same in every process.
-
-    Returns:
-        The means of the names that this process has.
-    """
+    """Mean of each named scalar over the processes that have it, without gradient, for the names that this process has.
+    ``names`` are the same in every process; ``values`` are this process's, on its device."""
     present = [name for name in names if name in values]
     if world_size() == 1:
         return {name: values[name].detach() for name in present}

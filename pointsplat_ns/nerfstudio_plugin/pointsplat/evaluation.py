@@ -16,6 +16,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
@@ -60,11 +61,9 @@ def evaluate_scene(
         model: renders the variants; must be in evaluation mode.
         scene: gives the background and the rasterize mode.
         variants: the scene's variants by name, on the model's device.
-        frames: cameras of shape (1,) and their photos.
-        count: number of frames, for the progress bar.
+        frames, count: cameras of shape (1,) and their photos, and their number, for the progress bar.
         lpips: computes LPIPS. If it fails for one view, the scene has no LPIPS.
         picture_folder: folder for an image of every view; None writes none.
-        progress: show a progress bar.
 
     Raises:
         DataError: if there is no photo.
@@ -89,7 +88,7 @@ def evaluate_scene(
                 values[name]["lpips"].append(float(distance))
         picture = torch.cat(pictures, dim=1)
         if picture_folder is not None:
-            _write_picture(picture, picture_folder / f"{scene.name}_{views:04d}.png")
+            write_picture(picture, picture_folder / f"{scene.name}_{views:04d}.png")
         views += 1
     if views == 0:
         raise DataError(
@@ -134,14 +133,8 @@ def summarize(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
 
 
 def summarize_by_reference(reports: list[SceneReport], has_photos: list[bool], with_std: bool) -> dict[str, Any]:
-    """As :func:`summarize`, with separate means for scenes compared with photos and scenes compared with renders of the
-    dense scene.
-
-    Args:
-        reports: reports of all scenes.
-        has_photos: for each scene, whether it was compared with photos.
-        with_std: add the standard deviation of the refined scenes' metrics over photos.
-    """
+    """As :func:`summarize`, with separate means for scenes compared with photos (``has_photos``, one for each report)
+    and scenes compared with renders of the dense scene."""
     names = {True: "photos", False: "dense renders"}
     parts = {
         photos: summarize([r for r, kind in zip(reports, has_photos, strict=True) if kind == photos], with_std)
@@ -187,10 +180,3 @@ def _now(device: torch.device) -> float:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
-
-
-def _write_picture(picture: Tensor, path: Path) -> None:
-    from PIL import Image
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray((255 * picture).round().to(torch.uint8).cpu().numpy()).save(path)

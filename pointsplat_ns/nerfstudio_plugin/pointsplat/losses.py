@@ -24,13 +24,8 @@ LOSSES = (*PIXEL_LOSSES, "lpips")
 
 
 class PhotoLoss:
-    """A pixel loss plus weighted LPIPS. If LPIPS cannot be computed, the pixel loss alone.
-
-    Args:
-        pixel_loss: one of :data:`PIXEL_LOSSES`.
-        lpips_weight: weight of LPIPS; 0 leaves it out.
-        lpips_net: network of LPIPS; "auto" is VGG on CUDA and AlexNet elsewhere.
-    """
+    """A pixel loss, one of :data:`PIXEL_LOSSES`, plus weighted LPIPS. If LPIPS cannot be computed, the pixel loss
+    alone. The network "auto" is VGG on CUDA and AlexNet elsewhere."""
 
     def __init__(self, pixel_loss: str, lpips_weight: float, lpips_net: Literal["auto", "alex", "vgg"]):
         self._pixel_loss, self._weight, self._net = pixel_loss, lpips_weight, lpips_net
@@ -38,14 +33,8 @@ class PhotoLoss:
         """Why LPIPS is left out of the loss; None while it is part of it."""
 
     def __call__(self, pairs: list[tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
-        """The terms of the loss; the loss is their sum.
-
-        Args:
-            pairs: renders and photos, each (H, W, 3) in [0, 1].
-
-        Returns:
-            Means over the pairs, by name: the pixel loss and the weighted ``lpips``.
-        """
+        """The terms of the loss, which is their sum, by name: the pixel loss and the weighted ``lpips``, as means over
+        pairs of renders and photos, each (H, W, 3) in [0, 1]."""
         pixel_loss = PIXEL_LOSSES[self._pixel_loss]
         losses = {self._pixel_loss: torch.stack([pixel_loss(render - photo) for render, photo in pairs]).mean()}
         distances: list[Tensor] = []

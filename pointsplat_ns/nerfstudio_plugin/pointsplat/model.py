@@ -86,11 +86,8 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     """Read by ``ns-export``: above 0, colours are SH coefficients. A scene may have any degree."""
 
     def prune_settings(self, keep: float | None = None) -> PruneSettings:
-        """How scenes are pruned; ``keep`` is the config's own by default.
-
-        Raises:
-            PointSplatError: if the settings fit no scene.
-        """
+        """How scenes are pruned; ``keep`` is the config's own by default. A PointSplatError if the settings fit no
+        scene."""
         return PruneSettings(self.keep if keep is None else keep, self.by, self.opacity_weight)
 
     def network_options(self) -> dict[str, Any]:
@@ -103,11 +100,7 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
         }
 
     def check(self) -> None:
-        """Refuse settings that fit no scene, and options that would have no effect.
-
-        Raises:
-            PointSplatError: if there is one.
-        """
+        """Raise a PointSplatError for settings that fit no scene, and for options that would have no effect."""
         for keep in (self.keep, *self.more_keeps):
             self.prune_settings(keep)
         if not 0 <= self.lpips_weight < math.inf:  # NaN fails too
@@ -133,11 +126,8 @@ class PointSplatModel(SplatfactoModel):
     config: PointSplatModelConfig  # type: ignore[assignment]  # Splatfacto's options would have no effect here
 
     def populate_modules(self) -> None:
-        """Build the network. The Gaussians of scenes are not parameters of the model.
-
-        Raises:
-            PointSplatError: if the config is not valid.
-        """
+        """Build the network. The Gaussians of scenes are not parameters of the model. A PointSplatError if the config
+        is not valid."""
         self.config.check()
         self.refiner = Refiner(preset(self.config.size, **self.config.network_options()))
         self.crop_box: OrientedBox | None = None
@@ -157,11 +147,8 @@ class PointSplatModel(SplatfactoModel):
         return PrunedScenes(cache, self.config.pruned_folder, self.refiner.prepare)
 
     def load_state_dict(self, dict, **kwargs):  # type: ignore[override]
-        """Load the network's weights. Splatfacto's own method would look for Gaussians.
-
-        Raises:
-            SceneError: if the weights are those of another network. nerfstudio would load the part that fits.
-        """
+        """Load the network's weights. Splatfacto's own method would look for Gaussians. A SceneError if the weights are
+        those of another network; nerfstudio would load the part that fits."""
         self._refined = None
         try:
             return torch.nn.Module.load_state_dict(self, dict, **{**kwargs, "strict": True})
@@ -181,16 +168,8 @@ class PointSplatModel(SplatfactoModel):
         return self.refiner.parameter_groups()
 
     def pruned_scene(self, index: int, dense: Gaussians | None = None, keep: float | None = None) -> PrunedScene:
-        """A pruned scene and its neighbour tables.
-
-        Args:
-            index: index of the scene.
-            dense: its Gaussians, if they have been read already.
-            keep: amount to keep; by default the config's.
-
-        Raises:
-            PointSplatError: if the settings do not fit this scene.
-        """
+        """A pruned scene and its neighbour tables, by its index. ``dense`` are its Gaussians, if they have been read
+        already; ``keep`` is by default the config's. A PointSplatError if the settings do not fit this scene."""
         return self._pruned.get(self.scenes[index], self.config.prune_settings(keep), self.device, dense)
 
     def refine(self, index: int) -> Gaussians:
@@ -224,12 +203,8 @@ class PointSplatModel(SplatfactoModel):
         return refined, time.perf_counter() - start
 
     def draw(self, gaussians: Gaussians, scene: DenseScene, camera: Cameras) -> dict[str, Tensor]:
-        """Render a scene with its background and rasterize mode.
-
-        Args:
-            gaussians: what to render, on the model's device.
-            scene: gives the background and the rasterize mode.
-            camera: of shape (1,), on the model's device.
+        """Render Gaussians with a scene's background and rasterize mode, from a camera of shape (1,), all on the
+        model's device.
 
         Returns:
             ``rgb`` (H, W, 3) in [0, 1], ``accumulation`` (H, W, 1), ``background`` (H, W, 3), and in evaluation
@@ -274,11 +249,7 @@ class PointSplatModel(SplatfactoModel):
         return self.draw(gaussians, self.scenes[self.shown], camera)
 
     def losses(self, index: int, frames: list[tuple[Cameras, dict]]) -> tuple[dict, dict[str, Tensor], dict]:
-        """Refine a scene and compare its renders with photos.
-
-        Args:
-            index: index of the scene.
-            frames: cameras of shape (1,) and their photos.
+        """Refine a scene, by its index, and compare its renders with photos from their cameras of shape (1,).
 
         Returns:
             Outputs of the last photo's camera; the losses (pixel loss and weighted LPIPS, averaged over the photos);

@@ -42,11 +42,8 @@ class PointSplatPipelineConfig(VanillaPipelineConfig):
 
 
 class PointSplatPipeline(VanillaPipeline):
-    """Each step prunes and refines one scene and renders it from some of its training cameras.
-
-    Raises:
-        SceneError: if ``--data`` holds no scene, or ``world_size`` processes are not connected.
-    """
+    """Each step prunes and refines one scene and renders it from some of its training cameras. A SceneError if
+    ``--data`` holds no scene, or ``world_size`` processes are not connected."""
 
     datamanager: ScenesDataManager
     config: PointSplatPipelineConfig
@@ -102,16 +99,13 @@ class PointSplatPipeline(VanillaPipeline):
         return self._model  # type: ignore[return-value]
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict, dict]:
-        """Losses of one scene at some of its training photos.
+        """Outputs of the last photo's camera, losses and metrics of one scene at some of its training photos.
 
         Random numbers (the order of serialization curves, dropped paths) depend only on the seed and on the scene's
         place in the sequence, as does the choice of scene and photos. So a resumed training continues as if it had not
         been stopped. Several processes take turns in that sequence. The values of their losses and metrics are means
-        over processes; the gradients are each process's own.
-
-        Returns:
-            Outputs of the last photo's camera; losses; and metrics. The metric ``faults`` is a list of texts, one for
-            each loss of this process that is not finite.
+        over processes; the gradients are each process's own. The metric ``faults`` is a list of texts, one for each
+        loss of this process that is not finite.
         """
         place = self.datamanager.place(step)
         torch.manual_seed(random.Random(f"{self.config.datamanager.seed} network {place}").getrandbits(63))

@@ -63,17 +63,8 @@ class PrunedScenes:
         device: torch.device | str,
         dense: Gaussians | None = None,
     ) -> PrunedScene:
-        """A pruned scene and its neighbour tables.
-
-        Args:
-            scene: the scene to prune.
-            settings: how to prune it.
-            device: device of the network.
-            dense: the scene's Gaussians, if they have been read already.
-
-        Raises:
-            PointSplatError: if the settings do not fit this scene; the message names it.
-        """
+        """A pruned scene and its neighbour tables, on the network's device. ``dense`` are the scene's Gaussians, if
+        they have been read already. A PointSplatError that names the scene if the settings do not fit it."""
         key = PrunedKey(scene.name, settings)
         if self._latest is None or self._latest[0] != key:
             pruned = self._cache.get(key)

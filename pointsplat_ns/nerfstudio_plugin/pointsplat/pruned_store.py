@@ -17,15 +17,8 @@ FORMAT = "pointsplat-pruned/1"
 
 
 def stored_path(folder: Path, name: str, content: str, settings: PruneSettings) -> Path:
-    """The path of a pruned scene's file.
-
-    Args:
-        folder: folder of all pruned scenes.
-        name: name of the scene, for people who look into the folder.
-        content: SHA-256 of the file that the dense scene is read from. A scene that is trained again has another one,
-            even under the same name.
-        settings: how the scene is pruned.
-    """
+    """The path of a pruned scene's file, by the SHA-256 of the file that the dense scene is read from and by how it is
+    pruned: a scene that is trained again has another one. The name is for people who look into the folder."""
     described = json.dumps([FORMAT, content, dataclasses.asdict(settings)], sort_keys=True)
     return folder / f"{file_stem(name)}-{hashlib.sha256(described.encode()).hexdigest()[:16]}.safetensors"
 
@@ -37,11 +30,8 @@ def write_pruned(path: Path, pruned: Gaussians, dense_count: int, seconds: float
 
 
 def read_pruned(path: Path) -> tuple[Gaussians, int, float]:
-    """Read a file of :func:`write_pruned`: the scene on the CPU, the dense count and the seconds.
-
-    Raises:
-        SceneError: if the file is damaged or of another kind.
-    """
+    """The scene on the CPU, the dense count and the seconds of a file of :func:`write_pruned`. A SceneError if the file
+    is damaged or of another kind."""
     from safetensors import SafetensorError, safe_open
 
     try:

@@ -90,14 +90,8 @@ def refiner_command(scenes: Path, output: Path, name: str, timestamp: str, size:
 
 
 def card_text(about: dict[str, Any], results: dict[str, Any], command: str, parameters: int) -> str:
-    """A model card in Markdown.
-
-    Args:
-        about: metadata of the weights.
-        results: results of ``ns-eval``.
-        command: the command that trained the refiner.
-        parameters: number of the network's parameters.
-    """
+    """A model card in Markdown, of the metadata of the weights, the results of ``ns-eval``, the command that trained
+    the refiner, and the number of the network's parameters."""
     rows = []
     for name, scene in results["scenes"].items():
         if not scene["seen_in_training"]:

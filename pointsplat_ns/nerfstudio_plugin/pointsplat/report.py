@@ -11,9 +11,6 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.results import VARIANTS, read_ev
 PHOTOS = "photos"
 """The reference of evaluations that name none."""
 
-NAMES = {PHOTOS: "held-out photos", "dense renders": "the dense scenes' own renders"}
-"""Texts for the table, by reference."""
-
 
 def report(evaluation: str | Path, html: str | Path | None = None) -> None:
     """Print the results that ``ns-eval`` wrote for a ``pointsplat`` run: dense, pruned and refined scenes side by side.
@@ -68,7 +65,7 @@ def _parts(results: dict[str, Any]) -> list[dict[str, Any]]:
 def _reference(part: dict[str, Any]) -> str:
     """Text that says what a part was compared with."""
     reference = part.get("reference", PHOTOS)
-    return NAMES.get(reference, reference)
+    return {PHOTOS: "held-out photos", "dense renders": "the dense scenes' own renders"}.get(reference, reference)
 
 
 def _settings(results: dict[str, Any]) -> str:

@@ -9,11 +9,9 @@ from typing import Any, NamedTuple
 from pointsplat_ns.nerfstudio_plugin.pointsplat.results import VARIANTS
 from pointsplat_ns.pages.html import page
 
-CHARTS = (("psnr", "PSNR, dB", 2), ("ssim", "SSIM", 3), ("lpips", "LPIPS, less is better", 3))
-"""What is drawn: a value of each variant, its title, digits to show."""
 COLUMNS = (("psnr", "PSNR dB", 2), ("ssim", "SSIM", 3), ("lpips", "LPIPS", 3), ("gaussians", "splats", 0),
            ("megabytes", "MB", 2), ("fps", "fps", 1))  # fmt: skip
-"""What the table has: a value of each variant, the column's title, digits to show."""
+"""Columns of the table: a value of each variant, the title, digits to show."""
 
 
 class Block(NamedTuple):
@@ -34,7 +32,7 @@ class Block(NamedTuple):
         return f"{self.name} (never seen)" if self.seen == "never" else self.name
 
 
-def write_report_page(title: str, settings: str, parts: list[tuple[str, list[Block]]], note: str, output: Path) -> Path:
+def write_report_page(title: str, settings: str, parts: list[tuple[str, list[Block]]], note: str, output: Path) -> None:
     """Write one self-contained HTML file with charts and a table of every scene and variant.
 
     Args:
@@ -43,19 +41,14 @@ def write_report_page(title: str, settings: str, parts: list[tuple[str, list[Blo
         parts: what the scenes were compared with, and the scenes.
         note: a line for the reader; empty for none.
         output: the file to write.
-
-    Returns:
-        ``output``.
-
-    Raises:
-        SceneError: if the file cannot be written.
     """
     from pointsplat_ns.io.files import replacing
 
+    charts = (("psnr", "PSNR, dB", 2), ("ssim", "SSIM", 3), ("lpips", "LPIPS, less is better", 3))
     shown = [
         {
             "reference": reference,
-            "charts": [chart for name, text, digits in CHARTS if (chart := _chart(name, text, digits, blocks))],
+            "charts": [chart for name, text, digits in charts if (chart := _chart(name, text, digits, blocks))],
             "rows": [_rows(block) for block in blocks],
         }
         for reference, blocks in parts
@@ -66,7 +59,6 @@ def write_report_page(title: str, settings: str, parts: list[tuple[str, list[Blo
     )
     with replacing(output) as part:
         part.write_text(text, encoding="utf-8")
-    return output
 
 
 def _chart(name: str, title: str, digits: int, blocks: list[Block]) -> dict[str, Any] | None:
@@ -104,10 +96,8 @@ def _ticks(low: float, high: float) -> list[float]:
 
 def _rows(block: Block) -> dict[str, Any]:
     """A block for the table: one row of texts for each variant."""
-    cells = {
-        variant: [_number(_value(values[column]), digits) for column, _, digits in COLUMNS]
-        for variant, values in ((variant, block.variants[variant]) for variant in VARIANTS)
-    }
+    values = block.variants
+    cells = {v: [_number(_value(values[v][name]), digits) for name, _, digits in COLUMNS] for v in VARIANTS}
     return {"name": block.title, "cells": cells}
 
 

@@ -15,19 +15,11 @@ VARIANTS = ("dense", "pruned", "refined")
 """The variants of each scene that an evaluation compares."""
 
 
-MAX_BYTES = 1 << 26
-"""An evaluation has about 2 kB a scene."""
-
-
 def read_evaluation(path: Path) -> dict[str, Any]:
-    """The results in a file that ``ns-eval`` wrote for a pointsplat run.
-
-    Raises:
-        DataError: if the file is missing or is not such an evaluation.
-    """
+    """The results in a file that ``ns-eval`` wrote for a pointsplat run; a DataError if it is none."""
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ValueError(f"more than {MAX_BYTES} bytes")
+        if path.stat().st_size > 1 << 26:  # an evaluation has about 2 kB a scene
+            raise ValueError("too large")
         results = json.loads(path.read_text("utf-8"))["results"]
         _check(results)
         json.dumps(results, ensure_ascii=False).encode("utf-8")  # halves of characters could not be shown
@@ -39,11 +31,8 @@ def read_evaluation(path: Path) -> dict[str, Any]:
 
 
 def _check(results: dict[str, Any]) -> None:
-    """Check all that :mod:`~pointsplat_ns.nerfstudio_plugin.pointsplat.report` shows.
-
-    Raises:
-        ValueError, KeyError, TypeError, AttributeError, OverflowError: if something is missing or of another type.
-    """
+    """Check all that :mod:`~pointsplat_ns.nerfstudio_plugin.pointsplat.report` shows. Errors are those of Python where
+    something is missing or of another type."""
     blocks = list(results["scenes"].values())
     if not blocks:
         raise ValueError("no scene")

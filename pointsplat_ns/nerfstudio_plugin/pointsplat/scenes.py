@@ -36,10 +36,7 @@ def dataparser_of(run: Run) -> DataParser:
     """The dataparser that a run was trained with, with the same settings.
 
     Only classes that nerfstudio or an installed plugin registers are used: the name in the run's file is looked up
-    among them and is never imported.
-
-    Raises:
-        SceneError: if the dataparser is not installed or does not know a setting.
+    among them and is never imported. A SceneError if the dataparser is not installed or does not know a setting.
     """
     from nerfstudio.configs.dataparser_configs import all_dataparsers
 
@@ -66,16 +63,8 @@ def dataparser_of(run: Run) -> DataParser:
 
 
 class TrainedScene(DenseScene):
-    """One trained run: its Gaussians and its posed photos, both read when they are needed.
-
-    Args:
-        name: unique among the scenes in use.
-        run: paths and settings of the run.
-        cache: for decoded photos, Gaussians and renders, shared among scenes.
-        poses: how to sample poses if the run's data is missing.
-        device: where the dense scene's own renders are computed.
-        has_photos: whether the run's data was found.
-    """
+    """One trained run: its Gaussians and its posed photos, both read when they are needed. Arguments are those of
+    :class:`DenseScene`; ``has_photos`` says whether the run's data was found."""
 
     def __init__(
         self,
@@ -120,11 +109,8 @@ class TrainedScene(DenseScene):
         return dataparser_of(self.run)
 
     def _outputs(self, split: str) -> DataparserOutputs:
-        """The dataparser's outputs for a split.
-
-        Raises:
-            DataError: if the data is damaged, or its coordinate frame is not that of the Gaussians.
-        """
+        """The dataparser's outputs for a split. A DataError if the data is damaged, or its coordinate frame is not that
+        of the Gaussians."""
         try:
             outputs = self._dataparser.get_dataparser_outputs(split=split)
         except PointSplatError:
@@ -181,9 +167,6 @@ def find_scenes(
             their data, and the PLY files; ``auto`` is ``photos`` if there is a run, ``dense`` otherwise.
         cache, poses, device: passed to the scenes.
         need_data: whether photos will be needed.
-
-    Returns:
-        ``photos`` or ``dense``, and the scenes.
 
     Raises:
         SceneError: if there is no scene, or a run's data is needed and not found.

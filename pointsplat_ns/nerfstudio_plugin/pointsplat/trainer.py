@@ -26,10 +26,7 @@ class AveragingOptimizers(Optimizers):
     """nerfstudio's optimisers, with gradients averaged over accumulated steps and over processes.
 
     nerfstudio sums accumulated gradients. Their norm, which clipping depends on, would then grow with their number.
-
-    Args:
-        config, param_groups: as nerfstudio's.
-        counted: number of accumulated steps by group; the trainer keeps it up to date.
+    ``counted`` is the number of accumulated steps by group; the trainer keeps it up to date.
     """
 
     def __init__(self, config: dict[str, Any], param_groups: dict[str, list[nn.Parameter]], counted: Mapping[str, int]):
@@ -63,12 +60,8 @@ class PointSplatTrainer(StoppableTrainer):
         self.gradient_accumulation_steps = defaultdict(lambda: steps.get("all", 1), steps)
 
     def setup_optimizers(self) -> AveragingOptimizers:
-        """The optimisers.
-
-        Raises:
-            PointSplatError: if ``gradient_accumulation_steps`` names an unknown part of the network or a number below
-                1, or ``max_skipped_steps`` is negative.
-        """
+        """The optimisers. A PointSplatError if ``gradient_accumulation_steps`` names an unknown part of the network or
+        a number below 1, or ``max_skipped_steps`` is negative."""
         groups = self.pipeline.get_param_groups()
         for name, steps in self.config.gradient_accumulation_steps.items():
             if name not in (*groups, "all") or steps < 1:
@@ -81,13 +74,9 @@ class PointSplatTrainer(StoppableTrainer):
         return AveragingOptimizers(self.config.optimizers.copy(), groups, self.pipeline.training_state.counted)
 
     def one_step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
-        """As nerfstudio's, but skips a step whose loss or gradients are not finite.
-
-        With a gradient scaler (``--mixed-precision``), the scaler handles gradients that overflow.
-
-        Raises:
-            SceneError: if more than ``max_skipped_steps`` have been skipped; a checkpoint is saved first.
-        """
+        """As nerfstudio's, but skips a step whose loss or gradients are not finite. With a gradient scaler
+        (``--mixed-precision``), the scaler handles gradients that overflow. If more than ``max_skipped_steps`` have
+        been skipped, a checkpoint is saved, and a SceneError ends training."""
         pipeline, state, every = self.pipeline, self.pipeline.training_state, self.gradient_accumulation_steps
         statistics = [(buffer, buffer.clone()) for buffer in pipeline.model.refiner.buffers()]
         gathered = state.set_gradients_aside(step, every)

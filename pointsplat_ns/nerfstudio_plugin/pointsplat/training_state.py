@@ -14,12 +14,8 @@ Gradients = list[tuple[nn.Parameter, Tensor]]
 
 
 class TrainingState:
-    """The scenes that a network has been trained on, the skipped steps, and accumulated gradients.
-
-    Args:
-        parts: the network's parameters, by part.
-        trained_on: identities of the scenes that this training uses.
-    """
+    """The scenes that a network has been trained on, the skipped steps, and accumulated gradients, by part of the
+    network."""
 
     def __init__(self, parts: Mapping[str, list[nn.Parameter]], trained_on: Iterable[str] = ()):
         self._parts = parts
@@ -33,15 +29,8 @@ class TrainingState:
         """Parts with accumulated gradients that were not due for an update at the latest step."""
 
     def set_gradients_aside(self, step: int, every: Mapping[str, int]) -> Gradients:
-        """At the beginning of a step: take the gradients that earlier steps accumulated off the parameters.
-
-        Args:
-            step: the step that begins.
-            every: number of steps from one update to the next, by part.
-
-        Returns:
-            The accumulated gradients. The parameters are left without any.
-        """
+        """At the beginning of a step: take the gradients that earlier steps accumulated off the parameters, and return
+        them. ``every`` is the number of steps from one update to the next, by part."""
         gathered: Gradients = []
         for name, parameters in self._parts.items():
             before = step % every[name]
@@ -55,17 +44,8 @@ class TrainingState:
 
     @torch.no_grad()
     def gather(self, gathered: Gradients, step: int, every: Mapping[str, int], skipped: bool) -> list[str]:
-        """At the end of a step: add the accumulated gradients to those of the step.
-
-        Args:
-            gathered: the result of :meth:`set_gradients_aside`.
-            step: the step that ends.
-            every: number of steps from one update to the next, by part.
-            skipped: whether the step was skipped and has no gradients.
-
-        Returns:
-            The parts that are due for an update.
-        """
+        """At the end of a step: add the accumulated gradients, ``gathered``, to those of the step, unless it was
+        skipped and has none. Returns the parts that are due for an update."""
         for parameter, gradient in gathered:
             parameter.grad = gradient if parameter.grad is None else parameter.grad.add_(gradient)
         for name in self._parts:
@@ -82,12 +62,8 @@ class TrainingState:
         return state
 
     def load(self, state: Mapping[str, Any], scenes: Iterable[str]) -> None:
-        """Load the state of a checkpoint.
-
-        Args:
-            state: the result of :meth:`to_dict`.
-            scenes: names of the present scenes; the counts of skipped steps of others are dropped.
-        """
+        """Load the result of :meth:`to_dict`. The counts of skipped steps of other scenes than the present ones are
+        dropped."""
         for name, gradients in state.get("gradients", {}).items():
             for parameter, gradient in zip(self._parts[name], gradients, strict=True):
                 parameter.grad = None if gradient is None else gradient.to(parameter)

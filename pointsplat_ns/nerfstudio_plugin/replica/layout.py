@@ -23,16 +23,10 @@ from pointsplat_ns.io.files import one_line
 
 logger = logging.getLogger(__name__)
 
-MAX_ROTATION_DRIFT = 1e-2
-"""Largest accepted entry of |R^T R - I|. Real files print few digits, which causes a drift of 1e-7 to 1e-4; it is
-removed. Beyond one percent the matrix holds a scale or a shear and is not a camera pose."""
-
 FARTHEST = 1e18
 """Poses with larger numbers count as lost tracking: float32, in which scenes are trained, cannot square them."""
 
 PixelCenters = Literal["auto", "integer", "half"]
-
-_LAYOUT_HINT = "a scene folder holds traj.txt and results/frame*.jpg"
 
 
 @dataclass(frozen=True)
@@ -104,23 +98,19 @@ class ReplicaScene:
 
 
 def load_replica(folder: Path, check_sizes: bool = True) -> ReplicaScene:
-    """Reads and checks a scene. Image headers are read, but no image is decoded.
+    """Read and check a scene. Image headers are read, but no image is decoded; with ``check_sizes``, every photo's size
+    is compared with ``cam_params.json``.
 
-    Frames whose pose is not finite, or farther than :data:`FARTHEST` (lost tracking), are dropped, with one warning.
-
-    Args:
-        folder: The scene folder.
-        check_sizes: Compare every photo's size, read from its header, with ``cam_params.json``.
-
-    Raises:
-        DataError: A file is missing, unreadable or inconsistent; the message names it.
+    Frames whose pose is not finite, or farther than :data:`FARTHEST` (lost tracking), are dropped, with one warning. A
+    DataError names a file that is missing, unreadable or inconsistent.
     """
     folder = Path(folder)
+    hint = "a scene folder holds traj.txt and results/frame*.jpg"
     if not folder.is_dir():
-        raise DataError(f"{folder}: no such folder; {_LAYOUT_HINT}")
+        raise DataError(f"{folder}: no such folder; {hint}")
     if not (folder / "traj.txt").is_file() and not (folder / "results").is_dir():
         scenes = sorted(p.parent.name for p in folder.glob("*/traj.txt"))
-        hint = f"it contains the scenes {', '.join(scenes)}: name one of them" if scenes else _LAYOUT_HINT
+        hint = f"it contains the scenes {', '.join(scenes)}: name one of them" if scenes else hint
         raise DataError(f"{folder}: not a scene of the Replica layout; {hint}")
     params = read_cam_params(folder)
     photos = _numbered(folder / "results", r"frame(\d+)\.(jpg|jpeg|png)", "frame*.jpg or frame*.png")
@@ -137,7 +127,7 @@ def load_replica(folder: Path, check_sizes: bool = True) -> ReplicaScene:
     if depths:
         missing = [n for n in numbers if n not in depths]
         if missing:
-            names = _some([_sibling_name(photos[n], "depth", ".png") for n in missing])
+            names = _some([f"depth{re.sub(r'[^0-9]', '', photos[n].stem)}.png" for n in missing])
             raise DataError(
                 f"{folder / 'results'}: {len(missing)} of {len(numbers)} photos have no depth image ({names}); "
                 "restore them, or remove all depth*.png to go without depth"
@@ -174,11 +164,8 @@ def load_replica(folder: Path, check_sizes: bool = True) -> ReplicaScene:
 
 
 def read_cam_params(folder: Path) -> PinholeParams:
-    """Reads ``cam_params.json`` from the scene folder or the folder above it.
-
-    Raises:
-        DataError: Not found in either place, not JSON, or a number missing or out of range.
-    """
+    """Intrinsics from the ``cam_params.json`` in the scene folder or the folder above it. A DataError if there is none,
+    it is not JSON, or a number is missing or out of range."""
     candidates = [folder / "cam_params.json", folder.absolute().parent / "cam_params.json"]
     path = next((p for p in candidates if p.is_file()), None)
     if path is None:
@@ -216,13 +203,8 @@ def read_cam_params(folder: Path) -> PinholeParams:
 
 
 def read_trajectory(path: Path) -> np.ndarray:
-    """Reads ``traj.txt``: float64 (F, 4, 4), camera-to-world, not yet checked to be rigid or finite.
-
-    Blank lines are ignored.
-
-    Raises:
-        DataError: The file is missing, or a line is not 16 numbers (the message gives its line number).
-    """
+    """The poses of a ``traj.txt``: float64 (F, 4, 4), camera-to-world, not yet checked to be rigid or finite. Blank
+    lines are ignored. A DataError if the file is missing, or a line is not 16 numbers."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -246,11 +228,8 @@ def read_trajectory(path: Path) -> np.ndarray:
 
 
 def read_photo(path: Path, params: PinholeParams) -> np.ndarray:
-    """Decodes one photo: uint8 (H, W, 3), sRGB.
-
-    Raises:
-        DataError: The file is missing or broken, not of 8 bits a channel, or its size differs from ``params``.
-    """
+    """One photo, uint8 (H, W, 3), sRGB. A DataError if it is missing or broken, not of 8 bits a channel, or of another
+    size than ``params``."""
     image = _open_image(path)
     _check_size(path, image.size, params)
     if image.mode.startswith(("I", "F")):
@@ -259,11 +238,8 @@ def read_photo(path: Path, params: PinholeParams) -> np.ndarray:
 
 
 def read_depth(path: Path, params: PinholeParams) -> np.ndarray:
-    """Decodes one depth image: float32 (H, W), scene units along the optical axis, 0 where unknown.
-
-    Raises:
-        DataError: The file is missing or broken, not 16 bit, or its size differs from ``params``.
-    """
+    """One depth image, float32 (H, W), scene units along the optical axis, 0 where unknown. A DataError if it is
+    missing or broken, not of 16 bits, or of another size than ``params``."""
     image = _open_image(path)
     _check_size(path, image.size, params)
     if image.mode not in ("I;16", "I;16B", "I"):
@@ -316,10 +292,6 @@ def _numbered(folder: Path, pattern: str, wanted: str) -> dict[int, Path]:
     return found
 
 
-def _sibling_name(path: Path, stem: str, suffix: str) -> str:
-    return stem + re.sub(r"\D", "", path.stem) + suffix
-
-
 def _missing_hint(numbers: list[int], poses: int) -> str:
     """Names the photos that are missing in the numbering, if that explains the difference in count."""
     last = max(numbers[0] + poses - 1, numbers[-1])
@@ -335,11 +307,8 @@ def _some(items: list[str], limit: int = 5) -> str:
 
 
 def _rigid(poses: np.ndarray, lines: list[int], path: Path) -> np.ndarray:
-    """Poses with each rotation replaced by the nearest orthonormal one (polar factor, by SVD).
-
-    Raises:
-        DataError: The last row is not (0, 0, 0, 1), the drift is too large, or the axes are mirrored.
-    """
+    """Poses with each rotation replaced by the nearest orthonormal one (polar factor, by SVD). A DataError if the last
+    row is not (0, 0, 0, 1), the drift is too large, or the axes are mirrored."""
     last = np.abs(poses[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1)
     rotation = poses[:, :3, :3]
     drift = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max(axis=(1, 2))
@@ -348,10 +317,11 @@ def _rigid(poses: np.ndarray, lines: list[int], path: Path) -> np.ndarray:
         if last[k] > 1e-6:
             row = " ".join(f"{v:g}" for v in poses[k, 3])
             raise DataError(f"{path}: line {line} ends in {row}; expected 0 0 0 1 (a matrix written row by row)")
-        if drift[k] > MAX_ROTATION_DRIFT:
+        # Few digits cause a drift of 1e-7 to 1e-4. Beyond one percent the matrix holds a scale or a shear.
+        if drift[k] > 1e-2:
             raise DataError(
                 f"{path}: line {line} is not a rigid pose (R^T R is off by {drift[k]:.2g}); "
-                f"expected a rotation within {MAX_ROTATION_DRIFT:g}"
+                "expected a rotation within 0.01"
             )
         if mirrored[k]:
             raise DataError(f"{path}: line {line} mirrors the axes (determinant -1); expected a rotation")

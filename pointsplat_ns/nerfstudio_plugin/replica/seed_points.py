@@ -6,11 +6,6 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.replica.layout import ReplicaScene, read_depth, read_photo
 from pointsplat_ns.system.progress import tracked
 
-EDGE = 0.05
-"""A pixel whose depth differs from a neighbour's by more than this share is taken to lie on an outline, where
-sensors and resampling produce points between two surfaces. On a plane, depth changes this much from one pixel to
-the next only at grazing angles (over 85 degrees for usual lenses)."""
-
 
 def fuse_depth(
     scene: ReplicaScene,
@@ -18,25 +13,14 @@ def fuse_depth(
     principal_point: tuple[float, float],
     progress: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Unprojects the depth images of a scene and thins them to about ``num_points`` points.
+    """Unproject the depth images of training frames and thin them to at most ``num_points`` points: xyz float32 (P, 3)
+    in scene units and rgb uint8 (P, 3). Deterministic; P = 0 if no pixel has a depth.
 
-    Reads at most 200 frames, evenly spaced, one at a time: neighbouring frames of a video see the same surfaces. Keeps
-    at most ``40 * num_points`` pixels in total, several for most voxels, so that time and memory do not grow with the
-    length of the capture. Each occupied voxel gives one point, the mean of its pixels. The voxel size is chosen so that
-    no more than ``num_points`` are left. Deterministic.
-
-    Args:
-        scene: The frames to use (pass training frames only), with depth.
-        num_points: Upper bound on the points returned.
-        principal_point: (cx, cy) with the first pixel's centre at 0.5.
-        progress: Show a progress bar.
-
-    Returns:
-        xyz float32 (P, 3) in scene units and rgb uint8 (P, 3), P <= ``num_points``; P = 0 if no
-        pixel has a depth.
-
-    Raises:
-        DataError: The scene has no depth images.
+    At most 200 frames are read, evenly spaced, one at a time: neighbouring frames of a video see the same surfaces. At
+    most ``40 * num_points`` pixels are kept in total, several for most voxels, so that time and memory do not grow with
+    the length of the capture. Each occupied voxel gives one point, the mean of its pixels. The voxels are as small as
+    ``num_points`` allows. ``principal_point`` is (cx, cy) with the first pixel's centre at 0.5. A DataError if the
+    scene has no depth images.
     """
     depths = scene.depths
     if depths is None:
@@ -71,17 +55,8 @@ def fuse_depth(
 
 
 def voxel_thin(xyz: np.ndarray, rgb: np.ndarray, num_points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Averages points over voxels of the smallest size that leaves at most ``num_points`` of them.
-
-    Args:
-        xyz: float32 (M, 3).
-        rgb: uint8 (M, 3).
-        num_points: Upper bound on the result.
-
-    Returns:
-        float32 (P, 3), uint8 (P, 3), in the order of the voxels. The input itself if it is
-        already small enough.
-    """
+    """Points xyz float32 (M, 3) and rgb uint8 (M, 3), averaged over voxels of the smallest size that leaves at most
+    ``num_points`` of them, in the order of the voxels; the input itself if it is small enough."""
     if len(xyz) <= num_points:
         return xyz, rgb
     low = xyz.min(axis=0).astype(np.float64)
@@ -112,8 +87,10 @@ def _voxel_keys(xyz: np.ndarray, low: np.ndarray, size: float) -> np.ndarray:
     return (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
 
 
-def _inner(depth: np.ndarray) -> np.ndarray:
-    """bool (H, W): depth is measured here and in the four neighbours, and is continuous with theirs."""
+def _inner(depth: np.ndarray, edge: float = 0.05) -> np.ndarray:
+    """bool (H, W): depth is measured here and in the four neighbours, and differs from theirs by a share of at most
+    ``edge``. Others are taken to lie on an outline, where sensors and resampling produce points between two surfaces:
+    on a plane, depth changes this much from one pixel to the next only at grazing angles (over 85 degrees)."""
     measured = depth > 0
     inner = measured.copy()
     for axis in (0, 1):
@@ -121,7 +98,7 @@ def _inner(depth: np.ndarray) -> np.ndarray:
         after = [slice(None), slice(None)]
         before[axis], after[axis] = slice(None, -1), slice(1, None)
         a, b = depth[tuple(before)], depth[tuple(after)]
-        joined = (a > 0) & (b > 0) & (np.abs(a - b) <= EDGE * np.minimum(a, b))
+        joined = (a > 0) & (b > 0) & (np.abs(a - b) <= edge * np.minimum(a, b))
         inner[tuple(before)] &= joined
         inner[tuple(after)] &= joined
     return inner

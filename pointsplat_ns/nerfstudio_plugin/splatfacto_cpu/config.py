@@ -24,9 +24,6 @@ from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainerConfig
 SPLATFACTO_STEPS = 30_000
 """Training steps that Splatfacto's schedules were chosen for."""
 
-MOST_HASTE = 8.0
-"""Maximum factor on the first learning rates, and on the threshold of densification: that of a run of 470 steps."""
-
 
 @dataclass
 class SplatfactoCpuTrainerConfig(StoppableTrainerConfig):
@@ -58,26 +55,18 @@ def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainer
     The interval of the opacity reset is a multiple of it.
 
     Few steps can train only few Gaussians, and have to take them far. So the gradient above which a Gaussian is split
-    or duplicated grows with the root of how many times shorter the run is, but at most by :data:`MOST_HASTE`. The
-    learning rates of Gaussians begin as many times higher, and end as Splatfacto's.
+    or duplicated grows with the root of how many times shorter the run is, but at most eightfold, as in a run of 470
+    steps. The learning rates of Gaussians begin as many times higher, and end as Splatfacto's.
     """
     length = max(1, config.first_step() + config.max_num_iterations)
     share = min(1.0, length / SPLATFACTO_STEPS)
     config = copy.deepcopy(config)
     defaults = SplatfactoModelConfig()
     model = config.pipeline.model
-    fitted: dict[str, float] = {
-        name: max(1, round(share * getattr(defaults, name)))
-        for name in (
-            "warmup_length",
-            "resolution_schedule",
-            "sh_degree_interval",
-            "stop_split_at",
-            "stop_screen_size_at",
-        )
-    }
+    steps = ("warmup_length", "resolution_schedule", "sh_degree_interval", "stop_split_at", "stop_screen_size_at")
+    fitted: dict[str, float] = {name: max(1, round(share * getattr(defaults, name))) for name in steps}
     fitted["refine_every"] = min(defaults.refine_every, max(25, round(length / 70)))
-    haste = min(MOST_HASTE, 1 / math.sqrt(share))
+    haste = min(8.0, 1 / math.sqrt(share))
     fitted["densify_grad_thresh"] = haste * defaults.densify_grad_thresh
     for name, value in fitted.items():
         if getattr(model, name) == getattr(defaults, name):

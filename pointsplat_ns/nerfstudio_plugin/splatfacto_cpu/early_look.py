@@ -21,21 +21,13 @@ if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras
     from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
-MOST_TIME = 0.02
-"""Largest share of the time that pictures take."""
-
 
 class EarlyLook:
-    """Logs how long a training will take, and writes pictures of a held-out view.
+    """Logs how long a training of ``count`` steps from step ``first`` on will take, and writes pictures of a held-out
+    view into a folder, as ``step-000000109.jpg``: the photo, and its render beside it.
 
     An estimate is logged after some seconds, and again whenever the resolution of training has risen. How much slower
     later steps are is told by rendering a view at full resolution; that Gaussians become more is not foreseen.
-
-    Args:
-        pipeline: of a Splatfacto model.
-        folder: where pictures go, as ``step-000000109.jpg``: the photo, and its render beside it.
-        first: number of the first step.
-        count: number of steps.
     """
 
     def __init__(self, pipeline: VanillaPipeline, folder: Path, first: int, count: int):
@@ -56,9 +48,9 @@ class EarlyLook:
         if self._due:
             self._picture(step + 1)
 
-    def _affordable(self) -> bool:
-        """Whether a picture as dear as the dearest so far keeps to :data:`MOST_TIME`."""
-        return self._spent + self._dearest <= MOST_TIME * (time.perf_counter() - self._start)
+    def _affordable(self, share: float = 0.02) -> bool:
+        """Whether pictures, with one as dear as the dearest so far, take no more than a share of the time."""
+        return self._spent + self._dearest <= share * (time.perf_counter() - self._start)
 
     def _estimate(self, step: int) -> None:
         factor, now = self._factor_at(step), time.perf_counter()

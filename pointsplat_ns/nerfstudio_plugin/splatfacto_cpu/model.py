@@ -44,9 +44,6 @@ from pointsplat_ns.rasterizer.rendering import Colors
 from pointsplat_ns.system.kernels import Kernels
 from pointsplat_ns.system.threads import one_thread
 
-LONE_POINT_SCALE = 0.01
-"""Standard deviation, in scene units, of the first Gaussian of a scene with a single seed point."""
-
 
 class LpipsMetric:
     """LPIPS, called like nerfstudio's metrics. Not a module, so that checkpoints do not hold its weights."""
@@ -79,10 +76,8 @@ class SplatfactoCpuModelConfig(RasterizerOptions, SplatfactoModelConfig):
 class SplatfactoCpuModel(SplatfactoModel):
     """Splatfacto that needs neither CUDA nor a network connection.
 
-    Args:
-        config: as Splatfacto's.
-        seed_points: positions (N, 3) in scene units and colours (N, 3) from 0 to 255. Rows that are not finite are
-            dropped, with a log line. If none is left, the scene starts from random points, as in Splatfacto.
+    ``seed_points`` are positions (N, 3) in scene units and colours (N, 3) from 0 to 255. Rows that are not finite are
+    dropped, with a log line. If none is left, the scene starts from random points, as in Splatfacto.
     """
 
     config: SplatfactoCpuModelConfig
@@ -189,18 +184,12 @@ class SplatfactoCpuModel(SplatfactoModel):
         self.info["radii"] = torch.zeros_like(self.info["radii"])  # nothing was seen
 
     def get_outputs(self, camera: Cameras | RayBundle) -> dict[str, Any]:
-        """Render one camera.
-
-        Args:
-            camera: of shape (1,), on the model's device.
+        """Render one camera of shape (1,), on the model's device. A DataError if the camera is no pinhole.
 
         Returns:
             ``rgb`` (H, W, 3) in [0, 1]; ``accumulation`` (H, W, 1); ``background``, (3,) in training and (H, W, 3) in
             evaluation; and ``depth`` (H, W, 1), in scene units along the viewing axis, or None in training unless
             ``output_depth_during_training`` is set.
-
-        Raises:
-            DataError: if the camera is no pinhole.
         """
         if not isinstance(camera, Cameras):
             return {}
@@ -300,11 +289,11 @@ def _distance_to_others(points: Tensor, k: int) -> Tensor:
     """Mean distance (N, 1) from each point (N, 3) to its ``k`` nearest other positions, float32 and positive.
 
     Points at the same position count once, so that no distance is zero. With fewer than ``k`` other positions, the
-    distance to the farthest is repeated; with none, the result is ``LONE_POINT_SCALE``.
+    distance to the farthest is repeated; with none, the result is 0.01 scene units.
     """
     places, place_of = torch.unique(points, dim=0, return_inverse=True)
     if len(places) < 2:
-        return torch.full((len(points), 1), LONE_POINT_SCALE)
+        return torch.full((len(points), 1), 0.01)
     distances = nearest(places, k + 1)[0][:, 1:]
     missing = distances[:, -1:].expand(-1, k - distances.shape[1])
     # Distinct positions can be so close that the distance is zero in float32.
@@ -357,16 +346,11 @@ class SplatfactoCpuPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """Mean metrics over the held-out frames.
+        """Mean metrics over the held-out frames; a DataError if no frame is held out.
 
-        Args:
-            step: given by the trainer, whose log takes only finite numbers: other metrics are then left out. Without
-                it, as in ``ns-eval``, they are None, and ``lpips_note`` says why LPIPS is missing.
-            output_path: folder for the rendered images; None writes none.
-            get_std: add the standard deviation of every metric; for a single image it is None.
-
-        Raises:
-            DataError: if no frame is held out.
+        Given a ``step``, by the trainer, whose log takes only finite numbers, other metrics are left out. Without it,
+        as in ``ns-eval``, they are None, and ``lpips_note`` says why LPIPS is missing. The standard deviation of a
+        single image is None.
         """
         if not self.datamanager.eval_dataset:
             raise DataError(

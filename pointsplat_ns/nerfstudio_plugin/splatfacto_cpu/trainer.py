@@ -26,12 +26,8 @@ if TYPE_CHECKING:
 
 
 class CheckingOptimizers(Optimizers):
-    """nerfstudio's optimisers, which leave out an update that would not be finite.
-
-    Args:
-        config, param_groups: as nerfstudio's.
-        skips: told of the groups with a gradient that is not finite, before each update; whether to leave it out.
-    """
+    """nerfstudio's optimisers, which leave out an update that would not be finite. Before each update, ``skips`` is
+    told of the groups with a gradient that is not finite, and says whether to leave it out."""
 
     def __init__(
         self,
@@ -72,11 +68,7 @@ class SplatfactoCpuTrainer(StoppableTrainer):
         self._skipped_in_a_row = 0
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """As nerfstudio's.
-
-        Raises:
-            PointSplatError: if the data cannot be used, or ``max_skipped_in_a_row`` is negative.
-        """
+        """As nerfstudio's. A PointSplatError if the data cannot be used, or ``max_skipped_in_a_row`` is negative."""
         if self.config.max_skipped_in_a_row < 0:
             raise PointSplatError(f"--max-skipped-in-a-row {self.config.max_skipped_in_a_row}: expected at least 0")
         super().setup(test_mode)
@@ -102,12 +94,9 @@ class SplatfactoCpuTrainer(StoppableTrainer):
         return CheckingOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._skips)
 
     def one_step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
-        """As nerfstudio's, but skips a step whose loss or gradients are not finite.
-
-        Raises:
-            DataError: if more than ``max_skipped_in_a_row`` have been skipped without one between that was not; a
-                checkpoint is saved first.
-        """
+        """As nerfstudio's, but skips a step whose loss or gradients are not finite. If more than
+        ``max_skipped_in_a_row`` have been skipped without one between that was not, a checkpoint is saved, and a
+        DataError ends training."""
         loss, losses, metrics = super().one_step(step)
         metrics["skipped_steps"] = self.skipped.total()
         if self._skipped_in_a_row > self.config.max_skipped_in_a_row:

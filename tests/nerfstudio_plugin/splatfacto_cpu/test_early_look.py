@@ -66,7 +66,7 @@ def test_pictures_are_sparse_and_take_no_more_than_their_share_of_the_time(cost,
         clock.now += 0.1
     look.after_training(11_999)
     assert len(list(tmp_path.iterdir())) == len(spent) <= most
-    assert cost * (len(spent) - 2) <= early_look.MOST_TIME * (clock.now - 1000)  # but for first and last
+    assert cost * (len(spent) - 2) <= 0.02 * (clock.now - 1000)  # but for first and last
     assert (tmp_path / "step-000012000.jpg").is_file()
     assert picture_steps(7000) == [110, 220, 440, 880, 1760, 3520, 7000]
 

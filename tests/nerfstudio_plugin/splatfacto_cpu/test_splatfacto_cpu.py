@@ -20,9 +20,8 @@ from PIL import Image
 from making import SHARED_DATA
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import MOST_HASTE, fitted_schedules, splatfacto_cpu_config
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import fitted_schedules, splatfacto_cpu_config
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import (
-    LONE_POINT_SCALE,
     SplatfactoCpuModel,
     SplatfactoCpuModelConfig,
 )
@@ -180,7 +179,7 @@ def test_few_seeds_have_finite_sizes(num):
     scales = build(SplatfactoCpuModelConfig(), (points, colors)).scales
     assert scales.shape == (num, 3) and scales.isfinite().all()
     if num == 1:
-        assert torch.allclose(scales.exp(), torch.tensor(LONE_POINT_SCALE))
+        assert torch.allclose(scales.exp(), torch.tensor(0.01))
 
 
 def test_coincident_seeds_take_their_size_from_other_places():
@@ -258,7 +257,7 @@ def test_rates_of_a_short_run_begin_higher_and_end_as_splatfactos(name, rate, la
     assert fitted_schedules(config).optimizers == config.optimizers
     for few in (10, 0):
         config.max_num_iterations = few
-        assert fitted_schedules(config).optimizers[name]["scheduler"].first == MOST_HASTE
+        assert fitted_schedules(config).optimizers[name]["scheduler"].first == 8.0
 
 
 def test_a_run_that_cannot_start_leaves_no_folder(tmp_path, wall_config, run_training):
