@@ -285,7 +285,8 @@ def _use_evaluation(path: Path) -> object:
         Console(file=io.StringIO()).print(table)
     parts = [(report._reference(part), report._blocks(results, part)) for part in report._parts(results)]
     page = path.with_suffix(".html")
-    return report.write_report_page("a", report._settings(results), parts, report._note(results), page)
+    report.write_report_page("a", report._settings(results), parts, report._note(results), page)
+    return page.read_text()
 
 
 def _use_points(path: Path) -> object:

@@ -36,11 +36,8 @@ class FoundScene:
 
 def find_scenes(folder: Path | str) -> list[FoundScene]:
     """Every scene below a folder, sorted by name: files that hold Gaussians, and the newest trained run of each
-    experiment, which has the name of the experiment's folder.
-
-    Raises:
-        SceneError: if there is no such folder, it is a run, or there is no scene below it.
-    """
+    experiment, which has the name of the experiment's folder. Raises SceneError if there is no such folder, it is a
+    run, or there is no scene below it."""
     folder = Path(folder)
     if not is_folder_of_scenes(folder):
         raise SceneError(f"{folder}: expected a folder with scenes below it")

@@ -27,7 +27,7 @@ logger = logging.getLogger("pointsplat_ns")
 
 
 def require_file(path: Path | str, what: str) -> Path:
-    """``path`` as a Path. A SceneError if it is no regular file, which says that ``what`` was expected."""
+    """``path`` as a Path. Raises SceneError if it is no regular file, which says that ``what`` was expected."""
     path = Path(path)
     if not path.exists():
         raise SceneError(f"{path}: no such file; expected {what}")
@@ -152,7 +152,8 @@ def _megabytes(size: int) -> str:
 
 
 def _mode_of(path: Path) -> int | None:
-    """Permission bits of a file that is to be replaced; None if there is none. A SceneError if it is not regular."""
+    """Permission bits of a file that is to be replaced; None if there is none. Raises SceneError if it is not
+    regular."""
     try:
         status = path.lstat()
     except FileNotFoundError:

@@ -11,8 +11,8 @@ from pointsplat_ns.io.files import replacing
 
 
 def write_picture(picture: Tensor, path: Path) -> None:
-    """Write an image (H, W, 3), clamped to [0, 1], as a PNG; as a JPEG if the path ends in ``.jpg``. A SceneError if it
-    cannot be written."""
+    """Write an image (H, W, 3), clamped to [0, 1], as a PNG; as a JPEG if the path ends in ``.jpg``. Raises SceneError
+    if it cannot be written."""
     from PIL import Image
 
     image = Image.fromarray((255 * picture.clamp(0, 1)).round().to(torch.uint8).cpu().numpy())

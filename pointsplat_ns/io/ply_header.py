@@ -77,11 +77,8 @@ class Header:
 
 
 def read_header(stream: BinaryIO, path: Path) -> Header:
-    """Parse the header at the start of ``stream``, which is left at an unspecified position.
-
-    Raises:
-        SceneError: if it is not a PLY header, has no end, or has a line that is not valid PLY.
-    """
+    """Parse the header at the start of ``stream``, which is left at an unspecified position. Raises SceneError if it is
+    not a PLY header, has no end, or has a line that is not valid PLY."""
     text, size = _header_text(stream, path)
     order: str | None = None
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []

@@ -226,10 +226,7 @@ def _find_data(data: Path, folder: Path, config_path: Path) -> Path:
 
 def read_transforms(path: Path) -> tuple[Tensor, float]:
     """The transform (3, 4) and the scale of a ``dataparser_transforms.json``; the identity and 1 if there is none.
-
-    Raises:
-        SceneError: if the file is not one.
-    """
+    Raises SceneError if the file is not one."""
     if not path.is_file():
         return torch.eye(4)[:3], 1.0
     try:

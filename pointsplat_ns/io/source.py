@@ -23,8 +23,8 @@ class SourceFile:
 
 
 def source_file(path: Path | str) -> SourceFile:
-    """The file that :func:`~pointsplat_ns.io.read_scene` reads a scene from: for a run, its checkpoint. A SceneError if
-    there is none, or it cannot be read."""
+    """The file that :func:`~pointsplat_ns.io.read_scene` reads a scene from: for a run, its checkpoint. Raises
+    SceneError if there is none, or it cannot be read."""
     path = Path(path)
     parts = _sog_parts(path)
     if parts:

@@ -20,12 +20,8 @@ class ImageError(PointSplatError, ValueError):
 
 
 def as_nchw(pred: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Both images as (B, 3, H, W), B = 1 for single ones.
-
-    Raises:
-        ImageError: if their shapes differ, are not (H, W, 3) or (B, H, W, 3), or hold no pixel, or if
-            a type is not floating-point.
-    """
+    """Both images as (B, 3, H, W), B = 1 for single ones. Raises ImageError if their shapes differ, are not (H, W, 3)
+    or (B, H, W, 3), or hold no pixel, or if a type is not floating-point."""
     for name, image in (("pred", pred), ("target", target)):
         if image.dim() not in (3, 4) or image.shape[-1] != 3 or image.numel() == 0:
             raise ImageError(f"{name} has shape {tuple(image.shape)}; expected (H, W, 3) or (B, H, W, 3)")

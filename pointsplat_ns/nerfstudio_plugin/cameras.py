@@ -27,8 +27,8 @@ def cameras_of_views(views: Views) -> Cameras:
 
 
 def near_plane_of(cameras: Cameras) -> float:
-    """Near plane of cameras (C,), scene units; gsplat's if they do not come from :func:`cameras_of_views`. A DataError
-    if they have several."""
+    """Near plane of cameras (C,), scene units; gsplat's if they do not come from :func:`cameras_of_views`. Raises
+    DataError if they have several."""
     carried = (cameras.metadata or {}).get("near_plane")
     if carried is None or carried.numel() == 0:
         return NEAR_PLANE
@@ -54,8 +54,8 @@ def need_pinhole(camera: Cameras) -> None:
 
 
 def views_of_cameras(cameras: Cameras, background: Tensor, rasterize_mode: RasterizeMode = "classic") -> Views:
-    """nerfstudio cameras (C,) as pinhole views on their device. Lens distortion is ignored. A DataError if the cameras
-    have images of several sizes, or several near planes."""
+    """nerfstudio cameras (C,) as pinhole views on their device. Lens distortion is ignored. Raises DataError if the
+    cameras have images of several sizes, or several near planes."""
     sizes = {(int(w), int(h)) for w, h in zip(cameras.width, cameras.height, strict=True)}
     if len(sizes) != 1:
         raise DataError(f"photos of {len(sizes)} sizes; expected one size for all views")

@@ -32,7 +32,7 @@ def finished(run: Path, steps: int, instead: str = "name another --output") -> b
 
 def remove_interrupted(run: Path) -> None:
     """Remove the folder of an interrupted training, if there is one: the next training would leave its old checkpoints
-    beside the new ones. A SceneError if the training there has finished."""
+    beside the new ones. Raises SceneError if the training there has finished."""
     if _steps_if_finished(run) is not None:
         raise SceneError(f"{run}: holds a finished training; expected an interrupted one or none; remove it yourself")
     shutil.rmtree(run, ignore_errors=True)

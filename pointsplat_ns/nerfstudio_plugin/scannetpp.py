@@ -42,8 +42,8 @@ class SeededScanNetpp(ScanNetpp):
     config: SeededScanNetppDataParserConfig
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:  # type: ignore[override]
-        """See the base class. ``split`` is "train" for ``frames``, "val" or "test" for ``test_frames``. A DataError if
-        ``transforms.json`` or COLMAP's files cannot be used."""
+        """See the base class. ``split`` is "train" for ``frames``, "val" or "test" for ``test_frames``. Raises
+        DataError if ``transforms.json`` or COLMAP's files cannot be used."""
         frames = self._frames()
         outputs = super()._generate_dataparser_outputs(split)
         if self.config.skip_bad:
@@ -107,8 +107,8 @@ class SeededScanNetpp(ScanNetpp):
 def _frame_of(folder: Path, poses: dict[str, np.ndarray]) -> np.ndarray:
     """The rigid motion (4, 4) from COLMAP's frame to that of poses, found from the photos that both know.
 
-    ``poses`` are camera-to-world (4, 4) in OpenGL axes by the name of the photo. A DataError if they know no photo in
-    common, or no motion takes all poses of the one to the other.
+    ``poses`` are camera-to-world (4, 4) in OpenGL axes by the name of the photo. Raises DataError if they know no photo
+    in common, or no motion takes all poses of the one to the other.
     """
     from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 

@@ -104,7 +104,7 @@ class StoppableTrainer(Trainer):
 
     def train(self) -> None:
         """As nerfstudio's, but Ctrl-C saves a checkpoint and ends ``ns-train`` with status 130. nerfstudio saves none
-        and ends with 0, as if it had finished. A PointSplatError if the number of threads is below 1."""
+        and ends with 0, as if it had finished. Raises PointSplatError if the number of threads is below 1."""
         with fixed_threads(self.config.threads), self._signals_noted():
             try:
                 super().train()

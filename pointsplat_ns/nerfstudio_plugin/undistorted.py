@@ -27,11 +27,9 @@ class UndistortedDataset(InputDataset):
     """Photos, masks and cameras of a split, undistorted together by nerfstudio's own function.
 
     ``cameras`` (C,) are pinholes. They differ in size and intrinsics from ``lens_cameras``, which took the photos,
-    where these have a lens.
-
-    Raises:
-        DataError: if a pose or an intrinsic is NaN or infinite, or a lens cannot be undone; when a photo is read that
-            is missing, broken, not the size that its camera says, or not of 8 bits a channel, or whose mask is.
+    where these have a lens. Raises DataError if a pose or an intrinsic is NaN or infinite, or a lens cannot be undone;
+    when a photo is read that is missing, broken, not the size that its camera says, or not of 8 bits a channel, or
+    whose mask is.
     """
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0):
@@ -115,7 +113,7 @@ def _undistorted(
     camera: Cameras, path: Path, image: np.ndarray, data: dict[str, Any]
 ) -> tuple[np.ndarray, np.ndarray, Tensor | None]:
     """Intrinsics (3, 3), photo and mask of the pinhole camera that is left of a camera (1,) with a lens and its photo
-    (H, W) or (H, W, 3 or 4). Of ``data`` only the mask is read. A DataError if the lens cannot be undone."""
+    (H, W) or (H, W, 3 or 4). Of ``data`` only the mask is read. Raises DataError if the lens cannot be undone."""
     single = camera.reshape(())
     distortion = np.zeros(6, np.float32) if single.distortion_params is None else single.distortion_params.numpy()
     try:

@@ -22,7 +22,7 @@ def gsplat_works() -> bool:
 
 
 def use_gsplat(backend: str, device: torch.device) -> bool:
-    """Whether ``backend`` ("gsplat" or "auto"; others are a ValueError) means gsplat for tensors on ``device``. A
+    """Whether ``backend`` ("gsplat" or "auto"; others are a ValueError) means gsplat for tensors on ``device``. Raises
     PointSplatError if gsplat is asked for and cannot be used."""
     if backend not in ("gsplat", "auto"):
         raise ValueError(f"backend is {backend!r}; expected torch, gsplat or auto")

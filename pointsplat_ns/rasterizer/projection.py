@@ -44,11 +44,9 @@ class Projected:
 def camera_centre(viewmat: Tensor) -> Tensor:
     """Position of the camera in the world, (3,), in float64: the solution of ``R c = -t``.
 
-    Solved rather than ``-R^T t``: a rotation stored in float32 is orthogonal to 1e-7 only, which a
-    translation of 1e6 turns into a tenth of a unit.
-
-    Raises:
-        ValueError: if the matrix is not finite, its rotation cannot be inverted, or its last row is not 0, 0, 0, 1.
+    Solved rather than ``-R^T t``: a rotation stored in float32 is orthogonal to 1e-7 only, which a translation of 1e6
+    turns into a tenth of a unit. Raises ValueError if the matrix is not finite, its rotation cannot be inverted, or its
+    last row is not 0, 0, 0, 1.
     """
     viewmat = viewmat.double()
     rows = viewmat.tolist()

@@ -26,11 +26,9 @@ class RefinerConfigError(PointSplatError, ValueError):
 class RefinerConfig:
     """All settings of a refiner's network.
 
-    The defaults are the sizes of the preset ``full``. Tuples of the encoder have one entry per
-    stage; ``strides`` and the tuples of the decoder have one entry fewer, finest first.
-
-    Raises:
-        RefinerConfigError: if the fields contradict one another.
+    The defaults are the sizes of the preset ``full``. Tuples of the encoder have one entry per stage; ``strides`` and
+    the tuples of the decoder have one entry fewer, finest first. Raises RefinerConfigError if the fields contradict one
+    another.
     """
 
     sh_degree: int = MAX_SH_DEGREE
@@ -149,11 +147,8 @@ class RefinerConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> RefinerConfig:
-        """The inverse of :meth:`to_dict`.
-
-        Raises:
-            RefinerConfigError: if a field is unknown or the fields contradict one another.
-        """
+        """The inverse of :meth:`to_dict`. Raises RefinerConfigError if a field is unknown or the fields contradict one
+        another."""
         fields = {field.name for field in dataclasses.fields(cls)}
         unknown = sorted(set(values) - fields)
         _require(not unknown, f"unknown refiner settings {', '.join(unknown)}; a newer version may have written them")

@@ -68,7 +68,7 @@ def save_feedback_refiner(network: FeedbackRefiner, path: Path | str, metadata: 
 
 
 def read_feedback_refiner(path: Path | str = PRETRAINED, device: torch.device | str = "cpu") -> FeedbackRefiner:
-    """Read a network, in evaluation mode; by default the shipped one. A WeightsError if the file is none."""
+    """Read a network, in evaluation mode; by default the shipped one. Raises WeightsError if the file is none."""
     path, network = Path(path), FeedbackRefiner()
     with opened_weights(path, FORMAT, "a feedback refiner") as (file, _):
         state = checked_tensors(file, network.state_dict(), path)

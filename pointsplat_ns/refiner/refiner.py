@@ -50,9 +50,7 @@ class Refiner(nn.Module):
         """Build the neighbour tables of a scene's positions, on the scene's device.
 
         Build them once for a scene and pass them to :meth:`forward` at every step. None if no Gaussian can be drawn.
-
-        Raises:
-            SceneError: if the SH degree exceeds the network's.
+        Raises SceneError if the SH degree exceeds the network's.
         """
         if scene.sh_degree > self.config.sh_degree:
             raise SceneError(

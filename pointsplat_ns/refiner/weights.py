@@ -40,10 +40,7 @@ def read_refiner(path: str | Path, device: torch.device | str = "cpu") -> Refine
     """Read a refiner in evaluation mode from a file.
 
     The file is not trusted: its configuration and the names, shapes and types of its tensors are checked before memory
-    is allocated.
-
-    Raises:
-        WeightsError: if the file is missing, damaged, of another kind, or its tensors do not fit.
+    is allocated. Raises WeightsError if the file is missing, damaged, of another kind, or its tensors do not fit.
     """
     path = Path(path)
     with opened_weights(path, FORMAT, "refiner weights") as (file, header):
@@ -55,7 +52,7 @@ def read_refiner(path: str | Path, device: torch.device | str = "cpu") -> Refine
 
 def checked_tensors(file: Any, expected: dict[str, torch.Tensor], path: Path) -> dict[str, torch.Tensor]:
     """The tensors of an opened file. Their names, shapes and kinds of numbers are compared with ``expected`` before
-    memory is allocated. A WeightsError if they do not fit, or are not finite."""
+    memory is allocated. Raises WeightsError if they do not fit, or are not finite."""
     names = sorted(file.keys())
     found = {name: file.get_slice(name) for name in names}
     wrong = [name for name in sorted({*expected, *found}) if _shape(expected, name) != _shape(found, name)]
@@ -85,11 +82,8 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
 @contextmanager
 def opened_weights(path: Path, expected_format: str, what: str) -> Iterator[tuple[Any, dict[str, str]]]:
     """Open a file of weights, and read its header only: the opened file, and the texts of its header. ``what`` is the
-    noun for its content in errors.
-
-    Raises:
-        WeightsError: if the file is missing, damaged or of another kind than ``expected_format``.
-    """
+    noun for its content in errors. Raises WeightsError if the file is missing, damaged or of another kind than
+    ``expected_format``."""
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():

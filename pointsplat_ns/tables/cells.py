@@ -100,7 +100,7 @@ def identity(scene: TableScene, options: TableOptions, machine: str) -> dict[str
 
 
 class CellJournal:
-    """The cells of one scene, in its folder in the folder of all tables, written as soon as they are measured. A
+    """The cells of one scene, in its folder in the folder of all tables, written as soon as they are measured. Raises
     SceneError if the scene's journal cannot be read."""
 
     def __init__(self, folder: Path, name: str):

@@ -104,8 +104,8 @@ def _badness(scene: SceneCells, point: Point) -> tuple[float, float]:
 
 
 def read_groups(folder: Path) -> list[Group]:
-    """All scenes below a folder of tables, in groups; the paper's datasets first, the others by name. A SceneError if a
-    journal cannot be read, or there is none."""
+    """All scenes below a folder of tables, in groups; the paper's datasets first, the others by name. Raises SceneError
+    if a journal cannot be read, or there is none."""
     scenes: dict[str, list[SceneCells]] = {}
     for path in sorted(folder.glob(f"*/{CELLS}")):
         journal = CellJournal(folder, path.parent.name)

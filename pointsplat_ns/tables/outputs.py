@@ -30,8 +30,8 @@ READING = (
 def write_tables(folder: Path, shares: Sequence[float], missing: Mapping[str, str]) -> list[Group]:
     """Write the tables of all scenes with cells in a folder, which has a folder for each; returns the scenes in groups.
 
-    ``shares`` are those of Table 1, for rows without measurements; ``missing`` has reasons for missing cells, by key. A
-    SceneError if a journal cannot be read, there is none, or a file cannot be written.
+    ``shares`` are those of Table 1, for rows without measurements; ``missing`` has reasons for missing cells, by key.
+    Raises SceneError if a journal cannot be read, there is none, or a file cannot be written.
     """
     groups = read_groups(folder)
     tables = {group.name: Layout(group, shares, missing).tables() for group in groups}

@@ -43,11 +43,7 @@ class TableScene:
 
 @dataclass(frozen=True)
 class TableOptions:
-    """Options of the measurement.
-
-    Raises:
-        PointSplatError: if an option is below 1.
-    """
+    """Options of the measurement. Raises PointSplatError if an option is below 1."""
 
     views: int = 10
     """Largest number of held-out views of a scene."""

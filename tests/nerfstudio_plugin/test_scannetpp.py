@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,7 +16,7 @@ from nerfstudio.data.utils import colmap_parsing_utils as colmap
 from captures import BAD, FRAMES, HELD_OUT, SEEDS, Capture, Lens
 from making import SHARED_DATA, pipeline_of
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.nerfstudio_plugin.paper_datasets import SCANNETPP_PARSERS
+from pointsplat_ns.nerfstudio_plugin.paper_datasets import paper_dataset
 from pointsplat_ns.nerfstudio_plugin.scannetpp import SeededScanNetppDataParserConfig
 
 FISHEYE = Lens("OPENCV_FISHEYE", (0.02, -0.01, 0.003, -0.001), focal=(30.0, 30.5))
@@ -136,10 +137,9 @@ def test_what_a_mask_hides_does_not_count(method, scene, wall_config, run_traini
     assert loss(0.5 * hidden) == loss(0.0) != loss(0.5 * ~hidden)
 
 
-def test_scenes_read_by_either_dataparser_are_known_as_the_datasets():
-    assert {kind.__name__ for kind in (ScanNetppDataParserConfig, SeededScanNetppDataParserConfig)} == {
-        *SCANNETPP_PARSERS
-    }
+@pytest.mark.parametrize("kind", [ScanNetppDataParserConfig, SeededScanNetppDataParserConfig])
+def test_scenes_read_by_either_dataparser_are_known_as_the_datasets(scene, kind):
+    assert paper_dataset(SimpleNamespace(dataparser_class=f"a.module.{kind.__name__}", data=scene)) == "ScanNet++"
 
 
 def test_a_real_capture_without_colmaps_model_is_read():

@@ -61,11 +61,8 @@ def is_model(path: Path) -> bool:
 
 
 def colmap_cameras(path: Path) -> CameraFile:
-    """The cameras of a COLMAP model; ``path`` is its folder, or one of the files in it.
-
-    Raises:
-        DataError: if a file is missing or damaged, or an image has no usable pose or camera.
-    """
+    """The cameras of a COLMAP model; ``path`` is its folder, or one of the files in it. Raises DataError if a file is
+    missing or damaged, or an image has no usable pose or camera."""
     folder = path if path.is_dir() else path.parent
     kind = next((kind for kind in ("bin", "txt") if (folder / f"images.{kind}").is_file()), "bin")
     cameras_path, images_path = folder / f"cameras.{kind}", folder / f"images.{kind}"

@@ -22,10 +22,7 @@ from pointsplat_ns.io.files import logger
 
 def nerfstudio_cameras(content: dict[str, Any], path: Path) -> CameraFile:
     """The cameras in the JSON of a ``transforms.json``. The size of the photos is looked up if the file has none.
-
-    Raises:
-        DataError: if a frame has no usable pose or intrinsics, or a camera has no focal length (a panorama).
-    """
+    Raises DataError if a frame has no usable pose or intrinsics, or a camera has no focal length (a panorama)."""
     frames = content["frames"]
     need_count(path, len(frames))
     size = functools.cache(lambda: _size_of_photos(frames[0], path))

@@ -51,11 +51,8 @@ def is_compressed(header: Header) -> bool:
 
 
 def read_compressed_ply(path: Path | str) -> Gaussians:
-    """Read a compressed PLY, of any SH degree up to 3, as :func:`~pointsplat_ns.io.read_scene` does.
-
-    Raises:
-        SceneError: if the file is no compressed PLY, is truncated, or does not fit into memory.
-    """
+    """Read a compressed PLY, of any SH degree up to 3, as :func:`~pointsplat_ns.io.read_scene` does. Raises SceneError
+    if the file is no compressed PLY, is truncated, or does not fit into memory."""
     path = require_file(path, "a compressed PLY file")
     with damage_named(path, "compressed PLY"):
         with path.open("rb") as stream:

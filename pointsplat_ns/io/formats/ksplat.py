@@ -53,11 +53,8 @@ class _Section:
 
 def read_ksplat(path: Path | str) -> Gaussians:
     """Read a ``.ksplat`` file of any compression, 0 to 2, and SH degree, 0 to 2, as
-    :func:`~pointsplat_ns.io.read_scene` does. Sections of fewer SH get zeros.
-
-    Raises:
-        SceneError: if the file is of another kind, is truncated, or declares more than it can hold.
-    """
+    :func:`~pointsplat_ns.io.read_scene` does. Sections of fewer SH get zeros. Raises SceneError if the file is of
+    another kind, is truncated, or declares more than it can hold."""
     path = require_file(path, "a .ksplat file")
     with damage_named(path, ".ksplat"):
         require_memory(path, 3 * path.stat().st_size)

@@ -107,11 +107,8 @@ def format_named(name: str) -> Format | None:
 
 
 def format_to_read(path: Path) -> Format | None:
-    """The format of a file or SOG folder by its first bytes, else by its name; None if neither is known.
-
-    Raises:
-        SceneError: if the file cannot be read, or its format is written only.
-    """
+    """The format of a file or SOG folder by its first bytes, else by its name; None if neither is known. Raises
+    SceneError if the file cannot be read, or its format is written only."""
     if path.is_dir():
         return format_named(META) if (path / META).is_file() else None
     named = format_named(path.name)

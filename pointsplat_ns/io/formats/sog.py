@@ -48,11 +48,8 @@ _LARGEST = 252  # alpha of a quaternion's pixel is this plus the index of its la
 
 def read_sog(path: Path | str) -> Gaussians:
     """Read a ``.sog`` file, or a folder of its parts or the ``meta.json`` in one, of version 2 or of the first, which
-    has no number, as :func:`~pointsplat_ns.io.read_scene` does.
-
-    Raises:
-        SceneError: if a part is missing or damaged, or declares more than it can hold.
-    """
+    has no number, as :func:`~pointsplat_ns.io.read_scene` does. Raises SceneError if a part is missing or damaged, or
+    declares more than it can hold."""
     path = Path(path)
     with damage_named(path, "SOG"), closing(Images(path)) as images:
         scene = _decode(images, images.meta(), path)
@@ -61,11 +58,7 @@ def read_sog(path: Path | str) -> Gaussians:
 
 def encode_sog(scene: Gaussians, progress: Progress = silent) -> bytes:
     """The bytes of a ``.sog`` file of a scene, float32 on the CPU. Gaussians are reordered, so that neighbours in the
-    images are neighbours in space.
-
-    Raises:
-        SceneError: if there are more Gaussians than the images can hold.
-    """
+    images are neighbours in space. Raises SceneError if there are more Gaussians than the images can hold."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
         for name, data in _parts(scene, progress).items():

@@ -32,11 +32,8 @@ _ROW = np.dtype([("means", "<f4", 3), ("stds", "<f4", 3), ("rgba", "u1", 4), ("q
 
 
 def read_splat(path: Path | str) -> Gaussians:
-    """Read a ``.splat`` file, as :func:`~pointsplat_ns.io.read_scene` does; the SH degree is 0.
-
-    Raises:
-        SceneError: if its size is not a multiple of 32 bytes, or it does not fit into memory.
-    """
+    """Read a ``.splat`` file, as :func:`~pointsplat_ns.io.read_scene` does; the SH degree is 0. Raises SceneError if
+    its size is not a multiple of 32 bytes, or it does not fit into memory."""
     path = require_file(path, "a .splat file")
     size = path.stat().st_size
     if size % _ROW.itemsize:

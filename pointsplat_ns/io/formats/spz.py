@@ -70,11 +70,8 @@ class _Head:
 
 def read_spz(path: Path | str) -> Gaussians:
     """Read an SPZ file of version 2, 3 or 4, as :func:`~pointsplat_ns.io.read_scene` does. The axes stay those of the
-    file. Of SH degree 4, the highest band is left out, which is logged.
-
-    Raises:
-        SceneError: if the file is of another kind or version, is truncated, or declares more than it can hold.
-    """
+    file. Of SH degree 4, the highest band is left out, which is logged. Raises SceneError if the file is of another
+    kind or version, is truncated, or declares more than it can hold."""
     path = require_file(path, "an SPZ file")
     with damage_named(path, "SPZ"):
         data = load_bytes(path)
@@ -146,11 +143,8 @@ def write_spz(
     version: Version = 3,
     sh_bits: tuple[int, int] = SH_BITS,
 ) -> None:
-    """Write an SPZ file, as :func:`encode_spz` makes it. Gaussians that cannot be drawn are left out.
-
-    Raises:
-        SceneError: if it cannot be written, or the scene is too large for the format.
-    """
+    """Write an SPZ file, as :func:`encode_spz` makes it. Gaussians that cannot be drawn are left out. Raises SceneError
+    if it cannot be written, or the scene is too large for the format."""
     data = encode_spz(keep_usable(scene.detach().to("cpu", torch.float32), path), progress, version, sh_bits)
     with replacing(path, len(data)) as part:
         part.write_bytes(data)

@@ -62,7 +62,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
 
     def set_timestamp(self) -> None:
         """As nerfstudio's; of processes that ``torchrun`` started, which are connected here, all take the first one's.
-        A PointSplatError if nerfstudio is to start several processes on a CPU, which it cannot."""
+        Raises PointSplatError if nerfstudio is to start several processes on a CPU, which it cannot."""
         kind, number = self.machine.device_type, self.machine.num_devices
         if kind != "cuda" and number > 1:
             raise PointSplatError(

@@ -72,8 +72,8 @@ class ScenesDataManager(SpiralSource):
 
     The scene and photos of a step depend only on the seed and the step, so that a resumed training continues as if it
     had not been stopped. Of W processes, process R takes the places R, W + R, 2 W + R... of one sequence: together they
-    see what one process sees in W times the steps. A SceneError if ``data`` holds no trained run, or ``eval_scenes``
-    names one that is not there.
+    see what one process sees in W times the steps. Raises SceneError if ``data`` holds no trained run, or
+    ``eval_scenes`` names one that is not there.
     """
 
     config: ScenesDataManagerConfig

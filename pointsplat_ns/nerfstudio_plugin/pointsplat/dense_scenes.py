@@ -121,7 +121,7 @@ class DenseScene:
         return dense
 
     def cameras(self, split: Split) -> Cameras:
-        """Pinhole cameras (C,) sampled in free space, different ones for each split. A DataError if nothing of the
+        """Pinhole cameras (C,) sampled in free space, different ones for each split. Raises DataError if nothing of the
         scene is visible, or no free position is found."""
         poses = self._poses
         seed = random.Random(f"{poses.seed} poses {split}").getrandbits(31)

@@ -86,7 +86,7 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     """Read by ``ns-export``: above 0, colours are SH coefficients. A scene may have any degree."""
 
     def prune_settings(self, keep: float | None = None) -> PruneSettings:
-        """How scenes are pruned; ``keep`` is the config's own by default. A PointSplatError if the settings fit no
+        """How scenes are pruned; ``keep`` is the config's own by default. Raises PointSplatError if the settings fit no
         scene."""
         return PruneSettings(self.keep if keep is None else keep, self.by, self.opacity_weight)
 
@@ -126,8 +126,8 @@ class PointSplatModel(SplatfactoModel):
     config: PointSplatModelConfig  # type: ignore[assignment]  # Splatfacto's options would have no effect here
 
     def populate_modules(self) -> None:
-        """Build the network. The Gaussians of scenes are not parameters of the model. A PointSplatError if the config
-        is not valid."""
+        """Build the network. The Gaussians of scenes are not parameters of the model. Raises PointSplatError if the
+        config is not valid."""
         self.config.check()
         self.refiner = Refiner(preset(self.config.size, **self.config.network_options()))
         self.crop_box: OrientedBox | None = None
@@ -147,8 +147,8 @@ class PointSplatModel(SplatfactoModel):
         return PrunedScenes(cache, self.config.pruned_folder, self.refiner.prepare)
 
     def load_state_dict(self, dict, **kwargs):  # type: ignore[override]
-        """Load the network's weights. Splatfacto's own method would look for Gaussians. A SceneError if the weights are
-        those of another network; nerfstudio would load the part that fits."""
+        """Load the network's weights. Splatfacto's own method would look for Gaussians. Raises SceneError if the
+        weights are those of another network; nerfstudio would load the part that fits."""
         self._refined = None
         try:
             return torch.nn.Module.load_state_dict(self, dict, **{**kwargs, "strict": True})
@@ -169,7 +169,7 @@ class PointSplatModel(SplatfactoModel):
 
     def pruned_scene(self, index: int, dense: Gaussians | None = None, keep: float | None = None) -> PrunedScene:
         """A pruned scene and its neighbour tables, by its index. ``dense`` are its Gaussians, if they have been read
-        already; ``keep`` is by default the config's. A PointSplatError if the settings do not fit this scene."""
+        already; ``keep`` is by default the config's. Raises PointSplatError if the settings do not fit this scene."""
         return self._pruned.get(self.scenes[index], self.config.prune_settings(keep), self.device, dense)
 
     def refine(self, index: int) -> Gaussians:

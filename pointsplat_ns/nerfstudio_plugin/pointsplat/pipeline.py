@@ -42,7 +42,7 @@ class PointSplatPipelineConfig(VanillaPipelineConfig):
 
 
 class PointSplatPipeline(VanillaPipeline):
-    """Each step prunes and refines one scene and renders it from some of its training cameras. A SceneError if
+    """Each step prunes and refines one scene and renders it from some of its training cameras. Raises SceneError if
     ``--data`` holds no scene, or ``world_size`` processes are not connected."""
 
     datamanager: ScenesDataManager

@@ -30,8 +30,8 @@ def write_pruned(path: Path, pruned: Gaussians, dense_count: int, seconds: float
 
 
 def read_pruned(path: Path) -> tuple[Gaussians, int, float]:
-    """The scene on the CPU, the dense count and the seconds of a file of :func:`write_pruned`. A SceneError if the file
-    is damaged or of another kind."""
+    """The scene on the CPU, the dense count and the seconds of a file of :func:`write_pruned`. Raises SceneError if the
+    file is damaged or of another kind."""
     from safetensors import SafetensorError, safe_open
 
     try:

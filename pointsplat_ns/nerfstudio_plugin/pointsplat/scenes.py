@@ -36,7 +36,7 @@ def dataparser_of(run: Run) -> DataParser:
     """The dataparser that a run was trained with, with the same settings.
 
     Only classes that nerfstudio or an installed plugin registers are used: the name in the run's file is looked up
-    among them and is never imported. A SceneError if the dataparser is not installed or does not know a setting.
+    among them and is never imported. Raises SceneError if the dataparser is not installed or does not know a setting.
     """
     from nerfstudio.configs.dataparser_configs import all_dataparsers
 
@@ -109,8 +109,8 @@ class TrainedScene(DenseScene):
         return dataparser_of(self.run)
 
     def _outputs(self, split: str) -> DataparserOutputs:
-        """The dataparser's outputs for a split. A DataError if the data is damaged, or its coordinate frame is not that
-        of the Gaussians."""
+        """The dataparser's outputs for a split. Raises DataError if the data is damaged, or its coordinate frame is not
+        that of the Gaussians."""
         try:
             outputs = self._dataparser.get_dataparser_outputs(split=split)
         except PointSplatError:

@@ -60,8 +60,8 @@ class PointSplatTrainer(StoppableTrainer):
         self.gradient_accumulation_steps = defaultdict(lambda: steps.get("all", 1), steps)
 
     def setup_optimizers(self) -> AveragingOptimizers:
-        """The optimisers. A PointSplatError if ``gradient_accumulation_steps`` names an unknown part of the network or
-        a number below 1, or ``max_skipped_steps`` is negative."""
+        """The optimisers. Raises PointSplatError if ``gradient_accumulation_steps`` names an unknown part of the
+        network or a number below 1, or ``max_skipped_steps`` is negative."""
         groups = self.pipeline.get_param_groups()
         for name, steps in self.config.gradient_accumulation_steps.items():
             if name not in (*groups, "all") or steps < 1:

@@ -59,8 +59,8 @@ class ReplicaDataParser(DataParser):
         self._scene: ReplicaScene | None = None
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
-        """See the base class. ``split`` is "train", or "val" or "test", which are the same held-out frames. A DataError
-        if the folder or the configuration cannot be used."""
+        """See the base class. ``split`` is "train", or "val" or "test", which are the same held-out frames. Raises
+        DataError if the folder or the configuration cannot be used."""
         config = self.config
         self._check_config()
         if self._scene is None:  # once for both splits
@@ -155,7 +155,7 @@ class ReplicaDataParser(DataParser):
 
 
 def read_eval_list(path: Path) -> list[int]:
-    """Frame numbers from a text file with one ``120``, ``frame000120`` or ``results/frame000120.jpg`` per line. A
+    """Frame numbers from a text file with one ``120``, ``frame000120`` or ``results/frame000120.jpg`` per line. Raises
     DataError if the file is missing or empty, or a line is not a frame."""
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()

@@ -164,8 +164,8 @@ def load_replica(folder: Path, check_sizes: bool = True) -> ReplicaScene:
 
 
 def read_cam_params(folder: Path) -> PinholeParams:
-    """Intrinsics from the ``cam_params.json`` in the scene folder or the folder above it. A DataError if there is none,
-    it is not JSON, or a number is missing or out of range."""
+    """Intrinsics from the ``cam_params.json`` in the scene folder or the folder above it. Raises DataError if there is
+    none, it is not JSON, or a number is missing or out of range."""
     candidates = [folder / "cam_params.json", folder.absolute().parent / "cam_params.json"]
     path = next((p for p in candidates if p.is_file()), None)
     if path is None:
@@ -204,7 +204,7 @@ def read_cam_params(folder: Path) -> PinholeParams:
 
 def read_trajectory(path: Path) -> np.ndarray:
     """The poses of a ``traj.txt``: float64 (F, 4, 4), camera-to-world, not yet checked to be rigid or finite. Blank
-    lines are ignored. A DataError if the file is missing, or a line is not 16 numbers."""
+    lines are ignored. Raises DataError if the file is missing, or a line is not 16 numbers."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -228,8 +228,8 @@ def read_trajectory(path: Path) -> np.ndarray:
 
 
 def read_photo(path: Path, params: PinholeParams) -> np.ndarray:
-    """One photo, uint8 (H, W, 3), sRGB. A DataError if it is missing or broken, not of 8 bits a channel, or of another
-    size than ``params``."""
+    """One photo, uint8 (H, W, 3), sRGB. Raises DataError if it is missing or broken, not of 8 bits a channel, or of
+    another size than ``params``."""
     image = _open_image(path)
     _check_size(path, image.size, params)
     if image.mode.startswith(("I", "F")):
@@ -238,7 +238,7 @@ def read_photo(path: Path, params: PinholeParams) -> np.ndarray:
 
 
 def read_depth(path: Path, params: PinholeParams) -> np.ndarray:
-    """One depth image, float32 (H, W), scene units along the optical axis, 0 where unknown. A DataError if it is
+    """One depth image, float32 (H, W), scene units along the optical axis, 0 where unknown. Raises DataError if it is
     missing or broken, not of 16 bits, or of another size than ``params``."""
     image = _open_image(path)
     _check_size(path, image.size, params)
@@ -307,8 +307,8 @@ def _some(items: list[str], limit: int = 5) -> str:
 
 
 def _rigid(poses: np.ndarray, lines: list[int], path: Path) -> np.ndarray:
-    """Poses with each rotation replaced by the nearest orthonormal one (polar factor, by SVD). A DataError if the last
-    row is not (0, 0, 0, 1), the drift is too large, or the axes are mirrored."""
+    """Poses with each rotation replaced by the nearest orthonormal one (polar factor, by SVD). Raises DataError if the
+    last row is not (0, 0, 0, 1), the drift is too large, or the axes are mirrored."""
     last = np.abs(poses[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1)
     rotation = poses[:, :3, :3]
     drift = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max(axis=(1, 2))

@@ -19,7 +19,7 @@ def fuse_depth(
     At most 200 frames are read, evenly spaced, one at a time: neighbouring frames of a video see the same surfaces. At
     most ``40 * num_points`` pixels are kept in total, several for most voxels, so that time and memory do not grow with
     the length of the capture. Each occupied voxel gives one point, the mean of its pixels. The voxels are as small as
-    ``num_points`` allows. ``principal_point`` is (cx, cy) with the first pixel's centre at 0.5. A DataError if the
+    ``num_points`` allows. ``principal_point`` is (cx, cy) with the first pixel's centre at 0.5. Raises DataError if the
     scene has no depth images.
     """
     depths = scene.depths

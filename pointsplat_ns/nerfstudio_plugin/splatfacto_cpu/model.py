@@ -184,7 +184,7 @@ class SplatfactoCpuModel(SplatfactoModel):
         self.info["radii"] = torch.zeros_like(self.info["radii"])  # nothing was seen
 
     def get_outputs(self, camera: Cameras | RayBundle) -> dict[str, Any]:
-        """Render one camera of shape (1,), on the model's device. A DataError if the camera is no pinhole.
+        """Render one camera of shape (1,), on the model's device. Raises DataError if the camera is no pinhole.
 
         Returns:
             ``rgb`` (H, W, 3) in [0, 1]; ``accumulation`` (H, W, 1); ``background``, (3,) in training and (H, W, 3) in

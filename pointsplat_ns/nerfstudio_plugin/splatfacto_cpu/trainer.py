@@ -68,7 +68,8 @@ class SplatfactoCpuTrainer(StoppableTrainer):
         self._skipped_in_a_row = 0
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """As nerfstudio's. A PointSplatError if the data cannot be used, or ``max_skipped_in_a_row`` is negative."""
+        """As nerfstudio's. Raises PointSplatError if the data cannot be used, or ``max_skipped_in_a_row`` is
+        negative."""
         if self.config.max_skipped_in_a_row < 0:
             raise PointSplatError(f"--max-skipped-in-a-row {self.config.max_skipped_in_a_row}: expected at least 0")
         super().setup(test_mode)
