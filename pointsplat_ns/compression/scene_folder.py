@@ -25,7 +25,7 @@ from pointsplat_ns.compression.scene_task import (
 )
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io.discovery import RESULTS_NAME, find_scenes
-from pointsplat_ns.io.files import logger, replacing
+from pointsplat_ns.io.files import logger, read_text, replacing
 from pointsplat_ns.system.claims import claim
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.workers import in_processes, in_turn
@@ -205,7 +205,7 @@ def _check_and_describe(output: Path, command: Command, force: bool) -> None:
 def _description(path: Path) -> dict | None:
     """The description of the results in a folder; None if there is none."""
     try:
-        known = json.loads(path.read_text("utf-8"))
+        known = json.loads(read_text(path))
     except FileNotFoundError:
         return None
     except (ValueError, RecursionError):

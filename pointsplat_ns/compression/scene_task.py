@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import content_hash, logger, one_line, replacing
+from pointsplat_ns.io.files import content_hash, logger, one_line, read_text, replacing
 from pointsplat_ns.io.ply import write_ply
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.system.claims import claim
@@ -228,7 +228,7 @@ def _is_number(value: Any, kind: type) -> bool:
 def _read_record(task: SceneTask) -> dict[str, Any] | None:
     """The content of a scene's record; None if it is missing or damaged."""
     try:
-        record = json.loads(task.record.read_text("utf-8"))
+        record = json.loads(read_text(task.record))
     except (OSError, ValueError, RecursionError):
         return None
     if not isinstance(record, dict) or record.get("status") not in ("done", "failed"):

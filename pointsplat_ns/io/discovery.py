@@ -154,7 +154,7 @@ def _files_with_gaussians(root: Path, wanted: Callable[[str], bool]) -> list[Pat
     """Files at or below a path that hold a scene and whose names are ``wanted``, sorted.
 
     Folders of runs, hidden folders and :data:`RESULTS_NAME`'s are not searched. A PLY may also hold points or a mesh,
-    so its header is read.
+    so its header is read. Pipes, sockets and devices may have no end, and are not opened.
     """
     paths = [root] if root.is_file() and wanted(root.name) else []
     for place, inner, files in os.walk(root):
@@ -165,10 +165,13 @@ def _files_with_gaussians(root: Path, wanted: Callable[[str], bool]) -> list[Pat
         paths += [Path(place) / name for name in files if wanted(name) and not name.startswith(".")]
     scenes = []
     for path in sorted(paths):
-        if path.suffix.lower() != ".ply" or _holds_gaussians(path):
-            scenes.append(path)
+        why = "" if path.is_file() else "not a regular file"
+        if not why and path.suffix.lower() == ".ply":
+            why = _why_none(path)
+        if why:
+            logger.warning("passed over %s: %s", path, why)
         else:
-            logger.warning("passed over %s: no Gaussians in it", path)
+            scenes.append(path)
     return scenes
 
 
@@ -208,14 +211,15 @@ def _when(run: Run) -> tuple[float, int]:
         return run.checkpoint.stat().st_mtime, run.step
 
 
-def _holds_gaussians(path: Path) -> bool:
+def _why_none(path: Path) -> str:
+    """Why a PLY holds no Gaussians; empty if it does."""
     try:
         with path.open("rb") as stream:
             header = read_header(stream, path)
-    except (SceneError, OSError):
-        return False
-    if is_compressed(header):
-        return True
-    return any(
-        {"opacity", "scale_0", "rot_0"} <= {name for name, _ in element.properties} for element in header.elements
-    )
+    except OSError as error:
+        return f"cannot be read ({error.strerror})"
+    except SceneError:
+        return "no Gaussians in it"
+    names = ({name for name, _ in element.properties} for element in header.elements)
+    found = is_compressed(header) or any({"opacity", "scale_0", "rot_0"} <= own for own in names)
+    return "" if found else "no Gaussians in it"

@@ -36,6 +36,25 @@ def require_file(path: Path | str, what: str) -> Path:
     return path
 
 
+def read_text(path: Path, most: int = 1 << 26) -> str:
+    """The text of a small file, which is not opened if it may have no end.
+
+    Args:
+        path: the file, in UTF-8.
+        most: largest size, bytes.
+
+    Raises:
+        OSError: if it is missing, a folder, a pipe or a device, or cannot be read.
+        ValueError: if it is larger, or no text.
+    """
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    if found.st_size > most:
+        raise ValueError(f"larger than {most:,} bytes")
+    return path.read_text("utf-8")
+
+
 def require_memory(path: Path | str, size: int) -> None:
     """Raise a SceneError if ``size`` bytes, which a file's content takes, are not free. A sparse file, whose zeros take
     no disk space, may claim any size."""

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.files import file_stem, logger, one_line
+from pointsplat_ns.io.files import file_stem, logger, one_line, read_text
 from pointsplat_ns.io.inert_yaml import Tagged, read_config
 from pointsplat_ns.io.splatfacto import is_complete
 
@@ -230,9 +230,7 @@ def read_transforms(path: Path) -> tuple[Tensor, float]:
     if not path.is_file():
         return torch.eye(4)[:3], 1.0
     try:
-        if path.stat().st_size > (1 << 16):  # nerfstudio writes some hundreds
-            raise ValueError(f"{path.stat().st_size} bytes")
-        content = json.loads(path.read_text("utf-8"))
+        content = json.loads(read_text(path, 1 << 16))  # nerfstudio writes some hundreds of bytes
         transform = torch.tensor(content["transform"], dtype=torch.float32)
         scale = float(content["scale"])
     except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError, RuntimeError) as error:

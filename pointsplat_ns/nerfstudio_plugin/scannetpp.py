@@ -16,6 +16,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.cameras import flip_camera_axes
+from pointsplat_ns.io.files import read_text
 
 
 @dataclass
@@ -57,7 +58,7 @@ class SeededScanNetpp(ScanNetpp):
         path = self.config.data / self.config.transforms_path
         expected = "expected JSON with frames and test_frames, as ScanNet++ has it"
         try:
-            meta = json.loads(path.read_text("utf-8"))
+            meta = json.loads(read_text(path, 1 << 28))
             return {frame["file_path"]: frame for frame in (*meta["frames"], *meta["test_frames"])}
         except FileNotFoundError as error:
             raise DataError(f"{path}: no such file; {expected}; --data names the scene's folder") from error

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.files import lack_of_room
+from pointsplat_ns.io.files import lack_of_room, read_text
 from pointsplat_ns.rooms.camera_path import capture_path
 from pointsplat_ns.rooms.render import default_intrinsics, render_room
 from pointsplat_ns.rooms.room import make_room
@@ -19,8 +19,8 @@ from pointsplat_ns.system.progress import Progress, tracked
 def is_written(folder: Path, frames: int, width: int, height: int) -> bool:
     """Whether a folder holds a room of such photos. As rooms get their names when they are complete, it then is."""
     try:
-        camera = json.loads((folder / "cam_params.json").read_text("utf-8"))["camera"]
-        poses = (folder / "traj.txt").read_text("utf-8").splitlines()
+        camera = json.loads(read_text(folder / "cam_params.json"))["camera"]
+        poses = read_text(folder / "traj.txt").splitlines()
         photos = list((folder / "results").glob("frame*.jpg"))
         return len(poses) == len(photos) == frames and (camera["w"], camera["h"]) == (width, height)
     except (OSError, ValueError, TypeError, KeyError, RecursionError):

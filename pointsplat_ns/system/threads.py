@@ -98,7 +98,8 @@ def fixed_threads(count: int | None) -> Iterator[None]:
     chosen; None changes nothing.
 
     Raises:
-        PointSplatError: if the number is below 1.
+        PointSplatError: if the number is below 1, or above 1024, which is more than machines have cores: the system
+            does not start any number of threads, and torch ends the program then.
 
     Example:
         >>> with fixed_threads(1):
@@ -108,8 +109,8 @@ def fixed_threads(count: int | None) -> Iterator[None]:
     if count is None:
         yield
         return
-    if count < 1:
-        raise PointSplatError(f"{count} threads; expected at least 1")
+    if not 1 <= count <= 1024:
+        raise PointSplatError(f"{count} threads; expected 1 to 1024")
     before, variable = torch.get_num_threads(), os.environ.get(ENVIRONMENT)
     torch.set_num_threads(count)
     os.environ[ENVIRONMENT] = str(count)

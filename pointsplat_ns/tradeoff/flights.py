@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import write_json
+from pointsplat_ns.io.files import read_text, write_json
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pruning import ply_bytes
 
@@ -57,9 +57,7 @@ def read_flight_beside(path: Path, dense: Path) -> dict[str, Any] | None:
 
 def _read(path: Path) -> dict[str, Any] | None:
     try:
-        if path.stat().st_size > MAX_BYTES:
-            return None
-        flight = json.loads(path.read_text("utf-8"))
+        flight = json.loads(read_text(path, MAX_BYTES))
     except (OSError, ValueError, RecursionError):
         return None
     keys = {"scenes", "views", "aspect", "up", "sure", "near", "background", "antialiased", "drag"}

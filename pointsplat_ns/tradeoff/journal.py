@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.io.files import one_line, write_json
+from pointsplat_ns.io.files import one_line, read_text, write_json
 from pointsplat_ns.tradeoff.points import Point, Quality
 from pointsplat_ns.tradeoff.settings import DENSE, Setting, setting_of
 
@@ -62,9 +62,7 @@ class Form:
             SceneError: if the file is not such a journal, or damaged.
         """
         try:
-            if path.stat().st_size > MOST_BYTES:
-                raise ValueError(f"larger than {MOST_BYTES:,} bytes")
-            content = json.loads(path.read_text("utf-8"))
+            content = json.loads(read_text(path, MOST_BYTES))
             if content["format"] != self.name:
                 raise ValueError(f"of format {content['format']}")
             if content["version"] != self.version:

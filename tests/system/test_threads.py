@@ -57,8 +57,9 @@ def test_a_fixed_number_of_threads_is_that_of_torch_and_of_programs_that_are_sta
     assert torch.get_num_threads() == before and os.environ.get("OMP_NUM_THREADS") == variable
 
 
-def test_less_than_one_thread_is_refused():
-    with pytest.raises(PointSplatError, match="0 threads; expected at least 1"), fixed_threads(0):
+@pytest.mark.parametrize("count", [0, 1_000_000])
+def test_numbers_of_threads_that_nothing_has_are_refused(count):
+    with pytest.raises(PointSplatError, match=f"{count} threads; expected 1 to 1024"), fixed_threads(count):
         pass
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.io.files import read_text
 
 REFINER_NAME = "refiner.safetensors"
 """File of the trained network in the run's folder, for ``pointsplat compact --refiner``."""
@@ -18,9 +19,7 @@ VARIANTS = ("dense", "pruned", "refined")
 def read_evaluation(path: Path) -> dict[str, Any]:
     """The results in a file that ``ns-eval`` wrote for a pointsplat run; a DataError if it is none."""
     try:
-        if path.stat().st_size > 1 << 26:  # an evaluation has about 2 kB a scene
-            raise ValueError("too large")
-        results = json.loads(path.read_text("utf-8"))["results"]
+        results = json.loads(read_text(path))["results"]
         _check(results)
         json.dumps(results, ensure_ascii=False).encode("utf-8")  # halves of characters could not be shown
         return results

@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.files import one_line
+from pointsplat_ns.io.files import one_line, read_text
 
 logger = logging.getLogger(__name__)
 
@@ -174,7 +174,7 @@ def read_cam_params(folder: Path) -> PinholeParams:
             '{"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}} in one of them'
         )
     try:
-        camera = json.loads(path.read_text(encoding="utf-8"))["camera"]
+        camera = json.loads(read_text(path))["camera"]
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: not valid JSON ({one_line(error)}); expected a camera's intrinsics") from None
     except (KeyError, TypeError):
@@ -206,10 +206,10 @@ def read_trajectory(path: Path) -> np.ndarray:
     """The poses of a ``traj.txt``: float64 (F, 4, 4), camera-to-world, not yet checked to be rigid or finite. Blank
     lines are ignored. Raises DataError if the file is missing, or a line is not 16 numbers."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, 1 << 28)
     except FileNotFoundError:
         raise DataError(f"{path}: not found; expected one camera-to-world (16 numbers) per line") from None
-    except UnicodeDecodeError:
+    except (OSError, ValueError):
         raise DataError(f"{path}: not a text file; expected one camera-to-world (16 numbers) per line") from None
     rows = []
     for number, line in enumerate(text.splitlines(), start=1):
