@@ -32,6 +32,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     ),
     "info": (
         ("what is in a scene", "pointsplat info room.ply"),
+        ("scenes side by side", "pointsplat info room.ply small.spz"),
         ("where other commands look at it from", "pointsplat info room.ply --views sheet.png"),
         ("the same for a program", "pointsplat info room.spz --json"),
     ),

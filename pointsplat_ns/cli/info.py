@@ -1,53 +1,84 @@
-"""``pointsplat info``: figures of a scene."""
+"""``pointsplat info``: figures of scenes."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import tyro
+
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Resolution, Scene, Up, check_output
+from pointsplat_ns.cli.scene_options import Resolution, Up, check_output
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_info import SceneInfo
 
 
 def info(
-    scene: Scene,
+    scenes: tyro.conf.Positional[tuple[Path, ...]],
     views: Path | None = None,
     resolution: Resolution = None,
     up: Up = None,
     force: bool = False,
     json_output: Json = False,
 ) -> None:
-    """Look at a scene: counts, SH, opacities, sizes, bounds, rows that look wrong, and what files of it would weigh.
+    """Look at scenes: format and size, counts, SH, up, fill, opacities, sizes, bounds, rows that look wrong, and what
+    files of other formats would weigh. Several make a table.
 
     Args:
-        scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
-        views: a .png file for a sheet of the views that other commands use without --poses.
-        resolution: size of these views, pixels. By default the size of the photos, if there are any, else 1920x1080.
+        scenes: files of any format, Splatfacto checkpoints, or runs (their folder or config.yml).
+        views: a .png file for a sheet of the views that other commands use without --poses, for one scene.
+        resolution: size of views, pixels. By default the size of the photos for the sheet, if there are any, else
+            1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is
             estimated. Write --up=-y for a negative axis.
         force: overwrite an existing file.
-        json_output: print JSON, and nothing else on standard output.
+        json_output: print JSON, and nothing else on standard output: an object, or a list for several scenes.
     """
     import pointsplat_ns as ps
-    from pointsplat_ns.looking.windows import parse_resolution
+    from pointsplat_ns.errors import PointSplatError
 
-    parse_resolution(resolution)
     check_output(views, ".png", force)
-    found = ps.info(scene)
-    sheet = None if views is None else ps.plot_views(scene, views, resolution=resolution, up=up)
+    if not scenes or (views is not None and len(scenes) > 1):
+        raise PointSplatError(f"{len(scenes)} scenes; expected {'one' if views else 'at least one'}")
+    found = [ps.info(scene, resolution=resolution, up=up) for scene in scenes]
+    sheet = None if views is None else ps.plot_views(scenes[0], views, resolution=resolution, up=up)
     if json_output:
-        print_json(found.as_dict())
+        print_json([one.as_dict() for one in found] if len(found) > 1 else found[0].as_dict())
         return
-    _print(found)
+    if len(found) > 1:
+        _print_table(found)
+    else:
+        _print(found[0])
     if sheet is not None:
         print(sheet)
 
 
+def _print_table(found: list[SceneInfo]) -> None:
+    """A line for each scene, sizes in MB."""
+    suffixes = [".ply", ".compressed.ply", ".spz", ".sog"]
+    rows = [["file", "format", "MB", "Gaussians", "SH", "up", "fill", "suspicious", *suffixes]]
+    for one in found:
+        sizes = [one.file_bytes.get(suffix, {}).get("100%") for suffix in suffixes]
+        rows.append([
+            one.file, one.format, f"{one.bytes / 1e6:.2f}", f"{one.gaussians:,}", f"{one.sh_degree}", one.up_text,
+            "-" if one.fill is None else f"{one.fill:.1f}", f"{sum(one.suspicious.values()):,}",
+            *("-" if size is None else f"{size / 1e6:.2f}" for size in sizes),
+        ])  # fmt: skip
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = [cell.ljust(width) if at in (0, 1, 5) else cell.rjust(width) for at, (cell, width) in
+                 enumerate(zip(row, widths, strict=True))]  # fmt: skip
+        print("  ".join(cells).rstrip())
+    print("fill: Gaussians drawn per pixel; the last four: MB in this format, .spz and .sog estimated")
+
+
 def _print(found: SceneInfo) -> None:
+    print(f"{found.file}: {found.format}, {found.bytes / 1e6:.2f} MB")
     print(f"{found.gaussians:,} Gaussians of SH degree {found.sh_degree}")
+    print(f"up: {found.up_text}{'; --up names another axis' if found.up_is_guess else ''}")
+    if found.fill is not None:
+        print(f"fill: {found.fill:.1f} Gaussians drawn per pixel, in {found.views}")
     if found.sh_energies:
         root = ", ".join(f"degree {index + 1}: {value**0.5:.3g}" for index, value in enumerate(found.sh_energies))
         print(f"what SH add to colours, root mean square: {root}")
@@ -59,7 +90,7 @@ def _print(found: SceneInfo) -> None:
     _bars("opacity", {f"{index * step:.1f}": count for index, count in enumerate(found.opacities)})
     _bars("largest standard deviation, scene units, from", found.sizes)
     print("suspicious: " + (", ".join(f"{what} {n:,}" for what, n in found.suspicious.items()) or "nothing"))
-    print("files, MB, if a share of the Gaussians is kept (.spz is estimated):")
+    print("files, MB, if a share of the Gaussians is kept (.spz and .sog are estimated):")
     shares = next(iter(found.file_bytes.values()), {})
     print(" " * 18 + "".join(f"{share:>9}" for share in shares))
     for suffix, sizes in found.file_bytes.items():

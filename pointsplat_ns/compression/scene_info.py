@@ -1,9 +1,10 @@
-"""Figures of a scene: counts, SH, opacities, sizes, bounds, suspicious rows, and sizes of files."""
+"""Figures of a scene: its file, counts, SH, up, fill, opacities, sizes, bounds, suspicious rows, and sizes of files."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,16 +12,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pointsplat_ns.errors import SceneError
+from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.quaternions import SHORTEST
 from pointsplat_ns.io.files import unusable_kept
-from pointsplat_ns.io.formats import FORMATS, Format
+from pointsplat_ns.io.formats import FORMATS, Format, format_name
+from pointsplat_ns.io.formats.sog import sog_bytes_like
+from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.io.scene import read_scene
+from pointsplat_ns.io.source import source_parts
+from pointsplat_ns.looking.fill import fill
+from pointsplat_ns.looking.upright import Up, up_named
+from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.looking.windows import parse_resolution
 from pointsplat_ns.pruning.duplicates import Copies
 from pointsplat_ns.pruning.sh_bands import band_energies
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
-from pointsplat_ns.system.progress import silent
 
 
 @dataclass(frozen=True)
@@ -34,8 +41,21 @@ class SceneInfo:
         (100, {})
     """
 
+    file: str
+    """The path of the scene; empty for Gaussians in memory, whose format is empty too, and whose size is 0."""
+    format: str
+    bytes: int
     gaussians: int
     sh_degree: int
+    up: list[float]
+    """The direction that is up, of length 1; empty if nothing is visible."""
+    up_is_guess: bool
+    """Whether it was estimated without evidence that agrees."""
+    fill: float | None
+    """Mean number of Gaussians drawn per pixel (:func:`pointsplat_ns.looking.fill.fill`) in sampled views; None if
+    there are none."""
+    views: str
+    """Number and size of these views, as text."""
     sh_energies: list[float]
     """Mean square of the contribution of each band to the colours, from degree 1 on."""
     opacities: list[int]
@@ -49,39 +69,69 @@ class SceneInfo:
     suspicious: dict[str, int]
     """Number of rows by kind of defect; kinds without rows are left out."""
     file_bytes: dict[str, dict[str, int]]
-    """Bytes of a file by format and share of the Gaussians that is kept. Sizes of ``.spz`` are estimates,
-    without an entry where the scene is too large for the format."""
+    """Bytes of a file by format and share of the Gaussians that is kept. Sizes of ``.spz`` and ``.sog`` are estimated
+    from 10,000 Gaussians; there is no entry where the scene is too large for the format."""
+
+    @property
+    def up_text(self) -> str:
+        """The direction that is up, named or in numbers, and whether it is a guess; "unknown" if nothing is visible."""
+        return str(Up(torch.tensor(self.up, dtype=torch.float64), not self.up_is_guess)) if self.up else "unknown"
 
     def as_dict(self) -> dict[str, Any]:
         """The figures as numbers, lists and dictionaries that JSON can hold."""
         return dataclasses.asdict(self)
 
 
-def info(scene: Gaussians | str | Path) -> SceneInfo:
+def info(
+    scene: Gaussians | str | Path, resolution: tuple[int, int] | str | None = None, up: str | None = None
+) -> SceneInfo:
     """Measure a scene.
 
     Args:
         scene: N Gaussians, or the path of a scene. Undrawable Gaussians of a file are counted too; other functions drop
             them when reading.
+        resolution: size of the pictures in which fill is counted, pixels; by default 1920x1080.
+        up: the axis that is up, such as "-y"; by default it is estimated.
 
     Raises:
         SceneError: if the file is not usable.
+        PointSplatError: if the resolution or the axis is none.
 
     Example:
         >>> import pointsplat_ns as ps
         >>> found = ps.info(ps.example_room())
-        >>> found.gaussians, found.sh_degree, found.file_bytes[".splat"]["10%"]
-        (62845, 1, 201120)
+        >>> found.gaussians, found.sh_degree, found.up_text, found.file_bytes[".splat"]["10%"]
+        (62845, 1, 'z', 201120)
     """
+    size, known = parse_resolution(resolution), up_named(up)
+    file, kind, bytes_ = "", "", 0
     if not isinstance(scene, Gaussians):
+        file = str(scene)
         with unusable_kept():
             scene = read_scene(scene)
+        parts = source_parts(file)
+        kind = format_name(parts[0] if len(parts) == 1 else parts[0].parent)
+        bytes_ = sum(part.stat().st_size for part in parts)
     scene = scene.detach().to("cpu", torch.float32)
     usable = scene.usable()
     good = scene[usable]
+    source = ViewSource(good, resolution=size, up=known)
+    try:
+        views = source.views(6)  # few, as info has to be fast
+        up_found: Up | None = source.up
+        filled, views_text = fill(good, views), f"{len(views)} views of {views.width} x {views.height} pixels"
+    except DataError:  # nothing is visible
+        up_found, filled, views_text = known, None, ""
     return SceneInfo(
+        file=file,
+        format=kind,
+        bytes=bytes_,
         gaussians=len(scene),
         sh_degree=scene.sh_degree,
+        up=[] if up_found is None else up_found.direction.tolist(),
+        up_is_guess=up_found is not None and not up_found.sure,
+        fill=filled,
+        views=views_text,
         sh_energies=band_energies(scene),
         opacities=torch.histc(good.alphas, 10, 0.0, 1.0).long().tolist(),
         sizes=_by_powers_of_ten(good.scales.amax(dim=1)) if len(good) else {},
@@ -125,16 +175,21 @@ def _corners(means: Tensor, outside: float) -> list[list[float]]:
 
 
 def _sizes(kind: Format, scene: Gaussians) -> dict[str, int]:
-    """Bytes of a file by share of the Gaussians. SPZ is estimated from up to 20,000 of them; empty for SOG and formats
-    without a size."""
+    """Bytes of a file by share of the Gaussians; empty for formats that are not written to one file."""
     counts = {f"{share:.0%}": int(share * len(scene) + 0.5) for share in (1.0, 0.5, 0.3, 0.1, 0.03)}
     if kind.bytes_of is not None:
         return {text: kind.bytes_of(count, scene.sh_degree) for text, count in counts.items()}
-    if kind.suffix != ".spz" or kind.encode is None:  # the palette of SOG does not grow with the scene
+    if kind.suffix not in (".spz", ".sog") or not len(scene):
         return {}
-    sample = scene[:: max(-(-len(scene) // 20_000), 1)]
     try:
-        each = len(kind.encode(sample, silent)) / max(len(sample), 1)
+        size = _spz_bytes_like(scene) if kind.suffix == ".spz" else sog_bytes_like(scene)
     except SceneError:  # positions that do not fit 24 bits
         return {}
-    return {text: round(each * count) for text, count in counts.items()}
+    return {text: size(count) for text, count in counts.items()}
+
+
+def _spz_bytes_like(scene: Gaussians) -> Callable[[int], int]:
+    """Estimated bytes of an SPZ file by the number of Gaussians, from 10,000 of them."""
+    sample = scene[:: -(-len(scene) // 10_000)]
+    each = len(encode_spz(sample)) / len(sample)
+    return lambda count: round(each * count)

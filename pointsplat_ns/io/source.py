@@ -25,16 +25,26 @@ class SourceFile:
 def source_file(path: Path | str) -> SourceFile:
     """The file that :func:`~pointsplat_ns.io.read_scene` reads a scene from: for a run, its checkpoint. Raises
     SceneError if there is none, or it cannot be read."""
-    path = Path(path)
-    parts = _sog_parts(path)
-    if parts:
+    parts = source_parts(path)
+    if len(parts) > 1 or parts[0].name == SOG_META:
         hashes = "".join(f"{part.name} {content_hash(part)}\n" for part in parts)
         total = sum(part.stat().st_size for part in parts)
         return SourceFile(parts[0].parent.resolve().name, total, hashlib.sha256(hashes.encode()).hexdigest())
+    [part] = parts
+    digest = content_hash(part)
+    return SourceFile(part.name, part.stat().st_size, digest)
+
+
+def source_parts(path: Path | str) -> list[Path]:
+    """The files that a scene is read from: all of a SOG folder, by name, the checkpoint of a run, or one. Raises
+    SceneError if a run has none, or a folder cannot be read."""
+    path = Path(path)
+    parts = _sog_parts(path)
+    if parts:
+        return parts
     if path.is_dir() or path.suffix.lower() in RUN_SUFFIXES:
-        path = open_run(path, need_data=False).checkpoint
-    digest = content_hash(path)
-    return SourceFile(path.name, path.stat().st_size, digest)
+        return [open_run(path, need_data=False).checkpoint]
+    return [path]
 
 
 def _sog_parts(path: Path) -> list[Path]:

@@ -78,9 +78,39 @@ def test_prune_writes_other_formats_and_counts_their_bytes(scene, tmp_path, caps
 def test_info_prints_a_page_or_json(scene, capsys):
     run("info", scene)
     said = capsys.readouterr().out
-    assert "400 Gaussians of SH degree 2" in said and "suspicious: nothing" in said and ".splat" in said
+    assert "400 Gaussians of SH degree 2" in said and "suspicious: nothing" in said and ".sog" in said
+    found = ps.info(scene)
+    assert said.startswith(f"{scene}: 3DGS PLY, 0.07 MB\n")
+    assert f"\nup: {found.up_text}" in said and f"\nfill: {found.fill:.1f} Gaussians drawn per pixel, in 6 v" in said
     run("info", scene, "--json")
-    assert json.loads(capsys.readouterr().out) == ps.info(scene).as_dict()
+    assert json.loads(capsys.readouterr().out) == found.as_dict()
+
+
+def test_info_takes_the_named_axis_and_says_when_it_guesses(scene, capsys):
+    run("info", scene, "--up=-y")
+    assert "\nup: -y\n" in capsys.readouterr().out
+    run("info", scene)  # a cloud that stands in no way
+    assert "(a guess); --up names another axis\n" in capsys.readouterr().out
+
+
+def test_info_of_several_files_is_a_table(scene, tmp_path, capsys):
+    other = tmp_path / "other.spz"
+    run("convert", scene, other)
+    capsys.readouterr()
+    run("info", scene, other)
+    head, *rows, _ = capsys.readouterr().out.splitlines()
+    for row, path in zip(rows, (scene, other), strict=True):
+        found = ps.info(path)
+        assert row.startswith(f"{path} ") and f"{found.gaussians:,}" in row and found.up_text in row
+        sog = f"{found.file_bytes['.sog']['100%'] / 1e6:.2f}"
+        assert row[head.index(".sog") :] == sog and found.format in row
+    run("info", scene, other, "--json")
+    assert json.loads(capsys.readouterr().out) == [ps.info(path).as_dict() for path in (scene, other)]
+    for words in ([], [scene, other, "--views", tmp_path / "sheet.png"]):
+        with pytest.raises(SystemExit) as ended:
+            run("info", *words)
+        assert ended.value.code in (1, 2)
+    assert not (tmp_path / "sheet.png").exists()
 
 
 def test_info_draws_where_a_scene_is_looked_at_from(scene, tmp_path, capsys):

@@ -112,7 +112,7 @@ def test_render_and_rooms_say_what_they_wrote(ply, as_json, coarse_rooms):
 def test_what_libraries_print_and_what_is_found_go_to_standard_error(ply, capsys, monkeypatch):
     found = ps.info(ball(5))
 
-    def chatty(path):
+    def chatty(path, **options):
         print("a library speaks")
         logging.getLogger("pointsplat_ns").info("a finding")
         return found

@@ -65,15 +65,15 @@ def palette_size(count: int) -> int:
     return size
 
 
-def palette(rows: Tensor, progress: Callable[[float], None]) -> tuple[Tensor, Tensor]:
+def palette(rows: Tensor, progress: Callable[[float], None], size: int | None = None) -> tuple[Tensor, Tensor]:
     """Rows that stand for finite float32 rows (N, D), by k-means in levels: rows are split into clusters, each gets its
     share of the palette, and is split in turn. That takes a small part of the time of k-means with as many clusters at
-    once. ``progress`` is called with the share done.
+    once. ``progress`` is called with the share done; ``size`` is a multiple of 64, by default :func:`palette_size`.
 
     Returns:
         The palette (P, D), P a multiple of 64, and the index (N,) of the entry for each row.
     """
-    n, size = len(rows), palette_size(len(rows))
+    n, size = len(rows), size or palette_size(len(rows))
     branches, deepest = 64, 6  # clusters that rows are split into, and how often
     if n <= size:
         return torch.cat([rows, rows.new_zeros(size - n, rows.shape[1])]), torch.arange(n)

@@ -124,6 +124,18 @@ def format_to_read(path: Path) -> Format | None:
     return named
 
 
+def format_name(path: Path) -> str:
+    """Name of the format of a file or SOG folder that can be read; a PLY's is that of its header, not of its name.
+    Raises SceneError as :func:`format_to_read`, or if a PLY's header is damaged."""
+    kind = format_to_read(path)
+    if kind is None:
+        return "Splatfacto checkpoint"
+    if kind.read is not _read_any_ply:
+        return kind.name
+    with path.open("rb") as stream:
+        return FORMATS[0 if is_compressed(read_header(stream, path)) else 1].name
+
+
 def format_to_write(path: Path | str) -> Format:
     """The format that a name asks for; a SceneError if no format that is written has such a name."""
     path = Path(path)
