@@ -243,16 +243,19 @@ def unusable_kept() -> Iterator[None]:
 
 
 def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:
-    """``scene`` without the Gaussians that cannot be drawn, whose number is logged.
+    """``scene`` without infinite values, and without the Gaussians that cannot be drawn, whose number is logged.
 
-    Opacity logits of +-Inf and log-scales of -Inf are valid (see
-    :meth:`~pointsplat_ns.gaussians.Gaussians.usable`).
+    Opacity logits of +-Inf (opacity 1 and 0) and log-scales of -Inf (a flat axis) can be drawn (see
+    :meth:`~pointsplat_ns.gaussians.Gaussians.usable`). They become +-30 and -87, which draw the same in float32.
     """
     if _everything.get():
         return scene
     usable = scene.usable()
     dropped = len(scene) - int(usable.sum())
-    if not dropped:
-        return scene
-    logger.warning("%s: dropped %d of %d Gaussians with NaN or infinite values", path, dropped, len(scene))
-    return scene[usable]
+    if dropped:
+        logger.warning("%s: dropped %d of %d Gaussians with NaN or infinite values", path, dropped, len(scene))
+        scene = scene[usable]
+    if bool(scene.opacities.isinf().any()) or bool(scene.scales.isinf().any()):
+        opacities = scene.opacities.nan_to_num(posinf=30.0, neginf=-30.0)
+        scene = scene.replace(opacities=opacities, scales=scene.scales.nan_to_num(neginf=-87.0))
+    return scene
