@@ -23,12 +23,12 @@ from pointsplat_ns.cli.scene_options import (
     Resolution,
     Scene,
     Up,
-    check_output,
-    check_outputs,
     check_poses,
+    claim_outputs,
     file_bytes,
     in_format_of,
     output_beside,
+    scene_written,
     warn_if_larger,
 )
 
@@ -133,8 +133,8 @@ def compact(
 
     check_poses(poses)
     output = output or output_beside(scene, "compact")
-    check_outputs(None if dry_run else output, picture, force)
-    check_output(html, ".html", force)
+    written = None if dry_run else output
+    claim_outputs(written, force, picture, html)
     check_limit(html_limit)
     keep = None if keep is None else in_format_of(keep, output)
     request = CompactRequest.of(_loaded(refiner), keep, by, sh, clean, RepairBudget(effort, seconds))
@@ -144,10 +144,10 @@ def compact(
     if not dry_run:
         ps.save(result.scene, output, progress=True)
         warn_if_larger(keep, output)
-    shown = None if picture is None else ps.plot_comparison(dense, result, picture)
-    if html is not None:
-        _write_page(scene, dense, result, html, html_limit, up)
-    written = None if dry_run else output
+    with scene_written(written):
+        shown = None if picture is None else ps.plot_comparison(dense, result, picture)
+        if html is not None:
+            _write_page(scene, dense, result, html, html_limit, up)
     if json_output:
         made = {
             "refined": result.accepted,

@@ -9,7 +9,7 @@ from typing import Literal
 import tyro
 
 from pointsplat_ns.cli.printing import Json, print_json, scene_result
-from pointsplat_ns.cli.scene_options import Scene, check_outputs, file_bytes
+from pointsplat_ns.cli.scene_options import Scene, claim_outputs, file_bytes
 
 
 def convert(
@@ -48,7 +48,7 @@ def convert(
     from pointsplat_ns.pruning import cut_sh
     from pointsplat_ns.system.progress import progress_bar
 
-    check_outputs(output, None, force)
+    claim_outputs(output, force)
     start = time.perf_counter()
     before = ps.load(scene)
     after = before if sh == "all" else cut_sh(before, int(sh))

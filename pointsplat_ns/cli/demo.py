@@ -7,6 +7,8 @@ import shutil
 import time
 from pathlib import Path
 
+from pointsplat_ns.cli.scene_options import claim_folder
+
 HELD_OUT = "room2"
 """The room without a part in the refiner's training."""
 
@@ -48,6 +50,7 @@ def demo(
     from pointsplat_ns.nerfstudio_plugin.running import finished
     from pointsplat_ns.system.packages import need
 
+    claim_folder(output)
     for folder in ("rooms", "scenes", "refiner", "pictures") if force else ():
         if (output / folder).exists():
             shutil.rmtree(output / folder)

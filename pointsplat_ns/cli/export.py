@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from pointsplat_ns.cli.printing import Json, print_json, scene_result
-from pointsplat_ns.cli.scene_options import check_outputs, file_bytes
+from pointsplat_ns.cli.scene_options import claim_outputs, file_bytes
 
 
 def export(
@@ -30,7 +30,7 @@ def export(
     """
     import pointsplat_ns as ps
 
-    check_outputs(output, None, force)
+    claim_outputs(output, force)
     start = time.perf_counter()
     exported = ps.load(run, scene)
     ps.save(exported, output, progress=True)

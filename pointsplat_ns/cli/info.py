@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Resolution, Up, check_output
+from pointsplat_ns.cli.scene_options import Resolution, Up, claim_outputs
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_info import SceneInfo
@@ -38,7 +38,7 @@ def info(
     import pointsplat_ns as ps
     from pointsplat_ns.errors import PointSplatError
 
-    check_output(views, ".png", force)
+    claim_outputs(None, force, views)
     if not scenes or (views is not None and len(scenes) > 1):
         raise PointSplatError(f"{len(scenes)} scenes; expected {'one' if views else 'at least one'}")
     found = [ps.info(scene, resolution=resolution, up=up) for scene in scenes]

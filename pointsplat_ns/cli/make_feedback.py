@@ -7,6 +7,8 @@ from typing import Annotated
 
 import tyro
 
+from pointsplat_ns.cli.scene_options import claim_file
+
 
 def make_feedback(
     scenes: Annotated[list[Path], tyro.conf.Positional],
@@ -54,6 +56,8 @@ def make_feedback(
     known = None if start is None else read_feedback_refiner(start)
     connect_torchrun()
     device, first, ready = torchrun_device(), torchrun_rank()[0] == 0, []
+    if first:
+        claim_file(output, force=True)
     with fixed_threads(threads):
         for path in tracked(scenes, "merging scenes", len(scenes), first):
             ready.append(TrainingScene.of(path.stem, ps.load(path).to(device), keep))

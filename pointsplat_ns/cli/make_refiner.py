@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from pointsplat_ns.cli.scene_options import claim_folder
+
 
 def make_refiner(
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("outputs/make-refiner"),
@@ -34,6 +36,8 @@ def make_refiner(
     import pointsplat_ns as ps
     from pointsplat_ns.nerfstudio_plugin.pointsplat.report import show_report
 
+    for folder in dict.fromkeys((output, weights or output)):
+        claim_folder(folder)
     result = ps.make_refiner(output, weights, size, steps, rooms, workers, seed)
     show_report(result.results)
     print(f"{result.weights}: the refiner, {result.weights.stat().st_size / 1e6:.1f} MB")

@@ -12,11 +12,12 @@ from pointsplat_ns.cli.scene_options import (
     Resolution,
     Scene,
     Up,
-    check_outputs,
     check_poses,
+    claim_outputs,
     in_format_of,
     need_one_scene,
     output_beside,
+    scene_written,
     warn_if_larger,
 )
 
@@ -79,7 +80,8 @@ def prune(
     need_one_scene(scene)
     check_poses(poses)
     output = output or output_beside(scene, "pruned")
-    check_outputs(None if dry_run else output, plot, force)
+    written = None if dry_run else output
+    claim_outputs(written, force, plot)
     keep = in_format_of(keep, output)
     request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune)
     with fixed_threads(threads):
@@ -88,8 +90,8 @@ def prune(
         ps.save(small, output, progress=True)
         warn_if_larger(keep, output)
     if plot is not None:
-        ps.plot_distributions({"before": dense, "after": small}, plot)
-    written = None if dry_run else output
+        with scene_written(written):
+            ps.plot_distributions({"before": dense, "after": small}, plot)
     if json_output:
         print_json({**scene_result(len(dense), small, seconds, written), "plot": plot})
         return

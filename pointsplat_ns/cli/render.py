@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Poses, Scene, check_poses
+from pointsplat_ns.cli.scene_options import Poses, Scene, check_poses, claim_file, claim_folder
 
 
 def render(
@@ -52,10 +52,15 @@ def render(
         json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
+    from pointsplat_ns.viewing.video import kind_of
 
     start = time.perf_counter()
     check_poses(poses)
     output = output or _beside(scene)
+    if kind_of(output) == "frames":
+        claim_folder(output)
+    else:
+        claim_file(output, force)
     count = ps.render_path(
         scene, output, other, path=path, views=poses, split=split, labels=labels, up=up, width=width, height=height,
         fps=fps, seconds=seconds, force=force, progress=True,

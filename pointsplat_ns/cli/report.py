@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tyro
 
-from pointsplat_ns.cli.scene_options import check_output
+from pointsplat_ns.cli.scene_options import claim_outputs
 
 
 def report(evaluation: tyro.conf.Positional[Path], html: Path | None = None, force: bool = False) -> None:
@@ -19,7 +19,7 @@ def report(evaluation: tyro.conf.Positional[Path], html: Path | None = None, for
     """
     import pointsplat_ns as ps
 
-    check_output(html, ".html", force)
+    claim_outputs(None, force, html=html)
     ps.report(evaluation, html)
     if html is not None:
         print(f"{html}: the same with charts")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -51,55 +54,78 @@ def need_one_scene(path: Path) -> None:
         )
 
 
-def check_outputs(scene: Path | None, picture: Path | None, force: bool) -> None:
-    """Check output paths before the long computations.
+_CLAIMS: ContextVar[ExitStack] = ContextVar("claims")
+
+
+@contextmanager
+def claims_until_the_end() -> Iterator[None]:
+    """Release all claims on outputs when the context ends: that of one command."""
+    with ExitStack() as claims:
+        token = _CLAIMS.set(claims)
+        try:
+            yield
+        finally:
+            _CLAIMS.reset(token)
+
+
+def claim_outputs(scene: Path | None, force: bool, png: Path | None = None, html: Path | None = None) -> None:
+    """Check and hold the files that a command is going to write, before its long computations and until it ends.
 
     Args:
-        scene: the file to write, of any writable format; None for none.
-        picture: the .png file to write; None for none.
+        scene: a scene, of any writable format; None for none.
         force: whether existing files may be overwritten.
+        png: a picture; None for none.
+        html: a page; None for none.
 
     Raises:
-        SceneError: if a path has another suffix, is a folder, or is a file that must not be overwritten.
+        SceneError: if a path has another suffix, or as :func:`~pointsplat_ns.io.outputs.claimed`.
     """
+    from pointsplat_ns.errors import SceneError
     from pointsplat_ns.io.formats import format_to_write
 
+    files = []
     if scene is not None:
         format_to_write(scene)
-        for name in _file_names(scene):
-            _check_free(scene.with_name(name), force)
-    check_output(picture, ".png", force)
+        files += [scene.with_name(name) for name in _file_names(scene)]
+    for path, kind in ((png, ".png"), (html, ".html")):
+        if path is not None and path.suffix.lower() != kind:
+            raise SceneError(
+                f"{path}: cannot write a {path.suffix or 'nameless'} file; expected a name that ends in {kind}"
+            )
+        files += [] if path is None else [path]
+    for file in files:
+        claim_file(file, force)
 
 
-def check_output(path: Path | None, kind: str, force: bool) -> None:
-    """Check the path of one file to write other than a scene.
+def claim_file(path: Path, force: bool) -> None:
+    """Check and hold one file until the command ends, see :func:`~pointsplat_ns.io.outputs.claimed`."""
+    from pointsplat_ns.io.outputs import claimed
+
+    _CLAIMS.get().enter_context(claimed(path, force))
+
+
+def claim_folder(folder: Path) -> None:
+    """Check and hold a folder until the command ends, see :func:`~pointsplat_ns.io.outputs.claimed_folder`."""
+    from pointsplat_ns.io.outputs import claimed_folder
+
+    _CLAIMS.get().enter_context(claimed_folder(folder))
+
+
+@contextmanager
+def scene_written(output: Path | None) -> Iterator[None]:
+    """Let errors say that the scene has been written before.
 
     Args:
-        path: the file; None for none.
-        kind: required suffix.
-        force: whether an existing file may be overwritten.
-
-    Raises:
-        SceneError: if it has another suffix, is a folder, or is a file that must not be overwritten.
+        output: the scene's file; None if none was written.
     """
-    from pointsplat_ns.errors import SceneError
+    from pointsplat_ns.errors import PointSplatError
 
-    if path is None:
-        return
-    if path.suffix.lower() != kind:
-        raise SceneError(
-            f"{path}: cannot write a {path.suffix or 'nameless'} file; expected a name that ends in {kind}"
-        )
-    _check_free(path, force)
-
-
-def _check_free(path: Path, force: bool) -> None:
-    from pointsplat_ns.errors import SceneError
-
-    if path.is_dir():
-        raise SceneError(f"{path}: is a folder; expected the name of a file to write")
-    if path.exists() and not force:
-        raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
+    try:
+        yield
+    except PointSplatError as error:
+        if output is None:
+            raise
+        raise type(error)(f"{error}; the scene was written before, to {output}") from error
 
 
 def check_poses(poses: Path | None) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from pointsplat_ns.cli.printing import Json, print_json
+from pointsplat_ns.cli.scene_options import claim_folder
 
 
 def tables(
@@ -50,6 +51,7 @@ def tables(
     """
     import pointsplat_ns as ps
 
+    claim_folder(output)
     found = ps.measure_tables(
         scenes, output, keeps=keeps, refiners=refiners, groups=groups, only=only, views=views, side=side,
         scoring_views=scoring_views, fine_tune=fine_tune, splat_transform=splat_transform, force=force, progress=True,

@@ -103,7 +103,8 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None) -> It
     is removed.
 
     Missing parent folders are created. Through a symbolic link, its target is written. A file that is replaced keeps
-    its mode. Of several writers of one path, each has a temporary path of its own, and the last one's file stays.
+    its mode. Of several writers of one path, each has a temporary path of its own, and the last one's file stays, but
+    for :func:`never_replaced`.
 
     Args:
         path: the file.
@@ -116,9 +117,7 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None) -> It
     path = Path(path)
     part: Path | None = None
     try:
-        target = Path(os.path.realpath(path)) if path.is_symlink() else path
-        if target.is_dir():
-            raise SceneError(f"{path}: is a folder; expected the name of a file to write")
+        target = target_of(path)
         mode = _mode_of(target)
         target.parent.mkdir(parents=True, exist_ok=True)
         _require_space(path, target.parent, size)
@@ -128,7 +127,7 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None) -> It
         yield part
         if mode is not None:
             part.chmod(mode)
-        os.replace(part, target)
+        (_put_new if path in _NEVER_REPLACED.get() else os.replace)(part, target)
     except OSError as error:
         why = error.strerror or one_line(error)
         raise SceneError(f"{path}: cannot be written ({why}{lack_of_room(error, part)})") from error
@@ -136,6 +135,46 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None) -> It
         if part is not None:
             with suppress(OSError):  # it may never have been there; the error above says why
                 part.unlink()
+
+
+_NEVER_REPLACED: ContextVar[frozenset[Path]] = ContextVar("never_replaced", default=frozenset())
+
+
+@contextmanager
+def never_replaced(path: Path) -> Iterator[None]:
+    """Let :func:`replacing` fail if there is a file at ``path`` in the end."""
+    token = _NEVER_REPLACED.set(_NEVER_REPLACED.get() | {path})
+    try:
+        yield
+    finally:
+        _NEVER_REPLACED.reset(token)
+
+
+def _put_new(part: Path, target: Path) -> None:
+    """Give a file its name, unless there is another file of this name. A rename would replace that one.
+
+    Raises:
+        FileExistsError: if there is one.
+    """
+    try:
+        os.link(part, target)
+    except OSError:  # there is one, or the file system has no links
+        if os.path.lexists(target):
+            raise FileExistsError(errno.EEXIST, "another file of this name has appeared meanwhile") from None
+        os.replace(part, target)
+
+
+def target_of(path: Path) -> Path:
+    """The file that is written for ``path``: the target of a symbolic link, else ``path`` itself.
+
+    Raises:
+        SceneError: if it is a folder, a device or a pipe.
+    """
+    target = Path(os.path.realpath(path)) if path.is_symlink() else path
+    if target.is_dir():
+        raise SceneError(f"{path}: is a folder; expected the name of a file to write")
+    _mode_of(target)
+    return target
 
 
 def _require_space(path: Path, folder: Path, size: int) -> None:
