@@ -6,6 +6,7 @@ Each command of the command line calls one of these functions.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +22,7 @@ from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refin
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
+from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.runs import REFINER_METHOD, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
@@ -267,7 +269,7 @@ def lod(
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used.
         resolution: as for :func:`prune`.
         up: as for :func:`prune`.
-        folder: output folder for each level as soon as it is made, a manifest and a picture; see :meth:`Levels.save`.
+        folder: output folder for the levels, a manifest and a picture; see :meth:`Levels.save`.
         force: overwrite existing files in ``folder``.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
@@ -289,12 +291,15 @@ def lod(
     """
     budgets = parse_levels(levels)  # these checks come before the scene is read
     PruneRequest(1.0, sh=sh)
-    if folder is not None:
-        check_folder(Path(folder), len(budgets), force)
-    dense, view_source = read_source(scene, views, resolution, up)
-    source = None if isinstance(scene, Gaussians) else source_file(scene)
-    with progress_bar(progress) as report:
-        made = make_levels(dense, levels, sh, view_source, source, folder, force, report)
+    with ExitStack() as stack:
+        if folder is not None:
+            check_folder(Path(folder), len(budgets), force)
+            stack.enter_context(claimed_folder(Path(folder)))
+        dense, view_source = read_source(scene, views, resolution, up)
+        source = None if isinstance(scene, Gaussians) else source_file(scene)
+        made = make_levels(dense, levels, sh, view_source, source, stack.enter_context(progress_bar(progress)))
+        if folder is not None:
+            made.save(folder, force)
     log(made.notes)
     return made
 

@@ -310,12 +310,6 @@ def _use_flight(path: Path) -> object:
     return read_flight_beside(path, path.parent / "b.json")
 
 
-def _use_levels(path: Path) -> object:
-    from pointsplat_ns.compression.level_folder import check_folder
-
-    return check_folder(path.parent, 2, force=False)
-
-
 @reader
 def record(folder: Path) -> Read:
     """The record of one of many scenes, and the description of all."""
@@ -351,5 +345,4 @@ READERS |= {
     "points": at("points.json", _use_points),
     "cells": at("room/cells.json", _use_cells, lambda folder: (folder / "room").mkdir()),
     "flight": at("a.json", _use_flight),
-    "levels": at("lod.json", _use_levels),
 }

@@ -15,7 +15,6 @@ from pointsplat_ns.cli.scene_options import (
     Scene,
     Up,
     check_poses,
-    claim_folder,
     need_one_scene,
     output_beside,
 )
@@ -66,7 +65,6 @@ def lod(
     need_one_scene(scene)
     check_poses(poses)
     folder = output or output_beside(scene, "lod").with_suffix("")
-    claim_folder(folder)
     with fixed_threads(threads):
         made = ps.lod(
             scene, levels, sh=sh, views=poses, resolution=resolution, up=up, folder=folder, force=force, progress=True

@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING, Literal
 
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Output, Poses, Resolution, Scene, Up, check_poses, claim_folder, output_beside
+from pointsplat_ns.cli.scene_options import Output, Poses, Resolution, Scene, Up, check_poses, output_beside
 
 if TYPE_CHECKING:
     from pointsplat_ns.tradeoff.points import Quality, Tradeoff
@@ -70,7 +70,6 @@ def tradeoff(
 
     check_poses(poses)
     folder = output or output_beside(scene, "tradeoff").with_suffix("")
-    claim_folder(folder)
     with fixed_threads(threads):
         found = ps.measure_tradeoff(
             scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, poses=poses,

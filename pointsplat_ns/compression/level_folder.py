@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -36,107 +36,86 @@ def check_folder(folder: Path, count: int, force: bool) -> None:
         force: whether existing files may be overwritten.
 
     Raises:
-        SceneError: if it is a file or named like one, or holds a file that must not be overwritten. Levels of an
-            interrupted command may be overwritten.
+        SceneError: if it is a file or named like one, or holds a file that must not be overwritten.
     """
     if folder.suffix.lower() in (".ply", ".json", ".png"):
         raise SceneError(f"{folder}: levels are several files; expected the name of a folder")
     if folder.exists() and not folder.is_dir():
         raise SceneError(f"{folder}: is a file; expected the name of a folder")
-    force = force or is_unfinished(folder)
     for name in (MANIFEST, PICTURE, *(name for index in range(count) for name in file_names(index))):
         if (folder / name).exists() and not force:
             raise SceneError(f"{folder / name}: exists already; name another folder, or overwrite it with --force")
 
 
-def is_unfinished(folder: Path) -> bool:
-    """Whether a folder holds the levels of an interrupted command."""
-    path = folder / MANIFEST
-    try:
-        if path.stat().st_size > 1 << 24:  # a manifest has about 1 kB for each level
-            return False
-        manifest = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return False
-    return (
-        isinstance(manifest, dict) and manifest.get("format") == FORMAT["format"] and manifest.get("complete") is False
-    )
+def write_levels(
+    folder: Path | str,
+    levels: Sequence[tuple[Gaussians, Tensor]],
+    about: dict[str, Any],
+    facts: Sequence[dict[str, Any]],
+    images: Sequence[Tensor] = (),
+    captions: Sequence[str] = (),
+    force: bool = False,
+) -> None:
+    """Write all levels, their manifest and their picture, or nothing.
 
-
-class LevelFolder:
-    """Writes levels to a folder, one after the other. Every file is written beside and renamed, so that an interruption
-    leaves whole files and a manifest that fits them.
+    All files are written beside before the first replaces an older one. Meanwhile there is no manifest, so that a
+    folder with it is whole.
 
     Args:
-        folder: created with the first file.
-        count: number of levels.
+        folder: created if it is missing.
+        levels: the scene of each, and the parents (M,) int32 of the level before it.
+        about: the manifest's facts on all levels together.
+        facts: its facts on each level.
+        images: (H, W, 3) each, of one size; none for no picture.
+        captions: text below each image.
         force: whether existing files may be overwritten.
 
     Raises:
-        SceneError: if the folder cannot be used, see :func:`check_folder`.
+        SceneError: if the folder cannot be used, see :func:`check_folder`, or a file cannot be written.
     """
+    folder = Path(folder)
+    check_folder(folder, len(levels), force)
+    rows = []
+    with ExitStack() as stack:
 
-    def __init__(self, folder: Path | str, count: int, force: bool = False):
-        self.folder = Path(folder)
-        check_folder(self.folder, count, force)
-        self._written: list[dict[str, Any]] = []
+        def part_of(name: str) -> Path:
+            return stack.enter_context(replacing(folder / name))
 
-    def write_level(self, scene: Gaussians, parents: Tensor) -> None:
-        """Write the next coarser level: its scene and the parents (M,) int32 of the level before it.
+        manifest = part_of(MANIFEST)  # entered first, left last
+        for index, (scene, parents) in enumerate(levels):
+            scene_name, parents_name = file_names(index)
+            scene_part, parents_part = part_of(scene_name), part_of(parents_name)
+            write_ply(scene, scene_part)
+            with parents_part.open("wb") as stream:
+                np.save(stream, parents.cpu().numpy())
+            parents_facts = _file_facts(parents_name, parents_part)
+            rows.append({**_file_facts(scene_name, scene_part), "parents": parents_facts, **facts[index]})
+        if images:
+            _draw(images, captions, part_of(PICTURE))
+        write_json({**FORMAT, **about, "levels": rows}, manifest)
+        for name in (MANIFEST, *(() if images else (PICTURE,))):
+            (folder / name).unlink(missing_ok=True)
 
-        Raises:
-            SceneError: if a file cannot be written.
-        """
-        if not self._written:
-            # From here on older levels are overwritten.
-            write_json({**FORMAT, "complete": False, "levels": []}, self.folder / MANIFEST)
-            (self.folder / PICTURE).unlink(missing_ok=True)
-        scene_name, parents_name = file_names(len(self._written))
-        write_ply(scene, self.folder / scene_name)
-        with replacing(self.folder / parents_name) as part, part.open("wb") as stream:
-            np.save(stream, parents.cpu().numpy())
-        self._written.append({**self._facts(scene_name), "parents": self._facts(parents_name)})
 
-    def write_manifest(self, about: dict[str, Any], levels: Sequence[dict[str, Any]], complete: bool = True) -> None:
-        """Write the manifest of the levels written so far.
+def _draw(images: Sequence[Tensor], captions: Sequence[str], path: Path) -> None:
+    """Draw images with a caption below each."""
+    from matplotlib.figure import Figure
 
-        Args:
-            about: facts on all levels together.
-            levels: facts on each written level.
-            complete: whether these are all levels.
+    columns, panel = min(3, len(images)), 5.0  # inches across
+    rows = math.ceil(len(images) / columns)
+    height, width = images[0].shape[:2]
+    size = (panel * columns, rows * (panel * height / width + 0.4))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axis in axes[len(images) :]:
+        axis.set_axis_off()
+    for axis, image, caption in zip(axes, images, captions, strict=False):
+        axis.imshow(image.cpu().clamp(0, 1).numpy())
+        axis.set_xticks([])
+        axis.set_yticks([])
+        axis.set_xlabel(caption, fontsize=12)
+    figure.savefig(path, dpi=100, format="png")
 
-        Raises:
-            SceneError: if it cannot be written.
-        """
-        rows = [{**files, **facts} for files, facts in zip(self._written, levels, strict=True)]
-        write_json({**FORMAT, "complete": complete, **about, "levels": rows}, self.folder / MANIFEST)
 
-    def write_picture(self, images: Sequence[Tensor], captions: Sequence[str]) -> None:
-        """Draw images (H, W, 3) of one size with a caption below each; without images, draw none.
-
-        Raises:
-            SceneError: if it cannot be written.
-        """
-        from matplotlib.figure import Figure
-
-        if not images:
-            return
-        columns, panel = min(3, len(images)), 5.0  # inches across
-        rows = math.ceil(len(images) / columns)
-        height, width = images[0].shape[:2]
-        size = (panel * columns, rows * (panel * height / width + 0.4))
-        figure = Figure(figsize=size, layout="constrained")
-        axes = figure.subplots(rows, columns, squeeze=False).ravel()
-        for axis in axes[len(images) :]:
-            axis.set_axis_off()
-        for axis, image, caption in zip(axes, images, captions, strict=False):
-            axis.imshow(image.cpu().clamp(0, 1).numpy())
-            axis.set_xticks([])
-            axis.set_yticks([])
-            axis.set_xlabel(caption, fontsize=12)
-        with replacing(self.folder / PICTURE) as part:
-            figure.savefig(part, dpi=100, format="png")
-
-    def _facts(self, name: str) -> dict[str, Any]:
-        path = self.folder / name
-        return {"file": name, "bytes": path.stat().st_size, "sha256": content_hash(path)}
+def _file_facts(name: str, path: Path) -> dict[str, Any]:
+    return {"file": name, "bytes": path.stat().st_size, "sha256": content_hash(path)}

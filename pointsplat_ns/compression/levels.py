@@ -26,7 +26,7 @@ from pointsplat_ns.compression.level_errors import (
     far_references,
     median_depth,
 )
-from pointsplat_ns.compression.level_folder import LevelFolder
+from pointsplat_ns.compression.level_folder import write_levels
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError
@@ -147,15 +147,8 @@ class Levels:
         Raises:
             SceneError: if the folder cannot be used, or holds a file that must not be overwritten.
         """
-        out = LevelFolder(folder, len(self), force)
-        for level in self:
-            out.write_level(level.scene, level.parents)
-        self._finish(out)
-
-    def _finish(self, out: LevelFolder) -> None:
-        """Write the picture and the manifest of the written levels."""
-        out.write_picture(*self._picture())
-        out.write_manifest(*self._manifest())
+        levels = [(level.scene, level.parents) for level in self]
+        write_levels(folder, levels, *self._manifest(), *self._picture(), force)
 
     def _manifest(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         """The manifest's facts on all levels together, and on each."""
@@ -266,11 +259,9 @@ def make_levels(
     sh: str = "all",
     views: ViewSource | None = None,
     source: SourceFile | None = None,
-    folder: str | Path | None = None,
-    force: bool = False,
     progress: Progress = silent,
 ) -> Levels:
-    """Make levels of detail in one pass, and measure and write each level as soon as it is made.
+    """Make levels of detail in one pass, and measure each level as soon as it is made.
 
     Args:
         dense: N Gaussians. Undrawable ones are left out first, and their number is logged.
@@ -279,18 +270,15 @@ def make_levels(
         views: source of the views to compare renders in; merging uses them too where they are known. By default poses
             sampled in free space.
         source: the file of ``dense``, for the manifest.
-        folder: output folder; None writes nothing.
-        force: overwrite existing files.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
 
     Raises:
         BudgetError: if a level does not fit the scene, or two levels have the same number of Gaussians.
-        SceneError: if no Gaussian can be drawn, or the folder cannot be written to.
+        SceneError: if no Gaussian can be drawn.
         DataError: if ``sh`` needs views and there are none.
         PointSplatError: if ``sh`` is unknown.
     """
     budgets = parse_levels(levels)
-    out = None if folder is None else LevelFolder(folder, len(budgets), force)
     need_usable(dense)
     dense = keep_usable(dense, "the dense scene")
     views = views or ViewSource(dense)
@@ -309,18 +297,12 @@ def make_levels(
         notes = (*notes, views.origin)
     farther = {times: far.psnr(dense)[0] for times, far in afar.items()}
     made: list[Level] = []
-
-    def so_far() -> Levels:
-        return Levels(dense, tuple(made), reference, farther, distance, views.origin, source, notes)
-
     before = torch.arange(len(dense), device=dense.device)  # [N] index in the level before
     start = time.perf_counter()
     known = views.known(MERGED_FROM)
     for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), known, views.resolution):
         seconds = time.perf_counter() - start
         parents = _parents(before, merged.assignment, len(made[-1].scene) if made else len(dense))
-        if out is not None:
-            out.write_level(merged.scene, parents)
         errors = None
         if reference is not None:
             what = f"measuring level {len(made)} of {len(counts) - 1}"
@@ -337,14 +319,9 @@ def make_levels(
                 seconds=seconds,
             )
         )
-        if out is not None:
-            out.write_manifest(*so_far()._manifest(), complete=False)
         before = merged.assignment
         start = time.perf_counter()
-    result = so_far()
-    if out is not None:
-        result._finish(out)
-    return result
+    return Levels(dense, tuple(made), reference, farther, distance, views.origin, source, notes)
 
 
 def _parents(finer: Tensor, coarser: Tensor, count: int) -> Tensor:

@@ -10,6 +10,7 @@ from pointsplat_ns.compression.posed_scene import read_posed
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.runs import may_be_run, name_of
 from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.io.source import source_file
@@ -20,7 +21,7 @@ from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, datase
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.tradeoff.measuring import Subject
 from pointsplat_ns.tradeoff.points import Tradeoff
-from pointsplat_ns.tradeoff.sweep import Options, Sweep, check_folder
+from pointsplat_ns.tradeoff.sweep import Options, Sweep, check_folder, removed_without_points
 from pointsplat_ns.tradeoff.targets import Search, targets_of
 from pointsplat_ns.views import Views
 
@@ -96,12 +97,12 @@ def measure_tradeoff(
     targets, size = targets_of(target_db, target_ms, target_mb), parse_resolution(resolution)
     upward = up_named(up)
     path, folder = Path(scene), Path(folder)
-    dense, given = (read_scene(path), None) if poses is None else read_posed(path, poses)
-    check_folder(folder, force)
-    subject = subject_of(dense, path, given, resolution=size, up=upward)
-    file = None if poses is None else Path(poses)
-    subject = replace(subject, name=name_of(path), sha256=source_file(path).sha256, poses=file)
-    with progress_bar(progress) as report:
+    with claimed_folder(folder), removed_without_points(folder), progress_bar(progress) as report:
+        dense, given = (read_scene(path), None) if poses is None else read_posed(path, poses)
+        check_folder(folder, force)
+        subject = subject_of(dense, path, given, resolution=size, up=upward)
+        file = None if poses is None else Path(poses)
+        subject = replace(subject, name=name_of(path), sha256=source_file(path).sha256, poses=file)
         sweep = Sweep(subject, folder, options, report)
         if targets is None:
             return sweep.run()

@@ -6,6 +6,8 @@ import hashlib
 import logging
 import math
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +25,7 @@ from pointsplat_ns.tradeoff.journal import POINTS, Journal
 from pointsplat_ns.tradeoff.machine import busy_note, machine_text
 from pointsplat_ns.tradeoff.measuring import Measurer, Subject
 from pointsplat_ns.tradeoff.outputs import OUTPUTS, write_outputs
-from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, speed_of
+from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, picture_path, speed_of
 from pointsplat_ns.tradeoff.settings import DENSE, DRAWN, REPAIRS, Setting, check_drawn, check_repairs
 from pointsplat_ns.tradeoff.walk import WALK, Enough, Plan, drawings, walk
 
@@ -88,6 +90,23 @@ def check_folder(folder: Path, force: bool) -> None:
                 f"{folder / name}: exists already, without {POINTS} to go on from; name another folder, or overwrite "
                 "it with --force"
             )
+
+
+@contextmanager
+def removed_without_points(folder: Path) -> Iterator[None]:
+    """On an error before the first point is saved, remove its pictures and scene: nothing could go on from them."""
+    places = picture_path(folder, 0, "").parent, flight_path(folder, "").parent
+    before = {path for place in places for path in place.glob("*")}
+    try:
+        yield
+    except BaseException:
+        if not (folder / POINTS).exists():
+            for place in places:
+                for path in {*place.glob("*")} - before:
+                    path.unlink()
+                with suppress(OSError):  # it is not there, or not empty
+                    place.rmdir()
+        raise
 
 
 class Sweep:

@@ -91,6 +91,22 @@ def test_the_same_command_goes_on_and_says_nothing_of_what_it_had(ply, capsys):
     assert "left at most" not in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ps.SceneError])
+def test_a_sweep_that_ends_before_its_first_point_leaves_nothing_of_its_own(error, ply, tmp_path, monkeypatch):
+    def failing(*_):
+        assert list((folder / "pictures").glob("*dense.png")), "nothing was written yet"
+        raise error("now")
+
+    monkeypatch.setattr(judging, "_timed", failing)
+    for folder in (tmp_path / "new", tmp_path / "old"):
+        (tmp_path / "old" / "pictures").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "old" / "pictures" / "mine.png").touch()
+        with pytest.raises(error):
+            ps.measure_tradeoff(ply, folder, points=2, views=2, repairs=("none",))
+    assert not (tmp_path / "new").exists()
+    assert [path.name for path in (tmp_path / "old").rglob("*")] == ["pictures", "mine.png"]
+
+
 def test_a_target_is_met_by_the_scene_that_is_written(ply, tmp_path, capsys):
     run("tradeoff", ply, "-o", tmp_path / "found", "--target-mb", "0.01", *FEW)
     said = capsys.readouterr().out

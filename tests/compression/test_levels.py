@@ -13,8 +13,8 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, normal_scene, same
+from pointsplat_ns.compression import level_folder
 from pointsplat_ns.compression.level_errors import FARTHER, displacement, median_depth
-from pointsplat_ns.compression.level_folder import file_names
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.pruning.merging import merge, merge_levels
@@ -116,7 +116,7 @@ def test_gaussians_too_faint_to_be_drawn_are_dropped_and_counted(levels):
 
 def test_the_manifest_is_true_of_the_files(folder, scene):
     manifest = manifest_of(folder)
-    assert (manifest["format"], manifest["version"], manifest["complete"]) == ("pointsplat-lod", 1, True)
+    assert (manifest["format"], manifest["version"]) == ("pointsplat-lod", 1)
     source = (folder.parent / "ball.ply").read_bytes()
     assert manifest["source"] == {
         "file": "ball.ply",
@@ -217,51 +217,21 @@ def test_a_scene_given_as_gaussians_has_no_file_in_the_manifest(levels, tmp_path
     assert [source[key] for key in ("file", "bytes", "sha256", "count", "sh_degree")] == [None, None, None, 400, 1]
 
 
-@pytest.mark.parametrize("after", [0, 1, 2])
-def test_an_interruption_leaves_whole_files_and_a_manifest_that_is_true_of_them(
-    after, scene, views, tmp_path, monkeypatch
+@pytest.mark.parametrize("where", [(DenseReference, "closeness"), (level_folder, "write_ply"), (level_folder, "_draw")])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ps.SceneError])
+def test_levels_that_fail_or_are_interrupted_leave_nothing_and_what_was_there_stays(
+    where, error, scene, views, tmp_path, monkeypatch
 ):
-    measured, closeness = [], DenseReference.closeness
+    def failing(*_, **__):
+        raise error("now")
 
-    def interrupted(*args):
-        if len(measured) == after:
-            raise KeyboardInterrupt
-        measured.append(closeness(*args))
-        return measured[-1]
-
-    monkeypatch.setattr(DenseReference, "closeness", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        ps.lod(scene, ASKED, views=views, folder=tmp_path / "out")
-    written = {name for index in range(after + 1) for name in file_names(index)}
-    assert set(contents(tmp_path / "out")) == written | {"lod.json"}
-    for index, count in enumerate((200, 100, 40)[: after + 1]):
-        assert len(ps.load(tmp_path / "out" / f"level_{index}.ply")) == count
-        assert np.load(tmp_path / "out" / f"level_{index}_parents.npy").max() == count - 1
-    manifest = manifest_of(tmp_path / "out")
-    assert manifest["complete"] is False
-    assert [level["count"] for level in manifest["levels"]] == [200, 100][:after]
-    assert [level.get("psnr") for level in manifest["levels"]] == [near.psnr for near in measured]
-    monkeypatch.undo()
-    ps.lod(scene, ASKED, views=views, folder=tmp_path / "out")  # the same again needs no --force
-    assert manifest_of(tmp_path / "out")["complete"] is True
-
-
-def test_an_interruption_while_overwriting_leaves_no_manifest_of_other_files(
-    folder, scene, views, tmp_path, monkeypatch
-):
-    out = tmp_path / "out"
-    ps.lod(scene, ["5%"], views=views, folder=out)
-    assert (out / "lod.json").exists() and (out / "lod.png").exists()
-
-    def interrupt(*args, **options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(DenseReference, "closeness", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        ps.lod(scene, ["50%"], views=views, folder=out, force=True)
-    assert set(contents(out)) == {*file_names(0), "lod.json"}
-    assert manifest_of(out)["levels"] == [] and manifest_of(out)["complete"] is False
-    assert len(ps.load(out / "level_0.ply")) == 200
+    ps.lod(scene, ["5%"], views=views, folder=tmp_path / "old")
+    before = contents(tmp_path / "old")
+    monkeypatch.setattr(*where, failing)
+    for name in ("new", "old"):
+        with pytest.raises(error):
+            ps.lod(scene, ["50%", "25%"], views=views, folder=tmp_path / name, force=True)
+    assert contents(tmp_path / "old") == before and not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("taken", ["lod.json", "lod.png", "level_0.ply", "level_3_parents.npy"])
@@ -353,9 +323,9 @@ def test_where_nothing_can_be_seen_levels_are_made_and_not_measured(scene, short
     assert levels.errors == [None] and levels.reference is None and len(levels[0].scene) == 200
     assert any(note.startswith("the levels' errors are not measured: no free place") for note in levels.notes)
     manifest = manifest_of(tmp_path / "out")
-    assert manifest["views"] is None and manifest["source"]["psnr_farther"] is None and manifest["complete"]
+    assert manifest["views"] is None and manifest["source"]["psnr_farther"] is None
     assert [manifest["levels"][0][key] for key in ("mse", "psnr", "ssim", "psnr_farther")] == [None] * 4
-    assert set(contents(tmp_path / "out")) == {*file_names(0), "lod.json"}
+    assert set(contents(tmp_path / "out")) == {"level_0.ply", "level_0_parents.npy", "lod.json"}
 
 
 def test_gaussians_that_cannot_be_drawn_are_left_out_before_all_else(scene, views, tmp_path, caplog):
