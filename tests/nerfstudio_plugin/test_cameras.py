@@ -82,8 +82,3 @@ def test_cameras_of_several_near_planes_or_sizes_are_refused(views):
     cameras.width = torch.tensor([[40], [41], [40]])
     with pytest.raises(DataError, match="photos of 2 sizes; expected one size for all views"):
         views_of_cameras(cameras, BACKGROUND)
-
-
-def test_rays_of_cameras_of_views_start_as_those_of_any(views):
-    rays = [some[:1].generate_rays(0) for some in (cameras_of_views(views), some_cameras())]
-    torch.testing.assert_close(rays[0].directions, rays[1].directions, atol=1e-6, rtol=0)

@@ -140,12 +140,6 @@ def test_cache_stays_within_its_bytes_and_drops_the_longest_unused(tmp_path):
     assert reads == [0, 1, 2, 1] and len(cache) == 2
 
 
-def test_a_photo_larger_than_the_cache_is_handed_out_and_not_kept(tmp_path):
-    cache = MemoryCache(max_bytes=10)
-    assert Frames(make_dataset(tmp_path), cache=cache)[0][1]["image"].shape == (HEIGHT, WIDTH, 3)
-    assert len(cache) == 0 and cache.num_bytes == 0
-
-
 def test_two_scenes_share_a_cache_without_mixing(tmp_path):
     (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
     cache = MemoryCache(max_bytes=10**9)

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from making import move_zero_layers, same, scene_to_refine, small_refiner
+from making import same, scene_to_refine, small_refiner
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.refiner import Refiner, preset
+from pointsplat_ns.refiner import Refiner
 
 
 def hard_scenes() -> dict[str, Gaussians]:
@@ -45,7 +45,9 @@ def test_an_untrained_refiner_returns_hard_scenes_to_the_bit_but_zero_quaternion
     assert same(refined, scene.replace(quats=torch.where(zero[:, None], identity, scene.quats)))
 
 
-@pytest.mark.parametrize("changes", [{"norm": "scene"}, {"norm": "batch"}, {"norm": "layer"}, {"grid": 384}])
+@pytest.mark.parametrize(
+    "changes", [{"norm": "scene"}, {"norm": "batch"}, {"norm": "layer"}, {"grid": 384}, {"encoder": "concat"}]
+)
 @pytest.mark.parametrize("training", [False, True])
 @pytest.mark.parametrize("name", hard_scenes())
 def test_output_and_gradients_of_hard_scenes_are_finite(name, training, changes):
@@ -68,12 +70,6 @@ def assert_finite(refiner: Refiner, scene: Gaussians, name: str) -> None:
     assert refiner.heads.mlps["features_dc"][-1].bias.grad.abs().max() > 0, name
 
 
-SLIM_FULL = {
-    "enc_channels": (16, 24, 32, 64, 128),
-    "enc_depths": (1,) * 5,
-    "dec_channels": (24, 24, 32, 64),
-    "dec_depths": (1,) * 4,
-}
 """The published grid, stages, strides, heads and patches, in fewer channels and blocks for the sake of time."""
 
 
@@ -82,15 +78,6 @@ def test_hard_scenes_do_squeeze_gaussians_into_one_cell():
     cells = {name: refiner.prepare(scene).levels[0].num_cells for name, scene in hard_scenes().items()}
     assert cells["coincident"] == 1 and cells["one voxel and one far"] == 2
     assert cells["outlier"] > 50 and cells["within 1e-30"] > 50, "these are handled: their Gaussians keep their cells"
-
-
-@pytest.mark.parametrize("encoder", ["dual", "concat"])
-@pytest.mark.parametrize(("size", "changes"), [("tiny", {}), ("small", {}), ("full", SLIM_FULL)])
-def test_each_size_trains_on_hard_scenes_with_finite_gradients(size, changes, encoder):
-    torch.manual_seed(0)
-    refiner = move_zero_layers(Refiner(preset(size, encoder=encoder, **changes))).train()
-    for name, scene in hard_scenes().items():
-        assert_finite(refiner, scene, name)
 
 
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])

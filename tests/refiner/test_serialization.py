@@ -12,13 +12,6 @@ def full_grid(side: int) -> torch.Tensor:
     return torch.tensor(list(itertools.product(range(side), repeat=3)))
 
 
-@pytest.mark.parametrize("curve", CURVES)
-@pytest.mark.parametrize("bits", [1, 2, 3, 4])
-def test_every_curve_visits_each_cell_of_a_full_grid_once(curve, bits):
-    codes = curve_codes(full_grid(2**bits), bits, [curve])[0]
-    assert codes.sort().values.tolist() == list(range(8**bits))
-
-
 @pytest.mark.parametrize("curve", ["hilbert", "hilbert-trans"])
 @pytest.mark.parametrize("bits", [1, 2, 3, 4])
 def test_consecutive_cells_of_the_hilbert_curve_share_a_face(curve, bits):

@@ -68,21 +68,6 @@ def test_an_adapted_grid_is_the_coarsest_that_keeps_most_points_apart(n):
     assert structure.levels[0].num_cells == occupied(coarsest) > occupied(coarsest // 2)
 
 
-def test_the_layout_depends_on_the_set_of_gaussians_and_not_on_their_order():
-    means = surface(300)
-    means[100:200] = means[:100]  # coincident pairs, told apart by their other parameters
-    scene = scene_at(means)
-    mix = torch.randperm(300, generator=torch.Generator().manual_seed(3))
-    a, b = build_structure(scene, preset("tiny")), build_structure(scene[mix], preset("tiny"))
-    assert torch.equal(a.order, mix[b.order])
-
-
-def test_all_coincident_points_make_one_cell_at_every_level():
-    structure = build_structure(scene_at(torch.full((40, 3), 2.5)), preset("small"))
-    assert [level.num_cells for level in structure.levels] == [1, 1, 1, 1]
-    assert [level.size for level in structure.levels] == [40, 1, 1, 1]
-
-
 def test_strides_beyond_the_finest_code_end_in_one_cell():
     config = preset("tiny", strides=(2**10, 2**10), grid=512)
     structure = build_structure(scene_at(surface(100)), config)

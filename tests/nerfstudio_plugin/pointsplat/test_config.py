@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import tyro
-from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 from making import small_config
@@ -42,16 +41,6 @@ def options(prefix: str) -> set[str]:
     return {name.removeprefix(prefix).replace("-", "_") for name in names}
 
 
-def refusal(capsys, *words: str) -> str:
-    """What is said of a command line that is refused."""
-    kind, config = method()
-    with pytest.raises(SystemExit) as caught:
-        tyro.cli(kind, default=config, args=words)
-    assert caught.value.code != 0
-    said = capsys.readouterr()
-    return said.out + said.err
-
-
 @pytest.mark.parametrize(
     ("prefix", "names"),
     [
@@ -81,16 +70,6 @@ def test_every_option_of_the_model_is_read_in_a_training(trained_walls, no_lpips
 
 
 @pytest.mark.parametrize(
-    ("option", "value"),
-    [("rasterize-mode", "antialiased"), ("background-color", "white"), ("ssim-lambda", "0.3"), ("sh-degree", "2")],
-)
-def test_an_option_of_splatfacto_is_refused_by_name(capsys, option, value):
-    assert hasattr(SplatfactoModelConfig, option.replace("-", "_")), "proves too little"
-    said = refusal(capsys, f"--pipeline.model.{option}", value)
-    assert "Unrecognized" in said and f"--pipeline.model.{option}" in said
-
-
-@pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"lpips_weight": 0.0, "lpips_net": "vgg"}, "lpips-net vgg: at --pipeline.model.lpips-weight 0"),
@@ -109,12 +88,3 @@ def test_settings_that_contradict_each_other_are_refused_and_leave_no_folder(tra
     with pytest.raises(PointSplatError, match=message):
         config.setup(local_rank=0, world_size=1).setup()
     assert not (tmp_path / "outputs").exists()
-
-
-def test_the_saved_settings_are_those_of_the_model_and_no_others(tmp_path):
-    from pointsplat_ns.io.inert_yaml import read_config
-
-    config = small_config(tmp_path, tmp_path / "outputs", 1)
-    config.save_config()
-    saved = read_config(config.get_base_dir() / "config.yml").fields["pipeline"].fields["model"].fields
-    assert MODEL_OPTIONS <= set(saved) and not {"rasterize_mode", "ssim_lambda", "sh_degree"} & set(saved)

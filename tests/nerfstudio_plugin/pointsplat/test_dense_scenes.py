@@ -183,10 +183,3 @@ def test_a_kept_picture_needs_no_dense_scene(rooms):
     first = [data["image"] for _, data in scene.rendered_train]
     with mock.patch.object(scene, "picture", side_effect=AssertionError("drawn again")):
         assert all(torch.equal(a, data["image"]) for a, (_, data) in zip(first, scene.rendered_train, strict=True))
-
-
-def test_the_viewer_gets_pictures_in_the_unit_range(rooms):
-    dataset = manager_of(rooms).train_dataset
-    assert len(dataset) == len(dataset.cameras) == 6
-    image = dataset[2]["image"]
-    assert image.shape == (24, 32, 3) and image.dtype == torch.float32 and 0.1 < image.max() <= 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from pathlib import Path
 from unittest import mock
 
@@ -109,10 +108,3 @@ def test_a_training_that_cannot_start_leaves_no_folder(trained_walls, tmp_path):
     with pytest.raises(SceneError, match="no_such_scene"):
         config.setup(local_rank=0, world_size=1).setup()
     assert [path.name for path in (tmp_path / "outputs").iterdir()] == ["of another run"]
-
-
-def test_the_saved_config_trains_again(trained, run_training, tmp_path):
-    config = copy.deepcopy(trained[0])
-    config.output_dir, config.max_num_iterations = tmp_path, 1
-    _, losses = run_training(config)
-    assert len(losses) == 1

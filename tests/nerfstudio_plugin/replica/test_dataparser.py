@@ -89,12 +89,6 @@ def test_seed_points_come_from_training_frames_alone_always_the_same_and_scale_w
     assert torch.allclose(by_hand["points3D_xyz"][:, 2], torch.tensor(0.2))
 
 
-def test_a_scene_without_depth_has_no_seed_points_and_no_depth_files(scene):
-    for path in (scene / "results").glob("depth*"):
-        path.unlink()
-    assert parse(scene).metadata == {}
-
-
 def reproject(scene, a, b, focal=1.0, opengl=False):
     """Frame a's pixels carried by its depth into frame b: depth disagreement (share), colour difference, share seen."""
     params = scene.params

@@ -204,15 +204,6 @@ def test_a_scene_without_depth_is_read_and_has_no_seed_points(tmp_path):
         fuse_depth(scene, 1000, scene.params.principal_point())
 
 
-def test_seed_points_lie_on_the_plane_that_the_depth_shows(tmp_path):
-    scene = load_replica(write_scene(tmp_path / "s"))
-    xyz, rgb = fuse_depth(scene, 1000, scene.params.principal_point())
-    assert len(xyz) == 4 * 6 * 8 and rgb.dtype == np.uint8
-    assert np.all(xyz[:, 2] == 2.0)
-    # The first pixel of frame 0: (0 - 3.5) / 5 * 2.
-    assert xyz[:, 0].min() == pytest.approx(-1.4) and xyz[:, 1].max() == pytest.approx(1.0)
-
-
 def test_seed_points_avoid_outlines_and_unknown_pixels(tmp_path):
     scene = load_replica(write_scene(tmp_path / "s", frames=1))
     raw = np.full((6, 8), 1000, np.uint16)
