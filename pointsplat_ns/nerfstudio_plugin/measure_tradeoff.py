@@ -108,7 +108,9 @@ def measure_tradeoff(
             return sweep.run()
         sweep.measure_dense()
         try:
-            found = Search(targets, sweep.plan, sweep.measure, sweep.measurer.cut_psnr).run()
+            found = Search(
+                targets, sweep.plan, sweep.measure, sweep.measurer.cut_psnr, sweep.measurer.judged_views.where
+            ).run()
         except BudgetError:
             sweep.finish()  # what was measured on the way
             raise

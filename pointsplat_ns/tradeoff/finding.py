@@ -53,7 +53,9 @@ def find_scene(
     kind = format_to_write(subject.suffix)
     size = kind.bytes_of or _estimated(subject)
     plan = Plan(len(dense), dense.sh_degree, (by,), repairs)
-    search = Search(targets, plan, measure, measurer.cut_psnr, size, exact=kind.suffix == ".ply")
+    search = Search(
+        targets, plan, measure, measurer.cut_psnr, measurer.judged_views.where, size, exact=kind.suffix == ".ply"
+    )
     interrupted = False
     try:
         if timed:
@@ -69,8 +71,10 @@ def find_scene(
     made = measurer.made(found.setting, progress)
     compacted = made.compacted or as_compacted(dense, made.scene, subject.new_views(), made.notes)
     notes = tuple(dict.fromkeys((*measurer.notes, *compacted.notes)))
-    seconds = time.perf_counter() - start
-    return replace(compacted, target=found.why, interrupted=interrupted, notes=notes, seconds=seconds)
+    seconds, why = time.perf_counter() - start, found.why
+    if measurer.judged_views.photos is not None and compacted.closeness is not None and len(compacted.stages) > 1:
+        why += f"; a repair is accepted in {compacted.closeness.where} of the photos that were trained on"
+    return replace(compacted, target=why, interrupted=interrupted, notes=notes, seconds=seconds)
 
 
 def _estimated(subject: Subject) -> Callable[[int, int], int]:

@@ -20,7 +20,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.pictures import write_picture
-from pointsplat_ns.looking.closeness import DenseReference
+from pointsplat_ns.looking.closeness import DenseReference, views_text
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.metrics import MOST_PSNR, SSIM_WINDOW, ImageError, finite_psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
@@ -42,6 +42,12 @@ class JudgedViews:
     photos: list[Tensor] | None  # [H, W, 3] in [0, 1], the photo of each view; None where there are none
     origin: str
     """Text on the origin of the views."""
+
+    @property
+    def where(self) -> str:
+        """Text: the number of views, and their width."""
+        of = "" if self.photos is None else " of held-out photos"
+        return f"{views_text(len(self.views))}{of}, {self.views.width} pixels wide"
 
     @staticmethod
     def compared(source: ViewSource, count: int) -> JudgedViews:

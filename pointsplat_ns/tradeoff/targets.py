@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from pointsplat_ns.compression.budget_search import BUDGETS
 from pointsplat_ns.compression.count_search import SearchSettings, find_count
 from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.metrics import MOST_PSNR
 from pointsplat_ns.pruning import ply_bytes, resolve_keep
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import Setting
@@ -33,7 +34,7 @@ class Targets:
     """Targets of a scene.
 
     Raises:
-        BudgetError: if there is no target, or a target is not a positive number.
+        BudgetError: if there is no target, or a target is not a positive number or above what differs from no error.
     """
 
     db: float | None = None
@@ -48,6 +49,10 @@ class Targets:
         for name, value in given.items():
             if value is not None and not 0 < value < math.inf:
                 raise BudgetError(f"{name} is {value:g}; expected a positive number")
+        if self.db is not None and self.db > MOST_PSNR:
+            raise BudgetError(
+                f"--target-db is {self.db:g}; no smaller scene reaches it, expected at most {MOST_PSNR:g}"
+            )
         if all(value is None for value in given.values()):
             raise BudgetError(f"no target is given; expected one of {', '.join(given)}")
 
@@ -111,6 +116,7 @@ class Search:
         plan: settings to try; only its first method is used.
         measure: from a setting to its point; deterministic.
         cut_psnr: as for :func:`~pointsplat_ns.tradeoff.walk.walk`.
+        where: text on the views that points are measured in.
         size: bytes of a file by count and SH degree, or an estimate; by default of a PLY.
         exact: whether files keep scenes exactly, as a PLY does.
     """
@@ -121,10 +127,11 @@ class Search:
         plan: Plan,
         measure: Callable[[Setting], Point],
         cut_psnr: Callable[[int], float],
+        where: str,
         size: Callable[[int, int], int] = ply_bytes,
         exact: bool = True,
     ):
-        self.targets, self.plan = targets, plan
+        self.targets, self.plan, self.where = targets, plan, where
         self.tried: dict[Setting, Point] = {}
         self._measure, self._cut_psnr, self._size, self._exact = measure, cut_psnr, size, exact
         self._ends: list[Setting] = []  # the result of each way
@@ -254,8 +261,8 @@ class Search:
         point = self._point(setting)
         time = "" if math.isnan(point.frame_ms) else f"{point.frame_ms:.3g} ms a frame, "
         why = (
-            f"{point.label}: {point.against_dense.psnr:.2f} dB against the dense scene's renders, {time}"
-            f"{point.bytes / 1e6:.2f} MB, {point.gaussians:,} Gaussians; {len(self.tried)} scenes tried"
+            f"{point.label}: {point.against_dense.psnr:.2f} dB against the dense scene's renders in {self.where}, "
+            f"{time}{point.bytes / 1e6:.2f} MB, {point.gaussians:,} Gaussians; {len(self.tried)} scenes tried"
         )
         cheaper = [s for s, p in self.tried.items() if self.targets.missed(p) and self._cost(s) < self._cost(setting)]
         if cheaper:
@@ -270,7 +277,7 @@ class Search:
             best = max(self.tried.values(), key=lambda point: point.against_dense.psnr)
             return (
                 f"no scene reaches --target-db {self.targets.db:g} in this format: the best tried has "
-                f"{best.against_dense.psnr:.2f} dB ({best.label})"
+                f"{best.against_dense.psnr:.2f} dB in {self.where} ({best.label})"
             )
         points = [self._point(end) for end in self._ends]
         size, ms = min(p.bytes for p in points) / 1e6, min(p.frame_ms for p in points)
@@ -281,7 +288,7 @@ class Search:
             obstacles.append(f"takes {ms:.3g} ms a frame, over --target-ms {self.targets.ms:g}")
         obstacle = " and ".join(obstacles) or "is either too large or too slow"
         limits = replace(self.targets, db=None)
-        within = Search(limits, self.plan, self._point, self._cut_psnr, self._size, self._exact).run().point
+        within = Search(limits, self.plan, self._point, self._cut_psnr, self.where, self._size, self._exact).run().point
         return (
             f"no scene meets all targets: what reaches {self.targets.db:g} dB {obstacle}; the best within the limits "
             f"has {within.against_dense.psnr:.2f} dB ({within.label}), so ask for less than that"

@@ -136,6 +136,19 @@ def test_ctrl_c_gives_the_best_so_far(dense, monkeypatch, after, found):
     assert len(result.scene) == points[-1].gaussians
 
 
+def test_it_is_said_in_which_views_a_target_holds_and_in_which_a_repair_is_accepted(dense, room_views, monkeypatch):
+    monkeypatch.setitem(repair.STEPS, "quick", 2)
+    photos = [ps.render(dense, view) for view in room_views]
+    subject = replace(subject_of(dense, None), held_out=lambda count: (room_views, photos))
+    repaired, pruned = (
+        find_scene(subject, Targets(mb=0.01), "opacity", (repairs,), lambda what, share: None).target
+        for repairs in ("quick", "none")
+    )
+    assert "dB against the dense scene's renders in 3 views of held-out photos, 48 pixels wide" in repaired
+    assert repaired.endswith("; a repair is accepted in 3 views of 48 pixels of the photos that were trained on")
+    assert "trained on" not in pruned
+
+
 def test_a_busy_machine_is_noted_with_a_target_of_time(dense, monkeypatch):
     monkeypatch.setattr(finding, "busy_note", lambda others: f"busy {len(others) > 0}")
     assert "busy True" in ps.compact(dense, by="opacity", target_ms=2.0).notes
@@ -150,6 +163,7 @@ def test_a_busy_machine_is_noted_with_a_target_of_time(dense, monkeypatch):
         ({"target_mb": 1e-6}, "too small for one Gaussian"),
         ({"target_mb": 1e-6, "target_format": ".spz"}, "too small for one Gaussian"),
         ({"target_ms": 1e-9}, "no scene meets --target-ms 1e-09"),
+        ({"target_db": 150.0}, "--target-db is 150; no smaller scene reaches it, expected at most 100"),
         ({"target_db": math.nan}, "--target-db is nan"),
         ({"target_db": 30.0, "keep": "10%", "sh": "0", "seconds": 3.0}, "keep, sh, seconds cannot be given"),
         ({"target_db": 30.0, "clean": True}, "clean cannot be given with a target"),

@@ -11,7 +11,7 @@ from trades import Trade
 
 
 def search(trade: Trade, targets: Targets, repairs=("none", "quick")) -> Search:
-    return Search(targets, Plan(trade.count, trade.sh_degree, repairs=repairs), trade.measure, trade.cut)
+    return Search(targets, Plan(trade.count, trade.sh_degree, repairs=repairs), trade.measure, trade.cut, "3 views")
 
 
 @pytest.mark.parametrize("db", [20.0, 27.0, 30.5, 36.0, 41.0])
@@ -35,6 +35,7 @@ def test_it_decides_count_degree_and_repair_from_the_scene():
 
 def test_what_the_next_cheaper_would_have_missed_is_said():
     found = search(Trade(), Targets(db=30.0)).run()
+    assert "dB against the dense scene's renders in 3 views, " in found.why
     assert "dB where 30 are wanted" in found.why and "the next cheaper" in found.why
 
 
