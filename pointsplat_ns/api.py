@@ -142,7 +142,7 @@ def prune(
         (1000, 0.1)
     """
     request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune)
-    _, pruned, _ = prune_source(scene, request, views, resolution, up, progress)
+    _, pruned, _, _ = prune_source(scene, request, views, resolution, up, progress)
     return pruned
 
 

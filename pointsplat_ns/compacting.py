@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest
-from pointsplat_ns.errors import SceneError
+from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.looking.upright import up_named
@@ -20,6 +20,7 @@ from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.compact import Compacted
+    from pointsplat_ns.compression.quality import Quality
     from pointsplat_ns.compression.requests import Effort
     from pointsplat_ns.tradeoff.targets import Targets
 
@@ -53,21 +54,31 @@ def prune_source(
     resolution: Resolution = None,
     up: str | None = None,
     progress: bool | Progress = False,
-) -> tuple[Gaussians, Gaussians, float]:
+    compared: bool = False,
+) -> tuple[Gaussians, Gaussians, float, Quality | None]:
     """Read a scene and prune it; notes are logged. Arguments as of :func:`pointsplat_ns.prune`.
 
     Returns:
-        The dense scene, the smaller scene, and the seconds of pruning.
+        The dense scene, the smaller scene, the seconds of pruning, and if ``compared`` how close both are; None if
+        there are no views.
     """
     from pointsplat_ns.compression.prune import prune_scene
+    from pointsplat_ns.compression.quality import QUALITY, quality_of
 
     dense, source = read_source(scene, views, resolution, up)
     start = time.perf_counter()
     with progress_bar(progress) as report:
         pruned = prune_scene(dense, request, source, report)
-    seconds = time.perf_counter() - start
+        seconds, quality = time.perf_counter() - start, None
+        if compared:
+            try:
+                looked = source.known(QUALITY.views) or pruned.views or source.whole()
+                report("comparing renders", 0.0)
+                quality = quality_of(dense, pruned.scene, looked)
+            except DataError:
+                pass  # no place to look from
     log(pruned.notes)
-    return dense, pruned.scene, seconds
+    return dense, pruned.scene, seconds, quality
 
 
 def compact_source(
@@ -108,7 +119,7 @@ def compact_source(
             size, upward = parse_resolution(resolution), up_named(up)
             subject = subject_of(dense, run_of(scene, views), given, request.refiner, goal.suffix, size, upward)
             result = find_scene(subject, goal.targets, request.prune.by, repairs_of(goal.effort), report)
-    log((*result.target.splitlines(), *result.verdict.splitlines(), *result.notes))
+    log((*result.notes, *result.verdict.splitlines(), *result.target.splitlines()))
     return dense, result
 
 

@@ -107,7 +107,7 @@ def render_path(
     film = FilmScenes(
         loaded[0], loaded[1] if other is not None else None, (modes[0], modes[-1]), split, labels if other else ()
     )
-    logger.info("%d frames of %d x %d: %s", len(chosen.views), chosen.views.width, chosen.views.height, chosen.origin)
+    logger.info("%d x %d pixels: %s", chosen.views.width, chosen.views.height, chosen.origin)
     frames = tracked(render_frames(film, chosen.views, chosen.fps), "rendering", len(chosen.views), progress)
     return write_frames(frames, output, chosen.fps, force)
 

@@ -119,7 +119,7 @@ def test_command_writes_what_the_function_writes(files, tmp_path, capsys):
     options = ["--width", "64", "--height", "48", "--fps", "10", "--seconds", "0.3", "--split", "wipe"]
     scenes = [str(files / "ball.ply"), str(files / "half.splat")]
     main(["render", *scenes, "-o", str(tmp_path / "by_command"), *options])
-    assert re.search(r"by_command: 3 frames, \d\.\d\d MB, in ", capsys.readouterr().out)
+    assert re.search(r"by_command: 3 frames, [\d.]+ kB, in ", capsys.readouterr().out)
     ps.render_path(scenes[0], tmp_path / "by_function", scenes[1], split="wipe", seconds=0.3, **SMALL)
     pairs = zip(frames_in(tmp_path / "by_command"), frames_in(tmp_path / "by_function"), strict=True)
     assert all((one == other).all() for one, other in pairs)

@@ -45,12 +45,12 @@ class _PrintHandler(logging.Handler):
 
 
 @contextmanager
-def _log_printed() -> Iterator[None]:
-    """Print the package's log, from level INFO on, while the context is open."""
+def _log_printed(level_printed: int) -> Iterator[None]:
+    """Print the package's log, from a level on, while the context is open."""
     logger = logging.getLogger("pointsplat_ns")
     handlers, propagate, level = logger.handlers, logger.propagate, logger.level
     logger.handlers, logger.propagate = [_PrintHandler()], False
-    logger.setLevel(logging.INFO)
+    logger.setLevel(level_printed)
     try:
         yield
     finally:
@@ -187,7 +187,8 @@ def _run(args: list[str]) -> None:
         from pointsplat_ns.system.memory import keep_freed_memory
 
         keep_freed_memory()
-        with _log_printed(), _ended_by_signals(), only_json(args), claims_until_the_end():
+        level = logging.DEBUG if "--verbose" in args else logging.INFO
+        with _log_printed(level), _ended_by_signals(), only_json(args), claims_until_the_end():
             if args == ["--version"]:
                 print(f"pointsplat-ns {__version__}")
             elif args and args[0] in COMMANDS:

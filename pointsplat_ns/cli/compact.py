@@ -10,11 +10,13 @@ import tyro
 from pointsplat_ns.cli.folders import compact_folder
 from pointsplat_ns.cli.printing import (
     Json,
+    Verbose,
     end_if_interrupted,
     print_distributions,
     print_json,
     print_result,
     scene_result,
+    written_size,
 )
 from pointsplat_ns.cli.scene_options import (
     Bands,
@@ -25,7 +27,6 @@ from pointsplat_ns.cli.scene_options import (
     Up,
     check_poses,
     claim_outputs,
-    file_bytes,
     in_format_of,
     output_beside,
     scene_written,
@@ -62,13 +63,15 @@ def compact(
     jobs: int | None = None,
     shard: str | None = None,
     threads: int | None = None,
+    verbose: Verbose = False,
     json_output: Json = False,
 ) -> None:
     """Make any scene smaller and repair it, or all scenes of a folder. No photos are needed.
 
-    Learned steps bring the smaller scene closer to renders of the dense scene. Both are then compared in other views,
-    and a repair that harms pictures of any size is left out. Views are those of --poses, else those of the run's
-    dataset; if there are none, they are sampled in free space.
+    Neighbours are merged; with --refiner a network refines the result in one pass; then learned steps repair it: they
+    bring it closer to renders of the dense scene. Each change is compared in other views, and left out if it harms
+    pictures of any size. Views are those of --poses, else those of the run's dataset; if there are none, they are
+    sampled in free space.
 
     A folder with config.yml is a run: one scene. Any other folder is a folder of scenes: all files with Gaussians below
     it, and the newest Splatfacto run of each experiment. Finished scenes are skipped, so the same command continues
@@ -110,6 +113,7 @@ def compact(
             part.
         threads: number of threads of each process. By default it adapts to the work and to other programs. Another
             number may change results by rounding.
+        verbose: print more: what was chosen for the scene, and the distributions of opacities and sizes.
         json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
@@ -158,13 +162,14 @@ def compact(
         }
         print_json({**scene_result(len(dense), result.scene, result.seconds, written), **made})
         return end_if_interrupted(result.interrupted)
-    what = "kept" + (" and refined" if result.accepted else "") + (" and repaired" if result.repair_accepted else "")
-    print_result(what, len(dense), result.scene, result.seconds, written)
-    print_distributions(dense, result.scene)
+    also = ["refined"] * result.accepted + ["repaired"] * result.repair_accepted
+    print_result(request.prune.by, also, len(dense), result.scene, result.seconds, written)
+    if verbose:
+        print_distributions(dense, result.scene)
     if shown is not None:
         print(shown)
     if html is not None:
-        print(f"{html}: {file_bytes(html) / 1e6:.2f} MB, to fly through in a browser")
+        print(f"{html}: {written_size(html)}, to fly through in a browser")
     end_if_interrupted(result.interrupted)
 
 
@@ -184,7 +189,7 @@ def _write_page(path: Path, dense: Gaussians, result: Compacted, html: Path, lim
 
     notes = []
     if result.psnr is not None:
-        notes.append(f"The compact scene has {result.psnr:.2f} dB PSNR against the dense scene's renders.")
+        notes.append(f"The compact scene has {result.psnr:.1f} dB PSNR against the dense scene.")
     ps.write_page(
         [dense, result.scene], html, ["dense", "compact"], title=name_of(path), notes=notes, views=result.views,
         up=up, limit_mb=limit_mb, progress=True,

@@ -8,8 +8,8 @@ from typing import Literal
 
 import tyro
 
-from pointsplat_ns.cli.printing import Json, print_json, scene_result
-from pointsplat_ns.cli.scene_options import Scene, claim_outputs, file_bytes
+from pointsplat_ns.cli.printing import Json, print_json, scene_result, seconds_text, written_size
+from pointsplat_ns.cli.scene_options import Scene, claim_outputs
 
 
 def convert(
@@ -64,5 +64,4 @@ def convert(
         return
     cut = f" cut to {after.sh_degree}" if after.sh_degree < before.sh_degree else ""
     degree = f"SH degree {before.sh_degree}{cut}"
-    size = file_bytes(output) / 1e6
-    print(f"{output}: {len(after):,} Gaussians, {degree}, {size:.2f} MB, in {seconds:.1f} s")
+    print(f"{output}: {len(after):,} Gaussians, {degree}, {written_size(output)}, in {seconds_text(seconds)}")

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from pointsplat_ns.cli.printing import Json, print_json, scene_result
-from pointsplat_ns.cli.scene_options import claim_outputs, file_bytes
+from pointsplat_ns.cli.printing import Json, print_json, scene_result, seconds_text, written_size
+from pointsplat_ns.cli.scene_options import claim_outputs
 
 
 def export(
@@ -38,5 +38,4 @@ def export(
     if json_output:
         print_json(scene_result(None, exported, seconds, output))
         return
-    size = file_bytes(output) / 1e6
-    print(f"{output}: {len(exported):,} Gaussians, {size:.2f} MB, in {seconds:.1f} s")
+    print(f"{output}: {len(exported):,} Gaussians, {written_size(output)}, in {seconds_text(seconds)}")

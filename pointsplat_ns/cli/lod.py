@@ -79,6 +79,7 @@ def _print_table(made: Levels, folder: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from pointsplat_ns.io.files import three_digits
     from pointsplat_ns.pruning import ply_bytes
 
     numbers = ("Gaussians", "share", "MB", "PSNR, dB", "worst, dB", "SSIM", "seconds")
@@ -92,7 +93,7 @@ def _print_table(made: Levels, folder: Path) -> None:
             f"level_{index}",
             f"{len(level.scene):,}",
             f"{100 * len(level.scene) / len(made.dense):.3g} %",
-            f"{ply_bytes(len(level.scene), level.scene.sh_degree) / 1e6:.2f}",
+            three_digits(ply_bytes(len(level.scene), level.scene.sh_degree) / 1e6),
             f"{near.psnr:.1f}" if near else "-",
             f"{near.worst:.1f}" if near else "-",
             f"{near.ssim:.3f}" if near and near.ssim is not None else "-",

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from pointsplat_ns.cli.printing import written_size
 from pointsplat_ns.cli.scene_options import claim_folder
 
 
@@ -40,6 +41,6 @@ def make_refiner(
         claim_folder(folder)
     result = ps.make_refiner(output, weights, size, steps, rooms, workers, seed)
     show_report(result.results)
-    print(f"{result.weights}: the refiner, {result.weights.stat().st_size / 1e6:.1f} MB")
+    print(f"{result.weights}: the refiner, {written_size(result.weights)}")
     print(f"{result.card}: its training and results")
     print(f"{result.pictures}: photo, dense, pruned and refined side by side")

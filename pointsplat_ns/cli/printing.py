@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.gaussians import Gaussians
 
 Json = Annotated[bool, tyro.conf.arg(name="json")]
+Verbose = bool
 
 _OUTPUT: ContextVar[IO[str] | None] = ContextVar("output", default=None)
 
@@ -77,29 +78,59 @@ def scene_result(before: int | None, scene: Gaussians, seconds: float, where: Pa
     }
 
 
-def print_result(what: str, before: int, scene: Gaussians, seconds: float, where: Path | None) -> None:
-    """Print one line with counts, file size (that of a PLY in a dry run) and time; ``where`` is None in a dry run."""
+def print_result(by: str, also: list[str], before: int, scene: Gaussians, seconds: float, where: Path | None) -> None:
+    """Print one line: what was done, counts, size of the file and time.
+
+    Args:
+        by: the method of pruning.
+        also: what was done after it, in order: refined, repaired.
+        before: number of Gaussians in the dense scene.
+        scene: the result.
+        seconds: duration.
+        where: the written file; None in a dry run, whose size is that of a PLY.
+    """
+    from pointsplat_ns.io.files import bytes_text
     from pointsplat_ns.pruning import ply_bytes
 
-    share = f" ({100 * len(scene) / before:.1f} %)" if before else ""
-    size = (ply_bytes(len(scene), scene.sh_degree) if where is None else file_bytes(where)) / 1e6
+    *first, last = ["merged" if by == "merge" else f"pruned by {by}", *also]
+    done = f"{', '.join(first)} and {last}" if first else last
+    size = bytes_text(ply_bytes(len(scene), scene.sh_degree)) + " as .ply" if where is None else written_size(where)
     place = "dry run, nothing is written" if where is None else where
-    print(f"{place}: {what} {len(scene):,} of {before:,} Gaussians{share}, {size:.2f} MB, in {seconds:.1f} s")
+    counts = f"{len(scene):,} of {before:,} Gaussians ({100 * len(scene) / before:.3g} %)"
+    print(f"{place}: {done} to {counts}, {size}, in {seconds_text(seconds)}")
+
+
+def written_size(where: Path) -> str:
+    """Size of a scene's file, in words."""
+    from pointsplat_ns.io.files import bytes_text
+
+    return bytes_text(file_bytes(where))
+
+
+def seconds_text(seconds: float) -> str:
+    """A duration with the digits that matter.
+
+    Example:
+        >>> seconds_text(3.14), seconds_text(31.4), seconds_text(314)
+        ('3.1 s', '31 s', '5 min 14 s')
+    """
+    minutes, rest = divmod(round(seconds), 60)
+    if seconds >= 100:
+        return f"{minutes} min {rest} s"
+    return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
 
 
 def print_distributions(before: Gaussians, after: Gaussians) -> None:
-    """Print a table of counts, file sizes and quantiles, before and after."""
+    """Print a table of counts and quantiles, before and after."""
     from rich.console import Console
     from rich.table import Table
 
     from pointsplat_ns.compression.distributions import opacity_quantiles, size_quantiles
-    from pointsplat_ns.pruning import ply_bytes
 
     table = Table("", "before", "after", caption="quantiles are 10 / 50 / 90 %; size is the largest standard deviation")
     rows = {
         "Gaussians": lambda s: f"{len(s):,}",
         "SH degree": lambda s: f"{s.sh_degree}",
-        "as .ply, MB": lambda s: f"{ply_bytes(len(s), s.sh_degree) / 1e6:.2f}",
         "opacity": lambda s: " / ".join(f"{value:.2f}" for value in opacity_quantiles(s)),
         "size, scene units": lambda s: " / ".join(f"{value:.2g}" for value in size_quantiles(s)),
     }

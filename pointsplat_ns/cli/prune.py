@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
-from pointsplat_ns.cli.printing import Json, print_distributions, print_json, print_result, scene_result
+from pointsplat_ns.cli.printing import Json, Verbose, print_distributions, print_json, print_result, scene_result
 from pointsplat_ns.cli.scene_options import (
     Bands,
     Output,
@@ -38,6 +39,7 @@ def prune(
     dry_run: bool = False,
     force: bool = False,
     threads: int | None = None,
+    verbose: Verbose = False,
     json_output: Json = False,
 ) -> None:
     """Make a scene smaller: merge neighbours, or keep the most important Gaussians. No photos are needed.
@@ -70,6 +72,7 @@ def prune(
         force: overwrite existing files.
         threads: number of threads. By default it adapts to the work and to other programs. Another number may
             change results by rounding.
+        verbose: print more: what was chosen for the scene, and the distributions of opacities and sizes.
         json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
@@ -85,7 +88,9 @@ def prune(
     keep = in_format_of(keep, output)
     request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune)
     with fixed_threads(threads):
-        dense, small, seconds = prune_source(scene, request, poses, resolution, up, progress=True)
+        dense, small, seconds, quality = prune_source(
+            scene, request, poses, resolution, up, progress=True, compared=True
+        )
     if not dry_run:
         ps.save(small, output, progress=True)
         warn_if_larger(keep, output)
@@ -93,9 +98,12 @@ def prune(
         with scene_written(written):
             ps.plot_distributions({"before": dense, "after": small}, plot)
     if json_output:
-        print_json({**scene_result(len(dense), small, seconds, written), "plot": plot})
+        compared = asdict(quality) if quality else {"psnr": None}
+        print_json({**scene_result(len(dense), small, seconds, written), **compared, "plot": plot})
         return
-    print_result("kept", len(dense), small, seconds, written)
-    print_distributions(dense, small)
+    print_result(by, [], len(dense), small, seconds, written)
+    print(quality or "not compared with the dense scene: there is no free place to look from")
+    if verbose:
+        print_distributions(dense, small)
     if plot is not None:
         print(f"{plot}: opacity and volume, before and after")

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from pointsplat_ns.cli.printing import Json, print_json
+from pointsplat_ns.cli.printing import Json, print_json, seconds_text
 from pointsplat_ns.cli.scene_options import Poses, Scene, check_poses, claim_file, claim_folder
 
 
@@ -52,6 +52,7 @@ def render(
         json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
+    from pointsplat_ns.io.files import bytes_text
     from pointsplat_ns.viewing.video import kind_of
 
     start = time.perf_counter()
@@ -71,7 +72,7 @@ def render(
         print_json({"output": output, "frames": count, "bytes": size, "seconds": seconds_taken})
         return
     frames = "1 frame" if count == 1 else f"{count} frames"
-    print(f"{output}: {frames}, {size / 1e6:.2f} MB, in {seconds_taken:.1f} s")
+    print(f"{output}: {frames}, {bytes_text(size)}, in {seconds_text(seconds_taken)}")
 
 
 def _beside(scene: Path) -> Path:

@@ -203,8 +203,8 @@ def compact_scene(
         made = stage(_last_kept(stages), at_work, request, judge, views, progress)
         stages += [] if made is None else [made]
     notes = pruned.notes
-    if views.origin and views.origin not in notes:
-        notes = (*notes, views.origin)
+    if views.origin and views.text not in notes:
+        notes = (views.text, *notes)
     reference = None if judge is None else judge.reference
     interrupted = any(stage.interrupted for stage in stages)
     seconds = time.perf_counter() - start

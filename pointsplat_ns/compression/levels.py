@@ -293,8 +293,8 @@ def make_levels(
         distance = median_depth(dense, reference)
     except DataError as error:
         notes = (*notes, f"the levels' errors are not measured: {error}")
-    if views.origin and views.origin not in notes:
-        notes = (*notes, views.origin)
+    if views.origin and views.text not in notes:
+        notes = (views.text, *notes)
     farther = {times: far.psnr(dense)[0] for times, far in afar.items()}
     made: list[Level] = []
     before = torch.arange(len(dense), device=dense.device)  # [N] index in the level before

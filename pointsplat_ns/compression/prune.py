@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.pruning import (
@@ -45,6 +46,8 @@ class Pruned:
     scene: Gaussians
     notes: tuple[str, ...]
     """Lines of text: SH bands dropped, PSNR reached, origin of the views."""
+    views: Views | None = None
+    """The views that merging looked from; None if it did not, or for another method."""
 
 
 def prune_scene(
@@ -68,6 +71,7 @@ def prune_scene(
     need_usable(dense)
     views = views or ViewSource(dense)
     notes: list[str] = []
+    seen: list[Views] = []  # the views of each scene that was merged
     full = _with_sh(dense, request.sh, views, progress, notes)
     count = request.count_of(len(full), full.sh_degree)
     start, cleaning = full, None
@@ -80,9 +84,9 @@ def prune_scene(
     report = functools.partial(progress, f"by {request.by}")
     if count is not None:
         method_views, weight = _views_of_method(request, views), request.opacity_weight
-        scene = prune(start, count, request.by, method_views, weight, report, notes.append, views.resolution)
+        scene = prune(start, count, request.by, method_views, weight, report, seen.append, views.resolution)
     else:
-        make = _pruner(start, request, views, report)
+        make = _pruner(start, request, views, report, seen)
         if cleaning is not None:
             make = _refilling(make, cleaning, full, len(start))
         scene = _search(dense, start, make, request, views, functools.partial(progress, "trying counts"), notes)
@@ -92,7 +96,9 @@ def prune_scene(
         tuned = views.scored(SCORED_VIEWS)
         scene = fine_tune(scene, tuned, dense, request.fine_tune, progress=functools.partial(progress, "fine-tuning"))
         notes.append(f"fine-tuned {request.fine_tune} steps against the dense scene's renders in {len(tuned)} views")
-    return Pruned(scene, (*notes, views.origin) if views.origin else tuple(notes))
+    if views.origin:
+        notes.insert(0, views.text)
+    return Pruned(scene, tuple(notes), seen[-1] if seen else None)
 
 
 def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress, notes: list[str]) -> Gaussians:
@@ -106,14 +112,15 @@ def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress, n
         progress("comparing SH degrees", 0.0)
         degree, psnr = needed_sh_degree(dense, views.compared())
         if math.isfinite(psnr):
-            reached = f"; renders reach {psnr:.1f} dB against all bands"
+            reached = f", {psnr:.1f} dB PSNR against all bands"
     else:
         degree = int(sh)
     if degree >= dense.sh_degree:
-        notes.append(f"SH degree {dense.sh_degree} kept, no band dropped")
+        notes.append(f"SH degree {dense.sh_degree} kept")
         return dense
     lost = 100 * energy_lost(dense, degree)
-    notes.append(f"SH degree {dense.sh_degree} cut to {degree}: {lost:.0f} % of the directional energy lost{reached}")
+    cut = f"SH degree {dense.sh_degree} cut to {degree}"
+    notes.append(f"{cut}: {lost:.0f} % of what SH add to colours is lost{reached}")
     return cut_sh(dense, degree)
 
 
@@ -125,13 +132,18 @@ def _views_of_method(request: PruneRequest, views: ViewSource) -> Views | Callab
 
 
 def _pruner(
-    scene: Gaussians, request: PruneRequest, views: ViewSource, progress: Callable[[float], None]
+    scene: Gaussians,
+    request: PruneRequest,
+    views: ViewSource,
+    progress: Callable[[float], None],
+    seen: list[Views],
 ) -> Callable[[int], Gaussians]:
-    """A function from a count to a scene of that many Gaussians. Scores are computed once, for all counts."""
+    """A function from a count to a scene of that many Gaussians. Scores are computed once, for all counts. The views
+    that merging looked from are added to ``seen``."""
     method = request.method
     if method.score is None:
         known = views.known(MERGED_FROM)
-        return lambda count: prune(scene, count, request.by, known, resolution=views.resolution)
+        return lambda count: prune(scene, count, request.by, known, looked=seen.append, resolution=views.resolution)
     progress(0.0)
     scored = functools.partial(views.scored, SCORED_VIEWS)
     scores = score_of(scene, method, scored, request.opacity_weight, progress)
@@ -173,8 +185,8 @@ def _search(
         compared = views.compared()
         reached = smallest_within(dense, make, compared, budget.value, progress)
         notes.append(
-            f"renders reach {reached.psnr:.1f} dB against the dense scene's, {reached.worst:.1f} dB in the worst of "
-            f"{len(compared)} views; {len(reached.tried)} counts tried"
+            f"{len(reached.tried)} sizes tried: {reached.psnr:.1f} dB PSNR against the dense scene, "
+            f"{reached.worst:.1f} dB in the worst of {len(compared)} views"
         )
         return reached.scene
     from pointsplat_ns.compression.budget_search import largest_within
@@ -182,5 +194,5 @@ def _search(
     assert isinstance(budget, Megabytes)
     kind = format_to_write(budget.suffix)
     found = largest_within(start, make, kind, check_size(budget, len(dense)), progress)
-    notes.append(f"as {kind.name} {found.size / 1e6:.2f} MB; {len(found.tried)} counts tried")
+    notes.append(f"{len(found.tried)} sizes tried: {bytes_text(found.size)} as {kind.name}")
     return found.scene

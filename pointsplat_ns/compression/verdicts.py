@@ -25,27 +25,27 @@ def verdict_of(result: Compacted) -> str:
         return "\n".join(lines)
     if result.before is None:
         return f"not refined or repaired: {_uncompared(result)}"
-    return f"not repaired: {result.before.psnr:.2f} dB against the dense scene's renders in {result.before.where}"
+    return f"not repaired: {result.before.psnr:.1f} dB PSNR against the dense scene ({result.before.where})"
 
 
 def _line(stage: Stage, result: Compacted) -> str:
-    noun, before, after = "refinement" if stage.name == "refine" else "repair", stage.before, stage.after
+    done = "refined by the network" if stage.name == "refine" else "repaired"
+    before, after = stage.before, stage.after
     if stage.reason is Reason.NOT_FINITE:
         unsound = int((result.pruned.usable() & ~stage.scene.usable()).sum())
-        return f"{noun} left out: {unsound:,} of {len(stage.scene):,} refined Gaussians are not finite"
+        return f"not {done}: {unsound:,} of {len(stage.scene):,} refined Gaussians are not finite"
     if before is None or after is None:
-        return f"{noun} left out: {_uncompared(result)}"
+        return f"not {done}: {_uncompared(result)}"
     figures = _figures(before, after)
-    cost = f"{stage.steps} steps in {stage.seconds:.1f} s" + (", interrupted" if stage.interrupted else "")
+    steps = "1 step" if stage.steps == 1 else f"{stage.steps} steps"
+    cost = f" by {steps} in {stage.seconds:.1f} s" + (", interrupted" if stage.interrupted else "")
+    cost = cost if stage.name == "repair" else ""
     if stage.reason is None:
-        share = "" if stage.strength == 1 else f" at {stage.strength:.0%} of its strength"
-        spent = f", {cost}" if stage.name == "repair" else ""
-        return f"{noun}{share}{spent}: {figures}"
+        share = "" if stage.strength == 1 else f", {stage.strength:.0%} of the change kept"
+        return f"{done}{cost}{share}: {figures}"
     if stage.name == "refine" and after.errors == before.errors:
-        return f"{noun} left out: it changes nothing, {before.psnr:.2f} dB in {before.where}"
-    return (
-        f"{noun} left out, {_REASONS[stage.reason]}" + (f" ({cost})" if stage.name == "repair" else "") + f": {figures}"
-    )
+        return f"not {done}, it changes nothing: {before.psnr:.1f} dB PSNR against the dense scene ({before.where})"
+    return f"not {done}{cost}, {_REASONS[stage.reason]}: {figures}"
 
 
 def _uncompared(result: Compacted) -> str:
@@ -54,8 +54,6 @@ def _uncompared(result: Compacted) -> str:
 
 def _figures(before: Closeness, after: Closeness) -> str:
     """Text with the errors before and after."""
-    figures = f"{before.psnr:.2f} -> {after.psnr:.2f} dB against the dense scene's renders in {before.where}"
-    if before.ssim is not None and after.ssim is not None:
-        figures += f", SSIM {before.ssim:.3f} -> {after.ssim:.3f}"
-    worst = f"worst view {before.worst:.2f} -> {after.worst:.2f} dB"
-    return f"{figures}, {worst}, closer in {closer_in(before, after)} of {len(before.errors)}"
+    gain = f"{before.psnr:.1f} -> {after.psnr:.1f} dB PSNR against the dense scene"
+    worst = f"worst {before.worst:.1f} -> {after.worst:.1f} dB, closer in {closer_in(before, after)}"
+    return f"{gain} ({before.where}; {worst})"

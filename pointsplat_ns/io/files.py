@@ -182,7 +182,7 @@ def _require_space(path: Path, folder: Path, size: int) -> None:
     disk = shutil.disk_usage(folder)
     if disk.total and size > disk.free:  # some network file systems tell nothing
         raise SceneError(
-            f"{path}: needs {_megabytes(size)}, {_megabytes(disk.free)} are free there, so nothing was written; make "
+            f"{path}: needs {bytes_text(size)}, {bytes_text(disk.free)} are free there, so nothing was written; make "
             "room or name another place"
         )
 
@@ -196,17 +196,29 @@ def lack_of_room(error: OSError, part: Path | None) -> str:
         free = shutil.disk_usage(part.parent).free if error.errno == errno.ENOSPC else 0
     except OSError:
         return ""
-    return f"; it needs more than {_megabytes(written + free)}; make room or name another place"
+    return f"; it needs more than {bytes_text(written + free)}; make room or name another place"
 
 
-def _megabytes(size: int) -> str:
-    """A number of bytes in MB, to two digits.
+def bytes_text(size: float) -> str:
+    """A number of bytes in kB, MB or GB of 1000, to three digits.
 
     Example:
-        >>> _megabytes(3_847), _megabytes(113_000_000)
-        ('0.0038 MB', '110 MB')
+        >>> bytes_text(3_847), bytes_text(113_400_000), bytes_text(2.5e9)
+        ('3.85 kB', '113 MB', '2.50 GB')
     """
-    return f"{float(f'{size / 1e6:.2g}'):,g} MB"
+    factor, unit = next((pair for pair in ((1e9, "GB"), (1e6, "MB")) if size >= pair[0]), (1e3, "kB"))
+    return f"{three_digits(size / factor)} {unit}"
+
+
+def three_digits(value: float) -> str:
+    """A positive number with the digits that matter: three, or all of a larger one.
+
+    Example:
+        >>> three_digits(0.3964), three_digits(14.27), three_digits(9999.6)
+        ('0.396', '14.3', '10,000')
+    """
+    decimals = max(0, 2 - math.floor(math.log10(value))) if value > 0 else 0
+    return f"{value:,.{decimals}f}"
 
 
 def _mode_of(path: Path) -> int | None:

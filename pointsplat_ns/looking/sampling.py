@@ -141,7 +141,7 @@ def unit_direction(up: Tensor) -> Tensor:
 
 
 def views_in_scene_units(
-    viewmats: Tensor, width: int, height: int, centre: Tensor, diagonal: float, settings: LookingSettings
+    viewmats: Tensor, width: int, height: int, centre: Tensor, diagonal: float, settings: LookingSettings = DEFAULTS
 ) -> Views:
     """Views of a scene from world-to-camera matrices (C, 4, 4) in units of its content, which has this centre (3,) and
     diagonal, scene units."""

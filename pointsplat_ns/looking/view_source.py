@@ -60,6 +60,11 @@ class ViewSource:
         self._rasterize_mode: RasterizeMode = "classic"
 
     @property
+    def text(self) -> str:
+        """A line on :attr:`origin`."""
+        return f"views: {self.origin}"
+
+    @property
     def resolution(self) -> tuple[int, int]:
         """Width and height of sampled views, pixels."""
         return self._resolution or RESOLUTION

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import logger
 from pointsplat_ns.looking.windows import RESOLUTION
 from pointsplat_ns.pruning.budget import Keep, resolve_keep
 from pointsplat_ns.pruning.coverage import coverage_score
@@ -115,7 +116,7 @@ def prune(
     views: Views | Callable[[], Views] | None = None,
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
-    note: Callable[[str], None] | None = None,
+    looked: Callable[[Views], None] | None = None,
     resolution: tuple[int, int] = RESOLUTION,
 ) -> Gaussians:
     """Prune a scene to a number of Gaussians.
@@ -128,7 +129,7 @@ def prune(
             such; for a function or None it samples views of its own.
         opacity_weight: lambda of the methods that weigh opacity; by default the paper's.
         progress: called with the share done, in [0, 1].
-        note: called with a line of text on the numbers that merging chose for this scene.
+        looked: called with the views that merging sampled or was given, if it rendered.
         resolution: width and height of the views that merging samples, pixels.
 
     Returns:
@@ -147,8 +148,9 @@ def prune(
     if method.score is None:
         given = views if isinstance(views, Views) else None
         merged = merge(scene, count, progress=progress, views=given, resolution=resolution)
-        if note is not None:
-            note(merged.finish.note)
+        logger.debug("%s", merged.finish.note)
+        if looked is not None and merged.views is not None:
+            looked(merged.views)
         return merged.scene
     return scene[select(score_of(scene, method, views, opacity_weight, progress), count)]
 

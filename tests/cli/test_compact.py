@@ -18,6 +18,7 @@ from pointsplat_ns.compression import acceptance, trained_refiner
 from pointsplat_ns.compression.requests import STEPS
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, read_scene, write_ply
+from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.pruning import METHODS, prune
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
@@ -72,10 +73,11 @@ def test_refinement_that_helps_is_written_and_shown(ply, helps, tmp_path, capsys
     kept = prune(read_ply(ply), 0.5, "opacity")
     assert same(read_ply(output), kept.replace(scales=kept.scales + 0.05))
     said = capsys.readouterr().out
-    assert re.search(r"small.ply: kept and refined 75 of 150 Gaussians \(50.0 %\), .* MB, in .* s", said)
-    before, after = map(float, re.search(r"(?m)^refinement: ([\d.]+) -> ([\d.]+) dB .* in 12 views", said).groups())
-    assert after > before
-    assert "\nposes sampled in free space, up is " in said and "SH degree" in said
+    assert re.search(r"small.ply: pruned by opacity and refined to 75 of 150 Gaussians \(50 %\), .* kB, in .* s", said)
+    lines = said.splitlines()
+    found = re.match(r"refined by the network: ([\d.]+) -> ([\d.]+) dB PSNR .* \(12 views", lines[1])
+    assert float(found[2]) > float(found[1])
+    assert lines[0].startswith("views: poses sampled in free space, up is ") and "small.ply: " in lines[2]
     assert "shown.png: dense, pruned, refined, side by side" in said
     height, width, _ = matplotlib.image.imread(tmp_path / "shown.png").shape
     assert width == 1600 and height > 1200  # three columns and rows of 4 to 3, and a line of titles
@@ -86,9 +88,9 @@ def test_a_page_to_fly_through_both_scenes_is_written(ply, helps, tmp_path, caps
     output, shown = tmp_path / "small.ply", tmp_path / "shown.html"
     run("compact", ply, "--refiner", helps, "-o", output, "--html", shown)
     said = capsys.readouterr().out
-    assert f"{shown}: {shown.stat().st_size / 1e6:.2f} MB, to fly through in a browser" in said
+    assert f"{shown}: {bytes_text(shown.stat().st_size)}, to fly through in a browser" in said
     text = shown.read_text("utf-8")
-    psnr = re.search(r"(?m)^refinement: [\d.]+ -> ([\d.]+) dB", said)[1]
+    psnr = re.search(r"(?m)^refined by the network: [\d.]+ -> ([\d.]+) dB", said)[1]
     assert f"The compact scene has {psnr} dB PSNR" in text and "<h1>room</h1>" in text
     flight = parts_of(shown).data["flight"]
     assert [(scene["name"], scene["amount"].split(",")[0]) for scene in flight["scenes"]] == [
@@ -140,7 +142,7 @@ def test_a_trained_run_may_be_used(option, ply, make_refined_run, tmp_path, caps
     trained = make_refined_run(tmp_path / "run", tmp_path / "nowhere", moved=-6.0)
     run("compact", ply, option, trained, "-o", tmp_path / "small.ply")
     assert same(read_ply(tmp_path / "small.ply"), prune(read_ply(ply), 0.5, "paper"))
-    assert "left out, it does not help" in capsys.readouterr().out
+    assert "not refined by the network, it does not help" in capsys.readouterr().out
 
 
 def test_the_refiner_that_ships_is_used_if_it_is_asked_for(ply, tmp_path, capsys, monkeypatch):
@@ -160,7 +162,7 @@ def test_where_nothing_can_be_compared_that_is_said_and_no_picture_is_drawn(help
         *("-o", tmp_path / "small.ply", "--picture", tmp_path / "shown.png"),
     )
     said = capsys.readouterr().out
-    assert "refinement left out: it cannot be compared with the dense scene (no free place" in said
+    assert "not refined by the network: it cannot be compared with the dense scene (no free place" in said
     assert "shown.png: not drawn" in said and not (tmp_path / "shown.png").exists()
     assert len(read_ply(tmp_path / "small.ply")) == 1
 
@@ -201,7 +203,7 @@ def test_a_name_is_made_up_where_none_is_given(helps, tmp_path, capsys):
     write_ply(room(), tmp_path / "room.ply")
     run("compact", tmp_path / "room.ply", "--refiner", helps)
     assert len(read_ply(tmp_path / "room_compact.ply")) == 75
-    assert f"{tmp_path / 'room_compact.ply'}: kept and refined 75 of 150" in capsys.readouterr().out
+    assert f"{tmp_path / 'room_compact.ply'}: pruned by opacity and refined to 75 of 150" in capsys.readouterr().out
 
 
 def test_files_that_exist_are_only_overwritten_by_force(ply, helps, tmp_path, capsys):
@@ -231,12 +233,12 @@ def test_a_scene_is_repaired_as_long_as_asked_and_what_it_brought_and_cost_is_sa
     run("compact", tmp_path / "room.ply", *options, "--picture", tmp_path / "shown.png")
     said = " ".join(capsys.readouterr().out.split())
     found = re.search(
-        r"repair(?: at \d+% of its strength)?, 25 steps in [\d.]+ s: ([\d.]+) -> ([\d.]+) dB against the dense scene's",
+        r"repaired by 25 steps in [\d.]+ s(?:, \d+% of the change kept)?: ([\d.]+) -> ([\d.]+) dB PSNR against",
         said,
     )
     assert found is not None, said
     assert float(found[2]) >= float(found[1]) + acceptance.ACCEPTANCE.min_gain
-    assert re.search(r"kept( and refined)? and repaired 40 of 400", said)
+    assert re.search(r"merged(, refined)? and repaired to 40 of 400", said)
     assert "repaired, side by side" in said
     assert len(read_ply(tmp_path / "small.ply")) == 40
 

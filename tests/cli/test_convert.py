@@ -8,6 +8,7 @@ import torch
 import pointsplat_ns as ps
 from making import cloud, same
 from pointsplat_ns.cli import main
+from pointsplat_ns.io.files import bytes_text
 
 
 @pytest.fixture
@@ -31,8 +32,8 @@ def fails(capsys, *words):
 def test_convert_writes_what_the_name_says_and_prints_its_size(scene, tmp_path, capsys, name):
     run("convert", scene, tmp_path / name)
     said = capsys.readouterr().out
-    size = sum(path.stat().st_size for path in (tmp_path / name).parent.iterdir() if path != scene) / 1e6
-    assert f"{tmp_path / name}: 400 Gaussians, SH degree 2, {size:.2f} MB" in said
+    size = sum(path.stat().st_size for path in (tmp_path / name).parent.iterdir() if path != scene)
+    assert f"{tmp_path / name}: 400 Gaussians, SH degree 2, {bytes_text(size)}" in said
     if name != "a.glb":
         back = tmp_path / "back.ply"
         run("convert", tmp_path / name, back)
@@ -72,7 +73,7 @@ def test_prune_writes_other_formats_and_counts_their_bytes(scene, tmp_path, caps
     assert (tmp_path / "s.splat").stat().st_size == 32 * 125
     run("prune", scene, "--by", "opacity", "--keep", "0.004MB", "-o", tmp_path / "s.spz")
     assert 3500 <= (tmp_path / "s.spz").stat().st_size <= 4000
-    assert "counts tried" in capsys.readouterr().out
+    assert "sizes tried" in capsys.readouterr().out
 
 
 def test_info_prints_a_page_or_json(scene, capsys):

@@ -15,6 +15,7 @@ from making import ball
 from pointsplat_ns.cli import main
 from pointsplat_ns.cli.lod import lod
 from pointsplat_ns.compression.levels import DEFAULT_LEVELS
+from pointsplat_ns.io.files import three_digits
 from posing import nerfstudio, written
 
 
@@ -61,7 +62,7 @@ def test_levels_are_written_beside_the_scene_and_printed(ply, capsys):
         cells = [cell.strip() for cell in row.strip("│").split("│")]
         assert cells[:2] == [f"level_{index}", f"{level['count']:,}"]
         assert cells[3:7] == [
-            f"{level['bytes'] / 1e6:.2f}",
+            three_digits(level["bytes"] / 1e6),
             f"{level['psnr']:.1f}",
             f"{level['worst_psnr']:.1f}",
             f"{level['ssim']:.3f}",

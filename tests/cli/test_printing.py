@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from pathlib import Path
 
 import pytest
@@ -133,5 +134,23 @@ def test_numbers_that_json_lacks_are_null(capsys, ply):
 def test_a_pipe_gets_results_without_bars_and_colours(ply, capsys):
     main(["prune", str(ply), "--keep", "50%"])
     said = capsys.readouterr()
-    assert "room_pruned.ply: kept 30 of 60" in said.out and said.err == ""
+    assert "room_pruned.ply: merged to 30 of 60" in said.out and said.err == ""
     assert not [letter for letter in said.out if ord(letter) < 32 and letter != "\n"]
+
+
+def test_prune_says_in_two_lines_what_it_wrote_and_how_good_it_is(ply, capsys, as_json):
+    words = ("prune", str(ply), "--keep", "50%", "--resolution", "96x54", "--force")
+    main([*words, "-o", "room.spz"])
+    written, quality = capsys.readouterr().out.splitlines()
+    size = Path("room.spz").stat().st_size
+    assert written.startswith(f"room.spz: merged to 30 of 60 Gaussians (50 %), {size / 1e3:.3g} kB, in ")
+    psnr = re.fullmatch(r"([\d.]+) dB PSNR against the dense scene \(8 views, 96 x 54\)", quality)[1]
+    found = as_json(*words, "-o", "room.spz")
+    assert (found["views"], found["width"], found["height"]) == (8, 96, 54)
+    assert f"{found['psnr']:.1f}" == psnr
+
+
+def test_what_was_chosen_for_the_scene_and_distributions_are_printed_if_asked_for(ply, capsys):
+    main(["prune", str(ply), "--keep", "50%", "--dry-run", "--verbose"])
+    said = capsys.readouterr().out
+    assert "sizes of merged Gaussians x " in said and "opacity" in said and "quantiles" in said

@@ -174,7 +174,7 @@ def test_of_two_that_write_one_file_at_once_one_has_written_all_of_it(kind, work
 def test_a_file_that_grows_beyond_what_may_be_written_is_one_error_and_the_old_one_stays(kind, work):
     place = work / "full" / kind
     said = (place / "said.txt").read_text()
-    assert said.startswith(f"SceneError: {place / 'out'}") and "it needs more than 0.0007 MB" in said
+    assert said.startswith(f"SceneError: {place / 'out'}") and "it needs more than 0.700 kB" in said
     assert shown(place / "out") == shown(place / "before") and not list((place / "out").rglob(".*"))
 
 
@@ -182,7 +182,7 @@ def test_a_disk_without_room_is_told_before_anything_is_written(tmp_path, monkey
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=3000))
     path = tmp_path / "a.ply"
-    with pytest.raises(SceneError, match=r"a\.ply: needs 0\.0038 MB, 0\.003 MB are free there, so nothing"):
+    with pytest.raises(SceneError, match=r"a\.ply: needs 3\.81 kB, 3\.00 kB are free there, so nothing"):
         ps.save(cloud(50, 1, 0), path)
     assert list(tmp_path.iterdir()) == []
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(total=0, free=0))
@@ -194,7 +194,7 @@ def test_a_disk_that_is_full_after_all_is_told_with_what_is_needed(tmp_path, mon
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=500_000))
     (tmp_path / "a").write_text("old")
-    with pytest.raises(SceneError, match=r"a: cannot be written \(.*; it needs more than 1.5 MB; make room"):
+    with pytest.raises(SceneError, match=r"a: cannot be written \(.*; it needs more than 1.50 MB; make room"):
         with replacing(tmp_path / "a") as part:
             part.write_bytes(np.zeros(1_000_000, np.uint8).tobytes())
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -28,7 +28,7 @@ class Finish:
     @property
     def note(self) -> str:
         """One line of text: the factor, and its gain."""
-        factor = f"merged: sizes x {math.exp(self.size_change):.3f}"
+        factor = f"sizes of merged Gaussians x {math.exp(self.size_change):.3f}"
         if self.psnr is None or self.psnr_before is None:
             return f"{factor}, by default"
         return f"{factor}, chosen by renders: {self.psnr_before:.2f} -> {self.psnr:.2f} dB"

@@ -20,6 +20,7 @@ from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.content import views_in_units
+from pointsplat_ns.looking.sampling import views_in_scene_units
 from pointsplat_ns.looking.windows import RESOLUTION, WindowRenders
 from pointsplat_ns.pruning.duplicates import Copies, Reduced
 from pointsplat_ns.pruning.merging.finishing import Finish, best_finish
@@ -48,6 +49,8 @@ class Merged:
     assignment: Tensor  # [N] int64, index in ``scene`` of the Gaussian that each was merged into; -1 if dropped
     finish: Finish
     """The numbers chosen for this scene."""
+    views: Views | None = None
+    """The views that decided, those given or sampled ones; None if nothing was rendered."""
 
 
 def merge(
@@ -155,7 +158,7 @@ def _levels(
         of_reduced = torch.full((len(reduced.scene),), -1)
         of_reduced[step.participants.members] = groups.group
         assignment = of_reduced[reduced.index]
-        yield Merged(result.to(scene.device), assignment.to(scene.device), finish)
+        yield Merged(result.to(scene.device), assignment.to(scene.device), finish, views or _views_of(step))
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,6 +171,14 @@ class Step:
     tree: Tree
     reference: WindowRenders | None
     """Renders of the scene, or of what remained once it was few enough to render."""
+
+
+def _views_of(step: Step) -> Views | None:
+    """The views that were sampled, in the scene's own units; None if there are none."""
+    if step.viewpoints is None:
+        return None
+    sampled, whole = step.viewpoints.views, step.participants
+    return views_in_scene_units(sampled.viewmats, sampled.width, sampled.height, whole.centre, whole.size)
 
 
 def first_step(

@@ -65,5 +65,5 @@ def test_the_top_of_the_trials_is_tried_too():
 
 def test_the_note_is_one_line():
     note = Finish(math.log(0.95), 31.0, 30.0).note
-    assert note == "merged: sizes x 0.950, chosen by renders: 30.00 -> 31.00 dB"
+    assert note == "sizes of merged Gaussians x 0.950, chosen by renders: 30.00 -> 31.00 dB"
     assert Finish().note.endswith("by default")
