@@ -7,17 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 
 from pointsplat_ns.compression.compact import compact_scene
+from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import CompactRequest, Effort, RepairBudget
 from pointsplat_ns.compression.scene_folder import WHOLE, Command, Shard, output_folder, run_on_folder
 from pointsplat_ns.compression.scene_task import Options, SceneResult, SmallerScene
 from pointsplat_ns.compression.trained_refiner import refiner_at
+from pointsplat_ns.io.formats import format_like
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.looking.windows import parse_resolution, size_text
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
-from pointsplat_ns.pruning import Keep
+from pointsplat_ns.pruning import Keep, Megabytes
 from pointsplat_ns.system.processes import connect_torchrun, gathered, torchrun_device, torchrun_rank
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 from pointsplat_ns.tradeoff.finding import find_scene
@@ -54,8 +56,10 @@ def compact_folder(
     Args:
         folder: scenes are the files with Gaussians below it, and the newest Splatfacto run of each experiment.
         output: folder for ``NAME.ply`` and its record ``NAME.ply.json`` of each scene, and the table ``scenes.csv``;
-            by default beside ``folder``: ``scenes_compact`` for ``scenes``.
-        keep: as for :func:`compact`.
+            by default beside ``folder``: ``scenes_compact`` for ``scenes``. Each result has the format of its scene's
+            file, or is a PLY where that cannot be written.
+        keep: as for :func:`compact`; a size such as "5MB" is that of the result in its own format. A scene with fewer
+            Gaussians than a count is kept whole.
         refiner: as for :func:`load_refiner`, or "shipped"; None for no refiner.
         by: as for :func:`compact`.
         sh: as for :func:`compact`.
@@ -64,7 +68,7 @@ def compact_folder(
         seconds: duration of the repair of each scene, as for :func:`compact`.
         target_db: PSNR that each scene has to reach, as for :func:`compact`.
         target_ms: as for :func:`compact`.
-        target_mb: as for :func:`compact`; of PLY files.
+        target_mb: as for :func:`compact`, in the format of each result.
         resolution: as for :func:`prune`.
         jobs: number of processes, which share the cores. With more than one, the program must be a file whose main code
             is under ``if __name__ == "__main__":``, as for any Python program that starts processes.
@@ -115,7 +119,8 @@ def compact_folder(
         options = {**options, "keep": None, "target_db": target_db, "target_ms": target_ms, "target_mb": target_mb}
         make = functools.partial(_found, refiner, device, targets, request.prune.by, repairs_of(effort), size)
     else:
-        make = functools.partial(_compacted, refiner, device, replace(request, refiner=None), size)
+        sized = isinstance(keep, str) and keep.strip().lower().endswith("mb")  # without a format: in that of the result
+        make = functools.partial(_compacted, refiner, device, replace(request, refiner=None), sized, size)
     with progress_bar(progress if rank == 0 else False) as report:
         results = run_on_folder(
             folder, target, Command("compact", make, options), jobs, part.within(rank, world_size), force, report
@@ -130,13 +135,21 @@ def _compacted(
     refiner: str | Path | None,
     device: str,
     request: CompactRequest,
+    sized: bool,
     resolution: tuple[int, int] | None,
     path: Path,
 ) -> SmallerScene:
     """Compact one scene of a folder. The request has no refiner, because each process loads its own."""
-    dense = read_scene(path)
+    dense, options = read_scene(path), request.prune
     source = ViewSource(dense, run=path, dataset_views=dataset_views, resolution=resolution)
-    result = compact_scene(dense, replace(request, refiner=_refiner_on(refiner, device)), source)
+    if isinstance(options.budget, int) and len(dense) < options.budget:
+        note, same = f"kept whole, with fewer Gaussians than --keep {options.budget}", options.sh == "all"
+        kept = dense if same else prune_scene(dense, replace(options, keep=1.0), source).scene
+        return SmallerScene(kept, len(dense), None, note, same)
+    if sized and isinstance(options.budget, Megabytes):
+        options = replace(options, keep=replace(options.budget, suffix=format_like(path).suffix))
+    request = replace(request, prune=options, refiner=_refiner_on(refiner, device))
+    result = compact_scene(dense, request, source)
     if result.interrupted:
         raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the repair of one scene
     return SmallerScene(result.scene, len(dense), result.psnr)
@@ -153,7 +166,8 @@ def _found(
 ) -> SmallerScene:
     """Find the cheapest version of one scene of a folder that meets targets."""
     dense = read_scene(path)
-    subject = subject_of(dense, path, refiner=_refiner_on(refiner, device), resolution=resolution)
+    suffix = format_like(path).suffix
+    subject = subject_of(dense, path, None, _refiner_on(refiner, device), suffix, resolution)
     result = find_scene(subject, targets, by, repairs, silent)
     if result.interrupted:
         raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the search of one scene

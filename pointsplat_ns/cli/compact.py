@@ -81,7 +81,7 @@ def compact(
         scene: a file of any format, a Splatfacto checkpoint, a run (its folder or config.yml), or a folder of scenes.
         output: the file to write, of any format as for prune; by default beside the scene: room_compact.ply for
             room.ply, compact.ply in the folder of a run. For a folder of scenes, another folder; by default
-            rooms_compact beside rooms.
+            rooms_compact beside rooms. Each result there has the format of its scene.
         keep: size of the result, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before repairs. By
             default the budget of the refiner's training; without a refiner 0.1.
         refiner: a trained network that refines the scene before the steps: a pointsplat run (its folder or config.yml),

@@ -73,6 +73,7 @@ def _print_table(results: list[SceneResult]) -> None:
     for result in results:
         numbers = (result.before, result.after, result.megabytes, result.psnr, result.seconds)
         cells = ("-" if value is None else f"{value:{form}}" for value, form in zip(numbers, forms, strict=True))
-        what = f"{result.status}: {result.error}" if result.error else result.status
+        said = result.error or result.note
+        what = f"{result.status}: {said}" if said else result.status
         table.add_row(escape(printable(result.name)), *cells, escape(printable(what)))
     Console().print(table)

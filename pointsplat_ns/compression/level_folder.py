@@ -14,12 +14,13 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import content_hash, write_ply
+from pointsplat_ns.io.discovery import LEVELS_NAME
 from pointsplat_ns.io.files import replacing, write_json
 
 FORMAT = {"format": "pointsplat-lod", "version": 1}
 """Format of the manifest. The version rises with each change that readers of the old version misread."""
 
-MANIFEST, PICTURE = "lod.json", "lod.png"
+MANIFEST, PICTURE = LEVELS_NAME, "lod.png"
 
 
 def file_names(index: int) -> tuple[str, str]:

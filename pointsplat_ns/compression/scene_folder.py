@@ -26,6 +26,7 @@ from pointsplat_ns.compression.scene_task import (
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io.discovery import RESULTS_NAME, find_scenes
 from pointsplat_ns.io.files import logger, read_text, replacing
+from pointsplat_ns.io.formats import format_like
 from pointsplat_ns.system.claims import claim
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.workers import in_processes, in_turn
@@ -107,7 +108,8 @@ def run_on_folder(
 
     Args:
         folder: searched by :func:`~pointsplat_ns.io.discovery.find_scenes`.
-        output: folder for ``NAME.ply`` and its record ``NAME.ply.json``, and the table ``scenes.csv``.
+        output: folder for ``NAME.ply``, or another format that a scene is in, its record ``NAME.ply.json``, and the
+            table ``scenes.csv``.
         command: the command.
         jobs: number of processes; 1 uses the calling process.
         shard: the part of the scenes to work on.
@@ -150,7 +152,10 @@ def output_folder(folder: Path, suffix: str) -> Path:
 def _tasks(folder: Path, output: Path) -> list[SceneTask]:
     if os.path.realpath(folder) == os.path.realpath(output):
         raise SceneError(f"{output}: holds the scenes themselves; name another folder for the results")
-    return [SceneTask(scene.name, scene.path, output / f"{scene.name}.ply") for scene in find_scenes(folder)]
+    return [
+        SceneTask(scene.name, scene.path, output / f"{scene.name}{format_like(scene.path).suffix}")
+        for scene in find_scenes(folder)
+    ]
 
 
 def _results(

@@ -12,6 +12,7 @@ import json
 import math
 import os
 import re
+import shutil
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -22,7 +23,8 @@ from typing import Any, Literal
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import content_hash, logger, one_line, read_text, replacing
-from pointsplat_ns.io.ply import write_ply
+from pointsplat_ns.io.formats import format_named, format_to_write
+from pointsplat_ns.io.scene import save_as
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.system.claims import claim
 
@@ -51,7 +53,7 @@ class SceneResult:
     source: str
     """Path of the file or run that was read."""
     output: str
-    """Path of the PLY that was written."""
+    """Path of the file that was written."""
     status: Status
     """``done before``: by an earlier call, or by another process. ``open``: not tried yet, or in another shard."""
     before: int | None = None
@@ -66,6 +68,8 @@ class SceneResult:
     """Duration."""
     error: str = ""
     """The error in one line; empty if there was none."""
+    note: str = ""
+    """A remark on the result; empty if there is none."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +81,15 @@ class SmallerScene:
     """Gaussians of the dense scene."""
     psnr: float | None
     """PSNR against the dense scene's renders, dB; None if nothing was compared."""
+    note: str = ""
+    """A remark for the table."""
+    same: bool = False
+    """Whether this is the dense scene itself, whose file is copied if its format stays."""
 
 
 @dataclass(frozen=True)
 class SceneTask:
-    """A scene to work on, and the PLY to write."""
+    """A scene to work on, and the file to write."""
 
     name: str
     source: Path
@@ -201,7 +209,11 @@ def _check_overwriting(task: SceneTask, force: bool) -> None:
 def _write(task: SceneTask, made: SmallerScene, key: str, options: Options, start: float) -> SceneResult:
     """Write a result and its record. A process killed in between leaves the record alone: the scene is unfinished."""
     with replacing(task.output) as part:
-        write_ply(made.scene, part)
+        kind = format_to_write(task.output)
+        if made.same and task.source.is_file() and format_named(task.source.name) is kind:
+            shutil.copyfile(task.source, part)
+        else:
+            save_as(kind, made.scene, part)
         done = task.result(
             "done",
             before=made.before,
@@ -209,6 +221,7 @@ def _write(task: SceneTask, made: SmallerScene, key: str, options: Options, star
             megabytes=part.stat().st_size / 1e6,
             psnr=made.psnr if made.psnr is not None and math.isfinite(made.psnr) else None,
             seconds=time.perf_counter() - start,
+            note=made.note,
         )
         task.output.unlink(missing_ok=True)  # an old scene must not stand beside the new record
         _write_record(task, done, {"key": key, "sha256": content_hash(part), "options": dict(options)})
@@ -235,4 +248,5 @@ def _read_record(task: SceneTask) -> dict[str, Any] | None:
         return None
     kinds = {"before": int, "after": int, "megabytes": float, "psnr": float, "seconds": float}
     numbers = all(_is_number(record.get(name), kind) for name, kind in kinds.items())
-    return record if numbers and isinstance(record.get("error"), str) else None
+    texts = all(isinstance(record.get(name), str) for name in ("error", "note"))
+    return record if numbers and texts else None

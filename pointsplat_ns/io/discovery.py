@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import datetime
@@ -11,7 +12,7 @@ from typing import Literal
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import file_stem, logger
-from pointsplat_ns.io.formats import READABLE
+from pointsplat_ns.io.formats import READABLE, format_named
 from pointsplat_ns.io.formats.compressed_ply import is_compressed
 from pointsplat_ns.io.ply_header import read_header
 from pointsplat_ns.io.runs import CONFIG_NAME, Run, open_run, scene_name
@@ -20,8 +21,14 @@ from pointsplat_ns.io.scene import is_folder_of_scenes, is_scene_file
 Supervision = Literal["auto", "photos", "dense"]
 """Training targets: a run's photos, or renders of the scene before it was pruned."""
 
-RESULTS_NAME = "pointsplat-scenes.json"
-"""File in the folder of what was made of many scenes. Such a folder is not searched for further scenes."""
+RESULTS_NAME, LEVELS_NAME, SWEEP_NAME = "pointsplat-scenes.json", "lod.json", "tradeoff.json"
+"""Files in folders that commands write: of results of many scenes, of levels, of a sweep."""
+
+RESULT_NAMES = frozenset((RESULTS_NAME, LEVELS_NAME, SWEEP_NAME))
+"""A folder with one of these files is not searched for scenes."""
+
+RESULT_ENDS = ("_pruned", "_compact")
+"""Ends of the names that commands give by default to what they make of a file."""
 
 
 @dataclass(frozen=True)
@@ -29,20 +36,28 @@ class FoundScene:
     """A scene below a folder."""
 
     name: str
-    """Where it lies below the folder, without a suffix and with ``/`` between folders; distinct."""
+    """Where it lies below the folder, with ``/`` between folders; distinct. It has no suffix: ``room``, or ``room_ply``
+    beside ``room_spz``."""
     path: Path
     """What :func:`~pointsplat_ns.io.read_scene` takes."""
 
 
 def find_scenes(folder: Path | str) -> list[FoundScene]:
     """Every scene below a folder, sorted by name: files that hold Gaussians, and the newest trained run of each
-    experiment, which has the name of the experiment's folder. Raises SceneError if there is no such folder, it is a
-    run, or there is no scene below it."""
+    experiment, which has the name of the experiment's folder. Results of earlier commands (:data:`RESULT_NAMES`,
+    :data:`RESULT_ENDS`) are passed over. Raises SceneError if there is no such folder, it is a run, or there is no
+    scene below it."""
     folder = Path(folder)
     if not is_folder_of_scenes(folder):
         raise SceneError(f"{folder}: expected a folder with scenes below it")
     files = _files_with_gaussians(folder, is_scene_file)
-    named = [(path.relative_to(folder).with_suffix("").as_posix(), path) for path in files]
+    stems = {_stem(path) for path in files}
+    for path in tuple(files):
+        sources = {_stem(path).removesuffix(end) for end in RESULT_ENDS} - {_stem(path)}
+        if sources & stems:
+            logger.warning("passed over %s: a result of %s", path, *sources)
+            files.remove(path)
+    named = [(_stem(path.relative_to(folder)), path) for path in files]
     if _run_folders(folder):
         try:
             runs = find_runs(folder, need_data=False)
@@ -51,6 +66,8 @@ def find_scenes(folder: Path | str) -> list[FoundScene]:
         named += [(_name_below(folder, run), run.folder) for run in runs]
     if not named:
         raise SceneError(f"{folder}: no scene below it; expected files ({READABLE}) or trained Splatfacto runs")
+    shared = {name for name, count in Counter(name for name, _ in named).items() if count > 1}
+    named = [(name + _format_end(path) if name in shared else name, path) for name, path in named]
     named.sort(key=lambda pair: (pair[0], str(pair[1])))
     names = distinct(name for name, _ in named)
     return [FoundScene(name, path) for name, (_, path) in zip(names, named, strict=True)]
@@ -153,12 +170,12 @@ def shown_scene(names: list[str], eval_scenes: Iterable[str]) -> str:
 def _files_with_gaussians(root: Path, wanted: Callable[[str], bool]) -> list[Path]:
     """Files at or below a path that hold a scene and whose names are ``wanted``, sorted.
 
-    Folders of runs, hidden folders and :data:`RESULTS_NAME`'s are not searched. A PLY may also hold points or a mesh,
+    Folders of runs, hidden folders and :data:`RESULT_NAMES`'s are not searched. A PLY may also hold points or a mesh,
     so its header is read. Pipes, sockets and devices may have no end, and are not opened.
     """
     paths = [root] if root.is_file() and wanted(root.name) else []
     for place, inner, files in os.walk(root):
-        if CONFIG_NAME in files or (RESULTS_NAME in files and Path(place) != root):
+        if CONFIG_NAME in files or (RESULT_NAMES.intersection(files) and Path(place) != root):
             inner.clear()
             continue
         inner[:] = sorted(name for name in inner if not name.startswith("."))
@@ -173,6 +190,17 @@ def _files_with_gaussians(root: Path, wanted: Callable[[str], bool]) -> list[Pat
         else:
             scenes.append(path)
     return scenes
+
+
+def _stem(path: Path) -> str:
+    """The path of a scene's file without the suffix of its format, such as ``.compressed.ply``."""
+    kind = format_named(path.name)
+    return path.as_posix()[: -len(path.suffix if kind is None else kind.suffix)]
+
+
+def _format_end(path: Path) -> str:
+    """The format of a file as the end of a scene's name, such as ``_ply``; nothing for a run."""
+    return "" if path.is_dir() else path.as_posix()[len(_stem(path)) :].replace(".", "_").lower()
 
 
 def _name_below(folder: Path, run: Run) -> str:

@@ -9,10 +9,10 @@ import torch
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable, require_file
-from pointsplat_ns.io.formats import READABLE, SOG_META, format_named, format_to_read, format_to_write
+from pointsplat_ns.io.formats import READABLE, SOG_META, Format, format_named, format_to_read, format_to_write
 from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, open_run
 from pointsplat_ns.io.splatfacto import read_checkpoint
-from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.system.progress import Progress, progress_bar, silent
 
 ACCEPTED = f"a scene ({READABLE}), a Splatfacto .ckpt, or a Splatfacto run (its folder or config.yml)"
 
@@ -97,7 +97,11 @@ def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False) 
         100
     """
     path = Path(path)
-    write = format_to_write(path).write
-    assert write is not None  # format_to_write gives no other
     with progress_bar(progress) as report:
-        write(keep_usable(scene.detach().to("cpu", torch.float32), path), path, report)
+        save_as(format_to_write(path), scene, path, report)
+
+
+def save_as(kind: Format, scene: Gaussians, path: Path, progress: Progress = silent) -> None:
+    """Write a scene in a format that is written, whatever the path's name; otherwise as :func:`save`."""
+    assert kind.write is not None
+    kind.write(keep_usable(scene.detach().to("cpu", torch.float32), path), path, progress)

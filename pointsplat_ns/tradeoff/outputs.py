@@ -7,6 +7,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pointsplat_ns.io.discovery import SWEEP_NAME
 from pointsplat_ns.io.files import replacing, write_json
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.tradeoff.front import Cost, Reference, pareto_front, quality_of
@@ -16,7 +17,7 @@ from pointsplat_ns.tradeoff.settings import DENSE
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-TABLE, JSON, PAGE = "tradeoff.csv", "tradeoff.json", "tradeoff.html"
+TABLE, JSON, PAGE = "tradeoff.csv", SWEEP_NAME, "tradeoff.html"
 PLOTS: dict[Cost, str] = {
     "frame_ms": "tradeoff_ms.png",
     "bytes": "tradeoff_mb.png",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -14,6 +15,7 @@ import pytest
 import pointsplat_ns as ps
 from making import ball, same
 from pointsplat_ns.cli import main
+from pointsplat_ns.io.formats import format_like, format_to_read
 from pointsplat_ns.system.claims import claim
 from pointsplat_ns.system.processes import torchrun_rank
 
@@ -61,6 +63,47 @@ def test_a_scene_that_fails_ends_it_with_status_1_after_the_others(folder, tmp_p
     assert "failed" in said.out and "truncated" in said.out and (tmp_path / "small" / "b.ply").is_file()
     assert said.err.splitlines()[0].startswith(f"a failed: {tmp_path / 'rooms' / 'a.ply'}: truncated")
     assert said.err.endswith("error: 1 of 2 scenes failed; the same command tries them again\n")
+
+
+def test_results_have_the_formats_of_their_scenes(folder, tmp_path, capsys):
+    scenes, small = tmp_path / "scenes", tmp_path / "small"
+    scene = ps.load(folder / "room1.ply")
+    for name in ("a.ply", "b.spz", "c.sog", "d.splat", "e.compressed.ply", "f.spz", "f.ply"):
+        ps.save(scene, scenes / name)
+    (scenes / "g.ply").write_bytes((scenes / "e.compressed.ply").read_bytes())
+    run("compact", scenes, "-o", small, *OPTIONS, "--json")
+    results = json.loads(capsys.readouterr().out)["scenes"]
+    written = {Path(result["source"]).name: Path(result["output"]).name for result in results}
+    assert written == {
+        **{name: name for name in ("a.ply", "b.spz", "c.sog", "d.splat", "e.compressed.ply")},
+        **{"f.ply": "f_ply.ply", "f.spz": "f_spz.spz", "g.ply": "g.compressed.ply"},
+    }
+    for result in results:
+        path = Path(result["output"])
+        assert len(ps.load(path)) == result["after"] == 61 and path.stat().st_size == result["megabytes"] * 1e6
+        assert format_to_read(path) is format_like(Path(result["source"])) is not None or path.suffix == ".ply"
+
+
+@pytest.mark.parametrize("option", ["--keep", "--target-mb"])
+def test_a_size_is_that_of_each_result_in_its_format(option, folder, tmp_path, capsys):
+    for name in ("a.ply", "b.spz", "c.splat"):
+        ps.save(ps.load(folder / "room1.ply"), tmp_path / "scenes" / name)
+    size = "0.002MB" if option == "--keep" else "0.002"
+    run("compact", tmp_path / "scenes", option, size, "--effort", "instant", "--json")
+    results = json.loads(capsys.readouterr().out)["scenes"]
+    assert all(0.0015 < result["megabytes"] <= 0.002 for result in results), results
+    assert len({result["after"] for result in results}) == 3
+
+
+@pytest.mark.parametrize("sh", ["all", "0"])
+def test_a_scene_with_fewer_gaussians_than_asked_for_is_kept_whole_and_the_table_says_so(sh, folder, tmp_path, capsys):
+    ps.save(ps.load(folder / "room1.ply"), tmp_path / "scenes" / "few.sog")
+    ps.save(ball(300, opacity=1.0, bright=1.0), tmp_path / "scenes" / "many.ply")
+    run("compact", tmp_path / "scenes", "-o", tmp_path / "small", "--keep", "150", "--effort", "instant", "--sh", sh)
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "few 121 121" in said and "kept whole" in said and "many 300 150" in said
+    copied = (tmp_path / "small" / "few.sog").read_bytes() == (tmp_path / "scenes" / "few.sog").read_bytes()
+    assert copied == (sh == "all") and len(ps.load(tmp_path / "small" / "few.sog")) == 121
 
 
 @pytest.mark.parametrize(

@@ -28,8 +28,8 @@ def test_files_and_the_newest_run_of_each_experiment_are_scenes_and_nothing_else
     assert found == {
         "deep/er/HALL": folder / "deep/er/HALL.PLY",
         "hall": folder / "hall.ply",
-        "kitchen": folder / "kitchen.ply",
-        "kitchen-2": newest,
+        "kitchen": newest,
+        "kitchen_ply": folder / "kitchen.ply",
     }
     assert all(len(read_scene(path)) > 0 for path in found.values())
     assert "passed over" in caplog.text and "points.ply" in caplog.text
@@ -57,6 +57,26 @@ def test_a_run_no_folder_and_a_folder_without_scenes_are_refused(make_run, tmp_p
 def test_files_of_every_format_are_scenes_and_a_sog_folder_is_one_scene(tmp_path):
     for name in ("a.spz", "b.sog", "c.splat", "d.compressed.ply", "e.glb", "folder/meta.json"):
         save(cloud(50, 0, 1), tmp_path / name)
-    assert [scene.name for scene in find_scenes(tmp_path)] == ["a", "b", "c", "d.compressed"]
+    assert [scene.name for scene in find_scenes(tmp_path)] == ["a", "b", "c", "d"]
     assert is_folder_of_scenes(tmp_path) and not is_folder_of_scenes(tmp_path / "folder")
     assert not is_folder_of_scenes(tmp_path / "a.spz")
+
+
+def test_files_that_differ_in_their_format_alone_have_names_that_say_it(tmp_path):
+    files = ("room.ply", "room.spz", "room.compressed.ply", "deep/room.spz", "hall.spz", "hall_spz.ply")
+    for name in files:
+        save(cloud(50, 0, 1), tmp_path / name)
+    names = {str(scene.path.relative_to(tmp_path)): scene.name for scene in find_scenes(tmp_path)}
+    assert names == dict(
+        zip(files, ("room_ply", "room_spz", "room_compressed_ply", "deep/room", "hall", "hall_spz"), strict=True)
+    )
+
+
+def test_results_of_earlier_commands_are_no_scenes(tmp_path, caplog):
+    made = ("room_pruned.ply", "room_compact.spz", "room_lod/level_0.ply", "room_tradeoff/room_10pct.ply")
+    for name in ("room.sog", "other_compact.ply", "deep/room_pruned.ply", *made):
+        save(cloud(50, 0, 1), tmp_path / name)
+    (tmp_path / "room_lod" / "lod.json").touch()
+    (tmp_path / "room_tradeoff" / "tradeoff.json").touch()
+    assert [scene.name for scene in find_scenes(tmp_path)] == ["deep/room_pruned", "other_compact", "room"]
+    assert f"passed over {tmp_path / 'room_compact.spz'}: a result of {tmp_path / 'room'}" in caplog.text

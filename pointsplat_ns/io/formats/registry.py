@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -143,4 +144,16 @@ def format_to_write(path: Path | str) -> Format:
     if kind is None or kind.write is None:
         what = f"a {kind.name} file" if kind else f"a {path.suffix or 'nameless'} file"
         raise SceneError(f"{path}: cannot write {what}; expected a name that ends in {WRITABLE}")
+    return kind
+
+
+def format_like(path: Path) -> Format:
+    """The format to write what is made of a scene: that of the scene's file if it can be written, else PLY."""
+    kind = format_named(path.name)
+    if path.is_dir() or kind is None or kind.write is None:
+        return format_to_write(".ply")
+    if kind.suffix == ".ply":
+        with suppress(SceneError, OSError), path.open("rb") as stream:
+            if is_compressed(read_header(stream, path)):
+                return format_to_write(".compressed.ply")
     return kind
