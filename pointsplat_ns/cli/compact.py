@@ -18,6 +18,7 @@ from pointsplat_ns.cli.printing import (
     scene_result,
     written_size,
 )
+from pointsplat_ns.cli.reading import Megabytes
 from pointsplat_ns.cli.scene_options import (
     Bands,
     Output,
@@ -51,13 +52,13 @@ def compact(
     seconds: float | None = None,
     target_db: float | None = None,
     target_ms: float | None = None,
-    target_mb: float | None = None,
+    target_mb: Megabytes | None = None,
     poses: Poses = None,
     resolution: Resolution = None,
     up: Up = None,
     picture: Path | None = None,
     html: Path | None = None,
-    html_limit: float = 60.0,
+    html_limit: Megabytes = 60.0,
     dry_run: bool = False,
     force: bool = False,
     jobs: int | None = None,

@@ -7,6 +7,7 @@ import shutil
 import time
 from pathlib import Path
 
+from pointsplat_ns.cli.reading import Share
 from pointsplat_ns.cli.scene_options import claim_folder
 
 HELD_OUT = "room2"
@@ -23,7 +24,7 @@ ADVICE = "start over with --force, or name another --output"
 
 def demo(
     output: Path = Path("outputs/demo"),
-    keep: float = 0.1,
+    keep: Share = 0.1,
     scene_steps: int = 900,
     refiner_steps: int = 300,
     frames: int = 60,

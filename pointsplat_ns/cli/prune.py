@@ -51,9 +51,9 @@ def prune(
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
         output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog, .splat or .glb. By
             default beside the scene: room_pruned.ply for room.ply, pruned.ply in the folder of a run.
-        keep: size of the result: a ratio (0.3), a percentage (30%), a count (50000), the size of the file (12MB; for
-            .spz and .sog the count is searched for, which takes two or three times as long), or auto:35, the smallest
-            scene whose renders reach 35 dB PSNR against those of the dense scene (auto alone means 35).
+        keep: size of the result: a ratio (0.3), a percentage (30%), a count (50000 or 50k), the size of the file (12MB
+            or 800kB; for .spz and .sog the count is searched for, which takes two or three times as long), or auto:35,
+            the smallest scene whose renders reach 35 dB PSNR against those of the dense scene (auto alone means 35).
         by: merge replaces neighbours by one Gaussian each and is by far the best; every other method keeps Gaussians as
             they are: coverage (empties no region), paper (eq. 3), authors (the formula of its released code), opacity,
             volume, log-volume, area, random; lightgaussian and pup score by views of the scene.

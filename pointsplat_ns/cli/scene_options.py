@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
@@ -153,7 +154,8 @@ def in_format_of(keep: str, output: Path) -> str:
     the output."""
     from pointsplat_ns.io.formats import format_to_write
 
-    return keep.strip() + format_to_write(output).budget_suffix if keep.strip().lower().endswith("mb") else keep
+    is_size = re.search(r"\d *[kmg]?b$", keep.strip(), re.IGNORECASE) and not keep.strip().startswith("auto")
+    return keep.strip() + format_to_write(output).budget_suffix if is_size else keep
 
 
 def warn_if_larger(keep: str | None, output: Path) -> None:

@@ -9,13 +9,14 @@ from typing import Annotated
 import tyro
 
 from pointsplat_ns.cli.printing import Json, print_json
+from pointsplat_ns.cli.reading import Share
 from pointsplat_ns.cli.scene_options import claim_folder
 
 
 def tables(
     scenes: tyro.conf.Positional[tuple[Path, ...]],
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
-    keeps: tuple[float, ...] = (0.5, 0.3, 0.1),
+    keeps: tuple[Share, ...] = (0.5, 0.3, 0.1),
     refiners: tuple[Path, ...] = (),
     groups: tuple[str, ...] = (),
     only: tuple[str, ...] = (),

@@ -6,6 +6,7 @@ import json
 from typing import TYPE_CHECKING, Literal
 
 from pointsplat_ns.cli.printing import Json, print_json
+from pointsplat_ns.cli.reading import Megabytes
 from pointsplat_ns.cli.scene_options import Output, Poses, Resolution, Scene, Up, check_poses, output_beside
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def tradeoff(
     drawn: tuple[Literal["exact", "fast", "half"], ...] = ("exact", "fast", "half"),
     target_db: float | None = None,
     target_ms: float | None = None,
-    target_mb: float | None = None,
+    target_mb: Megabytes | None = None,
     force: bool = False,
     threads: int | None = None,
     json_output: Json = False,

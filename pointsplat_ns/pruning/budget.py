@@ -11,10 +11,11 @@ from numbers import Integral, Real
 
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.io.formats.registry import WRITABLE, format_named, format_to_write
+from pointsplat_ns.system.quantities import parse_count, parse_megabytes, parse_number
 
 WANTED = (
     "expected a ratio above 0 and up to 1.0 (such as 0.3), a percentage (30%), a whole number of Gaussians "
-    "(such as 50000) or a size (12MB)"
+    "(such as 50000 or 50k) or a size (12MB)"
 )
 
 AUTO_PSNR = 35.0
@@ -49,6 +50,14 @@ class WithinPsnr:
     """A budget: the smallest scene whose renders reach this PSNR (dB) against the dense scene's own."""
 
     value: float
+
+
+class BareCount(int):
+    """A count that was typed as digits alone, such as 10: it may be meant as a percentage."""
+
+
+FEWEST, MANY = 100, 5000
+"""A bare count below the first is refused in scenes of the second number of Gaussians or more."""
 
 
 Keep = float | int | Megabytes | WithinPsnr
@@ -93,6 +102,11 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3) -> int:
     if isinstance(keep, Integral):
         if not 1 <= keep <= n:
             raise BudgetError(f"keep is {int(keep)} Gaussians; expected 1 to {n}, the number in the scene")
+        if isinstance(keep, BareCount) and keep < FEWEST and n >= MANY:
+            raise BudgetError(
+                f"keep is {int(keep)}, of {n:,} Gaussians; did you mean {int(keep)}%? Write {int(keep)}gaussians for "
+                "so few"
+            )
         return int(keep)
     if not 0 < keep <= 1:  # NaN fails too
         raise BudgetError(f"keep is {float(keep)!r}; {WANTED}")
@@ -135,8 +149,8 @@ def _count_that_fits(n: int, keep: Megabytes, sh_degree: int) -> int:
 
 
 def parse_keep(text: str) -> Keep:
-    """Parse a budget: ``0.3`` and ``30%`` are ratios, ``50000`` is a count, ``12MB`` and ``12MB.spz`` are sizes,
-    ``auto`` and ``auto:35`` are the PSNR (dB) that renders must reach against the dense scene's own.
+    """Parse a budget: ``0.3`` and ``30%`` are ratios; ``50000``, ``50k`` and ``12 Gaussians`` are counts; ``12MB`` and
+    ``800kB.spz`` are sizes; ``auto`` and ``auto:35`` are the PSNR (dB) that renders must reach against the dense scene.
 
     Raises:
         BudgetError: if it is none of these. The range of a ratio, count or size is checked by :func:`resolve_keep`.
@@ -154,11 +168,16 @@ def parse_keep(text: str) -> Keep:
             if not 0 < psnr < math.inf:
                 raise ValueError
             return WithinPsnr(psnr)
-        if size := re.fullmatch(r"(.*)[mM][bB](\.\S+)?", text):
-            return Megabytes(float(size[1]), (size[2] or ".ply").lower())
+        if size := re.fullmatch(r"(.*\d *[kmg]?b)(\.\S+)?", text, re.IGNORECASE):
+            return Megabytes(parse_megabytes(size[1]), (size[2] or ".ply").lower())
         if text.endswith("%"):
-            return float(text[:-1]) / 100
-        return int(text) if text.lstrip("+-").isdigit() else float(text)
+            return parse_number(text[:-1]) / 100
+        if count := re.fullmatch(r"(.*\d *[kmg]?) *gaussians?", text, re.IGNORECASE):
+            return parse_count(count[1])
+        if re.fullmatch(r"[+-]?\d+", text):
+            return BareCount(text)
+        number = parse_number(text)
+        return int(number) if number > 1 and number == int(number) or text[-1] in "kKmMgG" else number
     except BudgetError:
         raise
     except ValueError as error:

@@ -69,6 +69,13 @@ def test_a_budget_that_fits_no_count_of_the_scene_is_refused(n, keep, message):
         ("1", 1),
         ("1.0", 1.0),
         (" 50000 ", 50000),
+        *((text, 1000) for text in ("1e3", "1k", "1,000", "0.001M", "1000 Gaussians", "1kgaussians", "1.0e3")),
+        ("1 gaussian", 1),
+        ("10 %", 0.1),
+        ("12kb", Megabytes(0.012)),
+        ("1GB", Megabytes(1000.0)),
+        ("5,000 B", Megabytes(0.005)),
+        ("1.5 MB.sog", Megabytes(1.5, ".sog")),
         ("1e-2", 0.01),
         ("-5", -5),
         ("12MB", Megabytes(12.0)),
@@ -81,12 +88,38 @@ def test_a_budget_that_fits_no_count_of_the_scene_is_refused(n, keep, message):
 )
 def test_a_typed_budget_keeps_its_kind(text, keep):
     result = parse_keep(text)
-    assert result == keep and type(result) is type(keep)
+    assert result == keep and isinstance(result, type(keep))
+
+
+def test_few_gaussians_of_many_are_asked_about_unless_they_are_called_so():
+    for n, text, kept in ((5000, "10%", 500), (5000, "10gaussians", 10), (4999, "10", 10), (5000, "100", 100)):
+        assert resolve_keep(n, text) == kept
+    assert resolve_keep(5000, 10) == 10
+    wanted = r"keep is 10, of 5,000 Gaussians; did you mean 10%\? Write 10gaussians for so few"
+    with pytest.raises(BudgetError, match=wanted):
+        resolve_keep(5000, "10")
 
 
 @pytest.mark.parametrize(
     "text",
-    ["", "half", "%", "1,000", "0.3x", "MB", "xMB", "12GB", "auto:", "auto:0", "auto:-3", "auto:nan", "auto:inf"]
+    [
+        "",
+        "half",
+        "%",
+        "1,00",
+        "0,3",
+        "0.3x",
+        "MB",
+        "xMB",
+        "12TB",
+        "1e999",
+        "0.5 gaussians",
+        "auto:",
+        "auto:0",
+        "auto:-3",
+        "auto:nan",
+        "auto:inf",
+    ]
     + ["automatic"],
 )
 def test_a_typed_budget_that_is_none_is_refused(text):

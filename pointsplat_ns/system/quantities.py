@@ -1,0 +1,59 @@
+"""Counts and sizes as people write them: 1e3, 10k, 1.5M, 1,000, 12kB, 1GB."""
+
+from __future__ import annotations
+
+import math
+import re
+from decimal import Decimal
+
+_FACTORS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9}
+_NUMBER = re.compile(r"([+-]?(?:\d{1,3}(?:,\d{3})+|\d+)?(?:\.\d*)?(?:e[+-]?\d{1,3})?) ?([kmg]?)", re.IGNORECASE)
+
+
+def parse_number(text: str) -> float:
+    """A number, with k, M or G for thousands, millions or billions.
+
+    Raises:
+        ValueError: if it is none.
+
+    Example:
+        >>> parse_number("1e3"), parse_number("1.5M"), parse_number("1,000"), parse_number("0.3")
+        (1000.0, 1500000.0, 1000.0, 0.3)
+    """
+    found = _NUMBER.fullmatch(text.strip())
+    if found is None or not re.match(r"[+-]?[\d.]*\d", found[1]):
+        raise ValueError(f"{text!r} is no number; expected one such as 0.5, 1000, 1,000, 1e3, 10k or 1.5M")
+    number = float(Decimal(found[1].replace(",", "")) * _FACTORS[found[2].lower()])
+    if math.isinf(number):
+        raise ValueError(f"{text!r} is too large")
+    return number
+
+
+def parse_count(text: str) -> int:
+    """A whole number, as :func:`parse_number` reads it.
+
+    Raises:
+        ValueError: if it is none.
+
+    Example:
+        >>> parse_count("10k"), parse_count("1.5M")
+        (10000, 1500000)
+    """
+    number = parse_number(text)
+    if number != int(number):
+        raise ValueError(f"{text!r} is no whole number; expected one such as 1000, 1,000, 1e3 or 10k")
+    return int(number)
+
+
+def parse_megabytes(text: str) -> float:
+    """A size, in units of 10^6 bytes; a number without a unit is in MB.
+
+    Raises:
+        ValueError: if it is none.
+
+    Example:
+        >>> parse_megabytes("12kb"), parse_megabytes("1GB"), parse_megabytes("12"), parse_megabytes("5000B")
+        (0.012, 1000.0, 12.0, 0.005)
+    """
+    text = text.strip()
+    return parse_number(text[:-1]) / 1e6 if text.lower().endswith("b") else parse_number(text)
