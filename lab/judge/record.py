@@ -191,6 +191,8 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
                 parts.append(f"Leads in dB {where}:\n\n{table}")
         if at in (LPIPS_WIDTH, PHOTOS) and (table := _mean_table(figures, at, "dense_lpips", 3)):
             parts.append(f"LPIPS against renders of the dense scene, lower is better:\n\n{table}")
+    if table := _unlearned_table(rows, figures):
+        parts.append("## Scenes that the network was not trained on\n\n" + UNLEARNED + "\n\n" + table)
     parts.append("## Time\n\n" + TIME + "\n\n" + _cost_table(figures))
     if failed := [row for row in rows if row["failed"]]:
         lines = "\n".join(f"- {row['scene']}, {_share(row['keep'])}: {row['method']}" for row in failed)
@@ -207,6 +209,8 @@ because a judged scene had shown the need; their constants come from scenes for 
 views look from enclosed places of what is no room as a whole (both apt_kitchen_balcony).
 [benchmarks.md](../benchmarks.md#scenes) says where the scenes come from.
 The network that sets the steps of `compact` was trained on {", ".join(LEARNED)}."""
+
+UNLEARNED = f"""The gain of `compact` over `prune` in dB without {", ".join(LEARNED)}, in brackets with them."""
 
 TIME = """CPU seconds and peak memory of one process, with starting, reading and writing: mean and largest over scenes.
 splat-transform stands for the mode of the best PSNR."""
@@ -246,6 +250,17 @@ def _lead_table(figures: Figures, at: int | str, column: str) -> str:
             lines.append([_share(keep), *cells])
     heads = ["kept", f"`prune` over {NAME}", "worst", "`compact` over `prune`", "worst"]
     return markdown(heads, lines) if lines else ""
+
+
+def _unlearned_table(rows: list[Row], figures: Figures) -> str:
+    others = Figures([row for row in rows if row["scene"] not in LEARNED])
+    lines = []
+    for at in figures.ats:
+        without, gains = (each.lead("compact", at, "covered_psnr") for each in (others, figures))
+        if without:
+            cells = [f"{without[keep][0]:+.2f} ({gains[keep][0]:+.2f})" for keep in figures.keeps if keep in without]
+            lines.append([str(at), *cells])
+    return markdown(["width", *map(_share, others.keeps)], lines) if lines else ""
 
 
 def _cost_table(figures: Figures) -> str:

@@ -193,9 +193,7 @@ def which_way_up(
     inside = is_room(surface, UprightBox.of(surface, axis))
     if up is not None:
         return up, inside
-    weighted = surface.settings.seen_from_above_weight > 0
-    from_above = seen_from_above(scene, centre, diagonal, surface, axis) if weighted else 0.0
-    return pointing_up(surface, axis, inside, from_above), inside
+    return pointing_up(surface, axis, seen_from_above(scene, centre, diagonal, surface, axis)), inside
 
 
 def is_room(surface: Surface, box: UprightBox) -> bool:

@@ -173,8 +173,8 @@ class Search:
         return self.settings.target_share * share * self.surface.points[drawn]
 
     def _gains(self, viewmats: Tensor, visible: Tensor) -> Tensor:
-        """Coverage (V, P) that views (V, 4, 4) add at points, float32: 1 for a point in the middle of the picture,
-        nearby and of a small Gaussian, 0 outside of the picture and for points that are not ``visible`` (V, P)."""
+        """Coverage (V, P) that views (V, 4, 4) add at points, float32: 1 for a point nearby
+        and of a small Gaussian, 0 outside of the picture and for points that are not ``visible`` (V, P)."""
         settings, points = self.settings, self._points
         x, y, z = (viewmats[:, :3, :3].float() @ points.points.float().T + viewmats[:, :3, 3:].float()).unbind(1)
         edge = math.tan(math.radians(settings.field_of_view) / 2) * torch.tensor([self.width, self.height])
@@ -183,8 +183,7 @@ class Search:
         in_picture = visible & (z > 0) & (aside < 1)
         subtended = points.widths / z.clamp_min(1e-6)
         sharp = 1 / (1 + (subtended / settings.half_gain_angle).square())
-        central = 1 - settings.edge_loss * aside.square().clamp_max(1)
-        return in_picture * sharp * central / (1 + (z / settings.half_gain_distance).square())
+        return in_picture * sharp / (1 + (z / settings.half_gain_distance).square())
 
     def _is_free(self, viewmat: Tensor) -> bool:
         """Whether a view (4, 4) shows enough, hardly any surface that is very near, and no blur."""

@@ -28,8 +28,8 @@ class Up:
     direction: Tensor
     """(3,) float64, of length 1."""
     sure: bool = True
-    """Whether it was named, or the scene has level or vertical surfaces, and its mass and the side from which more is
-    seen agree with it."""
+    """Whether it was named, or the scene has level or vertical surfaces and more of it is seen from above than from
+    below."""
 
     def __str__(self) -> str:
         """The name of the axis, or the direction.
@@ -141,23 +141,22 @@ def upright_axis(surface: Surface, photos: PhotoPlaces | None = None) -> Tensor:
     return torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) if axis is None else axis
 
 
-def pointing_up(surface: Surface, axis: Tensor, inside: bool, from_above: float = 0.0) -> Up:
+def pointing_up(surface: Surface, axis: Tensor, from_above: float = 0.0) -> Up:
     """``axis`` (3,) or its opposite, whichever points up.
 
-    More is seen from above than from below, and mass lies low. Where both say little, z is up, or -y, as in scenes that
-    have the axes of their first camera.
+    More is seen from above than from below. If about the same is seen, z is up, or -y, as in scenes that have the axes
+    of their first camera.
 
     Args:
         surface: points of the scene, and the settings.
         axis: (3,) as :func:`upright_axis` gives it.
-        inside: whether the scene is a room that is looked at from inside.
-        from_above: as :func:`~pointsplat_ns.looking.whole.seen_from_above` gives it for ``axis``; 0 says nothing.
+        from_above: as :func:`~pointsplat_ns.looking.whole.seen_from_above` gives it for ``axis``.
     """
-    content, settings = _content(surface), surface.settings
-    evidence = _lift(content, axis, inside) + settings.seen_from_above_weight * from_above
-    sign = 1 if evidence + settings.usual_direction_weight * _usual(axis) >= 0 else -1
-    evident = float(uprightness(axis[None], content)) >= settings.min_uprightness
-    return Up(sign * axis, evident and sign * evidence >= 0)
+    settings = surface.settings
+    clear = abs(from_above) >= settings.min_seen_from_above
+    sign = 1 if (from_above if clear else _usual(axis)) >= 0 else -1
+    upright = float(uprightness(axis[None], _content(surface))) >= settings.min_uprightness
+    return Up(sign * axis, clear and upright)
 
 
 def _content(surface: Surface) -> Surface:
@@ -244,23 +243,6 @@ def _nearby(axes: Tensor, angle: float) -> Tensor:
     other = torch.linalg.cross(axes, right)
     turned = torch.cat([axes + side * math.tan(angle) for side in (right, -right, other, -other)])
     return turned / turned.norm(dim=1, keepdim=True)
-
-
-def _lift(content: Surface, axis: Tensor, inside: bool) -> float:
-    """Distance of the centre of mass below the middle, as a share of the height: above 0 if the axis points up.
-
-    A room has its furniture below. An object stands on a base or on the ground, which is wide: its points count by
-    their distance from the vertical line through its middle. All points count by a power of their trace factors.
-    """
-    heights = content.points @ axis
-    low, high = heights.quantile(heights.new_tensor(content.settings.outlier_quantiles))
-    share = ((heights - low) / (high - low).clamp_min(1e-300)).clamp(0, 1)
-    weights = content.trace_factors.double() ** content.settings.lift_trace_exponent
-    if not inside:
-        across = content.points - heights[:, None] * axis
-        weights = weights * (across - weights @ across / weights.sum()).norm(dim=1)
-    total = float(weights.sum())
-    return 0.5 - float(weights @ share) / total if total > 0 else 0.0
 
 
 def _usual(axis: Tensor) -> float:

@@ -142,14 +142,13 @@ def best_groups(
     Args:
         scene, members, masses, group: as for :func:`moments`.
         groups: their moments.
-        settings: ``regrouping_candidates``, ``regrouping_roundness``, ``regrouping_contrast`` and ``max_colour``.
+        settings: ``regrouping_candidates``, ``regrouping_contrast`` and ``max_colour``.
     """
     from scipy.spatial import cKDTree
 
     count = len(groups.mass)
     variance = (groups.cov[:, (0, 3, 5)].mean(1)).clamp_min(MIN_DIVISOR)
-    roundness = settings.regrouping_roundness * torch.eye(3, dtype=torch.float64)
-    shapes = unpack(groups.cov / variance[:, None]) + roundness
+    shapes = unpack(groups.cov / variance[:, None]) + 1e-6 * torch.eye(3, dtype=torch.float64)  # invertible if flat
     inverse = torch.linalg.inv(shapes)
     inverse = inverse[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)] * (_OCCURRENCES / variance[:, None])
     log_determinants = torch.logdet(shapes) + 3 * variance.log()
