@@ -48,7 +48,8 @@ class Surface:
         count = settings.surface_points
         drawn = torch.rand(count, generator=generator, dtype=torch.float64) * cumulative[-1]
         some = scene[torch.searchsorted(cumulative, drawn).clamp_max(len(scene) - 1).to(scene.device)].to("cpu")
-        stds, order = (some.stds.double() * (UNITS / size)).sort(dim=1)
+        # exp(scale) may be infinite; a point that far away is as good as one at a million times the content's size.
+        stds, order = (some.stds.double() * (UNITS / size)).clamp_max(1e6 * UNITS).sort(dim=1)
         axes = rotation_matrices(some.quats.double())  # columns are the axes
         axes = axes.gather(2, order[:, None, :].expand(-1, 3, 3))
         offsets = torch.randn(count, 3, generator=generator, dtype=torch.float64)

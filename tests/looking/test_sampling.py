@@ -52,6 +52,18 @@ def test_one_gaussian_is_looked_at(hollow_ball):
     assert len(views) >= 1 and render(hollow_ball[5:6], views[0]).max() > 0
 
 
+@pytest.mark.parametrize(
+    "name, value",
+    [("scales", 1e4), ("scales", -1e4), ("opacities", 1e4), ("opacities", -1e4), ("quats", 0.0), ("quats", 3e38),
+     ("means", 3e38), ("means", 1e-40), ("features_dc", 3e38), ("features_rest", 3e38)],
+)  # fmt: skip
+def test_a_few_extreme_gaussians_leave_views_that_are_finite(hollow_ball, name, value):
+    scene = hollow_ball.map(lambda tensor: tensor.clone())
+    getattr(scene, name)[::20] = value
+    views = sample_views(scene, 2, 48, 36)
+    assert len(views) == 2 and bool(views.viewmats.isfinite().all())
+
+
 def test_a_scene_that_shows_nothing_has_no_poses(hollow_ball):
     clear = hollow_ball.replace(opacities=torch.full_like(hollow_ball.opacities, -math.inf))
     for nothing in (clear, hollow_ball[:0], hollow_ball.map(lambda value: value * math.nan)):
