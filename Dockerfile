@@ -1,12 +1,8 @@
-# The commands of pointsplat_ns on a CPU:
+# The commands of pointsplat_ns on a CPU, but for those that train, which need nerfstudio:
 #   docker build -t pointsplat .
 #   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" pointsplat prune room.ply --keep 10%
 
 FROM python:3.11-slim AS build
-# Of nerfstudio's dependencies, fpsample and pyliblzfse have no wheels everywhere, and are compiled.
-RUN apt-get update \
-    && apt-get install --no-install-recommends -y build-essential \
-    && rm -rf /var/lib/apt/lists/*
 RUN python -m venv /opt/venv
 ENV PATH=/opt/venv/bin:$PATH
 # Builds of torch and torchvision without CUDA, both from one index, as they have to fit each other.
@@ -19,10 +15,9 @@ COPY method_configs method_configs
 RUN pip install --no-cache-dir .
 
 FROM python:3.11-slim
-# What OpenCV and open3d load of the system, and the compiler of the rasterizer's kernels: they are made for the processor
-# that they run on.
+# The compiler of the rasterizer's kernels: they are made for the processor that they run on.
 RUN apt-get update \
-    && apt-get install --no-install-recommends -y g++ libgl1 libglib2.0-0 libgomp1 libudev1 libx11-6 \
+    && apt-get install --no-install-recommends -y g++ libgomp1 \
     && rm -rf /var/lib/apt/lists/*
 COPY --from=build /opt/venv /opt/venv
 # Threads that wait for one another spin briefly and then sleep; caches go where any user may write.

@@ -1,7 +1,7 @@
 """What runs where nerfstudio is missing, and so are CUDA, Node, a compiler, a network and a home to write to.
 
-The environment has nothing but what ``requirements/core.txt`` asks for and what that in turn asks for, as links to what
-is installed here.
+The environment has nothing but what the package asks for without an extra and what that in turn asks for, as links to
+what is installed here.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import subprocess
 import sys
 from collections.abc import Iterable, Iterator
 from importlib import metadata
-from pathlib import Path
 
 import pytest
 import torch
@@ -28,7 +27,14 @@ from pointsplat_ns.errors import MissingPackageError
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
 from pointsplat_ns.system.packages import need
 
-CORE, NERFSTUDIO = (REPOSITORY / "requirements" / name for name in ("core.txt", "nerfstudio.txt"))
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pytest brings it along
+
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["project"]
+EXTRAS = PROJECT["optional-dependencies"]
+CORE, NERFSTUDIO = ([*map(Requirement, texts)] for texts in (PROJECT["dependencies"], EXTRAS["nerfstudio"]))
 
 WITH_ANOTHER = {"gsplat": "nerfstudio"}
 """Packages that are imported where the one that brings them is."""
@@ -72,16 +78,11 @@ RUNS = {
 """Commands that nothing is missing for, and what they print."""
 
 FAILS = {
-    "make-refiner -o made": "training needs nerfstudio, which is not installed; pip install pointsplat-ns adds it",
-    "render run -o run.mp4 --path dataset": "needs nerfstudio, which is not installed; pip install pointsplat-ns",
+    "make-refiner -o made": "training needs nerfstudio, which is not installed; "
+    "pip install 'pointsplat-ns[nerfstudio]' adds it",
+    "render run -o run.mp4 --path dataset": "needs nerfstudio, which is not installed; pip install 'pointsplat-ns[",
 }
 """Commands that something is missing for, and what they say."""
-
-
-def requirements_of(path: Path) -> list[Requirement]:
-    """The requirements in a file."""
-    lines = [line.strip() for line in path.read_text("utf-8").splitlines()]
-    return [Requirement(line) for line in lines if line and not line.startswith("#")]
 
 
 def installed_for(requirements: Iterable[Requirement], seen: set[str] | None = None) -> Iterator[metadata.Distribution]:
@@ -107,7 +108,7 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
     packages, nothing, work = folder / "packages", folder / "nothing", folder / "work"
     for made in (packages, nothing, work):
         made.mkdir()
-    for distribution in installed_for(requirements_of(CORE)):
+    for distribution in installed_for(CORE):
         tops = {file.parts[0] for file in distribution.files or () if file.parts[0] not in ("..", "__pycache__")}
         for top in tops:
             if not (packages / top).exists():
@@ -168,7 +169,7 @@ def test_all_but_the_plugin_can_be_imported_on_a_bare_machine(outcomes):
 
 
 def test_requirements_are_what_is_imported():
-    core, more = (_names(path) for path in (CORE, NERFSTUDIO))
+    core, more = ({canonicalize_name(requirement.name) for requirement in listed} for listed in (CORE, NERFSTUDIO))
     package = REPOSITORY / "pointsplat_ns"
     plugin, rest = set(), set()
     for path in (*package.rglob("*.py"), *(REPOSITORY / "method_configs").glob("*.py")):
@@ -179,8 +180,8 @@ def test_requirements_are_what_is_imported():
     assert _distributions((plugin | rest) - WITH_ANOTHER.keys()) == (core | more) - BY_NAME
 
 
-def _names(path: Path) -> set[str]:
-    return {canonicalize_name(requirement.name) for requirement in requirements_of(path)}
+def test_who_develops_has_nerfstudio_too():
+    assert any("nerfstudio" in requirement.extras for requirement in map(Requirement, EXTRAS["dev"]))
 
 
 def _distributions(imported: set[str]) -> set[str]:

@@ -7,6 +7,7 @@ one, but not its installation of this package.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -123,6 +124,18 @@ def test_sdist_gives_the_same_wheel(wheels):
 def test_wheel_holds(wheels, name):
     with zipfile.ZipFile(wheels["wheel"]) as archive:
         assert archive.getinfo(name).file_size == (ROOT / name).stat().st_size
+
+
+def test_wheel_asks_for_nerfstudio_in_an_extra_alone(wheels):
+    with zipfile.ZipFile(wheels["wheel"]) as archive:
+        [name] = [name for name in archive.namelist() if name.endswith(".dist-info/METADATA")]
+        lines = archive.read(name).decode().splitlines()
+    asked = [line.removeprefix("Requires-Dist: ") for line in lines if line.startswith("Requires-Dist: ")]
+    alone = {re.split(r"[^\w-]", line)[0] for line in asked if "extra ==" not in line}
+    assert "torch" in alone and not alone & {"nerfstudio", "open3d", "opencv-python-headless"}
+    assert [line for line in asked if line.startswith("nerfstudio")] == [
+        'nerfstudio<1.2,>=1.1.5; extra == "nerfstudio"'
+    ]
 
 
 def test_wheel_leaves_out_tests_and_the_lab(wheels):

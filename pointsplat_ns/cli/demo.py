@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from pointsplat_ns.cli.reading import Share
-from pointsplat_ns.cli.scene_options import claim_folder
+from pointsplat_ns.cli.scene_options import claim_folder, claim_outputs, file_bytes
 
 HELD_OUT = "room2"
 """The room without a part in the refiner's training."""
@@ -30,6 +30,7 @@ def demo(
     frames: int = 60,
     width: int = 256,
     height: int = 192,
+    scene_only: bool = False,
     force: bool = False,
 ) -> None:
     """Compact the scene that ships and draw it before and after, which takes a minute. Then continue with training,
@@ -46,11 +47,15 @@ def demo(
         frames: photos of each room.
         width: of a photo, pixels.
         height: of a photo, pixels.
+        scene_only: write the scene that ships as room.ply, in this folder, and end.
         force: start over: first remove rooms, trainings and pictures of an earlier demo in the folder.
     """
     from pointsplat_ns.nerfstudio_plugin.running import finished
     from pointsplat_ns.system.packages import need
 
+    if scene_only:
+        write_example(Path("room.ply"), force)
+        return
     claim_folder(output)
     for folder in ("rooms", "scenes", "refiner", "pictures") if force else ():
         if (output / folder).exists():
@@ -76,6 +81,16 @@ def training_folders(output: Path) -> tuple[dict[str, Path], Path]:
 
     scenes = {name: run_folder(output / "scenes", name, SCENE_METHOD, TIMESTAMP) for name in ROOMS}
     return scenes, run_folder(output / "refiner", "rooms", REFINER_METHOD, TIMESTAMP)
+
+
+def write_example(path: Path, force: bool) -> None:
+    """Write the shipped scene."""
+    import pointsplat_ns as ps
+
+    claim_outputs(path, force)
+    scene = ps.example_room()
+    ps.save(scene, path)
+    print(f"{path}: {len(scene):,} Gaussians, {file_bytes(path) / 1e6:.2f} MB")
 
 
 def compact_example(output: Path, keep: float) -> None:

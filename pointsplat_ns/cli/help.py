@@ -61,7 +61,10 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "make-feedback": (
         ("of two scenes", "pointsplat make-feedback kitchen.ply room.ply -o feedback.safetensors --updates 200"),
     ),
-    "demo": (("in a folder of its own", "pointsplat demo --output outputs/try --keep 0.2"),),
+    "demo": (
+        ("a scene to try commands with: room.ply", "pointsplat demo --scene-only"),
+        ("in a folder of its own", "pointsplat demo --output outputs/try --keep 0.2"),
+    ),
 }
 """Command lines of every command, with the purpose of each."""
 

@@ -24,5 +24,5 @@ def need(package: Literal["nerfstudio"], what: str) -> None:
         if error.name != package:  # it is there, and something that it needs is not
             raise
         # pip adds what an installed package asks for and lacks.
-        remedy = "pip install pointsplat-ns adds it"
+        remedy = f"pip install 'pointsplat-ns[{package}]' adds it"
         raise MissingPackageError(f"{what} needs {package}, which is not installed; {remedy}") from None

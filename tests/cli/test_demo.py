@@ -140,3 +140,13 @@ def test_the_demo_says_which_command_failed(tmp_path, capfd, monkeypatch):
         main(["demo", "--output", str(output)])
     error = capfd.readouterr().err
     assert end.value.code == 1 and "ns-train splatfacto-cpu" in error.splitlines()[-1]
+
+
+def test_the_scene_alone_is_written_here_and_not_over_another(small_example, monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    main(["demo", "--scene-only"])
+    assert len(read_ply(tmp_path / "room.ply")) == 400 and not (tmp_path / "outputs").exists()
+    assert capsys.readouterr().out.startswith("room.ply: 400 Gaussians, ")
+    with pytest.raises(SystemExit):
+        main(["demo", "--scene-only"])
+    assert "room.ply: exists already" in capsys.readouterr().err

@@ -65,6 +65,17 @@ def test_block_says_what_it_is(block):
     assert block.language in ("bash", "python", "text")
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_room_is_written_before_a_page_reads_it(page):
+    lines = page.read_text("utf-8").splitlines()
+    written = [number for number, line in enumerate(lines, 1) if "pointsplat demo --scene-only" in line]
+    for block in BLOCKS:
+        if block.page == page and block.language != "text":
+            for number, line in enumerate(block.text.splitlines(), block.line):
+                if re.search(r"(?<![\w/])room\.ply", line):
+                    assert written and written[0] <= number, f"{block.where}: {line}"
+
+
 @pytest.mark.parametrize("command", COMMANDS, ids=str)
 def test_command_is_one_that_works(command, tmp_path, monkeypatch, capsys):
     words = command.words
@@ -94,11 +105,10 @@ def test_command_is_one_that_works(command, tmp_path, monkeypatch, capsys):
         targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), flags=re.MULTILINE)
         assert {word for word in words[1:] if "=" not in word} <= set(targets)
     elif program == "pip":
-        assert words[1] == "install" and set(files_of(words)) <= {"requirements/core.txt", "oldest.txt"}
+        assert words[1] == "install" and set(files_of(words)) <= {"oldest.txt"}
+        assert {extra for word in words for extra in re.findall(r"\[(\w+)\]", word)} <= {"nerfstudio"}
     elif program == "uv":
-        assert words[1:3] == ("pip", "compile") and {word for word in words if word.startswith("requirements/")} == {
-            str(path.relative_to(ROOT)) for path in (ROOT / "requirements").iterdir()
-        }
+        assert words[1:3] == ("pip", "compile") and {"pyproject.toml", "--extra", "nerfstudio"} <= set(words)
     elif program == "pre-commit":
         assert words[1] in ("install", "run")
         assert (ROOT / ".pre-commit-config.yaml").is_file()
