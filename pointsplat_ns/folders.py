@@ -12,7 +12,7 @@ from pointsplat_ns.compression.requests import CompactRequest, Effort, RepairBud
 from pointsplat_ns.compression.scene_folder import WHOLE, Command, Shard, output_folder, run_on_folder
 from pointsplat_ns.compression.scene_task import Options, SceneResult, SmallerScene
 from pointsplat_ns.compression.trained_refiner import refiner_at
-from pointsplat_ns.io.formats import format_like
+from pointsplat_ns.io.formats import format_like, format_named
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.view_source import ViewSource
@@ -119,7 +119,7 @@ def compact_folder(
         options = {**options, "keep": None, "target_db": target_db, "target_ms": target_ms, "target_mb": target_mb}
         make = functools.partial(_found, refiner, device, targets, request.prune.by, repairs_of(effort), size)
     else:
-        sized = isinstance(keep, str) and keep.strip().lower().endswith("mb")  # without a format: in that of the result
+        sized = isinstance(keep, str) and format_named(keep.strip()) is None  # a size is then in the result's format
         make = functools.partial(_compacted, refiner, device, replace(request, refiner=None), sized, size)
     with progress_bar(progress if rank == 0 else False) as report:
         results = run_on_folder(
