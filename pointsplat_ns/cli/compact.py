@@ -91,27 +91,29 @@ def compact(
         sh: SH bands to keep, as for prune: all, up to a degree, or auto.
         clean: as for prune: first remove Gaussians that cannot be drawn or seen.
         effort: length of the repair: no steps (instant), 48 (quick, about as long as merging takes), or 400 (thorough).
-        seconds: duration of the repair, in place of --effort. Ctrl-C ends it earlier and writes the scene so
-            far.
+        seconds: duration of the repair, in place of --effort; by default none is set. Ctrl-C ends it earlier and writes
+            the scene so far.
         target_db: search for the smallest file of at least this PSNR against renders of the dense scene. The search
-            chooses count, SH degree and repair, in place of --keep and --sh.
-        target_ms: longest time of a frame, milliseconds. Without --target-db, search for the best within the limits.
-        target_mb: largest file, megabytes, in the format of the output.
+            chooses count, SH degree and repair, in place of --keep and --sh. By default there is no search.
+        target_ms: longest time of a frame, milliseconds; by default no limit. Without --target-db, search for the best
+            within the limits.
+        target_mb: largest file, in the format of the output: 12, 12MB, 800kB; by default no limit.
         poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
-            COLMAP model; for one scene.
+            COLMAP model; for one scene. By default the views of its dataset, or sampled ones.
         resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
             default the size of the photos, if there are any, else 1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is
             estimated. Write --up=-y for a negative axis.
-        picture: a .png file for images of some views: dense, before and after the repair, side by side.
+        picture: a .png file for images of some views: dense, before and after the repair, side by side; by default
+            none.
         html: an .html file that opens offline in a browser, to fly through the scene before and after, with a wipe
-            between them.
+            between them; by default none.
         html_limit: largest size of that file, MB. If both scenes take more, the dense one is left out.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
         jobs: for a folder: number of processes that share its scenes and the cores; by default 1.
-        shard: for a folder: only a part of its scenes; 2/5 is the second of five. Under torchrun each process takes its
-            part.
+        shard: for a folder: only a part of its scenes; 2/5 is the second of five; by default all. Under torchrun each
+            process takes its part.
         threads: number of threads of each process. By default it adapts to the work and to other programs. Another
             number may change results by rounding.
         verbose: print more: what was chosen for the scene, and the distributions of opacities and sizes.

@@ -32,8 +32,8 @@ def convert(
         output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog, meta.json (a SOG as a
             folder), .splat or .glb.
         sh: SH bands to keep: all, or up to a degree.
-        up: the new up axis: x, y, z, -x, -y or -z. The old up direction is estimated; -y:z names it as -y. Write
-            --up=-y for a negative axis.
+        up: the new up axis: x, y, z, -x, -y or -z. By default nothing is turned. The old up direction is estimated;
+            -y:z names it as -y. Write --up=-y for a negative axis.
         scale: factor on positions and sizes.
         original_frame: for a Splatfacto run: undo nerfstudio's rotation, shift and scale of its data.
         spz_version: version of an .spz file. 4 is newer, and fewer viewers read it.

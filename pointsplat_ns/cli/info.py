@@ -27,7 +27,8 @@ def info(
 
     Args:
         scenes: files of any format, Splatfacto checkpoints, or runs (their folder or config.yml).
-        views: a .png file for a sheet of the views that other commands use without --poses, for one scene.
+        views: a .png file for a sheet of the views that other commands use without --poses, for one scene; by default
+            none.
         resolution: size of views, pixels. By default the size of the photos for the sheet, if there are any, else
             1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is

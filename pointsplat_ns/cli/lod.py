@@ -48,7 +48,8 @@ def lod(
         output: the folder for the levels (level_0.ply is the finest), their parents, the manifest lod.json and the
             picture lod.png; by default beside the scene: room_lod for room.ply, lod in the folder of a run.
         sh: SH bands of every level: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
-        poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model.
+        poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model;
+            by default the views of its dataset, or sampled ones.
         resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
             default the size of the photos, if there are any, else 1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is

@@ -32,7 +32,7 @@ def make_feedback(
         output: file for the network.
         keep: budgets that the scenes are merged to: ratios (0.3), percentages (30%) or counts (50000).
         updates: number of updates of the network, at most.
-        seconds: time limit; the learning rate then falls with the time.
+        seconds: time limit, by default none; the learning rate then falls with the time.
         at_once: number of repairs in an update.
         seed: seed of the initial weights and of all choices.
         start: continue from this network with a third of the learning rate; by default from a network with plain Adam.

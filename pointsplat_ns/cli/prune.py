@@ -62,12 +62,12 @@ def prune(
         clean: first remove Gaussians that cannot be drawn or seen; --keep refers to the scene as read.
         fine_tune: number of steps of optimising the result against renders of the dense scene.
         poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
-            COLMAP model. They must be of this scene.
+            COLMAP model. They must be of this scene. By default the views of its dataset, or sampled ones.
         resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
             default the size of the photos, if there are any, else 1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is
             estimated. Write --up=-y for a negative axis.
-        plot: a .png file for a plot of the distributions of opacity and volume, before and after.
+        plot: a .png file for a plot of the distributions of opacity and volume, before and after; by default none.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
         threads: number of threads. By default it adapts to the work and to other programs. Another number may

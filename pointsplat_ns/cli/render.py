@@ -38,14 +38,14 @@ def render(
         path: dataset (exactly through the poses of the run's dataset), walk (past sampled views), orbit (about what
             they show), auto (dataset if there is one, else walk), or a camera path that nerfstudio's viewer saved
             (.json).
-        poses: a file of cameras in place of those of the dataset: cameras.json of 3DGS, transforms.json of nerfstudio,
+        poses: a file of cameras, by default those of the dataset: cameras.json of 3DGS, transforms.json of nerfstudio,
             or the folder of a COLMAP model. A folder then gets one frame for each, unless --seconds is given.
         split: layout of two scenes.
         labels: labels of two scenes; by default their names and counts. "" writes none on one.
         up: the axis that is up in the scene, for walks and orbits: x, y, z, -x, -y or -z; by default it is estimated.
             Write --up=-y for a negative axis.
         width: width of one scene's picture, pixels; by default that of the saved path, or of the photos, at most 960.
-        height: its height, pixels.
+        height: its height, pixels; by default in the proportion of the path or the photos.
         fps: frames a second; by default 24, or as in the saved path.
         seconds: length; by default 10, or long enough for every pose of the dataset or the saved path.
         force: overwrite existing files.

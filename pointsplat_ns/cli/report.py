@@ -14,7 +14,7 @@ def report(evaluation: tyro.conf.Positional[Path], html: Path | None = None, for
 
     Args:
         evaluation: the JSON file of ns-eval.
-        html: a .html file for the same with charts, one page that opens offline.
+        html: a .html file for the same with charts, one page that opens offline; by default none.
         force: overwrite an existing file.
     """
     import pointsplat_ns as ps

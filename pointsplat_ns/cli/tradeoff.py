@@ -50,15 +50,17 @@ def tradeoff(
         repairs: repairs to try: none, the refiner alone, or compact's efforts quick and thorough.
         views: largest number of views; without photos at most 12.
         poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model;
-            no photos are used then.
+            no photos are used then. By default the views of its dataset, or sampled ones.
         resolution: size of the pictures that people look at, pixels. Scenes are made for this size, and judged and
             timed in the pictures of comparisons. By default the size of the photos, if there are any, else 1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is
             estimated. Write --up=-y for a negative axis.
         drawn: qualities of frames: exact for all scenes; fast, and half (fast at half the resolution), for a few.
-        target_db: search for the smallest scene with at least this PSNR against the dense scene's renders.
-        target_ms: longest time of a frame, milliseconds. Without --target-db, search for the best within the limits.
-        target_mb: largest file, megabytes.
+        target_db: search for the smallest scene with at least this PSNR against the dense scene's renders. By default
+            there is no search.
+        target_ms: longest time of a frame, milliseconds; by default no limit. Without --target-db, search for the best
+            within the limits.
+        target_mb: largest file: 12, 12MB, 800kB; by default no limit.
         force: start over, and overwrite results in the folder.
         threads: number of threads. By default it adapts to the work and to other programs. Another number may
             change results by rounding. Frames are timed on all threads.

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from pointsplat_ns.cli import COMMANDS as COMMAND_NAMES
 from pointsplat_ns.cli import main
 from pointsplat_ns.cli.compact import compact
 from pointsplat_ns.cli.help import EXAMPLES, STATUSES
@@ -73,6 +74,16 @@ def test_all_say_the_same_of_the_number_of_threads(capsys):
     assert [name for name in with_threads if sentence not in helps[name]] == []
     for page in ("training.md", "reliability.md"):
         assert sentence in " ".join((PAGE.parent / page).read_text("utf-8").split())
+
+
+@pytest.mark.parametrize("name", COMMAND_NAMES)
+def test_the_help_of_every_option_says_its_default(name, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    options = re.split(r"(?m)^[│ ] (?=-)", shown(capsys, name, "--help").partition("\nexamples:\n")[0])[1:]
+    said = {option.split()[0].rstrip(","): " ".join(option.replace("│", " ").split()) for option in options}
+    assert said.pop("-h") and said or name == "view"
+    for option, text in said.items():
+        assert re.search(r"\(default: (?!None).*\)|\(required\)|[Bb]y default", text), f"{option}: {text}"
 
 
 def test_the_documentation_has_the_same_exit_statuses():
