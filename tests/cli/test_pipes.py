@@ -15,7 +15,7 @@ from pointsplat_ns.cli import main
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
 
-SECONDS = 60
+SECONDS = 300
 """Longest time of a command here; what waits for a pipe takes for ever."""
 
 ROOM = ("room.ply", "--by", "opacity")
