@@ -52,7 +52,7 @@ def test_notebook_shows_three_pictures(executed):
 
 def test_notebook_says_what_compacting_brought(executed):
     said = "".join(output.text for output in outputs(executed) if output.output_type == "stream")
-    assert "against the dense scene's renders" in said
+    assert "dB PSNR against the dense scene" in said
 
 
 def test_notebook_prints_no_warnings(executed):
