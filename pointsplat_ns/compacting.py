@@ -13,7 +13,7 @@ from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.looking.upright import up_named
-from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.looking.windows import parse_resolution
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.views import Views
@@ -63,7 +63,7 @@ def prune_source(
         there are no views.
     """
     from pointsplat_ns.compression.prune import prune_scene
-    from pointsplat_ns.compression.quality import QUALITY, quality_of
+    from pointsplat_ns.compression.quality import quality_of
 
     dense, source = read_source(scene, views, resolution, up)
     start = time.perf_counter()
@@ -72,7 +72,7 @@ def prune_source(
         seconds, quality = time.perf_counter() - start, None
         if compared:
             try:
-                looked = source.known(QUALITY.views) or pruned.views or source.whole()
+                looked = source.known(MERGED_FROM) or pruned.views or source.whole()
                 report("comparing renders", 0.0)
                 quality = quality_of(dense, pruned.scene, looked)
             except DataError:

@@ -7,12 +7,12 @@ exits with status 1.
 
 
 def printable(text: str) -> str:
-    """Text in one line that cannot steer a terminal: every character that is not printable becomes its escape, as in
+    r"""Text in one line that cannot steer a terminal: every character that is not printable becomes its escape, as in
     Python's ``repr``.
 
     Example:
         >>> print(printable("a name\x1b]0;with orders\x07\n"))
-        a name\\x1b]0;with orders\\x07\\n
+        a name\x1b]0;with orders\x07\n
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 

@@ -61,7 +61,7 @@ MODULES = "modules"
 RUNS = {
     "--version": "pointsplat-ns",
     "info room.ply": "600 Gaussians",
-    "prune room.ply --keep 10%": "kept 60 of 600",
+    "prune room.ply --keep 10%": "merged to 60 of 600",
     "compact room.ply --keep 30% --effort instant --html small.html": "small.html",
     "lod room.ply --levels 30%": "1 levels of 600 Gaussians",
     "tradeoff room.ply --points 2 --views 2 --resolution 64x48 --repairs none --drawn exact": "room_tradeoff",

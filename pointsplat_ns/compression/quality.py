@@ -9,7 +9,8 @@ import torch
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import DenseReference, views_text
-from pointsplat_ns.views import Views
+from pointsplat_ns.pruning.merging.settings import DEFAULTS as MERGING
+from pointsplat_ns.views import Views, spread_indices
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,12 @@ def quality_of(dense: Gaussians, scene: Gaussians, views: Views) -> Quality:
     Args:
         dense: N Gaussians.
         scene: K Gaussians.
-        views: views of the dense scene at full size; at most ``QUALITY.views`` of them are used.
+        views: views of the dense scene at full size, from which it was merged, if it was. At most ``QUALITY.views`` are
+            used, and none that the finish of merging compared, unless there are no others.
     """
+    finish = spread_indices(len(views), MERGING.finish_views)
+    if others := sorted({*range(len(views))} - {*finish}):
+        views = views[torch.tensor(others)]
     views = views.spread(QUALITY.views)
     psnr, _ = DenseReference(dense, _bands(views)).psnr(scene)
     return Quality(psnr, len(views), views.width, views.height)

@@ -101,7 +101,7 @@ def info(
         >>> import pointsplat_ns as ps
         >>> found = ps.info(ps.example_room())
         >>> found.gaussians, found.sh_degree, found.up_text, found.file_bytes[".splat"]["10%"]
-        (62845, 1, 'z', 201120)
+        (62845, 1, 'z (a guess)', 201120)
     """
     size, known = parse_resolution(resolution), up_named(up)
     file, kind, bytes_ = "", "", 0

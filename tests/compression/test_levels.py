@@ -283,7 +283,7 @@ def test_levels_that_fit_no_scene_are_refused_before_one_is_read(asked, message)
         (["50%", "401"], "level 401: keep is 401 Gaussians"),
         (["150%"], "level 150%: keep is 1.5"),
         ([0.5, 1.5], r"level 1\.5: keep is 1.5"),
-        (["nan"], "level nan: keep is nan"),
+        (["nan"], "level nan: keep is 'nan'"),
         (["0.0001MB"], "level 0.0001MB: keep is 0.0001MB, too small for one Gaussian"),
         ([True], "level True: keep is True"),
         (["50%", "0.5"], "levels 50% and 0.5 both mean 200 of 400 Gaussians; leave one out"),

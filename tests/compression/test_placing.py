@@ -63,8 +63,8 @@ def test_up_is_turned_to_where_it_is_wanted():
 
 def test_up_is_estimated_where_it_is_not_said():
     room = ps.example_room()[::20]
-    upside = ps.place(room, up="z:x")
-    back = ps.place(upside, up="z")
+    turned = ps.place(room, up="z:-y")
+    back = ps.place(turned, up="z")
     # Estimated to half a degree; the room is 6 m wide.
     assert float((back.means[:, 2] - room.means[:, 2]).abs().max()) < 0.1
 

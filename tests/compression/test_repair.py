@@ -196,7 +196,8 @@ def test_rates_of_the_means_follow_the_size_of_the_scene(pruned, ball_views):
         views = sample_views(scene, 2, 64, 48)
         after = next(optimised(scene, Adam(scene, AdamSettings()), itertools.repeat((views[0], target))))
         moved.append(float((after.means - scene.means).abs().max()) / size)
-    assert moved[0] == pytest.approx(moved[1], rel=1e-2) and moved[2] == pytest.approx(moved[1], rel=1e-2)
+    # 5 %: one step is some thirty spacings of float32 positions
+    assert moved[0] == pytest.approx(moved[1], rel=0.05) and moved[2] == pytest.approx(moved[1], rel=0.05)
 
 
 def test_what_is_right_already_hardly_moves_where_steps_are_damped(pruned, ball_views):
@@ -204,7 +205,8 @@ def test_what_is_right_already_hardly_moves_where_steps_are_damped(pruned, ball_
     view = ball_views[0]
     target = render(pruned, view).detach()
     target[:, : view.width // 2] = (target[:, : view.width // 2] + 0.3).clamp(max=1)
-    target[:, view.width // 2 :] += 1e-4 * torch.randn(target[:, view.width // 2 :].shape)
+    noise = torch.randn(target[:, view.width // 2 :].shape, generator=torch.Generator().manual_seed(0))
+    target[:, view.width // 2 :] += 1e-4 * noise
     moved = []
     for damping in (0.0, 0.5):
         adam, scene = Adam(pruned, AdamSettings(damping=damping)), pruned
