@@ -205,8 +205,8 @@ LEARNED = ("mujoco_tabletop", "pc_playbot", "pc_statue_st_peter", "lounge")
 
 SCENES = f"""No constant is chosen on scenes of the list "judged". Scenes of no list are "other". Four rules exist
 because a judged scene had shown the need; their constants come from scenes for tuning: repairs hold from nearer places
-(rock), merging holds before a white background (ethiopianHead), repairs take no views that large Gaussians fill, and
-views look from enclosed places of what is no room as a whole (both apt_kitchen_balcony).
+(rock, taebak), merging holds before a white background (ethiopianHead), repairs take no views that large Gaussians
+fill, and views look from enclosed places of what is no room as a whole (both apt_kitchen_balcony).
 [benchmarks.md](../benchmarks.md#scenes) says where the scenes come from.
 The network that sets the steps of `compact` was trained on {", ".join(LEARNED)}.
 Rows of captures are older than those of splats: merging sampled 48 views then, 24 now."""
