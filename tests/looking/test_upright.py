@@ -137,7 +137,7 @@ def test_where_photos_were_taken_decides_between_axes_that_suit_alike():
         assert float(found[axis].abs()) > math.cos(math.radians(3))
 
 
-@pytest.mark.parametrize(("from_above", "up", "sure"), [(0.2, UP, True), (-0.2, -UP, True), (-0.05, UP, False)])
+@pytest.mark.parametrize(("from_above", "up", "sure"), [(0.3, UP, True), (-0.3, -UP, True), (-0.05, UP, False)])
 def test_up_is_sure_where_clearly_more_is_seen_from_above(from_above, up, sure):
     surface = Surface.of(tower(), *content_size(tower()))
     found = pointing_up(surface, UP, from_above)
