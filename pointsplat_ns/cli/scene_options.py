@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Annotated, Literal
@@ -102,24 +102,14 @@ def claim_file(path: Path, force: bool) -> None:
     """Check and hold one file until the command ends, see :func:`~pointsplat_ns.io.outputs.claimed`."""
     from pointsplat_ns.io.outputs import claimed
 
-    _hold(claimed(path, force))
+    _CLAIMS.get().enter_context(claimed(path, force))
 
 
 def claim_folder(folder: Path) -> None:
     """Check and hold a folder until the command ends, see :func:`~pointsplat_ns.io.outputs.claimed_folder`."""
     from pointsplat_ns.io.outputs import claimed_folder
 
-    _hold(claimed_folder(folder))
-
-
-def _hold(claim: AbstractContextManager[object]) -> None:
-    """Enter a claim until the command ends; only check it where a function of a command is called by other code."""
-    claims = _CLAIMS.get(None)
-    if claims is not None:
-        claims.enter_context(claim)
-        return
-    with claim:
-        pass
+    _CLAIMS.get().enter_context(claimed_folder(folder))
 
 
 @contextmanager

@@ -81,8 +81,8 @@ class Comparison:
         whole = views.whole()
         sides = sides_of(whole.width, whole.height)
         others = (sides[0], sides[-1], ACCEPTANCE.nearer * sides[-1])
-        repeated = whole[torch.arange(len(whole)).repeat_interleave(ACCEPTANCE.windows)]
-        self._others = WindowRenders(dense, repeated, others) if len(sides) > 1 else None
+        windows = ACCEPTANCE.windows
+        self._others = WindowRenders(dense, whole, others, each=windows) if len(sides) > 1 else None
 
     def psnrs(self, scene: Gaussians) -> list[float]:
         """PSNR of a scene in the windows of each size, dB; empty where pictures are no larger than a window."""

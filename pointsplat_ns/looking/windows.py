@@ -38,7 +38,7 @@ class Windows:
     sides: tuple[int, ...]
     """Longer sides of the whole pictures, pixels, ascending."""
     views: tuple[Views, ...]
-    """Windows for each side, one of each view."""
+    """Windows for each side, the same number of each view."""
 
 
 def parse_resolution(text: str | tuple[int, int] | None) -> tuple[int, int] | None:
@@ -113,8 +113,9 @@ def windows_of(
     sides: Sequence[int] | None = None,
     seed: int = 0,
     settings: LookingSettings = DEFAULTS,
+    each: int = 1,
 ) -> Windows:
-    """One window of each view at each side; at the smallest side it is the whole picture.
+    """Windows of each view at each side; where a window holds the whole picture, it is one.
 
     Args:
         views: C views of any size.
@@ -122,15 +123,18 @@ def windows_of(
         sides: longer sides of the whole pictures, pixels; by default :func:`sides_of`.
         seed: seed of the positions of the windows.
         settings: ``window_side``.
+        each: number of windows of each view.
     """
     generator = random.Random(seed)
+    pairs = [pair for pair in zip(views, alphas, strict=True) for _ in range(each)]
     sides = tuple(sides or sides_of(views.width, views.height, settings))
 
     def of_side(side: int) -> Views:
-        positions = (_drawn_position(alpha, generator) for alpha in alphas)
-        found = [window(view, side, at, settings) for view, at in zip(views, positions, strict=True)]
-        Ks = torch.stack([view.K for view in found])
-        return replace(views, Ks=Ks, width=found[0].width, height=found[0].height)
+        found = [window(view, side, _drawn_position(alpha, generator), settings) for view, alpha in pairs]
+        if side <= settings.window_side:
+            found = found[::each]
+        viewmats, Ks = (torch.stack(some) for some in zip(*((view.viewmat, view.K) for view in found), strict=True))
+        return replace(views, viewmats=viewmats, Ks=Ks, width=found[0].width, height=found[0].height)
 
     return Windows(sides, tuple(map(of_side, sides)))
 
@@ -154,6 +158,7 @@ class WindowRenders:
         sides: as for :func:`windows_of`.
         seed: seed of the positions of the windows.
         settings: those of windows.
+        each: number of windows of each view.
     """
 
     @torch.no_grad()
@@ -164,10 +169,11 @@ class WindowRenders:
         sides: Sequence[int] | None = None,
         seed: int = 0,
         settings: LookingSettings = DEFAULTS,
+        each: int = 1,
     ):
         small = list(views.resized(settings.window_alpha_side))
         alphas = list(each_view(small, len(dense), lambda view: render_with_alpha(dense, view)[1][..., 0], settings))
-        windows = windows_of(views, alphas, sides, seed, settings)
+        windows = windows_of(views, alphas, sides, seed, settings, each)
         self.references = [DenseReference(dense, of_side, both_backgrounds=True) for of_side in windows.views]
         """Renders of the dense scene, for each side."""
 

@@ -88,6 +88,14 @@ def test_windows_of_a_picture_of_nothing_lie_in_its_middle(views, alpha):
     torch.testing.assert_close(found.views[-1][0].K, window(views[0], 640).K)
 
 
+def test_several_windows_of_each_view_are_as_one_of_each_repeated_and_whole_pictures_are_drawn_once(scene, views):
+    several = WindowRenders(scene, views, each=3)
+    repeated = WindowRenders(scene, views[torch.arange(len(views)).repeat_interleave(3)])
+    assert [len(one.views) for one in several.references] == [len(views), 3 * len(views), 3 * len(views)]
+    wider = scene.replace(scales=scene.scales + 0.1)
+    assert several.psnrs(wider) == pytest.approx(repeated.psnrs(wider), abs=1e-9)
+
+
 def test_the_scene_itself_is_not_wrong_in_any_window_and_a_wider_one_is(scene, views):
     renders = WindowRenders(scene, views)
     assert renders.psnrs(scene) == [100.0] * 3

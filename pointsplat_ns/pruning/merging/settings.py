@@ -31,8 +31,8 @@ class MergeSettings:
     rendered as soon as rounds have made it this small."""
 
     sampled_views: int = 24
-    """Number of views that are sampled where none are given; 0 turns sampling off. 48 are no
-    better on average and take a sixth longer."""
+    """Number of views that are sampled where none are given; 0 turns sampling off. 48 are no better on
+    average and take a sixth longer."""
 
     view_seed: int = 1
     """Seed of the sampled views."""

@@ -18,6 +18,7 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import fast_config, pipeline_of, run_of, same, without_data
+from pointsplat_ns.cli.scene_options import claims_until_the_end
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.pruning import prune
@@ -90,7 +91,8 @@ def test_both_exporters_write_the_refined_scene_with_the_photos_gone(trained, tr
     photos.rename(hidden)
     try:
         ExportGaussianSplat(load_config=config.get_base_dir() / "config.yml", output_dir=tmp_path).main()
-        export(config.get_base_dir(), tmp_path / "ours.ply")
+        with claims_until_the_end():
+            export(config.get_base_dir(), tmp_path / "ours.ply")
     finally:
         hidden.rename(photos)
     theirs, ours = read_ply(tmp_path / "splat.ply"), read_ply(tmp_path / "ours.ply")
@@ -103,10 +105,11 @@ def test_the_cli_exports_any_scene_of_the_run(trained, trained_walls, tmp_path):
     from pointsplat_ns.cli.export import export
 
     config, trainer, _ = trained
-    export(config.get_base_dir(), tmp_path / "a.ply", scene="wall-a")
+    with claims_until_the_end():
+        export(config.get_base_dir(), tmp_path / "a.ply", scene="wall-a")
     assert same(read_ply(tmp_path / "a.ply"), trainer.pipeline.eval().model.refine(0))
     assert not same(read_ply(tmp_path / "a.ply"), prune(read_scene(run_of(trained_walls, "wall-a")), 0.5))
-    with pytest.raises(SceneError, match="scene 'wall-z': no such scene.*wall-a, wall-b"):
+    with pytest.raises(SceneError, match="scene 'wall-z': no such scene.*wall-a, wall-b"), claims_until_the_end():
         export(config.get_base_dir(), tmp_path / "z.ply", scene="wall-z")
     assert not (tmp_path / "z.ply").exists()
 
