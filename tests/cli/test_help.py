@@ -72,7 +72,8 @@ def test_all_say_the_same_of_the_number_of_threads(capsys):
     with_threads = [name for name, text in helps.items() if "--threads" in text]
     assert {"prune", "compact", "lod", "tradeoff", "make-feedback"} <= {*with_threads}
     assert [name for name in with_threads if sentence not in helps[name]] == []
-    assert sentence in " ".join((PAGE.parent / "training.md").read_text("utf-8").split())
+    for page in ("training.md", "reliability.md"):
+        assert sentence in " ".join((PAGE.parent / page).read_text("utf-8").split())
 
 
 @pytest.mark.parametrize("name", COMMAND_NAMES)
