@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from statistics import fmean
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import open_run, scene_name
 from pointsplat_ns.metrics import finite_psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
-from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views
 
 METRICS = ("psnr", "ssim", "lpips")
@@ -32,12 +29,6 @@ def metrics_of(image: Tensor, target: Tensor, lpips: Lpips | None) -> dict[str, 
     """The :data:`METRICS` of one picture (H, W, 3) against another; without LPIPS where there is no network."""
     found = {"psnr": finite_psnr(image, target), "ssim": float(ssim(image, target))}
     return found if lpips is None else found | {"lpips": float(lpips(image, target))}
-
-
-@torch.no_grad()
-def mean_psnr(scene: Gaussians, views: Views, pictures: list[Tensor]) -> float:
-    """Mean PSNR of a scene's renders against one picture (H, W, 3) a view, dB, each at most 100."""
-    return fmean(finite_psnr(render(scene, view), picture) for view, picture in zip(views, pictures, strict=True))
 
 
 def lpips_or_none(wanted: bool) -> Lpips | None:

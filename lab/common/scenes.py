@@ -119,6 +119,6 @@ def trained_scenes(path: Path, index: int | None) -> list[Scene]:
     if not 0 <= index < len(views):
         raise SceneError(f"{path}: view {index} asked for; expected 0 to {len(views) - 1}")
     viewmat, focal = views.viewmats[index].float(), float(views.Ks[index, 0, 0] / views.width)
-    dense = dense[dense.usable() & dense.quats.any(1)]  # the yardstick knows no zero quaternions
+    dense = dense[dense.usable()]
     scenes = {f"{name_of(path)} dense": dense, f"{name_of(path)} {KEEP:.0%}": prune(dense, KEEP, "paper")}
     return [Scene(name, name, activated(scene), viewmat, focal) for name, scene in scenes.items()]

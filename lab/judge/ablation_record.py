@@ -36,6 +36,8 @@ rule off, or moves a setting to a value beside its default.
   scene covers.
 - CPU is CPU seconds of merging, relative to the defaults.
 - Variants come in the order of their mean changes. `other_views` shows how much is chance.
+- What a setting does stands under its field in `pointsplat_ns/pruning/merging/settings.py` and
+  `pointsplat_ns/looking/settings.py`.
 """
 
 
@@ -135,9 +137,8 @@ def _variant_table(found: list[Summary], keeps: list[float], table: str, setting
             f"`{field}` {_value(settings[f'{table}.{field}'])} to {_value(changes[field])}" for field in changes
         )
         cells = [summary.cell(keep) for keep in keeps]
-        sentence = variants.sentence_of(summary.name)
-        lines.append([f"`{summary.name}`", moves, *cells, f"{summary.cpu_ratio:.2f}", summary.count, sentence])
-    return markdown(["variant", "change", *map(_share, keeps), "CPU", "scenes and poses", "what it is"], lines)
+        lines.append([f"`{summary.name}`", moves, *cells, f"{summary.cpu_ratio:.2f}", summary.count])
+    return markdown(["variant", "change", *map(_share, keeps), "CPU", "scenes and poses"], lines)
 
 
 def _share(keep: float) -> str:

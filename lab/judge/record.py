@@ -54,6 +54,7 @@ PAGE = """# What smaller scenes lose
 - {peer} stands for the best of its modes: {modes}.
   The mode is chosen anew for each scene, budget, width and measure.
 - A scene counts at a budget once all three ways are measured.
+- Figures are means over scenes, with the worst scene in brackets.
 """
 
 
@@ -213,7 +214,7 @@ Rows of captures are older than those of splats: merging sampled 48 views then, 
 
 UNLEARNED = f"""The gain of `compact` over `prune` in dB without {", ".join(LEARNED)}, in brackets with them."""
 
-TIME = """CPU seconds and peak memory of one process, with starting, reading and writing: mean and largest over scenes.
+TIME = """CPU seconds and peak memory of one process, with starting, reading and writing: mean (largest) over scenes.
 splat-transform stands for the mode of the best PSNR."""
 
 
@@ -230,12 +231,14 @@ def _scene_table(rows: list[Row], figures: Figures) -> str:
 def _mean_table(figures: Figures, at: int | str, column: str, digits: int) -> str:
     lines = []
     for keep in figures.keeps:
-        for way in WAYS:
-            mean = figures.means.get((at, keep, way), {})
-            if column in mean:
-                values = [f"{mean[name]:.{digits}f}" for name in (column, f"{column}_median", f"{column}_worst")]
-                lines.append([_share(keep), _way(way), *values, mean[f"{column}_worst_scene"], str(mean["scenes"])])
-    return markdown(["kept", "way", "mean", "median", "worst", "of", "scenes"], lines) if lines else ""
+        means = [figures.means.get((at, keep, way), {}) for way in WAYS]
+        if all(column in mean for mean in means):
+            cells = [
+                f"{mean[column]:.{digits}f} ({mean[f'{column}_worst']:.{digits}f} {mean[f'{column}_worst_scene']})"
+                for mean in means
+            ]
+            lines.append([_share(keep), *cells, means[0]["scenes"]])
+    return markdown(["kept", *map(_way, WAYS), "scenes"], lines) if lines else ""
 
 
 def _lead_table(figures: Figures, at: int | str, column: str) -> str:
@@ -267,15 +270,17 @@ def _unlearned_table(rows: list[Row], figures: Figures) -> str:
 def _cost_table(figures: Figures) -> str:
     lines = []
     at = {photos: next((at for at in figures.ats if (at == PHOTOS) == photos), None) for photos in (False, True)}
-    for name, where in (("splats", at[False]), ("captures", at[True])):
+    for kind, where in (("splats", at[False]), ("captures", at[True])):
         for keep in figures.keeps:
-            for way in WAYS:
-                mean = figures.means.get((where, keep, way))
-                if mean is not None:
-                    seconds = [f"{mean[f'cpu_seconds{end}']:.0f}" for end in ("", "_worst")]
-                    memory = [f"{1e-9 * mean[f'peak_bytes{end}']:.2f}" for end in ("", "_worst")]
-                    lines.append([name, _share(keep), _way(way), *seconds, *memory])
-    return markdown(["scenes", "kept", "way", "CPU s", "largest", "GB", "largest"], lines) if lines else ""
+            means = [mean for way in WAYS if (mean := figures.means.get((where, keep, way))) is not None]
+            if len(means) == len(WAYS):
+                seconds, memory = (
+                    [f"{scale * mean[name]:.{digits}f} ({scale * mean[f'{name}_worst']:.{digits}f})" for mean in means]
+                    for name, scale, digits in (("cpu_seconds", 1, 0), ("peak_bytes", 1e-9, 2))
+                )
+                lines.append([kind, _share(keep), " / ".join(seconds), " / ".join(memory)])
+    ways = " / ".join(map(_way, WAYS))
+    return markdown(["scenes", "kept", f"CPU seconds: {ways}", "GB"], lines) if lines else ""
 
 
 def readme_table(rows: list[Row]) -> str:

@@ -274,58 +274,6 @@ def _use_replica(path: Path) -> object:
     return scene, scene.params.principal_point()
 
 
-def _use_evaluation(path: Path) -> object:
-    """What ``ns-eval`` wrote, as ``pointsplat report`` prints it and shows it on a page."""
-    from rich.console import Console
-
-    from pointsplat_ns.nerfstudio_plugin.pointsplat import report
-
-    results = report.read_evaluation(path)
-    for table in report.report_tables(results):
-        Console(file=io.StringIO()).print(table)
-    parts = [(report._reference(part), report._blocks(results, part)) for part in report._parts(results)]
-    page = path.with_suffix(".html")
-    report.write_report_page("a", report._settings(results), parts, report._note(results), page)
-    return page.read_text()
-
-
-def _use_points(path: Path) -> object:
-    from pointsplat_ns.tradeoff.journal import Journal
-
-    return Journal(path.parent, {"file": "abc"})
-
-
-def _use_cells(path: Path) -> object:
-    from pointsplat_ns.tables.cells import CellJournal
-
-    journal = CellJournal(path.parents[1], "room")
-    journal.check({"file": "abc"})
-    return journal
-
-
-def _use_flight(path: Path) -> object:
-    from pointsplat_ns.tradeoff.flights import read_flight_beside
-
-    (path.parent / "b.json").write_bytes(path.read_bytes())
-    return read_flight_beside(path, path.parent / "b.json")
-
-
-@reader
-def record(folder: Path) -> Read:
-    """The record of one of many scenes, and the description of all."""
-    from pointsplat_ns.compression.scene_folder import _description
-    from pointsplat_ns.compression.scene_task import SceneTask, _finished, known_result
-
-    task = SceneTask("a", folder / "a.spz", folder / "a.ply")
-
-    def read(data: bytes) -> object:
-        for path in (task.record, folder / "all.json"):
-            path.write_bytes(data)
-        return known_result(task), _finished(task, "abc"), _description(folder / "all.json")
-
-    return read
-
-
 READERS |= {
     "weights": at("a.safetensors", "pointsplat_ns.refiner.feedback:read_feedback_refiner", inside=_with_zeros),
     "pruned-scene": at("a.safetensors", "pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_store:read_pruned"),
@@ -341,8 +289,4 @@ READERS |= {
     "trajectory": at("traj.txt", _use_replica, _replica),
     "intrinsics": at("cam_params.json", _use_replica, _replica),
     "held-out-list": at("list.txt", "pointsplat_ns.nerfstudio_plugin.replica.dataparser:read_eval_list"),
-    "evaluation": at("a.json", _use_evaluation),
-    "points": at("points.json", _use_points),
-    "cells": at("room/cells.json", _use_cells, lambda folder: (folder / "room").mkdir()),
-    "flight": at("a.json", _use_flight),
 }

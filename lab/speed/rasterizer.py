@@ -1,11 +1,11 @@
-"""Time, memory and errors of the rasterizer, stage by stage, beside a plain C++ rasterizer, all in one run.
+"""Time, memory and errors of the rasterizer, stage by stage, all in one run.
 
     python -m lab.speed.rasterizer                                # synthetic room; a few minutes
     python -m lab.speed.rasterizer --scenes outputs/kitchen/...   # and a trained scene, dense and pruned to a tenth
     python -m lab.speed.rasterizer --variants eager compiled balanced fast --json out.json
 
 Machines differ and are shared: compare figures of one run, by their ratios. On a busy machine `--cpu-time` counts the
-CPU seconds of one thread, ours and the C++ peer's. gsplat on a GPU is measured by cuda.py.
+CPU seconds of one thread. gsplat on a GPU is measured by cuda.py.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from lab.common.printing import console, megabytes, number, start, table
 from lab.common.results import grouped, write_json
 from lab.common.scenes import Scene, room_scene, trained_scenes
 from lab.common.timing import now, peak_extra_bytes, slope, timed, use_cpu_time
-from lab.speed.yardstick import CLASSIC_EXTENT, EXACT_EXTENT, TIGHT_EXTENT, Yardstick, load_yardstick
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.metrics import psnr
 from pointsplat_ns.rasterizer import binning, rasterization
@@ -41,21 +40,15 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 """What is timed, by name: options of ``rasterization``. Errors are against the image of "eager"."""
 
-PEERS = {"C++ classic": (CLASSIC_EXTENT, False), "C++ tight": (TIGHT_EXTENT, True)}
-"""The C++ peer of the classic design, pixel by pixel over squares of 3 sigma; and turned inside out, Gaussian by
-Gaussian over tight boxes, which is faster (see yardstick.cpp): extent and whether by boxes."""
-
 STAGES = ("projection", "colours", "binning", "blending", "blending backward", "projection backward")
 SIZES = ((160, 120), (640, 480), (1200, 680))
 COUNTS = (10_000, 60_000, 200_000, 300_000, 1_000_000)
 MAIN_SIZE, MAIN_COUNT = (640, 480), 200_000
-MOST_PAIRS = 4 * 10**8
-"""Pairs of Gaussian and pixel beyond which the C++ peer is left out: it keeps 8 bytes of each for its backward pass."""
 
 
 @dataclass
 class Args:
-    """Time the rasterizer beside a C++ peer."""
+    """Time the rasterizer."""
 
     scenes: tuple[Path, ...] = ()
     """Trained scenes: Splatfacto runs (folder or config.yml), seen from a held-out camera, or PLY files."""
@@ -76,7 +69,7 @@ class Args:
     cpu_time: bool = False
     """Count CPU seconds of one thread in place of wall time: steadier still on a busy machine. Sets --threads 1."""
     threads: int | None = None
-    """Threads of torch; its own choice by default. The C++ peer always has one."""
+    """Threads of torch; its own choice by default."""
     device: str = "cpu"
     """Where our own code runs."""
     json: Path | None = None
@@ -96,11 +89,9 @@ class Result:
     seconds: dict[str, float]
     memory: dict[str, int | None]
     errors: dict[str, float] = field(default_factory=dict)
-    pairs: int | None = None
-    """Pairs of Gaussian and pixel that are drawn, as the C++ peer counts them."""
 
     def both(self, name: str) -> float | None:
-        """Seconds of forward and backward together, of a variant or a peer."""
+        """Seconds of forward and backward together, of a variant."""
         ahead, back = self.seconds.get(f"{name} forward"), self.seconds.get(f"{name} backward")
         return ahead + back if ahead is not None and back is not None else None
 
@@ -176,35 +167,10 @@ class Case:
         footprints = self.footprints_of(seen)
         return int(torch.unique(footprints.tiles(footprints.whole).gaussians).numel())
 
-    def time_yardstick(self, name: str, peer: Yardstick) -> dict[str, float]:
-        marks = [now()]
-        peer.forward(self.scene.tensors, self.scene.viewmat, self.K.cpu(), self.width, self.height, keep=True)
-        marks.append(now())
-        peer.backward(self.grad_image.cpu(), -self.grad_alphas.cpu())
-        return {f"{name} forward": marks[1] - marks[0], f"{name} backward": now() - marks[1]}
 
-    def disagreement(self, variant: str, peer: Yardstick) -> dict[str, float]:
-        """How far a variant is from the C++ peer without a cut at three standard deviations: the largest difference of
-        the image, the share of values that differ, the largest relative difference of a gradient (norms)."""
-        image, _ = peer.forward(
-            self.scene.tensors, self.scene.viewmat, self.K.cpu(), self.width, self.height, keep=True
-        )
-        theirs = peer.backward(self.grad_image.cpu(), -self.grad_alphas.cpu())
-        drawn = self.draw(variant)
-        ours = self.gradients(*drawn)
-        difference = (drawn[0].detach().cpu() - image).abs()
-        return {
-            "C++ image": float(difference.max()),
-            "C++ off by 1e-4": float((difference > 1e-4).float().mean()),
-            "C++ gradient": max(
-                float((a.cpu() - b).norm() / b.norm().clamp_min(1e-20)) for a, b in zip(ours, theirs, strict=True)
-            ),
-        }
-
-
-def run_case(case: Case, args: Args, module: Any) -> Result:
+def run_case(case: Case, args: Args) -> Result:
     """Everything that is measured of one case."""
-    base, errors, pairs = args.variants[0], {}, None
+    base, errors = args.variants[0], {}
     with torch.no_grad():
         exact = case.draw("eager")[0].clamp(0, 1)
         for name in args.variants:
@@ -214,18 +180,7 @@ def run_case(case: Case, args: Args, module: Any) -> Result:
         name: partial(case.time_variant, name) for name in args.variants
     }
     functions["stages"] = case.time_stages
-    if module is not None:
-        peer = Yardstick(module, EXACT_EXTENT)
-        peer.forward(case.scene.tensors, case.scene.viewmat, case.K.cpu(), case.width, case.height, keep=False)
-        pairs = peer.counts["drawn"]
-    with_peer = pairs is not None and pairs <= MOST_PAIRS
-    if with_peer:
-        for name, options in PEERS.items():
-            functions[name] = partial(case.time_yardstick, name, Yardstick(module, *options))
     seconds = timed(functions, args.repeats, args.budget, args.fastest)
-    functions.clear()  # the peers let go of what they kept
-    if with_peer:
-        errors |= case.disagreement(base, Yardstick(module, EXACT_EXTENT))
 
     def forward() -> None:
         with torch.no_grad():
@@ -236,7 +191,7 @@ def run_case(case: Case, args: Args, module: Any) -> Result:
         "training": peak_extra_bytes(lambda: case.gradients(*case.draw(base)), case.device),
     }
     scene, size = case.scene, (case.width, case.height)
-    return Result(scene.name, scene.family, *size, len(scene), case.visible(), seconds, memory, errors, pairs)
+    return Result(scene.name, scene.family, *size, len(scene), case.visible(), seconds, memory, errors)
 
 
 def plan(args: Args) -> list[tuple[Scene, tuple[int, int]]]:
@@ -262,7 +217,6 @@ def print_tables(results: list[Result], variants: tuple[str, ...]) -> None:
     """Everything that was measured; the first variant is what ratios refer to."""
     base, ms, ratio = variants[0], number(1, 1e3), number(2)
     timed_names = [*dict.fromkeys(name for r in results for name in r.seconds)]
-    used = [name for name in PEERS if any(r.both(name) for r in results)]
 
     def show(title: str, columns: dict[str, Callable[[Result], str]]) -> None:
         rows = [[r.scene, f"{r.width}x{r.height}", *(value(r) for value in columns.values())] for r in results]
@@ -279,24 +233,21 @@ def print_tables(results: list[Result], variants: tuple[str, ...]) -> None:
     show(
         f"Seconds of forward and backward in those of {base} (above 1: slower); {base}'s peak memory, MB",
         {
-            **{name: lambda r, n=name: over(r.both(n), r.both(base)) for name in (*variants[1:], *used)},
-            "drawn pairs, M": lambda r: number(1, 1e-6)(r.pairs),
+            **{name: lambda r, n=name: over(r.both(n), r.both(base)) for name in variants[1:]},
             **{f"memory, {name}": lambda r, n=name: megabytes(r.memory[n]) for name in results[0].memory},
         },
     )
     show(
-        "Errors against the exact image (colour units, dB), and against the C++ peer",
+        "Errors against the exact image (colour units, dB)",
         {name: lambda r, n=name: error(n, r.errors.get(n)) for name in results[0].errors},
     )
     lines = []
-    for against, sizes in (("pixels", lambda r: r.width * r.height), ("drawn pairs", lambda r: r.pairs or 0)):
-        by = {"all": results} if against == "drawn pairs" else grouped(results, lambda r: r.scene)  # type: ignore[arg-type, return-value]
-        for name, rows in by.items():
-            found = slope([sizes(r) for r in rows], [r.both(base) for r in rows])
-            if found is not None:
-                lines.append([name, against, len(rows), ratio(found)])
+    for name, rows in grouped(results, lambda r: r.scene).items():  # type: ignore[arg-type, return-value]
+        found = slope([r.width * r.height for r in rows], [r.both(base) for r in rows])
+        if found is not None:
+            lines.append([name, len(rows), ratio(found)])
     console().print(
-        table(f"Slopes of log time of {base}, both ways (1: linear)", ["", "over", "cases", "slope"], lines)
+        table(f"Slopes of log time of {base} over pixels, both ways (1: linear)", ["", "cases", "slope"], lines)
     )
 
 
@@ -313,16 +264,11 @@ def main(args: Args) -> None:
     cases = plan(args)
     if not cases:
         raise PointSplatError("nothing to draw; expected a count in --gaussians or a scene in --scenes")
-    module, reason = load_yardstick()
-    if module is None:
-        print(reason)
-    elif args.cpu_time:
-        module.use_cpu_time()
     clock = "CPU" if args.cpu_time else "wall"
-    print(f"torch {torch.__version__} on {args.device}, {torch.get_num_threads()} threads (C++ peer: 1), {clock} time")
+    print(f"torch {torch.__version__} on {args.device}, {torch.get_num_threads()} threads, {clock} time")
     results: list[Result] = []
     for i, (scene, (width, height)) in enumerate(cases, 1):
-        results.append(run_case(Case(scene, width, height, torch.device(args.device)), args, module))
+        results.append(run_case(Case(scene, width, height, torch.device(args.device)), args))
         settings = {"torch": torch.__version__, "threads": torch.get_num_threads(), "clock": clock}
         write_json(args.json, settings | {"cases": [vars(result) for result in results]})
         taken = number(1, 1e3)(results[-1].both(args.variants[0]))

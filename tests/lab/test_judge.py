@@ -53,11 +53,6 @@ def write_path(folder: Path, **changes: object) -> Path:
     return path
 
 
-def test_there_is_a_path_for_scenes_of_both_kinds():
-    assert len(PATHS) >= 14
-    assert {"tuning", "judged"} <= {tables.group_of(path.stem) for path in PATHS}
-
-
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
 def test_a_path_that_ships_has_sixteen_upright_views_from_different_places(path):
     found, views = camera_paths.read_path(path), camera_paths.views_of(path, 320)
@@ -170,20 +165,6 @@ def test_a_view_in_which_the_dense_scene_covers_nothing_counts_for_all_pixels_al
     scene = scene_of(ball(), away)
     [(_, _, found)] = scenes.losses(scene, [ball(0.5)], None)
     assert found["covered_psnr"] is None and found["dense_psnr"] == 100
-
-
-def test_lpips_is_left_out_of_wide_pictures(small, monkeypatch):
-    monkeypatch.setattr(scenes, "LPIPS_WIDTH", 32)
-    scene = scenes.load(small, (32, 64), 1)
-    sizes = []
-
-    def lpips(image, target):
-        sizes.append(image.shape)
-        return torch.tensor(0.25)
-
-    found = {look.at: measures for _, look, measures in scenes.losses(scene, [scene.dense], lpips)}
-    assert found[32]["dense_lpips"] == 0.25 and found[64]["dense_lpips"] is None
-    assert sizes == [(18, 32, 3)]
 
 
 def test_every_way_has_a_row_for_each_width(small, tmp_path, capsys):
@@ -327,24 +308,6 @@ def test_leads_are_of_prune_over_the_best_mode_and_of_compact_over_prune_at_each
     names, figures = (list(column.cells) for column in first.columns)
     lines = dict(zip(names, figures, strict=True))
     assert (lines["all mean"], lines["all worst"]) == ("+3.00", "+1.00 rock")
-
-
-def test_the_table_of_means_tells_mean_median_and_worst_of_each_width_and_how_many_scenes():
-    rows = [row(scene, "prune", psnr, at=at) for at in (960, 320) for scene, psnr in (("rock", 30.0), ("lounge", 20.0))]
-    narrow, wide = tables.mean_tables([*rows, row("diorama", "prune", 40.0)])
-    assert (narrow.title.split(":")[0], wide.title.split(":")[0]) == ("320 pixels wide", "960 pixels wide")
-    cells = {column.header: list(column.cells) for column in narrow.columns}
-    assert (cells["for"], cells["scenes"]) == (["judged"], ["3"])
-    assert (cells["covered PSNR"], cells["worst"]) == (["30.00 / 30.00 / 20.00"], ["lounge"])
-
-
-def test_the_list_names_the_kind_of_each_scene(folder, capsys):
-    write_path(folder).rename(folder / "rock.json")
-    write_path(folder)
-    judge.main(list_scenes=True)
-    lines = [re.findall(r"[\w.]+|-", line) for line in capsys.readouterr().out.splitlines()]
-    assert ["rock", "judged", "rock.json"] in lines and ["fox", "tuning", "-"] in lines
-    assert ["small", "other", "small.json"] in lines
 
 
 def test_what_cannot_be_judged_is_an_error_at_the_start(small, tmp_path):

@@ -108,12 +108,6 @@ def test_what_no_test_sees_survives_and_the_rest_is_caught(steps, of_steps_alone
     assert said.count("CPU s") == 1
 
 
-def test_the_same_seed_draws_the_same_faults(steps, of_steps_alone):
-    part = mutants.PARTS["steps"]
-    first = mutants.drawn(part, 4, 1, steps)
-    assert len(first) == 4 and first == mutants.drawn(part, 4, 1, steps) != mutants.drawn(part, 4, 2, steps)
-
-
 def test_a_test_that_fails_anyway_catches_nothing(steps, of_steps_alone):
     (steps / "tests" / "test_steps.py").write_text("def test_nothing():\n    assert False\n")
     with pytest.raises(RuntimeError, match="test_nothing fails on the code as it is"):

@@ -22,11 +22,3 @@ def test_the_table_and_the_picture_show_that_a_scene_tells(monkeypatch, capsys, 
     assert row[0] == "ball" and float(row[1]) > 2
     assert float(row[2].rstrip("%")) < 0.7 * float(row[3].rstrip("%"))
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_the_map_is_largest_about_the_eyes():
-    evidence = photo_places.PhotoEvidence.of(photographed(), torch.Generator().manual_seed(0))
-    drawn = photo_places.mapped("ball", evidence, EYES.double())
-    row, column = divmod(int(drawn.evidence.argmax()), photo_places.CELLS)
-    place = torch.tensor([column, row]) / (photo_places.CELLS - 1) * 2 * drawn.extent - drawn.extent
-    assert float((drawn.eyes - place).norm(dim=1).min()) < 0.35 * drawn.extent

@@ -26,11 +26,6 @@ def test_a_changed_row_changes_the_page(tmp_path):
     assert "| 10 % | PointSplat\\* | 11.91 |" in after  # of two scenes
 
 
-def test_prune_and_compact_are_left_to_the_judge():
-    ways = {way for group in record.read(RECORD / "results.json") for scene in group.scenes for way, _ in scene.cells}
-    assert "paper" in ways and not ways & {"merge", "compact"}
-
-
 def test_another_file_is_refused_by_name(tmp_path):
     path = tmp_path / "other.json"
     path.write_text("{}")
