@@ -12,9 +12,9 @@ from pointsplat_ns.compression.requests import CompactRequest, PruneRequest
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.scene import read_scene
+from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
-from pointsplat_ns.looking.windows import parse_resolution
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.views import Views
 

@@ -15,8 +15,8 @@ from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.io.formats import format_like, format_named
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
+from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.looking.windows import parse_resolution, size_text
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
 from pointsplat_ns.pruning import Keep, Megabytes

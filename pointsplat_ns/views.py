@@ -17,6 +17,9 @@ RasterizeMode = Literal["classic", "antialiased"]
 NEAR_PLANE = 0.01
 """Near plane of gsplat, scene units."""
 
+EPS2D = 0.3
+"""Added to the diagonal of each projected covariance, pixels^2: nothing is thinner than a pixel. As in 3DGS, gsplat."""
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -31,6 +34,7 @@ class View:
         background: (3,) colour behind the scene, RGB in [0, 1].
         rasterize_mode: "classic" or "antialiased", as in the scene's training.
         near_plane: least depth of drawn Gaussians, scene units; gsplat's by default.
+        eps2d: added to the diagonal of each projected covariance, pixels^2; 3DGS' by default.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -46,6 +50,7 @@ class View:
     background: Tensor  # [3] in [0, 1]
     rasterize_mode: RasterizeMode = "classic"
     near_plane: float = NEAR_PLANE  # scene units
+    eps2d: float = EPS2D  # pixels^2
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +69,7 @@ class Views:
         background: (3,) colour behind the scene, RGB in [0, 1].
         rasterize_mode: "classic" or "antialiased", as in the scene's training.
         near_plane: least depth of drawn Gaussians, scene units; gsplat's by default.
+        eps2d: added to the diagonal of each projected covariance, pixels^2; 3DGS' by default.
 
     Raises:
         DataError: if a shape does not fit the others, or the image has no pixel.
@@ -84,6 +90,7 @@ class Views:
     background: Tensor  # [3] in [0, 1]
     rasterize_mode: RasterizeMode = "classic"
     near_plane: float = NEAR_PLANE  # scene units
+    eps2d: float = EPS2D  # pixels^2
 
     def __post_init__(self) -> None:
         count = self.viewmats.shape[0] if self.viewmats.dim() else 0
@@ -110,7 +117,8 @@ class Views:
         """
         viewmats, Ks = self.viewmats[index], self.Ks[index]
         kind = View if viewmats.dim() == 2 else Views
-        return kind(viewmats, Ks, self.width, self.height, self.background, self.rasterize_mode, self.near_plane)
+        same = self.width, self.height, self.background, self.rasterize_mode, self.near_plane, self.eps2d
+        return kind(viewmats, Ks, *same)
 
     def __iter__(self) -> Iterator[View]:
         return (self[index] for index in range(len(self)))

@@ -99,7 +99,7 @@ LOOKING = {
     "no_max_near_pixels": dict(max_near_pixels=2.0),
     "no_min_alpha_inside": dict(min_alpha_inside=0.0),
     "no_min_alpha_outside": dict(min_alpha_outside=0.0),
-    "window_side_160": dict(window_side=160),
+    "smallest_side_160": dict(smallest_side=160),
 }
 """Variants of :class:`~pointsplat_ns.looking.settings.LookingSettings`, which are in force while ``merge`` runs.
 Merging does not test views for blur, so there are no variants of blur."""

@@ -13,8 +13,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, TRANSMITTANCE_MIN
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, FRUSTUM_MARGIN, TRANSMITTANCE_MIN
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
+from pointsplat_ns.views import EPS2D
 
 
 def rotations(quats: Tensor) -> Tensor:

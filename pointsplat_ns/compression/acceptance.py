@@ -18,8 +18,8 @@ import torch
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import Closeness, DenseReference
+from pointsplat_ns.looking.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.looking.windows import WindowRenders, sides_of
 from pointsplat_ns.pruning.merging.finishing import top_of_parabola
 from pointsplat_ns.system.progress import Progress, silent
 
@@ -34,9 +34,6 @@ class AcceptanceSettings:
     """Largest loss of PSNR, in dB, in pictures of another size."""
     nearer: int = 4
     """Factor on the full size of pictures for one more check, which stands for nearer cameras."""
-    windows: int = 3
-    """Number of windows of each view and size. One says little: the gain of a repair in 12 windows differs by up to 1.5
-    dB between two draws of their places."""
     clear_gain: float = 0.5
     """Gain of PSNR, in dB, of the whole change that makes trying smaller shares unnecessary."""
     apart: float = 0.05
@@ -64,8 +61,8 @@ class Reason(Enum):
 
 
 class Comparison:
-    """Compares scenes with the dense scene: in whole pictures of a middle size, and in windows of the smallest size, of
-    the full size, and of a larger size that stands for nearer cameras.
+    """Compares scenes with the dense scene: in whole pictures of a middle size, and in subsampled pictures of the
+    smallest size, of the full size, and of a larger size that stands for nearer cameras.
 
     Args:
         dense: N Gaussians, on the device that renders.
@@ -81,11 +78,10 @@ class Comparison:
         whole = views.whole()
         sides = sides_of(whole.width, whole.height)
         others = (sides[0], sides[-1], ACCEPTANCE.nearer * sides[-1])
-        windows = ACCEPTANCE.windows
-        self._others = WindowRenders(dense, whole, others, each=windows) if len(sides) > 1 else None
+        self._others = RendersOfSizes(dense, whole, others) if len(sides) > 1 else None
 
     def psnrs(self, scene: Gaussians) -> list[float]:
-        """PSNR of a scene in the windows of each size, dB; empty where pictures are no larger than a window."""
+        """PSNR of a scene in pictures of each other size, dB; empty where pictures have one size."""
         return [] if self._others is None else self._others.psnrs(scene)
 
 

@@ -26,14 +26,14 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.sizes import RESOLUTION, middle_sized, two_sizes
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS
-from pointsplat_ns.looking.windows import RESOLUTION, middle_sized
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, save_feedback_refiner
 from pointsplat_ns.system import processes
 from pointsplat_ns.system.threads import suitable_threads
-from pointsplat_ns.views import Views
+from pointsplat_ns.views import View, Views
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,6 @@ class FeedbackTrainingSettings:
     """Views of a scene in a batch of the sampler."""
     view_batches: int = 3
     """Batches of views of a scene."""
-    side: int | None = None
-    """Longer side of the views, pixels; by default the middle size of sampled views, as in repairs."""
     least_error: float = 1e-5
     """Added to mean squared errors (50 dB), so that nearly correct scenes do not dominate the loss."""
     rate: float = 3e-3
@@ -75,7 +73,8 @@ class TrainingScene:
     """Pruned scenes by budget."""
     psnr: dict[str, float]
     """PSNR of each pruned scene by budget, over the pixels that the dense scene covers, dB."""
-    views: Views
+    views: tuple[Views, Views]
+    """The same views of two sizes: those of even indices of the first, the others of the second."""
     _renders: dict[int, Tensor] = field(default_factory=dict)
     """Renders of the dense scene, 8 bits per channel, by the index of the view."""
 
@@ -87,11 +86,14 @@ class TrainingScene:
         viewmats, Ks = (torch.cat([getattr(v, field) for v in sampled]) for field in ("viewmats", "Ks"))
         first = sampled[0]
         views = Views(viewmats, Ks, first.width, first.height, first.background, near_plane=first.near_plane)
-        views = middle_sized(views) if TRAINING.side is None else views.resized(TRAINING.side)
         pruned = {budget: prune(dense, budget, "merge") for budget in keep}
-        reference = DenseReference(dense, views.spread(COMPARED_VIEWS))
+        reference = DenseReference(dense, middle_sized(views).spread(COMPARED_VIEWS))
         psnr = {budget: reference.psnr(scene)[0] for budget, scene in pruned.items()}
-        return cls(name, dense, pruned, psnr, views)
+        return cls(name, dense, pruned, psnr, two_sizes(views))
+
+    def view(self, index: int) -> View:
+        """A view of the size for its index."""
+        return self.views[index % 2][index]
 
     @torch.no_grad()
     def target(self, index: int) -> Tensor:
@@ -116,13 +118,13 @@ def roll_out(
     Returns:
         PSNR in dB: half of it from one view between a quarter and all of the steps, half from two views at the end.
     """
-    chosen = generator.sample(range(len(scene.views)), steps + 3)
+    chosen = generator.sample(range(len(scene.views[0])), steps + 3)
     measured = {generator.randrange(max(1, steps // 4), steps): chosen[steps : steps + 1], steps: chosen[steps + 1 :]}
     now, factor = scene.pruned[budget], initial_rate_factor(scene.psnr[budget])
     feedback = Feedback(now, len(scene.dense))
     reached: list[Tensor] = []
     for step in range(steps):
-        view = scene.views[chosen[step]]
+        view = scene.view(chosen[step])
         feedback.observe(gradients_of(now.detach(), view, scene.target(chosen[step]), TRAINING.backend))
         factors = network(feedback.features(now.detach(), step / steps, steps))
         now = feedback.moved(now, factor * rate_factor(step / steps), factors)
@@ -172,8 +174,8 @@ def train_feedback(
         raise DataError(f"{at_once} repairs in an update; expected at least as many as processes, {size}")
     needed_views = max(TRAINING.steps) + 3
     for scene in scenes:
-        if len(scene.views) < needed_views:
-            raise DataError(f"{scene.name}: {len(scene.views)} views; expected at least {needed_views}")
+        if len(scene.views[0]) < needed_views:
+            raise DataError(f"{scene.name}: {len(scene.views[0])} views; expected at least {needed_views}")
     generator = random.Random(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -211,7 +213,7 @@ def train_feedback(
 
 
 def _drawn(gaussians: Gaussians, scene: TrainingScene, index: int) -> Tensor:
-    return render(gaussians, scene.views[index], backend=TRAINING.backend)
+    return render(gaussians, scene.view(index), backend=TRAINING.backend)
 
 
 def _decibels(image: Tensor, target: Tensor) -> Tensor:

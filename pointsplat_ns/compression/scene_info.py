@@ -22,9 +22,9 @@ from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_parts
 from pointsplat_ns.looking.fill import fill
+from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.looking.windows import parse_resolution
 from pointsplat_ns.pruning.duplicates import Copies
 from pointsplat_ns.pruning.sh_bands import band_energies
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN

@@ -408,22 +408,19 @@ class LookingSettings:
     extra_rounds: int = 2
     """Number of rounds that are added to those of ``round_factor``."""
 
-    # Windows (windows.py)
+    # Sizes of pictures (sizes.py)
 
-    window_side: int = 320
-    """Longer side of a window, and of the smallest picture, pixels."""
-
-    window_alpha_side: int = 64
-    """Longer side of the pictures whose alpha decides where windows lie, pixels."""
+    smallest_side: int = 320
+    """Longer side of the smallest picture, and of subsampled ones, pixels."""
 
     # Views to optimise on (view_source.py)
 
     sampled_at_once: int = 32
     """Number of views that are sampled at a time."""
 
-    opposite_background_every: int = 4
+    opposite_background_every: int = 5
     """Of the sampled views of a scene without known views, one of this many has the opposite background, because nobody
-    knows before which one the scene is shown; 0 turns the rule off."""
+    knows before which one the scene is shown; 0 turns the rule off. Odd, so that both sizes of pictures have both."""
 
     # Coverage (coverage.py)
 

@@ -14,9 +14,9 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run
 from pointsplat_ns.looking.sampling import up_about, views_about
 from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
+from pointsplat_ns.looking.sizes import RESOLUTION, middle_sized, two_sizes
 from pointsplat_ns.looking.traces import PhotoPlaces, photo_places
 from pointsplat_ns.looking.upright import Up
-from pointsplat_ns.looking.windows import RESOLUTION, middle_sized
 from pointsplat_ns.views import RasterizeMode, View, Views, spread_indices
 
 MERGED_FROM = 48
@@ -156,7 +156,7 @@ class ViewSource:
         return self.views(COMPARED_VIEWS)
 
     def compared(self) -> Views:
-        """The views in which renders are compared, at :func:`~pointsplat_ns.looking.windows.middle_sized` size."""
+        """The views in which renders are compared, at :func:`~pointsplat_ns.looking.sizes.middle_sized` size."""
         return middle_sized(self._whole, self._settings)
 
     def scored(self, count: int) -> Views:
@@ -164,7 +164,8 @@ class ViewSource:
         return middle_sized(self.views(count), self._settings)
 
     def others(self, seed: int = 0) -> Iterator[View]:
-        """Views to optimise on, without end: none of the :meth:`compared` ones, and of the same size.
+        """Views to optimise on, without end: none of the :meth:`compared` ones. In turn they are of the same size, and
+        subsampled from their full size.
 
         Known views come in random order, each once before any is repeated. If they are too few beside the compared
         ones, new views are sampled without end.
@@ -179,17 +180,18 @@ class ViewSource:
         known = self.given if self.given is not None else self._of_dataset
         if known is not None and len(known) > 2 * len(compared):
             left = sorted(set(range(len(known))) - set(spread_indices(len(known), COMPARED_VIEWS)))
-            rest, generator = middle_sized(self._at_resolution(known), self._settings), random.Random(seed)
-            while True:
-                for index in generator.sample(left, len(left)):
-                    yield rest[index]
+            rest, generator = two_sizes(self._at_resolution(known), self._settings), random.Random(seed)
+            for turn, index in enumerate(drawn for _ in counted() for drawn in generator.sample(left, len(left))):
+                yield rest[turn % 2][index]
         at_once, every = self._settings.sampled_at_once, self._settings.opposite_background_every
         for batch in counted(1):
-            sampled = middle_sized(self._sampled(at_once, at_once * seed + batch), self._settings)
             sampled = dataclasses.replace(
-                sampled, background=compared.background, rasterize_mode=compared.rasterize_mode
+                self._sampled(at_once, at_once * seed + batch),
+                background=compared.background,
+                rasterize_mode=compared.rasterize_mode,
             )
+            sizes = two_sizes(sampled, self._settings)
             for turn, index in enumerate(random.Random(batch).sample(range(len(sampled)), len(sampled))):
-                view = sampled[index]
+                view = sizes[turn % 2][index]
                 opposite = known is None and every > 0 and turn % every == every - 1
                 yield dataclasses.replace(view, background=1 - view.background) if opposite else view

@@ -14,9 +14,9 @@ from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.runs import may_be_run, name_of
 from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.io.source import source_file
+from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
-from pointsplat_ns.looking.windows import parse_resolution
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.tradeoff.measuring import Subject

@@ -12,7 +12,7 @@ from torch import Tensor
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger
-from pointsplat_ns.looking.windows import RESOLUTION
+from pointsplat_ns.looking.sizes import RESOLUTION
 from pointsplat_ns.pruning.budget import Keep, resolve_keep
 from pointsplat_ns.pruning.coverage import coverage_score
 from pointsplat_ns.pruning.merging import merge

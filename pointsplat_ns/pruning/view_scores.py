@@ -200,6 +200,7 @@ def _project(means: Tensor, stds: Tensor, scene: Gaussians, views: Views, index:
         views.height,
         near_plane=views.near_plane,
         far_plane=math.inf,
+        eps2d=views.eps2d,
         antialiased=views.rasterize_mode == "antialiased",
     )
 

@@ -11,9 +11,6 @@ ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
 """A pixel is finished before the Gaussian that would bring its transmittance to this or less."""
 
-EPS2D = 0.3
-"""Added to the diagonal of each projected covariance (pixels^2): nothing is thinner than a pixel."""
-
 FRUSTUM_MARGIN = 0.3
 """The Jacobian of the projection is evaluated no farther outside the image than this share of half
 its extent (0.3 makes the 1.3 x field of view of 3DGS)."""

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.compiled import projection as compiled_projection
-from pointsplat_ns.rasterizer.constants import EPS2D
 from pointsplat_ns.rasterizer.ewa import Lens, Project
-from pointsplat_ns.views import View
+from pointsplat_ns.views import EPS2D, View
 
 
 @dataclass
@@ -94,7 +93,8 @@ def project_scene(scene: Gaussians, view: View) -> Projected:
     viewmat = view.viewmat.to(scene.device)  # float32 would move a camera that is far from the origin
     return project(
         scene.means, scene.quats, scene.stds, scene.alphas, viewmat, view.K.to(scene.means), view.width, view.height,
-        near_plane=view.near_plane, far_plane=math.inf, antialiased=view.rasterize_mode == "antialiased",
+        near_plane=view.near_plane, far_plane=math.inf, eps2d=view.eps2d,
+        antialiased=view.rasterize_mode == "antialiased",
     )  # fmt: skip
 
 

@@ -14,11 +14,11 @@ from pointsplat_ns.rasterizer.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
     COMPENSATION_MIN,
-    EPS2D,
     FRUSTUM_MARGIN,
     TRANSMITTANCE_MIN,
 )
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
+from pointsplat_ns.views import EPS2D
 
 
 def _rotation(quat: Tensor) -> Tensor:

@@ -12,11 +12,12 @@ from pointsplat_ns.rasterizer.arguments import check_options, check_tensors
 from pointsplat_ns.rasterizer.backends import use_gsplat
 from pointsplat_ns.rasterizer.blending import blend
 from pointsplat_ns.rasterizer.colors import sh_to_color
-from pointsplat_ns.rasterizer.constants import EPS2D, QUALITIES, TILE, Quality
+from pointsplat_ns.rasterizer.constants import QUALITIES, TILE, Quality
 from pointsplat_ns.rasterizer.frame import MEMORY_BUDGET, BlendOptions
 from pointsplat_ns.rasterizer.precision import full_precision
 from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, project
 from pointsplat_ns.rasterizer.tiles import Footprints
+from pointsplat_ns.views import EPS2D
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 QualityName = Literal["exact", "balanced", "fast"]

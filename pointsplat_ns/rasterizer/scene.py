@@ -89,6 +89,7 @@ def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tupl
         near_plane=view.near_plane,
         far_plane=math.inf,  # the unit of length may be small
         rasterize_mode=view.rasterize_mode,
+        eps2d=view.eps2d,
         **options,
     )
     return image[0], alpha[0]

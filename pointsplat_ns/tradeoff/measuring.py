@@ -22,8 +22,8 @@ from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.scene import read_scene, save
+from pointsplat_ns.looking.sizes import middle_sized
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.looking.windows import middle_sized
 from pointsplat_ns.pruning import cut_sh, need_usable, ply_bytes
 from pointsplat_ns.system.memory import PeakMemory
 from pointsplat_ns.system.progress import Progress, silent

@@ -13,7 +13,7 @@ from pointsplat_ns.compression.repair import Effort
 from pointsplat_ns.compression.trained_refiner import SHIPPED
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.windows import size_text
+from pointsplat_ns.looking.sizes import size_text
 from pointsplat_ns.pruning import method_named, ply_bytes
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.tradeoff.points import Point

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.sizes import size_text
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS
-from pointsplat_ns.looking.windows import size_text
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pruning import method_named
 from pointsplat_ns.system.progress import Progress

@@ -21,13 +21,14 @@ from pointsplat_ns.refiner.feedback import FeedbackRefiner, read_feedback_refine
 
 @pytest.fixture
 def small(hollow_ball, monkeypatch) -> TrainingScene:
-    monkeypatch.setattr(feedback_training, "TRAINING", FeedbackTrainingSettings(steps=(6,), side=48))
+    monkeypatch.setattr(feedback_training, "TRAINING", FeedbackTrainingSettings(steps=(6,)))
+    monkeypatch.setattr(feedback_training, "RESOLUTION", (48, 27))
     return TrainingScene.of("ball", hollow_ball, ["10%", "20%"], view_batches=1)
 
 
 def test_a_scene_is_merged_to_each_budget_and_has_views(small, hollow_ball):
     assert {budget: len(scene) for budget, scene in small.pruned.items()} == {"10%": 150, "20%": 300}
-    assert len(small.views) == 32 and max(small.views.width, small.views.height) == 48
+    assert all((len(views), views.width, views.height) == (32, 48, 27) for views in small.views)
     assert small.dense is hollow_ball
     assert 5 < small.psnr["10%"] < small.psnr["20%"] < 50
 
@@ -57,10 +58,11 @@ def test_scenes_that_cannot_be_trained_on_are_refused(small):
     with pytest.raises(DataError, match="no scene"):
         train_feedback([], 1)
     with pytest.raises(DataError, match="ball: 8 views; expected at least 9"):
-        train_feedback([replace(small, views=small.views[:8])], 1)
+        train_feedback([replace(small, views=(small.views[0][:8], small.views[1][:8]))], 1)
 
 
 def test_views_are_by_default_as_large_as_those_of_repairs(hollow_ball, monkeypatch):
     monkeypatch.setattr(feedback_training, "TRAINING", FeedbackTrainingSettings(batch_views=2))
     views = TrainingScene.of("ball", hollow_ball, ["20%"], view_batches=1).views
-    assert len(views) == 2 and (views.width, views.height) == (784, 441)
+    assert all((len(size), size.width, size.height) == (2, 784, 441) for size in views)
+    assert views[0].eps2d > 5 * views[1].eps2d

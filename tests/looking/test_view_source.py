@@ -13,10 +13,10 @@ from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.sizes import sides_of
 from pointsplat_ns.looking.traces import PhotoPlaces
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
-from pointsplat_ns.looking.windows import sides_of
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.views import Views
 
@@ -100,8 +100,8 @@ def test_a_resolution_that_is_asked_for_is_that_of_sampled_views_and_bounds_give
 
 def test_a_scene_without_known_views_is_repaired_before_another_background_as_well(scene):
     views = ViewSource(scene, resolution=(64, 48)).others()
-    behind = [next(views).background.tolist() for _ in range(8)]
-    assert behind.count([1.0, 1.0, 1.0]) == 2 and behind.count([0.0, 0.0, 0.0]) == 6
+    behind = [next(views).background.tolist() for _ in range(10)]
+    assert behind.count([1.0, 1.0, 1.0]) == 2 and behind.count([0.0, 0.0, 0.0]) == 8
 
 
 def test_views_that_are_sampled_beside_too_few_known_ones_are_drawn_as_these_are(scene):

@@ -2,7 +2,7 @@
 
 How large a merged Gaussian must be to look like its members depends on how these overlap and on what is behind them,
 and differs between scenes. The factor is chosen by the PSNR against the dense scene in windows of several sizes of the
-picture (:mod:`~pointsplat_ns.looking.windows`).
+picture (:mod:`~pointsplat_ns.looking.sizes`).
 """
 
 from __future__ import annotations

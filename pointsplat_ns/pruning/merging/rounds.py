@@ -21,7 +21,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.content import views_in_units
 from pointsplat_ns.looking.sampling import views_in_scene_units
-from pointsplat_ns.looking.windows import RESOLUTION, WindowRenders
+from pointsplat_ns.looking.sizes import RESOLUTION, RendersOfSizes
 from pointsplat_ns.pruning.duplicates import Copies, Reduced
 from pointsplat_ns.pruning.merging.finishing import Finish, best_finish
 from pointsplat_ns.pruning.merging.groups import Groups, merged_groups
@@ -169,7 +169,7 @@ class Step:
     viewpoints: Viewpoints | None
     state: State
     tree: Tree
-    reference: WindowRenders | None
+    reference: RendersOfSizes | None
     """Renders of the scene, or of what remained once it was few enough to render."""
 
 
@@ -246,9 +246,9 @@ def _reference(
     count: int,
     dense: Callable[[], Gaussians],
     settings: MergeSettings,
-) -> WindowRenders | None:
+) -> RendersOfSizes | None:
     """Windows of renders that results are compared with, of ``count`` Gaussians ``dense``; None if they are too many or
     there are no viewpoints."""
     if viewpoints is None or count > settings.max_count_rendered or settings.finish_views < 1:
         return None
-    return WindowRenders(participants.in_units(dense()), viewpoints.views.spread(settings.finish_views))
+    return RendersOfSizes(participants.in_units(dense()), viewpoints.views.spread(settings.finish_views))

@@ -1,0 +1,123 @@
+"""Pictures of several sizes, drawn in few pixels.
+
+3DGS adds 0.3 pixels^2 to the covariance of every projected Gaussian. So a scene that is right in small pictures may be
+wrong in large ones, and the other way around. Nothing else in a pixel depends on the size of the picture: every k-th
+pixel of a large picture is the picture of k times fewer pixels a side, with 0.3 / k^2 in place of 0.3. Such a
+subsampled picture covers all that the large one shows, at the cost of the small one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.closeness import DenseReference
+from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
+from pointsplat_ns.metrics import MOST_PSNR
+from pointsplat_ns.views import Views
+
+RESOLUTION = (1920, 1080)
+"""Width and height of sampled views, pixels: the size that most people look at."""
+
+MAX_SIDE = 16384
+"""Largest width or height of a resolution, pixels."""
+
+
+def parse_resolution(text: str | tuple[int, int] | None) -> tuple[int, int] | None:
+    """Width and height of pictures, pixels, as in "1920x1080"; None stays None.
+
+    Raises:
+        PointSplatError: if it is neither.
+
+    Example:
+        >>> parse_resolution("1920x1080"), parse_resolution((640, 480))
+        ((1920, 1080), (640, 480))
+    """
+    if text is None:
+        return None
+    parts = text.lower().split("x") if isinstance(text, str) else [str(part) for part in text]
+    if len(parts) != 2 or not all(part.strip().isdecimal() and 1 <= int(part) <= MAX_SIDE for part in parts):
+        raise PointSplatError(f"resolution is {text!r}; expected width and height in pixels, such as 1920x1080")
+    return int(parts[0]), int(parts[1])
+
+
+def size_text(resolution: tuple[int, int]) -> str:
+    """A width and height as :func:`parse_resolution` reads them."""
+    return "x".join(map(str, resolution))
+
+
+def sides_of(width: int, height: int, settings: LookingSettings = DEFAULTS) -> tuple[int, ...]:
+    """Longer sides of the pictures that renders are compared in, pixels: ``smallest_side`` of the settings, the whole
+    size, and their geometric mean. The whole size alone if it is no larger than the smallest.
+
+    Example:
+        >>> sides_of(1920, 1080), sides_of(540, 360), sides_of(64, 48)
+        ((320, 784, 1920), (320, 416, 540), (64,))
+    """
+    longest, smallest = max(width, height), settings.smallest_side
+    return (longest,) if longest <= smallest else (smallest, round(math.sqrt(smallest * longest)), longest)
+
+
+def middle_sized(views: Views, settings: LookingSettings = DEFAULTS) -> Views:
+    """Views at the middle one of their :func:`sides_of`: nearly as large as people look at, and quick to draw."""
+    sides = sides_of(views.width, views.height, settings)
+    return views.resized(sides[len(sides) // 2])
+
+
+def subsampled(views: Views, side: int, drawn_side: int) -> Views:
+    """Every k-th pixel of pictures of another size, k = ``side / drawn_side``.
+
+    Args:
+        views: C views of any size.
+        side: longer side of the whole pictures, pixels. If it is larger than the views' own, the pictures are as large
+            as those of a camera that is nearer.
+        drawn_side: longer side of what is drawn, pixels; at most that of ``views``.
+    """
+    drawn = views.resized(drawn_side)
+    return replace(drawn, eps2d=views.eps2d * (max(drawn.width, drawn.height) / side) ** 2)
+
+
+def two_sizes(views: Views, settings: LookingSettings = DEFAULTS) -> tuple[Views, Views]:
+    """Views :func:`middle_sized`, and views of as many pixels, subsampled from the whole size: to optimise on in
+    turn."""
+    middle = middle_sized(views, settings)
+    return middle, subsampled(views, max(views.width, views.height), max(middle.width, middle.height))
+
+
+class RendersOfSizes:
+    """Renders of a dense scene, subsampled from pictures of several sizes, with which renders of other scenes are
+    compared before two backgrounds.
+
+    Args:
+        dense: N Gaussians.
+        views: C views of the scene.
+        sides: longer sides of the whole pictures, pixels; by default :func:`sides_of`.
+        settings: ``smallest_side``: the longer side of what is drawn.
+    """
+
+    @torch.no_grad()
+    def __init__(
+        self,
+        dense: Gaussians,
+        views: Views,
+        sides: Sequence[int] | None = None,
+        settings: LookingSettings = DEFAULTS,
+    ):
+        sides = sides or sides_of(views.width, views.height, settings)
+        drawn = [subsampled(views, side, min(side, settings.smallest_side)) for side in sides]
+        self.references = [DenseReference(dense, of_side, both_backgrounds=True) for of_side in drawn]
+        """Renders of the dense scene, for each side."""
+
+    def psnrs(self, scene: Gaussians) -> list[float]:
+        """PSNR for each side, dB; at most :data:`~pointsplat_ns.metrics.MOST_PSNR`."""
+        return [min(reference.psnr(scene)[0], MOST_PSNR) for reference in self.references]
+
+    def psnr(self, scene: Gaussians) -> float:
+        """Mean of :meth:`psnrs` over the sides, dB."""
+        found = self.psnrs(scene)
+        return sum(found) / len(found)
