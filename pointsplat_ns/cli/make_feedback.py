@@ -62,7 +62,7 @@ def make_feedback(
         for path in tracked(scenes, "merging scenes", len(scenes), first):
             ready.append(TrainingScene.of(path.stem, ps.load(path).to(device), keep))
             if first:
-                print(f"{path}: {len(ready[-1].dense):,} Gaussians, {len(ready[-1].views)} views")
+                print(f"{path}: {len(ready[-1].dense):,} Gaussians, {len(ready[-1].views[0])} views")
         with progress_bar(first) as show:
             report = functools.partial(show, "training")
             train_feedback(ready, updates, at_once, seed, output, report, seconds or math.inf, known)

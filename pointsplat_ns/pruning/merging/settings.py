@@ -122,7 +122,7 @@ class MergeSettings:
     # Finish (finishing.py)
 
     finish_views: int = 4
-    """Number of views whose windows are compared; 0 turns the step off. 8 gain nothing on average and take an eighth
+    """Number of views that are compared; 0 turns the step off. 8 gain nothing on average and take an eighth
     longer."""
 
     depth_exponent: float = 0.15
