@@ -1,14 +1,26 @@
-"""Nearest neighbours among points in space."""
+"""Nearest neighbours among points in space: by a compiled tree of boxes (``neighbours.cpp``), else by scipy's k-d tree.
+
+Both are exact, in float64. They may differ in the order of neighbours at equal distances.
+"""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.threads import most_threads
 
 CHUNK = 1 << 17
 """Number of points asked for at once, to save memory."""
+
+LANES = 8
+"""Points in a leaf of the compiled tree, and children of a node."""
+
+MOST_COMPILED = 32
+"""Largest number of neighbours that the compiled tree finds."""
 
 
 def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
@@ -42,38 +54,116 @@ def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(distances), torch.from_numpy(indices).long()
 
 
-def other_neighbours(points: Tensor, k: int) -> Tensor:
+def other_neighbours(points: Tensor, k: int, compiled: bool | None = None) -> Tensor:
     """The nearest other points of every point, without their distances, in little memory.
 
     Where more than k points coincide, their nearest ones are the same few. So each of them has, in place of its last
-    two, its neighbours in the order of the search tree's leaves, where no two coincident points are far apart.
+    two, those before and after it in the order of the search tree, where no two coincident points are far apart.
 
     Args:
         points: (N, 3) float64, finite, on the CPU.
         k: number of neighbours, at least 2.
+        compiled: False leaves it to scipy; True warns if the kernel could not be compiled.
 
     Returns:
-        Indices (N, k) int32; a point's own index stands for none.
+        Indices (N, k) int32, the nearest first; a point's own index stands for none.
     """
+    if k <= MOST_COMPILED and len(points) and KERNELS.usable(compiled):
+        tree = PointTree(points)
+        near, walk = tree.others(k), tree.order
+    else:
+        near, walk = _others_by_scipy(points, k)
+    crowd = (near[:, k - 1] >= 0).nonzero()[:, 0]
+    crowd = crowd[(points[near[crowd, k - 1].long()] == points[crowd]).all(1)]
+    if len(crowd):
+        before, after = torch.empty_like(walk), torch.empty_like(walk)
+        before[walk], after[walk] = walk.roll(1), walk.roll(-1)
+        near[crowd, k - 2], near[crowd, k - 1] = before[crowd].to(torch.int32), after[crowd].to(torch.int32)
+    return near.where(near >= 0, torch.arange(len(points), dtype=torch.int32)[:, None])
+
+
+def _others_by_scipy(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Nearest other points (N, k) int32, -1 for none, and the order (N,) of the points in the search tree."""
     from scipy.spatial import cKDTree
 
-    n = len(points)
-    array = points.numpy()
+    n, array = len(points), points.numpy()
     tree = cKDTree(array, balanced_tree=False)
-    walk = torch.from_numpy(tree.indices.copy())  # newer releases of scipy give what must not be written to
-    near = torch.arange(n, dtype=torch.int32)[:, None].repeat(1, k)
+    near = torch.full((n, k), -1, dtype=torch.int32)
     ranks = list(range(1, min(k + 1, n) + 1))
-    crowded = []
     for these in torch.arange(n).split(CHUNK):
-        distances, found = tree.query(array[these[0] : these[-1] + 1], k=ranks, workers=most_threads())
+        _, found = tree.query(array[these[0] : these[-1] + 1], k=ranks, workers=most_threads())
         indices = torch.from_numpy(found)
         # The point itself is the first, or, among coincident ones, anywhere or missing: the first takes its place.
         indices = indices.where(indices != these[:, None], indices[:, :1])
         near[these, : len(ranks) - 1] = indices[:, 1:].to(torch.int32)
-        crowded.append(torch.from_numpy(distances[:, -1] == 0) & (len(ranks) == k + 1))
-    crowd = torch.cat(crowded)
-    if bool(crowd.any()):
-        before, after = torch.empty_like(walk), torch.empty_like(walk)
-        before[walk], after[walk] = walk.roll(1), walk.roll(-1)
-        near[crowd, k - 2], near[crowd, k - 1] = before[crowd].to(torch.int32), after[crowd].to(torch.int32)
-    return near
+    return near, torch.from_numpy(tree.indices.copy())  # newer releases of scipy give what must not be written to
+
+
+class PointTree:
+    """A tree of boxes over points, by the compiled kernel.
+
+    Args:
+        points: (N, 3) float64, finite, on the CPU; N is at least 1.
+    """
+
+    def __init__(self, points: Tensor):
+        count = len(points)
+        self.order = torch.arange(count)
+        """Indices (N,) int64 of the points as the leaves hold them."""
+        sizes = [-(-count // LANES)]  # leaves, then the nodes of each level
+        while len(sizes) < 2 or sizes[-1] > 1:
+            sizes.append(-(-sizes[-1] // LANES))
+        starts = [sum(sizes[1:level]) for level in range(1, len(sizes))]
+        self._tree = KERNELS.structs["Tree"](
+            points=points.contiguous(), order=self.order, count=count, levels=len(starts),
+            starts=(*starts, *[0] * (16 - len(starts))),
+            leaves=torch.empty(sizes[0], 3, LANES, dtype=torch.float64),
+            boxes=torch.empty(sum(sizes[1:]), 6, LANES, dtype=torch.float64),
+        )  # fmt: skip
+        KERNELS.library.pointsplat_order(self._tree)
+        self._run(count, KERNELS.library.pointsplat_leaves, self._tree)
+        for level in range(len(starts)):
+            self._run(count, KERNELS.library.pointsplat_boxes, self._tree, level)
+
+    def others(self, k: int) -> Tensor:
+        """The nearest other points (N, k) int32 of every point, the nearest first; -1 for none. ``k`` is at most
+        :data:`MOST_COMPILED`."""
+        return self._search(len(self.order), k)
+
+    def nearest(self, queries: Tensor, near: Tensor, k: int) -> Tensor:
+        """The nearest points of other points.
+
+        Args:
+            queries: (m, 3) float64, finite.
+            near: (m,) int64, for each query the index of a point; the nearer, the faster.
+            k: number of neighbours, at most :data:`MOST_COMPILED`.
+
+        Returns:
+            Indices (m, k) int32, the nearest first; -1 for none.
+        """
+        leaves = torch.empty_like(self.order)
+        leaves[self.order] = torch.arange(len(self.order)) // LANES
+        return self._search(len(queries), k, queries=queries.contiguous(), leaves=leaves[near])
+
+    def _search(self, count: int, k: int, **where: Tensor) -> Tensor:
+        found = torch.empty(count, k, dtype=torch.int32)
+        search = KERNELS.structs["Search"](tree=self._tree, count=count, wanted=k, found=found, **where)
+        self._run(count, KERNELS.library.pointsplat_nearest, search)
+        return found
+
+    @staticmethod
+    def _run(count: int, *call: object) -> None:
+        function, *arguments = call
+        on_threads(count >= SEVERAL, function, *arguments, threads=most_threads())  # type: ignore[arg-type]
+
+
+def _as_torch() -> bool:
+    """Whether the kernel finds the neighbours of some points as torch does by brute force."""
+    points = torch.randn(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    apart = (points[:, None] - points).square().sum(2).fill_diagonal_(torch.inf)
+    tree, own = PointTree(points), torch.arange(len(points))
+    near = apart.sort(dim=1).indices[:, :5].to(torch.int32)
+    return torch.equal(tree.others(5), near) and torch.equal(tree.nearest(points, own, 1)[:, 0].long(), own)
+
+
+KERNELS = Kernels("the search for neighbours", Path(__file__).with_name("neighbours.cpp"), _as_torch)

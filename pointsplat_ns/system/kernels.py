@@ -87,15 +87,16 @@ def _pool(process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="pointsplat-kernel")
 
 
-def on_threads(worth_it: bool, function: Callable[..., object], *arguments: object) -> None:
-    """Call a function of a C++ file in as many threads as torch uses, or in one if more are not worth it.
+def on_threads(worth_it: bool, function: Callable[..., object], *arguments: object, threads: int | None = None) -> None:
+    """Call a function of a C++ file in ``threads`` threads, by default as many as torch uses, or in one if more are not
+    worth it.
 
     The last parameter of the function points to the number of pieces of work that threads have taken. ctypes lets go of
     Python during the call.
     """
     taken = ctypes.c_int64(0)
     call = functools.partial(function, *arguments, ctypes.byref(taken))
-    threads = torch.get_num_threads() if worth_it else 1
+    threads = (threads or torch.get_num_threads()) if worth_it else 1
     others = [_pool(os.getpid()).submit(call) for _ in range(threads - 1)]
     call()
     for other in others:

@@ -18,6 +18,9 @@ CACHE_VARIABLE = "POINTSPLAT_CACHE"
 
 _FLAGS = ("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 
+_SHARED = Path(__file__).with_name("include")
+"""Folder of the headers that several files include."""
+
 
 class NativeCodeError(Exception):
     """There is no native code; the text says why, in one line."""
@@ -31,14 +34,14 @@ def load_native(source: Path) -> ctypes.CDLL:
     compiler and the processor. Where no such folder can be had it is built anew for each process.
 
     Args:
-        source: the file. It may include headers (``.h``) that lie beside it.
+        source: the file. It may include headers (``.h``) that lie beside it, or in ``system/include``.
 
     Raises:
         NativeCodeError: if there is no compiler, or it fails.
     """
     compiler = _compiler()
     machine, macros = _target(compiler)
-    texts = [file.read_bytes() for file in (source, *sorted(source.parent.glob("*.h")))]
+    texts = [file.read_bytes() for file in (source, *sorted(source.parent.glob("*.h")), *sorted(_SHARED.glob("*.h")))]
     key = hashlib.sha256(b"\0".join([*texts, macros, " ".join((compiler, machine, *_FLAGS)).encode()]))
     name = f"{source.stem}-{key.hexdigest()[:20]}.so"
     folder = _cache_folder()
@@ -83,7 +86,7 @@ def _build(compiler: str, machine: str, source: Path, library: Path) -> None:
     handle, part = tempfile.mkstemp(dir=library.parent, prefix=".", suffix=".part")
     os.close(handle)
     try:
-        ran = _run([compiler, *_FLAGS, *filter(None, [machine]), "-o", part, str(source)])
+        ran = _run([compiler, *_FLAGS, f"-I{_SHARED}", *filter(None, [machine]), "-o", part, str(source)])
         if ran.returncode != 0:
             raise NativeCodeError(f"{compiler}: {_first_line(ran.stderr.decode(errors='replace'))}")
         os.replace(part, library)

@@ -3,8 +3,12 @@
 import pytest
 import torch
 
+from making import assert_same_on_any_threads
 from pointsplat_ns.geometry import neighbours
-from pointsplat_ns.geometry.neighbours import nearest, other_neighbours
+from pointsplat_ns.geometry.neighbours import KERNELS, PointTree, nearest, other_neighbours
+
+needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
+compiled_or_not = pytest.mark.parametrize("compiled", [pytest.param(None, marks=needs_compiler), False])
 
 
 def points(n, d=3, seed=0, dtype=torch.float32):
@@ -48,22 +52,26 @@ def test_points_in_a_graph_are_taken():
     assert nearest(points(10).requires_grad_(), 2)[1].shape == (10, 2)
 
 
-def test_other_neighbours_are_the_nearest_without_the_point_itself(monkeypatch):
+@compiled_or_not
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
+def test_other_neighbours_are_the_nearest_without_the_point_itself(monkeypatch, compiled, scale):
     monkeypatch.setattr(neighbours, "CHUNK", 300)  # several pieces
-    where = points(1000).double()
-    assert torch.equal(other_neighbours(where, 8).long(), nearest(where, 9)[1][:, 1:])
+    where = scale * points(1000).double()
+    assert torch.equal(other_neighbours(where, 8, compiled).long(), by_brute_force(where, 9)[1][:, 1:])
 
 
+@compiled_or_not
 @pytest.mark.parametrize("n", [1, 2, 5])
-def test_where_there_are_few_others_the_rest_is_the_point_itself(n):
-    near = other_neighbours(points(n).double(), 8)
+def test_where_there_are_few_others_the_rest_is_the_point_itself(n, compiled):
+    near = other_neighbours(points(n).double(), 8, compiled)
     others = (near != torch.arange(n)[:, None]).sum(1)
     assert near.shape == (n, 8) and others.tolist() == [n - 1] * n
 
 
-def test_a_crowd_of_coincident_points_is_linked_all_the_way_through():
+@compiled_or_not
+def test_a_crowd_of_coincident_points_is_linked_all_the_way_through(compiled):
     """Their nearest ones alone may be the same few, from which no other is reached."""
-    near = other_neighbours(torch.zeros(500, 3, dtype=torch.float64), 4)
+    near = other_neighbours(torch.zeros(500, 3, dtype=torch.float64), 4, compiled)
     reached = torch.zeros(500, dtype=torch.bool)
     reached[0] = True
     for _ in range(500):
@@ -71,7 +79,33 @@ def test_a_crowd_of_coincident_points_is_linked_all_the_way_through():
     assert bool(reached.all())
 
 
-def test_points_beside_a_crowd_keep_their_own_neighbours():
+@compiled_or_not
+def test_points_beside_a_crowd_keep_their_own_neighbours(compiled):
     crowd, apart = torch.zeros(50, 3), 10 + points(100)
     where = torch.cat([crowd, apart]).double()
-    assert torch.equal(other_neighbours(where, 4)[50:].long(), nearest(where, 5)[1][50:, 1:])
+    near = other_neighbours(where, 4, compiled)
+    assert torch.equal(near[50:].long(), nearest(where, 5)[1][50:, 1:])
+
+
+@needs_compiler
+@pytest.mark.parametrize("n", [1, 7, 8, 9, 64, 65, 600, 5000])
+def test_trees_of_any_size_hold_each_point_once_and_find_the_nearest_of_other_places(n):
+    where = points(n).double() * torch.tensor([10.0, 1.0, 0.1])
+    where[: n // 3] = where[: n // 3].round()  # many coincide in some coordinates
+    queries = where + 0.2 * points(n, seed=1).double()
+    tree = PointTree(where)
+    assert torch.equal(tree.order.sort().values, torch.arange(n))
+    k = min(6, n)
+    near = tree.nearest(queries, torch.randint(n, (n,), generator=torch.Generator().manual_seed(2)), k)
+    distances = (queries[:, None] - where[near.long()]).square().sum(2)
+    wanted = (queries[:, None] - where).square().sum(2).sort(dim=1).values[:, :k]
+    torch.testing.assert_close(distances, wanted, rtol=1e-14, atol=0)  # float64, in another order
+    assert all(len(row.unique()) == k for row in near)
+
+
+@needs_compiler
+def test_any_number_of_threads_finds_the_same_neighbours():
+    where = points(20_000).double()
+    assert_same_on_any_threads(
+        lambda: [other_neighbours(where, 6), PointTree(where).nearest(where, torch.zeros(20_000, dtype=torch.int64), 3)]
+    )
