@@ -196,11 +196,6 @@ def test_views_may_be_those_of_a_run(scene, trained_walls, caplog):
     assert same(small, ps.prune(scene, "10%", "lightgaussian", views=ps.dataset_views(run)))
 
 
-def test_views_of_a_run_that_is_not_there_are_refused(scene, tmp_path):
-    with pytest.raises(ps.SceneError, match="gone: no such file or folder; expected views, a run"):
-        ps.prune(scene, "10%", views=tmp_path / "gone")
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -221,23 +216,12 @@ def test_options_that_fit_no_scene_are_refused_before_one_is_read(options, tmp_p
         assert "gone.ply" not in str(caught.value)
 
 
-def test_progress_may_be_watched(ply):
-    steps = []
-    ps.compact(ply, "10%", progress=lambda what, share: steps.append((what, share)))
-    assert list(dict.fromkeys(what for what, _ in steps)) == ["by merge", "comparing renders"]
-
-
 def test_what_was_found_is_logged_and_nothing_is_printed(scene, caplog, capsys):
     with caplog.at_level(logging.INFO, "pointsplat_ns"):
         result = ps.compact(scene, "10%", sh="0")
     assert result.verdict in caplog.messages
     assert any(message.startswith("SH degree 1 cut to 0") for message in caplog.messages)
     assert capsys.readouterr() == ("", "")
-
-
-def test_a_scene_that_stands_alone_has_no_scenes_by_name(ply):
-    with pytest.raises(ps.SceneError, match="holds one scene; leave the name out"):
-        ps.load(ply, "attic")
 
 
 @pytest.fixture(scope="module")
@@ -294,25 +278,3 @@ def saved(scene: ps.Gaussians, folder: Path) -> bytes:
 )
 def test_pointsplat_prune_writes_what_prune_gives(arguments, options, ply, tmp_path):
     assert written(tmp_path, "prune", ply, *arguments) == saved(ps.prune(ply, **options), tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "options"),
-    [
-        ((), {}),
-        (("--keep", "20%", "--by", "coverage", "--sh", "0"), {"keep": "20%", "by": "coverage", "sh": "0"}),
-    ],
-)
-def test_pointsplat_compact_writes_what_compact_gives(arguments, options, ply, tmp_path):
-    assert written(tmp_path, "compact", ply, *arguments) == saved(ps.compact(ply, **options).scene, tmp_path)
-
-
-def test_pointsplat_compact_takes_the_refiners_that_load_refiner_takes(ply, refiner_run, tmp_path):
-    result = ps.compact(ply, refiner=ps.load_refiner(refiner_run))
-    assert written(tmp_path, "compact", ply, "--refiner", refiner_run) == saved(result.scene, tmp_path)
-
-
-@pytest.mark.parametrize("scene_name", [None, "b"])
-def test_pointsplat_export_writes_what_load_gives(scene_name, refiner_run, tmp_path):
-    options = () if scene_name is None else ("--scene", scene_name)
-    assert written(tmp_path, "export", refiner_run, *options) == saved(ps.load(refiner_run, scene_name), tmp_path)

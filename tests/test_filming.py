@@ -142,23 +142,6 @@ def test_picture_is_the_view_that_shows_most(scene, tmp_path):
     assert np.abs(shown - to_uint8(ps.render(scene, best)).astype(int)).max() <= 2
 
 
-def test_walk_past_an_object_begins_with_all_of_it(scene, tmp_path):
-    ps.render_path(scene, tmp_path / "frames", path="walk", seconds=0.3, **SMALL)
-    first = to_uint8(ps.render(scene, opening_views(scene, 12, 64, 48).views[0])).astype(int)
-    assert np.abs(frames_in(tmp_path / "frames")[0] - first).max() <= 2
-
-
-def test_up_may_be_said(scene, tmp_path):
-    """Turned over, the same walk shows what is up below."""
-    ps.render_path(scene, tmp_path / "up.png", up="-y", **SMALL)
-    ps.render_path(scene, tmp_path / "down.png", up="y", **SMALL)
-    assert (tmp_path / "up.png").read_bytes() != (tmp_path / "down.png").read_bytes()
-    with pytest.raises(ps.PointSplatError, match="up is 'w'; expected x, y, z, -x, -y or -z"):
-        ps.render_path(scene, tmp_path / "none.png", up="w")
-    with ps.open_viewer(scene, up="-y", port=0) as viewer:
-        assert str(viewer._stage.frame.up) == "-y"
-
-
 def test_viewer_begins_with_the_poses_of_a_run(trained_walls):
     run = run_of(trained_walls, "wall-b")
     with ps.open_viewer(run, port=0) as viewer:
@@ -183,15 +166,6 @@ def test_given_views_keep_their_size_and_photos_are_reduced(scene, tmp_path):
     assert Image.open(tmp_path / "narrow.png").size == (80, 4)
 
 
-def test_news_of_merging_does_not_begin_pictures_anew(scene):
-    with ps.open_viewer(scene, port=0) as viewer:
-        stage = viewer._stage
-        stage._changed(False)
-        assert stage.made == 0
-        stage._changed(True)
-        assert stage.made == 1
-
-
 def test_a_folder_gets_a_frame_for_each_pose_of_a_file(scene, files, tmp_path):
     views = ps.sample_views(scene, 4, 64, 48)
     poses = written(inria(views), tmp_path / "cameras.json")
@@ -204,11 +178,3 @@ def test_a_folder_gets_a_frame_for_each_pose_of_a_file(scene, files, tmp_path):
         )  # poses are written with few digits
     given = ps.render_path(scene, tmp_path / "two", views=views, path="walk", seconds=0.2, **SMALL)
     assert given == len(frames_in(tmp_path / "two")) == 2
-
-
-def test_poses_of_a_file_that_see_nothing_are_refused(scene, tmp_path):
-    content = inria(ps.sample_views(scene, 4, 64, 48))
-    for camera in content:
-        camera["position"][1] -= 1e4
-    with pytest.raises(ps.DataError, match="0 of 4 cameras see anything of the scene"):
-        ps.render_path(scene, tmp_path / "a.png", views=written(content, tmp_path / "cameras.json"))

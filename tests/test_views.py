@@ -36,10 +36,6 @@ def test_a_view_is_drawn_as_its_views_are():
     assert torch.equal(view.background, torch.tensor([0.1, 0.2, 0.3]))
 
 
-def test_a_negative_index_counts_from_the_end():
-    assert places([make()[-1], make()[-5]]) == [4.0, 0.0]
-
-
 @pytest.mark.parametrize("index", [5, -6, [0, 5]])
 def test_an_index_out_of_range_is_an_index_error(index):
     with pytest.raises(IndexError):
@@ -76,12 +72,6 @@ def test_spread_takes_evenly_from_first_to_last(count, expected):
     assert places(make().spread(count)) == expected
 
 
-@pytest.mark.parametrize("count", [5, 6])
-def test_spread_leaves_views_alone_that_are_few_enough(count):
-    views = make()
-    assert views.spread(count) is views
-
-
 def test_resized_views_see_the_same_in_fewer_pixels():
     views = make()
     small = views.resized(32)
@@ -94,16 +84,6 @@ def test_resized_stretches_with_the_rounding_of_each_side():
     small = make(width=64, height=47).resized(32)  # 23.5 pixels high
     assert (small.width, small.height) == (32, 24)
     assert small.Ks[0, 1, 1].item() == pytest.approx(40 * 24 / 47)
-
-
-def test_resized_leaves_no_side_without_a_pixel():
-    assert make(width=640, height=1).resized(64).height == 1
-
-
-@pytest.mark.parametrize("side", [64, 65])
-def test_resized_does_not_enlarge(side):
-    views = make()
-    assert views.resized(side) is views
 
 
 @pytest.mark.parametrize(

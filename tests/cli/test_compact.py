@@ -12,17 +12,14 @@ import torch
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 from html_parts import parts_of
 from making import ball, same
-from pointsplat_ns import api
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression import acceptance, trained_refiner
 from pointsplat_ns.compression.requests import STEPS
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.io.files import bytes_text
-from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.pruning import METHODS, prune
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
-from posing import write_colmap_text
 
 
 def room(n: int = 150) -> Gaussians:
@@ -104,21 +101,6 @@ def test_a_page_to_fly_through_both_scenes_is_written(ply, helps, tmp_path, caps
     assert [scene["name"] for scene in parts_of(shown).data["flight"]["scenes"]] == ["compact"]
 
 
-def test_options_go_before_what_the_refiner_was_trained_with_and_a_dry_run_writes_nothing(ply, helps, tmp_path, capsys):
-    options = ("--keep", "9", "--by", "merge", "--sh", "0")
-    run("compact", ply, "--refiner", helps, *options, "-o", tmp_path / "small.ply")
-    small = read_ply(tmp_path / "small.ply")
-    assert len(small) == 9 and small.sh_degree == 0
-    said = capsys.readouterr().out
-    (tmp_path / "small.ply").unlink()
-    run("compact", ply, "--refiner", helps, *options, "--dry-run")
-    dry = capsys.readouterr().out
-    assert "dry run, nothing is written" in dry and list(tmp_path.iterdir()) == []
-    assert [line for line in said.splitlines() if "small.ply" not in line] == [
-        line for line in dry.splitlines() if "dry run" not in line
-    ]
-
-
 def test_a_run_is_compared_from_the_poses_of_its_dataset_and_as_it_was_drawn(helps, trained_walls, tmp_path, capsys):
     (source,) = (trained_walls / "wall-b" / "splatfacto-cpu").iterdir()
     seen = []
@@ -137,14 +119,6 @@ def test_a_run_is_compared_from_the_poses_of_its_dataset_and_as_it_was_drawn(hel
     assert len(read_ply(tmp_path / "small.ply")) == round(len(read_scene(source)) / 2 + 0.1)
 
 
-@pytest.mark.parametrize("option", ["--refiner", "--using"])  # as it was once called
-def test_a_trained_run_may_be_used(option, ply, make_refined_run, tmp_path, capsys):
-    trained = make_refined_run(tmp_path / "run", tmp_path / "nowhere", moved=-6.0)
-    run("compact", ply, option, trained, "-o", tmp_path / "small.ply")
-    assert same(read_ply(tmp_path / "small.ply"), prune(read_ply(ply), 0.5, "paper"))
-    assert "not refined by the network, it does not help" in capsys.readouterr().out
-
-
 def test_the_refiner_that_ships_is_used_if_it_is_asked_for(ply, tmp_path, capsys, monkeypatch):
     (tmp_path / "empty").mkdir()
     monkeypatch.setattr(trained_refiner, "PRETRAINED", tmp_path / "refiner.safetensors")
@@ -153,18 +127,6 @@ def test_the_refiner_that_ships_is_used_if_it_is_asked_for(ply, tmp_path, capsys
     weights(tmp_path / "refiner.safetensors", "scales", 0.15, keep=0.2)
     run("compact", ply, "--refiner", "shipped", "-o", tmp_path / "small.ply")
     assert len(read_ply(tmp_path / "small.ply")) == 30
-
-
-def test_where_nothing_can_be_compared_that_is_said_and_no_picture_is_drawn(helps, tmp_path, capsys):
-    write_ply(room()[5:6].replace(opacities=torch.tensor([[-4.0]])), tmp_path / "faint.ply")
-    run(
-        *("compact", tmp_path / "faint.ply", "--refiner", helps, "--keep", "1"),
-        *("-o", tmp_path / "small.ply", "--picture", tmp_path / "shown.png"),
-    )
-    said = capsys.readouterr().out
-    assert "not refined by the network: it cannot be compared with the dense scene (no free place" in said
-    assert "shown.png: not drawn" in said and not (tmp_path / "shown.png").exists()
-    assert len(read_ply(tmp_path / "small.ply")) == 1
 
 
 def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
@@ -197,13 +159,6 @@ def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
     ):
         assert wanted in refusal(capsys, output, scene, *options), options
     assert ".spz, .sog" in refusal(capsys, tmp_path / "small.obj", ply)
-
-
-def test_a_name_is_made_up_where_none_is_given(helps, tmp_path, capsys):
-    write_ply(room(), tmp_path / "room.ply")
-    run("compact", tmp_path / "room.ply", "--refiner", helps)
-    assert len(read_ply(tmp_path / "room_compact.ply")) == 75
-    assert f"{tmp_path / 'room_compact.ply'}: pruned by opacity and refined to 75 of 150" in capsys.readouterr().out
 
 
 def test_files_that_exist_are_only_overwritten_by_force(ply, helps, tmp_path, capsys):
@@ -241,14 +196,3 @@ def test_a_scene_is_repaired_as_long_as_asked_and_what_it_brought_and_cost_is_sa
     assert re.search(r"merged(, refined)? and repaired to 40 of 400", said)
     assert "repaired, side by side" in said
     assert len(read_ply(tmp_path / "small.ply")) == 40
-
-
-@pytest.mark.parametrize("budget", [{"keep": "50%"}, {"target_db": 5}])
-def test_poses_of_a_file_are_compared_in(budget, ply, tmp_path):
-    views = sample_views(room(), 5, 64, 48)
-    model = write_colmap_text(views, tmp_path / "sparse")
-    words = [word for name, value in budget.items() for word in (f"--{name.replace('_', '-')}", value)]
-    run("compact", ply, *words, "--effort", "instant", "--poses", model, "-o", tmp_path / "small.ply")
-    result = api.compact(ply, **budget, effort="instant", views=model)
-    torch.testing.assert_close(result.views.viewmats, views.viewmats.double())
-    assert same(read_ply(tmp_path / "small.ply"), result.scene)

@@ -54,13 +54,6 @@ def test_convert_writes_spz_of_either_version(scene, tmp_path):
     assert (tmp_path / "b.spz").read_bytes()[:4] == b"NGSP"
 
 
-def test_no_image_of_another_sog_folder_is_overwritten(scene, tmp_path, capsys):
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "folder" / "sh0.webp").write_bytes(b"a picture")
-    assert "sh0.webp: exists already" in fails(capsys, "convert", scene, tmp_path / "folder" / "meta.json")
-    assert (tmp_path / "folder" / "sh0.webp").read_bytes() == b"a picture"
-
-
 def test_convert_overwrites_nothing_and_names_what_it_can_write(scene, tmp_path, capsys):
     assert "exists already" in fails(capsys, "convert", scene, scene)
     assert ".spz, .sog" in fails(capsys, "convert", scene, tmp_path / "a.ksplat")
@@ -85,13 +78,6 @@ def test_info_prints_a_page_or_json(scene, capsys):
     assert f"\nup: {found.up_text}" in said and f"\nfill: {found.fill:.1f} Gaussians drawn per pixel, in 6 v" in said
     run("info", scene, "--json")
     assert json.loads(capsys.readouterr().out) == found.as_dict()
-
-
-def test_info_takes_the_named_axis_and_says_when_it_guesses(scene, capsys):
-    run("info", scene, "--up=-y")
-    assert "\nup: -y\n" in capsys.readouterr().out
-    run("info", scene)  # a cloud that stands in no way
-    assert "(a guess); --up names another axis\n" in capsys.readouterr().out
 
 
 def test_info_of_several_files_is_a_table(scene, tmp_path, capsys):

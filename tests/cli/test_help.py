@@ -5,9 +5,6 @@ from __future__ import annotations
 import inspect
 import re
 import shlex
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -96,22 +93,3 @@ def test_a_command_line_that_is_not_understood_has_status_2(capsys):
         main(["prune", "room.ply", "--keeep", "10%"])
     said = capsys.readouterr()
     assert end.value.code == 2 and "--keeep" in said.err and said.out == ""
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
-def test_bash_completes_commands_and_options(tmp_path):
-    script = tmp_path / "pointsplat"
-    with script.open("w") as stream:
-        words = [sys.executable, "-c", "from pointsplat_ns.cli import main; main()", "--tyro-print-completion", "bash"]
-        subprocess.run(words, stdout=stream, check=True)
-    function = re.search(r"complete .*-F (\w+) pointsplat", script.read_text())[1]
-    for typed, expected in ((["pointsplat", "tra"], "tradeoff"), (["pointsplat", "prune", "--kee"], "--keep")):
-        given = f"COMP_WORDS=({shlex.join(typed)}); COMP_CWORD={len(typed) - 1}; {function}"
-        given += "; IFS=$'\\n'; echo \"${COMPREPLY[*]}\""
-        done = subprocess.run(["bash", "-c", f"source {shlex.quote(str(script))}; {given}"], capture_output=True)
-        assert done.stdout.decode().splitlines() == [expected], done.stderr
-
-
-def test_zsh_gets_every_command(capsys):
-    script = shown(capsys, "--tyro-print-completion", "zsh")
-    assert script.startswith("#compdef pointsplat") and all(name in script for name in EXAMPLES)

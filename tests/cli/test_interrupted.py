@@ -24,28 +24,6 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 """Where the tests run in the background of a shell or by nohup, SIGINT or SIGHUP is ignored, also by what they start,
 unless told otherwise."""
 
-MAKE_REFINER = """
-import sys
-from pathlib import Path
-from pointsplat_ns.cli import main
-from pointsplat_ns.nerfstudio_plugin.pointsplat import make_refiner, recipe
-
-here = Path(sys.argv[1])
-# As ns-train was: it writes down that it runs, and ends with status 0 when it is interrupted.
-TRAINING = '''
-import os, sys, time
-from pathlib import Path
-try:
-    (Path(sys.argv[1]) / f"{os.getpid()}.pid").touch()
-    time.sleep(600)
-except KeyboardInterrupt:
-    pass
-'''
-(here / "training.py").write_text(TRAINING)
-make_refiner.write_room = lambda data, *_, **__: data.mkdir(parents=True)
-recipe.SceneSettings.train_command = lambda *_: f"{sys.executable} {here / 'training.py'} {here}"
-main(["make-refiner", "-o", str(here / "output"), "--workers", "2"])
-"""
 
 ROOMS = """
 import sys
@@ -100,27 +78,6 @@ def start(tmp_path):
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-
-
-def alive(pid: int) -> bool:
-    """Whether a process exists and has not ended."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
-@pytest.mark.parametrize("whom", ["group", "main process"])
-def test_make_refiner_stops_at_once_and_takes_its_trainings_with_it(start, tmp_path, whom):
-    process = start(MAKE_REFINER, count=2)
-    (os.killpg if whom == "group" else os.kill)(process.pid, signal.SIGINT)
-    said, errors = process.communicate(timeout=30)
-    assert process.returncode == 130, errors
-    assert errors.strip().splitlines()[-1] == "interrupted"
-    trainings = [int(path.stem) for path in tmp_path.glob("*.pid")]
-    assert len(trainings) == 2 == said.count("$ "), "a further training was started"
-    assert not any(alive(pid) for pid in trainings)
 
 
 @pytest.mark.parametrize("name", WRITES)

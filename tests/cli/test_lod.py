@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import inspect
 import json
-import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import pointsplat_ns as ps
@@ -16,7 +14,6 @@ from pointsplat_ns.cli import main
 from pointsplat_ns.cli.lod import lod
 from pointsplat_ns.compression.levels import DEFAULT_LEVELS
 from pointsplat_ns.io.files import three_digits
-from posing import nerfstudio, written
 
 
 @pytest.fixture()
@@ -71,34 +68,6 @@ def test_levels_are_written_beside_the_scene_and_printed(ply, capsys):
     assert (folder / "lod.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_run_gets_its_levels_in_its_folder_seen_from_its_dataset(trained_walls, tmp_path, capsys):
-    (trained,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
-    shutil.copytree(trained, tmp_path / "run")
-    before = set((tmp_path / "run").rglob("*"))
-    run("lod", tmp_path / "run", "--levels", "50%")
-    folder = tmp_path / "run" / "lod"
-    assert set((tmp_path / "run").rglob("*")) - before == {folder, *folder.iterdir()}
-    manifest = json.loads((folder / "lod.json").read_text("utf-8"))
-    (checkpoint,) = (tmp_path / "run" / "nerfstudio_models").iterdir()
-    assert manifest["source"]["file"] == checkpoint.name and manifest["source"]["bytes"] == checkpoint.stat().st_size
-    assert manifest["views"]["origin"] == "poses of the dataset"
-    assert len(np.load(folder / "level_0_parents.npy")) == manifest["source"]["count"]
-
-
-def test_what_exists_is_only_overwritten_by_force(ply, capsys):
-    folder = ply.with_name("room_lod")
-    folder.mkdir()
-    (folder / "level_0.ply").write_text("precious")
-    with pytest.raises(SystemExit) as caught:
-        run("lod", ply, "--levels", "50%")
-    said = capsys.readouterr()
-    assert caught.value.code == 1 and said.out == ""
-    assert "level_0.ply: exists already" in said.err and "--force" in said.err
-    assert contents(folder) == {"level_0.ply": b"precious"}
-    run("lod", ply, "--levels", "50%", "--force")
-    assert len(ps.load(folder / "level_0.ply")) == 200
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -116,22 +85,3 @@ def test_what_cannot_be_done_is_refused_in_one_line_and_writes_nothing(arguments
     [line] = said.err.splitlines()
     assert line.startswith("error: ") and message in line
     assert [path.name for path in tmp_path.iterdir()] == ["room.ply"]
-
-
-def test_what_is_no_scene_is_refused(tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        run("lod", tmp_path / "gone.ply")
-    assert "gone.ply: no such file; expected a scene (.compressed.ply, .ply" in capsys.readouterr().err
-
-
-def test_levels_are_compared_from_the_poses_of_a_file(ply, tmp_path):
-    views = ps.sample_views(ps.load(ply), 4, 64, 48)
-    poses = written(nerfstudio(views), tmp_path / "transforms.json")
-    run("lod", ply, "--levels", "50%", "--poses", poses, "-o", tmp_path / "by_command")
-    manifest = json.loads((tmp_path / "by_command" / "lod.json").read_text("utf-8"))
-    assert manifest["views"]["origin"] == "given views"
-    ps.lod(ply, ["50%"], views=poses).save(tmp_path / "by_api")
-    assert contents(tmp_path / "by_command") == contents(tmp_path / "by_api")
-    with pytest.raises(SystemExit):
-        run("lod", ply, "--poses", ply, "-o", tmp_path / "other")
-    assert not (tmp_path / "other").exists()

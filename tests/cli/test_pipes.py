@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 from pathlib import Path
 
 import pytest
@@ -67,15 +66,3 @@ def test_a_pipe_is_refused_in_one_line(pipe, words, said, capsys):
         main([*words])
     error = capsys.readouterr().err
     assert end.value.code == 1 and error.count("\n") == 1 and said in error
-
-
-def test_a_folder_of_scenes_passes_over_what_is_no_file(capsys):
-    os.mkfifo("a.ply")
-    os.mkfifo("b.spz")
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind("c.sog")
-        main(["compact", ".", "-o", "out", "--keep", "50%", "--by", "opacity", "--effort", "instant"])
-    assert capsys.readouterr().err.splitlines()[:3] == [
-        f"passed over {name}: not a regular file" for name in ("a.ply", "b.spz", "c.sog")
-    ]
-    assert len(ps.load("out/room.ply")) == 20

@@ -131,13 +131,6 @@ def test_numbers_that_json_lacks_are_null(capsys, ply):
     assert "Infinity" not in (said := capsys.readouterr().out) and json.loads(said)["gaussians"] == COUNT
 
 
-def test_a_pipe_gets_results_without_bars_and_colours(ply, capsys):
-    main(["prune", str(ply), "--keep", "50%"])
-    said = capsys.readouterr()
-    assert "room_pruned.ply: merged to 30 of 60" in said.out and said.err == ""
-    assert not [letter for letter in said.out if ord(letter) < 32 and letter != "\n"]
-
-
 def test_prune_says_in_two_lines_what_it_wrote_and_how_good_it_is(ply, capsys, as_json):
     words = ("prune", str(ply), "--keep", "50%", "--resolution", "96x54", "--force")
     main([*words, "-o", "room.spz"])

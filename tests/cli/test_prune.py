@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import re
 import shutil
 import subprocess
 import sys
@@ -14,17 +13,14 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import ball, box_room, normal_scene, same
+from making import ball, normal_scene, same
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression.trained_refiner import open_refiner_run, scenes_of_run
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.io.camera_files import read_views
-from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.view_source import COMPARED_VIEWS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning import METHODS, prune, select
-from pointsplat_ns.system import progress
 from posing import inria, written
 
 SEED = 5
@@ -45,15 +41,6 @@ def splatfacto_run(trained_walls) -> Path:
 @pytest.fixture(scope="module")
 def refined_run(make_refined_run, trained_walls, tmp_path_factory) -> Path:
     return make_refined_run(tmp_path_factory.mktemp("refined"), trained_walls, ("wall-b",), moved=0.5)
-
-
-def test_a_log_says_from_time_to_time_how_far_it_is(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(progress, "LINE_SECONDS", 0.005)
-    write_ply(box_room(1, count=1900), tmp_path / "scene.ply")
-    run("prune", tmp_path / "scene.ply", "-o", tmp_path / "small.ply")
-    lines = capsys.readouterr().err.splitlines()
-    assert any(re.fullmatch(r"\[\d:\d\d\] by merge: \d+ %(, about \d+:\d\d left)?", line) for line in lines)
-    assert not any(ord(letter) < 32 for line in lines for letter in line)
 
 
 def run(*args) -> None:
@@ -94,27 +81,12 @@ def test_prune_takes_every_kind_of_scene(kind, ply, splatfacto_run, tmp_path, ca
     assert [p.name for p in output.parent.iterdir()] == ["out.ply"]
 
 
-@pytest.mark.parametrize(("keep", "kept"), [("0.25", 20), ("25%", 20), ("7", 7), ("1.0", 80), ("1", 1)])
-def test_keep_is_a_ratio_a_percentage_or_a_count(ply, tmp_path, keep, kept):
-    run("prune", ply, "--by", "paper", "--keep", keep, "-o", tmp_path / "out.ply")
-    assert same(read_ply(tmp_path / "out.ply"), prune(read_ply(ply), kept, "paper"))
-
-
 def test_prune_scores_as_it_is_told(ply, tmp_path):
     run("prune", ply, "--keep", "9", "--by", "volume", "-o", tmp_path / "volume.ply")
     run("prune", ply, "--keep", "9", "--by", "paper", "--opacity-weight", "1.0", "-o", tmp_path / "opacity.ply")
     dense = read_ply(ply)
     assert same(read_ply(tmp_path / "volume.ply"), prune(dense, 9, "volume"))
     assert same(read_ply(tmp_path / "opacity.ply"), prune(dense, 9, "opacity"))
-
-
-@pytest.mark.parametrize(
-    "keep", ["0", "1.5", "nan", "inf", "-3", "81", "half", "", "0%", "101%", "0MB", "-1MB", "nanMB", "auto:0"]
-)
-@pytest.mark.parametrize("command", ["prune", "compact"])
-def test_a_keep_that_no_scene_can_satisfy_is_refused(command, keep, ply, refined_run, tmp_path, capsys):
-    using = ("--using", refined_run) if command == "compact" else ()
-    assert "keep is" in refusal(capsys, tmp_path / "out.ply", command, ply, *using, f"--keep={keep}")
 
 
 def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
@@ -139,14 +111,6 @@ def test_an_output_that_cannot_be_written_is_refused(ply, tmp_path, capsys):
     assert "cannot be written" in refusal(capsys, ply / "below_a_file.ply", "prune", ply)
 
 
-def test_the_help_names_every_method(capsys):
-    with pytest.raises(SystemExit) as caught:
-        run("prune", "--help")
-    words = re.findall(r"[\w-]+", capsys.readouterr().out)
-    assert caught.value.code == 0
-    assert set(METHODS) - set(words) == set()
-
-
 @pytest.mark.parametrize("by", ["lightgaussian", "pup"])
 def test_prune_looks_from_the_poses_of_the_run(by, splatfacto_run, tmp_path, capsys):
     run("prune", splatfacto_run, "--keep", "0.5", "--by", by, "-o", tmp_path / "out.ply")
@@ -156,21 +120,6 @@ def test_prune_looks_from_the_poses_of_the_run(by, splatfacto_run, tmp_path, cap
     assert "poses of the dataset" in capsys.readouterr().out
 
 
-def test_prune_keeps_what_fits_into_a_file(ply, tmp_path):
-    run("prune", ply, "--by", "opacity", "--keep", "0.005MB", "--sh", "1", "-o", tmp_path / "out.ply")
-    size, row = (tmp_path / "out.ply").stat().st_size, 4 * 26
-    assert size <= 5_000 < size + row and read_ply(tmp_path / "out.ply").sh_degree == 1
-
-
-def test_prune_finds_the_budget_of_a_run_by_rendering(splatfacto_run, tmp_path, capsys):
-    run("prune", splatfacto_run, "--by", "coverage", "--keep", "auto:30", "--sh", "auto", "-o", tmp_path / "out.ply")
-    said = capsys.readouterr().out
-    views = dataset_views(splatfacto_run).spread(COMPARED_VIEWS)
-    reached, _ = DenseReference(read_scene(splatfacto_run), views).psnr(read_ply(tmp_path / "out.ply"))
-    assert reached >= 30 and "views: poses of the dataset" in said
-    assert f": {reached:.1f} dB PSNR against the dense scene" in said
-
-
 def test_a_dry_run_says_all_and_writes_nothing(ply, tmp_path, capsys):
     before = sorted(tmp_path.iterdir())
     run("prune", ply, "--by", "coverage", "--keep", "0.25", "--sh", "0", "--dry-run")
@@ -178,13 +127,6 @@ def test_a_dry_run_says_all_and_writes_nothing(ply, tmp_path, capsys):
     assert sorted(tmp_path.iterdir()) == before
     assert "dry run, nothing is written: pruned by coverage to 20 of 80 Gaussians (25 %)" in said
     assert "SH degree 3 cut to 0: 100 % of what SH add to colours is lost" in said and "quantiles" not in said
-
-
-def test_prune_draws_the_distributions_when_it_is_asked_to(ply, tmp_path):
-    run("prune", ply, "--by", "paper", "-o", tmp_path / "out.ply")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["out.ply", "scene.ply"]
-    run("prune", ply, "--by", "paper", "-o", tmp_path / "out.ply", "--plot", tmp_path / "out.png", "--force")
-    assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(
@@ -221,13 +163,6 @@ def test_a_run_gets_its_ply_in_its_folder_and_never_among_its_checkpoints(named,
     assert set(folder.rglob("*")) - set(before) == {folder / "pruned.ply"}
 
 
-def test_a_checkpoint_that_stands_alone_gets_its_ply_beside_it(splatfacto_run, tmp_path):
-    (checkpoint,) = (splatfacto_run / "nerfstudio_models").iterdir()
-    shutil.copy(checkpoint, tmp_path / "alone.ckpt")
-    run("prune", tmp_path / "alone.ckpt", "--keep", "10%", "--by", "opacity")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["alone.ckpt", "alone_pruned.ply"]
-
-
 @pytest.mark.parametrize("named", [True, False])
 def test_a_scene_that_exists_is_only_overwritten_by_force(named, ply, capsys):
     output = ply.with_name("mine.ply" if named else "scene_pruned.ply")
@@ -241,20 +176,6 @@ def test_a_scene_that_exists_is_only_overwritten_by_force(named, ply, capsys):
     assert output.read_text() == "precious"
     run("prune", ply, *options, "--force")
     assert len(read_ply(output)) == 24
-
-
-def test_the_scene_itself_is_not_overwritten_either(ply, tmp_path, capsys):
-    before = ply.read_bytes()
-    assert "exists already" in refusal(capsys, ply, "prune", ply)
-    assert "exists already" in refusal(capsys, ply, "export", ply)
-    assert ply.read_bytes() == before
-
-
-def test_a_dry_run_is_not_stopped_by_what_it_would_overwrite(ply, capsys):
-    ply.with_name("scene_pruned.ply").write_text("precious")
-    run("prune", ply, "--by", "opacity", "--dry-run")
-    assert "dry run, nothing is written" in capsys.readouterr().out
-    assert ply.with_name("scene_pruned.ply").read_text() == "precious"
 
 
 def test_the_log_of_the_package_is_printed_while_a_command_runs_and_no_longer(ply, tmp_path, capsys):
@@ -277,15 +198,6 @@ def test_export_writes_the_scene_of_a_splatfacto_run_as_it_is(splatfacto_run, tm
     for i, path in enumerate((splatfacto_run, splatfacto_run / "config.yml", checkpoint, tmp_path / "alone.ckpt")):
         run("export", path, "-o", tmp_path / f"{i}.ply")
         assert same(read_ply(tmp_path / f"{i}.ply"), read_scene(checkpoint))
-
-
-def test_export_writes_the_refined_scene_of_a_pointsplat_run(refined_run, trained_walls, tmp_path, capsys):
-    for name, options in (("wall-b", ()), ("wall-a", ("--scene", "wall-a"))):
-        run("export", refined_run, *options, "-o", tmp_path / "out.ply", "--force")
-        (source,) = (trained_walls / name / "splatfacto-cpu").iterdir()
-        kept = prune(read_scene(source), 0.5, "paper")
-        assert same(read_ply(tmp_path / "out.ply"), kept.replace(opacities=kept.opacities + 0.5))
-        assert name in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("supervision", ["auto", "photos", "dense"])
@@ -371,10 +283,3 @@ def test_poses_in_another_frame_are_refused_before_the_work(posed, tmp_path, cap
     written(content, poses)
     error = refusal(capsys, tmp_path / "small.ply", "prune", room, "--poses", poses)
     assert f"{poses}: 0 of 5 cameras see anything of the scene" in error and "dataparser_transforms.json" in error
-
-
-@pytest.mark.parametrize("name", ["room.ply", "."])
-def test_poses_that_are_no_cameras_are_refused(name, posed, tmp_path, capsys):
-    room, _ = posed
-    error = refusal(capsys, tmp_path / "small.ply", "prune", room, "--poses", tmp_path / name)
-    assert "expected cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model" in error

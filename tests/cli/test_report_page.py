@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import json
-import math
 import re
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import pytest
 
 import pointsplat_ns as ps
 from browser import chromium, complaints
-from evaluations import WRONG, evaluation, places
+from evaluations import evaluation
 from html_parts import hashed, names_nothing_outside, parts_of, policy_of
 from pointsplat_ns.cli import main
 
@@ -48,13 +47,6 @@ def test_page_draws_every_scene_variant_and_value(page, capsys):
     assert places_of[2] == pytest.approx((places_of[0] + places_of[1]) / 2, abs=0.01)
 
 
-def test_page_says_where_it_is_and_the_table_is_printed_as_well(tmp_path, capsys):
-    path = write(tmp_path, evaluation())
-    main(["report", str(path), "--html", str(tmp_path / "eval.html")])
-    shown = capsys.readouterr().out
-    assert shown.count("refined") == 5 and f"{tmp_path / 'eval.html'}: the same with charts" in shown
-
-
 def test_page_loads_and_runs_nothing(page):
     names_nothing_outside(page)
     parts = parts_of(page)
@@ -79,41 +71,6 @@ def test_page_without_lpips_has_no_chart_of_it_and_says_why(tmp_path):
     text = (tmp_path / "eval.html").read_text("utf-8")
     assert not [mark for mark in marks_of(text) if "LPIPS" in mark] and "no LPIPS: no weights here" in text
     assert text.count("<td>–</td>") == 5 * 3
-
-
-def test_page_keeps_photos_and_dense_renders_apart(tmp_path):
-    content = evaluation()
-    results = content["results"]
-    rows = {
-        v: {**results["scenes"]["a"][v], "psnr": None if v == "dense" else 44.0} for v in ("dense", "pruned", "refined")
-    }
-    results["scenes"]["c"] = {"seen_in_training": True, "reference": "dense renders", **rows}
-    results["against_dense_renders"] = {"reference": "dense renders", "average": rows}
-    ps.report(write(tmp_path, content), tmp_path / "eval.html")
-    photos, dense = (tmp_path / "eval.html").read_text("utf-8").split("Compared with the dense scenes&#39; own renders")
-    assert "44.00" not in photos and len(marks_of(photos)) == 15
-    assert marks_of(dense)[0] == "c, PSNR, dB: pruned 44.00, refined 44.00" and len(marks_of(dense)) == 3
-
-
-def test_page_of_a_malformed_evaluation_is_shown_or_one_error(tmp_path, monkeypatch):
-    monkeypatch.setattr("pointsplat_ns.nerfstudio_plugin.pointsplat.report.show_report", lambda results: None)
-    whole, shown, refused = evaluation(), 0, 0
-    of_others = {"b", "refined", "average", "average_seen", "average_unseen"}  # read as the first scene is
-    for place in places(whole):
-        for wrong in (*WRONG, math.nan, math.inf, 1e308, -1e308, 0, 5e-324, "\ud800"):
-            if of_others & {*place}:
-                continue
-            broken = json.loads(json.dumps(whole))
-            node = broken
-            for key in place[:-1]:
-                node = node[key]
-            node[place[-1]] = wrong
-            try:
-                ps.report(write(tmp_path, broken), tmp_path / "eval.html")
-                shown += 1
-            except ps.DataError:
-                refused += 1
-    assert shown > 100 and refused > 100
 
 
 def test_an_existing_page_is_kept_unless_told_otherwise(page, tmp_path, capsys):

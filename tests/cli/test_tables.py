@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -73,24 +68,3 @@ def test_damaged_cells_and_unknown_names_are_one_line(ply, tmp_path, capsys):
             run("tables", ply, "-o", tmp_path / "tables", *words)
         said = capsys.readouterr().err
         assert ended.value.code == 1 and said.startswith(expected) and said.count("\n") == 1
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal on this system")
-def test_a_killed_command_goes_on_with_what_it_had(ply, tmp_path, capsys):
-    journal = tmp_path / "tables" / "room" / CELLS
-    code = "from pointsplat_ns.cli import main; main()"
-    words = ["tables", str(ply), "-o", str(tmp_path / "tables"), "--views", "2", "--side", "48", "--scoring-views", "2"]
-    with subprocess.Popen(
-        [sys.executable, "-c", code, *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        env={**os.environ, "TMPDIR": str(tmp_path)},
-    ) as process:  # fmt: skip
-        try:
-            while process.poll() is None and not journal.is_file():
-                time.sleep(0.02)
-        finally:
-            process.kill()
-    before = json.loads(journal.read_text())
-    assert process.returncode == -signal.SIGKILL and before["cells"][0]["point"]["key"] == "room/dense/100%"
-    run(*words, "--only", "room/paper-0.9/10%")
-    after = json.loads(journal.read_text())
-    assert after["cells"][: len(before["cells"])] == before["cells"] and len(after["cells"]) > len(before["cells"])

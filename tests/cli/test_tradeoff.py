@@ -18,8 +18,6 @@ from pointsplat_ns.compression import repair
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.tradeoff import judging, machine, outputs
-from pointsplat_ns.tradeoff.journal import POINTS
-from posing import inria, write_colmap_binary, written
 
 FEW = ("--views", "2", "--repairs", "none", "--drawn", "exact")
 
@@ -82,15 +80,6 @@ def test_the_recommended_point_or_the_next_best_is_printed_with_a_command(ply, c
     assert len(ps.load(f"room_{key}.ply")) < 400
 
 
-def test_the_same_command_goes_on_and_says_nothing_of_what_it_had(ply, capsys):
-    run("tradeoff", ply, "--points", "2", *FEW)
-    before = (ply.parent / "room_tradeoff" / POINTS).read_text()
-    capsys.readouterr()
-    run("tradeoff", ply, "--points", "2", *FEW)
-    assert (ply.parent / "room_tradeoff" / POINTS).read_text() == before
-    assert "left at most" not in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ps.SceneError])
 def test_a_sweep_that_ends_before_its_first_point_leaves_nothing_of_its_own(error, ply, tmp_path, monkeypatch):
     def failing(*_):
@@ -127,13 +116,6 @@ def test_a_quality_is_reached_and_what_is_cheaper_is_said(ply, tmp_path, capsys)
     assert "scenes tried; the next cheaper," in said and "dB where 25 are wanted" in said
 
 
-def test_targets_that_cannot_be_met_are_one_line_and_leave_what_was_measured(ply, tmp_path, capsys):
-    said = refusal(capsys, ply, "-o", tmp_path / "found", "--target-db", "25", "--target-mb", "0.005", *FEW)
-    assert said.count("\n") == 1 and "what reaches 25 dB takes" in said and "over --target-mb 0.005" in said
-    assert "the best within the limits has" in said
-    assert (tmp_path / "found" / "tradeoff.json").is_file() and not list((tmp_path / "found").glob("*.ply"))
-
-
 @pytest.mark.parametrize(
     "arguments, said",
     [
@@ -147,28 +129,7 @@ def test_numbers_that_mean_nothing_are_refused_before_the_scene_is_read(tmp_path
     assert said in refusal(capsys, tmp_path / "gone.ply", *arguments)
 
 
-def test_results_of_another_scene_are_not_overwritten_without_force(ply, tmp_path, capsys):
-    run("tradeoff", ply, "--points", "2", *FEW)
-    ps.save(box_room(1, 400), ply)
-    said = refusal(capsys, ply, "--points", "2", *FEW)
-    assert "its points are of another sweep" in said and "--force" in said
-    run("tradeoff", ply, "--points", "2", "--force", *FEW)
-
-
 def test_the_command_line_has_the_options_and_defaults_of_the_function():
     function, command = inspect.signature(ps.measure_tradeoff).parameters, inspect.signature(tradeoff).parameters
     assert set(function) - {"folder", "progress"} == set(command) - {"output", "threads", "json_output"}
     assert all(function[name].default == command[name].default for name in set(function) & set(command))
-
-
-def test_scenes_are_judged_from_the_poses_of_a_file_and_commands_name_it(ply, views, tmp_path, capsys):
-    poses = written(inria(views), tmp_path / "cameras.json")
-    run("tradeoff", ply, "--points", "2", *FEW, "--poses", poses)
-    folder = ply.with_name("room_tradeoff")
-    content = json.loads((folder / "tradeoff.json").read_text("utf-8"))
-    assert content["views_origin"] == "given views" and "48 x 36 pixels" in capsys.readouterr().out
-    command = shlex.split(content["points"][1]["command"])
-    assert command[command.index("--poses") + 1] == str(poses)
-    other = write_colmap_binary(views[[1, 0, 2]], tmp_path / "sparse")
-    assert "its points are of another sweep (poses:" in refusal(capsys, ply, "--points", "2", *FEW, "--poses", other)
-    assert "views: 'given views', now" in refusal(capsys, ply, "--points", "2", *FEW)

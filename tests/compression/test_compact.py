@@ -13,7 +13,6 @@ from making import ball, same
 from pointsplat_ns.compression import acceptance
 from pointsplat_ns.compression.acceptance import (
     ACCEPTANCE,
-    AcceptanceSettings,
     closer_in,
     improves,
     interpolate,
@@ -29,7 +28,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import Closeness, DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.pruning import PruneSettings, WithinPsnr, prune
+from pointsplat_ns.pruning import PruneSettings, prune
 from pointsplat_ns.refiner import Refiner, RefinerConfig
 from pointsplat_ns.system.progress import silent
 from pointsplat_ns.views import Views
@@ -150,15 +149,6 @@ def test_a_refiner_that_goes_too_far_is_taken_part_of_the_way(scene, views):
     assert result.after.psnr - result.before.psnr > 2 / 3 * (best - result.before.psnr) > 0
 
 
-def test_what_brings_next_to_nothing_is_left_out(scene, views, monkeypatch):
-    refiner = trained(tiny_refiner("scales", 0.002))
-    result = compacted(scene, refiner, views)
-    assert not result.accepted and result.before.psnr < result.after.psnr < result.before.psnr + ACCEPTANCE.min_gain
-    assert result.verdict.startswith("not refined by the network, it brings less than 0.1 dB: ")
-    monkeypatch.setattr(acceptance, "ACCEPTANCE", AcceptanceSettings(min_gain=0.001))
-    assert compacted(scene, refiner, views).accepted
-
-
 def test_a_share_of_the_way_is_linear_in_what_is_stored_and_finite_where_the_start_is():
     before = room(20)
     before.opacities[0], before.scales[1, 2] = math.inf, -math.inf
@@ -185,14 +175,6 @@ def test_the_bottom_of_a_parabola_is_found_whatever_its_scale(scale):
     assert parabola_minimum(*[scale * value for value in (5, 2, 1)]) == pytest.approx(1.0)
     assert parabola_minimum(0.0, 0.0, 0.0) == 0.0
     assert math.isnan(parabola_minimum(scale, math.nan, scale)) and math.isnan(parabola_minimum(math.inf, 1, 1))
-
-
-def test_an_untrained_refiner_changes_nothing_and_it_is_said(scene, views):
-    result = compacted(scene, trained(tiny_refiner()), views)
-    assert not result.accepted and "not refined by the network, it changes nothing: " in result.verdict
-    assert same(result.scene, result.refined)
-    whole = compacted(scene, trained(tiny_refiner("scales", 0.1)), views, keep=1.0)
-    assert not whole.accepted and same(whole.scene, scene) and whole.before.psnr == math.inf
 
 
 def test_what_is_not_finite_never_gets_out(scene, views):
@@ -264,14 +246,6 @@ def test_the_scene_is_pruned_as_the_request_says(scene, views):
         compacted(scene, refiner, views, keep=401)
 
 
-def test_a_wanted_psnr_is_met_before_refinement_so_in_any_case(scene, views):
-    for moved in (2.0, -0.05):
-        refiner = trained(tiny_refiner("features_dc", moved))
-        result = compacted(scene, refiner, views, keep=WithinPsnr(24.0), by="coverage")
-        assert result.before.psnr >= 24 and DenseReference(scene, views).psnr(result.scene)[0] >= result.before.psnr
-        assert any(" sizes tried: " in note for note in result.notes)
-
-
 def test_a_degree_above_the_networks_is_refused_before_anything_is_done(scene, views, monkeypatch):
     refiner = trained(tiny_refiner(sh_degree=0))
     with monkeypatch.context() as patch:
@@ -282,11 +256,6 @@ def test_a_degree_above_the_networks_is_refused_before_anything_is_done(scene, v
     strong = scene.replace(features_rest=scene.features_rest * 20)  # auto keeps the band: only now it is known
     with pytest.raises(SceneError, match="SH degree 1.*at most 0"):
         compacted(strong, refiner, views, sh="auto")
-
-
-def test_views_smaller_than_the_window_of_ssim_are_compared_by_psnr_alone(scene):
-    result = compacted(scene, trained(tiny_refiner("scales", 0.2)), sample_views(scene, 2, 8, 6))
-    assert result.after.ssim is None and "(2 views of 8 pixels" in result.verdict
 
 
 def test_progress_names_what_is_done_and_never_goes_back(scene, views):

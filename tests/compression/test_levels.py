@@ -14,7 +14,7 @@ import torch
 import pointsplat_ns as ps
 from making import ball, normal_scene, same
 from pointsplat_ns.compression import level_folder
-from pointsplat_ns.compression.level_errors import FARTHER, displacement, median_depth
+from pointsplat_ns.compression.level_errors import displacement, median_depth
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.pruning.merging import merge, merge_levels
@@ -62,13 +62,6 @@ def test_every_level_has_exactly_as_many_gaussians_as_asked_for_the_finest_first
     assert [len(level.scene) for level in levels] == [200, 100, 40, 12]
     assert [len(s) for s in levels.scenes] == [200, 100, 40, 12] and len(levels) == 4
     assert all(level.scene.sh_degree == scene.sh_degree for level in levels)
-
-
-def test_levels_may_be_given_in_any_order_and_form(scene, levels, views):
-    mixed = ps.lod(scene, [12, "25%", 0.1, "200"], views=views)
-    for one, other in zip(levels, mixed, strict=True):
-        assert same(one.scene, other.scene) and torch.equal(one.parents, other.parents)
-    assert [len(level.scene) for level in ps.lod(scene, "40 3%", views=views)] == [40, 12]
 
 
 def test_a_level_by_size_fits_into_its_file(scene, views, tmp_path):
@@ -202,11 +195,6 @@ def test_the_displacements_in_the_manifest_follow_from_the_files(folder):
         assert level["displacement"]["p95"] == pytest.approx(np.percentile(moved, 95), rel=1e-9)
 
 
-def test_save_writes_what_is_written_on_the_way(folder, views, tmp_path):
-    ps.lod(folder.parent / "ball.ply", ASKED, views=views).save(tmp_path / "saved")
-    assert contents(tmp_path / "saved") == contents(folder)
-
-
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
@@ -307,16 +295,6 @@ def test_a_level_of_all_gaussians_is_the_scene_itself(scene, views, tmp_path):
     assert second["mse"] > 0 and second["psnr"] > 0 and second["dropped"] == 40
 
 
-@pytest.mark.parametrize("asked", ["100%", "1"])
-def test_a_scene_of_one_gaussian_has_one_level(asked, short_search, tmp_path):
-    one = normal_scene(1)
-    levels = ps.lod(one, [asked], folder=tmp_path / "out")
-    assert same(levels[0].scene, one) and levels[0].parents.tolist() == [0]
-    assert manifest_of(tmp_path / "out")["levels"][0]["count"] == 1
-    with pytest.raises(ps.BudgetError, match="levels 50% and 25% both mean 1 of 1 Gaussians"):
-        ps.lod(one)
-
-
 def test_where_nothing_can_be_seen_levels_are_made_and_not_measured(scene, short_search, tmp_path):
     faint = scene.replace(opacities=torch.full_like(scene.opacities, -7.0))
     levels = ps.lod(faint, ["50%"], folder=tmp_path / "out")
@@ -328,54 +306,12 @@ def test_where_nothing_can_be_seen_levels_are_made_and_not_measured(scene, short
     assert set(contents(tmp_path / "out")) == {"level_0.ply", "level_0_parents.npy", "lod.json"}
 
 
-def test_gaussians_that_cannot_be_drawn_are_left_out_before_all_else(scene, views, tmp_path, caplog):
-    spoiled = ps.Gaussians(*(value.clone() for value in scene.tensors()))
-    spoiled.means[5], spoiled.scales[7] = math.nan, math.inf
-    levels = ps.lod(spoiled, ["50%", "10%"], views=views, folder=tmp_path / "out")
-    assert "dropped 2 of 400" in caplog.text
-    assert len(levels.dense) == len(levels.assignment(0)) == 398
-    assert [len(ps.load(tmp_path / "out" / f"level_{i}.ply")) for i in (0, 1)] == [199, 40]
-    with pytest.raises(ps.SceneError, match="none of the 400 Gaussians can be drawn"):
-        ps.lod(scene.replace(means=scene.means * math.nan))
-
-
 def test_bands_are_cut_for_all_levels_and_the_error_is_against_all_bands(scene, views):
     cut = ps.lod(scene, ["100%", "10%"], sh="0", views=views)
     assert [level.scene.sh_degree for level in cut] == [0, 0] and cut.dense.sh_degree == 1
     assert 0 < cut[0].errors.near.error < cut[1].errors.near.error
     assert any(note.startswith("SH degree 1 cut to 0") for note in cut.notes)
     assert same(cut[1].scene, ps.prune(scene, "10%", sh="0", views=views))
-
-
-def test_errors_are_those_that_compact_and_auto_budgets_go_by(scene, views, levels):
-    reference = DenseReference(scene, views)
-    for level in levels:
-        assert level.errors.near == reference.closeness(level.scene)
-
-
-def test_views_smaller_than_a_square_lack_it(scene):
-    views = ps.sample_views(scene, 1, 12, 9)
-    levels = ps.lod(scene, ["10%"], views=views)
-    assert list(levels[0].errors.farther) == [side for side in FARTHER if side <= 9]
-    assert levels[0].errors.near.ssim is None, "SSIM's window is larger, too"
-
-
-def test_the_same_scene_gives_the_same_bits(scene, views, levels):
-    again = ps.lod(scene, ASKED, views=views)
-    for one, other in zip(levels, again, strict=True):
-        assert same(one.scene, other.scene) and one.errors == other.errors and one.displacement == other.displacement
-
-
-def test_progress_may_be_watched(scene, views):
-    steps = []
-    ps.lod(scene, ["50%", "10%"], views=views, progress=lambda what, share: steps.append((what, share)))
-    assert list(dict.fromkeys(what for what, _ in steps)) == [
-        "rendering the dense scene",
-        "merging",
-        "measuring level 0 of 1",
-        "measuring level 1 of 1",
-    ]
-    assert all(0 <= share <= 1 for _, share in steps)
 
 
 def test_the_distance_is_that_of_what_is_seen():

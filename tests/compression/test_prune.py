@@ -11,7 +11,7 @@ import torch
 from making import ball, same
 from pointsplat_ns.compression.distributions import opacity_quantiles, plot_distributions, size_quantiles
 from pointsplat_ns.compression.prune import Pruned, prune_scene
-from pointsplat_ns.compression.requests import SH_CHOICES, PruneRequest
+from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import DenseReference
@@ -148,17 +148,6 @@ def test_what_is_no_scene_is_refused(scene):
 def test_options_that_fit_no_scene_are_refused_without_one(options, message):
     with pytest.raises(PointSplatError, match=message):
         PruneRequest(**{"keep": 0.5, "by": "paper", **options})
-
-
-@pytest.mark.parametrize("by", sorted(name for name, method in METHODS.items() if not method.weighs_opacity))
-def test_an_opacity_weight_is_refused_by_every_method_that_has_none(by):
-    with pytest.raises(PointSplatError, match="choose one of paper, authors, log-volume"):
-        PruneRequest(0.5, by, opacity_weight=0.5)
-
-
-@pytest.mark.parametrize("sh", SH_CHOICES)
-def test_every_choice_of_bands_may_be_asked_for_and_text_is_parsed(sh):
-    assert PruneRequest("10%", sh=sh).budget == 0.1
 
 
 def test_distributions_are_numbers_and_a_picture(scene, tmp_path):

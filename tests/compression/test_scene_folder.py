@@ -13,9 +13,9 @@ import pytest
 
 from making import cloud, same
 from pointsplat_ns.compression import scene_folder
-from pointsplat_ns.compression.scene_folder import Command, Shard, output_folder, run_on_folder
+from pointsplat_ns.compression.scene_folder import Command, Shard, run_on_folder
 from pointsplat_ns.compression.scene_task import SceneTask
-from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import read_ply, write_ply
 from pointsplat_ns.system import workers
 from pointsplat_ns.system.claims import claim
@@ -169,28 +169,6 @@ def test_shards_are_disjoint_and_the_last_one_has_the_whole_table(folder):
     assert [row["name"] for row in table(folder) if row["status"] == "open"] == ["a"]
 
 
-def test_processes_of_a_shard_share_it():
-    whole = list(range(23))
-    every = [Shard(index, 3).within(rank, 4).part(whole) for index in (1, 2, 3) for rank in range(4)]
-    assert sorted(sum(every, [])) == whole
-
-
-@pytest.mark.parametrize("text", ["0/3", "4/3", "1/0", "a/b", "1", "-1/3", "1/3/5", ""])
-def test_a_shard_that_is_none_is_refused(text):
-    with pytest.raises(DataError, match="shard .*expected"):
-        Shard.of(text)
-
-
-def test_results_among_the_scenes_are_not_taken_for_scenes(folder):
-    command = command_in(folder.parent)
-    for name in ("small", "small"):
-        results = run_on_folder(folder, folder / name, command)
-    assert [result.name for result in results] == ["a", "b", "deep/c"]
-    assert len(run_on_folder(folder, folder / "other", command)) == 3
-    with pytest.raises(SceneError, match="holds the scenes themselves"):
-        run_on_folder(folder, folder / "deep" / "..", command)
-
-
 def test_a_damaged_record_or_description_is_never_believed(folder):
     settle(folder)
     record = folder.parent / "small" / "a.ply.json"
@@ -239,18 +217,6 @@ def test_processes_that_are_killed_lose_no_scene_and_make_none_twice(tmp_path, m
     assert all(len(read_ply(results[name].output)) == 2 for name in done)
     assert shares[0] == 0 and shares[-1] == 1 and shares == sorted(shares)
     assert len(table(folder)) == 30
-
-
-def test_no_processes_are_refused(folder):
-    with pytest.raises(DataError, match="jobs is 0"):
-        settle(folder, jobs=0)
-
-
-def test_results_go_beside_the_folder_by_default(monkeypatch, tmp_path):
-    (tmp_path / "scenes").mkdir()
-    monkeypatch.chdir(tmp_path / "scenes")
-    for path in (Path("."), tmp_path / "scenes", Path("../scenes/")):
-        assert output_folder(path, "compact") == tmp_path / "scenes_compact"
 
 
 def test_what_the_folder_cannot_take_is_one_line(folder, monkeypatch):

@@ -10,12 +10,10 @@ import struct
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import pointsplat_ns as ps
 from making import SHARED_DATA, cloud, normal_scene, same_bits
-from pointsplat_ns.gaussians import SH_C0, Gaussians
+from pointsplat_ns.gaussians import SH_C0
 from pointsplat_ns.geometry.quaternions import zero_as_identity
 from pointsplat_ns.io.formats import FORMATS, format_to_read, format_to_write
 from pointsplat_ns.io.formats.registry import format_named
@@ -90,18 +88,6 @@ def test_a_scene_comes_back_within_half_a_step_of_its_format(tmp_path, suffix, d
         assert_close(suffix, before, after)
 
 
-@given(data=st.data())
-@settings(max_examples=5, deadline=None)
-@pytest.mark.parametrize("suffix", LOSSY)
-def test_writing_again_what_was_read_changes_nothing_to_speak_of(tmp_path_factory, suffix, data):
-    n, degree = data.draw(st.integers(1, 40)), data.draw(st.integers(0, 3))
-    folder = tmp_path_factory.mktemp("twice")
-    first, _ = written(mild(n, degree, data.draw(st.integers(0, 2**31))), folder / name_of(suffix))
-    second, ordered = written(first, folder / name_of(suffix))
-    assert greatest(ordered.alphas - second.alphas) <= 1e-6  # a byte stays the same byte
-    assert_close(suffix, ordered, second)
-
-
 @pytest.mark.parametrize("suffix", LOSSY)
 def test_opacities_of_exactly_0_and_1_come_back_as_finite_logits(tmp_path, suffix):
     scene = cloud(4, 0, 0).replace(opacities=torch.tensor([[torch.inf], [-torch.inf], [20.0], [-20.0]]))
@@ -111,30 +97,7 @@ def test_opacities_of_exactly_0_and_1_come_back_as_finite_logits(tmp_path, suffi
     assert bool((after.alphas[before.alphas < 0.5] < 1 / 255).all())  # what was not drawn is not drawn
 
 
-@pytest.mark.parametrize("suffix", (*LOSSY, ".ply", ".glb", "meta.json"))
-@pytest.mark.parametrize("degree", [0, 3])
-def test_a_scene_of_nothing_is_written(tmp_path, suffix, degree):
-    ps.save(Gaussians.empty(degree), tmp_path / name_of(suffix))
-    if suffix != ".glb":
-        assert len(ps.load(tmp_path / name_of(suffix))) == 0
-
-
-@pytest.mark.parametrize("suffix", LOSSY)
-def test_flat_gaussians_zero_quaternions_and_great_numbers_survive(tmp_path, suffix):
-    scene = mild(300, 1)
-    scene.scales[0] = -torch.inf
-    scene.quats[1] = 0
-    scene.means[2] = 1000.0
-    scene.features_dc[3] = 50.0
-    after, before = written(scene, tmp_path / name_of(suffix))
-    assert len(after) == 300
-    flat = before.scales[:, 0] == -torch.inf
-    assert bool((after.scales[flat] <= -9.9).all())
-    assert float(degrees_apart(before, after).max()) < 1.1
-    assert greatest(before.means - after.means) <= 2.0
-
-
-@pytest.mark.parametrize("suffix", LOSSY)
+@pytest.mark.parametrize("suffix", (*LOSSY, ".ply"))
 def test_gaussians_that_cannot_be_drawn_are_left_out(tmp_path, suffix, caplog):
     scene = cloud(5, 0, 1)
     scene.means[2, 1] = torch.nan

@@ -1,6 +1,5 @@
 """3DGS PLY files: exact to the bit on the way out and back, and clear about damage."""
 
-import logging
 import math
 import os
 from unittest import mock
@@ -36,19 +35,13 @@ def column_names(degree):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("n", [0, 1, 7])
+@pytest.mark.parametrize("n", [0, 1, 16_384 + 3])  # the last crosses a boundary of chunks
 def test_round_trip_is_exact_to_the_bit(tmp_path, n, degree):
     scene = normal_scene(n, degree)
     write_ply(scene, tmp_path / "a.ply")
     back = read_ply(tmp_path / "a.ply")
     assert back.sh_degree == degree and same_bits(scene, back)
     assert all(value.is_contiguous() for value in back.tensors())
-
-
-def test_round_trip_crosses_the_boundaries_of_chunks(tmp_path):
-    scene = normal_scene(16_384 + 3, 0)
-    write_ply(scene, tmp_path / "a.ply")
-    assert same_bits(scene, read_ply(tmp_path / "a.ply"))
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -197,19 +190,6 @@ def test_lists_before_the_gaussians_are_passed_over_in_ascii_and_refused_in_bina
     fails(tmp_path / "False.ply", "element 'face' of lists stands before 'vertex'")
 
 
-def test_rows_without_meaning_are_dropped_counted_and_said(tmp_path, caplog):
-    scene = normal_scene(6, 1)
-    path = tmp_path / "a.ply"
-    write_ply(scene, path)
-    rows = rows_of(path)
-    rows["x"][1], rows["f_rest_4"][3], rows["scale_2"][4] = math.nan, math.inf, math.inf
-    rewrite(path, rows, byte_order="<")
-    with caplog.at_level(logging.WARNING, "pointsplat_ns"):
-        back = read_ply(path)
-    assert same_bits(scene[[0, 2, 5]], back)
-    assert [r.getMessage() for r in caplog.records] == [f"{path}: dropped 3 of 6 Gaussians with NaN or infinite values"]
-
-
 def test_a_double_beyond_float32_is_dropped_not_read_as_infinite(tmp_path):
     write_ply(normal_scene(3, 0), tmp_path / "a.ply")
     rows = rows_of(tmp_path / "a.ply")
@@ -217,14 +197,6 @@ def test_a_double_beyond_float32_is_dropped_not_read_as_infinite(tmp_path):
     wide["y"][1] = 1e300
     rewrite(tmp_path / "b.ply", wide, byte_order="<")
     assert len(read_ply(tmp_path / "b.ply")) == 2
-
-
-def test_writing_leaves_out_rows_without_meaning_too(tmp_path, caplog):
-    means = torch.zeros(4, 3)
-    means[2] = math.nan
-    write_ply(normal_scene(4, 0).replace(means=means), tmp_path / "a.ply")
-    assert len(rows_of(tmp_path / "a.ply")) == 3
-    assert "dropped 1 of 4" in caplog.text
 
 
 def test_double_scenes_and_scenes_in_a_graph_can_be_written(tmp_path):

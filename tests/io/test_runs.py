@@ -47,14 +47,6 @@ def test_a_run_of_nerfstudio_is_read_whole(make_run, tmp_path):
     assert run.is_gaussian_scene
 
 
-def test_dataparser_fields_rebuild_the_dataparser_that_was_saved(make_run):
-    nerfstudio_dataparser = pytest.importorskip("nerfstudio.data.dataparsers.nerfstudio_dataparser")
-    run = open_run(make_run())
-    config = nerfstudio_dataparser.NerfstudioDataParserConfig
-    assert run.dataparser_class == f"{config.__module__}.{config.__qualname__}"
-    assert config(data=run.data, **run.dataparser_fields) == config(data=run.data, load_3D_points=True)
-
-
 @pytest.mark.parametrize("within", ["", "config.yml", "nerfstudio_models/step-000001999.ckpt"])
 def test_a_run_opens_by_any_of_its_names(make_run, within):
     folder = make_run(steps=(1999, 9999))
@@ -135,13 +127,6 @@ def test_missing_data_is_said_with_what_was_tried_and_only_where_needed(make_run
     )
     assert str(open_run(folder, need_data=False).data) == "data/kitchen"
     assert len(read_scene(folder)) == 5
-
-
-def test_absolute_data_is_tried_as_it_is(make_run, tmp_path):
-    folder = make_run()
-    text = (folder / "config.yml").read_text().replace("- data\n", f"- {tmp_path}/gone\n")
-    (folder / "config.yml").write_text(text)
-    fails(lambda: open_run(folder), f"{tmp_path}/gone/kitchen is not there; tried {tmp_path}/gone/kitchen;")
 
 
 def test_the_dataparsers_data_counts_where_the_datamanager_has_none(make_run, tmp_path):

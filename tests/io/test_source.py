@@ -35,13 +35,6 @@ def test_a_sog_folder_is_known_by_all_its_files(tmp_path):
     assert source_file(folder).sha256 != source.sha256
 
 
-def test_levels_are_made_of_a_sog_folder(tmp_path):
-    folder = tmp_path / "room"
-    ps.save(normal_scene(40), folder / "meta.json")
-    ps.lod(folder, ["50%"], folder=tmp_path / "levels")
-    assert len(ps.load(tmp_path / "levels" / "level_0.ply")) == 20
-
-
 @pytest.mark.parametrize("name", ["missing.ply", "missing"])
 def test_what_is_not_there_is_one_error(tmp_path, name):
     with pytest.raises(ps.SceneError, match=name):

@@ -180,49 +180,6 @@ def test_a_scene_of_few_large_gaussians_has_views_as_well(make_hollow_ball):
     assert len(sample_views(make_hollow_ball(40), 4, 64, 48)) == 4
 
 
-ALL_OFF = dataclasses.replace(
-    DEFAULTS,
-    outlier_quantiles=(0.0, 1.0),
-    max_area_quantile=1.0,
-    energy_exponent=0.0,
-    flatness_exponent=0.0,
-    flatness_exponent_without_sh=0.0,
-    max_log_factor=0.0,
-    promising_share=0.0,
-    min_surface_opacity=0.0,
-    surface_exponent=0.0,
-    min_uprightness=0.0,
-    usual_axis_factors=(0.0, 0.0),
-    usual_axis_factors_with_photos=(0.0, 0.0),
-    photo_level_weight=0.0,
-    min_seen_from_above=math.inf,
-    min_box_half_side=0.0,
-    eye_heights=(0.0, 1.0),
-    target_share=0.0,
-    photo_target_distance=math.inf,
-    min_photo_value=0.0,
-    half_gain_distance=math.inf,
-    half_gain_angle=math.inf,
-    min_clearance=0.0,
-    min_clearance_photos=0.0,
-    max_near_pixels=2.0,
-    min_alpha_inside=0.0,
-    min_alpha_outside=0.0,
-    max_blur=math.inf,
-    coarse_blur=0.0,
-    blur_growth=1.0,
-)
-"""Settings with each rule turned off that can be turned off and leaves photo places."""
-
-
-@pytest.mark.parametrize("make", [photographed, room])
-def test_views_are_sampled_with_all_rules_turned_off(make):
-    scene = make()
-    views = sample_views(scene, 4, 64, 48, settings=ALL_OFF)
-    assert len(views) == 4 and bool(views.viewmats.isfinite().all())
-    assert not torch.equal(views.viewmats, sample_views(scene, 4, 64, 48).viewmats)
-
-
 @pytest.mark.parametrize("off", [{"photo_share": 0.0}, {"min_sh_evidence": math.inf}])
 def test_views_near_photo_places_can_be_turned_off(off):
     """Not the estimate of up, which uses photo places as well: it is given."""

@@ -44,13 +44,6 @@ def test_z_or_minus_y_is_up_where_the_scene_stands_along_it(axis):
     assert pointing_up(surface, upright_axis(surface)).direction.tolist() == list(axis)
 
 
-def test_minus_y_is_found_where_a_scene_has_the_axes_of_its_first_camera():
-    scene = turned(tower(), Rotation.from_euler("x", 90, degrees=True))
-    surface = Surface.of(scene, *content_size(scene))
-    up = pointing_up(surface, upright_axis(surface)).direction
-    assert torch.equal(up, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
-
-
 def test_up_is_z_without_evidence():
     scene = ball(3000, log_size=math.log(0.05))
     surface = Surface.of(scene, *content_size(scene))

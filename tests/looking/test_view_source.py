@@ -109,18 +109,6 @@ def test_views_that_are_sampled_beside_too_few_known_ones_are_drawn_as_these_are
     assert next(ViewSource(scene, given=given).others()).rasterize_mode == "antialiased"
 
 
-def test_views_are_spread_resized_and_checked(ball_views):
-    assert torch.equal(ball_views.spread(2).viewmats, ball_views.viewmats[[0, 3]])
-    assert ball_views.spread(9) is ball_views
-    half = ball_views.resized(32)
-    assert (half.width, half.height) == (32, 24) and torch.allclose(half.Ks[:, :2], ball_views.Ks[:, :2] / 2)
-    assert ball_views.resized(64) is ball_views
-    with pytest.raises(DataError, match="viewmats of the views has shape"):
-        Views(torch.eye(4), ball_views.Ks, 8, 8, torch.zeros(3))
-    with pytest.raises(DataError, match="0 x 8 pixels"):
-        Views(ball_views.viewmats, ball_views.Ks, 0, 8, torch.zeros(3))
-
-
 def test_sampled_poses_near_photo_places_say_so(monkeypatch):
     asked = []
     photos = PhotoPlaces(torch.tensor([[0.5, 0.0, 0.0]], dtype=torch.float64), torch.ones(1))

@@ -48,13 +48,6 @@ def test_ssim_is_torchmetrics_away_from_the_border(shape):
     assert torch.allclose(ssim(a, b), expected, atol=1e-6)  # windows summed in another order
 
 
-@pytest.mark.parametrize("value", [0.0, 1e-4, 0.5, 1.0])
-def test_ssim_of_identical_flat_images_is_1(value):
-    image = torch.full((16, 16, 3), value)
-    # 1e-3: float32 cancellation in the variances, about 1e-7, against the constant 9e-4
-    assert float(ssim(image, image)) == pytest.approx(1.0, abs=1e-3)
-
-
 def test_ssim_in_float32_is_ssim_in_float64_on_dark_bright_and_striped_images():
     a, b = pair(24, 24, dtype=torch.float64)
     stripes = (torch.arange(24) % 2).double()[:, None, None].expand(24, 24, 3)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from unittest import mock
 
 import cv2
 import numpy as np
@@ -17,18 +15,14 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, Datapa
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.trainer import Trainer
-from nerfstudio.process_data import process_data_utils
-from nerfstudio.scripts.process_data import ProcessPolycam, ProcessRecord3D
 
-from captures import BAD, FRAMES, HEIGHT, SEEDS, WIDTH, Capture, Lens, colors_at, seen_from
+from captures import BAD, FRAMES, SEEDS, Capture, Lens, colors_at, seen_from
 from making import pipeline_of
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.nerfstudio_plugin.frames import Frame
 from pointsplat_ns.nerfstudio_plugin.scannetpp import SeededScanNetppDataParserConfig
 
 FISHEYE = Lens("OPENCV_FISHEYE", (0.02, -0.01, 0.003, -0.001), focal=(30.0, 30.5))
-SQUARE = Lens(focal=(45.0, 45.0), center=(WIDTH / 2, HEIGHT / 2))
-"""All that Record3D's converter takes over of the intrinsics."""
 
 
 @dataclass
@@ -38,8 +32,6 @@ class Layout:
     lens: Lens
     write: Callable[[Capture, Path], Path]
     dataparser: Callable[[], DataParserConfig]
-    seeds: bool = True
-    """Whether points come with the capture."""
     frames: int = FRAMES
     """Photos that are used."""
     wrong: float = 0.002
@@ -50,24 +42,6 @@ def as_colmap(capture: Capture, folder: Path) -> Path:
     names = capture.write_photos(folder / "images")
     capture.write_colmap(folder / "colmap/sparse/0", names)
     return folder
-
-
-def copied(image_paths: list[Path], image_dir: Path, **options) -> list[Path]:
-    """What nerfstudio has ffmpeg do with photos that are not to be made smaller, but for compressing them again."""
-    paths = [image_dir / f"frame_{number:05d}{path.suffix}" for number, path in enumerate(image_paths, 1)]
-    for path, source in zip(paths, image_paths, strict=True):
-        shutil.copy(source, path)
-    return paths
-
-
-def processed(process: Callable, write: Callable[[Capture, Path], Path], **options) -> Callable[[Capture, Path], Path]:
-    def written(capture: Capture, folder: Path) -> Path:
-        raw = write(capture, folder / "raw")
-        with mock.patch.object(process_data_utils, "copy_images_list", copied):
-            process(data=raw, output_dir=folder / "processed", num_downscales=0, **options).main()
-        return folder / "processed"
-
-    return written
 
 
 def nerfstudio_data() -> NerfstudioDataParserConfig:
@@ -89,17 +63,6 @@ LAYOUTS = {
     ),
     "scannetpp-seeded": Layout(
         FISHEYE, Capture.write_scannetpp, SeededScanNetppDataParserConfig, frames=FRAMES - len(BAD)
-    ),
-    # Polycam and Record3D write JPEG files.
-    "polycam": Layout(
-        Lens(),
-        processed(ProcessPolycam, Capture.write_polycam, crop_border_pixels=0),
-        nerfstudio_data,
-        seeds=False,
-        wrong=0.0045,
-    ),
-    "record3d": Layout(
-        SQUARE, processed(ProcessRecord3D, Capture.write_record3d), nerfstudio_data, seeds=False, wrong=0.0045
     ),
 }
 
@@ -164,9 +127,6 @@ def test_a_scene_starts_from_the_points_of_the_capture_and_learns(trained):
     learns = np.mean(trained.losses[-photos:]) < 0.98 * np.mean(trained.losses[:photos])
     assert learns or len(trained.losses) == 1
     outputs = trained.outputs
-    if not trained.layout.seeds:
-        assert "points3D_xyz" not in outputs.metadata
-        return
     transform = outputs.dataparser_transform.double()
     points = torch.from_numpy(trained.capture.seeds)
     placed = (points @ transform[:, :3].T + transform[:, 3]) * outputs.dataparser_scale

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
-from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetppDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
 
-from making import SHARED_DATA
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
-
-FOX = SHARED_DATA / "scannetpp/fox"
 
 
 def datamanagers(wall_scene, **settings):
@@ -71,16 +66,3 @@ def test_more_than_500_photos_need_neither_pinned_memory_nor_room(tmp_path):
     manager = config.setup(device="cpu")
     indices = [manager.next_train(step)[1]["image_idx"] for step in range(6)]
     assert len(set(indices)) == 6 and manager.frame_cache.num_bytes <= 1e4
-
-
-def test_real_photos_with_lens_distortion_are_undone_alike_in_training_and_evaluation():
-    if not FOX.exists():
-        pytest.skip(f"{FOX} is not here")
-    manager = LazyImageDatamanagerConfig(dataparser=ScanNetppDataParserConfig(data=FOX)).setup(device="cpu")
-    _, train = manager.next_train(0)
-    train_camera = manager.train_frames[train["image_idx"]][0]
-    eval_camera, held_out = manager.next_eval(0)
-    assert manager.train_dataset.lens_cameras.distortion_params.any()
-    assert train_camera.distortion_params is None and eval_camera.distortion_params is None
-    assert torch.equal(train_camera.get_intrinsics_matrices(), eval_camera.get_intrinsics_matrices())
-    assert train["image"].shape == held_out["image"].shape != (640, 360, 3)

@@ -126,20 +126,6 @@ def test_negative_indices_count_from_the_end_and_outside_is_an_index_error(tmp_p
     assert [data["image_idx"] for _, data in frames] == [0, 1, 2, 3, 4]
 
 
-def test_cache_stays_within_its_bytes_and_drops_the_longest_unused(tmp_path):
-    photo = WIDTH * HEIGHT * 3
-    cache = MemoryCache(max_bytes=2 * photo)
-    dataset = make_dataset(tmp_path)
-    frames = Frames(dataset, cache=cache)
-    reads = []
-    read = dataset.get_data
-    dataset.get_data = lambda index, **kwargs: reads.append(index) or read(index, **kwargs)
-    for index in (0, 1, 0, 2, 0, 1):
-        assert frames[index][1]["image_idx"] == index
-        assert cache.num_bytes <= cache.max_bytes
-    assert reads == [0, 1, 2, 1] and len(cache) == 2
-
-
 def test_two_scenes_share_a_cache_without_mixing(tmp_path):
     (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
     cache = MemoryCache(max_bytes=10**9)
@@ -165,26 +151,6 @@ def test_prefetched_photos_are_decoded_once_by_another_thread(tmp_path):
     assert frames[1][1]["image_idx"] == 1 and frames[2][1]["image_idx"] == 2
     assert sorted(index for index, _ in readers) == [1, 2]
     assert all(name.startswith("frames") for _, name in readers)
-
-
-def test_many_threads_get_the_right_photos(tmp_path):
-    dataset = make_dataset(tmp_path)
-    expected = [dataset.get_data(i, image_type="uint8")["image"] for i in range(5)]
-    frames = Frames(dataset, cache=MemoryCache(max_bytes=2 * WIDTH * HEIGHT * 3))
-    wrong = []
-
-    def work(seed):
-        for index in np.random.default_rng(seed).integers(0, 5, 30):
-            frames.prefetch([(int(index) + 1) % 5])
-            if not torch.equal(frames[int(index)][1]["image"], expected[index]):
-                wrong.append(index)
-
-    threads = [threading.Thread(target=work, args=(seed,)) for seed in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert wrong == []
 
 
 def test_writing_to_what_was_handed_out_does_not_change_the_next(tmp_path):

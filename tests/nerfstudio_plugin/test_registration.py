@@ -71,7 +71,7 @@ def test_any_module_may_come_first_and_imports_no_network_no_cuda_and_little_els
     # nerfstudio imports entry points from inside its own imports, so the order decides what is half imported.
     # (That nerfstudio itself may come first is what every test that parses its command line proves.)
     modules = (
-        *("replica.dataparser", "scannetpp", "frames", "splatfacto_cpu.model", "pointsplat.config"),
+        *("replica.dataparser", "splatfacto_cpu.model"),
         "pointsplat.scenes",  # what dataset_views imports
     )
     cases = ["method_configs.methods", *(f"pointsplat_ns.nerfstudio_plugin.{name}" for name in modules), "new modules"]

@@ -43,14 +43,6 @@ def test_a_warning_that_differs_in_anything_is_printed(known, change):
     assert printed(text, category, module) == [text]
 
 
-def test_quieting_twice_adds_no_filter():
-    with warnings.catch_warnings():
-        quiet_nerfstudio()
-        once = list(warnings.filters)
-        quiet_nerfstudio()
-        assert list(warnings.filters) == once
-
-
 @pytest.mark.parametrize(
     ("known", "shown"),
     [(JIT_SCRIPT, ""), (KnownWarning("another thing", FutureWarning, JIT_SCRIPT.module), "FutureWarning: another")],

@@ -216,27 +216,6 @@ def test_shift_shifts_and_the_wheel_comes_nearer_once_the_picture_was_clicked(op
     settle(opened)
 
 
-def test_two_fingers_shift_and_come_nearer(opened):
-    opened.execute_script("flight.setDrag('orbit'); scrollTo(0, 0)")
-    left, top = opened.execute_script("const { x, y } = flight.canvas.getBoundingClientRect(); return [x, y]")
-
-    def touch(kind: str, *places: tuple[float, float]) -> None:
-        points = [{"x": left + x, "y": top + y, "id": number} for number, (x, y) in enumerate(places)]
-        opened.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
-
-    start, reach = camera(opened), opened.execute_script("return flight.camera.reach")
-    touch("touchStart", (20, 60), (40, 60))
-    touch("touchMove", (20, 60), (60, 60))
-    nearer = opened.execute_script("return flight.camera.reach")
-    assert nearer == pytest.approx(reach / 2), "fingers twice as far apart"
-    touch("touchMove", (20, 80), (60, 80))
-    touch("touchEnd")
-    moved = np.subtract(camera(opened)["eye"], start["eye"])
-    assert camera(opened)["ahead"] == start["ahead"] and np.dot(moved, start["down"]) < 0, "what is seen goes down"
-    assert opened.execute_script("return flight.controls.pointers.size") == 0
-    settle(opened)
-
-
 def test_what_is_upside_down_is_turned_over_and_stays_so(opened):
     opened.execute_script("flight.setWipe(1)")
     before, up = picture(opened), opened.execute_script("return flight.camera.up")
@@ -247,15 +226,6 @@ def test_what_is_upside_down_is_turned_over_and_stays_so(opened):
         assert np.allclose(opened.execute_script("return flight.camera.up"), np.negative(up))
     opened.find_element(By.TAG_NAME, "canvas").send_keys("t")
     assert torch.equal(picture(opened), before)
-
-
-def test_steep_looks_stop_before_up_changes_sides(opened):
-    for _ in range(3):
-        opened.execute_script("flight.setDrag('look'); for (let i = 0; i < 40; i++) flight.camera.turn(0.1, 0.1)")
-        state = camera(opened)
-        up = opened.execute_script("return flight.camera.up")
-        assert 0.9 < np.dot(state["ahead"], up) <= 0.99 + 1e-9 and np.dot(state["down"], up) < 0
-        assert np.allclose(np.cross(state["down"], state["ahead"]), state["right"], atol=1e-12)
 
 
 def test_a_browser_without_workers_or_floats_draws_the_same(browser, written, opened):
@@ -310,20 +280,3 @@ def test_page_fits_a_phone_follows_the_colours_of_the_reader_and_names_its_contr
     assert opened.execute_script(script) == []
     names = [name.text for name in opened.find_elements(By.CSS_SELECTOR, ".flight-name strong")]
     assert names == ["dense", "compact"]
-
-
-def test_frames_are_counted_while_it_moves_and_fewer_pixels_drawn_where_that_is_slow(opened):
-    # Frames at times that are said, in one go: on a busy machine it would stand still between them.
-    script = """[flight.times, flight.detail] = [[], 1];
-      for (let frame = 0; frame < 8; frame++) {
-        flight.camera.turn(0.02, 0);
-        flight.change();
-        flight.show(1000 + arguments[0] * frame);
-      }
-      return [flight.part.rate.textContent, flight.detail];"""
-    assert opened.execute_script(script, 20) == ["50 frames/s", 1]
-    assert opened.execute_script(script, 500) == ["2 frames/s", 0.5]
-    drawn = "flight.detail = 0.25; flight.change(); flight.paint(); return flight.drawer.width"
-    assert opened.execute_script(drawn) == 48
-    settle(opened)
-    assert opened.execute_script("return flight.drawer.width") == 192

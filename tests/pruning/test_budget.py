@@ -4,13 +4,10 @@ import math
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pointsplat_ns.errors import BudgetError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import write_ply
 from pointsplat_ns.pruning import Megabytes, WithinPsnr, parse_keep, ply_bytes, resolve_keep
 
 
@@ -125,18 +122,6 @@ def test_few_gaussians_of_many_are_asked_about_unless_they_are_called_so():
 def test_a_typed_budget_that_is_none_is_refused(text):
     with pytest.raises(BudgetError, match="expected a ratio"):
         parse_keep(text)
-
-
-def scene_of(n, degree):
-    sizes = [(n, 3), (n, 3), (n, 4), (n, 1), (n, 3), (n, (degree + 1) ** 2 - 1, 3)]
-    return Gaussians(*(torch.zeros(size) for size in sizes))
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("n", [0, 1, 9, 10, 1234])
-def test_the_size_is_that_of_the_file(degree, n, tmp_path):
-    write_ply(scene_of(n, degree), tmp_path / "scene.ply")
-    assert ply_bytes(n, degree) == (tmp_path / "scene.ply").stat().st_size
 
 
 @settings(max_examples=200)

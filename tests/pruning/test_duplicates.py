@@ -12,7 +12,6 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import duplicates
 from pointsplat_ns.pruning.duplicates import Copies, stacked
 from pointsplat_ns.pruning.merging import merge, merge_levels
-from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
 
 
@@ -111,23 +110,3 @@ def test_levels_with_copies_are_nested_and_exact():
         parents[finer.assignment] = coarser.assignment
         assert torch.equal(parents[finer.assignment], coarser.assignment)
     assert same(levels[3].scene, next(merge_levels(scene, counts[3:])).scene)
-
-
-def test_renders_without_the_copies_are_those_with_them():
-    scene = cloud(40)
-    scene = Gaussians.cat([scene, scene[:20], scene[:20], scene[10:20]])
-    reduced = Copies(scene, torch.arange(len(scene))).reduced(40).scene
-
-    def drawn(some: Gaussians) -> torch.Tensor:
-        view, size = torch.eye(4), 64
-        view[:3, 3] = torch.tensor([-0.5, -0.5, 1.5])
-        K = torch.tensor([[size * 1.2, 0, size / 2], [0, size * 1.2, size / 2], [0, 0, 1.0]])
-        args = (some.means, some.quats, some.stds, some.alphas, some.sh, view[None], K[None], size, size)
-        return rasterization(*args, sh_degree=some.sh_degree)[0][0]
-
-    whole = drawn(scene)
-    trials = reduced, scene[:40], reduced.replace(scales=scene.scales[:40])
-    loss, dropped, not_grown = (float((drawn(some) - whole).square().mean()) for some in trials)
-    assert len(reduced) == 40 and same(scene[20:40], reduced[20:])
-    assert dropped > 1e-3  # the copies are seen
-    assert loss < dropped / 10 and loss < not_grown / 4

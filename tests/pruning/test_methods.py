@@ -137,18 +137,6 @@ def test_a_method_that_does_not_exist_or_does_not_take_its_options_is_refused(by
     assert isinstance(caught.value, DataError) == ("expected views" in message)
 
 
-def test_a_smaller_budget_keeps_a_subset_of_a_larger_one():
-    scene = normal_scene(200, 1)
-    sets = [set(kept(scene, keep).tolist()) for keep in (0.1, 0.3, 0.5)]
-    assert sets[0] < sets[1] < sets[2]
-
-
-def test_pruning_does_not_depend_on_the_unit_of_length():
-    scene = normal_scene(200, 1)
-    metres = scene.replace(means=scene.means * 1000, scales=scene.scales.double().add(math.log(1000)).float())
-    assert kept(scene, 0.3).tolist() == kept(metres, 0.3).tolist()
-
-
 def test_the_opacity_weight_reaches_the_score():
     scene = normal_scene(50, 1)
     most_opaque = scene.opacities[:, 0].topk(10).indices.sort().values

@@ -59,13 +59,6 @@ def test_without_variance_every_score_is_zero(case):
     assert paper_score(scene).tolist() == [0.0] * n
 
 
-def test_infinite_logits_are_opacity_1_and_0():
-    logits = torch.tensor([[math.inf], [-math.inf], [0.0], [40.0]])
-    score = paper_score(normal_scene(4, 1).replace(opacities=logits, scales=torch.zeros(4, 3)), 1.0)
-    assert score.isfinite().all() and score[0] >= score[3] > score[2] > score[1]
-    assert score[2] == pytest.approx(float((score[0] + score[1]) / 2), abs=0.5)
-
-
 def test_flat_gaussians_have_no_volume():
     scales = torch.zeros(3, 3)
     scales[1, 2] = -math.inf

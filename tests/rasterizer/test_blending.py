@@ -9,9 +9,8 @@ from torch.autograd.function import once_differentiable
 
 from making import camera_askew, splats_in_view
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.rasterizer import blending, frame, rasterization
+from pointsplat_ns.rasterizer import blending, rasterization
 from pointsplat_ns.rasterizer.constants import QUALITIES
-from pointsplat_ns.rasterizer.tiles import Footprints
 
 WIDTH, HEIGHT = 70, 45  # neither is a multiple of the tile
 
@@ -47,56 +46,6 @@ def test_a_lower_memory_budget_changes_neither_image_nor_gradients(pairs):
     wanted = draw(scene, absgrad=True)
     got = draw(scene, absgrad=True, memory_budget=pairs * blending.bytes_per_pair(scene[4][:, 0]))
     assert_same(got, wanted, 1e-12)  # sums over regions in another order
-
-
-@pytest.mark.parametrize(
-    "channels, double, size", [(1, False, 184), (3, False, 192), (256, False, 1204), (3, True, 384)]
-)
-def test_the_memory_budget_counts_channels_and_precision(channels, double, size, monkeypatch):
-    """192 bytes a pair for RGB in float32, of which each channel's gradient sum takes 4."""
-    dtype = torch.float64 if double else torch.float32
-    scene = make_scene(dtype=dtype)
-    scene[4] = scene[4][:, :1, 0].expand(-1, channels)
-    view, K = camera_askew(dtype)
-    asked, regions = [], blending.Footprints.regions
-    monkeypatch.setattr(blending.Footprints, "regions", lambda self, most: asked.append(most) or regions(self, most))
-    rasterization(*scene, view[None], K[None], WIDTH, HEIGHT, memory_budget=10**6)
-    assert asked == [10**6 // size]
-
-
-def test_regions_cover_every_tile_once_and_keep_within_the_budget_where_tiles_allow():
-    g = torch.Generator().manual_seed(3)
-    n = 300
-    means2d = torch.rand(n, 2, generator=g) * torch.tensor([200.0, 120.0])
-    cov2d = torch.tensor([[30.0, 5.0, 20.0]]).repeat(n, 1)
-    det = cov2d[:, 0] * cov2d[:, 2] - cov2d[:, 1] ** 2
-    footprints = Footprints(
-        means2d, cov2d, det, torch.full((n,), 0.9), torch.rand(n, generator=g), torch.zeros(n, dtype=torch.int64),
-        1, 200, 120,
-    )  # fmt: skip
-    total = footprints.tiles(footprints.whole).gaussians.numel()
-    for most in (10, 200, 1000, total * 10):
-        regions = footprints.regions(most)
-        seen = torch.zeros(footprints.rows, footprints.columns)
-        pairs = 0
-        for region in regions:
-            seen[region.top : region.bottom, region.left : region.right] += 1
-            count = footprints.tiles(region).gaussians.numel()
-            pairs += count
-            one_tile = region.bottom - region.top == 1 and region.right - region.left == 1
-            if most >= 200:
-                assert count <= most or one_tile
-        assert bool((seen == 1).all())
-        assert pairs == total
-    assert len(footprints.regions(total * 10)) == 1
-
-
-@pytest.mark.parametrize("n,size", [(20, 0.5), (3000, -4.0)])
-def test_long_chunks_of_few_tiles_equal_short_ones(n, size, monkeypatch):
-    scene = make_scene(n=n, size=size, seed=n, dtype=torch.float64)
-    long = draw(scene)
-    monkeypatch.setattr(frame.Frame, "LONGEST", frame.Frame.STEP)
-    assert_same(long, draw(scene), 1e-12)  # products and sums in another order
 
 
 @pytest.mark.parametrize("compiled", [False, None])

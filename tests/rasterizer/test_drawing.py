@@ -36,13 +36,6 @@ def test_bands_are_the_rows_of_the_render(scene, view, high):
     torch.testing.assert_close(torch.cat(bands), ps.render(scene, view), rtol=0, atol=1e-5)
 
 
-def test_some_columns_are_those_of_the_render(scene, view):
-    whole, drawing = ps.render(scene, view), Drawing(scene, view)
-    part = drawing.draw(Region(2, 5, 3, drawing.columns))
-    assert part.shape == (24, 75 - 24, 3)
-    torch.testing.assert_close(part, whole[16:40, 24:], rtol=0, atol=1e-5)
-
-
 def test_nothing_in_view_is_the_background(view):
     nothing = Drawing(ps.Gaussians.empty(), view).draw(Region(0, 1, 0, 2))
     assert torch.equal(nothing, view.background.expand(8, 16, 3))
@@ -53,9 +46,3 @@ def test_colours_without_meaning_are_left_out(scene, view):
     drawing = Drawing(broken, view)
     picture = drawing.draw(Region(0, drawing.rows, 0, drawing.columns))
     torch.testing.assert_close(picture, ps.render(scene[1:], view), rtol=0, atol=1e-5)
-
-
-def test_fast_is_nearly_the_same(scene, view):
-    drawing = Drawing(scene, view, "fast")
-    picture = drawing.draw(Region(0, drawing.rows, 0, drawing.columns))
-    assert 30 < float(ps.psnr(picture, ps.render(scene, view))) < 100

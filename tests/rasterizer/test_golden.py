@@ -101,17 +101,3 @@ def test_a_small_budget_does_draw_in_regions(stored, monkeypatch):
     monkeypatch.setattr(Footprints, "tiles", lambda self, region: regions.append(region) or tiles(self, region))
     draw(stored["degree 1"], golden.SCENES["degree 1"], F32, memory_budget=4000, **TORCH)
     assert len(set(regions)) > 1
-
-
-def test_the_comparison_fails_where_it_should(stored):
-    name = "antialiased"
-    shape, scene = golden.SCENES[name], dict(stored[name])
-    scene["opacities"] = scene["opacities"] * (1 + 1e-4)
-    with pytest.raises(AssertionError):
-        compare(draw(scene, shape, F32), stored[name], IMAGE_32, GRADIENT_32)
-
-
-def test_nothing_is_near_a_threshold(stored):
-    """So no rounding changes what is drawn, and the tolerances can be tight."""
-    for name in ("opaque", "large and faint"):
-        assert golden.far_from_thresholds(golden.SCENES[name], stored[name]), name

@@ -85,11 +85,3 @@ def skilling(point: list[int], bits: int) -> int:
 def test_hilbert_tables_give_the_codes_of_the_published_algorithm(bits):
     coords = torch.randint(0, 2**bits, (200, 3), generator=torch.Generator().manual_seed(2))
     assert curve_codes(coords, bits, ["hilbert"])[0].tolist() == [skilling(point, bits) for point in coords.tolist()]
-
-
-def test_curves_computed_together_are_those_computed_alone():
-    coords = torch.randint(0, 2**16, (100, 3), generator=torch.Generator().manual_seed(3))
-    together = curve_codes(coords, 16, CURVES)
-    assert all(
-        torch.equal(code, curve_codes(coords, 16, [curve])[0]) for code, curve in zip(together, CURVES, strict=True)
-    )

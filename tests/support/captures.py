@@ -146,33 +146,6 @@ class Capture:
         ]
         (model / "points3D.txt").write_text("\n".join(rows) + "\n")
 
-    def write_polycam(self, folder: Path) -> Path:
-        """A raw export of Polycam: ARKit's frame, whose y is up, and one JSON file a photo."""
-        names = self.write_photos(folder / "keyframes/corrected_images", ".jpg", first=1000)
-        (folder / "keyframes/depth").mkdir()
-        cameras = folder / "keyframes/corrected_cameras"
-        cameras.mkdir()
-        to_arkit = np.zeros((3, 3))
-        to_arkit[[0, 1, 2], [1, 2, 0]] = 1  # x, y, z of ARKit are y, z, x of nerfstudio's data
-        for name, pose in zip(names, self.poses, strict=True):
-            rows = to_arkit @ pose[:3]
-            camera = {f"t_{i}{j}": rows[i, j] for i in range(3) for j in range(4)}
-            (fx, fy), (cx, cy) = self.lens.focal, self.lens.center
-            size = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": WIDTH, "height": HEIGHT, "blur_score": 99.0}
-            (cameras / f"{Path(name).stem}.json").write_text(json.dumps({**camera, **size}))
-        return folder
-
-    def write_record3d(self, folder: Path) -> Path:
-        """An export of Record3D: numbered photos, and quaternions (x, y, z, w) and places in one file."""
-        self.write_photos(folder / "rgb", ".jpg")
-        for path in (folder / "rgb").iterdir():
-            path.rename(path.with_stem(str(int(path.stem))))
-        poses = [[*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]] for pose in self.poses]
-        fx, fy = self.lens.focal
-        K = [fx, 0, 0, 0, fy, 0, *self.lens.center, 1]
-        (folder / "metadata.json").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "K": K, "poses": poses}))
-        return folder
-
     def write_scannetpp(self, folder: Path) -> Path:
         """ScanNet++'s dslr/ folder: masks over what is not to be seen, one bad frame in each split, COLMAP's model in
         a frame of its own."""

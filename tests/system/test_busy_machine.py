@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 import threading
@@ -87,26 +86,6 @@ def test_one_bad_look_is_enough_and_three_good_ones_are_needed(machine):
     assert [machine.stalls(after=2) for _ in range(3)] == [True, True, False]
 
 
-def test_while_threads_stall_looks_get_rarer_and_all_are_used_soon_after(machine):
-    machine.stalled = True
-    for _ in range(600):
-        assert machine.stalls(after=0.1)
-    assert machine.looks < 15
-    machine.stalled = False
-    assert [machine.stalls(after=1) for _ in range(20)][-1] is False
-
-
-def test_that_the_machine_is_the_limit_is_said_once(machine, caplog):
-    with caplog.at_level(logging.WARNING, "pointsplat_ns"):
-        machine.stalls()
-        assert not caplog.records
-        machine.stalled = True
-        for _ in range(30):
-            machine.stalls(after=2)
-    [record] = caplog.records
-    assert "busy" in record.getMessage() and "--threads" in record.getMessage()
-
-
 def test_the_callers_threads_are_restored_also_after_an_error(machine):
     machine.stalled = True
     with pytest.raises(KeyboardInterrupt), suitable_threads():
@@ -127,11 +106,6 @@ def test_nothing_is_chosen_where_the_user_has(machine, count):
 def test_nothing_is_chosen_for_a_gpu(machine):
     machine.stalled = True
     assert used(torch.device("cuda")) == CORES
-
-
-def test_no_more_threads_than_cores(machine, monkeypatch):
-    monkeypatch.setattr(threads, "cores", lambda: 1)
-    assert used() == 1 and machine.looks == 0
 
 
 def test_a_step_within_a_step_is_left_alone(machine):

@@ -58,15 +58,6 @@ def test_a_folder_that_others_can_write_to_is_not_loaded_from(build, tmp_path):
     assert build(TWO).answer() == 2 and not list(build.cache.iterdir())
 
 
-def test_without_a_name_it_lies_in_the_users_cache(monkeypatch, tmp_path):
-    monkeypatch.delenv(native_code.CACHE_VARIABLE, raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert native_code._cache_folder() == tmp_path / "pointsplat_ns"
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    assert native_code._cache_folder() == tmp_path / "home/.cache/pointsplat_ns"
-
-
 @pytest.mark.parametrize("text", ["int answer( {\n", "#error no\n"])
 def test_what_does_not_compile_is_said_in_a_line_and_leaves_nothing(build, text):
     with pytest.raises(NativeCodeError, match="error") as caught:

@@ -61,15 +61,6 @@ def test_a_log_gets_a_plain_line_from_time_to_time_also_while_nothing_is_reporte
     assert log.getvalue().splitlines() == lines  # it ends with the work
 
 
-def test_a_terminal_that_cannot_move_its_cursor_gets_lines_too(stderr, monkeypatch):
-    monkeypatch.setenv("TERM", "dumb")
-    monkeypatch.setattr(progress, "LINE_SECONDS", 0.05)
-    shown = stderr(Terminal())
-    with progress_bar() as report:
-        report("First", 0.5)
-        assert "\x1b" not in read_until(shown, "First: 50 %\n")
-
-
 def test_work_goes_on_where_the_log_is_closed(stderr, monkeypatch):
     monkeypatch.setattr(progress, "LINE_SECONDS", 0.01)
     log = stderr(io.StringIO())
@@ -84,12 +75,6 @@ def test_work_goes_on_where_the_log_is_closed(stderr, monkeypatch):
 def test_nothing_is_written_where_there_is_no_terminal_and_little_to_do(stderr):
     shown = stderr(io.StringIO())
     assert list(tracked("abc", "Counting letters", 3)) == ["a", "b", "c"]
-    assert shown.getvalue() == ""
-
-
-def test_nothing_is_written_where_no_progress_is_wanted(stderr):
-    shown = stderr(Terminal())
-    assert list(tracked("abc", "Counting letters", 3, progress=False)) == ["a", "b", "c"]
     assert shown.getvalue() == ""
 
 

@@ -11,13 +11,12 @@ import pytest
 import pointsplat_ns as ps
 from making import box_room, same_bits
 from pointsplat_ns import folders
-from pointsplat_ns.cli import main
 from pointsplat_ns.compression import repair
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
-from pointsplat_ns.tradeoff import finding, judging, settings
+from pointsplat_ns.tradeoff import judging, settings
 from pointsplat_ns.tradeoff.finding import find_scene
 from pointsplat_ns.tradeoff.measuring import Measurer
 from pointsplat_ns.tradeoff.targets import Targets
@@ -102,13 +101,6 @@ def test_scenes_are_judged_in_the_views_that_compact_compares_in(
     assert max(views.width, views.height) == (405 if resolution is None else 96)
 
 
-def test_only_a_target_of_time_has_frames_timed(dense, monkeypatch):
-    found = ps.compact(dense, by="opacity", target_ms=2.0)
-    assert 2.0 >= 1e-2 * len(found.scene) > 2.0 / 1.2 and "ms a frame" in found.target
-    monkeypatch.setattr(judging, "_timed", lambda *args: pytest.fail("timed"))
-    assert "ms a frame" not in ps.compact(dense, by="opacity", target_mb=0.01).target
-
-
 def test_a_scene_that_needs_no_repair_is_given_as_it_was_pruned(dense, tmp_path):
     found = find_scene(subject_of(dense, None), Targets(mb=0.01), "opacity", ("none",), lambda what, share: None)
     assert found.scene is found.pruned and not found.accepted and not found.repair_accepted
@@ -147,12 +139,6 @@ def test_it_is_said_in_which_views_a_target_holds_and_in_which_a_repair_is_accep
     assert "dB against the dense scene's renders in 3 views of held-out photos, 48 pixels wide" in repaired
     assert repaired.endswith("; a repair is accepted in 3 views of 48 pixels of the photos that were trained on")
     assert "trained on" not in pruned
-
-
-def test_a_busy_machine_is_noted_with_a_target_of_time(dense, monkeypatch):
-    monkeypatch.setattr(finding, "busy_note", lambda others: f"busy {len(others) > 0}")
-    assert "busy True" in ps.compact(dense, by="opacity", target_ms=2.0).notes
-    assert not any("busy" in note for note in ps.compact(dense, by="opacity", target_mb=0.01).notes)
 
 
 @pytest.mark.parametrize(
@@ -196,18 +182,3 @@ def test_a_folder_with_a_target_that_no_scene_meets_says_so_for_each(tmp_path, d
     ps.save(dense, tmp_path / "rooms" / "a.ply")
     [result] = ps.compact_folder(tmp_path / "rooms", by="opacity", target_db=30.0, target_mb=0.002)
     assert result.status == "failed" and "the best within the limits has" in result.error
-
-
-def test_the_command_writes_what_was_found_and_says_at_what_cost(room, dense, tmp_path, capsys):
-    main(["compact", str(room), "--target-mb", "0.002", "--by", "opacity", "-o", str(tmp_path / "small.spz")])
-    said = " ".join(capsys.readouterr().out.split())
-    assert 0.0016 < 1e-6 * (tmp_path / "small.spz").stat().st_size <= 0.002
-    assert "dB against the dense scene's renders" in said and "scenes tried; the next better, " in said
-    found = ps.compact(dense, by="opacity", target_mb=0.002, target_format=".spz")
-    assert len(ps.load(tmp_path / "small.spz")) == len(found.scene)
-
-
-def test_the_command_refuses_what_the_search_decides_before_the_scene_is_read(tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        main(["compact", str(tmp_path / "gone.ply"), "--target-db", "30", "--keep", "10%"])
-    assert capsys.readouterr().err.startswith("error: keep cannot be given with a target")

@@ -7,10 +7,9 @@ import threading
 
 import pytest
 import torch
-from filelock import FileLock
 
 from pointsplat_ns.tradeoff import machine
-from pointsplat_ns.tradeoff.machine import OtherPrograms, cores, is_busy, machine_text, one_at_a_time
+from pointsplat_ns.tradeoff.machine import OtherPrograms, is_busy, one_at_a_time
 
 
 def test_a_second_measurement_waits_for_the_first_and_says_so():
@@ -30,38 +29,11 @@ def test_a_second_measurement_waits_for_the_first_and_says_so():
     other.join()
 
 
-def test_whoever_waits_gets_the_next_turn():
-    """Of two that measure one thing after the other, none has to wait until the other has measured everything."""
-    turns: list[str] = []
-
-    def measure(name: str) -> None:
-        for _ in range(2):
-            with one_at_a_time(lambda what, share: None):
-                turns.append(name)
-                threading.Event().wait(0.3)
-
-    both = [threading.Thread(target=measure, args=(name,)) for name in "ab"]
-    for thread in both:
-        thread.start()
-    for thread in both:
-        thread.join()
-    assert turns in (["a", "b", "a", "b"], ["b", "a", "b", "a"])
-
-
 def test_the_lock_is_given_back_after_an_error():
     for _ in range(2):
         with pytest.raises(RuntimeError), one_at_a_time(lambda what, share: None) as alone:
             assert alone
             raise RuntimeError
-
-
-def test_a_lock_that_belongs_to_another_user_is_not_waited_for(monkeypatch):
-    def refuse(*args, **options):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(FileLock, "acquire", refuse)
-    with one_at_a_time(lambda what, share: None) as alone:
-        assert not alone
 
 
 def _work(stop) -> None:
@@ -98,9 +70,3 @@ def test_a_machine_is_busy_when_too_few_cores_are_left(monkeypatch):
     monkeypatch.setattr(machine, "cores", lambda: 4)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     assert [is_busy(others) for others in (0.0, 2.0, 2.3, 4.0)] == [False, False, True, True]
-
-
-def test_the_machine_is_named_with_its_threads():
-    text = machine_text(torch.device("cpu"))
-    assert f"{torch.get_num_threads()} thread" in text and torch.__version__ in text and "cpu" in text
-    assert cores() >= 1

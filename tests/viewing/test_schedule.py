@@ -127,21 +127,6 @@ def test_gaussians_are_left_out_only_of_the_smallest_pictures(schedule, clock):
     assert [step.side for step in steps] == [960]
 
 
-def test_one_picture_comes_between_if_the_whole_is_much_larger(clock):
-    schedule: Schedule[str] = Schedule(1920, clock)
-    for _ in range(40):
-        schedule.submit("slow")
-        drawn(schedule, clock, 5.0)
-    sides = [step.side for step in rest(schedule, clock)]
-    assert sides[-1] == 1920 and len(sides) == 2 and SCHEDULE.moving_side < sides[0] < 1920
-
-
-def test_another_size_is_drawn_from_the_next_request_on(schedule, clock):
-    schedule.submit("small", 100)
-    steps = [drawn(schedule, clock), *rest(schedule, clock)]
-    assert max(step.side for step in steps) == 100
-
-
 def test_close_wakes_who_waits_and_outdates_what_is_drawn(schedule):
     schedule.submit("any")
     step = schedule.next(timeout=0)

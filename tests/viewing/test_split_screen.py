@@ -32,11 +32,6 @@ def test_each_side_of_a_wipe_is_the_render_of_its_scene(scenes, view, column):
     torch.testing.assert_close(picture, expected, rtol=0, atol=1e-5)
 
 
-def test_scene_that_is_not_seen_is_not_drawn(scenes, view):
-    assert Wipe(*scenes, view, 0)._first is None and Wipe(*scenes, view, 999)._second is None
-    assert Wipe(scenes[0], None, view).column == 70
-
-
 def test_side_by_side_is_both_renders_with_a_line_between(scenes, view):
     frame = render_frame(FilmScenes(*scenes), view)
     first, second = (to_uint8(ps.render(scene, view)).astype(int) for scene in scenes)
@@ -67,9 +62,3 @@ def test_labels_stand_at_the_top_of_their_sides():
     assert not (with_labels(blank, ["", "second"], 200)[:, :200] != 128).any()
     narrow = with_labels(blank, ["first", "second"], 30) != 128
     assert not narrow[:, :200].any() and narrow[:, 200:].any(), "no room on the left"
-
-
-def test_long_labels_are_shortened_to_their_half():
-    blank = np.full((100, 300, 3), 128, np.uint8)
-    written = with_labels(blank, ["long " * 50, ""], 150) != 128
-    assert written[:, :150].any() and not written[:, 150:].any()

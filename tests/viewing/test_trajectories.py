@@ -62,13 +62,6 @@ def test_path_goes_exactly_through_every_pose(frames):
     assert_rigid(path)
 
 
-def test_path_of_fewer_frames_than_poses_takes_some_of_them():
-    views = captured()
-    assert torch.equal(along(views, 4).viewmats, views.spread(4).viewmats)
-    assert torch.equal(along(views, 1).viewmats, views[:1].viewmats)
-    assert torch.equal(along(views[:1], 3).viewmats, views.viewmats[:1].repeat(3, 1, 1))
-
-
 def test_path_is_smooth():
     path = along(captured(), 400)
     for values in (places(path), path.viewmats[:, :3, :3].flatten(1)):
@@ -84,12 +77,6 @@ def test_positions_stay_between_those_given():
     assert bool((path >= given.amin(0) - 1e-9).all() & (path <= given.amax(0) + 1e-9).all())
 
 
-def test_poses_that_are_all_the_same_are_taken():
-    views = captured()[[3, 3, 3]]
-    for path in (along(views, 7), walk(views, 7), orbit(views, 7, torch.zeros(3))):
-        assert len(path) == 7 and bool(path.viewmats.isfinite().all())
-
-
 @pytest.mark.parametrize("up", [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.6, 0.0, 0.8]])
 def test_up_is_that_of_cameras_that_were_held_level(up):
     up = torch.tensor(up, dtype=torch.float64)
@@ -98,11 +85,6 @@ def test_up_is_that_of_cameras_that_were_held_level(up):
     level = torch.randn(20, 3, generator=generator, dtype=torch.float64)
     targets = eyes + level - (level @ up)[:, None] * up - 0.2 * up
     torch.testing.assert_close(up_of(views_at(eyes, targets, up)), up, rtol=0, atol=1e-6)
-
-
-def test_up_of_cameras_that_all_look_alike_is_up_in_their_pictures():
-    views = ring(torch.tensor([0.3, 0.3]))[:1]
-    assert float(up_of(views) @ -axes(views, 1)[0]) > 0.99
 
 
 def test_walk_never_leans_and_passes_the_views():
@@ -126,13 +108,6 @@ def test_orbit_goes_all_around_what_is_looked_at():
     assert float(steps.max()) < 1.6 * 2 * math.pi / 36
     assert bool(((axes(path, 2) * apart).sum(1) < 0).all())
     assert_rigid(path)
-
-
-def test_orbit_of_what_was_seen_from_one_side_stays_there():
-    path = orbit(ring(torch.linspace(0.2, 1.2, 6)), 50, torch.tensor([1.0, 2.0, 0.0]))
-    apart = places(path) - torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64)
-    sides = torch.atan2(apart[:, 1], apart[:, 0])
-    assert 0.15 < float(sides.min()) < 0.3 and 1.1 < float(sides.max()) < 1.25
 
 
 def test_orbit_in_a_room_is_a_turn_on_the_spot():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
 from captures import Capture
-from ns_commands import METHODS, Run, started
+from ns_commands import Run, started
 from pointsplat_ns.errors import DataError
 
 WIDTH, HEIGHT, FIELD_OF_VIEW = 40, 30, 60.0
@@ -101,20 +100,3 @@ def test_dataset_puts_beside_each_render_the_photo_as_its_camera_would_have_take
             assert np.abs(photo - dataset[index]["image"].numpy()).max() <= 1 / 255 + 1e-6
             shown = drawn_by_the_model(pipeline, dataset.cameras[index : index + 1])
             assert np.abs(picture - shown).max() <= 1 / 255 + 1e-6
-
-
-def test_without_ffmpeg_it_says_so_even_of_pictures(trained_by_ns_train, monkeypatch, capsys, tmp_path):
-    run = trained_by_ns_train(METHODS[0])
-    monkeypatch.undo()
-    monkeypatch.setenv("PATH", "")
-    with pytest.raises(SystemExit) as end:
-        drawn(run, "spiral", tmp_path)
-    assert end.value.code == 1 and "install ffmpeg" in capsys.readouterr().out
-
-
-@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
-@pytest.mark.parametrize("method", METHODS[:1])
-def test_spiral_is_a_film_where_ffmpeg_is(method, trained_by_ns_train, tmp_path):
-    run = trained_by_ns_train(method)
-    started(render, "spiral", "--load-config", run.config, "--output-path", tmp_path / "film.mp4", "--seconds", "0.2")
-    assert (tmp_path / "film.mp4").stat().st_size > 500

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import shutil
 from pathlib import Path
-from unittest import mock
 
 import pytest
 import torch
@@ -176,10 +175,3 @@ def test_nothing_is_kept_beyond_the_bound_and_all_is_found_again(rooms):
             again.append(data["image"])
             assert tight.cache.num_bytes <= bound
         assert all(torch.equal(a, b) for a, b in zip(unbounded, again, strict=True))
-
-
-def test_a_kept_picture_needs_no_dense_scene(rooms):
-    scene = scene_of(rooms)
-    first = [data["image"] for _, data in scene.rendered_train]
-    with mock.patch.object(scene, "picture", side_effect=AssertionError("drawn again")):
-        assert all(torch.equal(a, data["image"]) for a, (_, data) in zip(first, scene.rendered_train, strict=True))

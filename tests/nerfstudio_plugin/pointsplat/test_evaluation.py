@@ -16,7 +16,6 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import SHARED_DATA, pipeline_of, run_of
-from pointsplat_ns.metrics import ImageError
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, ReportedLpips
 
 LPIPS_WEIGHTS = SHARED_DATA / "weights"
@@ -132,27 +131,6 @@ def test_an_exact_picture_has_no_finite_psnr_and_is_null(evaluated, no_lpips):
     summary = summarize([report], with_std=True)
     json.dumps(summary, allow_nan=False)
     assert summary["psnr"] is None and summary["ssim"] == pytest.approx(1.0)
-
-
-def test_lpips_that_fails_at_one_view_is_null_for_all(evaluated):
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import evaluate_scene
-
-    model, scene = evaluated.model, evaluated.datamanager.scenes[0]
-    calls = []
-
-    def fails_at_the_third(rgb, photo):
-        calls.append(1)
-        if len(calls) == 3:
-            raise ImageError("too small")
-        return torch.tensor(0.5)
-
-    dense = scene.read_dense()
-    variants = {"dense": dense, "refined": dense}
-    frames, lpips = evaluated.datamanager.held_out(0), ReportedLpips()
-    with mock.patch("pointsplat_ns.metrics.lpips.cached_lpips", lambda *_: fails_at_the_third):
-        report = evaluate_scene(model, scene, variants, frames, 2, lpips)
-    assert lpips.reason == "too small"
-    assert report.variants["dense"]["lpips"] is None and report.variants["refined"]["lpips"] is None
 
 
 def test_a_distorted_scene_of_degree_0_is_judged_as_its_own_run_judges_it(lens_run, no_lpips):

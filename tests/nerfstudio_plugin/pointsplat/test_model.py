@@ -12,10 +12,8 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch loa
 from making import pipeline_of, run_of, same
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.io import read_scene
-from pointsplat_ns.metrics import ImageError
 from pointsplat_ns.metrics.lpips import load_lpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
-from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PhotoLoss
 from pointsplat_ns.pruning import METHODS, prune, score_of, select
 from pointsplat_ns.rasterizer import rasterization
 
@@ -125,18 +123,6 @@ def test_lpips_is_part_of_the_loss_where_it_can_be_had(trained_walls, some_lpips
         expected = 0.1 * load_lpips("alex")(outputs["rgb"], frame[1]["image"] / 255)
     assert float(losses["lpips"]) == pytest.approx(float(expected), rel=1e-4)  # float32 sums in another order
     assert not any("lpips" in name for name in pipeline.state_dict())
-
-
-def test_photos_too_small_for_lpips_are_trained_on_with_l1_alone(evaluated):
-    def too_small(*_):
-        raise ImageError("images of 8 x 8 pixels are too small")
-
-    index, frames = evaluated.datamanager.next_eval(0)
-    loss = PhotoLoss("l1", 0.1, "auto")
-    nets = mock.patch("pointsplat_ns.nerfstudio_plugin.pointsplat.losses.cached_lpips", lambda *_: too_small)
-    with nets, mock.patch.object(evaluated.model, "loss", loss):
-        assert set(evaluated.model.losses(index, frames)[1]) == {"l1"}
-    assert loss.no_lpips_reason == "images of 8 x 8 pixels are too small"
 
 
 def test_what_is_shown_follows_the_weights(trained, trained_walls):

@@ -19,13 +19,11 @@ CONCAT = (59 - 32) * (27 * 32 + 6 * 64)
 
 NETWORKS = {
     "II": ({"use_appearance": False, "use_position": False}, -POSITION - APPEARANCE),
-    "III": ({"use_appearance": False}, -APPEARANCE),
-    "IV": ({"use_position": False}, -POSITION),
     "V": ({}, 0),
     "concat": ({"encoder": "concat"}, CONCAT - GEOMETRY - POSITION - APPEARANCE),
     "batch norm": ({"norm": "batch"}, 0),
 }
-"""Settings by row of Table 4 (I is the pruned scene), and parameters beside those of the whole network."""
+"""Settings by row of Table 4, and parameters beside those of the whole network."""
 
 
 @pytest.mark.parametrize("row", NETWORKS)

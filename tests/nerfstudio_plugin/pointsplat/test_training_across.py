@@ -104,12 +104,11 @@ def test_pruned_scenes_are_kept_within_the_bound_and_made_again_alike(three_room
 # resuming
 
 
-@pytest.mark.parametrize(
-    ("stop", "accumulate", "schedule", "skipped"), [(4, 3, "step", {1, 4, 6}), (3, 1, "cosine", set())]
-)
 def test_an_interrupted_training_has_the_losses_and_skipped_steps_of_an_unbroken_one(
-    three_rooms, run_training, tmp_path, stop, accumulate, schedule, skipped
+    three_rooms, run_training, tmp_path
 ):
+    stop, accumulate, schedule, skipped = 4, 3, "step", {1, 4, 6}
+
     def config(name, steps):
         changed = dense_config(three_rooms, tmp_path / name, steps)
         changed.gradient_accumulation_steps, changed.schedule = {"all": accumulate}, schedule
@@ -130,7 +129,7 @@ def test_an_interrupted_training_has_the_losses_and_skipped_steps_of_an_unbroken
     rates = [t.optimizers.optimizers["means"].param_groups[0]["lr"] for t in (whole, resumed)]
     assert rates[0] == rates[1]
     state = torch.load(whole.checkpoint_dir / f"step-{stop:09d}.ckpt", weights_only=True)["pipeline"]["_extra_state"]
-    assert ("gradients" in state) == (accumulate == 3), "only gradients that wait for their update are saved"
+    assert "gradients" in state, "those that wait for their update are saved"
 
 
 def test_dropped_paths_and_shuffled_curves_are_those_of_an_unbroken_training(three_rooms):

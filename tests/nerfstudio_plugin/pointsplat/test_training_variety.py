@@ -42,14 +42,6 @@ def test_transforms_change_what_the_network_sees_and_nothing_else(trained_walls,
     assert moved == again, "the same seed draws the same transforms"
 
 
-def test_evaluation_sees_scenes_as_they_are(trained_walls, tmp_path):
-    pipeline = (
-        small_config(trained_walls, tmp_path, 1, augment=True).pipeline.setup(device="cpu", test_mode="test").eval()
-    )
-    refined, pruned = pipeline.model.refine(0), pipeline.model.pruned_scene(0).pruned
-    assert all(torch.equal(a, b) for a, b in zip(refined.tensors(), pruned.tensors(), strict=True))
-
-
 def test_pruned_scenes_are_taken_from_the_folder(trained_walls, tmp_path, monkeypatch):
     def pruned(**changes):
         config = small_config(trained_walls, tmp_path, 1, pruned_folder=tmp_path / "pruned", **changes)
@@ -151,11 +143,3 @@ def test_pixel_losses_at_extremes(name, scale):
     assert values[0].item() == pytest.approx(values[1].item(), rel=1e-5, abs=1e-9)
     assert found.grad.isfinite().all()
     assert torch.allclose(found.grad.double(), exact.grad, rtol=1e-4, atol=1e-7)
-
-
-def test_the_pixel_loss_is_the_one_asked_for(trained_walls, run_training, tmp_path, no_lpips):
-    losses = {
-        name: run_training(small_config(trained_walls, tmp_path / name, 1, pixel_loss=name))[1][0]
-        for name in PIXEL_LOSSES
-    }
-    assert losses["rmse"] > losses["l1"] > 0, "a root of mean squares is at least the mean"

@@ -63,13 +63,12 @@ def stopped_at(
     return end.value.code
 
 
-@pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_training_that_is_stopped_leaves_a_scene_and_can_be_gone_on_with(
-    number, status, wall_scene, wall_config, run_training, monkeypatch, tmp_path, capsys
+    wall_scene, wall_config, run_training, monkeypatch, tmp_path, capsys
 ):
     config = wall_config(wall_scene, tmp_path, steps=30)
     # Step 10 densifies, which is not to be interrupted.
-    assert stopped_at(10, config, run_training, monkeypatch, number) == status
+    assert stopped_at(10, config, run_training, monkeypatch, signal.SIGTERM) == 143
     said = capsys.readouterr()
     assert "stopping after this step" in said.err and said.err.endswith("interrupted\n")
     run = open_run(config.get_base_dir())
@@ -82,7 +81,7 @@ def test_a_training_that_is_stopped_leaves_a_scene_and_can_be_gone_on_with(
     assert trainer._start_step == 11 and trainer.step == 13
     state = torch.load(run.checkpoint, weights_only=True)
     assert state["step"] == 10
-    assert signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL)
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
 def test_a_training_of_a_refiner_stops_in_the_same_way(run_training, monkeypatch, tmp_path, no_lpips):

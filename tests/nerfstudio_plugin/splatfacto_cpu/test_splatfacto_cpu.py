@@ -17,7 +17,6 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.utils import writer
 from PIL import Image
 
-from making import SHARED_DATA
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import fitted_schedules, splatfacto_cpu_config
@@ -30,7 +29,6 @@ from pointsplat_ns.nerfstudio_plugin.stopping import STATE
 from pointsplat_ns.rasterizer import rasterization
 
 SEED = 20
-WEIGHTS = SHARED_DATA / "weights"
 
 
 def build(config, seeds=None, num_train_data: int = 3):
@@ -134,16 +132,6 @@ def test_crop_box_keeps_what_is_inside_and_an_empty_one_gives_background():
     assert empty["rgb"].shape == (31, 43, 3) and empty["depth"].shape == (31, 43, 1) and not empty["rgb"].any()
 
 
-def test_viewmats_invert_the_pose_and_pass_gradients():
-    generator = torch.Generator().manual_seed(SEED)
-    rotation = torch.linalg.qr(torch.randn((2, 3, 3), generator=generator, dtype=torch.float64))[0]
-    pose = torch.cat([rotation, torch.randn((2, 3, 1), generator=generator, dtype=torch.float64)], dim=2)
-    inverse = torch.linalg.inv(torch.cat([pose, pose.new_tensor([[[0, 0, 0, 1.0]]] * 2)], dim=1))
-    flip = torch.diag(pose.new_tensor([1.0, -1.0, -1.0, 1.0]))
-    torch.testing.assert_close(viewmats_from_opengl(pose), flip @ inverse, atol=1e-12, rtol=0)
-    assert torch.autograd.gradcheck(viewmats_from_opengl, pose.requires_grad_())
-
-
 @pytest.mark.parametrize(
     "settings",
     [{}, {"sh_degree": 0}, {"use_bilateral_grid": True, "camera_optimizer": CameraOptimizerConfig(mode="SE3")}],
@@ -180,13 +168,6 @@ def test_few_seeds_have_finite_sizes(num):
     assert scales.shape == (num, 3) and scales.isfinite().all()
     if num == 1:
         assert torch.allclose(scales.exp(), torch.tensor(0.01))
-
-
-def test_coincident_seeds_take_their_size_from_other_places():
-    points, colors = random_seeds(6)
-    alone = build(SplatfactoCpuModelConfig(), (points, colors)).scales
-    twice = build(SplatfactoCpuModelConfig(), (points.repeat(5, 1), colors.repeat(5, 1))).scales
-    torch.testing.assert_close(twice, alone.repeat(5, 1))
 
 
 def test_seeds_that_nearly_coincide_or_lie_far_out_have_finite_sizes():
@@ -388,27 +369,6 @@ def test_what_is_not_finite_is_null_in_a_report_and_absent_from_the_training_log
     assert report.get("psnr_std") is None, "one image has no standard deviation"
     assert all(isinstance(value, float) and math.isfinite(value) for value in log.values())
     assert "psnr" in log and "psnr_std" not in log
-
-
-def test_without_lpips_weights_the_metric_is_null_with_a_reason(trained, no_lpips):
-    pipeline = trained[1].pipeline
-    with mock.patch.object(pipeline.model, "lpips", type(pipeline.model.lpips)()):
-        report = pipeline.get_average_eval_image_metrics(get_std=True)
-        metrics, _ = pipeline.get_eval_image_metrics_and_images(step=1)
-    assert report["lpips"] is None and "no network" in report["lpips_note"]
-    assert "lpips" not in metrics and "psnr" in metrics
-
-
-def test_photos_too_small_for_lpips_have_no_lpips_but_the_other_metrics(trained, monkeypatch):
-    if not WEIGHTS.exists():
-        pytest.skip(f"{WEIGHTS} is not here")
-    monkeypatch.setenv("POINTSPLAT_LPIPS_WEIGHTS", str(WEIGHTS))
-    model = trained[1].pipeline.model
-    with mock.patch.object(model, "lpips", type(model.lpips)()) as lpips:
-        small = torch.full((20, 20, 3), 0.5)
-        outputs = {"rgb": small, "background": torch.zeros(3)}
-        metrics, _ = model.get_image_metrics_and_images(outputs, {"image": small + 0.1})
-    assert "lpips" not in metrics and metrics["psnr"] == pytest.approx(20, abs=1e-3) and "pixels" in lpips.reason
 
 
 def test_evaluating_without_held_out_frames_says_so(trained):

@@ -11,20 +11,12 @@ from pointsplat_ns.geometry.quaternions import rotation_matrices
 from pointsplat_ns.pruning.merging.covariance import (
     covariances,
     overlap,
-    pack,
     plane_axes,
     project,
     projected_area,
     rms_area,
     thinnest_axes,
-    unpack,
 )
-
-
-def test_the_six_numbers_are_those_of_the_matrix():
-    six = torch.arange(1.0, 7.0)[None]
-    assert unpack(six)[0].tolist() == [[1.0, 2.0, 3.0], [2.0, 4.0, 5.0], [3.0, 5.0, 6.0]]
-    assert torch.equal(pack(unpack(six)), six)
 
 
 def test_the_area_is_the_root_mean_square_over_directions():

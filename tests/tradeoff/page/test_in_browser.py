@@ -12,7 +12,6 @@ from flying import message, picture, shrink
 from pointsplat_ns.tradeoff.front import fastest_above, fastest_within, next_best, pareto_front
 
 pytest.importorskip("selenium", reason="selenium is not installed")
-from selenium.webdriver.common.action_chains import ActionChains  # noqa: E402
 from selenium.webdriver.common.by import By  # noqa: E402
 from selenium.webdriver.common.keys import Keys  # noqa: E402
 
@@ -65,11 +64,6 @@ def write(browser, selector: str, text: str) -> None:
     field.send_keys(text)
 
 
-def press(browser, key: str) -> None:
-    """Press a key wherever the focus is."""
-    ActionChains(browser).send_keys(key).perform()
-
-
 def test_slider_goes_along_the_front(opened, sweep):
     front = pareto_front(sweep[0].points, "frame_ms", "photos", "psnr")
     slider = one(opened, "#stop")
@@ -91,49 +85,6 @@ def test_every_picture_that_is_shown_can_be_drawn(opened):
     script = "return [...document.images].filter((i) => i.src && i.naturalWidth === 0).map((i) => i.id)"
     assert opened.execute_script(script) == []
     assert opened.execute_script("return document.getElementById('wipe-over').naturalWidth") == 64
-
-
-def test_another_view_shows_the_same_point(opened):
-    before = shown(opened)
-    choose(opened, "view", "1")
-    after = shown(opened)
-    assert after["name"] == before["name"] and after["panel-photo"] == pictures_of(opened, 1)["photo"]
-    assert all(after[name] != before[name] for name in before if name != "name")
-
-
-def test_axes_and_references_can_be_changed(opened, sweep):
-    ends = set()
-    for cost in ("frame_ms", "gaussians", "bytes"):
-        choose(opened, "cost", cost)
-        ends.add(one(opened, ".axes .title").text)
-    assert ends == {"milliseconds a frame", "Gaussians", "size of the file, MB"}
-    choose(opened, "metric", "ssim")
-    assert opened.find_elements(By.CSS_SELECTOR, ".axes .title")[1].text == "SSIM"
-    assert not opened.find_elements(By.CSS_SELECTOR, ".axes .infinite, .axes .threshold")
-    choose(opened, "metric", "psnr")
-    choose(opened, "reference", "renders")
-    assert opened.find_elements(By.CSS_SELECTOR, ".axes .infinite"), "the dense scene is identical to itself"
-    assert len(opened.find_elements(By.CSS_SELECTOR, "#chart .point")) == len(sweep[0].points)
-    one(opened, "#stop").send_keys(Keys.END)
-    assert shown(opened)["name"] == "dense" and not one(opened, "#error").is_displayed()
-    assert one(opened, "#no-error").is_displayed() and shown(opened)["wipe-under"] == pictures_of(opened, 0)["dense"]
-
-
-def test_chart_is_used_with_the_keyboard(opened, sweep):
-    order = [p.key for p in sorted(sweep[0].points, key=lambda p: p.frame_ms)]
-    opened.execute_script("arguments[0].focus()", one(opened, "#chart [tabindex='0']"))
-    press(opened, Keys.HOME)
-    for key in order:
-        focused = opened.switch_to.active_element
-        assert focused.get_attribute("data-key") == key and focused.get_attribute("aria-selected") == "true"
-        assert not one(opened, ".tip").get_property("hidden")
-        press(opened, Keys.ARROW_RIGHT)
-    front = {p.key for p in pareto_front(sweep[0].points, "frame_ms", "photos", "psnr")}
-    [beaten] = [p for p in sweep[0].points if p.key not in front]
-    opened.execute_script(
-        "arguments[0].dispatchEvent(new Event('click'))", one(opened, f"[data-key='{beaten.key}'].point")
-    )
-    assert shown(opened)["name"] == f"{beaten.label} (not on the front)"
 
 
 @pytest.mark.parametrize("db", [0, 0.5, 5, 14])
@@ -159,51 +110,8 @@ def test_recommended_by_renders_is_the_one_that_python_finds(opened, sweep, db):
     assert not one(opened, "#within").is_displayed()
 
 
-def test_command_is_copied(opened, sweep):
-    write(opened, "#within", "14")
-    command = fastest_within(sweep[0].points, 14).command
-    opened.execute_cdp_cmd("Browser.grantPermissions", {"permissions": ["clipboardReadWrite"]})
-    button = one(opened, "#recommended-command button")
-    button.click()
-    read = "const done = arguments[0]; navigator.clipboard.readText().then(done, (error) => done(String(error)))"
-    assert command and opened.execute_async_script(read) == command
-    assert button.text == "Copied"
-
-
-def test_wipe_uncovers_what_is_below(opened):
-    wipe = one(opened, "#wipe-range")
-    wipe.send_keys(Keys.HOME)
-    clip = "return getComputedStyle(document.getElementById('wipe-over')).clipPath"
-    assert opened.execute_script(clip) == "inset(0px 100% 0px 0px)"
-    wipe.send_keys(Keys.END)
-    assert opened.execute_script(clip) in ("inset(0px)", "inset(0px 0% 0px 0px)")
-
-
-def test_table_is_sorted_and_leads_to_the_pictures(opened, sweep):
-    def keys() -> list[str]:
-        return [row.get_attribute("data-key") for row in opened.find_elements(By.CSS_SELECTOR, "#points tbody tr")]
-
-    points = sweep[0].points
-    [head] = [h for h in opened.find_elements(By.CSS_SELECTOR, "#points thead th") if h.text == "PSNR dB, renders"]
-    head.find_element(By.TAG_NAME, "button").click()
-    ascending = [p.key for p in sorted(points, key=lambda p: p.against_dense.psnr)]
-    assert keys() == ascending and head.get_attribute("aria-sort") == "ascending"
-    head.find_element(By.TAG_NAME, "button").click()
-    assert keys() == ascending[::-1] and head.get_attribute("aria-sort") == "descending"
-    one(opened, f"#points [data-key='{points[2].key}'] button").click()
-    assert shown(opened)["name"].startswith(points[2].label)
-
-
 def test_page_fits_a_phone_and_follows_the_colours_of_the_reader(opened):
     assert phone_and_colours(opened) == (360, ["rgb(247, 247, 245)", "rgb(18, 21, 24)"])
-
-
-def test_controls_have_names(opened):
-    script = """return [...document.querySelectorAll("button, input, pre, [role='option'], [role='region'], svg[role]")]
-      .filter((e) => !(e.getAttribute("aria-label") || e.getAttribute("aria-labelledby")))
-      .filter((e) => !(e.labels?.length || e.innerText))
-      .filter((e) => !e.closest("[hidden]")).map((e) => e.outerHTML)"""
-    assert opened.execute_script(script) == []
 
 
 def test_page_without_photos_or_with_strange_names_works(browser, make_page, sweep):
@@ -221,16 +129,6 @@ def test_page_of_the_dense_scene_alone_works(browser, make_page, sweep):
     choose(browser, "reference", "renders")
     assert shown(browser)["name"] == "dense" and len(browser.find_elements(By.CSS_SELECTOR, "#chart .point")) == 1
     assert complaints(browser) == []
-
-
-def test_pointer_shows_what_a_point_is(opened, sweep):
-    [mark] = opened.find_elements(By.CSS_SELECTOR, f".point[data-key='{sweep[0].points[2].key}']")
-    opened.execute_script("arguments[0].scrollIntoView({block: 'center'})", mark)
-    ActionChains(opened).move_to_element(mark.find_element(By.CSS_SELECTOR, ".shape")).move_by_offset(1, 1).perform()
-    assert one(opened, ".tip strong").text == sweep[0].points[2].label
-    mark.find_element(By.CSS_SELECTOR, ".shape").click()
-    assert shown(opened)["name"] == sweep[0].points[2].label
-    assert one(opened, ".tip").is_displayed()
 
 
 def test_the_recommended_scene_is_flown_through_beside_all_else(browser, make_page):
