@@ -138,7 +138,10 @@ def _variant_table(found: list[Summary], keeps: list[float], table: str, setting
         )
         cells = [summary.cell(keep) for keep in keeps]
         lines.append([f"`{summary.name}`", moves, *cells, f"{summary.cpu_ratio:.2f}", summary.count])
-    return markdown(["variant", "change", *map(_share, keeps), "CPU", "scenes and poses"], lines)
+    heads = ["variant", "change", *map(_share, keeps), "CPU", "scenes and poses"]
+    if len(counts := {summary.count for summary in found}) > 1:
+        return markdown(heads, lines)
+    return f"Scenes and poses: {counts.pop()}.\n\n" + markdown(heads[:-1], [line[:-1] for line in lines])
 
 
 def _share(keep: float) -> str:
