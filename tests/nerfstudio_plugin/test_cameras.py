@@ -10,8 +10,8 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, near_plane_of, views_of_cameras
-from pointsplat_ns.views import NEAR_PLANE, Views
+from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, eps2d_of, near_plane_of, views_of_cameras
+from pointsplat_ns.views import EPS2D, NEAR_PLANE, Views
 
 SEED = 20
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
@@ -59,24 +59,25 @@ def test_cameras_of_views_are_the_pinhole_cameras_that_the_views_were_made_of_in
     assert (back.camera_to_worlds.dtype, back.fx.dtype) == (torch.float32, torch.float32)
 
 
-@pytest.mark.parametrize("near_plane", [NEAR_PLANE, 1e-7, 0.1, 300.0])
-def test_the_near_plane_goes_to_nerfstudios_cameras_and_back(views, near_plane):
-    cameras = cameras_of_views(dataclasses.replace(views, near_plane=near_plane))
+@pytest.mark.parametrize(("near_plane", "eps2d"), [(NEAR_PLANE, EPS2D), (1e-7, 0.0), (0.1, 0.02), (300.0, 1.0)])
+def test_near_plane_and_eps2d_go_to_nerfstudios_cameras_and_back(views, near_plane, eps2d):
+    cameras = cameras_of_views(dataclasses.replace(views, near_plane=near_plane, eps2d=eps2d))
     for some in (cameras, cameras[1:2], copy.deepcopy(cameras).to("cpu")):
         assert near_plane_of(some) == near_plane == views_of_cameras(some, BACKGROUND).near_plane
+        assert eps2d_of(some) == eps2d == views_of_cameras(some, BACKGROUND).eps2d
 
 
 def test_cameras_of_a_dataset_have_gsplats_near_plane(views):
     assert near_plane_of(some_cameras()) == views.near_plane == NEAR_PLANE
     with_others = some_cameras()
     with_others.metadata = {"cam_idx": 1}
-    assert near_plane_of(with_others) == NEAR_PLANE
+    assert near_plane_of(with_others) == NEAR_PLANE and eps2d_of(with_others) == EPS2D
 
 
 def test_cameras_of_several_near_planes_or_sizes_are_refused(views):
     cameras = cameras_of_views(views)
     cameras.metadata["near_plane"] = torch.tensor([[0.1], [0.1], [0.2]])
-    with pytest.raises(DataError, match="2 near planes; expected one for all views"):
+    with pytest.raises(DataError, match="2 values of near_plane; expected one for all views"):
         views_of_cameras(cameras, BACKGROUND)
     cameras = some_cameras()
     cameras.width = torch.tensor([[40], [41], [40]])

@@ -25,6 +25,7 @@ from pointsplat_ns.io.files import content_hash
 from pointsplat_ns.io.ply import read_ply
 from pointsplat_ns.looking.poses import BACKGROUND
 from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.sizes import RESOLUTION, subsampled
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.memory_cache import CacheKey, MemoryCache
 from pointsplat_ns.rasterizer import render
@@ -121,12 +122,17 @@ class DenseScene:
         return dense
 
     def cameras(self, split: Split) -> Cameras:
-        """Pinhole cameras (C,) sampled in free space, different ones for each split. Raises DataError if nothing of the
-        scene is visible, or no free position is found."""
+        """Pinhole cameras (C,) sampled in free space, different ones for each split. Every second one of the training
+        split is subsampled from a picture of the size that people look at. Raises DataError if nothing of the scene is
+        visible, or no free position is found."""
         poses = self._poses
         seed = random.Random(f"{poses.seed} poses {split}").getrandbits(31)
         count = poses.train if split == "train" else poses.test
-        return cameras_of_views(sample_views(self.dense(keep=True), count, poses.width, poses.height, seed))
+        views = sample_views(self.dense(keep=True), count, poses.width, poses.height, seed)
+        cameras, side = cameras_of_views(views), max(poses.width, poses.height)
+        if split == "train" and side < max(RESOLUTION) and cameras.metadata is not None:
+            cameras.metadata["eps2d"][1::2] = subsampled(views, max(RESOLUTION), side).eps2d
+        return cameras
 
     @cached_property
     def rendered_train(self) -> RenderedFrames:

@@ -25,7 +25,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.metrics import psnr
-from pointsplat_ns.nerfstudio_plugin.cameras import near_plane_of, need_pinhole
+from pointsplat_ns.nerfstudio_plugin.cameras import eps2d_of, near_plane_of, need_pinhole
 from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PhotoLoss
@@ -223,6 +223,7 @@ class PointSplatModel(SplatfactoModel):
             width=width,
             height=height,
             near_plane=near_plane_of(camera),
+            eps2d=eps2d_of(camera),
             sh_degree=gaussians.sh_degree,
             render_mode="RGB" if self.training else "RGB+ED",
             rasterize_mode=scene.rasterize_mode,

@@ -16,11 +16,13 @@ from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.io.discovery import find_plys
 from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.nerfstudio_plugin.cameras import eps2d_of
 from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import PlyScene, SampledPoses
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.views import EPS2D, Views
 
 POSES = SampledPoses(train=6, test=3, width=32, height=24, seed=1)
 
@@ -113,10 +115,10 @@ def test_targets_are_the_dense_scenes_exact_renders_in_8_bits(rooms):
     assert not scene.dense(keep=False).means.requires_grad
     for frames, tolerance in ((scene.rendered_train, 0.5 / 255 + 1e-6), (scene.rendered_eval, 1e-6)):
         camera, data = frames[-1]
-        views = sample_views(scene.read_dense(), 1, 32, 24)
-        views = type(views)(
-            viewmats_from_opengl(camera.camera_to_worlds), camera.get_intrinsics_matrices(), 32, 24, scene.background
-        )
+        views = Views(
+            viewmats_from_opengl(camera.camera_to_worlds), camera.get_intrinsics_matrices(), 32, 24, scene.background,
+            eps2d=eps2d_of(camera),
+        )  # fmt: skip
         image = data["image"].float() / (255 if data["image"].dtype == torch.uint8 else 1)
         # half a level where they are rounded, float32 noise where they are not
         torch.testing.assert_close(image, render(scene.read_dense(), views[0]), atol=tolerance, rtol=0)
@@ -124,6 +126,12 @@ def test_targets_are_the_dense_scenes_exact_renders_in_8_bits(rooms):
     assert scene.rendered_train[0][1]["image"].dtype == torch.uint8
     with pytest.raises(IndexError):
         scene.rendered_train[6]
+
+
+def test_every_second_training_picture_is_subsampled_from_one_of_the_size_that_people_look_at(rooms):
+    scene = scene_of(rooms)
+    assert [eps2d_of(camera) for camera, _ in scene.rendered_train] == 3 * [EPS2D, EPS2D * (32 / 1920) ** 2]
+    assert [eps2d_of(camera) for camera, _ in scene.rendered_eval] == 3 * [EPS2D]
 
 
 def test_a_tiny_room_is_seen_as_the_same_room_in_other_units(rooms, tmp_path):
