@@ -241,7 +241,7 @@ def compact(
     request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds))
     format_to_write(target_format)
     goal = goal_of(request, keep, target_db, target_ms, target_mb, target_format)
-    _, result = compact_source(scene, request, goal, views, resolution, up, progress)
+    _, result, _ = compact_source(scene, request, goal, views, resolution, up, progress)
     return result
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -63,7 +64,6 @@ def prune_source(
         there are no views.
     """
     from pointsplat_ns.compression.prune import prune_scene
-    from pointsplat_ns.compression.quality import quality_of
 
     dense, source = read_source(scene, views, resolution, up)
     start = time.perf_counter()
@@ -71,14 +71,19 @@ def prune_source(
         pruned = prune_scene(dense, request, source, report)
         seconds, quality = time.perf_counter() - start, None
         if compared:
-            try:
-                looked = source.known(MERGED_FROM) or pruned.views or source.whole()
-                report("comparing renders", 0.0)
-                quality = quality_of(dense, pruned.scene, looked)
-            except DataError:
-                pass  # no place to look from
+            quality = _quality(dense, pruned.scene, lambda: source.known(MERGED_FROM) or pruned.views or source.whole())
     log(pruned.notes)
     return dense, pruned.scene, seconds, quality
+
+
+def _quality(dense: Gaussians, scene: Gaussians, views: Callable[[], Views]) -> Quality | None:
+    """How close a scene is to the dense scene at full size; None if there is no place to look from."""
+    from pointsplat_ns.compression.quality import quality_of
+
+    try:
+        return quality_of(dense, scene, views())
+    except DataError:
+        return None
 
 
 def compact_source(
@@ -89,7 +94,8 @@ def compact_source(
     resolution: Resolution = None,
     up: str | None = None,
     progress: bool | Progress = False,
-) -> tuple[Gaussians, Compacted]:
+    compared: bool = False,
+) -> tuple[Gaussians, Compacted, Quality | None]:
     """Read a scene and compact it; verdicts and notes are logged. Arguments as of :func:`pointsplat_ns.compact`.
 
     Args:
@@ -100,9 +106,10 @@ def compact_source(
         resolution: size of the pictures.
         up: the axis that is up in the scene.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
+        compared: compare the result with the dense scene at full size, in the views that no repair uses.
 
     Returns:
-        The dense scene and the result.
+        The dense scene, the result, and if ``compared`` how close both are; None if there are no views.
     """
     dense, source = read_source(scene, views, resolution, up)
     with progress_bar(progress) as report:
@@ -119,8 +126,9 @@ def compact_source(
             size, upward = parse_resolution(resolution), up_named(up)
             subject = subject_of(dense, run_of(scene, views), given, request.refiner, goal.suffix, size, upward)
             result = find_scene(subject, goal.targets, request.prune.by, repairs_of(goal.effort), report)
+        quality = _quality(dense, result.scene, source.whole) if compared else None
     log((*result.notes, *result.verdict.splitlines(), *result.target.splitlines()))
-    return dense, result
+    return dense, result, quality
 
 
 def goal_of(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -147,7 +148,9 @@ def compact(
     request = CompactRequest.of(_loaded(refiner), keep, by, sh, clean, RepairBudget(effort, seconds))
     goal = goal_of(request, keep, target_db, target_ms, target_mb, format_to_write(output).budget_suffix)
     with fixed_threads(threads):
-        dense, result = compact_source(scene, request, goal, poses, resolution, up, progress=True)
+        dense, result, quality = compact_source(
+            scene, request, goal, poses, resolution, up, progress=True, compared=True
+        )
     if not dry_run:
         ps.save(result.scene, output, progress=True)
         warn_if_larger(keep, output)
@@ -160,13 +163,14 @@ def compact(
             "refined": result.accepted,
             "repaired": result.repair_accepted,
             "psnr": result.psnr,
+            "quality": None if quality is None else asdict(quality),
             "picture": picture,
             "html": html,
         }
         print_json({**scene_result(len(dense), result.scene, result.seconds, written), **made})
         return end_if_interrupted(result.interrupted)
     also = ["refined"] * result.accepted + ["repaired"] * result.repair_accepted
-    print_result(request.prune.by, also, len(dense), result.scene, result.seconds, written)
+    print_result(request.prune.by, also, len(dense), result.scene, result.seconds, written, quality)
     if verbose:
         print_distributions(dense, result.scene)
     if shown is not None:

@@ -7,8 +7,9 @@ import shutil
 import time
 from pathlib import Path
 
+from pointsplat_ns.cli.printing import written_size
 from pointsplat_ns.cli.reading import Share
-from pointsplat_ns.cli.scene_options import claim_folder, claim_outputs, file_bytes
+from pointsplat_ns.cli.scene_options import claim_folder, claim_outputs
 
 HELD_OUT = "room2"
 """The room without a part in the refiner's training."""
@@ -90,7 +91,7 @@ def write_example(path: Path, force: bool) -> None:
     claim_outputs(path, force)
     scene = ps.example_room()
     ps.save(scene, path)
-    print(f"{path}: {len(scene):,} Gaussians, {file_bytes(path) / 1e6:.2f} MB")
+    print(f"{path}: {len(scene):,} Gaussians, {written_size(path)}")
 
 
 def compact_example(output: Path, keep: float) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.cli.printing import print_json
-from pointsplat_ns.errors import printable
+from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_task import SceneResult
@@ -60,20 +60,12 @@ def compact_folder(
 
 
 def _print_table(results: list[SceneResult]) -> None:
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(caption="dB: PSNR against the scene's own renders")
-    table.add_column("scene", overflow="fold")
-    for name in ("before", "after", "MB", "dB", "seconds"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("status")
     forms = (",", ",", ".2f", ".1f", ".1f")
+    rows = []
     for result in results:
         numbers = (result.before, result.after, result.megabytes, result.psnr, result.seconds)
         cells = ("-" if value is None else f"{value:{form}}" for value, form in zip(numbers, forms, strict=True))
         said = result.error or result.note
-        what = f"{result.status}: {said}" if said else result.status
-        table.add_row(escape(printable(result.name)), *cells, escape(printable(what)))
-    Console().print(table)
+        rows.append((result.name, *cells, f"{result.status}: {said}" if said else result.status))
+    header = ("scene", "before", "after", "MB", "dB", "seconds", "status")
+    print_table(header, rows, "dB: PSNR against the scene's own renders", left=(0, 6))

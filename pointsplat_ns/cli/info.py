@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,40 +43,53 @@ def info(
     claim_outputs(None, force, views)
     if not scenes or (views is not None and len(scenes) > 1):
         raise PointSplatError(f"{len(scenes)} scenes; expected {'one' if views else 'at least one'}")
-    found = [ps.info(scene, resolution=resolution, up=up) for scene in scenes]
+    found: list[SceneInfo] = []
+    failed: list[dict[str, str]] = []
+    for scene in scenes:
+        try:
+            found.append(ps.info(scene, resolution=resolution, up=up))
+        except PointSplatError as error:
+            if len(scenes) == 1:
+                raise
+            print(f"error: {error}", file=sys.stderr)
+            failed.append({"file": str(scene), "error": str(error)})
     sheet = None if views is None else ps.plot_views(scenes[0], views, resolution=resolution, up=up)
     if json_output:
-        print_json([one.as_dict() for one in found] if len(found) > 1 else found[0].as_dict())
-        return
-    if len(found) > 1:
+        rows = [*(one.as_dict() for one in found), *failed]
+        print_json(rows if len(rows) > 1 else rows[0])
+    elif len(scenes) > 1:
         _print_table(found)
     else:
         _print(found[0])
-    if sheet is not None:
+    if sheet is not None and not json_output:
         print(sheet)
+    if failed:
+        raise PointSplatError(f"{len(failed)} of {len(scenes)} scenes cannot be read")
 
 
 def _print_table(found: list[SceneInfo]) -> None:
     """A line for each scene, sizes in MB."""
+    from pointsplat_ns.io.files import three_digits
+    from pointsplat_ns.system.terminal import print_table
+
     suffixes = [".ply", ".compressed.ply", ".spz", ".sog"]
-    rows = [["file", "format", "MB", "Gaussians", "SH", "up", "fill", "suspicious", *suffixes]]
+    rows = []
     for one in found:
         sizes = [one.file_bytes.get(suffix, {}).get("100%") for suffix in suffixes]
         rows.append([
-            one.file, one.format, f"{one.bytes / 1e6:.2f}", f"{one.gaussians:,}", f"{one.sh_degree}", one.up_text,
+            one.file, one.format, three_digits(one.bytes / 1e6), f"{one.gaussians:,}", f"{one.sh_degree}", one.up_text,
             "-" if one.fill is None else f"{one.fill:.1f}", f"{sum(one.suspicious.values()):,}",
-            *("-" if size is None else f"{size / 1e6:.2f}" for size in sizes),
+            *("-" if size is None else three_digits(size / 1e6) for size in sizes),
         ])  # fmt: skip
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = [cell.ljust(width) if at in (0, 1, 5) else cell.rjust(width) for at, (cell, width) in
-                 enumerate(zip(row, widths, strict=True))]  # fmt: skip
-        print("  ".join(cells).rstrip())
-    print("fill: Gaussians drawn per pixel; the last four: MB in this format, .spz and .sog estimated")
+    header = ["file", "format", "MB", "Gaussians", "SH", "up", "fill", "suspicious", *suffixes]
+    caption = "fill: Gaussians drawn per pixel; the last four: MB in this format, .spz and .sog estimated"
+    print_table(header, rows, caption, left=(0, 1, 5))
 
 
 def _print(found: SceneInfo) -> None:
-    print(f"{found.file}: {found.format}, {found.bytes / 1e6:.2f} MB")
+    from pointsplat_ns.io.files import bytes_text, three_digits
+
+    print(f"{found.file}: {found.format}, {bytes_text(found.bytes)}")
     print(f"{found.gaussians:,} Gaussians of SH degree {found.sh_degree}")
     print(f"up: {found.up_text}{'; --up names another axis' if found.up_is_guess else ''}")
     if found.fill is not None:
@@ -95,7 +109,7 @@ def _print(found: SceneInfo) -> None:
     shares = next(iter(found.file_bytes.values()), {})
     print(" " * 18 + "".join(f"{share:>9}" for share in shares))
     for suffix, sizes in found.file_bytes.items():
-        print(f"  {suffix:<16}" + "".join(f"{size / 1e6:>9.2f}" for size in sizes.values()))
+        print(f"  {suffix:<16}" + "".join(f"{three_digits(size / 1e6):>9}" for size in sizes.values()))
 
 
 def _bars(title: str, counts: dict[str, int]) -> None:

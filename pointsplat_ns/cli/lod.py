@@ -18,6 +18,7 @@ from pointsplat_ns.cli.scene_options import (
     need_one_scene,
     output_beside,
 )
+from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.levels import Levels
@@ -77,28 +78,24 @@ def lod(
 
 
 def _print_table(made: Levels, folder: Path) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
     from pointsplat_ns.io.files import three_digits
     from pointsplat_ns.pruning import ply_bytes
 
-    numbers = ("Gaussians", "share", "MB", "PSNR, dB", "worst, dB", "SSIM", "seconds")
-    table = Table(caption="against the dense scene's own renders; worst: of the views")
-    table.add_column("", no_wrap=True)
-    for name in numbers:
-        table.add_column(name, justify="right", no_wrap=True)
+    rows = []
     for index, level in enumerate(made):
         near = level.errors and level.errors.near
-        table.add_row(
-            f"level_{index}",
-            f"{len(level.scene):,}",
-            f"{100 * len(level.scene) / len(made.dense):.3g} %",
-            three_digits(ply_bytes(len(level.scene), level.scene.sh_degree) / 1e6),
-            f"{near.psnr:.1f}" if near else "-",
-            f"{near.worst:.1f}" if near else "-",
-            f"{near.ssim:.3f}" if near and near.ssim is not None else "-",
-            f"{level.seconds:.1f}",
+        rows.append(
+            (
+                f"level_{index}",
+                f"{len(level.scene):,}",
+                f"{100 * len(level.scene) / len(made.dense):.3g} %",
+                three_digits(ply_bytes(len(level.scene), level.scene.sh_degree) / 1e6),
+                f"{near.psnr:.1f}" if near else "-",
+                f"{near.worst:.1f}" if near else "-",
+                f"{near.ssim:.3f}" if near and near.ssim is not None else "-",
+                f"{level.seconds:.1f}",
+            )
         )
     print(f"{folder}: {len(made)} levels of {len(made.dense):,} Gaussians")
-    Console().print(table)
+    header = ("", "Gaussians", "share", "MB", "PSNR, dB", "worst, dB", "SSIM", "seconds")
+    print_table(header, rows, "against the dense scene's own renders; worst: of the views")

@@ -14,6 +14,7 @@ import tyro
 from pointsplat_ns.cli.scene_options import file_bytes
 
 if TYPE_CHECKING:
+    from pointsplat_ns.compression.quality import Quality
     from pointsplat_ns.gaussians import Gaussians
 
 Json = Annotated[bool, tyro.conf.arg(name="json")]
@@ -78,8 +79,10 @@ def scene_result(before: int | None, scene: Gaussians, seconds: float, where: Pa
     }
 
 
-def print_result(by: str, also: list[str], before: int, scene: Gaussians, seconds: float, where: Path | None) -> None:
-    """Print one line: what was done, counts, size of the file and time.
+def print_result(
+    by: str, also: list[str], before: int, scene: Gaussians, seconds: float, where: Path | None, quality: Quality | None
+) -> None:
+    """Print what was done, counts, size of the file and time, and how close the result is to the dense scene.
 
     Args:
         by: the method of pruning.
@@ -88,6 +91,7 @@ def print_result(by: str, also: list[str], before: int, scene: Gaussians, second
         scene: the result.
         seconds: duration.
         where: the written file; None in a dry run, whose size is that of a PLY.
+        quality: comparison with the dense scene; None if there are no views.
     """
     from pointsplat_ns.io.files import bytes_text
     from pointsplat_ns.pruning import ply_bytes
@@ -98,6 +102,7 @@ def print_result(by: str, also: list[str], before: int, scene: Gaussians, second
     place = "dry run, nothing is written" if where is None else where
     counts = f"{len(scene):,} of {before:,} Gaussians ({100 * len(scene) / before:.3g} %)"
     print(f"{place}: {done} to {counts}, {size}, in {seconds_text(seconds)}")
+    print(quality or "not compared with the dense scene: there is no free place to look from")
 
 
 def written_size(where: Path) -> str:
@@ -122,18 +127,18 @@ def seconds_text(seconds: float) -> str:
 
 def print_distributions(before: Gaussians, after: Gaussians) -> None:
     """Print a table of counts and quantiles, before and after."""
-    from rich.console import Console
-    from rich.table import Table
-
     from pointsplat_ns.compression.distributions import opacity_quantiles, size_quantiles
+    from pointsplat_ns.system.terminal import print_table
 
-    table = Table("", "before", "after", caption="quantiles are 10 / 50 / 90 %; size is the largest standard deviation")
     rows = {
         "Gaussians": lambda s: f"{len(s):,}",
         "SH degree": lambda s: f"{s.sh_degree}",
         "opacity": lambda s: " / ".join(f"{value:.2f}" for value in opacity_quantiles(s)),
         "size, scene units": lambda s: " / ".join(f"{value:.2g}" for value in size_quantiles(s)),
     }
-    for name, text in rows.items():
-        table.add_row(name, text(before), text(after))
-    Console().print(table)
+    print_table(
+        ("", "before", "after"),
+        [(name, text(before), text(after)) for name, text in rows.items()],
+        "quantiles are 10 / 50 / 90 %; size is the largest standard deviation",
+        left=(0, 1, 2),
+    )

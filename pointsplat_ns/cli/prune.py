@@ -5,7 +5,14 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
-from pointsplat_ns.cli.printing import Json, Verbose, print_distributions, print_json, print_result, scene_result
+from pointsplat_ns.cli.printing import (
+    Json,
+    Verbose,
+    print_distributions,
+    print_json,
+    print_result,
+    scene_result,
+)
 from pointsplat_ns.cli.scene_options import (
     Bands,
     Output,
@@ -101,8 +108,7 @@ def prune(
         compared = asdict(quality) if quality else {"psnr": None}
         print_json({**scene_result(len(dense), small, seconds, written), **compared, "plot": plot})
         return
-    print_result(by, [], len(dense), small, seconds, written)
-    print(quality or "not compared with the dense scene: there is no free place to look from")
+    print_result(by, [], len(dense), small, seconds, written, quality)
     if verbose:
         print_distributions(dense, small)
     if plot is not None:

@@ -160,14 +160,14 @@ def in_format_of(keep: str, output: Path) -> str:
 
 def warn_if_larger(keep: str | None, output: Path) -> None:
     """Warn if a file is larger than its budget: a repaired scene may compress less well than the pruned one."""
-    from pointsplat_ns.io.files import logger
+    from pointsplat_ns.io.files import bytes_text, logger
     from pointsplat_ns.pruning import Megabytes, parse_keep
 
     budget = None if keep is None else parse_keep(keep)
     if isinstance(budget, Megabytes) and file_bytes(output) > budget.value * 1e6:
         logger.warning(
-            "%s: %.2f MB, more than %s, which held before the repair; try a smaller --keep",
-            output, file_bytes(output) / 1e6, budget,
+            "%s: %s, more than %s, which held before the repair; try a smaller --keep",
+            output, bytes_text(file_bytes(output)), budget,
         )  # fmt: skip
 
 

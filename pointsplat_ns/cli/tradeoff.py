@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 from pointsplat_ns.cli.printing import Json, print_json
 from pointsplat_ns.cli.reading import Megabytes
 from pointsplat_ns.cli.scene_options import Output, Poses, Resolution, Scene, Up, check_poses, output_beside
+from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
     from pointsplat_ns.tradeoff.points import Quality, Tradeoff
@@ -95,43 +96,31 @@ def tradeoff(
 
 def _print_table(found: Tradeoff) -> None:
     """The figures that matter most; the others are in the table on disk."""
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Table
-
+    from pointsplat_ns.io.files import three_digits
     from pointsplat_ns.tradeoff.points import speed_of
 
     photos = found.points[0].against_photos is not None
     print(f"{found.scene}: {len(found.points)} points, {found.width} x {found.height} pixels, {found.views_origin}")
     print(found.machine)
-    caption = "*: recommended; times as fast as the dense scene: median and quartiles over views; dB of PSNR"
-    table = Table(box=SIMPLE, caption=caption, collapse_padding=True, pad_edge=False)
-    table.add_column("", min_width=18)
-    for name in [
-        "Gaussians",
-        "MB",
-        "times as fast",
-        "ms a\nframe",
-        "dB,\nrenders",
-        *(["dB,\nphotos"] if photos else []),
-    ]:
-        table.add_column(name, justify="right", no_wrap=True)
+    rows = []
     for point in found.points:
         speed = speed_of(point, found.points[0])
-        table.add_row(
-            point.label + (" *" if point.key == found.recommended else ""),
-            f"{point.gaussians:,}",
-            f"{point.bytes / 1e6:.2f}",
-            f"{speed.median:.1f} ({speed.low:.1f}-{speed.high:.1f})",
-            _ms(point.frame_ms),
-            f"{point.against_dense.psnr:.2f}",
-            *([_psnr(point.against_photos)] if photos else []),
+        rows.append(
+            (
+                point.label + (" *" if point.key == found.recommended else ""),
+                f"{point.gaussians:,}",
+                three_digits(point.bytes / 1e6),
+                f"{speed.median:.1f} ({speed.low:.1f}-{speed.high:.1f})",
+                three_digits(point.frame_ms),
+                f"{point.against_dense.psnr:.2f}",
+                *([_psnr(point.against_photos)] if photos else []),
+            )
         )
-    Console().print(table)
-
-
-def _ms(milliseconds: float) -> str:
-    return f"{milliseconds:.3g}" if milliseconds < 100 else f"{milliseconds:.0f}"
+    print_table(
+        ("", "Gaussians", "MB", "times as fast", "ms a\nframe", "dB,\nrenders", *(["dB,\nphotos"] if photos else [])),
+        rows,
+        "*: recommended; times as fast as the dense scene: median and quartiles over views; dB of PSNR",
+    )
 
 
 def _psnr(quality: Quality | None) -> str:

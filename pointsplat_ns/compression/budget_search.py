@@ -70,21 +70,13 @@ def smallest_within(
     psnr: float,
     progress: Callable[[float], None] | None = None,
 ) -> FoundQuality:
-    """Search for the smallest scene of a method whose renders reach ``psnr`` against those of the dense scene.
+    """Search for the smallest scene of a method whose renders reach ``psnr``, dB, against those of the dense scene in
+    some views; ``make`` gives the scene of a count.
 
     The PSNR is that of the mean squared error of all views, so bad views count more, over the pixels that the dense
     scene covers. The result was rendered and reaches ``psnr``. A smaller such scene may exist where PSNR does not
-    always rise with the count.
-
-    Args:
-        dense: N Gaussians.
-        make: from a count K to a scene of K Gaussians.
-        views: views that renders are compared in.
-        psnr: PSNR to reach, dB.
-        progress: called with the share done, in [0, 1].
-
-    Raises:
-        BudgetError: if ``psnr`` is not a positive number, if there is no view, or if not even all N Gaussians reach it.
+    always rise with the count. Raises BudgetError if ``psnr`` is not a positive number, if there is no view, or if not
+    even all N Gaussians reach it.
     """
     if not 0 < psnr < math.inf:
         raise BudgetError(f"the wanted PSNR is {psnr} dB; expected a positive number, such as 35")
@@ -118,18 +110,8 @@ def largest_within(
     limit: int,
     progress: Callable[[float], None],
 ) -> FoundSize:
-    """Search for the largest scene of a method whose file has at most ``limit`` bytes.
-
-    Args:
-        full: N Gaussians; all are kept if they fit.
-        make: from a count K to a scene of K Gaussians.
-        kind: a compressed format, whose size depends on the content.
-        limit: bytes.
-        progress: called with the share done, in [0, 1].
-
-    Raises:
-        BudgetError: if not even one Gaussian fits.
-    """
+    """Search for the largest scene of a method whose file, of a compressed format, has at most ``limit`` bytes;
+    ``make`` gives the scene of a count below that of ``full``. Raises BudgetError if not even one Gaussian fits."""
     n = len(full)
     tried: dict[int, int] = {}
     best: FoundSize | None = None

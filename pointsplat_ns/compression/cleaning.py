@@ -70,29 +70,16 @@ class Cleaning:
     """A line of text for each rule."""
 
     def apply(self, scene: Gaussians, at_least: int) -> Gaussians:
-        """The scene without its junk. The most opaque junk stays where fewer than ``at_least`` Gaussians would remain.
-
-        Args:
-            scene: the scene as read, perhaps with fewer SH bands.
-            at_least: in 1..N.
-        """
+        """The scene as read, perhaps with fewer SH bands, without its junk. The most opaque junk stays where fewer than
+        ``at_least`` Gaussians would remain."""
         dropped = _first(self.junk, self.count - at_least)
         return _without(scene, torch.cat([dropped.undrawable, dropped.unseen]))
 
 
 @torch.no_grad()
 def find_junk(scene: Gaussians, progress: Progress = silent) -> Junk:
-    """Find the Gaussians that cannot be drawn, and those that no camera sees.
-
-    The result is deterministic. It does not depend on the scene's unit of length, but for rounding.
-
-    Args:
-        scene: N Gaussians.
-        progress: called with the name of the task and the share of it that is done, in [0, 1].
-
-    Returns:
-        Indices on the CPU. All Gaussians are junk if none can be drawn.
-    """
+    """Find the Gaussians that cannot be drawn, and those that no camera sees: indices on the CPU. All are junk if none
+    can be drawn. The result is deterministic, and but for rounding does not depend on the unit of length."""
     usable = scene.usable()
     drawable = usable & (scene.alphas >= ALPHA_MIN)
     order = torch.where(usable, scene.alphas, -1.0).sort(stable=True).indices
@@ -123,14 +110,8 @@ def _has_pixels(scene: Gaussians, views: Views, progress: Progress) -> Tensor:
 
 
 def clean_scene(dense: Gaussians, at_least: int, views: ViewSource, progress: Progress = silent) -> Cleaning:
-    """Find the junk of a scene, and measure the PSNR of renders without it.
-
-    Args:
-        dense: N Gaussians.
-        at_least: least number of Gaussians that remain, in 1..N.
-        views: views to compare renders in. They do not decide which Gaussians are junk.
-        progress: called with the name of the task and the share of it that is done, in [0, 1].
-    """
+    """Find the junk of a scene, and measure the PSNR of renders without it. Views do not decide which Gaussians are
+    junk. At least ``at_least`` Gaussians, in 1..N, remain."""
     junk = find_junk(dense, progress=progress)
     dropped = _first(junk, len(dense) - at_least)
     if len(dropped) == 0:
@@ -187,11 +168,8 @@ def _without(scene: Gaussians, indices: Tensor) -> Gaussians:
 
 
 def _views_all_around(scene: Gaussians) -> Views:
-    """Views in six directions from places in free space, six in a row for each place.
-
-    Raises:
-        DataError: if there is no free space.
-    """
+    """Views in six directions from places in free space, six in a row for each place. Raises DataError if there is
+    none."""
     # Without SH, so that places do not depend on where photos were taken.
     without_sh = scene.replace(features_rest=scene.features_rest[:, :0])
     places = invert_rigid(sample_views(without_sh, SETTINGS.places, seed=SETTINGS.seed).viewmats)[:, :3, 3]

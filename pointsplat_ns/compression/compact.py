@@ -165,20 +165,12 @@ class Compacted:
 def compact_scene(
     dense: Gaussians, request: CompactRequest, views: ViewSource | None = None, progress: Progress = silent
 ) -> Compacted:
-    """Make a scene smaller, refine it if there is a refiner, and repair it for the budget of the request.
+    """Make a scene smaller, refine it if there is a refiner, and repair it for the budget of the request. Scenes of the
+    result are on the device of ``dense``. By default views are sampled in free space.
 
     Refinement and repair are accepted by comparing renders with those of the dense scene
     (:mod:`~pointsplat_ns.compression.acceptance`). A requested PSNR (``auto``) is reached before refinement, so that it
     holds in any case. The repair uses other views than the comparison.
-
-    Args:
-        dense: N Gaussians.
-        request: options.
-        views: source of views; by default poses sampled in free space.
-        progress: called with the name of the current task and the share of it that is done, in [0, 1].
-
-    Returns:
-        Scenes on the device of ``dense``.
 
     Raises:
         BudgetError, SceneError, PointSplatError: as :func:`~pointsplat_ns.compression.prune.prune_scene`.
@@ -212,14 +204,7 @@ def compact_scene(
 
 
 def as_compacted(dense: Gaussians, pruned: Gaussians, views: ViewSource, notes: tuple[str, ...]) -> Compacted:
-    """The result of :func:`compact_scene` for a scene that is only pruned.
-
-    Args:
-        dense: the scene before.
-        pruned: the scene after.
-        views: source of the views to compare renders in.
-        notes: lines of text on the pruning.
-    """
+    """The result of :func:`compact_scene` for a scene that is only pruned, with notes on the pruning."""
     reference = DenseReference(dense, views.compared())
     return Compacted((Stage("prune", pruned, reference.closeness(pruned)),), notes, reference, 0.0)
 
@@ -258,16 +243,8 @@ def _repair(
     views: ViewSource,
     progress: Progress,
 ) -> Stage | None:
-    """The repair; None if its budget is empty, there are no views, or the scene has no error.
-
-    Args:
-        last: the last stage that was kept.
-        dense: N Gaussians, on the device that renders.
-        request: options.
-        judge: compares scenes with the dense scene; None if there are no views.
-        views: source of views.
-        progress: called with the name of the current task and the share of it that is done, in [0, 1].
-    """
+    """The repair of the last stage that was kept; None if its budget is empty, there are no views (and so no judge), or
+    the scene has no error. ``dense`` is on the device that renders."""
     if judge is None or last.after is None or request.repair.empty or last.after.psnr == math.inf:
         return None
     progress("repairing", 0.0)

@@ -67,12 +67,9 @@ def find_count(
         first: the first count tried.
         most, least: bounds of the count.
         slope: rise of the measure for each e-fold of the count; None if it is not known.
-        settings: when the search ends, and how it steps.
 
     Example:
         >>> find_count(lambda count: count / 10, 42.0, at_least=True, first=1000, most=1000).count in range(420, 442)
-        True
-        >>> find_count(lambda count: count / 10, 42.0, at_least=False, first=1000, most=1000).count in range(400, 421)
         True
     """
     settings = settings or SearchSettings()

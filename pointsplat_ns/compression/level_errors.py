@@ -65,13 +65,8 @@ def _averaged(image: Tensor, side: int) -> Tensor:
 
 @torch.no_grad()
 def displacement(dense: Gaussians, level: Gaussians, assignment: Tensor) -> Displacement:
-    """Measure how far merging moved the centres of Gaussians.
-
-    Args:
-        dense: N Gaussians.
-        level: K Gaussians, merged from ``dense``.
-        assignment: (N,) index in ``level`` for each Gaussian of ``dense``; -1 if dropped. At least one is not dropped.
-    """
+    """Measure how far merging moved the centres of Gaussians, by the index (N,) in ``level`` of each Gaussian of
+    ``dense``; -1 if dropped. At least one is not dropped."""
     own = (assignment >= 0).nonzero()[:, 0]
     pieces = own.split(1 << 20)  # because float64 takes memory
     distances = torch.cat([(dense.means[i].double() - level.means[assignment[i]].double()).norm(dim=1) for i in pieces])

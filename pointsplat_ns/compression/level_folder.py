@@ -29,16 +29,8 @@ def file_names(index: int) -> tuple[str, str]:
 
 
 def check_folder(folder: Path, count: int, force: bool) -> None:
-    """Check that ``count`` levels may be written to a folder, before the long computations.
-
-    Args:
-        folder: need not exist.
-        count: number of levels.
-        force: whether existing files may be overwritten.
-
-    Raises:
-        SceneError: if it is a file or named like one, or holds a file that must not be overwritten.
-    """
+    """Raise a SceneError, before the long computations, if ``count`` levels may not be written to a folder: it is a
+    file or named like one, or holds a file that must not be overwritten."""
     if folder.suffix.lower() in (".ply", ".json", ".png"):
         raise SceneError(f"{folder}: levels are several files; expected the name of a folder")
     if folder.exists() and not folder.is_dir():
@@ -65,10 +57,8 @@ def write_levels(
     Args:
         folder: created if it is missing.
         levels: the scene of each, and the parents (M,) int32 of the level before it.
-        about: the manifest's facts on all levels together.
-        facts: its facts on each level.
-        images: (H, W, 3) each, of one size; none for no picture.
-        captions: text below each image.
+        about, facts: the manifest's facts on all levels together, and on each.
+        images, captions: (H, W, 3) each, of one size, with text below; none for no picture.
         force: whether existing files may be overwritten.
 
     Raises:

@@ -203,14 +203,9 @@ def _farther(psnrs: dict[int, float]) -> list[dict[str, Any]]:
 
 
 def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
-    """The text and the budget of each level, checked as far as that is possible without the scene.
-
-    Args:
-        levels: ratios, percentages, counts and sizes as for ``keep``; a text may hold several, separated by spaces.
-
-    Raises:
-        BudgetError: if there is no level, or a level is not a budget or needs a search.
-    """
+    """The text and the budget of each level, checked as far as that is possible without the scene: ratios, percentages,
+    counts and sizes as for ``keep``; a text may hold several, separated by spaces. Raises BudgetError if there is none,
+    or a level is not a budget or needs a search."""
     levels = levels.split() if isinstance(levels, str) else levels
     if not levels:
         raise BudgetError("no level given; expected at least one, such as 50%")
@@ -236,11 +231,8 @@ def _text(level: Keep) -> str:
 
 
 def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int) -> list[int]:
-    """The number of Gaussians of each level of a scene of ``n``, descending.
-
-    Raises:
-        BudgetError: if a level does not fit the scene, or two levels have the same number.
-    """
+    """The number of Gaussians of each level of a scene of ``n``, descending. Raises BudgetError if a level does not fit
+    the scene, or two levels have the same number."""
     texts: dict[int, str] = {}
     for text, budget in levels:
         try:

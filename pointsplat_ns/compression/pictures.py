@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from pointsplat_ns.compression.compact import Compacted
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import replacing
+from pointsplat_ns.io.files import bytes_text, replacing
 from pointsplat_ns.looking.closeness import Closeness
 from pointsplat_ns.looking.coverage import coverage
 from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
@@ -63,7 +63,7 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> st
 
 
 def _title(name: str, scene: Gaussians, close: Closeness | None) -> str:
-    size = f"{len(scene):,} Gaussians, {ply_bytes(len(scene), scene.sh_degree) / 1e6:.2f} MB"
+    size = f"{len(scene):,} Gaussians, {bytes_text(ply_bytes(len(scene), scene.sh_degree))}"
     return f"{name}\n{size}" + (f", {close.psnr:.2f} dB" if close is not None else "")
 
 
@@ -97,16 +97,8 @@ def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
 
 
 def side_by_side(rows: Sequence[Sequence[ArrayLike]], titles: list[str], path: Path | str) -> None:
-    """Draw a grid of images of one size, a title above each column.
-
-    Args:
-        rows: images (H, W, 3) in [0, 1], one per column in each row.
-        titles: titles of the columns.
-        path: the PNG file to write.
-
-    Raises:
-        SceneError: if the file cannot be written.
-    """
+    """Draw a grid of images (H, W, 3) in [0, 1] of one size to a PNG file, with a title above each column. Raises
+    SceneError if the file cannot be written."""
     from matplotlib.figure import Figure
 
     height, width = np.shape(rows[0][0])[:2]

@@ -96,11 +96,8 @@ def _frame_at(path: str | Path) -> Similarity:
 
 
 def run_frame(run: Run) -> Similarity:
-    """The similarity from the frame of a run's data to the frame of its scene.
-
-    Raises:
-        SceneError: if the run's transform is not a rotation with one scale.
-    """
+    """The similarity from the frame of a run's data to that of its scene. Raises SceneError if the run's transform is
+    not a rotation with one scale."""
     linear = run.transform[:, :3].double()
     size = float(torch.linalg.det(linear).abs()) ** (1 / 3)
     matrix = linear / size if size > 0 else linear

@@ -23,15 +23,8 @@ LONGEST_SIDE = 1600
 
 
 def read_posed(scene: Gaussians | Path | str, poses: Path | str) -> tuple[Gaussians, Views]:
-    """Read a scene and its views. The file of cameras is read first; then both are checked against each other.
-
-    Args:
-        scene: N Gaussians, or the path of a scene.
-        poses: as for :func:`views_for`.
-
-    Raises:
-        SceneError, DataError: as :func:`views_for`, :func:`~pointsplat_ns.io.read_scene` and :func:`check_views_show`.
-    """
+    """Read a scene and its views. The file of cameras is read first; then both are checked against each other. Errors
+    are those of :func:`views_for`, :func:`~pointsplat_ns.io.read_scene` and :func:`check_views_show`."""
     views = views_for(scene, poses)
     dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
     check_views_show(dense, views, poses)
@@ -39,21 +32,11 @@ def read_posed(scene: Gaussians | Path | str, poses: Path | str) -> tuple[Gaussi
 
 
 def views_for(scene: Gaussians | Path | str, poses: Path | str) -> Views:
-    """Read the views of a scene from a file.
+    """Read the views of a scene from a file of cameras, of at most 1600 pixels on the longer side.
 
     A ``dataparser_transforms.json`` in the scene's run, beside the scene or beside the poses moves them into the
-    scene's frame. The views have the rasterize mode of the scene's run.
-
-    Args:
-        scene: N Gaussians, or the path of a scene.
-        poses: as for :func:`~pointsplat_ns.io.camera_files.read_views`.
-
-    Returns:
-        C views of at most 1600 pixels on the longer side.
-
-    Raises:
-        SceneError: if a file is missing, or the transforms are not usable.
-        DataError: if the file has no usable cameras.
+    scene's frame. The views have the rasterize mode of the scene's run. Raises SceneError if a file is missing, or the
+    transforms are not usable, and DataError if the file has no usable cameras.
     """
     if isinstance(scene, Gaussians):
         return read_views(poses).resized(LONGEST_SIDE)
@@ -66,20 +49,12 @@ def views_for(scene: Gaussians | Path | str, poses: Path | str) -> Views:
 
 
 def check_views_show(scene: Gaussians, views: Views, poses: Path | str) -> None:
-    """Refuse views if the scene is not in the picture in most of them.
+    """Raise a DataError, with the path ``poses`` of the cameras, if fewer than half of the views show the scene.
 
     A view shows the scene if a visible Gaussian is in the picture, and the content is at least 2 % as wide as the
     picture: many a distant camera has a dot of the scene in its picture. The content leaves out 5 % of the Gaussians at
     each end of each axis, because far floaters are in the picture of nearly any camera. An even choice of up to 4096
-    Gaussians and 256 cameras is checked.
-
-    Args:
-        scene: N Gaussians; a scene without a visible Gaussian is not refused here.
-        views: C cameras.
-        poses: path of the cameras, for the error.
-
-    Raises:
-        DataError: if fewer than half of the views show the scene.
+    Gaussians and 256 cameras is checked. A scene without a visible Gaussian is not refused here.
     """
     visible = (scene.usable() & (scene.alphas >= ALPHA_MIN)).nonzero()[:, 0]
     means = scene.means[visible[:: max(1, len(visible) // 4096)]].double().cpu()

@@ -53,19 +53,8 @@ class Pruned:
 def prune_scene(
     dense: Gaussians, request: PruneRequest, views: ViewSource | None = None, progress: Progress = silent
 ) -> Pruned:
-    """Make a scene smaller.
-
-    Args:
-        dense: N Gaussians.
-        request: options.
-        views: source of views; by default poses sampled in free space.
-        progress: called with the name of the current task and the share of it that is done, in [0, 1].
-
-    Raises:
-        BudgetError: if the budget cannot be met.
-        SceneError: if no Gaussian of the scene can be drawn.
-        DataError: if views are needed and there are none.
-    """
+    """Make a scene smaller, by default with views sampled in free space. Raises BudgetError if the budget cannot be
+    met, SceneError if no Gaussian of the scene can be drawn, and DataError if views are needed and there are none."""
     if len(dense) == 0:
         raise BudgetError(f"keep is {request.keep} but the scene holds no Gaussians; expected at least one")
     need_usable(dense)
@@ -167,17 +156,8 @@ def _search(
     progress: Callable[[float], None],
     notes: list[str],
 ) -> Gaussians:
-    """The scene of a budget that needs a search; adds a line to ``notes``.
-
-    Args:
-        dense: the reference of comparisons.
-        start: the largest scene allowed.
-        make: from a count to a scene of that many Gaussians.
-        request: its budget is a PSNR, or the size of a compressed file.
-        views: source of the views to compare renders in.
-        progress: called with the share done, in [0, 1].
-        notes: lines of text.
-    """
+    """The scene of a budget that needs a search: a PSNR against ``dense``, or the size of a compressed file. ``start``
+    is the largest scene allowed; ``make`` gives the scene of a count. Adds a line to ``notes``."""
     budget = request.budget
     if isinstance(budget, WithinPsnr):
         from pointsplat_ns.compression.budget_search import smallest_within

@@ -42,11 +42,8 @@ def quality_of(dense: Gaussians, scene: Gaussians, views: Views) -> Quality:
     """Compare a scene with the dense scene in subsampled pictures (:mod:`~pointsplat_ns.looking.sizes`). On a statue, a
     bathroom and flowers the PSNR is within 0.03 dB of that of the whole pictures.
 
-    Args:
-        dense: N Gaussians.
-        scene: K Gaussians.
-        views: views of the dense scene at full size, from which it was merged, if it was. At most :data:`MOST_VIEWS`
-            are used, and none that the finish of merging compared, unless there are no others.
+    Of the views, which are at full size, at most :data:`MOST_VIEWS` are used, and none that the finish of merging
+    compared, unless there are no others.
     """
     finish = spread_indices(len(views), MERGING.finish_views)
     if others := sorted({*range(len(views))} - {*finish}):

@@ -45,11 +45,8 @@ def default_device() -> torch.device:
 
 @dataclass(frozen=True)
 class RepairBudget:
-    """Length of a repair, in steps or seconds.
-
-    Raises:
-        PointSplatError: if it is not a positive time or one of :data:`STEPS`.
-    """
+    """Length of a repair, in steps or seconds. Raises PointSplatError if it is not a positive time or one of
+    :data:`STEPS`."""
 
     effort: Effort = "quick"
     """Number of steps, see :data:`STEPS`. The result does not depend on the speed of the machine."""
@@ -130,15 +127,9 @@ class PruneRequest:
         return method_named(self.by)
 
     def count_of(self, n: int, sh_degree: int) -> int | None:
-        """Number of Gaussians to keep of ``n``; None if it needs a search (a PSNR, or the size of a compressed file).
-
-        Args:
-            n: number of Gaussians in the dense scene.
-            sh_degree: SH degree of the result, on which the number that fits a file depends.
-
-        Raises:
-            BudgetError: if the budget does not fit the scene.
-        """
+        """Number of Gaussians to keep of ``n``, which depends on the SH degree of the result where it has to fit a
+        file; None if it needs a search (a PSNR, or the size of a compressed file). Raises BudgetError if the budget
+        does not fit the scene."""
         if not found_by_trying(self.budget):
             return resolve_keep(n, self.budget, sh_degree)
         if isinstance(self.budget, Megabytes):
@@ -166,19 +157,8 @@ class CompactRequest:
         clean: bool = False,
         repair: RepairBudget = NO_REPAIR,
     ) -> CompactRequest:
-        """A request from options that may be missing.
-
-        Args:
-            refiner: None for no refinement.
-            keep: None is the budget of the refiner's training; without a refiner, :data:`COMPACT_KEEP`.
-            by: None is the method of the refiner's training; without a refiner, merging.
-            sh: as of :class:`PruneRequest`.
-            clean: as of :class:`PruneRequest`.
-            repair: length of the repair; by default there is none.
-
-        Raises:
-            BudgetError, PointSplatError: as :class:`PruneRequest`.
-        """
+        """A request from options that may be missing: ``keep`` and ``by`` are then those of the refiner's training;
+        without a refiner, :data:`COMPACT_KEEP` and merging. Errors are those of :class:`PruneRequest`."""
         usual_keep, usual_by, weight = COMPACT_KEEP, "merge", None
         if refiner is not None:
             usual_keep, usual_by, weight = refiner.settings.keep, refiner.settings.by, refiner.settings.opacity_weight
@@ -192,11 +172,8 @@ class CompactRequest:
         return default_device() if self.refiner is None else self.refiner.device
 
     def check_sh_degree(self, dense: Gaussians) -> None:
-        """Refuse a scene whose SH degree exceeds the refiner's, before the long computations.
-
-        Raises:
-            SceneError: if the degree after pruning is certain to exceed it.
-        """
+        """Raise a SceneError, before the long computations, if the SH degree after pruning is certain to exceed the
+        refiner's."""
         if self.refiner is None:
             return
         sh, limit = self.prune.sh, self.refiner.network.config.sh_degree

@@ -114,7 +114,6 @@ def run_on_folder(
         jobs: number of processes; 1 uses the calling process.
         shard: the part of the scenes to work on.
         force: overwrite files of other origin or with other options.
-        progress: called with the name of the current task and the share of it that is done, in [0, 1].
 
     Returns:
         The results of the shard's scenes, in the order of their names.
@@ -184,11 +183,8 @@ def _clear(task: SceneTask) -> None:
 
 
 def _check_and_describe(output: Path, command: Command, force: bool) -> None:
-    """Write the description of the results. Refuse a folder with results of another command or other options.
-
-    Raises:
-        SceneError: if the output is no folder, or holds results of another command or other options.
-    """
+    """Write the description of the results. Raises SceneError if the output is no folder, or holds results of another
+    command or other options."""
     path, description = output / RESULTS_NAME, command.description
     if output.exists() and not output.is_dir():
         raise SceneError(f"{output}: is a file; expected the name of a folder")

@@ -113,18 +113,11 @@ class SceneTask:
 def make_result(
     task: SceneTask, make: Callable[[Path], SmallerScene], options: Options, force: bool = False
 ) -> SceneResult | None:
-    """Make the result of a scene, unless it is finished or another process works on it.
+    """Make the result of a scene, unless it is finished; None if another process works on it.
 
-    An error gives a result with the status ``failed``. It leaves no file but its record.
-
-    Args:
-        task: the scene.
-        make: from the path of the scene to the smaller scene.
-        options: all options that ``make`` depends on.
-        force: overwrite a file of other origin, or a changed result.
-
-    Returns:
-        The result; None if another process works on the scene.
+    An error gives a result with the status ``failed``. It leaves no file but its record. ``options`` are all options
+    that ``make``, from the path of the scene to the smaller scene, depends on. With ``force``, a file of other origin,
+    or a changed result, is overwritten.
     """
     start = time.perf_counter()
     try:

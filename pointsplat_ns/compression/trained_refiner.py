@@ -82,6 +82,8 @@ def load_refiner(path: Path | str | None = None, device: torch.device | str | No
         )
     path = PRETRAINED if path is None else Path(path)
     kind = path.suffix.lower()
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise WeightsError(f"{path}: not a regular file; expected a trained pointsplat run or a .safetensors file")
     if kind == ".safetensors":
         network, settings = read_refiner(path), _settings_of_file(path)
     elif path.is_file() and kind not in (".yml", ".yaml", ".ckpt"):
@@ -99,26 +101,14 @@ SHIPPED = "shipped"
 
 
 def refiner_at(path: Path | str | None, device: torch.device | str | None = None) -> TrainedRefiner | None:
-    """A trained refiner, or None.
-
-    Args:
-        path: as for :func:`load_refiner`, or :data:`SHIPPED`; None for no refiner.
-        device: device of the network.
-
-    Raises:
-        WeightsError, SceneError: as :func:`load_refiner`.
-    """
+    """The trained refiner at a path as for :func:`load_refiner`, or at :data:`SHIPPED`; None for None."""
     if path is None:
         return None
     return load_refiner(None if str(path) == SHIPPED else path, device)
 
 
 def open_refiner_run(path: Path | str, need_data: bool) -> Run:
-    """The ``pointsplat`` run at a path.
-
-    Raises:
-        SceneError: if there is no run, or it is damaged or of another kind.
-    """
+    """The ``pointsplat`` run at a path. Raises SceneError if there is none, or it is damaged or of another kind."""
     run = open_run(path, need_data)
     if run.method_name != REFINER_METHOD:
         raise SceneError(f"{path}: a run of the method {run.method_name or 'unknown'}; expected a {REFINER_METHOD} run")
@@ -126,17 +116,9 @@ def open_refiner_run(path: Path | str, need_data: bool) -> Run:
 
 
 def scenes_of_run(run: Run) -> tuple[dict[str, Path], str]:
-    """The training scenes of a ``pointsplat`` run, and the scene for viewers and exporters.
-
-    Args:
-        run: opened with its data.
-
-    Returns:
-        Checkpoints and PLY files of the dense scenes by name, and the name of the scene for viewers and exporters.
-
-    Raises:
-        SceneError: if the scenes are no longer there.
-    """
+    """Checkpoints and PLY files of the dense scenes, by name, that a ``pointsplat`` run was trained on, and the name of
+    the scene for viewers and exporters. The run is opened with its data. Raises SceneError if the scenes are no longer
+    there."""
     runs, plys, reason = find_runs_and_plys(run.data, run.datamanager_fields.get("supervision", "auto"))
     scenes = {name: scene.checkpoint for name, scene in runs.items()} | plys
     if not scenes:
@@ -146,23 +128,14 @@ def scenes_of_run(run: Run) -> tuple[dict[str, Path], str]:
 
 def settings_from(saved: Mapping[str, Any]) -> PruneSettings:
     """Pruning settings from a run's model settings or a file's metadata. The opacity weight is ignored for methods that
-    have none.
-
-    Raises:
-        KeyError: if a setting is missing.
-        PointSplatError, TypeError, ValueError, OverflowError: if a setting is not usable.
-    """
+    have none. Raises KeyError for a missing setting, and other errors if one is not usable."""
     by, saved_weight = saved["by"], saved.get("opacity_weight")
     weight = None if saved_weight is None else float(saved_weight)
     return PruneSettings(float(saved["keep"]), by, weight if method_named(by).weighs_opacity else None)
 
 
 def network_options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The network options in a run's model settings, as changes to the preset of its size.
-
-    Raises:
-        KeyError: if an option is missing.
-    """
+    """The network options in a run's model settings, as changes to the preset of its size."""
     return {name: settings[name] for name in ("encoder", "use_appearance", "use_position", "norm")}
 
 

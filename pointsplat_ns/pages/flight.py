@@ -54,18 +54,9 @@ class FlightFrame:
 
     @staticmethod
     def of(scene: Gaussians, views: Views | None = None, up: Up | None = None) -> FlightFrame:
-        """The frame of a scene, which also suits smaller versions of it.
-
-        Args:
-            scene: N Gaussians.
-            views: known views. A flight starts at the view that shows most, see
-                :func:`~pointsplat_ns.looking.opening.opening_views`.
-            up: which way is up; by default that of the views, or estimated.
-
-        Raises:
-            SceneError: if no Gaussian can be drawn.
-            DataError: if no Gaussian is visible.
-        """
+        """The frame of a scene, which also suits smaller versions of it. A flight starts at the known view that shows
+        most, see :func:`~pointsplat_ns.looking.opening.opening_views`; by default up is that of the views, or
+        estimated. Raises SceneError if no Gaussian can be drawn, and DataError if none is visible."""
         need_usable(scene)
         known = None if views is None or len(views) == 0 else views.spread(KNOWN_VIEWS)
         if up is None and known is not None:
@@ -75,13 +66,7 @@ class FlightFrame:
         return FlightFrame(centre, size, opening.up, views_in_units(opening.views, centre, size), opening.whole)
 
     def packed(self, scene: Gaussians, name: str, progress: Progress = silent) -> dict[str, str]:
-        """A scene for the page: its name, text on its size, and its data in units of the content as base64 of SPZ 3.
-
-        Args:
-            scene: N Gaussians.
-            name: name in the page.
-            progress: called while compressing.
-        """
+        """A scene for the page: its name, text on its size, and its data in units of the content as base64 of SPZ 3."""
         placed = in_units(scene.detach(), self.centre.to(scene.device), self.size).to("cpu", torch.float32)
         near = placed.usable() & (placed.means.abs() <= MAX_COORDINATE).all(1)
         left_out = int((~near).sum())
@@ -93,11 +78,7 @@ class FlightFrame:
         return {"name": name, "amount": f"{len(scene):,} Gaussians, {megabytes:.2f} MB as .ply", "spz": spz}
 
     def data(self, packed: Sequence[dict[str, str]]) -> dict[str, Any]:
-        """Data for ``flight.js``.
-
-        Args:
-            packed: results of :meth:`packed` for one or two scenes; the first is on the left.
-        """
+        """Data for ``flight.js``, from results of :meth:`packed` for one or two scenes; the first is on the left."""
         fov = 2 * torch.atan(0.5 * max(self.views.width, self.views.height) / self.views.Ks[:, 0, 0].abs())
         return {
             "scenes": list(packed),

@@ -19,16 +19,8 @@ ERROR_GAIN = 8
 
 
 def read_png(path: Path, width: int, height: int) -> np.ndarray:
-    """The pixels of a PNG file, (height, width, 3) uint8.
-
-    Args:
-        path: the file.
-        width: expected width in pixels. It is checked before the pixels are read.
-        height: expected height in pixels.
-
-    Raises:
-        DataError: if the file is missing, not a PNG, damaged, or of another size.
-    """
+    """The pixels of a PNG file, (height, width, 3) uint8. The size is checked before the pixels are read. Raises
+    DataError if the file is missing, not a PNG, damaged, or of another size."""
     from PIL import Image, UnidentifiedImageError
 
     expected = f"expected a PNG picture of {width} x {height} pixels"

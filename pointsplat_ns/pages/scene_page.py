@@ -104,11 +104,7 @@ def write_page(
 
 
 def check_limit(limit_mb: float) -> None:
-    """Refuse an impossible limit before the long computations.
-
-    Raises:
-        PointSplatError: if the limit is not above 0.
-    """
+    """Raise a PointSplatError, before the long computations, if the limit is not above 0."""
     if not limit_mb > 0:
         raise PointSplatError(f"a page of at most {limit_mb:g} MB; expected a number above 0")
 
@@ -116,11 +112,8 @@ def check_limit(limit_mb: float) -> None:
 def _without_the_largest(
     included: list[dict[str, str]], path: Path, size: int, limit_mb: float
 ) -> tuple[list[dict[str, str]], str]:
-    """The scenes without the largest, and a line of text on the largest.
-
-    Raises:
-        PointSplatError: if there is only one scene.
-    """
+    """The scenes without the largest, and a line of text on the largest. Raises PointSplatError if there is only
+    one."""
     excess = f"the page would have {size / 1e6:.1f} MB, more than the {limit_mb:g} MB allowed"
     if len(included) == 1:
         raise PointSplatError(f"{path}: {excess}; expected a larger limit, or fewer Gaussians")

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from pointsplat_ns.io.files import three_digits
 from pointsplat_ns.tables.means import Group, Mean
 from pointsplat_ns.tables.paper import published
 from pointsplat_ns.tables.ways import (
@@ -73,7 +74,12 @@ class Layout:
                 mean = self.group.mean(way.name, share)
                 figures: Row = ("not measured", NO_FIGURE, NO_FIGURE, NO_FIGURE)
                 if mean is not None:
-                    figures = (f"{mean.gaussians:,.0f}", _fps(mean.fps), f"{mean.megabytes:.2f}", self._scenes(mean))
+                    figures = (
+                        f"{mean.gaussians:,.0f}",
+                        _fps(mean.fps),
+                        three_digits(mean.megabytes),
+                        self._scenes(mean),
+                    )
                 rows.append((_percent(share), way.label, *figures))
             sections.append(tuple(rows))
         notes = self._reasons([pair for block in blocks for pair in block])

@@ -82,12 +82,8 @@ class Maker:
 
     def make(self, way: Way, share: float, progress: Progress) -> MadeScene:
         """The scene of a measurable cell, and the cost of making it. The time includes scores that other cells share.
-
-        Raises:
-            ProgramFailed: if another program fails.
-            SceneError: if its result cannot be read, or the SH degree exceeds the refiner's.
-            DataError: if there are no views.
-        """
+        Raises ProgramFailed if another program fails, SceneError if its result cannot be read or the SH degree exceeds
+        the refiner's, and DataError if there are no views."""
         dense = self.scene.dense
         if way.name == DENSE:
             return MadeScene(dense, 0.0, None)

@@ -34,20 +34,12 @@ logger = logging.getLogger("pointsplat_ns")
 
 
 class Measuring:
-    """Measures the missing cells of some scenes.
+    """Measures the missing cells of some scenes, of different names.
 
-    Args:
-        scenes: scenes with different names.
-        folder: folder of all tables.
-        shares: shares of Table 1.
-        tools: weights, programs and options.
-        only: patterns of keys, such as ``fox/merge/10%`` or ``*/merge/*``. If given, only matching cells are measured,
-            also those with a measurement.
-        progress: called with the name of the current task and its share done, in [0, 1].
-
-    Raises:
-        SceneError: if the folder holds cells of other scenes, views or another machine, or a damaged journal.
-        PointSplatError: if two scenes have one name, or no cell matches ``only``.
+    ``shares`` are those of Table 1. ``only`` are patterns of keys, such as ``fox/merge/10%`` or ``*/merge/*``; if
+    given, only matching cells are measured, also those with a measurement. Raises SceneError if the folder holds cells
+    of other scenes, views or another machine, or a damaged journal, and PointSplatError if two scenes have one name, or
+    no cell matches ``only``.
     """
 
     def __init__(
@@ -78,11 +70,8 @@ class Measuring:
         self._seconds: dict[str, list[float]] = {}
 
     def run(self) -> None:
-        """Measure all cells. A cell that cannot be made is left out, with the reason in :attr:`missing`.
-
-        Raises:
-            KeyboardInterrupt: measured cells are on disk.
-        """
+        """Measure all cells. A cell that cannot be made is left out, with the reason in :attr:`missing`. After Ctrl-C,
+        measured cells are on disk."""
         wanted = []
         for work, way, share in self._cells:
             if why := work.missing(way, share):

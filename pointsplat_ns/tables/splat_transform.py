@@ -27,12 +27,8 @@ class Reducer:
 
     def reduce(self, source: Path, count: int, timeout: float | None = None) -> tuple[Gaussians, Usage]:
         """Run the program on a PLY, to keep ``count`` Gaussians: the smaller scene, and the cost with reading and
-        writing. No file is left beside the PLY.
-
-        Raises:
-            ProgramFailed: if the program fails, takes longer than ``timeout`` seconds or writes no file.
-            SceneError: if its file cannot be read.
-        """
+        writing. No file is left beside the PLY. Raises ProgramFailed if it fails, takes longer than ``timeout`` seconds
+        or writes no file, and SceneError if its file cannot be read."""
         with tempfile.TemporaryDirectory(dir=source.parent) as folder:
             target = Path(folder) / "small.ply"
             args = self.command(source, count, target)

@@ -23,18 +23,12 @@ from pointsplat_ns.tradeoff.walk import Plan
 def find_scene(
     subject: Subject, targets: Targets, by: str, repairs: tuple[Repair, ...], progress: Progress
 ) -> Compacted:
-    """Find the cheapest scene that meets targets by :class:`~pointsplat_ns.tradeoff.targets.Search`.
+    """Find the cheapest scene that meets targets by :class:`~pointsplat_ns.tradeoff.targets.Search`, with a method of
+    pruning and the repairs to try.
 
     Scenes are judged in the views of :func:`~pointsplat_ns.tradeoff.measuring.views_to_judge`, after writing and
     reading them in the subject's format. Frames are timed only for a target of time. Ctrl-C ends the search with the
     cheapest scene found so far.
-
-    Args:
-        subject: the scene.
-        targets: the targets.
-        by: the method of pruning.
-        repairs: repairs to try.
-        progress: called with the name of the current task and the share of it that is done, in [0, 1].
 
     Raises:
         BudgetError: if no scene meets all targets; the text tells the reachable values.

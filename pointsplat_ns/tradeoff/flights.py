@@ -16,20 +16,8 @@ MAX_BYTES = 4_000_000
 
 
 def keep_flight(frame: FlightFrame, scene: Gaussians, name: str, path: Path) -> bool:
-    """Write a scene for the page, if it is small enough.
-
-    Args:
-        frame: unit, up direction and views of the page.
-        scene: N Gaussians.
-        name: name in the page.
-        path: the file, at :func:`~pointsplat_ns.tradeoff.points.flight_path`.
-
-    Returns:
-        Whether it was written.
-
-    Raises:
-        SceneError: if the file cannot be written.
-    """
+    """Write a scene for the page to a file at :func:`~pointsplat_ns.tradeoff.points.flight_path`, under a name, if it
+    is small enough. Returns whether it was written."""
     if ply_bytes(len(scene), scene.sh_degree) > 20 * MAX_BYTES:  # SPZ in a page has at least a tenth of the bytes
         return False
     packed = frame.packed(scene, name)
@@ -40,13 +28,8 @@ def keep_flight(frame: FlightFrame, scene: Gaussians, name: str, path: Path) -> 
 
 
 def read_flight_beside(path: Path, dense: Path) -> dict[str, Any] | None:
-    """Read a scene of :func:`keep_flight`, with the dense scene on the left if both fit; None if there is no such file,
-    or it holds something else.
-
-    Args:
-        path: file of the scene.
-        dense: file of the dense scene, which may be the same.
-    """
+    """Read a scene of :func:`keep_flight`, with the dense scene, of another file, on the left if both fit; None if
+    there is no such file, or it holds something else."""
     flight = _read(path)
     beside = _read(dense) if dense != path else None
     if flight is None or beside is None:

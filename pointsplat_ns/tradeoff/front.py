@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from typing import Literal
 
+from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.tradeoff.points import Point, Quality, speed_of
 
 Reference = Literal["renders", "photos"]
@@ -34,10 +35,8 @@ def quality_of(point: Point, reference: Reference, metric: Metric) -> float | No
 
 
 def pareto_front(points: Sequence[Point], cost: Cost, reference: Reference, metric: Metric) -> list[Point]:
-    """The points that no other point beats in both cost and quality, cheapest first.
-
-    Of points with equal cost and quality, the first is taken. Points without the metric are left out.
-    """
+    """The points that no other point beats in both cost and quality, cheapest first. Of points with equal cost and
+    quality, the first is taken. Points without the metric are left out."""
     sign = -1 if metric == "lpips" else 1  # LPIPS is a distance: less is better
     judged = [(point, sign * value) for point in points if (value := quality_of(point, reference, metric)) is not None]
     front: list[Point] = []
@@ -50,12 +49,8 @@ def pareto_front(points: Sequence[Point], cost: Cost, reference: Reference, metr
 
 
 def fastest_first(points: Sequence[Point], trusted: bool = True) -> list[Point]:
-    """The points sorted by time of a frame, then number of Gaussians, then size of the file.
-
-    Args:
-        points: any points.
-        trusted: whether times can be trusted. If not, the time is ignored.
-    """
+    """The points sorted by time of a frame, then number of Gaussians, then size of the file; times that are not
+    ``trusted`` are ignored."""
     return sorted(points, key=lambda point: (point.frame_ms if trusted else 0.0, point.gaussians, point.bytes))
 
 
@@ -114,14 +109,8 @@ def next_best(points: Sequence[Point]) -> Point | None:
 
 
 def recommend(points: Sequence[Point], within: float, trusted: bool = True) -> tuple[Point, str]:
-    """The fastest point within a loss, and a line of text on it. If it is the dense scene, the text has the figures of
-    the next best too.
-
-    Args:
-        points: the dense scene, then others.
-        within: the largest loss, dB.
-        trusted: as for :func:`fastest_first`.
-    """
+    """The fastest point that loses at most ``within`` dB, and a line of text on it. The first point is the dense scene;
+    if it is the fastest, the text has the figures of the next best too. ``trusted`` as for :func:`fastest_first`."""
     dense = points[0]
     best = fastest_within(points, within, trusted) or fastest_above(points, psnr_within(within), trusted) or dense
     if dense.against_photos is not None:
@@ -144,7 +133,7 @@ def recommend(points: Sequence[Point], within: float, trusted: bool = True) -> t
 
 def _figures(point: Point, dense: Point, trusted: bool) -> str:
     """Count, size, and where times are trusted the time of a frame."""
-    figures = f"{point.gaussians:,} Gaussians, {point.bytes / 1e6:.2f} MB in place of {dense.bytes / 1e6:.2f}"
+    figures = f"{point.gaussians:,} Gaussians, {bytes_text(point.bytes)} in place of {bytes_text(dense.bytes)}"
     if not trusted:
         return figures
     return f"{figures}, {speed_of(point, dense)}: {point.frame_ms:.3g} ms a frame in place of {dense.frame_ms:.3g}"

@@ -42,25 +42,15 @@ class Form:
     """Name of the whole, in the singular."""
 
     def write(self, path: Path, identity: Identity, records: Sequence[DataclassInstance]) -> None:
-        """Write all records.
-
-        Raises:
-            SceneError: if the file cannot be written.
-        """
+        """Write all records."""
         rows = [dataclasses.asdict(record) for record in records]
         content = {"format": self.name, "version": self.version, "of": dict(identity), self.records: rows}
         write_json(content, path)
 
     def read(self, path: Path, restored: Callable[[dict[str, Any]], T]) -> tuple[dict[str, Any], list[T]]:
-        """Read the identity and the records of a file. The file is not trusted.
-
-        Args:
-            path: the file.
-            restored: makes a record from the result of :func:`dataclasses.asdict`; see :func:`check_types`.
-
-        Raises:
-            SceneError: if the file is not such a journal, or damaged.
-        """
+        """Read the identity and the records of a file, which is not trusted. ``restored`` makes a record from the
+        result of :func:`dataclasses.asdict`; see :func:`check_types`. Raises SceneError if the file is not such a
+        journal, or damaged."""
         try:
             content = json.loads(read_text(path, MOST_BYTES))
             if content["format"] != self.name:
@@ -75,16 +65,7 @@ class Form:
             ) from error
 
     def check(self, path: Path, of: Identity, identity: Identity) -> None:
-        """Check the identity of a file.
-
-        Args:
-            path: the file, for the error.
-            of: the identity of the file.
-            identity: the expected values.
-
-        Raises:
-            SceneError: if they differ.
-        """
+        """Raise a SceneError if the identity ``of`` a file differs from the expected one."""
         for name, value in identity.items():
             if of.get(name) != value:
                 raise SceneError(
@@ -100,15 +81,8 @@ POINTS_FORM = Form("pointsplat-tradeoff-points", 2, "points", "a sweep")
 
 
 class Journal:
-    """The points of one scene, measured in the same views on the same machine.
-
-    Args:
-        folder: of the sweep.
-        identity: values that all points have in common.
-
-    Raises:
-        SceneError: if the folder holds points of something else, or a file of points that cannot be read.
-    """
+    """The points of one scene, measured in the same views on the same machine, in the folder of a sweep. Raises
+    SceneError if the folder holds points of another identity, or a file of points that cannot be read."""
 
     def __init__(self, folder: Path, identity: Identity):
         self.path, self._identity = folder / POINTS, dict(identity)
@@ -121,11 +95,7 @@ class Journal:
                 self._take(point)
 
     def add(self, point: Point) -> None:
-        """Add a point, and write all points.
-
-        Raises:
-            SceneError: if the file cannot be written.
-        """
+        """Add a point, and write all points."""
         self._take(point)
         points = ([self.dense] if self.dense is not None else []) + [*self.points.values()]
         POINTS_FORM.write(self.path, self._identity, points)
@@ -145,11 +115,8 @@ def _point_of_sweep(values: dict[str, Any]) -> Point:
 
 
 def restored_point(values: dict[str, Any]) -> Point:
-    """The inverse of :func:`dataclasses.asdict` for a point.
-
-    Raises:
-        ValueError, TypeError, KeyError: if the values are not those of a point.
-    """
+    """The inverse of :func:`dataclasses.asdict` for a point. Errors are those of Python if the values are not those of
+    a point."""
     qualities = {name: _quality(values[name]) for name in ("against_dense", "against_photos")}
     point = Point(**{**values, **qualities})
     check_types(point)
@@ -165,11 +132,7 @@ def _quality(values: dict[str, Any] | None) -> Quality | None:
 
 
 def check_types(of: DataclassInstance) -> None:
-    """Check that the values of a record have the types of its fields.
-
-    Raises:
-        ValueError: if a value has another type.
-    """
+    """Raise a ValueError if a value of a record has another type than its field."""
     for field in dataclasses.fields(of):
         value, kind = getattr(of, field.name), str(field.type)
         if not _has_type(value, kind.removesuffix(" | None")) and not (value is None and kind.endswith("None")):

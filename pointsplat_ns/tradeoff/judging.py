@@ -52,10 +52,7 @@ class JudgedViews:
     @staticmethod
     def compared(source: ViewSource, count: int) -> JudgedViews:
         """At most ``count`` views without photos: the views of comparisons in ``compact``, which no optimisation uses.
-
-        Raises:
-            DataError: if there are no views.
-        """
+        Raises DataError if there are none."""
         views = source.compared().spread(min(count, COMPARED_VIEWS))
         return JudgedViews(views, None, source.origin)
 
@@ -87,18 +84,12 @@ class Judged:
 
 
 class Judge:
-    """Judges scenes in the same views, against the same targets.
+    """Judges scenes in the same views, against the same targets: the dense scene's renders, and photos if there are
+    some.
 
-    Args:
-        dense: the dense scene.
-        judged_views: the views, with photos if there are some.
-        folder: folder of the sweep, for pictures; None writes none.
-        dense_ms: time of a frame of the dense scene in milliseconds, the unit of measured ratios; by default it is
-            measured beside the first timed scene.
-
-    Raises:
-        DataError: if the views are too small for SSIM.
-        SceneError: if a picture cannot be written.
+    Pictures go to the folder of the sweep, if one is given. ``dense_ms`` is the time of a frame of the dense scene in
+    milliseconds, the unit of measured ratios; by default it is measured beside the first timed scene. Raises DataError
+    if the views are too small for SSIM, and SceneError if a picture cannot be written.
     """
 
     @torch.no_grad()
@@ -121,15 +112,8 @@ class Judge:
     def judge(
         self, scene: Gaussians, key: str, progress: Callable[[float], None], timed: bool = True, drawn: Drawn = "exact"
     ) -> Judged:
-        """Render a scene, write pictures of it, and time it.
-
-        Args:
-            scene: the scene to judge.
-            key: key of its point.
-            progress: called with the share done, in [0, 1].
-            timed: whether to time it.
-            drawn: quality of its frames; frames of the dense scene are always exact.
-        """
+        """Render a scene, write pictures of it under the key of its point, and time it if ``timed``. Frames are drawn
+        as ``drawn``, those of the dense scene always exactly. ``progress`` is called with the share done."""
         images = []
         passes = 1 + 2 * ROUNDS * timed
         for view in self.views:

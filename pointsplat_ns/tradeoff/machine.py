@@ -40,14 +40,8 @@ def _processor() -> str:
 
 @contextmanager
 def one_at_a_time(progress: Progress) -> Iterator[bool]:
-    """Hold the lock of measurements on this machine while the context is open; wait for others that hold it.
-
-    Args:
-        progress: called with a text while waiting.
-
-    Yields:
-        Whether the lock was taken: its file may belong to another user.
-    """
+    """Hold the lock of measurements on this machine while the context is open; wait for others that hold it, which
+    ``progress`` is told. Yields whether the lock was taken: its file may belong to another user."""
     from filelock import FileLock, Timeout
 
     lock = FileLock(Path(tempfile.gettempdir()) / LOCK, mode=0o666)
@@ -95,11 +89,8 @@ def is_busy(others: float) -> bool:
 
 
 def busy_note(others: Sequence[float]) -> str:
-    """A line of text if other programs disturbed measurements; else empty.
-
-    Args:
-        others: cores that other programs used during each measurement.
-    """
+    """A line of text if other programs disturbed measurements, from the cores that they used during each; else
+    empty."""
     disturbed = [cores_used for cores_used in others if is_busy(cores_used)]
     if not disturbed:
         return ""

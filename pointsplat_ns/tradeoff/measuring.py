@@ -82,18 +82,9 @@ def make(
     progress: Progress,
     refiner: TrainedRefiner | None = None,
 ) -> MadeScene:
-    """Make the scene of a setting.
-
-    Args:
-        dense: N Gaussians.
-        setting: the setting.
-        new_views: makes a source of views; called once for each scene, so that time and result equal the command's.
-        progress: called with the name of the current task and the share of it that is done, in [0, 1].
-        refiner: as for :class:`Subject`.
-
-    Raises:
-        KeyboardInterrupt: on Ctrl-C, also during a repair.
-    """
+    """Make the scene of a setting. ``new_views`` makes a source of views; it is called once, so that time and result
+    equal the command's. ``refiner`` is as for :class:`Subject`. Raises KeyboardInterrupt on Ctrl-C, also during a
+    repair."""
     peak, start = PeakMemory(), time.perf_counter()
     sh = str(setting.sh_degree) if setting.sh_degree < dense.sh_degree else "all"
     compacted = None
@@ -113,13 +104,8 @@ def make(
 
 
 def through_file(scene: Gaussians, suffix: str) -> tuple[int, Gaussians]:
-    """The size of a scene's file in bytes, and the scene after writing and reading: exact for a PLY, with fewer bits
-    for other formats.
-
-    Args:
-        scene: N Gaussians.
-        suffix: suffix of the format, such as ``.spz``. Formats without a reader, such as ``.glb``, return ``scene``.
-    """
+    """The size of a scene's file of a suffix such as ``.spz`` in bytes, and the scene after writing and reading: exact
+    for a PLY, with fewer bits for other formats. Formats without a reader, such as ``.glb``, return ``scene``."""
     kind = format_to_write(suffix)
     if kind.suffix == ".ply":
         return ply_bytes(len(scene), scene.sh_degree), scene
@@ -130,17 +116,9 @@ def through_file(scene: Gaussians, suffix: str) -> tuple[int, Gaussians]:
 
 
 def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
-    """The views to judge scenes in, of the size of comparisons in ``compact``, and a note.
-
-    They are the views of held-out photos, or else the views of comparisons in ``compact``, which no repair uses.
-
-    Args:
-        subject: the scene.
-        count: largest number of views.
-
-    Raises:
-        DataError: if there are no views.
-    """
+    """At most ``count`` views to judge scenes in, of the size of comparisons in ``compact``, and a note. They are the
+    views of held-out photos, or else the views of comparisons in ``compact``, which no repair uses. Raises DataError if
+    there are none."""
     note = ""
     if subject.held_out is not None:
         try:
@@ -155,18 +133,11 @@ def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
 
 
 class Measurer:
-    """Makes scenes of settings and measures them.
+    """Makes scenes of settings and measures them in at most ``views`` views.
 
-    Args:
-        subject: the scene.
-        views: largest number of views.
-        progress: called with a text while waiting for the lock.
-        folder: folder for pictures; None writes none.
-        timed: whether to time frames. If not, times are NaN, and other measurements may run at the same time.
-
-    Raises:
-        SceneError: if no Gaussian can be drawn.
-        DataError: if there are no views.
+    Pictures go to ``folder``, if there is one. Without ``timed``, times are NaN, and other measurements may run at the
+    same time. ``progress`` is called with a text while waiting for the lock. Raises SceneError if no Gaussian can be
+    drawn, and DataError if there are no views.
     """
 
     def __init__(
@@ -210,12 +181,8 @@ class Measurer:
         return replace(point, against_dense=replace(point.against_dense, psnr=math.inf))
 
     def measure(self, setting: Setting, show: Progress) -> Point:
-        """The point of a setting.
-
-        Args:
-            setting: what to measure.
-            show: called with the name of the current task (empty during the judgement) and its share done.
-        """
+        """The point of a setting. ``show`` is called with the name of the current task (empty during the judgement) and
+        its share done."""
         naming = self.naming
         names = (naming.key(setting), naming.label(setting), naming.command(setting))
         with self._alone():

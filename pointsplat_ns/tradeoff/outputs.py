@@ -29,16 +29,8 @@ OUTPUTS = (TABLE, JSON, PAGE, *PLOTS.values())
 
 
 def write_outputs(sweep: Tradeoff, folder: Path, progress: Progress = silent) -> None:
-    """Write the table, the JSON, the plots and the page of a sweep.
-
-    Args:
-        sweep: the points.
-        folder: folder of the sweep, with the pictures.
-        progress: called while pictures are compressed for the page.
-
-    Raises:
-        SceneError: if a file cannot be written.
-    """
+    """Write the table, the JSON, the plots and the page of a sweep to its folder, which has the pictures. Raises
+    SceneError if a file cannot be written."""
     from pointsplat_ns.tradeoff.page import write_page
 
     dense = sweep.points[0]
@@ -68,16 +60,8 @@ def _row(point: Point, dense: Point) -> dict[str, object]:
 
 
 def plot(sweep: Tradeoff, cost: Cost, path: Path) -> None:
-    """Draw the PSNR of all points, against the dense scene's renders and, if there are any, photos.
-
-    Args:
-        sweep: the points.
-        cost: the horizontal axis.
-        path: the PNG file to write.
-
-    Raises:
-        SceneError: if it cannot be written.
-    """
+    """Draw the PSNR of all points over a cost, against the dense scene's renders and, if there are any, photos, to a
+    PNG file."""
     from matplotlib.figure import Figure
 
     panels: dict[Reference, str] = {"renders": "against the dense scene's renders"}

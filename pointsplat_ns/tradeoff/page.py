@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.files import replacing
+from pointsplat_ns.io.files import replacing, three_digits
 from pointsplat_ns.pages.flight import SCRIPTS
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.pages.pictures import ERROR_GAIN, error_colors, error_map, fit, read_png
@@ -38,22 +38,13 @@ Picture = Callable[[], np.ndarray]
 
 
 def write_page(sweep: Tradeoff, folder: Path, output: Path, progress: bool | Progress = False) -> Path:
-    """Write one self-contained HTML file with the points of a sweep, which needs no other file.
+    """Write one self-contained HTML file with the points of a sweep, which needs no other file; returns its path.
 
     It plots quality against cost with the Pareto front. A slider along the front shows every view beside the dense
     scene and the photo, with an error map and a wipe. Below are the fastest good point with its command, and a table of
-    all points. Views are those with a picture of the dense scene. The page has a flight through the recommended scene,
-    if it is at :func:`~pointsplat_ns.tradeoff.points.flight_path`, beside the dense scene if both fit.
-
-    Args:
-        sweep: the points. The first is the dense scene.
-        folder: the folder of the sweep, with the pictures at
-            :func:`~pointsplat_ns.tradeoff.points.picture_path`. Photos may be missing.
-        output: the file to write.
-        progress: show a progress bar while pictures are compressed.
-
-    Returns:
-        ``output``.
+    all points. Views are those with a picture of the dense scene, in the folder of the sweep. The page has a flight
+    through the recommended scene, if it is at :func:`~pointsplat_ns.tradeoff.points.flight_path`, beside the dense
+    scene if both fit.
 
     Raises:
         DataError: if there is no point or no view, a picture is missing, damaged or of another size than the views, or
@@ -208,7 +199,7 @@ def _cells(point: Point, dense: Point) -> dict[str, tuple[float | None, str]]:
         "share": (point.share, f"{100 * point.share:.3g} %"),
         "gaussians": (point.gaussians, f"{point.gaussians:,}"),
         "sh_degree": (point.sh_degree, str(point.sh_degree)),
-        "bytes": (point.bytes, f"{point.bytes / 1e6:.2f}"),
+        "bytes": (point.bytes, three_digits(point.bytes / 1e6)),
         "speed": (speed.median, f"{speed.median:.2f} ({speed.low:.2f}–{speed.high:.2f})"),
         "frame_ms": (ms, f"{ms:,.0f}" if ms >= 100 else f"{ms:.1f}"),
         "seconds": (point.seconds, f"{point.seconds:.1f}"),

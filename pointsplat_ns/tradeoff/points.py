@@ -116,30 +116,16 @@ class Tradeoff:
     """One line of text on the reason for it, and its cost."""
 
     def point(self, key: str) -> Point:
-        """The point with a key.
-
-        Raises:
-            KeyError: if there is no such point.
-        """
+        """The point with a key. Raises KeyError if there is no such point."""
         return {point.key: point for point in self.points}[key]
 
 
 def picture_path(folder: Path, view: int, what: str) -> Path:
-    """Path of the picture of a view.
-
-    Args:
-        folder: the folder of the sweep.
-        view: the view's number, from 0.
-        what: a point's ``key``, or ``photo``.
-    """
+    """Path of the picture of a view, by its number from 0, in the folder of a sweep: of a point's ``key``, or of the
+    ``photo``."""
     return folder / "pictures" / f"{view:02d}_{what}.png"
 
 
 def flight_path(folder: Path, key: str) -> Path:
-    """Path of a point's scene for flights in the page.
-
-    Args:
-        folder: the folder of the sweep.
-        key: key of the point.
-    """
+    """Path of a point's scene for flights in the page, in the folder of a sweep."""
     return folder / "scenes" / f"{key}.json"

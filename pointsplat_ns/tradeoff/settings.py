@@ -66,11 +66,8 @@ class Setting:
 
 
 def setting_of(point: Point) -> Setting:
-    """The setting of a point other than the dense scene.
-
-    Raises:
-        PointSplatError: if its repair, method or quality of frames is unknown.
-    """
+    """The setting of a point other than the dense scene. Raises PointSplatError if its repair, method or quality of
+    frames is unknown."""
     repair, drawn = check_repairs((point.repair,))[0], check_drawn((point.drawn,))[0]
     return Setting(point.gaussians, point.sh_degree, repair, method_named(point.by).name, drawn)
 
@@ -145,11 +142,8 @@ class Naming:
 
 
 def check_repairs(repairs: tuple[str, ...]) -> tuple[Repair, ...]:
-    """Repairs, each once, in the order of :data:`REPAIRS`.
-
-    Raises:
-        PointSplatError: if there is no repair, or a repair is unknown.
-    """
+    """Repairs, each once, in the order of :data:`REPAIRS`. Raises PointSplatError if there is none, or one is
+    unknown."""
     unknown = [repair for repair in repairs if repair not in REPAIRS]
     if unknown or not repairs:
         raise PointSplatError(f"repairs are {', '.join(repairs) or 'empty'}; expected some of {', '.join(REPAIRS)}")
@@ -157,11 +151,7 @@ def check_repairs(repairs: tuple[str, ...]) -> tuple[Repair, ...]:
 
 
 def check_drawn(drawn: tuple[str, ...]) -> tuple[Drawn, ...]:
-    """Qualities of frames, each once, in the order of :data:`DRAWN`.
-
-    Raises:
-        PointSplatError: if a quality of frames is unknown.
-    """
+    """Qualities of frames, each once, in the order of :data:`DRAWN`. Raises PointSplatError if one is unknown."""
     unknown = [way for way in drawn if way not in DRAWN]
     if unknown:
         raise PointSplatError(f"frames drawn {', '.join(unknown)}; expected some of {', '.join(DRAWN)}")

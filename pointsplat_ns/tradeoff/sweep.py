@@ -14,6 +14,7 @@ from pathlib import Path
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.looking.sizes import size_text
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS
 from pointsplat_ns.pages.flight import FlightFrame
@@ -34,11 +35,7 @@ logger = logging.getLogger("pointsplat_ns")
 
 @dataclass(frozen=True)
 class Options:
-    """Options of a sweep.
-
-    Raises:
-        PointSplatError: if an option is invalid.
-    """
+    """Options of a sweep. Raises PointSplatError if an option is invalid."""
 
     points: int = 12
     """Largest number of scenes, with the dense scene."""
@@ -74,10 +71,7 @@ class Options:
 
 def check_folder(folder: Path, force: bool) -> None:
     """Check, before the long computations, that a sweep may write to a folder; with ``force``, remove an older sweep.
-
-    Raises:
-        SceneError: if it is a file, or holds results but no points to go on from.
-    """
+    Raises SceneError if it is a file, or holds results but no points to go on from."""
     if folder.exists() and not folder.is_dir():
         raise SceneError(f"{folder}: is a file; expected the name of a folder")
     if force:
@@ -110,18 +104,8 @@ def removed_without_points(folder: Path) -> Iterator[None]:
 
 
 class Sweep:
-    """Measures settings of a scene.
-
-    Args:
-        subject: the scene.
-        folder: where points, pictures and results go.
-        options: what to measure.
-        progress: called with the name of the current task and the share of it that is done, in [0, 1].
-
-    Raises:
-        SceneError: if no Gaussian can be drawn, or the folder holds points of another sweep.
-        DataError: if there is no view.
-    """
+    """Measures settings of a scene, and writes points, pictures and results to a folder. Raises SceneError if no
+    Gaussian can be drawn, or the folder holds points of another sweep, and DataError if there is no view."""
 
     def __init__(self, subject: Subject, folder: Path, options: Options, progress: Progress):
         self.subject, self.folder, self.options, self.progress = subject, folder, options, progress
@@ -152,11 +136,7 @@ class Sweep:
         }
 
     def run(self) -> Tradeoff:
-        """Measure the points of the walk, and write the results.
-
-        Raises:
-            KeyboardInterrupt, SystemExit: on Ctrl-C or another signal, after writing the results so far.
-        """
+        """Measure the points of the walk, and write the results; on Ctrl-C or another signal, those so far."""
         dense, points = self.measure_dense(self.most), self.journal.points
 
         def measure(setting: Setting) -> Point:
@@ -184,12 +164,8 @@ class Sweep:
         return self.journal.dense
 
     def measure(self, setting: Setting, of: int | None = None) -> Point:
-        """The point of a setting, measured if it is missing.
-
-        Args:
-            setting: the setting.
-            of: largest number of points in the end; None if it is not known.
-        """
+        """The point of a setting, measured if it is missing. ``of`` is the largest number of points in the end; None if
+        it is not known."""
         if setting not in self.journal.points:
             start = time.perf_counter()
             point = self.measurer.measure(setting, self._shower(1 + len(self.journal.points), of))
@@ -211,12 +187,8 @@ class Sweep:
         return self.measurer.made(setting, self.progress).scene
 
     def result(self, recommended: Point | None = None, why: str = "") -> Tradeoff:
-        """All points so far: the dense scene first, the others by size.
-
-        Args:
-            recommended: the recommended point; by default see :func:`~pointsplat_ns.tradeoff.front.recommend`.
-            why: a line of text on it.
-        """
+        """All points so far: the dense scene first, the others by size. By default the recommended point and the line
+        of text on it are those of :func:`~pointsplat_ns.tradeoff.front.recommend`."""
         dense = self.journal.dense
         assert dense is not None
         settings = sorted(
@@ -291,7 +263,7 @@ class Sweep:
         figures = [] if point.by == DENSE else [f"{point.against_dense.psnr:.1f} dB against the dense scene"]
         figures += [f"{point.against_photos.psnr:.2f} dB against photos"] if point.against_photos is not None else []
         figures += [str(speed_of(point, dense))] if dense is not None and point is not dense else []
-        figures += [f"{point.frame_ms:.3g} ms a frame", f"{point.bytes / 1e6:.2f} MB"]
+        figures += [f"{point.frame_ms:.3g} ms a frame", bytes_text(point.bytes)]
         left = ""
         if of is not None and done < of:
             minutes = (of - done) * sum(self._seconds) / len(self._seconds) / 60

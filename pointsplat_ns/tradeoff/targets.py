@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from pointsplat_ns.compression.budget_search import BUDGETS
 from pointsplat_ns.compression.count_search import SearchSettings, find_count
 from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.metrics import MOST_PSNR
 from pointsplat_ns.pruning import ply_bytes, resolve_keep
 from pointsplat_ns.tradeoff.points import Point
@@ -31,11 +32,8 @@ SEARCH = SearchSettings(precision=1.1)
 
 @dataclass(frozen=True)
 class Targets:
-    """Targets of a scene.
-
-    Raises:
-        BudgetError: if there is no target, or a target is not a positive number or above what differs from no error.
-    """
+    """Targets of a scene. Raises BudgetError if there is no target, or one is not a positive number or above what
+    differs from no error."""
 
     db: float | None = None
     """Least PSNR against the dense scene's renders, over the pixels that it covers, dB."""
@@ -64,7 +62,7 @@ class Targets:
         if self.ms is not None and point.frame_ms > self.ms:
             words.append(f"{point.frame_ms:.3g} ms a frame where {self.ms:g} are allowed")
         if self.mb is not None and point.bytes > 1e6 * self.mb:
-            words.append(f"{point.bytes / 1e6:.2f} MB where {self.mb:g} are allowed")
+            words.append(f"{bytes_text(point.bytes)} where {self.mb:g} are allowed")
         return words
 
 
@@ -77,15 +75,8 @@ def targets_of(
     clean: bool = False,
     seconds: float | None = None,
 ) -> Targets | None:
-    """Targets from options that may be missing; None if all are missing.
-
-    Args:
-        db, ms, mb: see :class:`Targets`.
-        keep, sh, clean, seconds: options of ``compact`` that the search decides.
-
-    Raises:
-        BudgetError: if a target is invalid, or such an option is given with a target.
-    """
+    """Targets from options that may be missing; None if all are missing. Raises BudgetError if a target is invalid, or
+    an option of ``compact`` that the search decides (keep, sh, clean, seconds) is given with a target."""
     if db is ms is mb is None:
         return None
     decided = {"keep": keep is not None, "sh": sh != "all", "clean": clean, "seconds": seconds is not None}
@@ -139,11 +130,8 @@ class Search:
         self._slope: float | None = None  # dB for each e-fold of the count, from the previous way
 
     def run(self) -> Found:
-        """Search.
-
-        Raises:
-            BudgetError: if no scene meets all targets; the text tells the obstacle and the reachable values.
-        """
+        """Search. Raises BudgetError if no scene meets all targets; the text tells the obstacle and the reachable
+        values."""
         plan, by = self.plan, self.plan.methods[0]
         for repair in plan.repairs:
             self._try(Setting(plan.count, plan.sh_degree, repair, by))
@@ -211,11 +199,8 @@ class Search:
         return replace(way, count=found.count)
 
     def _within(self, way: Setting) -> Setting:
-        """The setting of a way with the most Gaussians within the limits of time and size.
-
-        Raises:
-            BudgetError: if no setting is within them.
-        """
+        """The setting of a way with the most Gaussians within the limits of time and size. Raises BudgetError if there
+        is none."""
         count, limit = self._fitting(way), self.targets.ms
         if limit is None:
             return replace(way, count=count)
@@ -233,11 +218,8 @@ class Search:
         return replace(way, count=found.count)
 
     def _fitting(self, way: Setting) -> int:
-        """Nearly the largest count of a way whose file is within the limit of size.
-
-        Raises:
-            BudgetError: if not even one Gaussian fits.
-        """
+        """Nearly the largest count of a way whose file is within the limit of size. Raises BudgetError if not even one
+        Gaussian fits."""
         if self.targets.mb is None:
             return self.plan.count
         limit = math.floor(1e6 * self.targets.mb)
@@ -262,7 +244,7 @@ class Search:
         time = "" if math.isnan(point.frame_ms) else f"{point.frame_ms:.3g} ms a frame, "
         why = (
             f"{point.label}: {point.against_dense.psnr:.2f} dB against the dense scene's renders in {self.where}, "
-            f"{time}{point.bytes / 1e6:.2f} MB, {point.gaussians:,} Gaussians; {len(self.tried)} scenes tried"
+            f"{time}{bytes_text(point.bytes)}, {point.gaussians:,} Gaussians; {len(self.tried)} scenes tried"
         )
         cheaper = [s for s, p in self.tried.items() if self.targets.missed(p) and self._cost(s) < self._cost(setting)]
         if cheaper:
@@ -280,10 +262,10 @@ class Search:
                 f"{best.against_dense.psnr:.2f} dB in {self.where} ({best.label})"
             )
         points = [self._point(end) for end in self._ends]
-        size, ms = min(p.bytes for p in points) / 1e6, min(p.frame_ms for p in points)
+        size, ms = min(p.bytes for p in points), min(p.frame_ms for p in points)
         obstacles = []
-        if self.targets.mb is not None and size > self.targets.mb:
-            obstacles.append(f"takes {size:.2f} MB, over --target-mb {self.targets.mb:g}")
+        if self.targets.mb is not None and size > 1e6 * self.targets.mb:
+            obstacles.append(f"takes {bytes_text(size)}, over --target-mb {self.targets.mb:g}")
         if self.targets.ms is not None and ms > self.targets.ms:
             obstacles.append(f"takes {ms:.3g} ms a frame, over --target-ms {self.targets.ms:g}")
         obstacle = " and ".join(obstacles) or "is either too large or too slow"

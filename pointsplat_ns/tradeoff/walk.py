@@ -82,13 +82,9 @@ class Plan:
 def walk(plan: Plan, measure: Measure, dense: Point, cut_psnr: Callable[[int], float]) -> None:
     """Measure settings, one after the other, until all gaps are flat or the measure raises :class:`Enough`.
 
-    Args:
-        plan: settings to try.
-        measure: called for one setting more than once. The same points give the same walk, so that an interrupted walk
-            can continue.
-        dense: the dense scene.
-        cut_psnr: from an SH degree to the PSNR in dB of the dense scene's renders without the bands above, against all
-            bands.
+    ``measure`` is called for one setting more than once. The same points give the same walk, so that an interrupted
+    walk can continue. ``cut_psnr`` gives, by SH degree, the PSNR in dB of the dense scene's renders without the bands
+    above, against all bands.
     """
     trial, *others = counts = [*dict.fromkeys(resolve_keep(plan.count, share) for share in (WALK.trial, *WALK.others))]
     losses: dict[Setting, float] = {}
@@ -136,16 +132,12 @@ def _search(way: Setting, counts: list[int], loss: Callable[[Setting], float], p
 
 
 def drawings(plan: Plan, measured: Mapping[Setting, Point], dense: Point, measure: Measure) -> None:
-    """Measure settings with other qualities of frames after the walk; at most ``WALK.drawings``.
+    """Measure settings with other qualities of frames after the walk; at most ``WALK.drawings``. ``measured`` are all
+    points of the walk.
 
     Of the scenes within the wanted loss, the scene with the fewest Gaussians is drawn fast. If that loses too much,
     larger scenes are tried. Half the resolution blurs pictures, which matters least for small scenes: the best scenes
     of a tenth and three tenths are drawn that way.
-
-    Args:
-        plan, dense: as for :func:`walk`.
-        measured: all points of the walk.
-        measure: as for :func:`walk`, but it need not end.
     """
     exact = {setting: point for setting, point in measured.items() if setting.drawn == "exact"}
     fewest, _ = recommend([dense, *exact.values()], plan.within, trusted=False)

@@ -20,21 +20,11 @@ READABLE_NAMES = (*(kind.suffix for kind in FORMATS if kind.read and kind.suffix
 
 
 def received(request: Request, folder: Path) -> tuple[Path, str]:
-    """Write the body of a request into a folder.
+    """Write the body of a request into an empty folder: the file, and its name for people.
 
-    The client's name decides the end of the file's name, which has to be one of :data:`READABLE_NAMES`, and is shown to
-    people. It is no path.
-
-    Args:
-        request: ``options`` has the file's ``name``.
-        folder: an empty folder.
-
-    Returns:
-        The file, and its name for people.
-
-    Raises:
-        SceneError: if no scene has such a name, the file is empty, or there is no room for it.
-        ValueError: if the client sends less than it said.
+    The client's name (``name`` in the options) decides the end of the file's name, which has to be one of
+    :data:`READABLE_NAMES`, and is shown to people. It is no path. Raises SceneError if no scene has such a name, the
+    file is empty, or there is no room for it, and ValueError if the client sends less than it said.
     """
     given = request.options["name"]
     name = "".join(sign if sign.isprintable() else "?" for sign in given.replace("\\", "/").rpartition("/")[2])[:80]

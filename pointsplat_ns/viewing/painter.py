@@ -71,12 +71,8 @@ def paint(step: Step[PictureRequest]) -> Iterator[np.ndarray | None]:
 
 
 class Painter:
-    """A thread that draws the steps of a schedule, until it is closed.
-
-    Args:
-        show: called with each picture, its step, and the seconds of drawing.
-        paint: draws a step.
-    """
+    """A thread that draws the steps of a schedule, until it is closed. ``show`` is called with each picture, its step,
+    and the seconds of drawing; ``paint`` draws a step."""
 
     def __init__(
         self,

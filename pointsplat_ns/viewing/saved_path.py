@@ -47,12 +47,8 @@ class SavedPath:
 
 def read_path(path: Path | str) -> SavedPath:
     """Read a camera path: JSON with ``camera_path``, ``render_width`` and ``render_height``, as nerfstudio's viewer
-    saves it.
-
-    Raises:
-        SceneError: if there is no such file.
-        DataError: if the file is too large, is not such JSON, has another camera model, or has an invalid camera.
-    """
+    saves it. Raises SceneError if there is no such file, and DataError if it is too large, is not such JSON, has
+    another camera model, or has an invalid camera."""
     path = require_file(path, "a camera path saved by nerfstudio's viewer (JSON)")
     if path.stat().st_size > LIMITS.bytes:
         raise DataError(f"{path}: {path.stat().st_size / 1e6:.0f} MB; expected a camera path of at most 64 MB")

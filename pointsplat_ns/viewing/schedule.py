@@ -51,12 +51,8 @@ class Step(Generic[R]):
 
 
 class Schedule(Generic[R]):
-    """The steps from the newest request to its full picture. Several threads may use it; one of them draws.
-
-    Args:
-        full_side: longer side of the full picture, pixels.
-        clock: returns seconds.
-    """
+    """The steps from the newest request to its full picture, whose longer side has ``full_side`` pixels. Several
+    threads may use it; one of them draws."""
 
     def __init__(self, full_side: int = 960, clock: Callable[[], float] = time.monotonic):
         self._full_side, self._clock = full_side, clock
@@ -86,14 +82,8 @@ class Schedule(Generic[R]):
             self._changed.notify_all()
 
     def next(self, timeout: float | None = None) -> Step[R] | None:
-        """The next step to draw; waits until there is one.
-
-        Args:
-            timeout: longest wait in seconds; by default without limit.
-
-        Returns:
-            The step; None after the timeout, or if the schedule is closed.
-        """
+        """The next step to draw; waits until there is one, at most ``timeout`` seconds. None after that, or if the
+        schedule is closed."""
         end = None if timeout is None else time.monotonic() + timeout
         with self._changed:
             while not self._closed:

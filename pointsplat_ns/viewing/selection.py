@@ -45,14 +45,11 @@ class MergingStopped(Exception):
 
 
 class Selection:
-    """A scene at a budget that may change. :meth:`choose` acts at once; a thread then merges to the same budget, which
-    gives the scene that ``pointsplat prune`` writes.
+    """A scene at a budget that may change. :meth:`choose` acts at once; after ``rest`` seconds without a new budget, a
+    thread merges to the same budget, which gives the scene that ``pointsplat prune`` writes.
 
-    Args:
-        scene: N Gaussians. Undrawable ones are left out.
-        source: source of views: merging uses those of the dataset.
-        changed: called from any thread, with True for a new scene, and with False for new status text alone.
-        rest: seconds without a new budget before merging starts.
+    Undrawable Gaussians are left out. Merging uses the dataset's views of ``source``. ``changed`` is called from any
+    thread, with True for a new scene, and with False for new status text alone.
     """
 
     def __init__(self, scene: Gaussians, source: ViewSource, changed: Callable[[bool], None], rest: float = 1.0):

@@ -55,16 +55,8 @@ class Route:
 
 
 class Server(ThreadingHTTPServer):
-    """Answers requests to routes, on threads of its own, until it is closed.
-
-    Args:
-        host: the address to listen on.
-        port: the first port to try; 0 takes any free port.
-        routes: by their paths.
-
-    Raises:
-        PointSplatError: if no port is free, or the host is not an address of this machine.
-    """
+    """Answers requests to routes, on threads of its own, until it is closed. ``port`` is the first to try; 0 takes any
+    free port. Raises PointSplatError if no port is free, or the host is not an address of this machine."""
 
     daemon_threads = True
     block_on_close = False
@@ -119,13 +111,8 @@ def _free_address(host: str, port: int) -> tuple[socket.AddressFamily, tuple[str
 
 
 def refusal(method: str, headers: Mapping[str, str], hosts: tuple[str, ...] | None) -> http.HTTPStatus | None:
-    """The status of a request that is refused for its sender; None if it is served.
-
-    Args:
-        method: GET or POST. Browsers name the origin of each POST.
-        headers: headers of the request.
-        hosts: accepted names of the server; None for any.
-    """
+    """The status of a request that is refused for its sender; None if it is served. Browsers name the origin of each
+    POST. ``hosts`` are accepted names of the server; None for any."""
     asked, origin = headers.get("Host", ""), headers.get("Origin")
     name = asked[1 : asked.find("]")] if asked.startswith("[") else asked.partition(":")[0]
     if hosts is not None and name not in hosts:  # a foreign page whose name resolves to this server
@@ -206,11 +193,7 @@ class _Body(io.RawIOBase):
         self._stream, self.left = stream, length
 
     def read(self, size: int = -1) -> bytes:
-        """At most ``size`` bytes; empty at the end.
-
-        Raises:
-            ValueError: if the client sends less than it said.
-        """
+        """At most ``size`` bytes; empty at the end. Raises ValueError if the client sends less than it said."""
         wanted = self.left if size < 0 else min(size, self.left)
         data = self._stream.read(wanted)
         if len(data) < wanted:

@@ -24,17 +24,9 @@ if TYPE_CHECKING:
 
 
 class Wipe:
-    """The picture of one or two scenes in one view: the first left of a column, the second from there on. Hidden parts
-    of a scene are not drawn.
-
-    Args:
-        first: N Gaussians.
-        second: Gaussians; None draws the first alone.
-        view: the camera of both.
-        column: first column of the second scene, pixels, from 0 to the view's width.
-        modes: the rasterize modes of both; by default the view's.
-        quality: of the rasterizer.
-    """
+    """The picture of one or two scenes in one view: the first left of a column (in pixels, from 0 to the view's width),
+    the second, if there is one, from there on. Hidden parts of a scene are not drawn. Rasterize modes are by default
+    the view's."""
 
     def __init__(
         self,

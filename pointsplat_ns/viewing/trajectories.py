@@ -21,20 +21,12 @@ STOPS = 12
 
 
 def along(views: Views, frames: int) -> Views:
-    """A smooth path exactly through views, in their order: each is one of its frames.
+    """A smooth path exactly through views, in their order, each of which is one of its ``frames`` cameras (float64);
+    some views are left out if there are more.
 
     Positions are interpolated without overshoot (PCHIP), rotations with continuous acceleration (a spline of
-    rotations). The time between two views is proportional to their distance plus their angle.
-
-    Args:
-        views: C cameras; some are left out if there are more than ``frames``.
-        frames: number of frames, at least 1.
-
-    Returns:
-        ``frames`` cameras, float64.
-
-    Raises:
-        DataError: if there is no view, or ``frames`` is not positive.
+    rotations). The time between two views is proportional to their distance plus their angle. Raises DataError if there
+    is no view, or ``frames`` is not positive.
     """
     views = _spread(views, frames)
     places, turns = _poses(views)
@@ -50,19 +42,11 @@ def along(views: Views, frames: int) -> Views:
 
 
 def walk(views: Views, frames: int, up: Tensor | None = None, from_first: bool = False) -> Views:
-    """A smooth, upright walk past some views of a scene, in a short order. Cameras do not roll.
+    """A smooth, upright walk of ``frames`` cameras (float64) past at most 12 of the views, evenly spread, in a short
+    order. Cameras do not roll.
 
-    Args:
-        views: C cameras; at most 12 of them, evenly spread, are used.
-        frames: number of frames, at least 1.
-        up: (3,) up direction of length 1; by default from the views.
-        from_first: begin at the first of the views, not where the walk is shortest.
-
-    Returns:
-        ``frames`` cameras, float64.
-
-    Raises:
-        DataError: if there is no view, or ``frames`` is not positive.
+    ``up`` (3,) has length 1; by default it is that of the views. With ``from_first`` it begins at the first of the
+    views, not where the walk is shortest. Raises DataError if there is no view, or ``frames`` is not positive.
     """
     views = _spread(views.spread(STOPS), frames)
     places, turns = _poses(views)
@@ -79,22 +63,13 @@ def walk(views: Views, frames: int, up: Tensor | None = None, from_first: bool =
 
 
 def orbit(views: Views, frames: int, centre: Tensor, up: Tensor | None = None) -> Views:
-    """A closed orbit about the common focus of views, at their median distance and height.
+    """A closed orbit of ``frames`` cameras (float64) about the common focus of views, at their median distance and
+    height.
 
     Where a side has no views, the path swings to and fro over the other sides. In a room, where views look away from
-    each other, the camera turns on the spot.
-
-    Args:
-        views: C cameras.
-        frames: number of frames, at least 1.
-        centre: (3,) centre of the scene's content, for views without a common focus.
-        up: (3,) up direction of length 1; by default from the views.
-
-    Returns:
-        ``frames`` cameras, float64.
-
-    Raises:
-        DataError: if there is no view, or ``frames`` is not positive.
+    each other, the camera turns on the spot. ``centre`` (3,) of the scene's content is for views without a common
+    focus; ``up`` (3,) has length 1, and is by default that of the views. Raises DataError if there is no view, or
+    ``frames`` is not positive.
     """
     _check(views, frames)
     places, turns = (torch.from_numpy(values) for values in _poses(views))

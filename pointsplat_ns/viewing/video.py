@@ -26,11 +26,8 @@ _FRAME = re.compile(r"frame_\d{5,}\.png")
 
 
 def kind_of(output: Path | str) -> Kind:
-    """Kind of output of a path: a video (.mp4), one picture (.png), or a folder of pictures (no suffix).
-
-    Raises:
-        SceneError: if the path has another suffix.
-    """
+    """Kind of output of a path: a video (.mp4), one picture (.png), or a folder of pictures (no suffix). Raises
+    SceneError if the path has another suffix."""
     path = Path(output)
     kinds: dict[str, Kind] = {".mp4": "video", ".png": "picture", "": "frames"}
     kind = "frames" if path.is_dir() else kinds.get(path.suffix.lower())
@@ -43,11 +40,8 @@ def kind_of(output: Path | str) -> Kind:
 
 
 def check_output(output: Path | str, force: bool) -> Kind:
-    """Kind of output of a path, checked before the long work.
-
-    Raises:
-        SceneError: as :func:`kind_of`, or if a file must not be overwritten.
-    """
+    """Kind of output of a path, checked before the long work. Raises SceneError as :func:`kind_of`, or if a file must
+    not be overwritten."""
     path, kind = Path(output), kind_of(output)
     if kind == "frames" and path.exists():
         found = sorted({item.name for item in path.iterdir()} - {LOCK_NAME}) if path.is_dir() else [path.name]
@@ -62,20 +56,9 @@ def check_output(output: Path | str, force: bool) -> Kind:
 
 
 def write_frames(frames: Iterable[np.ndarray], output: Path | str, fps: float, force: bool = False) -> int:
-    """Write all frames or none.
-
-    Args:
-        frames: (H, W, 3) uint8 each, of one size; of even width and height for a video. One frame for a picture.
-        output: a file that ends in .mp4 or .png, or a folder.
-        fps: frames a second of a video.
-        force: overwrite existing files.
-
-    Returns:
-        The number of frames.
-
-    Raises:
-        SceneError: if it cannot be written.
-    """
+    """Write all frames, (H, W, 3) uint8 each, or none, to a file that ends in .mp4 or .png, or to a folder; returns
+    their number. Those of a video have one size, of even width and height; a picture is one frame. Raises SceneError if
+    it cannot be written."""
     path, kind = Path(output), check_output(output, force)
     if kind == "video":
         return _write_video(frames, path, fps)

@@ -90,11 +90,8 @@ class _Stage:
         self._tell()
 
     def request(self, wanted: dict[str, Any]) -> tuple[PictureRequest, int]:
-        """What a page asked for, and the longer side of the picture, pixels.
-
-        Raises:
-            ValueError, TypeError, KeyError: if it is not what the page of this server sends.
-        """
+        """What a page asked for, and the longer side of the picture, pixels. Errors are those of Python if it is not
+        what the page of this server sends."""
         camera, views = wanted["camera"], self.frame.views
         width, height = (min(max(int(wanted[name]), 1), LARGEST_SIDE) for name in ("width", "height"))
         eye, right, down, ahead = (_vector(camera[name]) for name in ("eye", "right", "down", "ahead"))
@@ -140,19 +137,13 @@ class _Stage:
 
 
 class Viewer:
-    """Shows one or two scenes in the browser, until it is closed; also the context of a ``with`` block.
+    """Shows one or two scenes, both in the same frame, in the browser, until it is closed; also the context of a
+    ``with`` block.
 
-    Args:
-        scenes: one or two scenes, both in the same frame; none for a page to drop a scene on.
-        host: the address to listen on.
-        port: the first port to try; 0 takes any free port.
-        up: which way is up; by default that of the first scene's known views, or estimated.
-        read: reads a dropped file, which has this name; only without scenes.
-
-    Raises:
-        SceneError: if no Gaussian of a scene can be drawn.
-        DataError: if no Gaussian of the first scene is visible.
-        PointSplatError: if no port is free.
+    Without scenes, a page takes a dropped file, which ``read`` reads with its name. ``port`` is the first to try; 0
+    takes any free port. By default up is that of the first scene's known views, or estimated. Raises SceneError if no
+    Gaussian of a scene can be drawn, DataError if none of the first scene is visible, and PointSplatError if no port is
+    free.
     """
 
     def __init__(

@@ -45,11 +45,8 @@ class Watcher:
             self._painter.schedule.submit(request, side)
 
     def next(self, number: int, texts: int, seconds: float) -> tuple[Shown, int]:
-        """Wait for a picture other than ``number``, or for newer texts; at most some seconds.
-
-        Returns:
-            The newest picture, and the number of the newest texts.
-        """
+        """Wait for a picture other than ``number``, or for newer texts, at most some seconds: the newest picture, and
+        the number of the newest texts."""
         with self._changed:
             self._changed.wait_for(
                 lambda: self._closed or self._shown.number != number or self._texts != texts, seconds

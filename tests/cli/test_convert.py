@@ -8,7 +8,7 @@ import torch
 import pointsplat_ns as ps
 from making import cloud, same
 from pointsplat_ns.cli import main
-from pointsplat_ns.io.files import bytes_text
+from pointsplat_ns.io.files import bytes_text, three_digits
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def test_info_prints_a_page_or_json(scene, capsys):
     said = capsys.readouterr().out
     assert "400 Gaussians of SH degree 2" in said and "suspicious: nothing" in said and ".sog" in said
     found = ps.info(scene)
-    assert said.startswith(f"{scene}: 3DGS PLY, 0.07 MB\n")
+    assert said.startswith(f"{scene}: 3DGS PLY, {bytes_text(scene.stat().st_size)}\n")
     assert f"\nup: {found.up_text}" in said and f"\nfill: {found.fill:.1f} Gaussians drawn per pixel, in 6 v" in said
     run("info", scene, "--json")
     assert json.loads(capsys.readouterr().out) == found.as_dict()
@@ -85,12 +85,15 @@ def test_info_of_several_files_is_a_table(scene, tmp_path, capsys):
     run("convert", scene, other)
     capsys.readouterr()
     run("info", scene, other)
-    head, *rows, _ = capsys.readouterr().out.splitlines()
-    for row, path in zip(rows, (scene, other), strict=True):
+    said = capsys.readouterr().out
+    for path in (scene, other):
         found = ps.info(path)
-        assert row.startswith(f"{path} ") and f"{found.gaussians:,}" in row and found.up_text in row
-        sog = f"{found.file_bytes['.sog']['100%'] / 1e6:.2f}"
-        assert row[head.index(".sog") :] == sog and found.format in row
+        [row] = [line for line in said.splitlines() if str(path) in line]
+        cells = [cell.strip() for cell in row.strip("│").split("│")]
+        assert (
+            cells[:2] == [str(path), found.format] and cells[3] == f"{found.gaussians:,}" and cells[5] == found.up_text
+        )
+        assert cells[-1] == three_digits(found.file_bytes[".sog"]["100%"] / 1e6)
     run("info", scene, other, "--json")
     assert json.loads(capsys.readouterr().out) == [ps.info(path).as_dict() for path in (scene, other)]
     for words in ([], [scene, other, "--views", tmp_path / "sheet.png"]):
@@ -98,6 +101,21 @@ def test_info_of_several_files_is_a_table(scene, tmp_path, capsys):
             run("info", *words)
         assert ended.value.code in (1, 2)
     assert not (tmp_path / "sheet.png").exists()
+
+
+def test_info_goes_on_after_a_file_that_is_no_scene(scene, tmp_path, capsys):
+    bad = tmp_path / "bad.ply"
+    bad.write_text("no scene")
+    for words in ([], ["--json"]):
+        with pytest.raises(SystemExit) as ended:
+            run("info", bad, scene, *words)
+        said = capsys.readouterr()
+        assert ended.value.code == 1 and str(bad) in said.err and "1 of 2 scenes cannot be read" in said.err
+        if words:
+            good, failed = json.loads(said.out)
+            assert good == ps.info(scene).as_dict() and failed["file"] == str(bad) and str(bad) in failed["error"]
+        else:
+            assert str(scene) in said.out and str(bad) not in said.out
 
 
 def test_info_draws_where_a_scene_is_looked_at_from(scene, tmp_path, capsys):

@@ -64,6 +64,7 @@ def test_compact_says_what_helped_of_one_scene_and_of_a_folder(ply, as_json):
     made = as_json("compact", ply, "--keep", "50%", "--effort", "instant")
     assert len(written(made)) == COUNT // 2
     assert made["refined"] in (True, False) and made["repaired"] is False and made["psnr"] > 5
+    assert made["quality"]["psnr"] > 5 and (made["quality"]["width"], made["quality"]["height"]) == (64, 48)
     Path("rooms").mkdir()
     ply.rename("rooms/a.ply")
     many = as_json("compact", "rooms", "--keep", "50%", "--effort", "instant")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.resources
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -107,6 +108,10 @@ def test_anything_else_is_no_refiner(tmp_path):
         load_refiner(tmp_path / "gone")
     with pytest.raises(WeightsError, match="no such file"):
         load_refiner(tmp_path / "gone.safetensors")
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "config.yml").touch()  # of a run in the same folder
+    with pytest.raises(WeightsError, match="pipe: not a regular file; expected a trained pointsplat run"):
+        load_refiner(tmp_path / "pipe")
 
 
 def test_where_the_refiner_that_ships_is_missing_it_is_said_what_to_do(tmp_path, monkeypatch):

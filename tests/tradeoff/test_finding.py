@@ -13,6 +13,7 @@ from making import box_room, same_bits
 from pointsplat_ns import folders
 from pointsplat_ns.compression import repair
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
@@ -46,7 +47,7 @@ def test_the_file_that_is_written_has_the_quality(dense, room_views, tmp_path, s
     ps.save(found.scene, tmp_path / f"found{suffix}")
     assert mean_psnr(ps.load(tmp_path / f"found{suffix}"), dense, room_views) >= 25 - 1e-3  # sums in another order
     size = (tmp_path / f"found{suffix}").stat().st_size
-    assert f", {size / 1e6:.2f} MB, {len(found.scene):,} Gaussians" in found.target
+    assert f", {bytes_text(size)}, {len(found.scene):,} Gaussians" in found.target
     assert "the next cheaper, " in found.target and "dB where 25 are wanted" in found.target
 
 

@@ -130,6 +130,6 @@ def test_the_dense_scene_comes_with_the_next_best_and_its_cost(photos, loss):
     dense, poor, other = (point(*some, photos=db) for some, db in zip(settings, photos, strict=True))
     best, why = recommend([dense, poor, other], 0.5)
     assert best is dense and "is the dense scene itself" in why
-    assert f"the next best, {other.label}, loses {loss} 10,000 Gaussians, 2.48 MB in place of 24.80, " in why
+    assert f"the next best, {other.label}, loses {loss} 10,000 Gaussians, 2.48 MB in place of 24.8 MB, " in why
     assert "50 ms a frame in place of 100, made in 3 s" in why
     assert recommend([dense], 0.5)[1].endswith("is the dense scene itself")

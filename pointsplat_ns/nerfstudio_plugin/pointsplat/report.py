@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pointsplat_ns.nerfstudio_plugin.pointsplat.report_page import COLUMNS, Block, write_report_page
+from pointsplat_ns.nerfstudio_plugin.pointsplat.report_page import COLUMNS, Block, number_text, write_report_page
 from pointsplat_ns.nerfstudio_plugin.pointsplat.results import VARIANTS, read_evaluation
+from pointsplat_ns.system.terminal import print_table
 
 PHOTOS = "photos"
 """The reference of evaluations that name none."""
@@ -41,19 +42,25 @@ ns-eval wrote
 
 
 def show_report(results: dict[str, Any]) -> None:
-    """Print an evaluation: one table per reference, and the reason if LPIPS is missing."""
-    from rich.console import Console
-
-    for table in report_tables(results):
-        Console().print(table)
+    """Print an evaluation: a table for the scenes compared with photos, one for those compared with dense renders, and
+    the reason if LPIPS is missing."""
+    for part in _parts(results):
+        blocks = _blocks(results, part)
+        rows = [
+            (
+                block.name if variant == VARIANTS[0] else "",
+                block.seen if variant == VARIANTS[0] else "",
+                variant,
+                *(number_text(block.variants[variant][column], digits, "-") for column, _, digits in COLUMNS),
+            )
+            for block in blocks
+            for variant in VARIANTS
+        ]
+        header = ("scene", "seen", "variant", *(name for _, name, _ in COLUMNS))
+        title = f"{_settings(results)}; compared with {_reference(part)}"
+        print_table(header, rows, title=title, left=(0, 1, 2), section=len(VARIANTS))
     if note := _note(results):
         print(note)
-
-
-def report_tables(results: dict[str, Any]) -> list:
-    """A rich table for the scenes compared with photos, and one for those compared with dense renders. No average mixes
-    the two."""
-    return [_table(results, part) for part in _parts(results)]
 
 
 def _parts(results: dict[str, Any]) -> list[dict[str, Any]]:
@@ -91,30 +98,3 @@ def _blocks(results: dict[str, Any], part: dict[str, Any]) -> list[Block]:
         averages = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
         blocks += [Block("average", seen, part[key], is_average=True) for seen, key in averages if key in part]
     return blocks
-
-
-def _table(results: dict[str, Any], part: dict[str, Any]):
-    """One row for each scene and variant of a part, then the averages; "seen" says whether the scene was trained on."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title=escape(f"{_settings(results)}; compared with {_reference(part)}"))
-    table.add_column("scene")
-    table.add_column("seen")
-    table.add_column("variant")
-    for _, name, _ in COLUMNS:
-        table.add_column(name, justify="right")
-    for block in _blocks(results, part):
-        for i, row in enumerate(VARIANTS):
-            table.add_row(
-                escape(block.name) if i == 0 else "",
-                block.seen if i == 0 else "",
-                row,
-                *(_number(block.variants[row][column], digits) for column, _, digits in COLUMNS),
-                end_section=i == len(VARIANTS) - 1,
-            )
-    return table
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:,.{digits}f}"

@@ -77,7 +77,7 @@ def _chart(name: str, title: str, digits: int, blocks: list[Block]) -> dict[str,
     rows = []
     for block in blocks:
         marks = [
-            {"variant": variant, "at": place(value), "text": _number(value, digits)}
+            {"variant": variant, "at": place(value), "text": number_text(value, digits)}
             for variant in VARIANTS
             if (value := _value(block.variants[variant][name])) is not None
         ]
@@ -97,7 +97,7 @@ def _ticks(low: float, high: float) -> list[float]:
 def _rows(block: Block) -> dict[str, Any]:
     """A block for the table: one row of texts for each variant."""
     values = block.variants
-    cells = {v: [_number(_value(values[v][name]), digits) for name, _, digits in COLUMNS] for v in VARIANTS}
+    cells = {v: [number_text(_value(values[v][name]), digits) for name, _, digits in COLUMNS] for v in VARIANTS}
     return {"name": block.title, "cells": cells}
 
 
@@ -106,5 +106,6 @@ def _value(value: Any) -> float | None:
     return float(value) if value is not None and abs(value) < 1e12 else None
 
 
-def _number(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:,.{digits}f}"
+def number_text(value: float | None, digits: int, unknown: str = "–") -> str:
+    """A number with so many decimals; ``unknown`` for None."""
+    return unknown if value is None else f"{value:,.{digits}f}"

@@ -1,0 +1,35 @@
+"""Tables on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+
+from pointsplat_ns.errors import printable
+
+
+def print_table(
+    header: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    caption: str = "",
+    title: str = "",
+    left: Collection[int] = (0,),
+    section: int = 0,
+) -> None:
+    """Print a table. Columns whose number is in ``left`` are aligned left and may be folded; others are aligned right.
+    A line follows each ``section`` rows. Where there is no terminal, the table is as wide as it needs to be."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=400)
+    table = Table(title=escape(title) or None, caption=escape(caption) or None)
+    for number, name in enumerate(header):
+        if number in left:
+            table.add_column(name, overflow="fold")
+        else:
+            table.add_column(name, justify="right", no_wrap=True)
+    for number, row in enumerate(rows, start=1):
+        table.add_row(*(escape(printable(cell)) for cell in row), end_section=section > 0 and number % section == 0)
+    console.print(table)
