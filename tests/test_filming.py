@@ -16,10 +16,8 @@ import pointsplat_ns as ps
 from making import ball, decoded, run_of
 from pointsplat_ns.cli import main
 from pointsplat_ns.geometry.cameras import viewmats_to_opengl
-from pointsplat_ns.looking.content import views_in_units
 from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.viewing.split_screen import to_uint8
-from posing import inria, written
 
 SMALL = {"width": 64, "height": 48, "fps": 10}
 
@@ -142,17 +140,6 @@ def test_picture_is_the_view_that_shows_most(scene, tmp_path):
     assert np.abs(shown - to_uint8(ps.render(scene, best)).astype(int)).max() <= 2
 
 
-def test_viewer_begins_with_the_poses_of_a_run(trained_walls):
-    run = run_of(trained_walls, "wall-b")
-    with ps.open_viewer(run, port=0) as viewer:
-        assert viewer.origin == "poses of the dataset"
-        frame, [viewed] = viewer._stage.frame, viewer._stage.scenes
-        shown = views_in_units(ps.dataset_views(run), frame.centre, frame.size).viewmats
-        opened = frame.views.viewmats[1:] if frame.whole else frame.views.viewmats
-        assert len(opened) > 1 and all(any(torch.allclose(one, p, atol=1e-5) for p in shown) for one in opened)
-        assert viewed.mode == "antialiased" and viewed.name == "wall-b"
-
-
 def test_address_that_cannot_be_listened_on_ends_the_command_in_one_line(files, capsys):
     with pytest.raises(SystemExit):
         main(["view", str(files / "ball.ply"), "--host", "192.0.2.1"])
@@ -164,17 +151,3 @@ def test_given_views_keep_their_size_and_photos_are_reduced(scene, tmp_path):
     assert Image.open(tmp_path / "given.png").size == (1000, 50)
     ps.render_path(scene, tmp_path / "narrow.png", path=ps.sample_views(scene, 1, 1001, 50), width=80)
     assert Image.open(tmp_path / "narrow.png").size == (80, 4)
-
-
-def test_a_folder_gets_a_frame_for_each_pose_of_a_file(scene, files, tmp_path):
-    views = ps.sample_views(scene, 4, 64, 48)
-    poses = written(inria(views), tmp_path / "cameras.json")
-    main(["render", str(files / "ball.ply"), "--poses", str(poses), "-o", str(tmp_path / "frames")])
-    frames = frames_in(tmp_path / "frames")
-    assert len(frames) == 4
-    for view, frame in zip(views, frames, strict=True):
-        assert (
-            np.abs(frame - to_uint8(ps.render(scene, view)).astype(int)).mean() < 1
-        )  # poses are written with few digits
-    given = ps.render_path(scene, tmp_path / "two", views=views, path="walk", seconds=0.2, **SMALL)
-    assert given == len(frames_in(tmp_path / "two")) == 2

@@ -9,7 +9,6 @@ import re
 import shlex
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
@@ -63,13 +62,6 @@ def test_a_bug_keeps_its_traceback(monkeypatch):
 def test_the_version_is_printed(capsys):
     main(["--version"])
     assert capsys.readouterr().out == f"pointsplat-ns {ps.__version__}\n"
-
-
-def test_commands_run_in_a_thread_too(capsys):
-    thread = threading.Thread(target=main, args=(["--version"],))
-    thread.start()
-    thread.join()
-    assert ps.__version__ in capsys.readouterr().out
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from making import box_room
-from pointsplat_ns import cli, save
+from pointsplat_ns import cli
 from pointsplat_ns.cli import main
 
 
@@ -47,12 +46,3 @@ def test_what_is_no_number_is_refused_with_those_that_are(capsys):
     with pytest.raises(SystemExit) as end:
         main(["prune", "a.ply", "--fine-tune", "1.5"])
     assert end.value.code == 2 and "is no whole number" in " ".join(capsys.readouterr().err.split())
-
-
-def test_ten_gaussians_of_thousands_are_refused_with_both_ways_to_write_it(tmp_path, capsys):
-    save(box_room(0, 5000), tmp_path / "a.ply")
-    with pytest.raises(SystemExit) as end:
-        main(["prune", str(tmp_path / "a.ply"), "--keep", "10", "--by", "opacity"])
-    assert end.value.code == 1
-    assert "did you mean 10%? Write 10gaussians for so few" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]

@@ -114,15 +114,6 @@ def test_what_is_seen_in_the_room_stays(kind, room):
     assert undrawable == [] and ROOM not in unseen
 
 
-def test_a_sky_of_giants_that_is_seen_stays(room):
-    open_room = room[room.means[:, 2] < 0.9]  # without its ceiling
-    angles = torch.arange(8) * math.pi / 4
-    sky = torch.stack([angles.cos(), angles.sin(), torch.full((8,), 1.5)], dim=1) * 20
-    scene = Gaussians.cat([open_room, blobs(sky, math.log(8.0), 4.0)])
-    gone = set(junk_of(scene)[1])
-    assert not gone & set(range(len(open_room), len(scene)))
-
-
 def test_what_cannot_be_drawn_goes_the_meaningless_first(room):
     bad = blobs(torch.zeros(3, 3), -2.0, 0.0)
     bad.opacities[:, 0] = torch.tensor([-7.0, -8.0, 3.0])

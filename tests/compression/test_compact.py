@@ -113,16 +113,6 @@ def test_a_refiner_that_helps_is_kept_and_the_figures_are_those_of_the_renders(s
     )
 
 
-def test_the_psnr_of_the_result_is_that_of_the_scene_returned(scene, views):
-    reference = DenseReference(scene, views)
-    for refiner, accepted in ((tiny_refiner("scales", 0.1), True), (tiny_refiner("features_dc", -2.0), False)):
-        result = compacted(scene, trained(refiner), views)
-        assert result.accepted == accepted
-        assert result.psnr == reference.psnr(result.scene)[0]
-        assert result.views is views
-        assert result.seconds > 0
-
-
 def test_a_refiner_that_harms_is_left_out_and_both_figures_are_said(scene, views):
     result = compacted(scene, trained(tiny_refiner("features_dc", -2.0)), views)
     assert not result.accepted and same(result.scene, prune(scene, 0.5, "opacity"))

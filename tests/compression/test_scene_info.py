@@ -1,6 +1,5 @@
 """What is said of a scene."""
 
-import json
 import math
 
 import pytest
@@ -8,7 +7,6 @@ import torch
 
 import pointsplat_ns as ps
 from making import cloud
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.sog import encode_sog, sog_bytes_like
@@ -103,16 +101,3 @@ def test_up_is_named_or_estimated_and_fill_is_that_of_the_views():
     views = ViewSource(scene, resolution=(64, 48), up=up_named("-y")).views(6)
     assert named.fill == pytest.approx(fill(scene, views)) and named.fill != pytest.approx(found.fill)
     assert named.views == f"{len(views)} views of 64 x 48 pixels"
-
-
-def test_a_scene_of_nothing_has_no_bounds():
-    found = ps.info(Gaussians.empty(1))
-    assert found.gaussians == 0 and found.bounds == [] and found.sizes == {}
-    assert found.up_text == "unknown" and found.fill is None
-    json.dumps(found.as_dict())
-
-
-def test_a_scene_too_large_for_spz_has_no_size_in_it():
-    scene = cloud(10)
-    scene.means[0] = 1e9
-    assert ".spz" not in ps.info(scene).file_bytes and ".ply" in ps.info(scene).file_bytes

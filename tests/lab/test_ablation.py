@@ -136,19 +136,6 @@ def test_a_run_is_merged_without_poses_and_with_them(trained_walls, tmp_path, mo
     assert given[:2] == [None, None] and all(len(views) > 2 for views in given[2:])
 
 
-def test_what_cannot_be_measured_is_an_error_at_the_start(small):
-    with pytest.raises(SystemExit, match="--variants no_such; expected some of: no_renders, .*no_regrouping"):
-        ablation.main((small,), variants=("no_regrouping", "no_such"))
-    with pytest.raises(SystemExit, match="no scene named"):
-        ablation.main()
-    with pytest.raises(SystemExit, match="expected shares above 0"):
-        ablation.main((small,), keep=(30,))
-    with pytest.raises(SystemExit, match="0 views of width 960; expected at least 1, and 20 pixels"):
-        ablation.main((small,), views=0)
-    with pytest.raises(SystemExit, match="expected one of both"):
-        ablation.main((small,), write=(small,))
-
-
 def row(scene: str, method: str, psnr: float, seconds: float, at: int | str = 960, keep: float = 0.1) -> dict:
     known = {"scene": scene, "digest": "0", "gaussians": 1000, "at": at, "keep": keep, "method": method}
     return known | {"changes": variants.changes_of(method), "covered_psnr": psnr, "cpu_seconds": seconds}
@@ -208,20 +195,6 @@ def test_the_record_of_several_files_is_written_and_gives_the_same_page_again(tm
     assert page == record.page(ROWS, record.settings_of(8, 960))
     ablation.main(write=(files[0],), record_folder=folder)
     assert files[1].read_text() == page
-
-
-def test_what_cannot_be_recorded_is_an_error_and_writes_nothing(tmp_path):
-    whole, folder = write_rows(tmp_path / "a.json", ROWS), tmp_path / "record"
-    (tmp_path / "c.json").write_text("{}")
-    for files, said in (
-        ((tmp_path / "c.json",), "expected a file that ablation.py wrote"),
-        ((whole, whole), "rows that another file has, of ['fox', 'lounge', 'rock']"),
-        ((whole, write_rows(tmp_path / "b.json", [], 4)), "was written with views 4, the files before 8;"),
-        ((write_rows(tmp_path / "d.json", ROWS[:1]),), "no variant and the defaults of one scene"),
-    ):
-        with pytest.raises(SystemExit, match=re.escape(said)):
-            ablation.main(write=files, record_folder=folder)
-    assert not folder.exists()
 
 
 def test_the_record_that_is_committed_has_the_page_of_its_rows():

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from PIL import Image
 
 from lab.judge import camera_paths, judge, scenes, tables
 from making import box_room
@@ -99,25 +98,6 @@ def test_a_view_has_what_it_looks_at_in_its_middle_and_the_field_across_its_widt
 def test_a_path_that_means_nothing_is_an_error_with_the_reason(folder, changes, said):
     with pytest.raises(SystemExit, match=re.escape(said)):
         camera_paths.views_of(write_path(folder, **changes), 320)
-
-
-@pytest.mark.parametrize("text, said", [("", "cannot be read as JSON"), ("[]", "found list"), (None, "no such file")])
-def test_a_file_that_is_no_path_is_an_error(folder, text, said):
-    path = folder / "small.json"
-    if text is not None:
-        path.write_text(text)
-    with pytest.raises(SystemExit, match=said):
-        camera_paths.views_of(path, 320)
-
-
-def test_a_sheet_shows_all_views(small, capsys):
-    judge.main((small,), sheet=small.parent / "sheets")
-    with Image.open(small.parent / "sheets" / "small.png") as sheet:
-        assert sheet.size == (4 * 320, 180)
-        shown = [sheet.crop((320 * i, 0, 320 * i + 320, 180)).getextrema() for i in range(4)]
-    assert all(max(high for _, high in bands) > 100 for bands in shown[:3])
-    assert shown[3] == ((0, 0),) * 3  # there is no fourth view
-    assert "small.png" in capsys.readouterr().out
 
 
 def ball(colour: float = 1.0) -> Gaussians:
@@ -308,25 +288,3 @@ def test_leads_are_of_prune_over_the_best_mode_and_of_compact_over_prune_at_each
     names, figures = (list(column.cells) for column in first.columns)
     lines = dict(zip(names, figures, strict=True))
     assert (lines["all mean"], lines["all worst"]) == ("+3.00", "+1.00 rock")
-
-
-def test_what_cannot_be_judged_is_an_error_at_the_start(small, tmp_path):
-    with pytest.raises(SystemExit, match="no scene named"):
-        judge.main()
-    with pytest.raises(SystemExit, match="gone.ply: no such file or folder"):
-        judge.main((small, tmp_path / "gone.ply"))
-    with pytest.raises(SystemExit, match="two scenes have one name"):
-        judge.main((small, small))
-    write_ply(box_room(seed=3, count=30), tmp_path / "other.ply")
-    with pytest.raises(SystemExit, match="no such file; expected a camera path for other"):
-        judge.main((small, tmp_path / "other.ply"))
-    with pytest.raises(SystemExit, match="FileNotFoundError"):
-        judge.main((small,), splat_transform=(str(tmp_path / "nothing"),))
-    with pytest.raises(SystemExit, match=re.escape("--again merge; expected some of: prune, compact")):
-        judge.main((small,), again=("merge",), resume=True)
-    with pytest.raises(SystemExit, match="--again without --resume"):
-        judge.main((small,), again=("prune",))
-    with pytest.raises(SystemExit, match="expected shares above 0"):
-        judge.main((small,), keep=(30,))
-    with pytest.raises(SystemExit, match="expected at least 1, and 20 pixels"):
-        judge.main((small,), widths=(8,))

@@ -199,35 +199,6 @@ def test_drags_move_what_is_seen_with_the_pointer(opened, drag):
     settle(opened)
 
 
-def test_shift_shifts_and_the_wheel_comes_nearer_once_the_picture_was_clicked(opened):
-    start, canvas = camera(opened), opened.find_element(By.TAG_NAME, "canvas")
-    wheel = "arguments[0].dispatchEvent(new WheelEvent('wheel', {deltaY: -90, cancelable: true, bubbles: true}))"
-    opened.execute_script("arguments[0].blur()", canvas)
-    assert opened.execute_script("return " + wheel, canvas) and camera(opened) == start, "the page is scrolled"
-    opened.execute_script("arguments[0].focus()", canvas)
-    assert not opened.execute_script("return " + wheel, canvas)
-    nearer = np.subtract(camera(opened)["eye"], start["eye"])
-    assert np.dot(nearer, start["ahead"]) == pytest.approx(np.linalg.norm(nearer)) and np.abs(nearer).max() > 0
-    chain = ActionChains(opened).key_down(Keys.SHIFT).move_to_element_with_offset(canvas, 40, 20)
-    before = camera(opened)
-    chain.click_and_hold().move_by_offset(0, 20).release().key_up(Keys.SHIFT).perform()
-    shifted = np.subtract(camera(opened)["eye"], before["eye"])
-    assert np.dot(shifted, before["down"]) == pytest.approx(-np.linalg.norm(shifted)) and np.abs(shifted).max() > 0
-    settle(opened)
-
-
-def test_what_is_upside_down_is_turned_over_and_stays_so(opened):
-    opened.execute_script("flight.setWipe(1)")
-    before, up = picture(opened), opened.execute_script("return flight.camera.up")
-    opened.find_element(By.CSS_SELECTOR, "[data-flight='over']").click()
-    for lead in ("", "flight.goTo(0)"):
-        opened.execute_script(lead)
-        assert ps.psnr(picture(opened).flip(0, 1), before) > 50
-        assert np.allclose(opened.execute_script("return flight.camera.up"), np.negative(up))
-    opened.find_element(By.TAG_NAME, "canvas").send_keys("t")
-    assert torch.equal(picture(opened), before)
-
-
 def test_a_browser_without_workers_or_floats_draws_the_same(browser, written, opened):
     expected = picture(opened)
     without = """

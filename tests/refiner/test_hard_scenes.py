@@ -73,13 +73,6 @@ def assert_finite(refiner: Refiner, scene: Gaussians, name: str) -> None:
 """The published grid, stages, strides, heads and patches, in fewer channels and blocks for the sake of time."""
 
 
-def test_hard_scenes_do_squeeze_gaussians_into_one_cell():
-    refiner = small_refiner(grid=384)
-    cells = {name: refiner.prepare(scene).levels[0].num_cells for name, scene in hard_scenes().items()}
-    assert cells["coincident"] == 1 and cells["one voxel and one far"] == 2
-    assert cells["outlier"] > 50 and cells["within 1e-30"] > 50, "these are handled: their Gaussians keep their cells"
-
-
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
 @pytest.mark.parametrize("name", ["means", "scales", "quats", "features_dc", "features_rest"])
 def test_unusable_gaussians_come_back_unchanged_and_the_others_as_if_those_were_not_there(name, bad):

@@ -94,13 +94,6 @@ def test_a_scene_of_lower_degree_is_refined_as_if_padded_with_zeros(sh_degree):
     assert same(a, b.replace(features_rest=b.features_rest[:, : a.features_rest.shape[1]]))
 
 
-def test_a_network_of_degree_zero_refines_scenes_of_degree_zero():
-    scene = scene_to_refine(sh_degree=0)
-    refined = small_refiner(sh_degree=0)(scene)
-    assert refined.features_rest.shape == (200, 0, 3)
-    assert not torch.equal(refined.features_dc, scene.features_dc)
-
-
 def test_clamping_for_the_network_does_not_clamp_the_scene():
     scene = scene_to_refine(5).replace(opacities=torch.tensor([[torch.inf], [-torch.inf], [40.0], [-40.0], [0.0]]))
     moved = small_refiner()(scene).opacities - scene.opacities

@@ -92,10 +92,12 @@ def inline_code() -> Iterator[tuple[Path, str]]:
 
 
 BLOCKS = [block for page in PAGES for block in blocks_of(page)]
-COMMANDS = [
+EVERY = [
     *(command for block in BLOCKS if block.language == "bash" for command in commands_of(block)),
     *(Command(f"pointsplat {name} --help", (*shlex.split(text),)) for name in EXAMPLES for _, text in EXAMPLES[name]),
 ]
+COMMANDS = [*{command.words: command for command in reversed(EVERY)}.values()]
+"""Each command line once, where it is shown first."""
 
 
 class Parsed(BaseException):

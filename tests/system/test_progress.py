@@ -61,17 +61,6 @@ def test_a_log_gets_a_plain_line_from_time_to_time_also_while_nothing_is_reporte
     assert log.getvalue().splitlines() == lines  # it ends with the work
 
 
-def test_work_goes_on_where_the_log_is_closed(stderr, monkeypatch):
-    monkeypatch.setattr(progress, "LINE_SECONDS", 0.01)
-    log = stderr(io.StringIO())
-    done = []
-    for number in tracked(range(3), "Counting", 3):
-        log.close()
-        time.sleep(0.05)
-        done.append(number)
-    assert done == [0, 1, 2]
-
-
 def test_nothing_is_written_where_there_is_no_terminal_and_little_to_do(stderr):
     shown = stderr(io.StringIO())
     assert list(tracked("abc", "Counting letters", 3)) == ["a", "b", "c"]

@@ -11,7 +11,6 @@ import pointsplat_ns as ps
 from making import box_room
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.looking.closeness import DenseReference
-from pointsplat_ns.tables import making
 from pointsplat_ns.tables.cells import CELLS
 from pointsplat_ns.tables.ways import FIGURE_4, Network, all_cells
 from pointsplat_ns.tradeoff.judging import Judge
@@ -159,18 +158,6 @@ def test_more_steps_are_measured_and_other_cells_left_alone(measured, few_ways):
     assert cells_of(second)["lightgaussian-tuned", 0.3].made_with == "3 steps"
     unchanged = [key for key, cell in cells_of(first).items() if cell == cells_of(second)[key]]
     assert unchanged == [("dense", 1.0), ("paper", 0.1), ("paper", 0.3), ("lightgaussian", 0.3)]
-
-
-def test_scores_are_computed_once_for_all_budgets(measured, few_ways, monkeypatch):
-    scored, score_of = [], making.score_of
-
-    def counted(scene, method, *args):
-        scored.append(method.name)
-        return score_of(scene, method, *args)
-
-    monkeypatch.setattr(making, "score_of", counted)
-    measured(keeps=(0.5, 0.3))
-    assert scored == ["paper", "lightgaussian"]
 
 
 def test_tables_are_of_all_scenes_of_the_folder(measured, tmp_path, room):

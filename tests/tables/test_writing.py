@@ -143,13 +143,6 @@ def test_the_papers_figures_never_stand_beside_other_datasets(tmp_path, plain_fi
     assert "(paper)" not in text and "39.40" not in text and "29.81" not in text
 
 
-def test_nor_beside_a_group_with_one_other_scene(tmp_path, plain_figure):
-    write_scene(tmp_path, "room0", "Replica", "Replica")
-    write_scene(tmp_path, "my_room", "Replica")
-    write_tables(tmp_path, (0.3, 0.1), {})
-    assert "(paper)" not in (tmp_path / "tables.md").read_text()
-
-
 def test_they_stand_beside_ours_where_the_dataset_is_the_same(tmp_path, plain_figure):
     write_scene(tmp_path, "room0", "Replica", "Replica")
     write_scene(tmp_path, "0a5c013435", "ScanNet++", "ScanNet++")
@@ -163,14 +156,6 @@ def test_they_stand_beside_ours_where_the_dataset_is_the_same(tmp_path, plain_fi
     assert rows_of(Layout(first, (0.3,), {}).tables()[3])["V", "yes"][-3:] == ("23.46", "0.855", "0.374")
     assert "do not say of which scenes they are" in (tmp_path / "tables.md").read_text()
     assert json.loads((tmp_path / "tables.json").read_text())["paper"]["Replica"]["table 1, pup, 10%"]["psnr"] == 17.34
-
-
-def test_busy_machines_and_versions_are_named(tmp_path, plain_figure):
-    write_scene(tmp_path, "fox")
-    write_tables(tmp_path, (0.3, 0.1), {})
-    text = (tmp_path / "tables.md").read_text()
-    assert "by pointsplat\\_ns 0.1.0, commit 0123456789ab." in text and "busy" not in text
-    assert "| fox | 1,000 | 3 held-out photos | 64 x 48 |" in text
 
 
 def test_figure_4_is_drawn_and_its_medians_are_those_of_the_bins(tmp_path):

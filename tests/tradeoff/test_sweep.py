@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -21,7 +20,6 @@ from pointsplat_ns.tradeoff.outputs import OUTPUTS, PAGE, PLOTS, TABLE
 from pointsplat_ns.tradeoff.points import picture_path
 from pointsplat_ns.tradeoff.settings import Setting
 from pointsplat_ns.tradeoff.sweep import Options, check_folder
-from trades import point
 
 
 def names(folder):
@@ -131,12 +129,6 @@ def test_a_point_whose_pictures_are_gone_is_measured_again(new_sweep, tmp_path):
     assert again.against_dense == first.against_dense
 
 
-def test_more_points_can_be_asked_for_later(new_sweep, tmp_path):
-    few = new_sweep(tmp_path, points=2).run().points
-    more = new_sweep(tmp_path, points=3).run().points
-    assert len(more) == 3 and set(few) < set(more)
-
-
 def test_held_out_photos_are_what_scenes_are_judged_by(new_sweep, tmp_path, room, room_views):
     photos = list(ps.render(ps.load(room), room_views))
     photos = [(photo + 0.05).clamp(0, 1) for photo in photos]
@@ -146,15 +138,6 @@ def test_held_out_photos_are_what_scenes_are_judged_by(new_sweep, tmp_path, room
     assert result.points[0].against_photos.psnr < 40 and result.points[0].against_dense.psnr == math.inf
     assert len(list((tmp_path / "pictures").glob("*_photo.png"))) == 2
     assert "held-out photos" in result.why
-
-
-@pytest.mark.parametrize("resolution, side", [(None, 506), ((640, 480), 453), ((48, 36), 48)])
-def test_held_out_photos_are_judged_at_the_middle_size_of_the_resolution(room, room_views, no_lpips, resolution, side):
-    dense, large = ps.load(room), replace(room_views[:1], width=800, height=600)
-    photos = [torch.zeros(large.height, large.width, 3)]
-    subject = measuring.Subject(dense, room, "room", "", list, lambda count: (large, photos), resolution=resolution)
-    judged_views = measuring.Measurer(subject, 1, lambda what, share: None).judged_views
-    assert judged_views.views.width == side and judged_views.photos[0].shape == (judged_views.views.height, side, 3)
 
 
 def test_where_photos_cannot_be_had_it_says_why_and_goes_on_without(new_sweep, tmp_path):
@@ -188,16 +171,6 @@ def test_scenes_drawn_otherwise_come_on_top_and_are_not_made_again(new_sweep, tm
     assert new_sweep(tmp_path, **options).run().points == first and len(made) == 2, "nothing is measured twice"
 
 
-def test_no_more_scenes_are_kept_in_memory_than_the_dense_one_weighs(new_sweep, tmp_path):
-    running = new_sweep(tmp_path)
-    for count in (100, 200, 150, 390):
-        running.scene(Setting(count, 1))
-    assert [*running.measurer._kept] == [Setting(390, 1)]
-    running.scene(Setting(5, 1))
-    running.scene(Setting(5, 1, drawn="fast"))
-    assert [*running.measurer._kept] == [Setting(390, 1), Setting(5, 1)]
-
-
 @pytest.mark.parametrize("drawn", [("exact",), ("exact", "fast", "half")])
 def test_progress_never_goes_back_and_ends(new_sweep, tmp_path, drawn):
     shares = []
@@ -220,20 +193,6 @@ def test_results_without_points_are_not_overwritten(tmp_path):
         check_folder(tmp_path, force=False)
     check_folder(tmp_path, force=True)
     assert names(tmp_path) == []
-
-
-def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
-    (tmp_path / "file").write_text("precious")
-    with pytest.raises(SceneError, match="is a file; expected the name of a folder"):
-        check_folder(tmp_path / "file", force=True)
-
-
-def test_points_are_listed_by_size_the_dense_scene_first(new_sweep, tmp_path):
-    running = new_sweep(tmp_path)
-    running.measure_dense()
-    for setting in (Setting(10, 1), Setting(40, 0), Setting(40, 1)):
-        running.journal.add(point(setting, 30.0, of=400))
-    assert [(p.gaussians, p.sh_degree) for p in running.result().points][1:] == [(40, 1), (40, 0), (10, 1)]
 
 
 @pytest.mark.parametrize(

@@ -62,11 +62,6 @@ def test_a_scene_without_sh_bands_has_one_way():
     assert {s.sh_degree for s in walked(Trade(sh_degree=0), Plan(100_000, 0))} == {0}
 
 
-def test_other_methods_are_measured_at_three_budgets():
-    found = walked(Trade(gains={}), Plan(100_000, 3, ("merge", "paper"), ("none",)))
-    assert [s.count for s in found if s.by == "paper"] == [10_000, 30_000, 3_000]
-
-
 def test_it_ends_where_the_front_is_flat():
     flat = Trade(slope=0.01, at_all=60.0, gains={}, cuts={0: 1.0, 1: 1.0, 2: 1.0})
     assert len(walked(flat)) == 4  # a tenth, the repair there, and the two other budgets
@@ -96,13 +91,6 @@ def test_what_will_be_recommended_is_looked_for_first(within, most, factor):
 def test_an_interrupted_walk_goes_on_as_it_would_have(known):
     whole, resumed = walked(Trade(), most=14), walked(Trade(), most=14, known=known)
     assert list(whole) == list(resumed)
-
-
-@pytest.mark.parametrize("count", [1, 2, 5, 30])
-def test_the_smallest_scenes_can_be_walked(count):
-    settings = list(walked(Trade(count=count)))
-    assert settings and len(settings) == len(set(settings))
-    assert all(1 <= setting.count <= count for setting in settings)
 
 
 def test_photos_go_before_renders():
@@ -145,21 +133,3 @@ def test_the_smallest_scene_within_the_loss_is_drawn_fast_and_larger_ones_until_
     assert first == replace(min(exact, key=lambda setting: setting.count), drawn="fast")
     assert others and all(setting.count > first.count for setting in others)
     assert any(PLAIN.psnr(setting) >= psnr_within(plan.within) for setting in others)
-
-
-def test_one_that_is_drawn_fast_at_no_loss_is_enough():
-    trade = replace(PLAIN, drawings={"fast": 90.0}, at_all=36.2)  # nothing smaller is within the loss
-    plan = Plan(100_000, 3, repairs=("none",), within=0.6, drawn=("fast",))
-    first, *_ = drawn_after(trade, plan)
-    assert trade.psnr(first) >= psnr_within(plan.within)
-
-
-def test_the_best_of_a_tenth_and_three_tenths_are_drawn_at_half_the_size():
-    plan = Plan(100_000, 3, drawn=("half",))
-    found = drawn_after(Trade(), plan)
-    assert [(s.count, s.repair, s.drawn) for s in found] == [(10_000, "quick", "half"), (30_000, "quick", "half")]
-
-
-def test_nothing_is_drawn_otherwise_where_nobody_asked_or_nothing_is_within_the_loss():
-    assert drawn_after(PLAIN, Plan(100_000, 3, drawn=())) == []
-    assert drawn_after(replace(PLAIN, at_all=20.0), Plan(100_000, 3, repairs=("none",), drawn=("fast",))) == []

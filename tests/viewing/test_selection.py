@@ -110,14 +110,6 @@ def test_failed_merge_leaves_what_was_chosen_and_says_why(selection, news, monke
     assert len(selection.current.scene) == 200
 
 
-def test_merged_scenes_take_no_more_memory_than_the_scene(selection, news, monkeypatch):
-    monkeypatch.setattr(module, "prune", lambda scene, count, **_: scene[:count])
-    for percent in (60, 50, 40, 30):
-        selection.choose(percent)
-        news.wait(lambda: selection.current.how == "merged")
-    assert list(selection._merged) == [40, 30]
-
-
 def test_close_ends_the_thread(scene, news):
     made = Selection(scene, ViewSource(scene), news, rest=0.0)
     made.choose(10)

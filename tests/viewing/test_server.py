@@ -24,7 +24,7 @@ from making import ball
 from pointsplat_ns.viewing import dropped
 from pointsplat_ns.viewing import viewer as viewing
 from pointsplat_ns.viewing.server import LOCAL, refusal
-from pointsplat_ns.viewing.viewer import MOST_PAGES, Viewer
+from pointsplat_ns.viewing.viewer import Viewer
 
 CLIENT = "a page of the tests"
 
@@ -160,18 +160,6 @@ def test_bodies_have_a_size_that_is_said_and_not_too_large(viewer):
     assert post(viewer, "/look", b"x", Transfer_Encoding="chunked")[0] == 411
 
 
-def test_pages_are_few_and_the_oldest_gives_way(viewer):
-    for index in range(MOST_PAGES + 2):
-        assert said(viewer, "/look", **looked(client=f"page number {index:06}"))[0] == 204
-    assert len(viewer._watchers) == MOST_PAGES and "page number 000000" not in viewer._watchers
-    painting = [thread for thread in threading.enumerate() if thread.name == "painting"]
-    end = time.monotonic() + 30
-    while len(painting) > MOST_PAGES and time.monotonic() < end:
-        time.sleep(0.05)
-        painting = [thread for thread in threading.enumerate() if thread.name == "painting"]
-    assert len(painting) <= MOST_PAGES
-
-
 @pytest.mark.parametrize("suffix", [name for name in dropped.READABLE_NAMES if name not in (".ckpt", ".ksplat")])
 def test_a_dropped_scene_of_any_format_is_shown(suffix, empty, tmp_path):
     assert b"Drop a file here" in answer(empty, "GET", "/")[1]
@@ -181,14 +169,6 @@ def test_a_dropped_scene_of_any_format_is_shown(suffix, empty, tmp_path):
     assert f"<strong>my ball{suffix}</strong>".encode() in answer(empty, "GET", "/")[1]
     assert said(empty, "/look", **looked())[0] == 204
     assert whole_picture(empty, 1)[0].std() > 10
-
-
-def test_another_dropped_scene_replaces_the_first_and_old_pages_are_told(empty, tmp_path):
-    ps.save(ball(300), tmp_path / "a.ply")
-    for _ in range(2):
-        assert post(empty, "/drop?name=a.ply", (tmp_path / "a.ply").read_bytes())[0] == 204
-    assert said(empty, "/look", **looked())[0] == 409
-    assert said(empty, "/look", **looked(stage=2))[0] == 204
 
 
 HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 999999999\nproperty float x\nend_header\n"

@@ -168,18 +168,3 @@ def test_a_run_whose_data_is_gone_is_learned_from_its_own_renders(trained_walls,
 
 
 # memory
-
-
-def test_nothing_is_kept_beyond_the_bound_and_all_is_found_again(rooms):
-    one = scene_of(rooms)
-    dense_bytes = sum(value.numel() * value.element_size() for _, value in one.read_dense().items())
-    unbounded = [data["image"] for _, data in one.rendered_train]
-    picture_bytes = unbounded[0].numel()
-    assert one.cache.num_bytes == dense_bytes + len(unbounded) * picture_bytes
-    for bound in (0, 2 * picture_bytes, dense_bytes + picture_bytes):
-        tight = scene_of(rooms, bound)
-        again = []
-        for _, data in tight.rendered_train:
-            again.append(data["image"])
-            assert tight.cache.num_bytes <= bound
-        assert all(torch.equal(a, b) for a, b in zip(unbounded, again, strict=True))

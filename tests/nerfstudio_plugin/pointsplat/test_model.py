@@ -40,13 +40,6 @@ def test_untrained_the_refined_scene_is_the_pruned_one_to_the_bit(trained_walls)
         assert smaller.pruned.sh_degree == dense.sh_degree
 
 
-@pytest.mark.parametrize(("keep", "kept"), [(17, 17), (2, 2), (1.0, None)])
-def test_keep_is_a_ratio_up_to_1_and_a_count_above(trained_walls, keep, kept):
-    pipeline = pipeline_of(run_of(trained_walls, "wall-a"), keep=float(keep))
-    scene = pipeline.model.pruned_scene(0)
-    assert len(scene.pruned) == (kept or scene.dense_count)
-
-
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
@@ -59,13 +52,6 @@ def test_keep_is_a_ratio_up_to_1_and_a_count_above(trained_walls, keep, kept):
 def test_settings_that_mean_nothing_are_refused_before_anything_is_read(trained_walls, settings, error, message):
     with pytest.raises(error, match=message):
         pipeline_of(trained_walls, **settings)
-
-
-def test_what_one_scene_cannot_give_is_refused_when_it_is_pruned(trained_walls):
-    with pytest.raises(BudgetError, match=r"wall-a.*\.ckpt: keep is 1000000 Gaussians; expected 1 to"):
-        pipeline_of(trained_walls, keep=1e6).model.pruned_scene(0)
-    with pytest.raises(PointSplatError, match="opacity_weight is 1.5; expected 0 to 1"):
-        pipeline_of(trained_walls, opacity_weight=1.5).model.pruned_scene(0)
 
 
 def test_a_scene_is_drawn_as_it_was_trained(trained_walls):

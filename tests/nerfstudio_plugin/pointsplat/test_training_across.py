@@ -83,24 +83,6 @@ def test_the_loss_is_against_the_dense_scene_even_where_there_are_photos(trained
     assert losses["dense"] < 0.5 / 255 and losses["photos"] > 5 / 255
 
 
-def test_pruned_scenes_are_kept_within_the_bound_and_made_again_alike(three_rooms):
-    config = dense_config(three_rooms, Path("unused"), 1)
-    config.pipeline.datamanager.cache_gigabytes = 0.0
-    none_kept = config.pipeline.setup(device="cpu", test_mode="test").model
-    config.pipeline.datamanager.cache_gigabytes = 0.05
-    pipeline = config.pipeline.setup(device="cpu", test_mode="test")
-    kept = pipeline.model
-    first = [kept.pruned_scene(index) for index in range(3)]
-    again = [none_kept.pruned_scene(index) for index in (0, 1, 2, 0)]
-    assert all(kept.pruned_scene(index) is first[index] for index in range(3))
-    assert again[3] is not again[0] and none_kept.pruned_scene(0) is again[3], "the latest is there in any case"
-    for one, other in ((again[3], again[0]), (again[1], first[1])):
-        assert all(torch.equal(a, b) for (_, a), (_, b) in zip(one.pruned.items(), other.pruned.items(), strict=True))
-    structures = first[0].structure
-    smallest = structures.order.numel() * 8 + sum(v.numel() * 4 for _, v in first[0].pruned.items())
-    assert pipeline.datamanager.cache.num_bytes > 3 * smallest, "neighbour tables count, too"
-
-
 # resuming
 
 
