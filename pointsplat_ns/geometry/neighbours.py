@@ -99,6 +99,32 @@ def _others_by_scipy(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
     return near, torch.from_numpy(tree.indices.copy())  # newer releases of scipy give what must not be written to
 
 
+def nearest_of(points: Tensor, queries: Tensor, near: Tensor, k: int, compiled: bool | None = None) -> Tensor:
+    """The nearest points of other places.
+
+    Args:
+        points: (N, 3) float64, finite, on the CPU; N is at least 1.
+        queries: (m, 3) likewise.
+        near: (m,) int64, for each query the index of a point; the nearer, the faster.
+        k: number of neighbours.
+        compiled: as for :func:`other_neighbours`.
+
+    Returns:
+        Indices (m, min(k, N)) int32, the nearest first.
+    """
+    k = min(k, len(points))
+    if k <= MOST_COMPILED and KERNELS.usable(compiled):
+        return PointTree(points).nearest(queries, near, k)
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(points.numpy(), balanced_tree=False)
+    found = torch.empty(len(queries), k, dtype=torch.int32)
+    for rows in torch.arange(len(queries)).split(CHUNK):
+        indices = tree.query(queries[rows].numpy(), k=list(range(1, k + 1)), workers=most_threads())[1]
+        found[rows] = torch.from_numpy(indices).to(torch.int32)
+    return found
+
+
 class PointTree:
     """A tree of boxes over points, by the compiled kernel.
 
@@ -131,16 +157,7 @@ class PointTree:
         return self._search(len(self.order), k)
 
     def nearest(self, queries: Tensor, near: Tensor, k: int) -> Tensor:
-        """The nearest points of other points.
-
-        Args:
-            queries: (m, 3) float64, finite.
-            near: (m,) int64, for each query the index of a point; the nearer, the faster.
-            k: number of neighbours, at most :data:`MOST_COMPILED`.
-
-        Returns:
-            Indices (m, k) int32, the nearest first; -1 for none.
-        """
+        """As :func:`nearest_of`, for at most :data:`MOST_COMPILED` neighbours."""
         leaves = torch.empty_like(self.order)
         leaves[self.order] = torch.arange(len(self.order)) // LANES
         return self._search(len(queries), k, queries=queries.contiguous(), leaves=leaves[near])

@@ -39,10 +39,21 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 
 def quaternions_of(matrices: Tensor) -> Tensor:
-    """Quaternions (..., 4) wxyz, float64, of rotation matrices (..., 3, 3) on the CPU."""
-    from scipy.spatial.transform import Rotation
+    """Quaternions (..., 4) wxyz, float64, of rotation matrices (..., 3, 3).
 
-    return torch.from_numpy(Rotation.from_matrix(matrices.double().numpy()).as_quat())[..., [3, 0, 1, 2]]
+    The entries of a matrix are products of the components of q. They give 4 q q^T, of which the row with the largest
+    diagonal is the best multiple of q (Shepperd 1978, Journal of Guidance and Control 1(3)).
+    """
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrices.double().unbind(-2))
+    rows = [
+        torch.stack([1 + a + e + i, h - f, c - g, d - b], dim=-1),
+        torch.stack([h - f, 1 + a - e - i, b + d, c + g], dim=-1),
+        torch.stack([c - g, b + d, 1 - a + e - i, f + h], dim=-1),
+        torch.stack([d - b, c + g, f + h, 1 - a - e + i], dim=-1),
+    ]
+    products = torch.stack(rows, dim=-2)  # [..., 4, 4]
+    best = products.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None].expand(*products.shape[:-2], 1, 4)
+    return torch.nn.functional.normalize(products.gather(-2, best)[..., 0, :], dim=-1)
 
 
 def zero_as_identity(quats: Tensor) -> Tensor:

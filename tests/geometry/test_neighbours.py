@@ -5,7 +5,7 @@ import torch
 
 from making import assert_same_on_any_threads
 from pointsplat_ns.geometry import neighbours
-from pointsplat_ns.geometry.neighbours import KERNELS, PointTree, nearest, other_neighbours
+from pointsplat_ns.geometry.neighbours import KERNELS, PointTree, nearest, nearest_of, other_neighbours
 
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 compiled_or_not = pytest.mark.parametrize("compiled", [pytest.param(None, marks=needs_compiler), False])
@@ -87,20 +87,23 @@ def test_points_beside_a_crowd_keep_their_own_neighbours(compiled):
     assert torch.equal(near[50:].long(), nearest(where, 5)[1][50:, 1:])
 
 
-@needs_compiler
+@compiled_or_not
 @pytest.mark.parametrize("n", [1, 7, 8, 9, 64, 65, 600, 5000])
-def test_trees_of_any_size_hold_each_point_once_and_find_the_nearest_of_other_places(n):
+def test_the_nearest_of_other_places_are_those_of_brute_force(n, compiled):
     where = points(n).double() * torch.tensor([10.0, 1.0, 0.1])
     where[: n // 3] = where[: n // 3].round()  # many coincide in some coordinates
     queries = where + 0.2 * points(n, seed=1).double()
-    tree = PointTree(where)
-    assert torch.equal(tree.order.sort().values, torch.arange(n))
-    k = min(6, n)
-    near = tree.nearest(queries, torch.randint(n, (n,), generator=torch.Generator().manual_seed(2)), k)
+    near = nearest_of(where, queries, torch.randint(n, (n,), generator=torch.Generator().manual_seed(2)), 6, compiled)
     distances = (queries[:, None] - where[near.long()]).square().sum(2)
-    wanted = (queries[:, None] - where).square().sum(2).sort(dim=1).values[:, :k]
+    wanted = (queries[:, None] - where).square().sum(2).sort(dim=1).values[:, :6]
     torch.testing.assert_close(distances, wanted, rtol=1e-14, atol=0)  # float64, in another order
-    assert all(len(row.unique()) == k for row in near)
+    assert all(len(row.unique()) == min(6, n) for row in near)
+
+
+@needs_compiler
+@pytest.mark.parametrize("n", [1, 8, 9, 600, 5000])
+def test_a_tree_holds_each_point_once(n):
+    assert torch.equal(PointTree(points(n).double()).order.sort().values, torch.arange(n))
 
 
 @needs_compiler

@@ -4,7 +4,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from pointsplat_ns.geometry.quaternions import SHORTEST, rotation_components, rotation_matrices, zero_as_identity
+from pointsplat_ns.geometry.quaternions import (
+    SHORTEST,
+    quaternions_of,
+    rotation_components,
+    rotation_matrices,
+    zero_as_identity,
+)
 from pointsplat_ns.rasterizer import rasterization, reference
 from pointsplat_ns.rasterizer.spherical_harmonics import unit_rows
 from pointsplat_ns.refiner.normalize import canonical_quats
@@ -22,6 +28,17 @@ def test_rotation_matrices_are_those_of_scipy_whatever_the_length(length, dtype,
     found = rotation_matrices(quats * length)
     # A few roundings of numbers up to 1.
     assert found.dtype == dtype and (found - wanted).abs().max() < tolerance
+
+
+def test_quaternions_of_rotation_matrices_are_those_that_made_them_or_their_negatives():
+    """Half turns too, where the real part is 0."""
+    quats = random_quats()
+    quats = torch.cat([quats, torch.eye(4, dtype=torch.float64), quats * torch.tensor([1e-9, 1.0, 1.0, 1.0])])
+    quats = torch.nn.functional.normalize(quats, dim=1)
+    found = quaternions_of(rotation_matrices(quats).view(4, -1, 3, 3)).view(-1, 4)
+    alike = (found * quats).sum(1)
+    torch.testing.assert_close(found.norm(dim=1), torch.ones(len(quats), dtype=torch.float64))
+    torch.testing.assert_close(found * alike.sign()[:, None], quats, rtol=0, atol=1e-9)  # as far as the real parts go
 
 
 def test_both_layouts_hold_the_same_matrices():

@@ -1,22 +1,25 @@
-"""Which pairs go: disjoint pairs of neighbours, the cheapest first."""
+"""Which pairs go: disjoint pairs of neighbours, the cheapest first, found by compiled kernels (``matching.cpp``) or in
+torch."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.pruning.merging.settings import DEFAULTS
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import CHUNK
-from pointsplat_ns.system.threads import in_threads
+from pointsplat_ns.system.threads import in_threads, most_threads
 
 _SCATTER = 2654435761
 """Odd, so that multiplying by it modulo 2^32 permutes the numbers of pairs (Knuth's multiplicative hashing)."""
 
 
 def cheapest_pairs(
-    near: Tensor, costs: Tensor, most: int, passes: int = DEFAULTS.matching_passes
+    near: Tensor, costs: Tensor, most: int, passes: int = DEFAULTS.matching_passes, compiled: bool | None = None
 ) -> tuple[Tensor, Tensor]:
     """Disjoint pairs of neighbours.
 
@@ -29,10 +32,19 @@ def cheapest_pairs(
             the mean of their two costs counts.
         most: largest number of pairs.
         passes: number of passes.
+        compiled: False leaves it to torch; True warns if the kernels could not be compiled.
 
     Returns:
         First and second members, (E,) int64 each; at least one pair if there is any neighbour and ``most`` is not 0.
     """
+    suited = near.dtype == torch.int32 and KERNELS.usable_for(compiled, costs)
+    first, second, price = (_by_kernels if suited else _candidates)(near, costs, passes)
+    chosen = price.sort(stable=True).indices[:most]
+    return first[chosen], second[chosen]
+
+
+def _candidates(near: Tensor, costs: Tensor, passes: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The pairs that all passes take: first and second members, (E,) int64 each, and costs, (E,) float32."""
     n = len(near)
     costs = _symmetric(near, costs)
     free = torch.ones(n, dtype=torch.bool)
@@ -65,10 +77,8 @@ def cheapest_pairs(
         if len(rows) == 0:
             break
     if not firsts:
-        return torch.empty(0, dtype=torch.int64), torch.empty(0, dtype=torch.int64)
-    first, second, price = torch.cat(firsts), torch.cat(seconds), torch.cat(prices)
-    chosen = price.sort(stable=True).indices[:most]
-    return first[chosen], second[chosen]
+        return torch.empty(0, dtype=torch.int64), torch.empty(0, dtype=torch.int64), torch.empty(0)
+    return torch.cat(firsts), torch.cat(seconds), torch.cat(prices)
 
 
 def _symmetric(near: Tensor, costs: Tensor) -> Tensor:
@@ -94,3 +104,31 @@ def _keys(rows: Tensor, costs: Tensor) -> Tensor:
     k = costs.shape[1]
     numbers = rows[:, None] * k + torch.arange(k)
     return (costs[rows].view(torch.int32).long() << 32) | ((numbers * _SCATTER) & 0xFFFFFFFF)
+
+
+def _by_kernels(near: Tensor, costs: Tensor, passes: int) -> tuple[Tensor, Tensor, Tensor]:
+    """As :func:`_candidates`, to the bit."""
+    n, k = near.shape
+    pairs = [torch.empty(n // 2, dtype=dtype) for dtype in (torch.int64, torch.int64, torch.float32)]
+    found = torch.zeros(1, dtype=torch.int64)
+    task = KERNELS.structs["Matching"](
+        near=near.contiguous(), given=costs.contiguous(), costs=torch.empty_like(costs), count=n, neighbours=k,
+        passes=passes, best=torch.empty(n, dtype=torch.int64), rows=torch.arange(n), found=found,
+        **dict(zip(("firsts", "seconds", "prices"), pairs, strict=True)),
+    )  # fmt: skip
+    on_threads(n >= SEVERAL, KERNELS.library.pointsplat_symmetric, task, threads=most_threads())
+    KERNELS.library.pointsplat_match(task)
+    first, second, price = (values[: int(found)] for values in pairs)
+    return first, second, price
+
+
+def _as_torch() -> bool:
+    """Whether the kernels find some pairs as torch does."""
+    generator = torch.Generator().manual_seed(0)
+    near = torch.randint(200, (200, 6), generator=generator, dtype=torch.int32)
+    costs = torch.randint(9, (200, 6), generator=generator).float()  # many of them equal
+    found = [function(near, costs, 4) for function in (_by_kernels, _candidates)]
+    return all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+KERNELS = Kernels("merging", Path(__file__).with_name("matching.cpp"), _as_torch)

@@ -22,33 +22,42 @@ have a closed form:
 
 A_pq is the area of the summed covariance S_p + S_q, and d_pq the Mahalanobis distance of the centres under it.
 
-Below, E and H are written out in these overlaps: no difference of pictures or of colours is stored for each pair.
+A compiled kernel (``pair_cost.cpp``) does all of it where there is a compiler, in float32. In torch below, E and H are
+written out in these overlaps: no difference of pictures or of colours is stored for each pair.
 
 Shapes: n Gaussians, m of them at once, k neighbours of each, C colour axes.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from pointsplat_ns.pruning.merging import projections as planes
 from pointsplat_ns.pruning.merging.projections import DIRECTIONS, MIN_DIVISOR_32, Projections, area_of, directions_of
 from pointsplat_ns.pruning.merging.replacement import growth
 from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
-from pointsplat_ns.pruning.merging.state import State
-from pointsplat_ns.system.threads import in_threads
+from pointsplat_ns.pruning.merging.state import CHANNELS, State
+from pointsplat_ns.system.declarations import Struct
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
+from pointsplat_ns.system.threads import in_threads, most_threads
 
-CHANNELS = 3
-"""Number of colour channels: contrasts are per channel, costs are sums over channels."""
+MOST_NEIGHBOURS, MOST_AXES = 32, 16
+"""Largest numbers of neighbours and of colour axes that the kernel is made for."""
 
 GAUSSIANS_AT_ONCE = 1 << 14
 """Number of Gaussians whose pairs are computed at once: about 50 MB."""
 
 
 def pair_costs(
-    state: State, near: Tensor, settings: MergeSettings = DEFAULTS, dtype: torch.dtype = torch.float32
+    state: State,
+    near: Tensor,
+    settings: MergeSettings = DEFAULTS,
+    dtype: torch.dtype = torch.float32,
+    compiled: bool | None = None,
 ) -> Tensor:
     """Expected change of pictures by merging each Gaussian with each of its neighbours.
 
@@ -56,11 +65,15 @@ def pair_costs(
         state: n Gaussians.
         near: (n, k) indices of the neighbours of each.
         settings: contrasts and cover of the cost, growth of the replacement.
-        dtype: precision of the costs; Gaussians are projected in float64.
+        dtype: precision of the costs; torch projects Gaussians in float64.
+        compiled: False leaves it to torch; True warns if the kernels could not be compiled.
 
     Returns:
         (n, k): squared colour units times solid angle, with the surroundings of the first of each pair.
     """
+    fits = near.shape[1] <= MOST_NEIGHBOURS and state.colours.shape[1] <= MOST_AXES and near.dtype == torch.int32
+    if fits and dtype == torch.float32 and KERNELS.usable(compiled):
+        return _by_kernels(state, near, settings)
     n = len(state)
     directions = torch.empty(n, 3, dtype=torch.uint8)
     everyone = torch.arange(n).split(GAUSSIANS_AT_ONCE)
@@ -212,3 +225,59 @@ def _changes(
     colour.addcmul_(ik, gik, value=-1).addcmul_(jk, gjk, value=-1).clamp_min_(0)
     cover = (gjj + gii).add_(gkk).add_(gij).sub_(gik).sub_(gjk).clamp_min_(0)
     return colour, cover
+
+
+def _by_kernels(state: State, near: Tensor, settings: MergeSettings) -> Tensor:
+    """As :func:`pair_costs`, float32."""
+    count, library = len(state), KERNELS.library
+    costs = torch.empty(near.shape, dtype=torch.float32)
+    task = KERNELS.structs["Costs"](
+        planes=_planes(), limits=_limits(), contrasts=_contrasts(settings), centre=tuple(state.centre.tolist()),
+        size=state.size, means=state.means, cov=state.cov, alphas=state.alphas, colours=state.colours.contiguous(),
+        weights=state.weights, count=count, axes=state.colours.shape[1], neighbours=near.shape[1],
+        table=torch.empty(count, 12, dtype=torch.float32), near=near.contiguous(), costs=costs,
+    )  # fmt: skip
+    for function in (library.pointsplat_projected, library.pointsplat_pair_costs):
+        on_threads(count >= SEVERAL, function, task, threads=most_threads())
+    return costs
+
+
+def _planes() -> Struct:
+    tables = {"axes": planes.PLANE_AXES, "to_plane": planes.TO_PLANE, "triples": planes.TRIPLES}
+    return KERNELS.structs["Planes"](**{name: tuple(table.flatten().tolist()) for name, table in tables.items()})
+
+
+def _limits() -> Struct:
+    return KERNELS.structs["Limits"](
+        max_coordinate=planes.MAX_COORDINATE, max_width=planes.MAX_WIDTH, min_width=planes.MIN_WIDTH,
+        roundness=planes.ROUNDNESS, min_divisor=planes.MIN_DIVISOR_32,
+    )  # fmt: skip
+
+
+def _contrasts(settings: MergeSettings) -> Struct:
+    names = ("min_contrast", "background_contrast", "background_decay", "min_cover", "max_opacity", "growth_exponent")
+    values = {name: getattr(settings, name) for name in (*names, "max_growth_ratio")}
+    return KERNELS.structs["Contrasts"](channels=CHANNELS, **values)
+
+
+def _as_torch() -> bool:
+    """Whether the kernels compute the costs of some pairs as torch does."""
+    generator = torch.Generator().manual_seed(0)
+    count = 90
+
+    def random(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    factors = 0.2 * random(count, 3, 3).double()
+    cov = (factors @ factors.mT).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    state = State(
+        means=random(count, 3).double(), cov=cov, alphas=random(count).double(), colours=random(count, 5),
+        weights=random(count), counts=torch.ones(count, dtype=torch.int32),
+        centre=torch.full((3,), 0.5, dtype=torch.float64), size=1.3,
+    )  # fmt: skip
+    near = torch.randint(count, (count, 9), generator=generator, dtype=torch.int32)
+    ours, torchs = _by_kernels(state, near, DEFAULTS), pair_costs(state, near, compiled=False)
+    return agreement([ours], [torchs], off=1e-4, share=1e-2)
+
+
+KERNELS = Kernels("merging", Path(__file__).with_name("pair_cost.cpp"), _as_torch)

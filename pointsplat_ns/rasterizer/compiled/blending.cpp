@@ -31,25 +31,6 @@ inline Row load(const float* from) {
 
 inline void store(float* to, Row row) { std::memcpy(to, &row, sizeof(Row)); }
 
-inline float sum(Row row) {
-    return ((row[0] + row[4]) + (row[2] + row[6])) + ((row[1] + row[5]) + (row[3] + row[7]));
-}
-
-// 2^x to 1e-7 for x <= 0; 2^-126 below -126. A polynomial of 2^f on [-0.5, 0.5], fitted for the least relative error.
-inline Row exp2_of(Row x) {
-    x = larger(x, ZERO - 126.0f);
-    const Row shifted = x + 12582912.0f;  // 1.5 * 2^23: rounds to the nearest integer
-    const Row whole = shifted - 12582912.0f;
-    const Row f = x - whole;
-    Row p = f * 0.00015345774590969086f + 0.0013399930903688073f;
-    p = p * f + 0.009618489071726799f;
-    p = p * f + 0.05550328642129898f;
-    p = p * f + 0.24022646248340607f;
-    p = p * f + 0.6931471824645996f;
-    p = p * f + 1.0f;
-    return p * reinterpret_cast<Row>((__builtin_convertvector(whole, Mask) + 127) << 23);
-}
-
 }  // namespace
 
 extern "C" {

@@ -47,6 +47,25 @@ inline Lane root(Lane x) {
     return each(x, [](float value) { return std::sqrt(value); });
 }
 
+inline float sum(Lane x) {
+    return ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]));
+}
+
+// 2^x to 1e-7 for x <= 0; 2^-126 below -126. A polynomial of 2^f on [-0.5, 0.5], fitted for the least relative error.
+inline Lane exp2_of(Lane x) {
+    x = larger(x, ZERO - 126.0f);
+    const Lane shifted = x + 12582912.0f;  // 1.5 * 2^23: rounds to the nearest integer
+    const Lane whole = shifted - 12582912.0f;
+    const Lane f = x - whole;
+    Lane p = f * 0.00015345774590969086f + 0.0013399930903688073f;
+    p = p * f + 0.009618489071726799f;
+    p = p * f + 0.05550328642129898f;
+    p = p * f + 0.24022646248340607f;
+    p = p * f + 0.6931471824645996f;
+    p = p * f + 1.0f;
+    return p * reinterpret_cast<Lane>((__builtin_convertvector(whole, Mask) + 127) << 23);
+}
+
 template <int D>
 inline Lane dot(const Lane (&a)[D], const Lane (&b)[D]) {
     Lane sum = a[0] * b[0];

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import math
 
+import pytest
 import torch
 
+from making import assert_same_on_any_threads
 from pointsplat_ns.pruning.merging import matching
-from pointsplat_ns.pruning.merging.matching import cheapest_pairs
+from pointsplat_ns.pruning.merging.matching import KERNELS, cheapest_pairs
+
+needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 
 
 def ring(n: int) -> torch.Tensor:
@@ -57,9 +61,25 @@ def test_equal_costs_along_a_chain_yield_many_pairs_at_once():
 def test_pieces_give_the_same_as_the_whole(monkeypatch):
     g = torch.Generator().manual_seed(1)
     near, costs = torch.randint(0, 500, (500, 4), generator=g, dtype=torch.int32), torch.rand(500, 4, generator=g)
-    whole = cheapest_pairs(near, costs.clone(), 500)
+    whole = cheapest_pairs(near, costs, 500, compiled=False)
     monkeypatch.setattr(matching, "CHUNK", 37)
-    assert all(torch.equal(a, b) for a, b in zip(whole, cheapest_pairs(near, costs.clone(), 500), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(whole, cheapest_pairs(near, costs, 500, compiled=False), strict=True))
+
+
+@needs_compiler
+@pytest.mark.parametrize("n", [1, 2, 300, 20_000])
+def test_kernels_find_the_pairs_of_torch_to_the_bit_on_any_number_of_threads(n):
+    """With neighbours that occur twice, or are none, and with costs that are equal, infinite or no numbers."""
+    g = torch.Generator().manual_seed(n)
+    near = torch.randint(0, n, (n, 6), generator=g, dtype=torch.int32)
+    near[::3, 2], near[::5, 1] = near[::3, 4], torch.arange(n, dtype=torch.int32)[::5]
+    costs = torch.randint(0, 9, (n, 6), generator=g) / 8
+    costs[::7, 0], costs[::11, 3] = math.inf, math.nan
+    for passes in (1, 6):
+        torchs = cheapest_pairs(near, costs, n, passes, compiled=False)
+        assert_same_on_any_threads(lambda passes=passes: cheapest_pairs(near, costs, n, passes, compiled=True))
+        found = cheapest_pairs(near, costs, n, passes, compiled=True)
+        assert all(torch.equal(a, b) for a, b in zip(found, torchs, strict=True)) and (len(torchs[0]) or n < 3)
 
 
 def test_itself_is_no_neighbour_and_a_cost_that_is_no_number_is_no_pair():

@@ -17,6 +17,7 @@ from pointsplat_ns.pruning.merging import covariance as algebra
 from pointsplat_ns.pruning.merging.merged_scene import deepened
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX
+from pointsplat_ns.system.kernels import Kernels
 from pointsplat_ns.views import Views
 
 RENDERED = replace(DEFAULTS, min_count_rendered=0)
@@ -77,6 +78,16 @@ def test_a_gaussian_that_is_merged_with_no_other_is_unchanged_to_the_bit_and_so_
     assert same(merged.scene[single], scene[where])
     scene.means[3] = math.nan
     assert same(*(some.map(lambda value: value.nan_to_num(7.0)) for some in (merge(scene, 200).scene, scene)))
+
+
+def test_without_a_compiler_the_same_gaussians_are_merged_but_for_rounding(monkeypatch):
+    scene = ball(2500)
+    compiled = merge(scene, 400)
+    monkeypatch.setattr(Kernels, "usable", lambda kernels, wanted: False)
+    by_torch = merge(scene, 400)
+    into = [merged.scene.means[merged.assignment] for merged in (compiled, by_torch)]
+    apart = (into[0] - into[1]).norm(dim=1)
+    assert compiled.finish.psnr is not None and float((apart < 1e-4).float().mean()) > 0.95
 
 
 def test_a_smooth_wall_at_a_quarter_looks_the_same_and_far_better_than_a_quarter_of_it():

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
+from making import assert_same_on_any_threads, cloud
 from pointsplat_ns.gaussians import SH_C0, Gaussians
 from pointsplat_ns.pruning.merging import DEFAULTS
 from pointsplat_ns.pruning.merging import covariance as algebra
-from pointsplat_ns.pruning.merging.pair_cost import costs_in_plane, pair_costs
+from pointsplat_ns.pruning.merging.pair_cost import KERNELS, costs_in_plane, pair_costs
 from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.projections import (
     DIRECTIONS,
@@ -21,6 +23,9 @@ from pointsplat_ns.pruning.merging.projections import (
     in_content_units,
 )
 from pointsplat_ns.pruning.merging.state import State, initial_state
+
+needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
+compiled_or_not = pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_compiler), False])
 
 
 def state_of(scene: Gaussians, size: float = 1.0) -> State:
@@ -128,11 +133,10 @@ def test_sizes_are_in_units_of_the_scene_and_bounded_where_they_are_wide_beyond_
     torch.testing.assert_close(cov[:, 0].sqrt(), expected, rtol=1e-6, atol=0.0)  # sizes are given in float32
 
 
-def test_costs_are_finite_and_not_negative_at_the_extremes():
-    """Positions, sizes and opacities over the whole range, each Gaussian with each other."""
+def extremes(n: int) -> Gaussians:
+    """Positions, sizes and opacities over the whole range."""
     g = torch.Generator().manual_seed(0)
-    n = 60
-    scene = Gaussians(
+    return Gaussians(
         means=torch.randn(n, 3, generator=g) * 10 ** torch.empty(n, 1).uniform_(-8, 30, generator=g),
         scales=torch.empty(n, 3).uniform_(-90, 90, generator=g),
         quats=torch.randn(n, 4, generator=g),
@@ -140,9 +144,47 @@ def test_costs_are_finite_and_not_negative_at_the_extremes():
         features_dc=torch.randn(n, 3, generator=g) * 10 ** torch.empty(n, 1).uniform_(-8, 30, generator=g),
         features_rest=torch.zeros(n, 0, 3),
     )
-    others = torch.arange(n, dtype=torch.int32).expand(n, n)
-    costs = pair_costs(state_of(scene), others)
+
+
+@compiled_or_not
+def test_costs_are_finite_and_not_negative_at_the_extremes(compiled):
+    """Each Gaussian with the next ones."""
+    state, others = state_of(extremes(200)), (torch.arange(200)[:, None] + torch.arange(30)) % 200
+    costs = pair_costs(state, others.to(torch.int32), compiled=compiled)
     assert bool(costs.isfinite().all()) and bool((costs >= 0).all())
+
+
+@needs_compiler
+@pytest.mark.parametrize("k", [1, 6, 8, 9, 30])
+@pytest.mark.parametrize("axes", [1, 3, 8])
+def test_kernels_are_as_near_to_float64_as_torch_is(k, axes):
+    """Gaussians of a splat's proportions, some of them opaque, so that replacements grow. A cost is the difference of
+    larger numbers, so the error of either is a share of the larger ones of a Gaussian's costs."""
+    g = torch.Generator().manual_seed(2)
+    n = 500
+    scene = Gaussians(
+        means=torch.rand(n, 3, generator=g),
+        scales=torch.tensor([-2.5, -3.0, -6.0]) + 0.5 * torch.randn(n, 3, generator=g),
+        quats=torch.randn(n, 4, generator=g),
+        opacities=4 * torch.randn(n, 1, generator=g),
+        features_dc=torch.randn(n, 3, generator=g),
+        features_rest=torch.randn(n, 3, 3, generator=g),
+    )
+    n_axes = replace(DEFAULTS, colour_axes=axes)
+    participants = Participants(scene, torch.arange(n), torch.full((3,), 0.5, dtype=torch.float64), 1.7)
+    state = initial_state(participants, torch.rand(n, generator=g), n_axes)
+    near = torch.randint(0, n, (n, k), generator=g, dtype=torch.int32)
+    exact = pair_costs(state, near, dtype=torch.float64)
+    scale = exact.amax(1, keepdim=True)
+    kernels, torchs = (((pair_costs(state, near, compiled=on) - exact) / scale).abs() for on in (True, False))
+    for share, times in ((0.5, 2), (0.99, 2), (1.0, 5)):  # the largest error of a few thousand varies more
+        assert float(kernels.quantile(share)) < times * float(torchs.quantile(share))
+
+
+@needs_compiler
+def test_any_number_of_threads_gives_the_same_costs():
+    state, others = state_of(cloud(9000)), (torch.arange(9000)[:, None] + torch.arange(1, 7)) % 9000
+    assert_same_on_any_threads(lambda: [pair_costs(state, others.to(torch.int32))])
 
 
 def test_float32_costs_rank_pairs_as_float64_does():
@@ -159,8 +201,6 @@ def test_float32_costs_rank_pairs_as_float64_does():
     )
     state = state_of(scene)
     i, j = torch.arange(n), torch.randint(0, n, (n, 8), generator=g)
-    single = pair_costs(state, j.to(torch.int32)).double()
     for direction in range(len(DIRECTIONS)):
         a, b = (costs_along(state, direction, i, j, dtype) for dtype in (torch.float64, torch.float32))
         assert float((a - b).abs().max()) < 1e-3 * float(a.max())
-    assert bool(single.isfinite().all())

@@ -9,7 +9,7 @@ from making import cloud
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.merging import DEFAULTS
 from pointsplat_ns.pruning.merging.covariance import covariances, unpack
-from pointsplat_ns.pruning.merging.regrouping import Moments, best_groups, masses_of, moments
+from pointsplat_ns.pruning.merging.regrouping import Members, Moments, best_groups, moments
 
 ALL = torch.arange(200)
 
@@ -23,12 +23,15 @@ def random_groups(scene: Gaussians, count: int) -> torch.Tensor:
 
 def moments_of(scene: Gaussians, group: torch.Tensor, count: int) -> Moments:
     """Moments of groups of all."""
-    return moments(scene, ALL, masses_of(scene, ALL), group, count)
+    return moments(Members.of(scene, ALL), group, count)
 
 
 def after(scene: Gaussians, group: torch.Tensor, count: int) -> torch.Tensor:
-    """The group that each fits best."""
-    return best_groups(scene, ALL, masses_of(scene, ALL), group, moments_of(scene, group, count))
+    """The group that each fits best: the same by kernels and without them."""
+    members, groups = Members.of(scene, ALL), moments_of(scene, group, count)
+    found, torchs = (best_groups(members, group, groups, compiled=compiled) for compiled in (None, False))
+    assert torch.equal(found, torchs)
+    return found
 
 
 def likelihood(scene: Gaussians, group: torch.Tensor, count: int) -> float:
@@ -39,13 +42,13 @@ def likelihood(scene: Gaussians, group: torch.Tensor, count: int) -> float:
     log_density = torch.stack([normal.log_prob(mean[None].expand(count, 3)) for mean in scene.means.double()])
     within = (torch.linalg.inv(unpack(groups.cov))[group] * unpack(own)).sum((1, 2))
     fit = log_density.gather(1, group[:, None])[:, 0] - 0.5 * within
-    return float((fit * masses_of(scene, ALL)).sum() / groups.mass.sum())
+    return float((fit * Members.of(scene, ALL).masses).sum() / groups.mass.sum())
 
 
 def test_moments_are_those_of_the_members_and_between_them():
     scene, group = cloud(200), random_groups(cloud(200), 7)
     groups = moments_of(scene, group, 7)
-    masses = masses_of(scene, ALL)
+    masses = Members.of(scene, ALL).masses
     for number in range(7):
         these = (group == number).nonzero()[:, 0]
         weights = masses[these] / masses[these].sum()
