@@ -11,9 +11,18 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.rasterizer import binning
+from pointsplat_ns.rasterizer.compiled import blending as kernels
+from pointsplat_ns.rasterizer.constants import ALPHA_MIN, Quality
+from pointsplat_ns.rasterizer.frame import MEMORY_BUDGET
+from pointsplat_ns.rasterizer.projection import project_scene
 from pointsplat_ns.rasterizer.rendering import Colors, QualityName, rasterization
+from pointsplat_ns.rasterizer.tiles import Footprints
 from pointsplat_ns.system.threads import one_thread, suitable_threads
 from pointsplat_ns.views import View, Views
+
+BYTES_PER_WEIGHT = 32
+"""Bytes that a pair of tile and Gaussian takes where only its weight is asked for."""
 
 
 def render(
@@ -117,16 +126,36 @@ def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
     return depth[..., 0], alpha[..., 0]
 
 
-def pixels_of(scene: Gaussians, view: View) -> Tensor:
+def pixels_of(scene: Gaussians, view: View, compiled: bool | None = None) -> Tensor:
     """Visible pixels of each Gaussian, (N,), at least float32: the sum over the pixels of a picture of its blending
     weight, which is its alpha times the transmittance in front of it. It is the gradient of the sum of the picture by
-    the colour, and 0 where the view does not show the Gaussian."""
+    the colour, and 0 where the view does not show the Gaussian. ``compiled`` is that of
+    :func:`pointsplat_ns.rasterization`."""
     scene = scene.detach().to(torch.promote_types(scene.dtype, torch.float32))
-    colors = torch.zeros_like(scene.means[:, :1]).requires_grad_()
-    with suitable_threads(scene.device), torch.enable_grad():
-        image, _ = _rasterized(scene, view, colors)
-        (pixels,) = torch.autograd.grad(image.sum(), colors)
+    with suitable_threads(scene.device):
+        if kernels.KERNELS.usable_for(compiled, scene.means):
+            return _weighed(scene, view)
+        with torch.enable_grad():
+            colors = torch.zeros_like(scene.means[:, :1]).requires_grad_()
+            image, _ = _rasterized(scene, view, colors, compiled=compiled)
+            (pixels,) = torch.autograd.grad(image.sum(), colors)
     return pixels[:, 0]
+
+
+@torch.no_grad()
+def _weighed(scene: Gaussians, view: View) -> Tensor:
+    """:func:`pixels_of` in one pass, without a picture."""
+    seen = project_scene(scene, view)
+    shape = seen.means2d, seen.cov2d, seen.det, seen.opacities
+    footprints = Footprints(
+        *shape, seen.beyond, torch.zeros_like(seen.ids), 1, view.width, view.height, ALPHA_MIN,
+        binning.engine_of(None, *shape),
+    )  # fmt: skip
+    inputs = kernels.inputs_of(*shape, seen.means2d[:, :0], Quality())
+    weights = torch.zeros_like(seen.opacities)
+    for region in footprints.regions(MEMORY_BUDGET // BYTES_PER_WEIGHT):
+        weights += kernels.weigh_region(footprints, footprints.tiles(region), inputs)
+    return scene.means.new_zeros(len(scene)).index_copy_(0, seen.ids, weights)
 
 
 def _alphas(scene: Gaussians) -> Tensor:

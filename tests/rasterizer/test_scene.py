@@ -9,10 +9,13 @@ import torch
 import torch.nn.functional as F
 
 import pointsplat_ns as ps
-from making import box_room
+from making import assert_same_on_any_threads, box_room
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer import pixels_of, projection
+from pointsplat_ns.rasterizer import scene as scene_module
 from pointsplat_ns.rasterizer.pixel_walk import sum_over_pixels
 from pointsplat_ns.rasterizer.projection import project_scene
+from pointsplat_ns.views import Views
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +70,9 @@ def test_a_scene_on_cuda_is_projected_from_a_view_on_the_cpu(room, views):
     torch.testing.assert_close(seen.means2d.cpu(), wanted.means2d, rtol=0, atol=1e-3)  # pixels: rounded in another way
 
 
+@pytest.mark.parametrize("compiled", [None, False])
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
-def test_pixels_of_gaussians_are_sums_of_their_weights(room, views, dtype):
+def test_pixels_of_gaussians_are_sums_of_their_weights(room, views, dtype, compiled):
     scene = room.to(dtype)
     counted = scene.to(torch.promote_types(dtype, torch.float32))
     tolerance = 1e-9 if dtype == torch.float64 else 1e-4
@@ -80,6 +84,32 @@ def test_pixels_of_gaussians_are_sums_of_their_weights(room, views, dtype):
         )  # fmt: skip
         wanted = torch.zeros(len(scene), dtype=counted.dtype).index_add_(0, seen.ids, weights[:, 0])
         with torch.no_grad():  # as it is where scenes are merged
-            pixels = pixels_of(scene, view)
+            pixels = pixels_of(scene, view, compiled)
         assert pixels.dtype == counted.dtype and float(pixels.sum()) > 0.5 * view.width * view.height
         torch.testing.assert_close(pixels, wanted, rtol=tolerance, atol=tolerance)
+
+
+def test_pixels_are_the_same_on_any_threads_and_to_rounding_in_several_regions(room, views, monkeypatch):
+    whole = pixels_of(room, views[0])
+    assert_same_on_any_threads(lambda: [pixels_of(room, view) for view in views])
+    monkeypatch.setattr(scene_module, "MEMORY_BUDGET", 32 * 3000)
+    torch.testing.assert_close(pixels_of(room, views[0]), whole, rtol=1e-5, atol=1e-6)  # float32, in another order
+
+
+def test_pixels_behind_saturated_ones_are_zero():
+    """More Gaussians than a chunk, the first ones opaque."""
+    count = 300
+    depths = 1.0 + 0.01 * torch.arange(count)
+    scene = Gaussians(
+        means=torch.stack([torch.zeros(count), torch.zeros(count), depths], dim=1),
+        scales=torch.full((count, 3), 2.0),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        opacities=torch.full((count, 1), 8.0),
+        features_dc=torch.zeros(count, 3),
+        features_rest=torch.zeros(count, 0, 3),
+    )
+    eye, K = torch.eye(4, dtype=torch.float64)[None], torch.tensor([[[20.0, 0, 12], [0, 20.0, 12], [0, 0, 1]]])
+    view = Views(eye, K.double(), 24, 24, torch.zeros(3))[0]
+    ours, torchs = (pixels_of(scene, view, compiled) for compiled in (None, False))
+    torch.testing.assert_close(ours, torchs, rtol=1e-5, atol=1e-5)
+    assert float(ours[0]) > 500 and not ours[5:].any()

@@ -62,7 +62,7 @@ template <int D>
 struct Chunk {
     int size;
     float half_a[CHUNK];          // of log2 alpha = base - half_a w^2
-    float color[CHUNK][D];
+    float color[CHUNK][D ? D : 1];
     float r[CHUNK], a[CHUNK], d[CHUNK];
     Row y[CHUNK], base[CHUNK], w[CHUNK], bound[CHUNK];  // by row of the tile: dv, base, w in its middle, largest log2 alpha
 
@@ -214,6 +214,37 @@ void differentiate_tile(const Task& task, int64_t tile) {
     }
 }
 
+// Writes for each Gaussian on a tile the sum over the pixels of its blending weight.
+void weigh_tile(const Task& task, int64_t tile) {
+    const Place place = place_of(task, tile);
+    Row through[TILE];
+    for (int row = 0; row < TILE; ++row) through[row] = place.inside[row];
+    const int64_t end = task.offsets[tile + 1];
+    Chunk<0> chunk;
+    for (int64_t at = task.offsets[tile]; at < end; at += chunk.size) {
+        chunk.read(task, at, std::min(at + CHUNK, end), place.x, place.y);
+        Row weights[CHUNK] = {}, left = ZERO;
+        for (int row = 0; row < TILE; ++row) {
+            Row t = through[row];
+            if (!(sum(t) > 0.0f)) continue;
+            for (int k = 0; k < chunk.size; ++k) {
+                if (!chunk.reaches(k, row, task.log2_alpha_min)) continue;
+                const Row alpha = chunk.alpha(k, row, chunk.w_of(k, row), task);
+                const Row after = t * (1.0f - alpha);
+                const Mask drawn = after > task.transmittance_min;
+                weights[k] += drawn ? alpha * t : ZERO;
+                t = drawn ? after : ZERO;
+            }
+            through[row] = t, left += t;
+        }
+        for (int k = 0; k < chunk.size; ++k) task.sums[at + k] = sum(weights[k]);
+        if (!(sum(left) > 0.0f)) {
+            std::fill(task.sums + at + chunk.size, task.sums + end, 0.0f);
+            break;
+        }
+    }
+}
+
 template <typename Work>
 void each_tile(const Task& task, int64_t* next, Work work) {
     for (;;) {
@@ -261,6 +292,9 @@ void pointsplat_differentiate(const Task* task, int64_t* next) {
         case 4: return differentiate_all<4>(*task, next);
     }
 }
+
+// For colours of no channel: ``sums`` has one column.
+void pointsplat_weigh(const Task* task, int64_t* next) { each_tile(*task, next, weigh_tile); }
 
 // For each of ``count`` Gaussians the sum of its pairs: rows ``pairs[starts[i]]`` to ``pairs[starts[i + 1] - 1]``.
 void pointsplat_gather(const float* sums, const int64_t* pairs, const int64_t* starts, const int64_t* order, int64_t count,

@@ -100,6 +100,16 @@ def blend_region(
     return KernelTape(before, blended, chunks) if keep_tape else None
 
 
+def weigh_region(footprints: Footprints, tiles: TileList, inputs: KernelInputs) -> Tensor:
+    """Blending weight of each Gaussian, summed over the pixels of a region, (M,); ``inputs`` have no channels."""
+    sums = inputs.table.new_empty(tiles.gaussians.numel())
+    task = _task(footprints, tiles, inputs, tiles.offsets, sums)
+    task.fill(final_=None, chunks=None, sums=sums)
+    on_threads(len(sums) >= SEVERAL, KERNELS.library.pointsplat_weigh, task)
+    # one thread, in the order of the tiles
+    return sums.new_zeros(len(tiles.order)).index_add_(0, tiles.gaussians, sums)
+
+
 def differentiate_region(
     footprints: Footprints,
     tiles: TileList,

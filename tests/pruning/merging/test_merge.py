@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from making import cloud, same
+from making import ball, cloud, same
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.merging import DEFAULTS, Finish, Merged, merge, merge_levels
