@@ -15,6 +15,7 @@ from torch import Tensor
 from pointsplat_ns.compacting import Source, compact_source, goal_of, log, prune_source, read_source
 from pointsplat_ns.compression.compact import Compacted
 from pointsplat_ns.compression.level_folder import check_folder
+from pointsplat_ns.compression.level_stream import Chunks, check_stream_folder
 from pointsplat_ns.compression.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
 from pointsplat_ns.compression.pictures import plot_views as draw_views
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
@@ -254,6 +255,7 @@ def lod(
     resolution: tuple[int, int] | str | None = None,
     up: str | None = None,
     folder: str | Path | None = None,
+    stream: Chunks | None = None,
     force: bool = False,
     progress: bool | Progress = False,
 ) -> Levels:
@@ -270,6 +272,7 @@ def lod(
         resolution: as for :func:`prune`.
         up: as for :func:`prune`.
         folder: output folder for the levels, a manifest and a picture; see :meth:`Levels.save`.
+        stream: sizes of the pieces of a streamed SOG, which is written instead; see :meth:`Levels.save_stream`.
         force: overwrite existing files in ``folder``.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
@@ -293,12 +296,18 @@ def lod(
     PruneRequest(1.0, sh=sh)
     with ExitStack() as stack:
         if folder is not None:
-            check_folder(Path(folder), len(budgets), force)
+            if stream is None:
+                check_folder(Path(folder), len(budgets), force)
+            else:
+                check_stream_folder(Path(folder), force)
             stack.enter_context(claimed_folder(Path(folder)))
         dense, view_source = read_source(scene, views, resolution, up)
         source = None if isinstance(scene, Gaussians) else source_file(scene)
-        made = make_levels(dense, levels, sh, view_source, source, stack.enter_context(progress_bar(progress)))
-        if folder is not None:
+        report = stack.enter_context(progress_bar(progress))
+        made = make_levels(dense, levels, sh, view_source, source, report)
+        if folder is not None and stream is not None:
+            made.save_stream(folder, force, stream, report)
+        elif folder is not None:
             made.save(folder, force)
     log(made.notes)
     return made

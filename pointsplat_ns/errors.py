@@ -44,8 +44,8 @@ class SceneError(PointSplatError):
         ...     ps.load("nowhere.ply")
         ... except ps.SceneError as error:
         ...     print(error)
-        nowhere.ply: no such file; expected a scene (.compressed.ply, .ply, .spz, .sog, meta.json, .ksplat, .splat), a \
-Splatfacto .ckpt, or a Splatfacto run (its folder or config.yml)
+        nowhere.ply: no such file; expected a scene (.compressed.ply, .ply, .spz, .sog, lod-meta.json, meta.json, \
+.ksplat, .splat), a Splatfacto .ckpt, or a Splatfacto run (its folder or config.yml)
     """
 
 

@@ -28,6 +28,9 @@ def lod(
     scene: Scene,
     levels: tuple[str, ...] = ("50%", "25%", "10%", "3%"),
     output: Output = None,
+    stream: bool = False,
+    chunk_count: int = 512,
+    chunk_extent: float | None = None,
     sh: Bands = "all",
     poses: Poses = None,
     resolution: Resolution = None,
@@ -38,6 +41,9 @@ def lod(
 ) -> None:
     """Make levels of detail: the scene merged to fewer and fewer Gaussians in one pass, the error of each measured.
 
+    With --stream, the whole scene and these levels are written as a streamed SOG, of which viewers load the parts that
+    they need.
+
     Each level is merged from the one before, so that every Gaussian has one parent in the next coarser level. Renders
     are compared with the dense scene's, from --poses, else from the poses of the run's dataset if it is found, else
     from poses sampled in free space.
@@ -47,7 +53,11 @@ def lod(
         levels: sizes of the levels, in any order: ratios (0.3), percentages (30%), counts (50000) or sizes of the
             file (12MB).
         output: the folder for the levels (level_0.ply is the finest), their parents, the manifest lod.json and the
-            picture lod.png; by default beside the scene: room_lod for room.ply, lod in the folder of a run.
+            picture lod.png; by default beside the scene: room_lod for room.ply, lod in the folder of a run. With
+            --stream, the folder for lod-meta.json and its SOG files, by default room_stream.
+        stream: write a streamed SOG (PlayCanvas, SuperSplat, Babylon). The scene itself is its finest level.
+        chunk_count: Gaussians in a chunk of a stream, thousands of 1024, about.
+        chunk_extent: largest side of a leaf of a stream, scene units. By default an eighth of the content's diagonal.
         sh: SH bands of every level: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
         poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model;
             by default the views of its dataset, or sampled ones.
@@ -62,16 +72,21 @@ def lod(
     """
     import pointsplat_ns as ps
     from pointsplat_ns.compression.level_folder import MANIFEST
+    from pointsplat_ns.compression.level_stream import Chunks
     from pointsplat_ns.system.threads import fixed_threads
 
     need_one_scene(scene)
     check_poses(poses)
-    folder = output or output_beside(scene, "lod").with_suffix("")
+    folder = output or output_beside(scene, "stream" if stream else "lod").with_suffix("")
+    chunks = Chunks(chunk_count << 10, chunk_extent) if stream else None
     with fixed_threads(threads):
         made = ps.lod(
-            scene, levels, sh=sh, views=poses, resolution=resolution, up=up, folder=folder, force=force, progress=True
-        )
-    if json_output:
+            scene, ("100%", *levels) if stream else levels, sh=sh, views=poses, resolution=resolution, up=up,
+            folder=folder, stream=chunks, force=force, progress=True,
+        )  # fmt: skip
+    if json_output and stream:
+        print_json({"output": folder, "levels": [level.facts(len(made.dense)) for level in made]})
+    elif json_output:
         print_json({"output": folder, **json.loads((folder / MANIFEST).read_text("utf-8"))})
     else:
         _print_table(made, folder)

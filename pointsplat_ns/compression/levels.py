@@ -27,6 +27,7 @@ from pointsplat_ns.compression.level_errors import (
     median_depth,
 )
 from pointsplat_ns.compression.level_folder import write_levels
+from pointsplat_ns.compression.level_stream import Chunks, write_stream
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError
@@ -149,6 +150,17 @@ class Levels:
         """
         levels = [(level.scene, level.parents) for level in self]
         write_levels(folder, levels, *self._manifest(), *self._picture(), force)
+
+    def save_stream(
+        self,
+        folder: str | Path,
+        force: bool = False,
+        chunks: Chunks | None = None,
+        progress: Progress = silent,
+    ) -> list[int]:
+        """Write the levels as a streamed SOG, as ``pointsplat lod --stream`` does; see
+        :func:`~pointsplat_ns.compression.level_stream.write_stream`. Returns the number of Gaussians of each."""
+        return write_stream(folder, self.scenes, [level.parents for level in self.levels[1:]], chunks, force, progress)
 
     def _manifest(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         """The manifest's facts on all levels together, and on each."""

@@ -110,7 +110,7 @@ def info(
         with unusable_kept():
             scene = read_scene(scene)
         parts = source_parts(file)
-        kind = format_name(parts[0] if len(parts) == 1 else parts[0].parent)
+        kind = format_name(parts[0] if len(parts) == 1 else Path(file))
         bytes_ = sum(part.stat().st_size for part in parts)
     scene = scene.detach().to("cpu", torch.float32)
     usable = scene.usable()

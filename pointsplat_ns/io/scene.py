@@ -9,7 +9,7 @@ import torch
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable, require_file
-from pointsplat_ns.io.formats import READABLE, SOG_META, Format, format_named, format_to_read, format_to_write
+from pointsplat_ns.io.formats import READABLE, Format, format_named, format_to_read, format_to_write
 from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, open_run
 from pointsplat_ns.io.splatfacto import read_checkpoint
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
@@ -18,11 +18,13 @@ ACCEPTED = f"a scene ({READABLE}), a Splatfacto .ckpt, or a Splatfacto run (its 
 
 
 def is_scene_file(path: Path | str) -> bool:
-    """Whether :func:`read_scene` takes a file for a whole scene, by its suffix. Runs and SOG folders are told by what
-    lies in them instead."""
+    """Whether :func:`read_scene` takes a file for a whole scene, by its suffix. Runs and SOG folders, streamed or not,
+    are told by what lies in them instead."""
     path = Path(path)
     kind = format_named(path.name)
-    return path.suffix.lower() == ".ckpt" or (kind is not None and kind.read is not None and path.name != SOG_META)
+    return path.suffix.lower() == ".ckpt" or (
+        kind is not None and kind.read is not None and kind.suffix.startswith(".")
+    )
 
 
 def is_folder_of_scenes(path: Path | str) -> bool:
@@ -37,8 +39,9 @@ def read_scene(path: Path | str) -> Gaussians:
     What a file begins with tells its format, else its name.
 
     Args:
-        path: a 3DGS or compressed ``.ply``, ``.spz``, ``.sog`` (or its folder, or the ``meta.json`` in it), ``.splat``,
-            ``.ksplat``, ``.ckpt``, ``config.yml`` or a run's folder. The photos of a run are not needed.
+        path: a 3DGS or compressed ``.ply``, ``.spz``, ``.sog`` (or its folder, or the ``meta.json`` in it), a streamed
+            SOG (``lod-meta.json`` or its folder, of which the finest level is read), ``.splat``, ``.ksplat``,
+            ``.ckpt``, ``config.yml`` or a run's folder. The photos of a run are not needed.
 
     Returns:
         The scene, float32 on the CPU. Log-scales and logits are those of the file.

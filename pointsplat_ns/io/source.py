@@ -8,14 +8,15 @@ from pathlib import Path
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import content_hash, one_line
-from pointsplat_ns.io.formats import SOG_META
+from pointsplat_ns.io.formats import SOG_META, STREAM_META
+from pointsplat_ns.io.formats.sog_stream import stream_parts
 from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, open_run
 
 
 @dataclass(frozen=True)
 class SourceFile:
-    """The file that a dense scene was read from. Of a SOG folder, ``bytes`` are those of all its files, and ``sha256``
-    is that of the lines "name hash" of each, by name."""
+    """The file that a dense scene was read from. Of a SOG folder, streamed or not, ``bytes`` are those of all its
+    files, and ``sha256`` is that of the lines "path hash" of each, by its path in the folder."""
 
     name: str
     bytes: int
@@ -27,17 +28,18 @@ def source_file(path: Path | str) -> SourceFile:
     SceneError if there is none, or it cannot be read."""
     parts = source_parts(path)
     if len(parts) > 1 or parts[0].name == SOG_META:
-        hashes = "".join(f"{part.name} {content_hash(part)}\n" for part in parts)
+        folder = _folder_of(Path(path))
+        hashes = "".join(f"{part.relative_to(folder).as_posix()} {content_hash(part)}\n" for part in parts)
         total = sum(part.stat().st_size for part in parts)
-        return SourceFile(parts[0].parent.resolve().name, total, hashlib.sha256(hashes.encode()).hexdigest())
+        return SourceFile(folder.resolve().name, total, hashlib.sha256(hashes.encode()).hexdigest())
     [part] = parts
     digest = content_hash(part)
     return SourceFile(part.name, part.stat().st_size, digest)
 
 
 def source_parts(path: Path | str) -> list[Path]:
-    """The files that a scene is read from: all of a SOG folder, by name, the checkpoint of a run, or one. Raises
-    SceneError if a run has none, or a folder cannot be read."""
+    """The files that a scene is read from: all of a SOG folder, by name, streamed or not, the checkpoint of a run, or
+    one. Raises SceneError if a run has none, or a folder cannot be read."""
     path = Path(path)
     parts = _sog_parts(path)
     if parts:
@@ -47,13 +49,22 @@ def source_parts(path: Path | str) -> list[Path]:
     return [path]
 
 
+def _folder_of(path: Path) -> Path:
+    return path.parent if path.name in (SOG_META, STREAM_META) else path
+
+
 def _sog_parts(path: Path) -> list[Path]:
-    """The files of a SOG folder, by name: its ``meta.json`` and its images; none if the path is no such folder."""
-    folder = path.parent if path.name == SOG_META else path
-    if not (folder / SOG_META).is_file() or (folder / CONFIG_NAME).is_file():
+    """The files of a SOG folder, streamed or not, by name: its JSON and its images; none if the path is no such
+    folder."""
+    folder = _folder_of(path)
+    streamed = path.name != SOG_META and (folder / STREAM_META).is_file()
+    if not (streamed or (folder / SOG_META).is_file()) or (folder / CONFIG_NAME).is_file():
         return []
     try:
-        names = sorted(part for part in folder.iterdir() if part.name == SOG_META or part.suffix.lower() == ".webp")
+        if streamed:
+            names = sorted(stream_parts(folder / STREAM_META))
+        else:
+            names = sorted(part for part in folder.iterdir() if part.name == SOG_META or part.suffix.lower() == ".webp")
         return [part for part in names if part.is_file()]
     except OSError as error:
         raise SceneError(f"{folder}: cannot be read ({error.strerror or one_line(error)})") from error

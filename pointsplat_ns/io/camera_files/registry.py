@@ -11,7 +11,7 @@ from pointsplat_ns.io.camera_files.colmap import colmap_cameras, is_model
 from pointsplat_ns.io.camera_files.inria import inria_cameras
 from pointsplat_ns.io.camera_files.nerfstudio import nerfstudio_cameras
 from pointsplat_ns.io.files import logger, one_line, require_file, require_memory
-from pointsplat_ns.io.formats import SOG_META, format_named
+from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_named
 from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, TRANSFORMS_NAME, read_transforms
 from pointsplat_ns.views import Views
 
@@ -22,7 +22,7 @@ def is_camera_file(path: Path | str) -> bool:
     """Whether a path is no run and no scene, so that it can only hold cameras. What is in a file is not looked at."""
     path = Path(path)
     if path.is_dir():
-        return is_model(path) or not any((path / name).is_file() for name in (CONFIG_NAME, SOG_META))
+        return is_model(path) or not any((path / name).is_file() for name in (CONFIG_NAME, SOG_META, STREAM_META))
     return path.suffix.lower() not in RUN_SUFFIXES and format_named(path.name) is None
 
 

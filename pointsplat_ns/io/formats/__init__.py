@@ -17,12 +17,14 @@ from pointsplat_ns.io.formats.registry import (
 )
 from pointsplat_ns.io.formats.sog_images import META as SOG_META
 from pointsplat_ns.io.formats.sog_images import PARTS as SOG_PARTS
+from pointsplat_ns.io.formats.sog_stream import STREAM_META
 
 __all__ = [
     "FORMATS",
     "READABLE",
     "SOG_META",
     "SOG_PARTS",
+    "STREAM_META",
     "WRITABLE",
     "Format",
     "format_like",

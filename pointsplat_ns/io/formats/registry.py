@@ -23,6 +23,7 @@ from pointsplat_ns.io.formats.glb import encode_glb, glb_bytes
 from pointsplat_ns.io.formats.ksplat import read_ksplat
 from pointsplat_ns.io.formats.sog import encode_sog, read_sog, write_sog_folder
 from pointsplat_ns.io.formats.sog_images import META
+from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
 from pointsplat_ns.io.formats.splat import drawing_order, encode_splat, read_splat, splat_bytes
 from pointsplat_ns.io.formats.spz import encode_spz, read_spz
 from pointsplat_ns.io.ply import ply_bytes, read_ply, write_ply
@@ -91,6 +92,7 @@ FORMATS = (
     ),
     Format("SPZ", ".spz", read_spz, _writer(encode_spz), (b"\x1f\x8b", b"NGSP"), encode=encode_spz),
     Format("SOG", ".sog", read_sog, _writer(encode_sog), (b"PK\x03\x04",), encode=encode_sog, order=morton_order),
+    Format("streamed SOG", STREAM_META, read_sog_stream),
     Format("SOG folder", META, read_sog, write_sog_folder, encode=encode_sog, order=morton_order),
     Format("ksplat", ".ksplat", read_ksplat),
     Format("splat", ".splat", read_splat, _writer(encode_splat), bytes_of=splat_bytes, order=drawing_order),
@@ -108,10 +110,10 @@ def format_named(name: str) -> Format | None:
 
 
 def format_to_read(path: Path) -> Format | None:
-    """The format of a file or SOG folder by its first bytes, else by its name; None if neither is known. Raises
-    SceneError if the file cannot be read, or its format is written only."""
+    """The format of a file or SOG folder, streamed or not, by its first bytes, else by its name; None if neither is
+    known. Raises SceneError if the file cannot be read, or its format is written only."""
     if path.is_dir():
-        return format_named(META) if (path / META).is_file() else None
+        return next((format_named(name) for name in (STREAM_META, META) if (path / name).is_file()), None)
     named = format_named(path.name)
     try:
         with path.open("rb") as stream:

@@ -62,7 +62,7 @@ def encode_sog(scene: Gaussians, progress: Progress = silent) -> bytes:
     images are neighbours in space. Raises SceneError if there are more Gaussians than the images can hold."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
-        for name, data in _parts(scene, progress).items():
+        for name, data in sog_parts(scene, progress).items():
             # The same scene gives the same bytes, whenever it is written.
             archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data)
     return stream.getvalue()
@@ -79,7 +79,7 @@ def sog_bytes_like(scene: Gaussians) -> Callable[[int], int]:
         scene: N > 0 Gaussians, float32 on the CPU.
     """
     sample = scene[:: -(-len(scene) // 10_000)]
-    parts = _parts(sample.replace(features_rest=sample.features_rest[:, :0]), silent)
+    parts = sog_parts(sample.replace(features_rest=sample.features_rest[:, :0]), silent)
     fixed = len(parts.pop(META))
     each = sum(map(len, parts.values())) / len(sample)
     if not scene.sh_degree:
@@ -106,7 +106,7 @@ def write_sog_folder(scene: Gaussians, path: Path, progress: Progress = silent) 
     All parts are written beside before the first replaces an older one. Meanwhile there is no ``meta.json``, so that a
     folder with it is whole. Errors are those of :func:`encode_sog` and :func:`~pointsplat_ns.io.files.replacing`.
     """
-    parts = _parts(scene, progress)
+    parts = sog_parts(scene, progress)
     with ExitStack() as stack:
         # Left in the opposite order: meta.json comes last.
         for name in [META, *(name for name in parts if name != META)]:
@@ -203,15 +203,16 @@ def _numbers(values: Any, count: int | None = None) -> Array:
     return array
 
 
-def _parts(scene: Gaussians, progress: Progress) -> dict[str, bytes]:
-    """The files of a SOG folder by name."""
+def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> dict[str, bytes]:
+    """The files of a SOG folder by name, of a scene, float32 on the CPU. ``ordered`` says that neighbours in space
+    follow one another already; otherwise Gaussians are reordered. Raises SceneError as :func:`encode_sog`."""
     n = len(scene)
     width = max(4 * math.ceil(math.sqrt(n) / 4), 4)
     height = max(4 * math.ceil(n / width / 4), 4)
     if max(width, height) > MAX_SIDE:
         raise SceneError(f"{n} Gaussians; a SOG file holds at most {MAX_SIDE**2}")
     progress("packing", 0.0)
-    scene = scene[morton_order(scene)]
+    scene = scene if ordered else scene[morton_order(scene)]
     images: dict[str, tuple[Array, int, int]] = {}
 
     def add(name: str, columns: Sequence[Array]) -> list[str]:

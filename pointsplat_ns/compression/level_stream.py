@@ -1,0 +1,128 @@
+"""Levels of detail as a streamed SOG: which part of which level is a leaf of its tree.
+
+Levels are nested, so a leaf holds the same part of the scene in every level: the descendants of Gaussians of the
+coarsest one. Where two leaves of different levels meet, nothing is drawn twice and nothing is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import BudgetError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.formats import STREAM_META
+from pointsplat_ns.io.formats.coding import morton_order
+from pointsplat_ns.io.formats.sog_stream import Node, write_sog_stream
+from pointsplat_ns.looking.content import content_size
+from pointsplat_ns.system.progress import Progress, silent
+
+SIDES = 8
+"""Leaves along the diagonal of the content, by default."""
+
+LEAST = 8192
+"""Gaussians of the finest level in a leaf, up to which it is not cut for its extent. The tree has one entry for a leaf,
+and viewers choose a level for each, so that leaves of few Gaussians cost more than they save."""
+
+
+@dataclass(frozen=True)
+class Chunks:
+    """Sizes of the pieces of a stream."""
+
+    count: int = 1 << 19
+    """Gaussians of the finest level in a leaf, at most, and in a file that gets no further leaf."""
+    extent: float | None = None
+    """Largest side of a leaf, scene units; by default an eighth of the diagonal of the content."""
+
+    def __post_init__(self) -> None:
+        if self.count < 1 or (self.extent is not None and not self.extent > 0):
+            raise BudgetError(f"chunks of {self.count} Gaussians and {self.extent} units; expected positive numbers")
+
+
+def check_stream_folder(folder: Path, force: bool) -> None:
+    """Raise SceneError if a stream may not be written to a folder, which need not exist."""
+    if folder.suffix.lower() in (".ply", ".sog", ".json", ".png") or (folder.exists() and not folder.is_dir()):
+        raise SceneError(f"{folder}: a stream is several files; expected the name of a folder")
+    if (folder / STREAM_META).exists() and not force:
+        raise SceneError(f"{folder / STREAM_META}: exists already; name another folder, or overwrite it with --force")
+
+
+def write_stream(
+    folder: Path | str,
+    levels: Sequence[Gaussians],
+    parents: Sequence[Tensor],
+    chunks: Chunks | None = None,
+    force: bool = False,
+    progress: Progress = silent,
+) -> list[int]:
+    """Write levels of detail as a streamed SOG.
+
+    Args:
+        folder: created if it is missing.
+        levels: the finest first.
+        parents: for each level but the last, the index (M,) in the next of the parent of each Gaussian; -1 for those
+            that are too faint to be drawn, which are left out.
+        chunks: sizes of the pieces.
+        force: whether an existing stream may be overwritten.
+        progress: called while encoding.
+
+    Returns:
+        The number of Gaussians written of each level.
+
+    Raises:
+        SceneError: if the folder cannot be used, or a file cannot be written.
+    """
+    folder = Path(folder)
+    check_stream_folder(folder, force)
+    scenes = [level.detach().to("cpu", torch.float32) for level in levels]
+    sizes = chunks or Chunks()
+    tree = partition(scenes, [of.cpu().long() for of in parents], sizes)
+    return write_sog_stream(scenes, tree, folder / STREAM_META, sizes.count, progress)["counts"]
+
+
+def partition(levels: Sequence[Gaussians], parents: Sequence[Tensor], chunks: Chunks) -> Node:
+    """A tree whose leaves hold the descendants of neighbours in the coarsest level, in Morton order; for the arguments
+    see :func:`write_stream`."""
+    coarsest = levels[-1]
+    ancestors = [torch.arange(len(coarsest))]
+    for of in reversed(parents):
+        ancestors.insert(0, torch.where(of >= 0, ancestors[0][of.clamp_min(0)], -1))
+    kept = ancestors[0] >= 0
+    weights = torch.bincount(ancestors[0][kept], minlength=len(coarsest))
+    extent = content_size(coarsest)[1] / SIDES if chunks.extent is None else chunks.extent
+    leaf_of = torch.empty(len(coarsest), dtype=torch.int64)
+    leaves = 0
+
+    def split(members: Tensor) -> tuple | int:  # a leaf's number, or two parts
+        nonlocal leaves
+        points, weight = coarsest.means[members], weights[members]
+        total, sides = int(weight.sum()), points.amax(dim=0) - points.amin(dim=0) if len(members) else torch.zeros(3)
+        too_wide = float(sides.max()) > extent and total > LEAST
+        if len(members) > 1 and (total > chunks.count or too_wide):
+            order = points[:, int(sides.argmax())].argsort(stable=True)
+            half = int((weight[order].cumsum(0) < total / 2).sum()) + 1
+            cut = min(max(half, 1), len(members) - 1)
+            return split(members[order[:cut]]), split(members[order[cut:]])
+        leaf_of[members] = leaves
+        leaves += 1
+        return leaves - 1
+
+    parts = split(torch.arange(len(coarsest)))
+    rows = []
+    for scene, ancestor in zip(levels, ancestors, strict=True):
+        order = morton_order(scene)
+        order = order[ancestor[order] >= 0]
+        leaf = leaf_of[ancestor[order]]
+        counts = torch.bincount(leaf, minlength=leaves)
+        rows.append(order[leaf.argsort(stable=True)].split(counts.tolist()))
+
+    def node(part: tuple | int) -> Node:
+        if isinstance(part, tuple):
+            return Node(children=(node(part[0]), node(part[1])))
+        return Node(rows=tuple(of_level[part] for of_level in rows))
+
+    return node(parts)

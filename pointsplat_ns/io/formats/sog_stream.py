@@ -1,0 +1,235 @@
+"""Streamed SOG: PlayCanvas' folder of SOG files for viewers that load the parts of a scene that they need.
+
+``lod-meta.json`` holds a tree of boxes. A leaf names for each level of detail, the finest first, consecutive rows of
+one SOG folder, ``LEVEL_NUMBER/meta.json``. A viewer draws one level of every leaf. The scene that is read is one level.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.quaternions import rotation_matrices
+from pointsplat_ns.io.files import keep_usable, read_text, replacing, require_file, require_memory, unusable_kept
+from pointsplat_ns.io.formats.coding import damage_named
+from pointsplat_ns.io.formats.sog import read_sog, sog_parts
+from pointsplat_ns.io.formats.sog_images import META
+from pointsplat_ns.system.progress import Progress, silent
+
+STREAM_META = "lod-meta.json"
+"""The file that tells of all others."""
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """A part of a scene: a leaf, or two nodes."""
+
+    rows: tuple[Tensor, ...] = ()
+    """Of a leaf: the indices of its Gaussians in each level."""
+    children: tuple[Node, ...] = ()
+
+
+def read_sog_stream(path: Path | str, level: int = 0) -> Gaussians:
+    """Read one level of a streamed SOG, and its surroundings (``environment``) if it has them.
+
+    Args:
+        path: ``lod-meta.json``, or the folder of it.
+        level: 0 is the finest; -1 the coarsest.
+
+    Raises:
+        SceneError: if there is no such level, a file is missing, damaged or lies outside the folder, or has another
+            number of Gaussians than the tree says.
+    """
+    path = Path(path)
+    path = path / STREAM_META if path.is_dir() else path
+    require_file(path, f"the {STREAM_META} of a streamed SOG")
+    with damage_named(path, "streamed SOG"):
+        meta = _meta(path)
+        levels = meta["lodLevels"]
+        if not -levels <= level < levels:
+            raise SceneError(f"{path}: no level {level}; it has {levels}, 0 is the finest")
+        names, counts = meta["filenames"], _counts(meta["tree"], level % levels, meta["filenames"])
+        require_memory(path, 4 * 14 * sum(counts.values()))
+        files: list[tuple[Path, int | None]] = [
+            (_beside(path, names[index]), counts[index]) for index in sorted(counts)
+        ]
+        environment = meta.get("environment")
+        if environment is not None:
+            files.append((_beside(path, environment), None))
+    parts = []
+    for file, count in files:
+        with unusable_kept():
+            parts.append(read_sog(file))
+        if count not in (None, len(parts[-1])):
+            raise SceneError(f"{file}: {len(parts[-1])} Gaussians; {STREAM_META} names {count} of level {level}")
+    degree = max((part.sh_degree for part in parts), default=0)
+    scene = Gaussians.cat([Gaussians.empty(degree), *(_of_degree(part, degree) for part in parts)])
+    return keep_usable(scene, path)
+
+
+def stream_parts(path: Path) -> list[Path]:
+    """All files of the streamed SOG with this ``lod-meta.json``, which comes first. Raises SceneError as
+    :func:`read_sog_stream`."""
+    with damage_named(path, "streamed SOG"):
+        meta = _meta(path)
+        names = [name for name in (*meta["filenames"], meta.get("environment")) if name is not None]
+        found = [path]
+        for file in (_beside(path, name) for name in names):
+            found += [file] if file.name != META else sorted(file.parent.glob("*.webp")) + [file]
+        return found
+
+
+def write_sog_stream(
+    levels: Sequence[Gaussians], tree: Node, path: Path, chunk: int, progress: Progress = silent
+) -> dict[str, Any]:
+    """Write a streamed SOG: all of it, or nothing.
+
+    All files are written beside before the first replaces an older one. Meanwhile there is no ``lod-meta.json``.
+
+    Args:
+        levels: the finest first; float32 on the CPU, of Gaussians that can be drawn.
+        tree: its leaves have rows of every level. Gaussians that are in no leaf are left out.
+        path: the ``lod-meta.json``, in a folder that is created if it is missing.
+        chunk: a SOG file is full when it has more Gaussians than this.
+        progress: called while encoding.
+
+    Returns:
+        The content of ``lod-meta.json``.
+
+    Raises:
+        SceneError: if a file cannot be written.
+    """
+    names: list[str] = []
+    open_file = [(-1, 0)] * len(levels)  # of each level: index in names, Gaussians in it
+    rows: dict[int, list[Tensor]] = {}  # of each file
+    level_of: list[int] = []
+    counts = [0] * len(levels)
+
+    def entry(level: int, members: Tensor) -> dict[str, int]:
+        file, held = open_file[level]
+        if file < 0 or held > chunk:
+            file, held = len(names), 0
+            names.append(f"{level}_{level_of.count(level)}/{META}")
+            level_of.append(level)
+            rows[file] = []
+        rows[file].append(members)
+        open_file[level] = (file, held + len(members))
+        counts[level] += len(members)
+        return {"file": file, "offset": held, "count": len(members)}
+
+    def node(part: Node) -> dict[str, Any]:
+        if part.children:
+            children = [node(child) for child in part.children]
+            lows, highs = zip(*((child["bound"]["min"], child["bound"]["max"]) for child in children), strict=True)
+            bound = {"min": [min(axis) for axis in zip(*lows, strict=True)]}
+            return {"bound": bound | {"max": [max(axis) for axis in zip(*highs, strict=True)]}, "children": children}
+        lods = {str(level): entry(level, members) for level, members in enumerate(part.rows) if len(members)}
+        return {
+            "bound": _bound([scene[members] for scene, members in zip(levels, part.rows, strict=True)]),
+            "lods": lods,
+        }
+
+    described = node(tree)
+    meta = {
+        "version": 1,
+        "asset": {"generator": "pointsplat-ns"},
+        "count": sum(counts),
+        "counts": counts,
+        "lodLevels": len(levels),
+        "lodErrors": False,
+        "filenames": names,
+        "tree": described,
+    }
+    with ExitStack() as stack:
+        # Left in the opposite order: lod-meta.json comes last.
+        stack.enter_context(replacing(path)).write_text(json.dumps(meta, separators=(",", ":")), "utf-8")
+        for file, name in enumerate(names):
+            scene = levels[level_of[file]][torch.cat(rows[file])]
+            folder = path.parent / name.partition("/")[0]
+            parts = sog_parts(scene, _part_of(progress, file, len(names)), ordered=True)
+            for part, data in sorted(parts.items(), key=lambda item: item[0] != META):
+                stack.enter_context(replacing(folder / part, len(data))).write_bytes(data)
+        path.unlink(missing_ok=True)
+    return meta
+
+
+def _part_of(progress: Progress, index: int, count: int) -> Callable[[str, float], None]:
+    return lambda what, share: progress(f"file {index + 1} of {count}", (index + share) / count)
+
+
+def _bound(parts: Sequence[Gaussians]) -> dict[str, list[float]]:
+    """The box of the boxes of all Gaussians, of one standard deviation along their axes, as other programs write it."""
+    scene = Gaussians.cat([_of_degree(part, 0) for part in parts])
+    half = (rotation_matrices(scene.quats).abs() @ scene.stds[..., None])[..., 0]
+    low, high = (scene.means - half).amin(dim=0), (scene.means + half).amax(dim=0)
+    limit = torch.finfo(torch.float32).max
+    corners = {"min": low, "max": high}
+    return {name: _with_seven_digits(corner.nan_to_num(0.0, limit, -limit)) for name, corner in corners.items()}
+
+
+def _with_seven_digits(values: Tensor) -> list[float]:
+    """Numbers with the digits that float32 has."""
+    return [float(f"{value:.7g}") for value in values.tolist()]
+
+
+def _of_degree(scene: Gaussians, degree: int) -> Gaussians:
+    """A scene with as many SH bands as asked for; those that it does not have are zero."""
+    rest = scene.features_rest.new_zeros(len(scene), (degree + 1) ** 2 - 1, 3)
+    known = min(rest.shape[1], scene.features_rest.shape[1])
+    rest[:, :known] = scene.features_rest[:, :known]
+    return scene.replace(features_rest=rest)
+
+
+def _meta(path: Path) -> dict[str, Any]:
+    """The content of ``lod-meta.json``, checked but for its tree."""
+    meta = json.loads(read_text(path))
+    if not isinstance(meta, dict) or meta.get("version", 1) != 1:
+        raise SceneError(f"{path}: not a {STREAM_META} of version 1")
+    levels, names = meta["lodLevels"], meta["filenames"]
+    if not isinstance(levels, int) or isinstance(levels, bool) or not 0 < levels <= 1000:
+        raise ValueError(f"{levels!r} levels, expected 1 to 1000")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or len({*names}) != len(names):
+        raise ValueError("filenames are no list of names that differ")
+    return meta
+
+
+def _beside(path: Path, name: Any) -> Path:
+    """A file that ``lod-meta.json`` names. It must lie in its folder or below, and be SOG."""
+    parts = PurePosixPath(name).parts if isinstance(name, str) else ()
+    if not parts or ".." in parts or PurePosixPath(name).is_absolute() or set("\\:") & set(name):
+        raise SceneError(f"{path}: names the file {name!r}; expected one in its own folder")
+    if parts[-1] != META and not name.lower().endswith(".sog"):
+        raise SceneError(f"{path}: names the file {name!r}; expected a {META} or a .sog")
+    return path.parent.joinpath(*parts)
+
+
+def _counts(tree: Any, level: int, names: list[str]) -> Counter[int]:
+    """The number of Gaussians of a level that the tree names in each file, by the file's index."""
+    counts: Counter[int] = Counter()
+    waiting = [tree]
+    while waiting:
+        node = waiting.pop()
+        if not isinstance(node, dict) or not isinstance(node.get("children", []), list):
+            raise ValueError("a node of the tree is no object")
+        waiting += node.get("children", [])
+        entry = node.get("lods", {}).get(str(level))
+        if entry is None:
+            continue
+        numbers = [entry[key] for key in ("file", "offset", "count")]
+        if not all(isinstance(number, int) and 0 <= number < math.inf for number in numbers):
+            raise ValueError(f"rows {numbers} of a level, expected whole numbers")
+        if numbers[0] >= len(names):
+            raise ValueError(f"file {numbers[0]} of {len(names)}")
+        counts[numbers[0]] += numbers[2]
+    return counts
