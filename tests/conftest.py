@@ -35,10 +35,7 @@ external_methods.get_external_methods = lambda: ({}, {})
 
 def wall_colors(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Colours (..., 3) in [0, 1] of the wall at x, y in scene units."""
-    return np.stack(
-        [0.5 + 0.4 * np.sin(4 * x), 0.5 + 0.4 * np.cos(5 * y), 0.5 + 0.4 * np.sin(3 * x + 2 * y)],
-        axis=-1,
-    )
+    return np.stack([0.5 + 0.4 * np.sin(4 * x), 0.5 + 0.4 * np.cos(5 * y), 0.5 + 0.4 * np.sin(3 * x + 2 * y)], axis=-1)
 
 
 def write_wall(scene: Path, num_frames: int = NUM_FRAMES, width: int = WIDTH, height: int = HEIGHT) -> Path:

@@ -198,13 +198,7 @@ def test_views_may_be_those_of_a_run(scene, trained_walls, caplog):
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"by": "best"},
-        {"by": "merge", "opacity_weight": 0.5},
-        {"keep": "half"},
-        {"sh": "4"},
-        {"fine_tune": -1},
-    ],
+    [{"by": "best"}, {"by": "merge", "opacity_weight": 0.5}, {"keep": "half"}, {"sh": "4"}, {"fine_tune": -1}],
 )
 def test_options_that_fit_no_scene_are_refused_before_one_is_read(options, tmp_path):
     with pytest.raises(ps.PointSplatError) as caught:

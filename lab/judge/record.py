@@ -173,9 +173,7 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
     modes = sorted({row["method"] for row in rows if row["method"].startswith(NAME)})
     parts = [
         PAGE.format(
-            views=settings["views"],
-            peer=NAME,
-            modes=", ".join(mode.removeprefix(NAME).strip() for mode in modes),
+            views=settings["views"], peer=NAME, modes=", ".join(mode.removeprefix(NAME).strip() for mode in modes)
         ),
         "## Scenes\n\n" + SCENES + "\n\n" + _scene_table(rows, figures),
     ]

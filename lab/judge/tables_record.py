@@ -29,6 +29,9 @@ ROOT = Path(__file__).parents[2]
 TABLES = (1, 3, 4)
 """Tables of quality. Table 2 has times, which need an idle machine."""
 
+LEFT_OUT = ("SSIM (renders)", "LPIPS (renders)", "scenes")
+"""Columns that the page leaves to the measured rows."""
+
 FIGURE = "results_figure4.png"
 
 PAGE = """# The paper's networks and scores on two rooms
@@ -78,18 +81,23 @@ def _cell(values: dict[str, Any]) -> Cell:
 
 def tables_of(group: Group) -> list[Table]:
     """The tables of a group, without rows that were not measured."""
-    found = [
-        dataclasses.replace(
-            table,
-            sections=tuple(tuple(row for row in rows if "not measured" not in row) for rows in table.sections),
-            notes=(),
-        )
-        for table in Layout(group, (), {}).tables()
-        if table.number in TABLES
-    ]
+    found = [_shortened(table) for table in Layout(group, (), {}).tables() if table.number in TABLES]
     if known := medians(group):
         found.append(figure_medians(group, known))
     return found
+
+
+def _shortened(table: Table) -> Table:
+    shown = [column for column, name in enumerate(table.header) if name not in LEFT_OUT]
+    return dataclasses.replace(
+        table,
+        header=tuple(table.header[column] for column in shown),
+        sections=tuple(
+            tuple(tuple(row[column] for column in shown) for row in rows if "not measured" not in row)
+            for rows in table.sections
+        ),
+        notes=(),
+    )
 
 
 def page(groups: list[Group]) -> str:

@@ -131,12 +131,7 @@ def test_the_unit_of_length_does_not_matter(factor, room):
 
 
 @pytest.mark.parametrize(
-    "scene",
-    [
-        box_room(0, 1),
-        box_room(0, 30).replace(scales=torch.full((30, 3), -math.inf)),
-    ],
-    ids=["one", "all points"],
+    "scene", [box_room(0, 1), box_room(0, 30).replace(scales=torch.full((30, 3), -math.inf))], ids=["one", "all points"]
 )
 def test_where_there_is_nothing_to_compare_with_nothing_goes(scene):
     assert junk_of(scene) == ([], [])

@@ -11,13 +11,7 @@ import torch
 import pointsplat_ns.compression.compact as compact_module
 from making import ball, same
 from pointsplat_ns.compression import acceptance
-from pointsplat_ns.compression.acceptance import (
-    ACCEPTANCE,
-    closer_in,
-    improves,
-    interpolate,
-    parabola_minimum,
-)
+from pointsplat_ns.compression.acceptance import ACCEPTANCE, closer_in, improves, interpolate, parabola_minimum
 from pointsplat_ns.compression.compact import Compacted, compact_scene
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import Repaired

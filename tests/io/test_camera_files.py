@@ -19,14 +19,7 @@ from pointsplat_ns.geometry.cameras import invert_rigid, viewmats_to_opengl
 from pointsplat_ns.geometry.quaternions import rotation_matrices
 from pointsplat_ns.io.camera_files import cameras, is_camera_file, read_views, registry, transforms_beside
 from pointsplat_ns.io.camera_files.cameras import Limits
-from posing import (
-    inria,
-    name_of,
-    nerfstudio,
-    write_colmap_binary,
-    write_colmap_text,
-    written,
-)
+from posing import inria, name_of, nerfstudio, write_colmap_binary, write_colmap_text, written
 
 SEED = 3
 

@@ -244,25 +244,3 @@ def test_files_that_others_published_are_read(name, caplog):
     assert bool(scene.opacities.isfinite().all()) and bool(scene.usable().all())
     assert "dropped" not in caplog.text
     assert format_to_read(SPLATS / name).name in ("compressed PLY", "SPZ", "SOG", "SOG folder")
-
-
-@pytest.mark.skipif(not SPLATS.is_dir(), reason="the files are not there")
-@pytest.mark.parametrize("name", [name for name in REAL if "." in name])
-def test_they_are_read_as_an_independent_reader_reads_them(name, monkeypatch):
-    monkeypatch.syspath_prepend(str(SPLATS))
-    import gsio
-
-    theirs, ours = gsio.read_any(str(SPLATS / name)), ps.load(SPLATS / name)
-    for field, value, within in (
-        ("means", ours.means, 1e-5),
-        ("scales", ours.scales, 1e-5),
-        ("dc", ours.features_dc, 1e-5),
-    ):
-        assert np.abs(theirs[field] - value.numpy()).max() <= within, field  # float32 in another order
-    # It keeps the ends of opacities at 0 and 1.
-    assert np.abs(1 / (1 + np.exp(-theirs["opac"])) - ours.alphas.numpy()).max() <= 0.3 / 255
-    unit = theirs["quats"] / np.linalg.norm(theirs["quats"], axis=1, keepdims=True)
-    assert np.abs((unit * ours.quats.numpy()).sum(1)).min() > 1 - 1e-6
-    if ours.sh_degree:
-        # It takes the bytes 0 and 255 of the compressed PLY for the middle of their steps.
-        assert np.abs(theirs["rest"] - ours.features_rest.numpy()).max() <= 4 / 256

@@ -10,14 +10,7 @@ import torch
 from making import ball
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.sizes import (
-    RendersOfSizes,
-    middle_sized,
-    parse_resolution,
-    sides_of,
-    subsampled,
-    two_sizes,
-)
+from pointsplat_ns.looking.sizes import RendersOfSizes, middle_sized, parse_resolution, sides_of, subsampled, two_sizes
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import EPS2D
 

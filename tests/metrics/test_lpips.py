@@ -166,15 +166,6 @@ def test_cached_lpips_is_loaded_once_for_each_device_and_gives_what_load_lpips_g
     assert {buffer.device.type for buffer in cached_lpips("alex", "meta").buffers()} == {"meta"}
 
 
-def test_a_failed_download_is_tried_again_later_and_not_at_every_call(clock, nowhere):
-    texts = set()
-    for clock[0], times in ((0.0, 1), (1.0, 1), (599.0, 1), (601.0, 2)):
-        with pytest.raises(LpipsUnavailable) as caught:
-            cached_lpips("alex", "cpu")
-        texts.add(str(caught.value))
-        assert len(nowhere) == times and len(texts) == 1
-
-
 # In a report
 
 

@@ -14,14 +14,13 @@ from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetppDataParser
 from nerfstudio.data.utils import colmap_parsing_utils as colmap
 
 from captures import BAD, FRAMES, HELD_OUT, SEEDS, Capture, Lens
-from making import SHARED_DATA, pipeline_of
+from making import pipeline_of
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.paper_datasets import paper_dataset
 from pointsplat_ns.nerfstudio_plugin.scannetpp import SeededScanNetppDataParserConfig
 
 FISHEYE = Lens("OPENCV_FISHEYE", (0.02, -0.01, 0.003, -0.001), focal=(30.0, 30.5))
 TRANSFORMS = "dslr/nerfstudio/transforms.json"
-FOX = SHARED_DATA / "scannetpp/fox"
 
 
 @pytest.fixture(scope="module")
@@ -140,9 +139,3 @@ def test_what_a_mask_hides_does_not_count(method, scene, wall_config, run_traini
 @pytest.mark.parametrize("kind", [ScanNetppDataParserConfig, SeededScanNetppDataParserConfig])
 def test_scenes_read_by_either_dataparser_are_known_as_the_datasets(scene, kind):
     assert paper_dataset(SimpleNamespace(dataparser_class=f"a.module.{kind.__name__}", data=scene)) == "ScanNet++"
-
-
-def test_a_real_capture_without_colmaps_model_is_read():
-    if not FOX.exists():
-        pytest.skip(f"{FOX} is not here")
-    assert len(parsed(FOX).image_filenames) == 45 and len(parsed(FOX, "test").image_filenames) == 5

@@ -73,8 +73,7 @@ def test_a_command_that_reads_poses_with_nerfstudio_prints_no_warning(trained_wa
     # In a fresh process dataset_views is what first imports nerfstudio.
     (run,) = (config.parent for config in (trained_walls / "wall-a").rglob("config.yml"))
     result = run_quietly(
-        *("pointsplat", "prune", run, "--keep", "50%", "--by", "lightgaussian"),
-        *("-o", tmp_path / "small.ply"),
+        *("pointsplat", "prune", run, "--keep", "50%", "--by", "lightgaussian"), *("-o", tmp_path / "small.ply")
     )
     assert (result.returncode, result.stderr) == (0, "")
     assert "dataset" in result.stdout, result.stdout  # else nerfstudio was not needed, and this proves nothing

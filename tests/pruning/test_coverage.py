@@ -40,11 +40,7 @@ def shares_by_definition(masses, run, first):
 
 
 @settings(max_examples=200, deadline=None)
-@given(
-    st.lists(st.sampled_from([0.0, 0.25, 0.5, 1.0, 3.0, 700.0]), max_size=40),
-    st.integers(1, 7),
-    st.data(),
-)
+@given(st.lists(st.sampled_from([0.0, 0.25, 0.5, 1.0, 3.0, 700.0]), max_size=40), st.integers(1, 7), st.data())
 def test_mass_shares_are_their_definition(masses, run, data):
     first = data.draw(st.integers(0, run - 1))
     found = mass_shares(torch.tensor(masses, dtype=torch.float64).log(), run, first)

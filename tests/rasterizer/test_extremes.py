@@ -135,12 +135,7 @@ def test_degenerate_gaussians(case, mode):
     CASES[case](scene)
     if mode == "antialiased" and any(word in case for word in ("lines", "points", "needles")):
         scene[3][:] = 40.0  # the compensation is at or near its lower bound of 0.005
-    check(
-        scene,
-        camera_askew(),
-        mode=mode,
-        reference=case != "log-scales from -80 to 20",
-    )
+    check(scene, camera_askew(), mode=mode, reference=case != "log-scales from -80 to 20")
     # (with axes of 1e20 pixels the reference's xx yy - xy^2 cancels to 0 even in float64)
 
 

@@ -51,10 +51,7 @@ def quality(images: Sequence[Tensor], references: Sequence[Tensor]) -> Quality:
 
 @torch.no_grad()
 def measured_room(
-    folder: Path,
-    scene: ps.Gaussians,
-    budgets: Sequence[tuple[str, float]] = BUDGETS,
-    views: ps.Views | None = None,
+    folder: Path, scene: ps.Gaussians, budgets: Sequence[tuple[str, float]] = BUDGETS, views: ps.Views | None = None
 ) -> Tradeoff:
     """Measure a scene at some budgets and write the pictures.
 

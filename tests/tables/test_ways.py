@@ -9,16 +9,7 @@ import pytest
 from pointsplat_ns.pruning import METHODS
 from pointsplat_ns.tables import paper
 from pointsplat_ns.tables.paper import published
-from pointsplat_ns.tables.ways import (
-    PROTOCOL,
-    TABLE_1,
-    TABLE_3,
-    TABLE_4,
-    Network,
-    all_cells,
-    cell_key,
-    selected,
-)
+from pointsplat_ns.tables.ways import PROTOCOL, TABLE_1, TABLE_3, TABLE_4, Network, all_cells, cell_key, selected
 from pointsplat_ns.tradeoff.points import Quality
 
 CELLS = all_cells(PROTOCOL.shares)

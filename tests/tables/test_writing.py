@@ -125,10 +125,7 @@ def test_rows_that_are_missing_somewhere_say_where_and_why(tmp_path):
     rows = rows_of(table)
     assert rows["30 %", "PointSplat"] == ("not measured", *("-",) * 7)
     assert rows["30 %", "PUP-3DGS*"][-1] == "1 of 2" and rows["30 %", "merge (our default)"][-1] == "2"
-    assert table.notes == (
-        "Not measured on fox: PUP-3DGS*: not yet",
-        "Not measured: PointSplat: no weights",
-    )
+    assert table.notes == ("Not measured on fox: PUP-3DGS*: not yet", "Not measured: PointSplat: no weights")
 
 
 @pytest.mark.parametrize("name, dataset", [("room0", ""), ("office0", ""), ("410c470782", ""), ("room0", "replica")])

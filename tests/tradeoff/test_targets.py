@@ -71,10 +71,7 @@ def test_a_slower_scene_of_a_smaller_file_does_not_hide_one_that_is_fast_enough(
 
 @pytest.mark.parametrize(
     "targets, said",
-    [
-        (Targets(db=40.0, mb=0.5), "over --target-mb 0.5"),
-        (Targets(db=40.0, ms=3.0), "over --target-ms 3"),
-    ],
+    [(Targets(db=40.0, mb=0.5), "over --target-mb 0.5"), (Targets(db=40.0, ms=3.0), "over --target-ms 3")],
 )
 def test_targets_that_exclude_one_another_name_the_obstacle_and_the_best_reachable(targets, said):
     trade = Trade()

@@ -11,10 +11,8 @@ from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.viewer.viewer import Viewer
 
 from captures import Capture
-from making import box_room, dense_config
 from ns_commands import VIEWER, Run, started
 from ns_viewer import Look, look
-from pointsplat_ns.io import write_ply
 
 
 def looked_at(config: Path, pose: np.ndarray | None = None) -> Look:
@@ -50,10 +48,3 @@ def looked_at(config: Path, pose: np.ndarray | None = None) -> Look:
 
 def test_viewer_serves_its_page_and_what_the_model_draws_until_ctrl_c(run: Run, capture: Capture):
     looked_at(run.config, capture.poses[0]).check()
-
-
-def test_viewer_shows_a_refiner_of_scenes_that_have_no_photos(run_training, no_lpips, tmp_path):
-    write_ply(box_room(0, size=0.12, smooth=True), tmp_path / "room.ply")
-    config = dense_config(tmp_path / "room.ply", tmp_path / "runs", steps=1)
-    run_training(config)
-    looked_at(config.get_base_dir() / "config.yml").check()

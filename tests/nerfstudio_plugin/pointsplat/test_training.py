@@ -10,7 +10,6 @@ import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import fast_config, pipeline_of
-from pointsplat_ns.errors import SceneError
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.results import REFINER_NAME
 from pointsplat_ns.refiner import read_refiner
@@ -98,13 +97,3 @@ def test_learning_rates_rise_fall_and_never_rise_again(steps):
     assert rates[peak] == 1.0 and peak == max(1, round(0.05 * steps))
     assert all(a >= b for a, b in zip(rates[peak:], rates[peak + 1 :], strict=False))
     assert rates[-1] == pytest.approx(0.02) or steps == 1
-
-
-def test_a_training_that_cannot_start_leaves_no_folder(trained_walls, tmp_path):
-    config = fast_config(trained_walls, tmp_path / "outputs")
-    config.pipeline.datamanager.eval_scenes = ("no_such_scene",)
-    (tmp_path / "outputs" / "of another run").mkdir(parents=True)
-    config.save_config()
-    with pytest.raises(SceneError, match="no_such_scene"):
-        config.setup(local_rank=0, world_size=1).setup()
-    assert [path.name for path in (tmp_path / "outputs").iterdir()] == ["of another run"]

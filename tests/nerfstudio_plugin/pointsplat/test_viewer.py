@@ -19,7 +19,7 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch loa
 from making import fast_config, pipeline_of, run_of, same
 from pointsplat_ns.cli.scene_options import claims_until_the_end
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io import read_ply, read_scene, write_ply
+from pointsplat_ns.io import read_ply, read_scene
 from pointsplat_ns.pruning import prune
 
 
@@ -131,7 +131,6 @@ def test_ns_render_draws_the_sampled_views_of_a_scene_without_photos(three_rooms
             assert np.abs(matplotlib.image.imread(path)[..., :3] - image.numpy()).max() < 1 / 255  # rounded to 8 bits
 
 
-def test_a_training_does_not_save_the_transform_of_one_scene_as_its_own(hollow_ball, tmp_path):
-    write_ply(hollow_ball, tmp_path / "ball.ply")
-    pipeline = pipeline_of(tmp_path / "ball.ply", test_mode="val")
+def test_a_training_does_not_save_the_transform_of_one_scene_as_its_own(trained_walls):
+    pipeline = pipeline_of(trained_walls, test_mode="val")
     assert not hasattr(pipeline.datamanager, "train_dataparser_outputs")

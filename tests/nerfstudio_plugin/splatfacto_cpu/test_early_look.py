@@ -69,14 +69,3 @@ def test_pictures_are_sparse_and_take_no_more_than_their_share_of_the_time(cost,
     assert cost * (len(spent) - 2) <= 0.02 * (clock.now - 1000)  # but for first and last
     assert (tmp_path / "step-000012000.jpg").is_file()
     assert picture_steps(7000) == [110, 220, 440, 880, 1760, 3520, 7000]
-
-
-def test_a_picture_that_cannot_be_written_does_not_end_the_training(monkeypatch, tmp_path):
-    clock = Clock(monkeypatch)
-    with_photos = pipeline()
-    with_photos.datamanager.eval_dataset = [0]
-    (tmp_path / "pictures").touch()  # a file where the folder should be
-    look = EarlyLook(with_photos, tmp_path / "pictures", first=0, count=2)
-    monkeypatch.setattr(look, "_look", lambda: (torch.zeros(4, 5, 3), torch.ones(4, 5, 3)))
-    look.after_training(1)
-    assert len(clock.lines) == 1 and clock.lines[0].startswith("no more pictures: ")

@@ -17,13 +17,10 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.utils import writer
 from PIL import Image
 
-from pointsplat_ns.errors import DataError, PointSplatError, SceneError
+from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import fitted_schedules, splatfacto_cpu_config
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import (
-    SplatfactoCpuModel,
-    SplatfactoCpuModelConfig,
-)
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModel, SplatfactoCpuModelConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import SplatfactoCpuTrainer
 from pointsplat_ns.nerfstudio_plugin.stopping import STATE
 from pointsplat_ns.rasterizer import rasterization
@@ -190,13 +187,6 @@ def test_pure_colours_stay_finite_at_degree_0(level):
     model = build(SplatfactoCpuModelConfig(sh_degree=0), (random_seeds(4)[0], torch.full((4, 3), level)))
     assert model.features_dc.isfinite().all()
     assert torch.allclose(model.colors, torch.tensor(level / 255), atol=0.5 / 255 + 1e-6)  # within half a level
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="asks what happens without CUDA")
-def test_asking_for_gsplat_without_cuda_says_so():
-    model = build(SplatfactoCpuModelConfig(backend="gsplat"), random_seeds()).eval()
-    with pytest.raises(PointSplatError, match="backend gsplat.*cpu.*use auto or torch"):
-        model.get_outputs(camera_at())
 
 
 def test_schedules_follow_the_length_of_the_run_and_spare_what_was_set_by_hand():

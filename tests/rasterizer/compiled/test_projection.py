@@ -268,12 +268,7 @@ def kernel_calls(monkeypatch):
 @needs_compiler
 @pytest.mark.parametrize(
     ("dtype", "compiled", "names"),
-    [
-        (F32, None, ALL_KERNELS),
-        (F32, False, set()),
-        (F64, None, set()),
-        (F64, True, set()),
-    ],
+    [(F32, None, ALL_KERNELS), (F32, False, set()), (F64, None, set()), (F64, True, set())],
 )
 def test_kernels_are_called_for_float32_unless_they_are_not_wanted(dtype, compiled, names, kernel_calls):
     *scene, view, K = (t.to(dtype) for t in (*splats_in_view(60, seed=7, scale=-2.0), *camera_askew()))
