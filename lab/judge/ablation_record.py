@@ -130,8 +130,11 @@ def _scene_table(rows: list[Row], keeps: list[float]) -> str:
 
 
 def _variant_table(found: list[Summary], keeps: list[float], table: str, settings: dict[str, Any]) -> str:
+    still = [summary for summary in found if not any(map(any, summary.changes.values()))]
     lines = []
     for summary in found:
+        if summary in still:
+            continue
         changes = variants.changes_of(summary.name)
         moves = "; ".join(
             f"`{field}` {_value(settings[f'{table}.{field}'])} to {_value(changes[field])}" for field in changes
@@ -140,8 +143,10 @@ def _variant_table(found: list[Summary], keeps: list[float], table: str, setting
         lines.append([f"`{summary.name}`", moves, *cells, f"{summary.cpu_ratio:.2f}", summary.count])
     heads = ["variant", "change", *map(_share, keeps), "CPU", "scenes and poses"]
     if len(counts := {summary.count for summary in found}) > 1:
-        return markdown(heads, lines)
-    return f"Scenes and poses: {counts.pop()}.\n\n" + markdown(heads[:-1], [line[:-1] for line in lines])
+        text = markdown(heads, lines)
+    else:
+        text = f"Scenes and poses: {counts.pop()}.\n\n" + markdown(heads[:-1], [line[:-1] for line in lines])
+    return text + (f"\n\nWithout any effect: {', '.join(f'`{summary.name}`' for summary in still)}." if still else "")
 
 
 def _share(keep: float) -> str:

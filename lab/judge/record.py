@@ -217,13 +217,15 @@ splat-transform stands for the mode of the best PSNR."""
 
 
 def _scene_table(rows: list[Row], figures: Figures) -> str:
-    lines = []
+    lines, missing = [], []
     for (at, scene), same in sorted(grouped(rows, lambda row: (row["at"] == PHOTOS, row["scene"])).items()):
         there = {row["keep"] for row in figures.rows if row["scene"] == scene}
-        kept = ", ".join(_share(keep) for keep in sorted(there, reverse=True)) or "none yet"
+        if gaps := [_share(keep) for keep in figures.keeps if keep not in there]:
+            missing.append(f"{scene} at {', '.join(gaps)}")
         where = "held-out photos" if at else "camera path"
-        lines.append([scene, f"{same[0]['gaussians']:,}", where, group_of(scene) or "other", kept])
-    return markdown(["scene", "Gaussians", "views", "list", "budgets measured"], lines)
+        lines.append([scene, f"{same[0]['gaussians']:,}", where, group_of(scene) or "other"])
+    table = markdown(["scene", "Gaussians", "views", "list"], lines)
+    return table + (f"\n\nNot measured: {'; '.join(missing)}." if missing else "")
 
 
 def _mean_table(figures: Figures, at: int | str, column: str, digits: int) -> str:
@@ -235,8 +237,8 @@ def _mean_table(figures: Figures, at: int | str, column: str, digits: int) -> st
                 f"{mean[column]:.{digits}f} ({mean[f'{column}_worst']:.{digits}f} {mean[f'{column}_worst_scene']})"
                 for mean in means
             ]
-            lines.append([_share(keep), *cells, means[0]["scenes"]])
-    return markdown(["kept", *map(_way, WAYS), "scenes"], lines) if lines else ""
+            lines.append([_share(keep), *cells])
+    return markdown(["kept", *map(_way, WAYS)], lines) if lines else ""
 
 
 def _lead_table(figures: Figures, at: int | str, column: str) -> str:
