@@ -182,6 +182,7 @@ def compact(
     clean: bool = False,
     effort: Effort = "quick",
     seconds: float | None = None,
+    photos: bool = False,
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: float | None = None,
@@ -211,6 +212,8 @@ def compact(
         clean: as for :func:`prune`.
         effort: "instant" takes no steps; "quick" and "thorough" take 48 and 400.
         seconds: duration of the repair, in place of ``effort``; Ctrl-C ends it earlier and keeps the scene so far.
+        photos: also train on the training photos of the run's dataset, by 400 ("quick") or 4000 steps ("thorough"), or
+            for ``seconds``. Every eighth photo takes part in no step and says whether the result is better.
         target_db: least PSNR against the given scene's renders, over the pixels that it covers, dB; in the views of
             held-out photos if the run has any.
         target_ms: longest time of a frame, milliseconds, drawn by this package in these views.
@@ -239,7 +242,7 @@ def compact(
         >>> result.psnr > 15, result.seconds > 0
         (True, True)
     """
-    request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds))
+    request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds), photos)
     format_to_write(target_format)
     goal = goal_of(request, keep, target_db, target_ms, target_mb, target_format)
     _, result, _ = compact_source(scene, request, goal, views, resolution, up, progress)

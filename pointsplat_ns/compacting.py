@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest
-from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.errors import BudgetError, DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.looking.sizes import parse_resolution
@@ -21,6 +21,7 @@ from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.compact import Compacted
+    from pointsplat_ns.compression.photo_repair import Photos
     from pointsplat_ns.compression.quality import Quality
     from pointsplat_ns.compression.requests import Effort
     from pointsplat_ns.tradeoff.targets import Targets
@@ -116,7 +117,8 @@ def compact_source(
         if goal is None:
             from pointsplat_ns.compression.compact import compact_scene
 
-            result = compact_scene(dense, request, source, report)
+            photos = None if request.photos is None else training_photos(run_of(scene, views))
+            result = compact_scene(dense, request, source, report, photos)
         else:
             from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
             from pointsplat_ns.tradeoff.finding import find_scene
@@ -154,6 +156,8 @@ def goal_of(
     """
     if db is ms is mb is None:
         return None
+    if request.photos is not None:
+        raise BudgetError("a search for targets renders the dense scene alone; expected targets or photos, not both")
     from pointsplat_ns.tradeoff.targets import targets_of
 
     targets = targets_of(db, ms, mb, keep, request.prune.sh, request.prune.clean, request.repair.seconds)
@@ -195,6 +199,20 @@ def run_of(scene: Source, views: ViewsInput) -> Path | None:
     """The file or folder whose dataset may have the poses."""
     named = scene if views is None else views
     return Path(named) if isinstance(named, (str, Path)) else None
+
+
+def training_photos(run: Path | None) -> Photos:
+    """The training photos of a run's dataset.
+
+    Raises:
+        SceneError: if there is no run.
+        DataError: if its data is not found.
+    """
+    if run is None:
+        raise SceneError("photos are read from the dataset of a run; expected the path of a run")
+    from pointsplat_ns.nerfstudio_plugin.dataset_views import training_photos
+
+    return training_photos(run)
 
 
 def log(lines: tuple[str, ...]) -> None:

@@ -51,6 +51,7 @@ def compact(
     clean: bool = False,
     effort: Literal["instant", "quick", "thorough"] = "quick",
     seconds: float | None = None,
+    photos: bool = False,
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: Megabytes | None = None,
@@ -94,6 +95,8 @@ def compact(
         effort: length of the repair: no steps (instant), 48 (quick, about as long as merging takes), or 400 (thorough).
         seconds: duration of the repair, in place of --effort; by default none is set. Ctrl-C ends it earlier and writes
             the scene so far.
+        photos: for a run: after the repair also train on the training photos of its dataset, by 400 steps (quick) or
+            4000 (thorough), or for --seconds. Every eighth photo takes part in no step and says whether it helped.
         target_db: search for the smallest file of at least this PSNR against renders of the dense scene. The search
             chooses count, SH degree and repair, in place of --keep and --sh. By default there is no search.
         target_ms: longest time of a frame, milliseconds; by default no limit. Without --target-db, search for the best
@@ -125,6 +128,8 @@ def compact(
     from pointsplat_ns.system.threads import fixed_threads
 
     if is_folder_of_scenes(scene):
+        if photos:
+            raise ps.SceneError(f"{scene}: a folder of scenes; --photos is for one run")
         with fixed_threads(threads):
             compact_folder(
                 scene, output, poses, up, picture, html, dry_run, json_output, keep=keep, refiner=refiner, by=by, sh=sh,
@@ -145,7 +150,7 @@ def compact(
     claim_outputs(written, force, picture, html)
     check_limit(html_limit)
     keep = None if keep is None else in_format_of(keep, output)
-    request = CompactRequest.of(_loaded(refiner), keep, by, sh, clean, RepairBudget(effort, seconds))
+    request = CompactRequest.of(_loaded(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), photos)
     goal = goal_of(request, keep, target_db, target_ms, target_mb, format_to_write(output).budget_suffix)
     with fixed_threads(threads):
         dense, result, quality = compact_source(
@@ -162,6 +167,7 @@ def compact(
         made = {
             "refined": result.accepted,
             "repaired": result.repair_accepted,
+            "photo_psnr": result.photo_psnr,
             "psnr": result.psnr,
             "quality": None if quality is None else asdict(quality),
             "picture": picture,
@@ -170,6 +176,7 @@ def compact(
         print_json({**scene_result(len(dense), result.scene, result.seconds, written), **made})
         return end_if_interrupted(result.interrupted)
     also = ["refined"] * result.accepted + ["repaired"] * result.repair_accepted
+    also += ["trained on photos"] * (result.last.photos is not None)
     print_result(request.prune.by, also, len(dense), result.scene, result.seconds, written, quality)
     if verbose:
         print_distributions(dense, result.scene)

@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pointsplat_ns.compression.acceptance import Comparison, Reason, accept_change
+from pointsplat_ns.compression.photo_repair import SETTINGS as PHOTOS
+from pointsplat_ns.compression.photo_repair import PhotoRepaired, Photos, photo_repair
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import repair
-from pointsplat_ns.compression.requests import CompactRequest
+from pointsplat_ns.compression.requests import CompactRequest, PhotoBudget
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import Closeness, DenseReference
@@ -27,7 +29,7 @@ from pointsplat_ns.views import Views
 class Stage:
     """One stage of compaction: its scene and its figures."""
 
-    name: Literal["prune", "refine", "repair"]
+    name: Literal["prune", "refine", "repair", "photos"]
     scene: Gaussians
     """The scene after the share ``strength`` of the stage; after the whole stage, if it is left out."""
     after: Closeness | None
@@ -44,6 +46,8 @@ class Stage:
     """Duration of a repair."""
     interrupted: bool = False
     """Whether Ctrl-C ended a repair early."""
+    photos: PhotoRepaired | None = None
+    """Figures of optimising against photos."""
 
     @property
     def accepted(self) -> bool:
@@ -123,6 +127,14 @@ class Compacted:
         return self.repaired is not None and self.repaired.accepted
 
     @property
+    def photo_psnr(self) -> float | None:
+        """PSNR of ``scene`` in the photos that no step used, dB; None if it was not trained on photos."""
+        trained = self._stage("photos")
+        if trained is None or trained.photos is None:
+            return None
+        return trained.photos.after if trained.accepted else trained.photos.before
+
+    @property
     def before(self) -> Closeness | None:
         """Errors of ``pruned`` against the reference; None if there are no views."""
         return self.stages[0].after
@@ -163,10 +175,15 @@ class Compacted:
 
 
 def compact_scene(
-    dense: Gaussians, request: CompactRequest, views: ViewSource | None = None, progress: Progress = silent
+    dense: Gaussians,
+    request: CompactRequest,
+    views: ViewSource | None = None,
+    progress: Progress = silent,
+    photos: Photos | None = None,
 ) -> Compacted:
     """Make a scene smaller, refine it if there is a refiner, and repair it for the budget of the request. Scenes of the
-    result are on the device of ``dense``. By default views are sampled in free space.
+    result are on the device of ``dense``. By default views are sampled in free space. With ``photos``, the scene is
+    trained on them last, if the request has a budget for it.
 
     Refinement and repair are accepted by comparing renders with those of the dense scene
     (:mod:`~pointsplat_ns.compression.acceptance`). A requested PSNR (``auto``) is reached before refinement, so that it
@@ -194,6 +211,8 @@ def compact_scene(
     for stage in (_refine, _repair):
         made = stage(_last_kept(stages), at_work, request, judge, views, progress)
         stages += [] if made is None else [made]
+    if photos is not None and request.photos is not None and not request.photos.empty:
+        stages.append(_on_photos(_last_kept(stages), at_work, request.photos, photos, judge, views, progress))
     notes = pruned.notes
     if views.origin and views.text not in notes:
         notes = (views.text, *notes)
@@ -254,3 +273,22 @@ def _repair(
     scene = change.scene if change.reason is None else repaired.scene.to(last.scene.device)
     figures = (repaired.steps, repaired.seconds, repaired.interrupted)
     return Stage("repair", scene, change.closeness, last.after, change.strength, change.reason, *figures)
+
+
+def _on_photos(
+    last: Stage,
+    dense: Gaussians,
+    budget: PhotoBudget,
+    photos: Photos,
+    judge: Comparison | None,
+    views: ViewSource,
+    progress: Progress,
+) -> Stage:
+    """The scene after optimising against photos; arguments as of :func:`_repair`."""
+    progress("training on photos", 0.0)
+    report = functools.partial(progress, "training on photos")
+    trained = photo_repair(last.scene.to(dense.device), dense, photos, views, budget, report)
+    reason = None if trained.after >= trained.before + PHOTOS.min_gain else Reason.SMALL_GAIN
+    after = None if judge is None else judge.reference.closeness(trained.scene)
+    scene, figures = trained.scene.to(last.scene.device), (trained.steps, trained.seconds, trained.interrupted)
+    return Stage("photos", scene, after, last.after, 1.0, reason, *figures, photos=trained)

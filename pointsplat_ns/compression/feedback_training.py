@@ -125,7 +125,7 @@ def roll_out(
     reached: list[Tensor] = []
     for step in range(steps):
         view = scene.view(chosen[step])
-        feedback.observe(gradients_of(now.detach(), view, scene.target(chosen[step]), TRAINING.backend))
+        feedback.observe(gradients_of(now.detach(), view, scene.target(chosen[step]), backend=TRAINING.backend))
         factors = network(feedback.features(now.detach(), step / steps, steps))
         now = feedback.moved(now, factor * rate_factor(step / steps), factors)
         if step + 1 in measured:

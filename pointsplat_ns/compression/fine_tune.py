@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, optimised
+from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, Example, optimised
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer import render
-from pointsplat_ns.views import View, Views
+from pointsplat_ns.views import Views
 
 
 def fine_tune(
@@ -59,9 +59,7 @@ def fine_tune(
     return scene
 
 
-def _examples(
-    views: Views, targets: Gaussians | Sequence[Tensor], like: Gaussians, seed: int
-) -> Iterator[tuple[View, Tensor]]:
+def _examples(views: Views, targets: Gaussians | Sequence[Tensor], like: Gaussians, seed: int) -> Iterator[Example]:
     """Views in random order, each once before any is repeated, and their target images; without end."""
     images: dict[int, Tensor] = {}
     generator = random.Random(seed)
@@ -69,7 +67,7 @@ def _examples(
         for index in reversed(generator.sample(range(len(views)), len(views))):
             if index not in images:
                 images[index] = _target(targets, views, index, like)
-            yield views[index], images[index]
+            yield Example(views[index], images[index])
 
 
 def _target(targets: Gaussians | Sequence[Tensor], views: Views, index: int, like: Gaussians) -> Tensor:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -104,10 +104,18 @@ class Adam:
         return max(self._damping[name], 1e-15)
 
 
+class Example(NamedTuple):
+    """A view and the image that is wanted there."""
+
+    view: View
+    target: Tensor  # [H, W, 3] in [0, 1]
+    mask: Tensor | None = None  # [H, W, 1] bool, the pixels that count; None for all
+
+
 def optimised(
     scene: Gaussians,
     adam: Adam,
-    examples: Iterator[tuple[View, Tensor]],
+    examples: Iterator[Example],
     choose: Callable[[Gaussians], tuple[float, Tensor | None]] = lambda scene: (1.0, None),
 ) -> Iterator[Gaussians]:
     """Yield the scene after each step, without end. Values that are not finite (the logit of opacity 1, the log-scale
@@ -116,15 +124,14 @@ def optimised(
     Args:
         scene: K Gaussians; not changed.
         adam: its averages; made from the same scene.
-        examples: views and their target images (H, W, 3) in [0, 1], without end.
+        examples: views and their target images, without end.
         choose: from the scene before a step to the arguments ``share`` and ``factors`` of :meth:`Adam.moves`. It is
             called after the gradients of the step are computed.
     """
     scene = scene.detach()
     while True:
         with suitable_threads(scene.device):
-            view, target = next(examples)
-            adam.observe(gradients_of(scene, view, target))
+            adam.observe(gradients_of(scene, *next(examples)))
             scene = adam.moved(scene, *choose(scene))
         yield scene
 
@@ -138,7 +145,11 @@ def extent(scene: Gaussians) -> float:
 
 
 def gradients_of(
-    scene: Gaussians, view: View, target: Tensor, backend: Literal["torch", "auto"] = "torch"
+    scene: Gaussians,
+    view: View,
+    target: Tensor,
+    mask: Tensor | None = None,
+    backend: Literal["torch", "auto"] = "torch",
 ) -> dict[str, Tensor]:
     """Gradients of the loss of one view by parameter. A gradient is 0 where it or the value itself is not finite.
 
@@ -146,11 +157,13 @@ def gradients_of(
         scene: K Gaussians.
         view: the camera.
         target: (H, W, 3) target image in [0, 1].
+        mask: (H, W, 1) bool, the pixels that count; None for all.
         backend: the rasterizer, as for :func:`pointsplat_ns.rasterizer.render`.
     """
     leaves = scene.map(lambda value: value.detach().requires_grad_())
     with torch.enable_grad():
-        _loss(render(leaves, view, backend=backend), target).backward()
+        image = render(leaves, view, backend=backend)
+        _loss(*((image, target) if mask is None else (image * mask, target * mask))).backward()
     return {name: _finite_gradient(value) for name, value in leaves.items()}
 
 

@@ -12,14 +12,13 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.compression.feedback import REPAIR, Feedback
-from pointsplat_ns.compression.optimiser import optimised
+from pointsplat_ns.compression.optimiser import Example, optimised
 from pointsplat_ns.compression.requests import STEPS, Effort, RepairBudget
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, shipped_feedback_refiner
 from pointsplat_ns.system.threads import one_thread
-from pointsplat_ns.views import View
 
 __all__ = ["STEPS", "Effort", "RepairBudget", "Repaired", "repair", "rate_factor", "initial_rate_factor"]
 
@@ -91,12 +90,12 @@ def repair(
     return Repaired(scene, steps, time.perf_counter() - start, interrupted)
 
 
-def _examples(dense: Gaussians, views: ViewSource) -> Iterator[tuple[View, Tensor]]:
+def _examples(dense: Gaussians, views: ViewSource) -> Iterator[Example]:
     """Views and renders of the dense scene in them, without end."""
     for view in views.others():
         with torch.no_grad():
             target = render(dense, view)
-        yield view, target
+        yield Example(view, target)
 
 
 def rate_factor(done: float) -> float:

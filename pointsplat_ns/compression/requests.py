@@ -38,6 +38,10 @@ STEPS: dict[Effort, int] = {"instant": 0, "quick": 48, "thorough": 400}
 """Number of repair steps of each effort. "quick" takes about as long as merging 100,000 to a million Gaussians."""
 
 
+PHOTO_STEPS: dict[Effort, int] = {"instant": 0, "quick": 400, "thorough": 4000}
+"""Number of steps on photos of each effort."""
+
+
 def default_device() -> torch.device:
     """CUDA if available, else the CPU."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -60,21 +64,36 @@ class RepairBudget:
             raise PointSplatError(f"the time to repair is {self.seconds:g} s; expected 0 or more")
 
     @property
+    def steps(self) -> int:
+        """Number of steps of the effort."""
+        return STEPS[self.effort]
+
+    @property
     def empty(self) -> bool:
         """Whether the budget has no step."""
-        return self.seconds == 0 if self.seconds is not None else STEPS[self.effort] == 0
+        return self.seconds == 0 if self.seconds is not None else self.steps == 0
 
     def share_done(self, steps: int, seconds: float) -> float:
         """Used share of the budget after ``steps`` steps and ``seconds`` seconds; 1 or more at the end. The budget must
         not be empty."""
-        return seconds / self.seconds if self.seconds is not None else steps / STEPS[self.effort]
+        return seconds / self.seconds if self.seconds is not None else steps / self.steps
 
     def steps_in_all(self, steps: int, done: float) -> int | None:
         """Expected number of steps in the budget, if ``steps`` steps used the share ``done`` of it; None before the
         first step of a budget in seconds."""
         if self.seconds is None:
-            return STEPS[self.effort]
+            return self.steps
         return round(steps / done) if done else None
+
+
+@dataclass(frozen=True)
+class PhotoBudget(RepairBudget):
+    """Length of the optimisation against photos."""
+
+    @property
+    def steps(self) -> int:
+        """Number of steps of the effort."""
+        return PHOTO_STEPS[self.effort]
 
 
 NO_REPAIR = RepairBudget("instant")
@@ -146,6 +165,8 @@ class CompactRequest:
     """None for no refinement."""
     repair: RepairBudget = NO_REPAIR
     """Length of the repair."""
+    photos: PhotoBudget | None = None
+    """Length of the optimisation against photos; None for none."""
 
     @classmethod
     def of(
@@ -156,15 +177,21 @@ class CompactRequest:
         sh: str = "all",
         clean: bool = False,
         repair: RepairBudget = NO_REPAIR,
+        photos: bool = False,
     ) -> CompactRequest:
         """A request from options that may be missing: ``keep`` and ``by`` are then those of the refiner's training;
-        without a refiner, :data:`COMPACT_KEEP` and merging. Errors are those of :class:`PruneRequest`."""
+        without a refiner, :data:`COMPACT_KEEP` and merging. With ``photos``, a number of seconds is for the steps on
+        photos, and the repair is quick. Errors are those of :class:`PruneRequest`."""
         usual_keep, usual_by, weight = COMPACT_KEEP, "merge", None
         if refiner is not None:
             usual_keep, usual_by, weight = refiner.settings.keep, refiner.settings.by, refiner.settings.opacity_weight
         by = usual_by if by is None else by
         weight = weight if method_named(by).weighs_opacity else None
-        return cls(PruneRequest(usual_keep if keep is None else keep, by, sh, weight, clean), refiner, repair)
+        prune = PruneRequest(usual_keep if keep is None else keep, by, sh, weight, clean)
+        if not photos:
+            return cls(prune, refiner, repair)
+        trained = PhotoBudget(repair.effort, repair.seconds)
+        return cls(prune, refiner, repair if repair.seconds is None else RepairBudget(), trained)
 
     @property
     def device(self) -> torch.device:

@@ -9,6 +9,7 @@ from pointsplat_ns.looking.closeness import Closeness
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.compact import Compacted, Stage
+    from pointsplat_ns.compression.photo_repair import PhotoRepaired
 
 _REASONS = {
     Reason.NO_GAIN: "it does not help",
@@ -29,6 +30,8 @@ def verdict_of(result: Compacted) -> str:
 
 
 def _line(stage: Stage, result: Compacted) -> str:
+    if stage.photos is not None:
+        return _photo_line(stage.photos, kept=stage.accepted)
     done = "refined by the network" if stage.name == "refine" else "repaired"
     before, after = stage.before, stage.after
     if stage.reason is Reason.NOT_FINITE:
@@ -46,6 +49,13 @@ def _line(stage: Stage, result: Compacted) -> str:
     if stage.name == "refine" and after.errors == before.errors:
         return f"not {done}, it changes nothing: {before.psnr:.1f} dB PSNR against the dense scene ({before.where})"
     return f"not {done}{cost}, {_REASONS[stage.reason]}: {figures}"
+
+
+def _photo_line(trained: PhotoRepaired, kept: bool) -> str:
+    cost = f"on {trained.used} photos by {trained.steps} steps in {trained.seconds:.1f} s"
+    cost += ", interrupted" if trained.interrupted else ""
+    gain = f"{trained.before:.1f} -> {trained.after:.1f} dB PSNR in {trained.unseen} photos that no step used"
+    return f"trained {cost}: {gain}" if kept else f"not trained {cost}, it does not help: {gain}"
 
 
 def _uncompared(result: Compacted) -> str:

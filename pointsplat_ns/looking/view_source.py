@@ -183,6 +183,18 @@ class ViewSource:
             rest, generator = two_sizes(self._at_resolution(known), self._settings), random.Random(seed)
             for turn, index in enumerate(drawn for _ in counted() for drawn in generator.sample(left, len(left))):
                 yield rest[turn % 2][index]
+        yield from self.sampled(seed)
+
+    def sampled(self, seed: int = 0) -> Iterator[View]:
+        """Sampled views without end, of the sizes of :meth:`others`.
+
+        Args:
+            seed: of the sampler.
+
+        Raises:
+            DataError: if none can be sampled.
+        """
+        compared, known = self.compared(), self.given is not None or self._of_dataset is not None
         at_once, every = self._settings.sampled_at_once, self._settings.opposite_background_every
         for batch in counted(1):
             sampled = dataclasses.replace(
@@ -193,5 +205,5 @@ class ViewSource:
             sizes = two_sizes(sampled, self._settings)
             for turn, index in enumerate(random.Random(batch).sample(range(len(sampled)), len(sampled))):
                 view = sizes[turn % 2][index]
-                opposite = known is None and every > 0 and turn % every == every - 1
+                opposite = not known and every > 0 and turn % every == every - 1
                 yield dataclasses.replace(view, background=1 - view.background) if opposite else view

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
 
+from pointsplat_ns.compression.optimiser import Example
+from pointsplat_ns.compression.photo_repair import Photos
 from pointsplat_ns.errors import DataError, MissingPackageError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.io.runs import open_run, scene_name
@@ -73,6 +76,32 @@ def dataset_photos(path: Path | str, split: Split, count: int) -> tuple[Views, l
     return views, photos
 
 
+def training_photos(path: Path | str) -> Photos:
+    """The training photos of a run's dataset, read when they are asked for. Arguments and errors are those of
+    :func:`dataset_views`; a photo that cannot be used is a DataError when it is asked for."""
+    scene, frames = _open(path, "train")
+    _views_of(scene, frames, "train")
+    return TrainingPhotos(scene, frames)
+
+
+class TrainingPhotos(Sequence[Example]):
+    """Photos of a split, and the views on the CPU that they show once undistorted."""
+
+    def __init__(self, scene: TrainedScene, frames: Frames):
+        self._scene, self._frames = scene, frames
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, index: int) -> Example:  # type: ignore[override]
+        from pointsplat_ns.nerfstudio_plugin.cameras import views_of_cameras
+
+        camera, data = self._frames[index]
+        view = views_of_cameras(camera.to("cpu"), self._scene.background, self._scene.rasterize_mode)[0]
+        photo = data["image"][..., :3]
+        return Example(view, photo.float() / 255 if photo.dtype == torch.uint8 else photo.float(), data.get("mask"))
+
+
 def _open(path: Path | str, split: Split) -> tuple[TrainedScene, Frames]:
     """The scene of a run, and the frames of a split."""
     run = open_run(path)  # before nerfstudio is imported, which takes seconds
@@ -82,10 +111,10 @@ def _open(path: Path | str, split: Split) -> tuple[TrainedScene, Frames]:
         raise DataError(str(error)) from error
     import_nerfstudio()
 
-    from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
+    from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache, free_memory_share
     from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
-    scene = TrainedScene(scene_name(run), run, MemoryCache(0))
+    scene = TrainedScene(scene_name(run), run, MemoryCache(free_memory_share()))
     return scene, scene.train_frames if split == "train" else scene.eval_frames
 
 

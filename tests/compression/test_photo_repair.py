@@ -1,0 +1,152 @@
+"""Training a smaller scene on photos: what it gains where no step looked, which pixels count, and how it ends."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import random
+
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from pointsplat_ns.compression import photo_repair as module
+from pointsplat_ns.compression.compact import compact_scene
+from pointsplat_ns.compression.optimiser import Example, gradients_of
+from pointsplat_ns.compression.photo_repair import every_kth_pixel, photo_repair
+from pointsplat_ns.compression.requests import PHOTO_STEPS, CompactRequest, PhotoBudget, RepairBudget
+from pointsplat_ns.errors import BudgetError, DataError, SceneError
+from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.pruning import prune
+from pointsplat_ns.rasterizer import render
+from pointsplat_ns.views import EPS2D
+
+CPU = torch.device("cpu")
+
+
+class Few(ViewSource):
+    """Fresh views of 48 x 36 pixels."""
+
+    def sampled(self, seed: int = 0):
+        for number in itertools.count(1):
+            yield from sample_views(self._scene, 8, 48, 36, seed=number)
+
+
+@pytest.fixture(autouse=True)
+def few_steps(monkeypatch):
+    monkeypatch.setitem(PHOTO_STEPS, "quick", 40)
+
+
+@pytest.fixture(scope="module")
+def pruned(hollow_ball):
+    return prune(hollow_ball, 300, "merge")
+
+
+@pytest.fixture(scope="module")
+def photos(hollow_ball):
+    """Photos of the ball in other colours than the dense scene has: only photos can teach them."""
+    views = sample_views(hollow_ball, 18, 48, 36, seed=5)
+    photographed = hollow_ball.replace(features_dc=hollow_ball.features_dc + 0.4)
+    return [Example(view, render(photographed, view).detach()) for view in views]
+
+
+def test_photos_teach_what_the_dense_scene_does_not_know(hollow_ball, pruned, photos):
+    before, shares = [value.clone() for value in pruned.tensors()], []
+    trained = photo_repair(pruned, hollow_ball, photos, Few(hollow_ball), PhotoBudget("quick"), shares.append)
+    assert trained.after > trained.before + 1
+    assert (trained.used, trained.unseen, trained.steps) == (15, 3, 40) and not trained.interrupted
+    assert len(trained.scene) == 300 and bool(trained.scene.usable().all())
+    assert all(torch.equal(a, b) for a, b in zip(before, pruned.tensors(), strict=True)), "the input was changed"
+    assert shares == pytest.approx([(step + 1) / 40 for step in range(40)])
+
+
+def test_unseen_photos_and_held_back_pixels_are_in_no_step(hollow_ball, pruned, photos, monkeypatch):
+    taken = []
+    monkeypatch.setattr(
+        module, "every_kth_pixel", lambda photo, *rest: taken.append(id(photo)) or every_kth_pixel(photo, *rest)
+    )
+    photo_repair(pruned, hollow_ball, photos, Few(hollow_ball), PhotoBudget("quick"))
+    unseen = {id(photo) for photo in photos[::8]}
+    assert taken[:3] == [id(photo) for photo in photos[::8]]  # compared before the first step
+    # 30 of 40 steps take a photo, 1 of 4 a render of the dense scene; the rest are comparisons.
+    assert sum(photo not in unseen for photo in taken) == 30
+
+
+def test_the_scene_that_is_best_in_unseen_photos_is_the_result(hollow_ball, pruned, photos, monkeypatch):
+    """Steps that are far too long harm: the scene stays as it was."""
+    monkeypatch.setattr(module, "SETTINGS", dataclasses.replace(module.SETTINGS, faster=1e4, last_factor=1.0))
+    trained = photo_repair(pruned, hollow_ball, photos, Few(hollow_ball), PhotoBudget("quick"))
+    assert trained.scene is pruned and trained.after == trained.before
+
+
+def test_ctrl_c_gives_the_best_scene_so_far(hollow_ball, pruned, photos):
+    def stop(share: float) -> None:
+        if share > 0.6:
+            raise KeyboardInterrupt
+
+    trained = photo_repair(pruned, hollow_ball, photos, Few(hollow_ball), PhotoBudget("quick"), stop)
+    assert trained.interrupted and trained.steps == 25 and trained.after > trained.before + 0.5
+
+
+def test_seconds_end_it(hollow_ball, pruned, photos):
+    trained = photo_repair(pruned, hollow_ball, photos, Few(hollow_ball), PhotoBudget(seconds=0.3))
+    assert trained.steps >= 1 and trained.seconds >= 0.3
+
+
+def test_one_photo_is_too_few(hollow_ball, pruned, photos):
+    with pytest.raises(DataError, match="1 photos to train on; expected at least two"):
+        photo_repair(pruned, hollow_ball, photos[:1], Few(hollow_ball), PhotoBudget("quick"))
+
+
+@pytest.mark.parametrize("generator", [None, random.Random(3)])
+def test_every_kth_pixel_of_a_photo_is_what_its_view_draws(hollow_ball, generator):
+    view = sample_views(hollow_ball, 1, 159, 120, seed=2)[0]
+    whole = Example(view, render(hollow_ball, view).detach(), torch.rand(120, 159, 1) < 0.5)
+    part = every_kth_pixel(whole, 53, CPU, generator)
+    assert (part.view.width, part.view.height, part.view.eps2d) == (53, 40, EPS2D / 9)
+    assert part.target.shape == (40, 53, 3) and part.mask is not None and part.mask.shape == (40, 53, 1)
+    # 3DGS bounds the projection at 1.3 times the picture, whose middle moves a little.
+    assert float((render(hollow_ball, part.view) - part.target).abs().mean()) < 2e-4
+    assert float(part.target.std()) > 0.05
+    assert every_kth_pixel(whole, 100, CPU).target.shape == (120, 159, 3)
+
+
+def test_masked_pixels_neither_pull_nor_count(hollow_ball, pruned, photos):
+    mask = torch.zeros(36, 48, 1, dtype=torch.bool)
+    mask[:, :24] = True
+    wrong = [photo._replace(target=torch.where(mask, photo.target, 1 - photo.target), mask=mask) for photo in photos]
+    right = [photo._replace(mask=mask) for photo in photos]
+    first, second = (gradients_of(pruned, *some[1]) for some in (wrong, right))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert any(float(value.abs().max()) > 0 for value in first.values())
+    assert module._psnr(pruned, wrong, [0, 8]) == module._psnr(pruned, right, [0, 8])
+
+
+def test_compact_says_what_photos_brought(hollow_ball, photos):
+    request = CompactRequest.of(keep=0.2, repair=RepairBudget("quick"), photos=True)
+    request = dataclasses.replace(request, repair=RepairBudget("instant"))
+    result = compact_scene(hollow_ball, request, Few(hollow_ball, resolution=(64, 48)), photos=photos)
+    assert result.last.name == "photos" and result.photo_psnr == result.last.photos.after
+    assert "trained on 15 photos by 40 steps in" in result.verdict
+    assert "dB PSNR in 3 photos that no step used" in result.verdict
+    assert len(result.scene) == 300
+
+
+def test_a_number_of_seconds_is_for_the_photos():
+    request = CompactRequest.of(repair=RepairBudget(seconds=60), photos=True)
+    assert request.repair == RepairBudget("quick") and request.photos == PhotoBudget(seconds=60)
+    assert CompactRequest.of(repair=RepairBudget(seconds=60)).photos is None
+
+
+def test_a_run_is_compacted_with_its_photos(trained_walls):
+    (config,) = (trained_walls / "wall-a").rglob("config.yml")
+    result = ps.compact(config.parent, "50%", effort="quick", photos=True)
+    assert result.stages[-1].name == "photos" and result.photo_psnr > 5
+    with pytest.raises(BudgetError, match="expected targets or photos"):
+        ps.compact(config.parent, photos=True, target_db=20)
+
+
+def test_photos_of_no_run_are_asked_for(hollow_ball):
+    with pytest.raises(SceneError, match="expected the path of a run"):
+        ps.compact(hollow_ball, "50%", photos=True)
