@@ -117,7 +117,7 @@ def compact_source(
         if goal is None:
             from pointsplat_ns.compression.compact import compact_scene
 
-            photos = None if request.photos is None else training_photos(run_of(scene, views))
+            photos = None if request.photos is None else training_photos(run_of(scene, None))
             result = compact_scene(dense, request, source, report, photos)
         else:
             from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of

@@ -211,7 +211,8 @@ def compact_scene(
     for stage in (_refine, _repair):
         made = stage(_last_kept(stages), at_work, request, judge, views, progress)
         stages += [] if made is None else [made]
-    if photos is not None and request.photos is not None and not request.photos.empty:
+    stopped = any(stage.interrupted for stage in stages)
+    if photos is not None and request.photos is not None and not request.photos.empty and not stopped:
         stages.append(_on_photos(_last_kept(stages), at_work, request.photos, photos, judge, views, progress))
     notes = pruned.notes
     if views.origin and views.text not in notes:
