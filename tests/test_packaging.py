@@ -34,6 +34,7 @@ SHIPPED = (
     "pointsplat_ns/pruning/merging/matching.cpp",
     "pointsplat_ns/pruning/merging/pair_cost.cpp",
     "pointsplat_ns/pruning/merging/regrouping.cpp",
+    "pointsplat_ns/pruning/merging/replacement.cpp",
     "pointsplat_ns/rasterizer/compiled/blending.cpp",
     "pointsplat_ns/rasterizer/compiled/colors.cpp",
     "pointsplat_ns/rasterizer/compiled/projection.cpp",
