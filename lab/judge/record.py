@@ -208,7 +208,8 @@ because a judged scene had shown the need; their constants come from scenes for 
 fill, and views look from enclosed places of what is no room as a whole (both apt_kitchen_balcony).
 [benchmarks.md](../benchmarks.md#scenes) says where the scenes come from.
 The network that sets the steps of `compact` was trained on {", ".join(LEARNED)}.
-Rows of captures are older than those of splats: merging sampled 48 views then, 24 now."""
+Rows of captures are older than those of splats: merging sampled 48 views then, 24 now, and a
+repair saw pictures of one size."""
 
 UNLEARNED = f"""The gain of `compact` over `prune` in dB without {", ".join(LEARNED)}, in brackets with them."""
 
