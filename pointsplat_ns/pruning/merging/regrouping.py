@@ -60,7 +60,7 @@ class Members:
             scene.means[rows].double(),
             cov,
             in_pieces(masses, torch.arange(len(rows))),
-            bounded_colours(scene.features_dc[rows], settings).float(),
+            bounded_colours(scene.features_dc[rows], settings),
         )
 
     def __len__(self) -> int:

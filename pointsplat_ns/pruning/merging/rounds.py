@@ -21,7 +21,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.content import views_in_units
 from pointsplat_ns.looking.sampling import views_in_scene_units
-from pointsplat_ns.looking.sizes import RESOLUTION, RendersOfSizes
+from pointsplat_ns.looking.sizes import RESOLUTION, RendersOfSizes, sides_of
 from pointsplat_ns.pruning.duplicates import Copies, Reduced
 from pointsplat_ns.pruning.merging.finishing import Finish, best_finish
 from pointsplat_ns.pruning.merging.groups import Groups, merged_groups
@@ -247,8 +247,10 @@ def _reference(
     dense: Callable[[], Gaussians],
     settings: MergeSettings,
 ) -> RendersOfSizes | None:
-    """Windows of renders that results are compared with, of ``count`` Gaussians ``dense``; None if they are too many or
-    there are no viewpoints."""
+    """Renders that results are compared with, of ``count`` Gaussians ``dense``, in the smallest pictures and the largest;
+    None if they are too many or there are no viewpoints."""
     if viewpoints is None or count > settings.max_count_rendered or settings.finish_views < 1:
         return None
-    return RendersOfSizes(participants.in_units(dense()), viewpoints.views.spread(settings.finish_views))
+    views = viewpoints.views.spread(settings.finish_views)
+    sides = sides_of(views.width, views.height)
+    return RendersOfSizes(participants.in_units(dense()), views, sorted({sides[0], sides[-1]}))

@@ -57,8 +57,8 @@ def initial_state(participants: Participants, weights: Tensor, settings: MergeSe
 
 
 def bounded_colours(coefficients: Tensor, settings: MergeSettings) -> Tensor:
-    """SH coefficients in colour units, within ``max_colour``, float64."""
-    return (coefficients.double() * SH_C0).clamp_(-settings.max_colour, settings.max_colour)
+    """SH coefficients in colour units, within ``max_colour``, float32."""
+    return (coefficients.float() * SH_C0).clamp_(-settings.max_colour, settings.max_colour)
 
 
 def _principal_colours(scene: Gaussians, members: Tensor, settings: MergeSettings) -> Tensor:
@@ -69,13 +69,16 @@ def _principal_colours(scene: Gaussians, members: Tensor, settings: MergeSetting
         parts = scene.features_dc[rows], scene.features_rest[rows].reshape(len(rows), -1)
         return bounded_colours(torch.cat(parts, dim=1), settings)
 
+    pieces = members.split(CHUNK)
     width = 3 + 3 * scene.features_rest.shape[1]
+    shift = coefficients(pieces[0]).mean(0)  # near the mean, so that float32 holds the squares
     total, products = torch.zeros(width, dtype=torch.float64), torch.zeros(width, width, dtype=torch.float64)
-    for rows in members.split(CHUNK):
-        values = coefficients(rows)
+    for rows in pieces:
+        values = coefficients(rows) - shift
         total += values.sum(0)
         products += values.T @ values
     mean = total / len(members)
     covariance = products - len(members) * mean[:, None] * mean
-    axes = torch.linalg.eigh(covariance).eigenvectors[:, -settings.colour_axes :]
-    return in_pieces(lambda rows: (coefficients(rows) - mean) @ axes, members, axes.shape[1], dtype=torch.float32)
+    axes = torch.linalg.eigh(covariance).eigenvectors[:, -settings.colour_axes :].float()
+    middle = (shift + mean).float()
+    return in_pieces(lambda rows: (coefficients(rows) - middle) @ axes, members, axes.shape[1], dtype=torch.float32)

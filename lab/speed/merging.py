@@ -1,0 +1,123 @@
+"""CPU time of the parts of merging, by compiled kernels and in torch, and of the whole.
+
+    python -m lab.speed.merging                              # synthetic room of 100,000
+    python -m lab.speed.merging scenes/bouquet.ply --json merging.json
+
+Each part is timed on the state before the first round, on one thread, in CPU seconds, kernels and torch in turns; each
+costs as much again in the rounds that follow, in proportion to what remains. Compare figures of one run, by their
+ratios.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+
+from lab.common.printing import console, number, start, table
+from lab.common.results import Row, write_json
+from lab.common.scenes import KEEP, room
+from lab.common.timing import now, peak_extra_bytes, seconds_of, timed, use_cpu_time
+from lab.common.ways import count_of
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.neighbours import other_neighbours
+from pointsplat_ns.io import read_scene
+from pointsplat_ns.pruning.merging import DEFAULTS, merge
+from pointsplat_ns.pruning.merging.matching import cheapest_pairs
+from pointsplat_ns.pruning.merging.pair_cost import pair_costs
+from pointsplat_ns.pruning.merging.participants import Participants
+from pointsplat_ns.pruning.merging.regrouping import Members, best_groups, moments
+from pointsplat_ns.pruning.merging.replacement import replace_pairs
+from pointsplat_ns.pruning.merging.state import initial_state
+from pointsplat_ns.pruning.merging.viewpoints import sampled_viewpoints
+from pointsplat_ns.rasterizer import pixels_of
+
+Part = Callable[[bool], object]
+
+
+def parts_of(scene: Gaussians) -> dict[str, Part]:
+    """The parts of merging, by name, as functions of whether they use compiled kernels."""
+    participants = Participants.of(scene, scene.usable().nonzero()[:, 0])
+    state = initial_state(participants, torch.ones(len(participants)), DEFAULTS)
+    near = other_neighbours(state.means, DEFAULTS.neighbours)
+    costs = pair_costs(state, near)
+    first, second = cheapest_pairs(near, costs, int(DEFAULTS.round_share * len(state)))
+    members, count = Members.of(scene, participants.members), count_of(KEEP, len(state))
+    group = torch.arange(len(state)) * count // len(state)  # neighbours along the curve
+    groups = moments(members, group, count)
+    parts: dict[str, Part] = {
+        "neighbours": partial(other_neighbours, state.means, DEFAULTS.neighbours),
+        "costs of pairs": lambda compiled: pair_costs(state, near, compiled=compiled),
+        "matching": lambda compiled: cheapest_pairs(near, costs, len(first), compiled=compiled),
+        "replacement": lambda compiled: replace_pairs(state, first, second, DEFAULTS, compiled),
+        "choice of groups": lambda compiled: best_groups(members, group, groups, compiled=compiled),
+    }
+    whole = participants.in_units(scene)
+    if viewpoints := sampled_viewpoints(whole, 1920, 1080, DEFAULTS):
+        view = viewpoints.views.resized(DEFAULTS.visibility_side)[0]
+        parts["visible pixels, a view"] = lambda compiled: pixels_of(whole, view, compiled)
+    return parts
+
+
+def measured(scene: Gaussians, repeats: int, budget: float) -> tuple[list[Row], Row]:
+    """Seconds of each part, and of the whole with its peak memory."""
+    functions = {}
+    for name, part in parts_of(scene).items():
+        for compiled in (True, False):
+            key = f"{name}/{compiled}"
+            functions[key] = lambda key=key, part=part, on=compiled: {key: seconds_of(lambda: part(on))}
+    seconds = timed(functions, repeats, budget)
+    names = dict.fromkeys(key.rpartition("/")[0] for key in seconds)
+    rows: list[Row] = [
+        {"part": name, "seconds": seconds[f"{name}/True"], "seconds_torch": seconds[f"{name}/False"]} for name in names
+    ]
+    begin = now()
+    peak = peak_extra_bytes(lambda: merge(scene, count_of(KEEP, len(scene))), torch.device("cpu"))
+    return rows, {"seconds": now() - begin, "peak_bytes": peak}
+
+
+@torch.no_grad()
+def main(
+    scene: tyro.conf.Positional[Path | None] = None,
+    gaussians: int = 100_000,
+    repeats: int = 3,
+    budget: float = 120.0,
+    json_path: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
+) -> None:
+    """Print what the parts of merging take.
+
+    Args:
+        scene: a PLY; by default a synthetic room.
+        gaussians: size of the room.
+        repeats: rounds of measurements, of which medians are taken.
+        budget: seconds after which no further round begins.
+        json_path: write the figures there.
+    """
+    use_cpu_time()
+    torch.set_num_threads(1)
+    dense = room(gaussians) if scene is None else read_scene(scene)
+    rows, whole = measured(dense, repeats, budget)
+    n = len(dense)
+    write_json(json_path, {"gaussians": n, "sh_degree": dense.sh_degree, "parts": rows, "whole": whole})
+    lines = [
+        [
+            row["part"],
+            *(number(2, 1e6 / n)(row[key]) for key in ("seconds", "seconds_torch")),
+            number(1)(row["seconds_torch"] / row["seconds"]),
+        ]
+        for row in rows
+    ]
+    heads = ("part", "kernels, us a Gaussian", "torch, us a Gaussian", "ratio")
+    console().print(table(f"merging {n:,} Gaussians, the first round, CPU time of one thread", heads, lines))
+    memory = (
+        "" if whole["peak_bytes"] is None else f", {whole['peak_bytes'] / n:,.0f} bytes a Gaussian beyond the scene"
+    )
+    print(f"whole, to {KEEP:.0%}: {whole['seconds']:.1f} CPU s{memory}")
+
+
+if __name__ == "__main__":
+    start(main)
