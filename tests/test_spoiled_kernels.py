@@ -7,11 +7,16 @@ import shutil
 import pytest
 import torch
 
+from pointsplat_ns.geometry import neighbours
 from pointsplat_ns.metrics import structural_similarity
+from pointsplat_ns.pruning.merging import matching, pair_cost, regrouping, replacement
 from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
 from pointsplat_ns.system.kernels import Kernels
 
-MODULES = (blending, projection, colors, tiles, structural_similarity)
+MODULES = (
+    *(blending, projection, colors, tiles, structural_similarity),
+    *(neighbours, pair_cost, matching, replacement, regrouping),
+)
 
 
 @pytest.mark.skipif(not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="there is no C++ compiler")
@@ -30,7 +35,7 @@ missing = next((module.KERNELS.why_missing for module in MODULES if module.KERNE
     [
         pytest.param(blending, "alpha / (1.0f - alpha)", "alpha", 1, id="a gradient"),
         pytest.param(blending, "-3.5f, -2.5f", "-2.5f, -3.5f", 1, id="two pixels"),
-        pytest.param(blending, "alpha * t : ZERO;", "alpha : ZERO;", 2, id="a weight"),
+        pytest.param(blending, "alpha * t : ZERO;", "alpha : ZERO;", 3, id="a weight"),
         pytest.param(
             projection, "grad_det0 += grad_ratio / s.det * (s.blur / s.det)", "grad_det0 += grad_ratio / s.det", 1,
             id="a projected gradient",
@@ -42,6 +47,12 @@ missing = next((module.KERNELS.why_missing for module in MODULES if module.KERNE
         pytest.param(colors, "grad_rest + task.ids[row] * task.rest_row", "grad_rest", 1, id="a part's gradient"),
         pytest.param(tiles, "level - dy * dy * inverse_yy", "level - dy * inverse_yy", 1, id="which tiles"),
         pytest.param(tiles, "tile_to(y + half_y,", "tile_to(y - half_y,", 1, id="a box"),
+        pytest.param(blending, "weights[k] += drawn ? alpha * t", "weights[k] += drawn ? t", 1, id="visible pixels"),
+        pytest.param(neighbours, "dx * dx + dy * dy", "dx * dx + dy", 1, id="a distance"),
+        pytest.param(pair_cost, "ik = wi * ii + wj * ij", "ik = wi * ii", 1, id="a cost"),
+        pytest.param(matching, "j > i ? (cost", "j < i ? (cost", 1, id="a pair"),
+        pytest.param(replacement, "wj * sj.xy + both * (apart.x * apart.y)", "wj * sj.xy", 1, id="a covariance"),
+        pytest.param(regrouping, "(cov[1] + x * y)", "(cov[1] - x * y)", 1, id="a fit"),
         pytest.param(structural_similarity, "- square + C2;", "+ C2;", 1, id="a variance"),
         pytest.param(structural_similarity, "column - REACH * task.step,", "column,", 1, id="a border's gradient"),
         pytest.param(

@@ -247,7 +247,7 @@ def _reference(
     dense: Callable[[], Gaussians],
     settings: MergeSettings,
 ) -> RendersOfSizes | None:
-    """Renders that results are compared with, of ``count`` Gaussians ``dense``, in the smallest pictures and the largest;
+    """Renders of ``count`` Gaussians ``dense`` that results are compared with, in the smallest and largest pictures;
     None if they are too many or there are no viewpoints."""
     if viewpoints is None or count > settings.max_count_rendered or settings.finish_views < 1:
         return None

@@ -157,6 +157,7 @@ def _as_torch() -> bool:
     footprints = Footprints(means2d, cov2d, det, opacities, depths, cameras, 1, width, height)
     number = footprints.rows * footprints.columns
     grads = random(number, 3, PIXELS), random(number, PIXELS)
+    grads[0][:, 0] = 1.0  # the gradient by the first channel is then the sum of a Gaussian's weights
     drawn = []
     tiles = footprints.tiles(footprints.whole)
     for engine in (blocks, sys.modules[__name__]):
@@ -166,6 +167,8 @@ def _as_torch() -> bool:
         summed = engine.differentiate_region(footprints, tiles, inputs, tape, final, *grads, True)
         drawn.append((image, final, summed, *engine.chain(summed[:, :MOMENTS], cov2d, det, opacities)))
     torchs, ours = drawn
+    torchs += (torchs[2][:, MOMENTS],)
+    ours += (weigh_region(footprints, tiles, inputs_of(means2d, cov2d, det, opacities, colors[:, :0], Quality())),)
     return agreement(ours, torchs, off=1e-3, share=1e-2)  # a pixel at a threshold may fall either way
 
 
