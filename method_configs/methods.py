@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from nerfstudio.plugins.types import MethodSpecification
 
-from pointsplat_ns.nerfstudio_plugin.excepthook import errors_in_one_line
-from pointsplat_ns.nerfstudio_plugin.registration import load_specification
+from pointsplat_ns.nerfstudio_plugin.registration import errors_in_one_line, load_specification
 
 
 def _splatfacto_cpu() -> MethodSpecification:

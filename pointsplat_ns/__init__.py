@@ -21,11 +21,10 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from pointsplat_ns.api import compact, example_room, load, lod, lpips, plot_views, prune, refine
+    from pointsplat_ns.api import compact, example_room, load, lod, plot_views, prune, refine
     from pointsplat_ns.compression.compact import Compacted
-    from pointsplat_ns.compression.distributions import plot_distributions
     from pointsplat_ns.compression.levels import Levels
-    from pointsplat_ns.compression.pictures import plot_comparison
+    from pointsplat_ns.compression.pictures import plot_comparison, plot_distributions
     from pointsplat_ns.compression.placing import place
     from pointsplat_ns.compression.scene_info import SceneInfo, info
     from pointsplat_ns.compression.scene_task import SceneResult
@@ -37,6 +36,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.io.scene import save
     from pointsplat_ns.looking.sampling import sample_views
     from pointsplat_ns.metrics import psnr, ssim
+    from pointsplat_ns.metrics.lpips import lpips
     from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
     from pointsplat_ns.nerfstudio_plugin.measure_tables import measure_tables
     from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import measure_tradeoff
@@ -49,11 +49,10 @@ if TYPE_CHECKING:
     from pointsplat_ns.views import View, Views
 
 _PUBLIC = {
-    "pointsplat_ns.api": ("compact", "example_room", "load", "lod", "lpips", "plot_views", "prune", "refine"),
+    "pointsplat_ns.api": ("compact", "example_room", "load", "lod", "plot_views", "prune", "refine"),
     "pointsplat_ns.compression.compact": ("Compacted",),
-    "pointsplat_ns.compression.distributions": ("plot_distributions",),
     "pointsplat_ns.compression.levels": ("Levels",),
-    "pointsplat_ns.compression.pictures": ("plot_comparison",),
+    "pointsplat_ns.compression.pictures": ("plot_comparison", "plot_distributions"),
     "pointsplat_ns.compression.placing": ("place",),
     "pointsplat_ns.compression.scene_info": ("SceneInfo", "info"),
     "pointsplat_ns.compression.scene_task": ("SceneResult",),
@@ -66,6 +65,7 @@ _PUBLIC = {
     "pointsplat_ns.io.scene": ("save",),
     "pointsplat_ns.filming": ("open_viewer", "render_path"),
     "pointsplat_ns.metrics": ("psnr", "ssim"),
+    "pointsplat_ns.metrics.lpips": ("lpips",),
     "pointsplat_ns.nerfstudio_plugin.dataset_views": ("dataset_views",),
     "pointsplat_ns.nerfstudio_plugin.measure_tables": ("measure_tables",),
     "pointsplat_ns.nerfstudio_plugin.measure_tradeoff": ("measure_tradeoff",),

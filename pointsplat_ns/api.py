@@ -8,9 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Literal
-
-from torch import Tensor
 
 from pointsplat_ns.compacting import Source, compact_source, goal_of, log, prune_source, read_source
 from pointsplat_ns.compression.compact import Compacted
@@ -350,36 +347,6 @@ def plot_views(
     """
     dense, source = read_source(scene, views, resolution, up)
     return draw_views(dense.detach().to("cpu"), source, path)
-
-
-def lpips(pred: Tensor, target: Tensor, net: Literal["alex", "vgg"] = "alex") -> Tensor:
-    """LPIPS, the perceptual distance of images (Zhang et al. 2018).
-
-    torchvision downloads the backbone's weights at the first call, unless the environment variable
-    ``POINTSPLAT_LPIPS_WEIGHTS`` names a folder or file with them.
-
-    Args:
-        pred: (H, W, 3) or (B, H, W, 3), in [0, 1]; at least 31 pixels a side for "alex", 16 for "vgg".
-        target: the same shape.
-        net: the backbone: "alex" as in most papers, "vgg" as in most losses.
-
-    Returns:
-        A scalar, or (B,); 0 for identical images. Differentiable.
-
-    Raises:
-        LpipsUnavailable: if the weights are not available; the text tells the reason.
-        ImageError: if the images cannot be compared.
-
-    Example:
-        >>> import pointsplat_ns as ps
-        >>> room = ps.example_room()
-        >>> image = ps.render(room, ps.sample_views(room, 1)[0])
-        >>> float(ps.lpips(image, image))  # doctest: +SKIP
-        0.0
-    """
-    from pointsplat_ns.metrics.lpips import cached_lpips
-
-    return cached_lpips(net, pred.device)(pred, target)
 
 
 def _is_refiner_run(path: str | Path) -> bool:

@@ -97,20 +97,12 @@ def compact_source(
     progress: bool | Progress = False,
     compared: bool = False,
 ) -> tuple[Gaussians, Compacted, Quality | None]:
-    """Read a scene and compact it; verdicts and notes are logged. Arguments as of :func:`pointsplat_ns.compact`.
-
-    Args:
-        scene: N Gaussians, or the path of a scene.
-        request: options. A search uses only its method and refiner, and decides the rest.
-        goal: the goal of a search; None for no search.
-        views: cameras to compare renders in.
-        resolution: size of the pictures.
-        up: the axis that is up in the scene.
-        progress: True shows a bar; a function is called with the current task and the share of it that is done.
-        compared: compare the result with the dense scene at full size, in the views that no repair uses.
+    """Read a scene and compact it, or search for a goal; verdicts and notes are logged. Arguments as of
+    :func:`pointsplat_ns.compact`. A search uses only the method and the refiner of the request, and decides the rest.
 
     Returns:
-        The dense scene, the result, and if ``compared`` how close both are; None if there are no views.
+        The dense scene, the result, and if ``compared`` how close both are at full size, in the views that no repair
+        uses; None if there are no views.
     """
     dense, source = read_source(scene, views, resolution, up)
     with progress_bar(progress) as report:
@@ -141,19 +133,9 @@ def goal_of(
     mb: float | None,
     suffix: str,
 ) -> Goal | None:
-    """The goal of a search; None if no target is given.
-
-    Args:
-        request: the other options.
-        keep: None if it is not given; a search decides it.
-        db: least PSNR against the dense scene's renders, dB.
-        ms: longest time of a frame, milliseconds.
-        mb: largest file, in units of 10^6 bytes.
-        suffix: suffix of the format whose size counts.
-
-    Raises:
-        BudgetError: if a target is not positive, or an option was given that a search decides.
-    """
+    """The goal of a search, from a PSNR against the dense scene's renders in dB, the time of a frame in milliseconds
+    and the size of a file of a format in units of 10^6 bytes; None if no target is given. Raises BudgetError if a
+    target is not positive, or an option was given that a search decides, such as ``keep``."""
     if db is ms is mb is None:
         return None
     if request.photos is not None:
@@ -167,13 +149,10 @@ def goal_of(
 def read_source(
     scene: Source, views: ViewsInput, resolution: Resolution, up: str | None = None
 ) -> tuple[Gaussians, ViewSource]:
-    """Read the dense scene, and make its source of views. Arguments as of :func:`pointsplat_ns.prune`.
-
-    Raises:
-        SceneError: if a file is missing or damaged, or the scene is a ``pointsplat`` run, which is pruned already.
-        DataError: if a file of cameras is not usable, or most of them see nothing of the scene.
-        PointSplatError: if the resolution or ``up`` is not valid.
-    """
+    """Read the dense scene, and make its source of views. Arguments as of :func:`pointsplat_ns.prune`. Raises
+    SceneError if a file is missing or damaged, or the scene is a ``pointsplat`` run, which is pruned already; DataError
+    if a file of cameras is not usable, or most of them see nothing of the scene; and PointSplatError if the resolution
+    or ``up`` is not valid."""
     size, upward = parse_resolution(resolution), up_named(up)
     if isinstance(views, (str, Path)):
         from pointsplat_ns.io.camera_files import is_camera_file

@@ -5,6 +5,11 @@ one line that names the file, what was found, what was expected and what to do. 
 exits with status 1.
 """
 
+from __future__ import annotations
+
+import importlib
+from typing import Literal
+
 
 def printable(text: str) -> str:
     r"""Text in one line that cannot steer a terminal: every character that is not printable becomes its escape, as in
@@ -84,3 +89,15 @@ class MissingPackageError(PointSplatError):
         ...
         pointsplat_ns.errors.MissingPackageError: training needs nerfstudio, which is not installed
     """
+
+
+def need(package: Literal["nerfstudio"], what: str) -> None:
+    """Raise a MissingPackageError, which says ``what`` needs a package, if it cannot be imported."""
+    try:
+        importlib.import_module(package)
+    except ModuleNotFoundError as error:
+        if error.name != package:  # it is there, and something that it needs is not
+            raise
+        # pip adds what an installed package asks for and lacks.
+        remedy = f"pip install 'pointsplat-ns[{package}]' adds it"
+        raise MissingPackageError(f"{what} needs {package}, which is not installed; {remedy}") from None

@@ -17,7 +17,7 @@ from making import ball, decoded, run_of
 from pointsplat_ns.cli import main
 from pointsplat_ns.geometry.cameras import viewmats_to_opengl
 from pointsplat_ns.looking.opening import opening_views
-from pointsplat_ns.viewing.split_screen import to_uint8
+from pointsplat_ns.viewing.film import to_uint8
 
 SMALL = {"width": 64, "height": 48, "fps": 10}
 

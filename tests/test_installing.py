@@ -24,9 +24,8 @@ from evaluations import evaluation
 from making import REPOSITORY, imports_of
 from pointsplat_ns.cli import demo, main
 from pointsplat_ns.cli.scene_options import claims_until_the_end
-from pointsplat_ns.errors import MissingPackageError
+from pointsplat_ns.errors import MissingPackageError, need
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
-from pointsplat_ns.system.packages import need
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Literal
 
-from pointsplat_ns.tables.splat_transform import NAME, Reducer, SplatTransform
+from pointsplat_ns.tables.making import Reducer, SplatTransform
 
 Way = Literal["prune", "compact", "thorough"]
 
@@ -30,7 +30,7 @@ def programs_of(ways: tuple[Way, ...], splat_transform: tuple[str, ...]) -> list
     for path in splat_transform:
         found = SplatTransform(path)
         if found.missing:
-            raise SystemExit(f"{NAME}: {found.missing}")
+            raise SystemExit(f"{'splat-transform'}: {found.missing}")
         programs += [mode for mode in found.modes if mode.label not in [known.label for known in programs]]
     return programs
 

@@ -34,7 +34,7 @@ from pointsplat_ns.io import read_scene, write_ply
 from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.system.programs import ProgramFailed
 from pointsplat_ns.system.progress import tracked
-from pointsplat_ns.tables.splat_transform import Reducer
+from pointsplat_ns.tables.making import Reducer
 
 LEAST_WIDTH = 20
 """Pixels: a lower picture is smaller than SSIM's window."""

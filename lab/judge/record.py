@@ -23,14 +23,14 @@ from lab.common.scenes import group_of
 from lab.judge.scenes import LPIPS_WIDTH, MEASURES, PHOTOS
 from lab.judge.tables import AHEAD, all_leads, at_order, means
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.tables.splat_transform import NAME
+from pointsplat_ns.tables.making import PEER
 
 ROOT = Path(__file__).parents[2]
 
 OURS = ("prune", "compact")
 """Our ways, as rows call them."""
 
-WAYS = (NAME, *OURS)
+WAYS = (PEER, *OURS)
 """What tables show, in this order; splat-transform is the best of its modes."""
 
 DIGITS = {"seconds": 1, "cpu_seconds": 1, "peak_bytes": -6} | {
@@ -108,7 +108,7 @@ def complete(rows: list[Row]) -> list[Row]:
     result = []
     for same in grouped(rows, lambda row: (row["scene"], row["at"], row["keep"])).values():
         measured = [row for row in same if not row["failed"]]
-        there = {NAME if row["method"].startswith(NAME) else row["method"] for row in measured}
+        there = {PEER if row["method"].startswith(PEER) else row["method"] for row in measured}
         if there >= {*WAYS}:
             result += measured
     return result
@@ -117,9 +117,9 @@ def complete(rows: list[Row]) -> list[Row]:
 def best_peers(rows: list[Row]) -> Iterator[Row]:
     """One row of splat-transform for each scene, width and budget: the best of its modes by each measure, and the costs
     of the mode of the best PSNR."""
-    peers = [row for row in rows if row["method"].startswith(NAME)]
+    peers = [row for row in rows if row["method"].startswith(PEER)]
     for same in grouped(peers, lambda row: (row["scene"], row["at"], row["keep"])).values():
-        found = dict(max(same, key=lambda row: row["covered_psnr"]), method=NAME)
+        found = dict(max(same, key=lambda row: row["covered_psnr"]), method=PEER)
         for name in MEASURES:
             known = [row[name] for row in same if row[name] is not None]
             if known:
@@ -170,10 +170,10 @@ class Figures:
 def page(rows: list[Row], settings: dict[str, Any]) -> str:
     """The page of all tables."""
     figures = Figures(rows)
-    modes = sorted({row["method"] for row in rows if row["method"].startswith(NAME)})
+    modes = sorted({row["method"] for row in rows if row["method"].startswith(PEER)})
     parts = [
         PAGE.format(
-            views=settings["views"], peer=NAME, modes=", ".join(mode.removeprefix(NAME).strip() for mode in modes)
+            views=settings["views"], peer=PEER, modes=", ".join(mode.removeprefix(PEER).strip() for mode in modes)
         ),
         "## Scenes\n\n" + SCENES + "\n\n" + _scene_table(rows, figures),
     ]
@@ -253,7 +253,7 @@ def _lead_table(figures: Figures, at: int | str, column: str) -> str:
                 for text in (f"{mean:+.2f}", f"{least:+.2f} ({scene})")
             ]
             lines.append([_share(keep), *cells])
-    heads = ["kept", f"`prune` over {NAME}", "worst", "`compact` over `prune`", "worst"]
+    heads = ["kept", f"`prune` over {PEER}", "worst", "`compact` over `prune`", "worst"]
     return markdown(heads, lines) if lines else ""
 
 

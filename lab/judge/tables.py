@@ -15,7 +15,7 @@ from lab.common.scenes import JUDGED, TUNING, group_of
 from lab.common.ways import WAYS
 from lab.judge.camera_paths import path_of
 from lab.judge.scenes import MEASURES, PHOTOS
-from pointsplat_ns.tables.splat_transform import NAME
+from pointsplat_ns.tables.making import PEER
 
 COSTS = ("seconds", "cpu_seconds", "peak_bytes")
 """What making a scene smaller took."""
@@ -94,7 +94,7 @@ def leads(rows: list[Row], method: str, rivals: tuple[str, ...] | None) -> list[
     result = []
     for (scene, keep), same in grouped(rows, lambda row: (row["scene"], row["keep"])).items():
         ours = [row for row in same if row["method"] == method]
-        peers = [row for row in same if (row["method"].startswith(NAME) if rivals is None else row["method"] in rivals)]
+        peers = [row for row in same if (row["method"].startswith(PEER) if rivals is None else row["method"] in rivals)]
         lead: Row = {"scene": scene, "keep": keep}
         for column in AHEAD:
             known = [row for row in peers if row[column] is not None]
@@ -152,7 +152,7 @@ def lead_tables(rows: list[Row]) -> Iterator[Table]:
     """For each width, who is ahead of whom by how much, with mean and worst over scenes."""
     by_kind = grouped(all_leads(rows), lambda lead: (lead["method"], lead["at"]))
     for method, rivals in BEHIND.items():
-        over = f"the best mode of {NAME}" if rivals is None else " or ".join(rivals)
+        over = f"the best mode of {PEER}" if rivals is None else " or ".join(rivals)
         for at in sorted({at for found, at in by_kind if found == method}, key=at_order):
             for column, where in AHEAD.items():
                 if known := [lead for lead in by_kind[method, at] if column in lead]:
@@ -168,7 +168,7 @@ def _lead_lines(known: list[Row], column: str, keeps: list[float]) -> Iterator[l
     groups = grouped(known, lambda lead: group_of(lead["scene"]) or "other")
     for group, members in (groups | ({"all": known} if len(groups) > 1 else {})).items():
         for scene, same in grouped(members, lambda lead: lead["scene"]).items() if group != "all" else ():
-            beside = {lead["keep"]: f"{lead[column]:+.2f} {lead[f'{column}_peer'].removeprefix(NAME)}" for lead in same}
+            beside = {lead["keep"]: f"{lead[column]:+.2f} {lead[f'{column}_peer'].removeprefix(PEER)}" for lead in same}
             yield [scene, *(beside.get(keep, "-") for keep in keeps)]
         budgets = grouped(members, lambda lead: lead["keep"])
         means = {keep: fmean(lead[column] for lead in same) for keep, same in budgets.items()}

@@ -17,11 +17,10 @@ import tyro
 from lab.common.printing import start
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.tables.cells import About, Cell
-from pointsplat_ns.tables.figure import medians, plot_figure
-from pointsplat_ns.tables.layout import Layout, Table, figure_medians
+from pointsplat_ns.tables.layout import Layout, Table, figure_medians, markdown_table
 from pointsplat_ns.tables.means import Group, SceneCells
+from pointsplat_ns.tables.outputs import medians, plot_figure
 from pointsplat_ns.tables.ways import OURS
-from pointsplat_ns.tables.writing import markdown_table
 from pointsplat_ns.tradeoff.journal import restored_point
 
 ROOT = Path(__file__).parents[2]

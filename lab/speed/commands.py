@@ -26,7 +26,7 @@ from lab.common.ways import Way, count_of, programs_of
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.system.programs import ProgramFailed
-from pointsplat_ns.tables.splat_transform import Reducer
+from pointsplat_ns.tables.making import Reducer
 
 START = 1000
 """Gaussians of the scene that shows what starting a program costs."""

@@ -11,7 +11,6 @@ import tyro
 from pointsplat_ns.cli.folders import compact_folder
 from pointsplat_ns.cli.printing import (
     Json,
-    Verbose,
     end_if_interrupted,
     print_distributions,
     print_json,
@@ -19,9 +18,9 @@ from pointsplat_ns.cli.printing import (
     scene_result,
     written_size,
 )
-from pointsplat_ns.cli.reading import Megabytes
 from pointsplat_ns.cli.scene_options import (
     Bands,
+    Megabytes,
     Output,
     Poses,
     Resolution,
@@ -66,7 +65,7 @@ def compact(
     jobs: int | None = None,
     shard: str | None = None,
     threads: int | None = None,
-    verbose: Verbose = False,
+    verbose: bool = False,
     json_output: Json = False,
 ) -> None:
     """Make any scene smaller and repair it, or all scenes of a folder. No photos are needed.

@@ -8,8 +8,7 @@ import time
 from pathlib import Path
 
 from pointsplat_ns.cli.printing import written_size
-from pointsplat_ns.cli.reading import Share
-from pointsplat_ns.cli.scene_options import claim_folder, claim_outputs
+from pointsplat_ns.cli.scene_options import Share, claim_folder, claim_outputs
 
 HELD_OUT = "room2"
 """The room without a part in the refiner's training."""
@@ -51,8 +50,8 @@ def demo(
         scene_only: write the scene that ships as room.ply, in this folder, and end.
         force: start over: first remove rooms, trainings and pictures of an earlier demo in the folder.
     """
+    from pointsplat_ns.errors import need
     from pointsplat_ns.nerfstudio_plugin.running import finished
-    from pointsplat_ns.system.packages import need
 
     if scene_only:
         write_example(Path("room.ply"), force)
@@ -78,7 +77,7 @@ def demo(
 def training_folders(output: Path) -> tuple[dict[str, Path], Path]:
     """Folders of the trained scenes by room, and the folder of the trained refiner."""
     from pointsplat_ns.io.runs import REFINER_METHOD
-    from pointsplat_ns.nerfstudio_plugin.commands import SCENE_METHOD, run_folder
+    from pointsplat_ns.nerfstudio_plugin.running import SCENE_METHOD, run_folder
 
     scenes = {name: run_folder(output / "scenes", name, SCENE_METHOD, TIMESTAMP) for name in ROOMS}
     return scenes, run_folder(output / "refiner", "rooms", REFINER_METHOD, TIMESTAMP)
@@ -95,12 +94,7 @@ def write_example(path: Path, force: bool) -> None:
 
 
 def compact_example(output: Path, keep: float) -> None:
-    """Compact the shipped scene, and draw it before and after.
-
-    Args:
-        output: folder for the scene, the smaller one and the image.
-        keep: share of the Gaussians to keep.
-    """
+    """Compact the shipped scene to a share of its Gaussians, and draw it before and after, in a folder."""
     import pointsplat_ns as ps
     from pointsplat_ns.nerfstudio_plugin.running import run
 
@@ -118,19 +112,16 @@ def train_and_judge(
     output: Path, keep: float, scene_steps: int, refiner_steps: int, photos: tuple[int, int, int]
 ) -> None:
     """Train a scene of each of three rooms and a refiner on two of them; evaluate it on the third, and export the
-    third.
-
-    Args:
-        output: folder for all results.
-        keep: share of the Gaussians to keep.
-        scene_steps: training steps of each room.
-        refiner_steps: training steps of the refiner.
-        photos: number of photos of each room, their width and height in pixels.
-    """
-    from pointsplat_ns.nerfstudio_plugin.commands import evaluate_command, train_refiner_command, train_scene_command
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.report import show_report
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.results import read_evaluation
-    from pointsplat_ns.nerfstudio_plugin.running import finished, remove_interrupted, run
+    third. ``photos`` are the number of photos of each room, their width and height in pixels."""
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.report import read_evaluation, show_report
+    from pointsplat_ns.nerfstudio_plugin.running import (
+        evaluate_command,
+        finished,
+        remove_interrupted,
+        run,
+        train_refiner_command,
+        train_scene_command,
+    )
     from pointsplat_ns.rooms import write_room
 
     start = time.perf_counter()
@@ -167,14 +158,8 @@ def train_and_judge(
 
 
 def before_after(views: list[Path], scene: dict, path: Path, rows: int = 3) -> None:
-    """Draw some views with captions: photo, dense, pruned and refined side by side.
-
-    Args:
-        views: images written by ``ns-eval``, each with the four side by side.
-        scene: the scene's part of the evaluation.
-        path: the PNG file to write.
-        rows: number of views, spread over all.
-    """
+    """Draw some views, spread over all, with captions from the evaluation of a scene: photo, dense, pruned and refined
+    side by side, as in the images that ``ns-eval`` wrote."""
     from matplotlib.image import imread
     from numpy import array_split
     from numpy.typing import ArrayLike

@@ -24,19 +24,9 @@ def compact_folder(
     json_output: bool,
     **options,
 ) -> None:
-    """Compact every scene of a folder, and print a table of them.
-
-    Args:
-        folder: the folder.
-        output: the folder for results.
-        poses, up, picture, html, dry_run: options that folders do not support.
-        json_output: print JSON in place of a table.
-        options: further ones of :func:`pointsplat_ns.compact_folder`.
-
-    Raises:
-        SceneError: if an option is for one scene only.
-        PointSplatError: if a scene fails, after all the others.
-    """
+    """Compact every scene of a folder, with further options of :func:`pointsplat_ns.compact_folder`, and print a table
+    of them, or JSON. Raises SceneError if an option is given that is for one scene only, and PointSplatError if a scene
+    fails, after all the others."""
     import pointsplat_ns as ps
     from pointsplat_ns.compression.scene_folder import TABLE_NAME, output_folder
     from pointsplat_ns.system.processes import torchrun_rank

@@ -80,14 +80,7 @@ STATUSES = {
 
 
 def after_help(args: list[str]) -> str:
-    """Text to print after the help that arguments ask for; empty if they ask for none.
-
-    Example:
-        >>> print(after_help(["rooms", "--help"]))
-        examples:
-          # two rooms of 40 photos
-          pointsplat rooms -o rooms --seeds 0 1 --frames 40
-    """
+    """Text to print after the help that arguments ask for; empty if they ask for none."""
     if not {"-h", "--help"} & {*args}:
         return ""
     if args[0] in EXAMPLES:

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from pointsplat_ns.gaussians import Gaussians
 
 Json = Annotated[bool, tyro.conf.arg(name="json")]
-Verbose = bool
 
 _OUTPUT: ContextVar[IO[str] | None] = ContextVar("output", default=None)
 
@@ -46,27 +45,14 @@ def print_json(content: Any) -> None:
 
 
 def end_if_interrupted(interrupted: bool) -> None:
-    """End a command as Ctrl-C does, once the best result so far is written and printed.
-
-    Args:
-        interrupted: whether Ctrl-C ended the work early.
-
-    Raises:
-        KeyboardInterrupt: if so.
-    """
+    """End a command that Ctrl-C interrupted as Ctrl-C does, once the best result so far is written and printed."""
     if interrupted:
         raise KeyboardInterrupt
 
 
 def scene_result(before: int | None, scene: Gaussians, seconds: float, where: Path | None) -> dict[str, Any]:
-    """The JSON values of a result.
-
-    Args:
-        before: number of Gaussians in the dense scene; None if there is no such scene.
-        scene: the resulting scene.
-        seconds: duration.
-        where: the written file; None in a dry run, whose ``bytes`` are those of a PLY.
-    """
+    """The JSON values of a result, from ``before`` Gaussians in the dense scene, if there is one. Without a written
+    file, as in a dry run, ``bytes`` are those of a PLY."""
     from pointsplat_ns.pruning import ply_bytes
 
     return {
@@ -82,17 +68,8 @@ def scene_result(before: int | None, scene: Gaussians, seconds: float, where: Pa
 def print_result(
     by: str, also: list[str], before: int, scene: Gaussians, seconds: float, where: Path | None, quality: Quality | None
 ) -> None:
-    """Print what was done, counts, size of the file and time, and how close the result is to the dense scene.
-
-    Args:
-        by: the method of pruning.
-        also: what was done after it, in order: refined, repaired.
-        before: number of Gaussians in the dense scene.
-        scene: the result.
-        seconds: duration.
-        where: the written file; None in a dry run, whose size is that of a PLY.
-        quality: comparison with the dense scene; None if there are no views.
-    """
+    """Print what was done by a method and ``also`` after it (refined, repaired), counts, size of the file (that of a
+    PLY in a dry run) and time, and how close the result is to the dense scene."""
     from pointsplat_ns.io.files import bytes_text
     from pointsplat_ns.pruning import ply_bytes
 
@@ -127,7 +104,7 @@ def seconds_text(seconds: float) -> str:
 
 def print_distributions(before: Gaussians, after: Gaussians) -> None:
     """Print a table of counts and quantiles, before and after."""
-    from pointsplat_ns.compression.distributions import opacity_quantiles, size_quantiles
+    from pointsplat_ns.compression.pictures import opacity_quantiles, size_quantiles
     from pointsplat_ns.system.terminal import print_table
 
     rows = {

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from pointsplat_ns.cli.printing import (
     Json,
-    Verbose,
     print_distributions,
     print_json,
     print_result,
@@ -46,7 +45,7 @@ def prune(
     dry_run: bool = False,
     force: bool = False,
     threads: int | None = None,
-    verbose: Verbose = False,
+    verbose: bool = False,
     json_output: Json = False,
 ) -> None:
     """Make a scene smaller: merge neighbours, or keep the most important Gaussians. No photos are needed.

@@ -1,15 +1,18 @@
-"""Arguments and output paths that several commands share."""
+"""Arguments and output paths that several commands share, and how counts and sizes are read as people write them."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+from pointsplat_ns.system.quantities import parse_count, parse_megabytes, parse_number
 
 Scene = tyro.conf.Positional[Path]
 Output = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
@@ -20,16 +23,9 @@ Bands = Literal["all", "auto", "0", "1", "2", "3"]
 
 
 def output_beside(scene: Path, suffix: str) -> Path:
-    """The default path of the result.
-
-    Args:
-        scene: the input file or folder.
-        suffix: last part of the result's name.
-
-    Returns:
-        For a file, a path beside it: ``room_pruned.ply`` for ``room.ply``. For a run, a path in its folder:
-        ``pruned.ply``; never in its checkpoint folder, because nerfstudio takes every file there for a checkpoint.
-    """
+    """The default path of the result. For a file, a path beside it: ``room_pruned.ply`` for ``room.ply``. For a run, a
+    path in its folder: ``pruned.ply``; never in its checkpoint folder, because nerfstudio takes every file there for a
+    checkpoint."""
     if scene.is_dir():
         return scene / f"{suffix}.ply"
     if scene.absolute().parent.name == "nerfstudio_models":
@@ -40,11 +36,7 @@ def output_beside(scene: Path, suffix: str) -> Path:
 
 
 def need_one_scene(path: Path) -> None:
-    """Refuse a folder of scenes where a single scene is expected.
-
-    Raises:
-        SceneError: if the path is a folder of scenes.
-    """
+    """Raise a SceneError if the path is a folder of scenes."""
     from pointsplat_ns.errors import SceneError
     from pointsplat_ns.io.scene import ACCEPTED, is_folder_of_scenes
 
@@ -70,17 +62,9 @@ def claims_until_the_end() -> Iterator[None]:
 
 
 def claim_outputs(scene: Path | None, force: bool, png: Path | None = None, html: Path | None = None) -> None:
-    """Check and hold the files that a command is going to write, before its long computations and until it ends.
-
-    Args:
-        scene: a scene, of any writable format; None for none.
-        force: whether existing files may be overwritten.
-        png: a picture; None for none.
-        html: a page; None for none.
-
-    Raises:
-        SceneError: if a path has another suffix, or as :func:`~pointsplat_ns.io.outputs.claimed`.
-    """
+    """Check and hold the files that a command is going to write (a scene of any writable format, a picture, a page),
+    before its long computations and until it ends. Raises SceneError if a path has another suffix, or as
+    :func:`~pointsplat_ns.io.outputs.claimed`."""
     from pointsplat_ns.errors import SceneError
     from pointsplat_ns.io.formats import format_to_write
 
@@ -114,11 +98,7 @@ def claim_folder(folder: Path) -> None:
 
 @contextmanager
 def scene_written(output: Path | None) -> Iterator[None]:
-    """Let errors say that the scene has been written before.
-
-    Args:
-        output: the scene's file; None if none was written.
-    """
+    """Let errors say that the scene has been written before, to ``output`` if that is not None."""
     from pointsplat_ns.errors import PointSplatError
 
     try:
@@ -130,14 +110,7 @@ def scene_written(output: Path | None) -> Iterator[None]:
 
 
 def check_poses(poses: Path | None) -> None:
-    """Check that a path can hold cameras.
-
-    Args:
-        poses: the file or folder; None for none.
-
-    Raises:
-        SceneError: if it is a run or a scene.
-    """
+    """Raise a SceneError if a path cannot hold cameras because it is a run or a scene."""
     if poses is None:
         return
     from pointsplat_ns.errors import SceneError
@@ -181,3 +154,42 @@ def _file_names(path: Path) -> tuple[str, ...]:
     from pointsplat_ns.io.formats import SOG_META, SOG_PARTS
 
     return (path.name, *SOG_PARTS) if path.name == SOG_META else (path.name,)
+
+
+def _spec(metavar: str, parse: Callable[[str], Any]) -> PrimitiveConstructorSpec:
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=metavar,
+        instance_from_str=lambda words: parse(words[0]),
+        is_instance=lambda value: isinstance(value, (int, float)) and not isinstance(value, bool),
+        str_from_instance=lambda value: [f"{value:g}" if isinstance(value, float) else str(value)],
+    )
+
+
+def _share(text: str) -> float:
+    return parse_number(text[:-1]) / 100 if text.endswith("%") else parse_number(text)
+
+
+Share = Annotated[float, _spec("SHARE", _share)]
+"""A share of the Gaussians, such as 0.1 or 10%."""
+
+Megabytes = Annotated[float, _spec("MB", parse_megabytes)]
+"""A size, in units of 10^6 bytes: 12, 12MB, 800kB or 1GB."""
+
+
+def quantities() -> ConstructorRegistry:
+    """A context in which tyro reads numbers as :func:`~pointsplat_ns.system.quantities.parse_number` does."""
+    registry = ConstructorRegistry()
+
+    @registry.primitive_rule
+    def number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+        return _RULES.get(info.type)
+
+    return registry
+
+
+def _float(text: str) -> float:
+    return float(text) if text.lower().lstrip("+-") in ("nan", "inf") else parse_number(text)  # commands refuse them
+
+
+_RULES = {int: _spec("INT", parse_count), float: _spec("FLOAT", _float)}

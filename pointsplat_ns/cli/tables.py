@@ -9,8 +9,7 @@ from typing import Annotated
 import tyro
 
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.reading import Share
-from pointsplat_ns.cli.scene_options import claim_folder
+from pointsplat_ns.cli.scene_options import Share, claim_folder
 
 
 def tables(

@@ -6,8 +6,7 @@ import json
 from typing import TYPE_CHECKING, Literal
 
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.reading import Megabytes
-from pointsplat_ns.cli.scene_options import Output, Poses, Resolution, Scene, Up, check_poses, output_beside
+from pointsplat_ns.cli.scene_options import Megabytes, Output, Poses, Resolution, Scene, Up, check_poses, output_beside
 from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:

@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.distributions import size_quantiles
 from pointsplat_ns.compression.level_errors import (
     Displacement,
     RenderErrors,
@@ -28,6 +27,7 @@ from pointsplat_ns.compression.level_errors import (
 )
 from pointsplat_ns.compression.level_folder import write_levels
 from pointsplat_ns.compression.level_stream import Chunks, write_stream
+from pointsplat_ns.compression.pictures import size_quantiles
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError

@@ -66,12 +66,8 @@ def psnr_of(error: float, covered: float = 1.0) -> float:
     """PSNR over the pixels that a scene covers, dB: all squared error, halos beside the scene included, divided by the
     share of the pixels that it covers. Empty background does not make it better.
 
-    Args:
-        error: mean squared error over all pixels, data range 1.
-        covered: share of the pixels that the dense scene covers, in [0, 1]; where it is 0, all pixels count.
-
-    Returns:
-        inf for no error, NaN for NaN.
+    ``error`` is the mean squared error over all pixels, data range 1. Where the share ``covered``, in [0, 1], is 0, all
+    pixels count. inf for no error, NaN for NaN.
 
     Example:
         >>> psnr_of(0.001), psnr_of(0.001, covered=0.1)

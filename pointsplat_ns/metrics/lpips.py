@@ -302,3 +302,31 @@ def _download(net: Net, target: Path, allowed: bool) -> None:
         raise LpipsUnavailable(f"LPIPS's {net} backbone cannot be downloaded ({why}); {remedy}") from error
     finally:
         socket.setdefaulttimeout(timeout)
+
+
+def lpips(pred: Tensor, target: Tensor, net: Literal["alex", "vgg"] = "alex") -> Tensor:
+    """LPIPS, the perceptual distance of images (Zhang et al. 2018).
+
+    torchvision downloads the backbone's weights at the first call, unless the environment variable
+    ``POINTSPLAT_LPIPS_WEIGHTS`` names a folder or file with them.
+
+    Args:
+        pred: (H, W, 3) or (B, H, W, 3), in [0, 1]; at least 31 pixels a side for "alex", 16 for "vgg".
+        target: the same shape.
+        net: the backbone: "alex" as in most papers, "vgg" as in most losses.
+
+    Returns:
+        A scalar, or (B,); 0 for identical images. Differentiable.
+
+    Raises:
+        LpipsUnavailable: if the weights are not available; the text tells the reason.
+        ImageError: if the images cannot be compared.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> room = ps.example_room()
+        >>> image = ps.render(room, ps.sample_views(room, 1)[0])
+        >>> float(ps.lpips(image, image))  # doctest: +SKIP
+        0.0
+    """
+    return cached_lpips(net, pred.device)(pred, target)

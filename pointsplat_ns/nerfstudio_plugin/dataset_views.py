@@ -12,11 +12,10 @@ from torch import Tensor
 
 from pointsplat_ns.compression.optimiser import Example
 from pointsplat_ns.compression.photo_repair import Photos
-from pointsplat_ns.errors import DataError, MissingPackageError
+from pointsplat_ns.errors import DataError, MissingPackageError, need
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.io.runs import open_run, scene_name
 from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstudio
-from pointsplat_ns.system.packages import need
 from pointsplat_ns.views import Views, spread_indices
 
 if TYPE_CHECKING:
@@ -111,7 +110,7 @@ def _open(path: Path | str, split: Split) -> tuple[TrainedScene, Frames]:
         raise DataError(str(error)) from error
     import_nerfstudio()
 
-    from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache, free_memory_share
+    from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache, free_memory_share
     from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
     scene = TrainedScene(scene_name(run), run, MemoryCache(free_memory_share()))

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.io.files import logger
-from pointsplat_ns.io.runs import may_be_run, name_of, open_run
+from pointsplat_ns.io.runs import Run, may_be_run, name_of, open_run
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
-from pointsplat_ns.nerfstudio_plugin.paper_datasets import paper_dataset
+from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.tables.cells import CELLS
-from pointsplat_ns.tables.making import Tools
+from pointsplat_ns.tables.making import Refiners, Tools
 from pointsplat_ns.tables.means import Group
 from pointsplat_ns.tables.measuring import Measuring
 from pointsplat_ns.tables.outputs import OUTPUTS, write_tables
-from pointsplat_ns.tables.refiners import Refiners
 from pointsplat_ns.tables.scene import OpenedScene, TableOptions, TableScene
 from pointsplat_ns.tables.ways import PROTOCOL
 from pointsplat_ns.tradeoff.judging import JudgedViews
@@ -184,3 +184,22 @@ def _sampled(source: ViewSource, options: TableOptions) -> tuple[JudgedViews, Ju
     """Views alone, to judge in and to train on."""
     held_out = JudgedViews.compared(source, options.views)
     return held_out, JudgedViews(source.views(options.training_views), None, source.origin)
+
+
+def paper_dataset(run: Run) -> str:
+    """The dataset of the paper that a run, opened with its data, was trained on: "Replica" or "ScanNet++"; empty if it
+    is another, or its data is gone."""
+    parser, name = run.dataparser_class.rpartition(".")[2], run.data.name
+    # The scenes of NICE-SLAM's Replica, which the paper follows; it does not say which three it tests on.
+    if parser == "ReplicaDataParserConfig" and re.fullmatch(r"room[0-2]|office[0-4]", name):
+        try:
+            scene = load_replica(run.data, check_sizes=False)
+        except DataError:
+            return ""
+        size = (scene.params.width, scene.params.height)
+        # The rooms that this package makes may have the same names, but not this size and number.
+        return "Replica" if size == (1200, 680) and len(scene) == 2000 else ""
+    ours, theirs = "SeededScanNetppDataParserConfig", "ScanNetppDataParserConfig"
+    if parser in (ours, theirs) and re.fullmatch(r"[0-9a-f]{10}", name) and (run.data / "dslr").is_dir():
+        return "ScanNet++"
+    return ""

@@ -32,13 +32,12 @@ def _environment() -> Environment:
 def page(
     template: str, scripts: tuple[str, ...] = (), *, with_workers: bool = False, connects: bool = False, **values: Any
 ) -> str:
-    """One HTML page with its style, scripts and data in it.
+    """One HTML page with its style, scripts and data in it, from a template that extends ``base.html``.
 
     Its content security policy allows the script and style with the page's hashes and embedded pictures, and no other
     resource. So a text without escaping could run no code.
 
     Args:
-        template: name of a template that extends ``base.html``.
         scripts: names of the scripts, in their order in the page.
         with_workers: allow workers, whose programs are parts of the scripts.
         connects: allow requests to the server that the page comes from.

@@ -37,17 +37,11 @@ def read_png(path: Path, width: int, height: int) -> np.ndarray:
 
 
 def error_map(picture: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """The difference of two pictures at half size, as colours from black over red to white.
+    """The difference of two pictures (H, W, 3) uint8 at half size (rounded up), as colours from black over red to
+    white.
 
     The largest difference of the three channels is averaged over 2 x 2 pixels, which takes a fifth of the bytes, and
-    multiplied by :data:`ERROR_GAIN`.
-
-    Args:
-        picture: (H, W, 3) uint8.
-        reference: the same shape.
-
-    Returns:
-        (ceil(H / 2), ceil(W / 2), 3) uint8; a last odd row or column is averaged with itself.
+    multiplied by :data:`ERROR_GAIN`. A last odd row or column is averaged with itself.
 
     Example:
         >>> import numpy as np
@@ -75,20 +69,9 @@ def error_colors() -> np.ndarray:
 def fit(
     pictures: Sequence[Callable[[], np.ndarray]], limit: int, progress: bool | Progress = False
 ) -> tuple[list[str], str]:
-    """Data URIs of pictures as WebP, at the best quality at which all of them together fit.
-
-    Args:
-        pictures: functions that return (H, W, 3) uint8. They are called again for each quality, so that only one
-            picture at a time takes memory.
-        limit: maximum of the sum of the URIs' lengths, in bytes.
-        progress: show a progress bar.
-
-    Returns:
-        One URI for each picture, and text on the compression.
-
-    Raises:
-        DataError: if they do not fit at the lowest quality.
-    """
+    """Data URIs of pictures as WebP, at the best quality at which all of them together have at most ``limit`` bytes,
+    and text on the compression. Pictures are functions that return (H, W, 3) uint8; they are called again for each
+    quality, so that only one at a time takes memory. Raises DataError if they do not fit at the lowest quality."""
     # A random sample estimates the size, because every twelfth picture may be of one kind.
     sample = random.Random(0).sample(pictures, min(24, len(pictures)))
     for side in (None, 480, 320, 160):  # largest sides, pixels; None keeps the size

@@ -94,14 +94,8 @@ class Features:
 
 
 def gaussian_features(scene: Gaussians, cube: UnitCube, num_rest: int, dtype: torch.dtype) -> Features:
-    """Network input of a scene.
-
-    Args:
-        scene: usable Gaussians (``scene.usable()`` holds for all), N of them.
-        cube: the scene's unit cube, on the scene's device.
-        num_rest: SH coefficients of degree 1 and higher for each colour channel of the network.
-        dtype: floating type of the network.
-    """
+    """Network input of a scene of N usable Gaussians, with its unit cube, for so many SH coefficients of degree 1 and
+    higher a colour channel, in the network's floating type."""
     log_scale_limit, sh_limit = RANGES.log_scale_limit, RANGES.sh_limit
     log_scales = (cube.log_scales(scene.scales) - RANGES.log_scale_centre) / RANGES.log_scale_unit
     logits = scene.opacities.clamp(-RANGES.opacity_limit, RANGES.opacity_limit) / RANGES.opacity_unit

@@ -14,9 +14,8 @@ from torch import Tensor, nn
 
 from pointsplat_ns.refiner.config import RefinerConfig
 from pointsplat_ns.refiner.encoder import make_norm
-from pointsplat_ns.refiner.patches import Order, by_patches
-from pointsplat_ns.refiner.rows import by_rows, rows_at_a_time
-from pointsplat_ns.refiner.sparse_ops import segment_max, segment_mean, submanifold_conv
+from pointsplat_ns.refiner.serialization import Order, by_patches
+from pointsplat_ns.refiner.sparse_ops import by_rows, rows_at_a_time, segment_max, segment_mean, submanifold_conv
 from pointsplat_ns.refiner.structure import GridLevel, Structure
 
 
@@ -46,7 +45,7 @@ class SubmanifoldConv(nn.Module):
 
 class PatchAttention(nn.Module):
     """Multi-head attention within patches of K consecutive points along a curve, see
-    :mod:`~pointsplat_ns.refiner.patches`. With at most K points in all, this is plain attention.
+    :mod:`~pointsplat_ns.refiner.serialization`. With at most K points in all, this is plain attention.
     """
 
     def __init__(self, channels: int, heads: int, patch: int):

@@ -7,13 +7,14 @@ So one sort serves all grids of the network.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.geometry.morton import interleave, spread_bits
+from pointsplat_ns.refiner.sparse_ops import by_rows, permute, rows_at_a_time
 
 
 def curve_codes(coords: Tensor, bits: int, curves: Sequence[str]) -> list[Tensor]:
@@ -100,3 +101,26 @@ def _hilbert_states() -> tuple[Tensor, Tensor]:
             digits.append(sum((bit ^ parity) << (2 - i) for i, bit in enumerate(gray)))
             following.append(states[reached])
     return torch.tensor(digits).view(-1, 8), torch.tensor(following).view(-1, 8)
+
+
+Order = tuple[Tensor, Tensor]
+"""The order of points along a curve and its inverse, (N,) int64 each."""
+
+
+def by_patches(
+    function: Callable[[Tensor], Tensor],  # [P * K, C] -> [P * K, C], each patch by itself
+    x: Tensor,  # [N, C]
+    width: int,  # columns of the widest tensor within the function
+    patch: int = 1,
+    order: Order | None = None,  # None: the order in memory
+) -> Tensor:
+    """``function(x)``. # [N, C]"""
+    patch = max(1, min(patch, len(x)))
+    full = len(x) // patch * patch  # points in whole patches
+    if order is not None:
+        x = permute(x, *order)
+    whole = x if full == len(x) else x[:full]  # a slice of everything would cost a copy in the backward pass
+    out = by_rows(function, whole, rows_at_a_time(width, patch))
+    if full < len(x):
+        out = torch.cat([out, function(x[len(x) - patch :])[full - len(x) :]])
+    return out if order is None else permute(out, order[1], order[0])

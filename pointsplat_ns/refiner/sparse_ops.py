@@ -1,4 +1,4 @@
-"""The sparse operations of the network: permutation, maximum and mean per cluster, submanifold convolution.
+"""The sparse operations of the network: permutation, maximum and mean per cluster, submanifold convolution, pieces.
 
 The first, second and fourth have their own backward. Autograd's backward of a gather accumulates row by row; for a
 permutation or distinct targets a gather is enough. No function allocates more than a few times [N, C].
@@ -6,14 +6,12 @@ permutation or distinct targets a gather is enough. No function allocates more t
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
-
-from pointsplat_ns.refiner.rows import rows_at_a_time
 
 KernelMap = list[tuple[Tensor, Tensor]]
 """Pairs of neighbouring cells, from ``structure.neighbour_pairs``: for each offset in one half of the kernel, the cells
@@ -125,3 +123,30 @@ def segment_mean(
     """Mean over the rows of each cluster. # [size, C]"""
     count = torch.bincount(cluster, minlength=size).to(x.dtype)
     return x.new_zeros(size, x.shape[1]).index_add_(0, cluster, x).div_(count[:, None])
+
+
+MAX_ELEMENTS = 2**20
+"""Largest number of elements of the widest tensor in one call on a CPU: 4 MB in float32."""
+
+
+def rows_at_a_time(width: int, multiple: int = 1) -> int:
+    """Number of rows of ``width`` elements that a CPU computes in one call: a positive multiple of ``multiple``."""
+    return max(1, MAX_ELEMENTS // (width * multiple)) * multiple
+
+
+def by_rows(
+    function: Callable[[Tensor], Tensor],  # [R, Cin] -> [R, Cout], row by row
+    x: Tensor,  # [N, Cin]
+    rows: int,
+) -> Tensor:
+    """``function(x)``, on a CPU computed from ``rows`` rows at a time. # [N, Cout]"""
+    if x.device.type != "cpu" or len(x) <= rows:
+        return function(x)
+    if torch.is_grad_enabled():
+        return torch.cat([function(part) for part in x.split(rows)])
+    first = function(x[:rows])
+    out = first.new_empty(len(x), *first.shape[1:])
+    out[:rows] = first
+    for start in range(rows, len(x), rows):
+        out[start : start + rows] = function(x[start : start + rows])
+    return out

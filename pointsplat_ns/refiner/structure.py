@@ -81,14 +81,10 @@ def structure_key(config: RefinerConfig) -> tuple:
 
 @torch.no_grad()
 def build_structure(scene: Gaussians, config: RefinerConfig) -> Structure:
-    """Levels of a scene.
+    """Levels of a scene of at least one usable Gaussian, by ``grid``, ``strides`` and ``curves`` of the configuration.
 
     Points with equal finest codes (1 / 2^16 of the cube) are ordered by all their parameters, so that the result does
     not depend on the order of the Gaussians.
-
-    Args:
-        scene: at least one usable Gaussian.
-        config: ``grid``, ``strides`` and ``curves`` are used.
     """
     cube = unit_cube(scene.means)
     units = 2**FINE_BITS if config.grid is None else config.grid << STRUCTURE.fixed_grid_bits

@@ -40,13 +40,8 @@ class Room:
 
 
 def make_room(seed: int) -> Room:
-    """The room of a seed: its size, furniture, materials and lights.
-
-    Args:
-        seed: 0 or more; the same seed gives the same room.
-
-    Raises:
-        DataError: if the seed is negative.
+    """The room of a seed, 0 or more: its size, furniture, materials and lights. Raises DataError if the seed is
+    negative.
 
     Example:
         >>> [round(metres, 1) for metres in make_room(3).size]

@@ -9,23 +9,13 @@ from pathlib import Path
 
 @contextmanager
 def claim(path: Path, wait: bool = False) -> Iterator[bool]:
-    """Hold the lock of a file while the context is open.
+    """Hold the lock of a file, whose missing folders are created, while the context is open. Yields whether the lock is
+    held here; always true with ``wait``, for a lock that another process holds.
 
     The operating system holds the lock, so that it ends with the process, however that ends. Between machines this
-    holds as far as the file system that they share passes locks on.
-
-    The file stays. It may be removed only while it is held, and only if whoever gets the lock of the removed file sees
-    that there is nothing left to do.
-
-    Args:
-        path: the lock file. Missing folders are created.
-        wait: wait for a lock that another process holds.
-
-    Yields:
-        Whether the lock is held here; always true with ``wait``.
-
-    Raises:
-        OSError: if the file system has no locks, or the file cannot be written.
+    holds as far as the file system that they share passes locks on. The file stays. It may be removed only while it is
+    held, and only if whoever gets the lock of the removed file sees that there is nothing left to do. Raises OSError if
+    the file system has no locks, or the file cannot be written.
 
     Example:
         >>> import tempfile

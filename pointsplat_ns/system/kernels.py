@@ -1,32 +1,248 @@
-"""Functions of a C++ file of this package: built and tried when first used, and called on several threads."""
+"""Functions of a C++ file of this package: built by the machine's compiler and tried when first used, and called on
+several threads.
+
+Structs and functions are read from the file itself, so that nothing is declared twice. A file shares what stands
+between ``extern "C" {`` and ``}  // extern "C"``: functions, and plain structs of numbers, arrays, pointers and earlier
+structs.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
+import hashlib
+import math
 import os
+import re
+import shutil
+import stat
+import subprocess
+import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 
-from pointsplat_ns.system.declarations import Struct, functions_of, structs_of
-from pointsplat_ns.system.native_code import NativeCodeError, load_native
+_NUMBERS = {
+    "int": (ctypes.c_int, None),
+    "int32_t": (ctypes.c_int32, torch.int32),
+    "int64_t": (ctypes.c_int64, torch.int64),
+    "float": (ctypes.c_float, torch.float32),
+    "double": (ctypes.c_double, torch.float64),
+}
+
+
+class Pointer:
+    """Type of a pointer, which takes contiguous tensors on the CPU, of one dtype or of any, structs, addresses and
+    None."""
+
+    def __init__(self, dtype: torch.dtype | None):
+        self.dtype = dtype
+
+    def address(self, value: Any) -> int | None:
+        """The address of a tensor; None and addresses as they are. Raises TypeError if the tensor has another dtype or
+        device, or is not contiguous."""
+        if value is None or not isinstance(value, torch.Tensor):
+            return value
+        fits = self.dtype is None or value.dtype is self.dtype
+        if not (fits and value.is_cpu and value.is_contiguous()):
+            raise TypeError(
+                f"tensor of {value.dtype} on {value.device} with strides {value.stride()}; expected {self.dtype} on "
+                "the CPU, contiguous"
+            )
+        return value.data_ptr()
+
+    def from_param(self, value: Any) -> Any:
+        """What ctypes passes for an argument."""
+        if value is None or isinstance(value, (int, torch.Tensor)):
+            return ctypes.c_void_p(self.address(value))
+        return ctypes.byref(value) if isinstance(value, ctypes.Structure) else value
+
+
+class Struct(ctypes.Structure):
+    """A struct of a C++ file. :meth:`fill` sets pointers to what :class:`Pointer` takes, and keeps tensors alive."""
+
+    __slots__ = ("kept",)
+    members: ClassVar[dict[str, Pointer | None]] = {}
+    """The type of each field that is a pointer, None for others."""
+
+    def __init__(self, **values: Any):
+        self.kept: dict[str, Any] = {}
+        self.fill(**values)
+
+    def fill(self, **values: Any) -> None:
+        """Set fields. Raises AttributeError if there is no such field, and TypeError if a value does not fit its
+        type."""
+        self.kept.update(values)
+        members = self.members
+        for name, value in values.items():
+            pointer = members.get(name)
+            setattr(self, name, value if pointer is None else pointer.address(value))
+
+
+def structs_of(text: str) -> dict[str, type[Struct]]:
+    """The structs that the text of a C++ file shares, by name. Raises ValueError if a field is of an unknown type."""
+    found: dict[str, type[Struct]] = {}
+    for name, body in re.findall(r"^struct (\w+) \{\n(.*?)^\};", _shared(text), re.M | re.S):
+        members, fields = {}, []
+        for statement in filter(None, map(str.strip, body.split(";"))):
+            for field, kind in _declared(statement, found):
+                members[field] = kind if isinstance(kind, Pointer) else None
+                fields.append((field, ctypes.c_void_p if isinstance(kind, Pointer) else kind))
+        found[name] = type(name, (Struct,), {"__slots__": (), "members": members, "_fields_": fields})
+    return found
+
+
+def functions_of(text: str, structs: dict[str, type[Struct]]) -> dict[str, tuple[Any, list[Any]]]:
+    """Type of the result and types of the arguments of the functions that the text of a C++ file shares, by name, given
+    its structs. Raises ValueError if a type is unknown."""
+    found = {}
+    for result, name, parameters in re.findall(r"^(\w+) (\w+)\(([^)]*)\) \{", _shared(text), re.M):
+        listed = [_declared(parameter, structs) for parameter in filter(None, parameters.split(","))]
+        found[name] = None if result == "void" else _NUMBERS[result][0], [kind for ((_, kind),) in map(list, listed)]
+    return found
+
+
+def _shared(text: str) -> str:
+    """What a C++ file shares, without comments."""
+    return "\n".join(
+        re.sub(r"//.*", "", part) for part in re.findall(r'^extern "C" \{\n(.*?)^\}  // extern "C"', text, re.M | re.S)
+    )
+
+
+def _declared(statement: str, structs: dict[str, type[Struct]]) -> Iterator[tuple[str, Any]]:
+    """Names and types that a statement such as ``const float *a, b[3]`` declares; arrays are flat."""
+    matched = re.fullmatch(r"(?:const )?(\w+)\b(.*)", " ".join(statement.split()))
+    for declarator in matched[2].split(",") if matched else [""]:
+        parts = re.fullmatch(r" ?(\*?) ?(\w+)((?:\[\d+\])*)", declarator)
+        base = matched and ((structs.get(matched[1]), None) if matched[1] in structs else _NUMBERS.get(matched[1]))
+        if not parts or not base:
+            raise ValueError(f"{statement!r}: not a declaration of numbers, arrays, pointers or structs")
+        kind: Any = Pointer(base[1]) if parts[1] else base[0]
+        if parts[3]:  # of several dimensions: all numbers in a row
+            kind = kind * math.prod(map(int, re.findall(r"\d+", parts[3])))
+        yield parts[2], kind
+
+
+CACHE_VARIABLE = "POINTSPLAT_CACHE"
+"""Environment variable with the folder for what is built; by default pointsplat_ns in the user's cache folder."""
+
+_FLAGS = ("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
+
+_SHARED = Path(__file__).with_name("include")
+"""Folder of the headers that several files include."""
+
+
+class NativeCodeError(Exception):
+    """There is no native code; the text says why, in one line."""
+
+
+@functools.cache
+def load_native(source: Path) -> ctypes.CDLL:
+    """Compile a C++ file, which may include headers (``.h``) that lie beside it, unless that was done before, and load
+    it.
+
+    The library lies in a folder of the user's, which others cannot write to, named by a hash of the source, the
+    compiler and the processor. Where no such folder can be had it is built anew for each process. Raises
+    NativeCodeError if there is no compiler, or it fails.
+    """
+    compiler = _compiler()
+    machine, macros = _target(compiler)
+    texts = [file.read_bytes() for file in (source, *sorted(source.parent.glob("*.h")), *sorted(_SHARED.glob("*.h")))]
+    key = hashlib.sha256(b"\0".join([*texts, macros, " ".join((compiler, machine, *_FLAGS)).encode()]))
+    name = f"{source.stem}-{key.hexdigest()[:20]}.so"
+    folder = _cache_folder()
+    with contextlib.ExitStack() as stack:
+        if folder is None:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pointsplat-")))
+        library = folder / name
+        try:
+            if not library.is_file():
+                _build(compiler, machine, source, library)
+            return ctypes.CDLL(str(library))
+        except OSError as error:
+            raise NativeCodeError(f"{library}: {_first_line(str(error))}") from error
+
+
+def _compiler() -> str:
+    """Path of a C++ compiler."""
+    named = os.environ.get("CXX")
+    found = next(filter(None, map(shutil.which, [named] if named else ("c++", "g++", "clang++"))), None)
+    if found is None:
+        raise NativeCodeError(f"CXX is {named}, which is not there" if named else "there is no C++ compiler")
+    return found
+
+
+def _target(compiler: str) -> tuple[str, bytes]:
+    """The flag for this processor, and what the compiler then defines: its version and what the processor can do."""
+    # Flags for code of this very processor: compilers know one or the other.
+    for machine in (
+        "-march=native",
+        "-mcpu=native",
+        "",
+    ):
+        arguments = [compiler, *filter(None, [machine]), "-dM", "-E", "-x", "c++", os.devnull]
+        ran = _run(arguments)
+        if ran.returncode == 0:
+            return machine, ran.stdout
+    raise NativeCodeError(f"{compiler}: {_first_line(ran.stderr.decode(errors='replace'))}")
+
+
+def _build(compiler: str, machine: str, source: Path, library: Path) -> None:
+    """Compile beside and rename, so that a library that is there is whole."""
+    handle, part = tempfile.mkstemp(dir=library.parent, prefix=".", suffix=".part")
+    os.close(handle)
+    try:
+        ran = _run([compiler, *_FLAGS, f"-I{_SHARED}", *filter(None, [machine]), "-o", part, str(source)])
+        if ran.returncode != 0:
+            raise NativeCodeError(f"{compiler}: {_first_line(ran.stderr.decode(errors='replace'))}")
+        os.replace(part, library)
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(part)
+
+
+def _run(arguments: list[str]) -> subprocess.CompletedProcess[bytes]:
+    try:
+        # For a compiler.
+        return subprocess.run(arguments, capture_output=True, stdin=subprocess.DEVNULL, timeout=120.0, check=False)
+    except (OSError, subprocess.SubprocessError) as error:
+        raise NativeCodeError(f"{arguments[0]}: {_first_line(str(error))}") from error
+
+
+def _cache_folder() -> Path | None:
+    """A folder that is the user's alone; None if there is none."""
+    named = os.environ.get(CACHE_VARIABLE)
+    home = os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
+    folder = Path(named) if named else Path(home) / "pointsplat_ns"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        about = folder.stat()
+    except (OSError, RuntimeError):  # the second: a home that is not known
+        return None
+    shared = about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    ours = not hasattr(os, "getuid") or about.st_uid == os.getuid()
+    return folder if ours and not shared and os.access(folder, os.W_OK) else None
+
+
+def _first_line(text: str) -> str:
+    """The first line that says something, cut to a readable length."""
+    return next((line.strip() for line in text.splitlines() if line.strip()), "no reason given")[:200]
+
 
 SEVERAL = 4000
 """Gaussians, or pairs of Gaussian and tile, from which on several threads are faster than one."""
 
 
 class Kernels:
-    """Functions of a C++ file that are faster than torch.
+    """Functions of a C++ file that are faster than torch, for a feature that warnings name by ``what``.
 
-    Args:
-        what: name of the feature, for warnings.
-        source: the file. What it declares is what Python calls, see :mod:`~pointsplat_ns.system.declarations`.
-        agree: whether the functions do what torch does, on a small input, so that no miscompilation passes; it may call
-            them.
+    What the file declares is what Python calls. ``agree`` tells whether
+    the functions do what torch does, on a small input, so that no miscompilation passes; it may call them.
     """
 
     def __init__(self, what: str, source: Path, agree: Callable[[], bool]):
@@ -39,11 +255,7 @@ class Kernels:
 
     @functools.cached_property
     def library(self) -> ctypes.CDLL:
-        """The functions, built if need be.
-
-        Raises:
-            NativeCodeError: if this machine cannot build them.
-        """
+        """The functions, built if need be. Raises NativeCodeError if this machine cannot build them."""
         library = load_native(self.source)
         for name, (result, parameters) in functions_of(self.source.read_text("utf-8"), self.structs).items():
             function = getattr(library, name)
@@ -62,11 +274,8 @@ class Kernels:
         return "" if agree else f"what the compiler made of {self.source.name} does not do what torch does"
 
     def usable(self, wanted: bool | None) -> bool:
-        """Whether to use them.
-
-        Args:
-            wanted: False where they are not wanted; None where a machine without a compiler is no reason for a warning.
-        """
+        """Whether to use them: not if ``wanted`` is False. None means that a machine without a compiler is no reason
+        for a warning."""
         if wanted is False:
             return False
         if self.why_missing and wanted:

@@ -6,36 +6,28 @@ import ctypes
 import sys
 from pathlib import Path
 
-_M_TRIM_THRESHOLD, _M_MMAP_MAX, _M_ARENA_MAX = -1, -4, -8  # of mallopt(3)
-
 
 def keep_freed_memory() -> bool:
-    """Let the process reuse freed memory instead of returning it to the system.
+    """Let the process reuse freed memory instead of returning it to the system; whether the setting was made.
 
     By default glibc maps a new block for every allocation above 32 MB, and the system then clears it page by page. When
     training on a CPU, each step frees and allocates the same large tensors, and this can take more time than the
     arithmetic. The price: the process never returns memory until it ends. Without Linux and glibc, nothing is changed.
-
-    Returns:
-        Whether the setting was made.
     """
-    return _set({_M_MMAP_MAX: 0, _M_TRIM_THRESHOLD: -1})
+    return _set({-4: 0, -1: -1})  # M_MMAP_MAX, M_TRIM_THRESHOLD
 
 
 def share_freed_memory() -> bool:
-    """Let threads that come and go reuse the memory of one another.
+    """Let threads that come and go reuse the memory of one another; whether the setting was made.
 
     By default glibc gives each new thread a place of its own to allocate from, up to eight for each core, and memory
     that was freed there serves no other. Threads that exist keep theirs. Without Linux and glibc, nothing is changed.
-
-    Returns:
-        Whether the setting was made.
     """
-    return _set({_M_ARENA_MAX: 2})  # enough for a thread that draws and the others
+    return _set({-8: 2})  # M_ARENA_MAX: enough for a thread that draws and the others
 
 
 def _set(values: dict[int, int]) -> bool:
-    """Set parameters of glibc's malloc; whether that was possible."""
+    """Set parameters of glibc's malloc by their numbers in mallopt(3); whether that was possible."""
     if not sys.platform.startswith("linux"):
         return False
     try:

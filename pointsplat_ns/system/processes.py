@@ -36,11 +36,8 @@ def torchrun_device() -> torch.device:
 
 
 def connect_torchrun(backend: Literal["gloo", "nccl"] = "gloo") -> None:
-    """Connect the processes that ``torchrun`` started together; does nothing in one alone, or a second time.
-
-    Args:
-        backend: nccl where each process has a GPU of its own.
-    """
+    """Connect the processes that ``torchrun`` started together; does nothing in one alone, or a second time. The
+    backend is nccl where each process has a GPU of its own."""
     if torchrun_rank()[1] == 1 or dist.is_initialized():
         return
     if backend == "nccl":

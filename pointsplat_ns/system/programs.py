@@ -48,14 +48,9 @@ class ProgramFailed(PointSplatError):
 
 
 def run_measured(args: Sequence[str], timeout: float | None = None) -> Usage:
-    """Run a program to its end, without a shell; what it prints is kept for the error.
-
-    Args:
-        args: the program, and what it is given.
-        timeout: seconds after which it is ended, with all that it started.
-
-    Raises:
-        ProgramFailed: if it cannot be started, is killed, takes too long or ends with another status than 0.
+    """Run a program to its end, without a shell; what it prints is kept for the error. After ``timeout`` seconds it is
+    ended, with all that it started. Raises ProgramFailed if it cannot be started, is killed, takes too long or ends
+    with another status than 0.
 
     Example:
         >>> run_measured([sys.executable, "-c", "pass"]).seconds > 0

@@ -28,9 +28,7 @@ def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
     log file, a line from time to time, such as ``[1:30] merging: 45 %, about 1:50 left``: minutes and seconds since the
     beginning, and what is left of the task at hand.
 
-    Args:
-        progress: True shows a bar or writes lines, on standard error; False shows nothing; a function is returned as it
-            is.
+    True shows a bar or writes lines, on standard error; False shows nothing; a function is returned as it is.
     """
     if callable(progress):
         yield progress
@@ -90,12 +88,8 @@ def _lines(stream: IO[str]) -> Iterator[Progress]:
 
 
 def _left(share: float, gained: float, taken: float) -> str:
-    """Time left of a task, in words; empty if nothing can be said.
-
-    Args:
-        share: that is done.
-        gained: the part of it that took the seconds.
-        taken: seconds.
+    """Time left of a task, in words, from the share that is done, and the part of it that took some seconds; empty if
+    nothing can be said.
 
     Example:
         >>> _left(0.25, 0.25, 30.0), _left(0.5, 0.0, 0.0), _left(1.0, 1.0, 30.0)

@@ -11,10 +11,7 @@ _NUMBER = re.compile(r"([+-]?(?:\d{1,3}(?:,\d{3})+|\d+)?(?:\.\d*)?(?:e[+-]?\d{1,
 
 
 def parse_number(text: str) -> float:
-    """A number, with k, M or G for thousands, millions or billions.
-
-    Raises:
-        ValueError: if it is none.
+    """A number, with k, M or G for thousands, millions or billions. Raises ValueError if it is none.
 
     Example:
         >>> parse_number("1e3"), parse_number("1.5M"), parse_number("1,000"), parse_number("0.3")
@@ -30,10 +27,7 @@ def parse_number(text: str) -> float:
 
 
 def parse_count(text: str) -> int:
-    """A whole number, as :func:`parse_number` reads it.
-
-    Raises:
-        ValueError: if it is none.
+    """A whole number, as :func:`parse_number` reads it. Raises ValueError if it is none.
 
     Example:
         >>> parse_count("10k"), parse_count("1.5M")
@@ -46,10 +40,7 @@ def parse_count(text: str) -> int:
 
 
 def parse_megabytes(text: str) -> float:
-    """A size, in units of 10^6 bytes; a number without a unit is in MB.
-
-    Raises:
-        ValueError: if it is none.
+    """A size, in units of 10^6 bytes; a number without a unit is in MB. Raises ValueError if it is none.
 
     Example:
         >>> parse_megabytes("12kb"), parse_megabytes("1GB"), parse_megabytes("12"), parse_megabytes("5000B")

@@ -1,4 +1,4 @@
-"""Pieces of work on several threads, and how many threads torch uses.
+"""The cores of this process, pieces of work on several threads, and how many threads torch uses.
 
 Threads that share one operation wait for one another at its end. Where other programs keep the cores busy, one of them
 is always late, and a step on two threads can take ten times as long as on one. :func:`suitable_threads` therefore uses
@@ -17,12 +17,12 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TypeVar
 
 import torch
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.system.cores import cores
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -95,17 +95,8 @@ def in_threads(function: Callable[[Item], object], items: Sequence[Item]) -> Non
 @contextmanager
 def fixed_threads(count: int | None) -> Iterator[None]:
     """Let torch use so many threads while the context is open, here and in programs that are started, whatever would be
-    chosen; None changes nothing.
-
-    Raises:
-        PointSplatError: if the number is below 1, or above 1024, which is more than machines have cores: the system
-            does not start any number of threads, and torch ends the program then.
-
-    Example:
-        >>> with fixed_threads(1):
-        ...     torch.get_num_threads()
-        1
-    """
+    chosen; None changes nothing. Raises PointSplatError if the number is below 1, or above 1024: the system does not
+    start any number of threads, and torch ends the program then."""
     if count is None:
         yield
         return
@@ -132,10 +123,8 @@ class Load:
     finds threads stalling, up to 8 s, and halves with each other. Threads count as stalling while one of the latest
     three looks says so, as some looks find nothing on a busy machine. A look takes some milliseconds.
 
-    Args:
-        seconds: called with a number of threads and a bound; gives the seconds that a piece of work takes on so many
-            threads, or any time above the bound once that is reached.
-        clock: gives the time, seconds.
+    ``seconds`` is called with a number of threads and a bound; it gives the seconds that a piece of work takes on so
+    many threads, or any time above the bound once that is reached. ``clock`` gives the time, seconds.
     """
 
     def __init__(self, seconds: Callable[[int, float], float], clock: Callable[[], float] = time.monotonic):
@@ -194,16 +183,9 @@ def suitable_threads(device: torch.device | None = None) -> Iterator[None]:
     """Let torch use all its threads while the context is open, or one if they stall just now.
 
     At most as many are used as the process has cores. Nothing is chosen for a GPU, where ``OMP_NUM_THREADS`` is set,
-    nor within another such context. A result must not depend on the choice, which depends on the load: use it for
-    work that gives the same bits on one thread and several, or for which a tolerance is stated.
-
-    Args:
-        device: the device that computes; None for the CPU.
-
-    Example:
-        >>> for image in range(3):
-        ...     with suitable_threads():
-        ...         _ = torch.ones(1000).sum()
+    nor within another such context. A result must not depend on the choice, which depends on the load: use it for work
+    that gives the same bits on one thread and several, or for which a tolerance is stated. A ``device`` of None is the
+    CPU.
     """
     before, outer = torch.get_num_threads(), chosen.most
     on_cpu = device is None or device.type == "cpu"
@@ -218,3 +200,50 @@ def suitable_threads(device: torch.device | None = None) -> Iterator[None]:
     finally:
         torch.set_num_threads(before)
         chosen.most, chosen.settled = outer, False
+
+
+def cores() -> int:
+    """Number of cores that this process may use: as its affinity and the quotas of its control groups (those of a
+    container, for one) allow."""
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quota = cpu_quota()
+    return allowed if quota is None else max(1, min(allowed, int(quota)))
+
+
+@functools.cache
+def cpu_quota(root: Path = Path("/")) -> float | None:
+    """Number of cores that Linux's control groups allow this process, the least of its group and all above; None if
+    there is no limit. ``proc`` and ``sys`` are below ``root``."""
+    try:
+        lines = (root / "proc/self/cgroup").read_text("utf-8").splitlines()
+    except OSError:
+        return None
+    found = []
+    for line in lines:
+        _, controllers, group = (line.split(":", 2) + ["", ""])[:3]
+        if controllers == "":  # version 2
+            top, limit_of = root / "sys/fs/cgroup", _limit_v2
+        elif "cpu" in controllers.split(","):
+            top, limit_of = root / "sys/fs/cgroup" / controllers, _limit_v1
+        else:
+            continue
+        folder = top / group.lstrip("/")
+        # In a container, the group may be named as the host sees it, and be mounted as the top.
+        found += [limit_of(each) for each in (folder, *folder.parents) if each.is_relative_to(top)]
+    return min((limit for limit in found if limit is not None), default=None)
+
+
+def _limit_v2(folder: Path) -> float | None:
+    try:
+        quota, period = (folder / "cpu.max").read_text("utf-8").split()
+        return None if quota == "max" else int(quota) / int(period)
+    except (OSError, ValueError, ZeroDivisionError):
+        return None
+
+
+def _limit_v1(folder: Path) -> float | None:
+    try:
+        quota, period = (int((folder / f"cpu.cfs_{name}_us").read_text("utf-8")) for name in ("quota", "period"))
+        return None if quota <= 0 else quota / period
+    except (OSError, ValueError, ZeroDivisionError):
+        return None

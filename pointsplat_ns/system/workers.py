@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeVar
 
 import torch
 
-from pointsplat_ns.system.cores import cores
+from pointsplat_ns.system.threads import cores
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -41,10 +41,8 @@ def threads_for(jobs: int) -> int:
 
 
 def in_turn(function: Callable[[Item], Result | None], items: Sequence[Item]) -> Generator[Result, None, None]:
-    """The results of a function for each item, made in this process.
-
-    An item whose result is None is tried again later, until it has one.
-    """
+    """The results of a function for each item, made in this process. An item whose result is None is tried again later,
+    until it has one."""
     waiting = _Waiting(items)
     while waiting:
         if (number := waiting.pop()) is None:
@@ -184,11 +182,8 @@ class _Worker(Generic[Item, Result]):
             pass
 
     def take(self) -> Result | None:
-        """What it has made of its item; None if it says only that it is ready.
-
-        Raises:
-            EOFError, OSError: if it has ended.
-        """
+        """What it has made of its item; None if it says only that it is ready. Raises EOFError or OSError if it has
+        ended."""
         result = self.pipe.recv()
         self.ready, self.at = True, None
         return result

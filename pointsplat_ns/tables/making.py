@@ -1,25 +1,39 @@
-"""Makes the scene of a cell, and tells its tools or the reason why it cannot be made."""
+"""Makes the scene of a cell: by this package, by weights that are found by their metadata, or by splat-transform, a
+Node package and the peer of merging. Tells its tools, or the reason why it cannot be made."""
 
 from __future__ import annotations
 
 import functools
+import math
+import re
+import shlex
+import subprocess
 import tempfile
 import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
 from pointsplat_ns.compression.fine_tune import fine_tune
+from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import write_ply
+from pointsplat_ns.io import read_ply, write_ply
+from pointsplat_ns.io.source import source_file
 from pointsplat_ns.pruning import method_named, resolve_keep, score_of, select
+from pointsplat_ns.pruning.scores import DEFAULT_OPACITY_WEIGHT
+from pointsplat_ns.refiner import read_metadata
+from pointsplat_ns.system.programs import ProgramFailed, Usage, run_measured
 from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.tables.refiners import Refiners, Weights
 from pointsplat_ns.tables.scene import OpenedScene, TableOptions
-from pointsplat_ns.tables.splat_transform import SplatTransform
 from pointsplat_ns.tables.ways import PROTOCOL, Network, Way
 from pointsplat_ns.tradeoff.measuring import MadeScene, make
 from pointsplat_ns.tradeoff.settings import DENSE, EFFORTS, Setting
+
+PEER = "splat-transform"
 
 
 class Tools:
@@ -129,3 +143,133 @@ class Maker:
             self._folder = tempfile.TemporaryDirectory()
             write_ply(self.scene.dense, Path(self._folder.name) / "dense.ply")
         return Path(self._folder.name) / "dense.ply"
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """A trained refiner."""
+
+    path: Path
+    """Path as given."""
+    refiner: TrainedRefiner
+    trained_on: frozenset[str]
+    """Names of training scenes; empty if they are not known."""
+
+    @cached_property
+    def digest(self) -> str:
+        """The first 12 hexadecimal digits of the file's SHA-256."""
+        return source_file(self.refiner.source).sha256[:12]
+
+    @property
+    def network(self) -> Network:
+        """Description of the network and its training."""
+        config, settings = self.refiner.network.config, self.refiner.settings
+        weight = settings.opacity_weight
+        if weight is None and method_named(settings.by).weighs_opacity:
+            weight = DEFAULT_OPACITY_WEIGHT
+        return Network(config.encoder, settings.by, weight, config.use_appearance, config.use_position)
+
+    @property
+    def text(self) -> str:
+        """One line that identifies the weights."""
+        return f"weights {self.digest} ({self.network}, keep {self.refiner.settings.keep:g})"
+
+
+class Refiners:
+    """Weights to choose from; paths and errors are those of :func:`pointsplat_ns.load_refiner`."""
+
+    def __init__(self, paths: Sequence[Path]):
+        self.all = tuple(map(_read, paths))
+
+    def find(self, network: Network, share: float, scene: str) -> tuple[Weights | None, str]:
+        """The weights for a row (the needed network, a share of the Gaussians, the name of a scene), or the reason for
+        none. Of several, those with the training budget nearest to ``share`` are taken, by ratio. Weights trained on
+        the scene itself are excluded."""
+        fitting = [weights for weights in self.all if weights.network == network]
+        unseen = [weights for weights in fitting if scene not in weights.trained_on]
+        if unseen:
+            return min(unseen, key=lambda weights: _distance(weights.refiner.settings.keep, share)), ""
+        if fitting:
+            return None, f"its weights ({fitting[0].path}) were trained on this scene"
+        return None, f"no weights were given (--refiners) of a {network}"
+
+
+def _distance(keep: float | int, share: float) -> float:
+    """Distance of a training budget from a share; infinite for budgets in Gaussians."""
+    return abs(math.log(keep / share)) if keep <= 1 else math.inf
+
+
+def _read(path: Path) -> Weights:
+    inside = path / "refiner.safetensors"  # of a finished training; a checkpoint does not name its training scenes
+    file = inside if path.is_dir() and inside.is_file() else path
+    metadata = read_metadata(file) if file.suffix.lower() == ".safetensors" else {}
+    return Weights(path, load_refiner(file), _names(metadata.get("scenes")))
+
+
+def _names(scenes: Any) -> frozenset[str]:
+    """Names of scenes from metadata: a list, or text with commas."""
+    words = scenes.split(",") if isinstance(scenes, str) else scenes if isinstance(scenes, list) else []
+    return frozenset(str(word).strip() for word in words if str(word).strip())
+
+
+@dataclass(frozen=True)
+class Reducer:
+    """A program that reads a PLY and writes a smaller one."""
+
+    label: str
+    command: Callable[[Path, int, Path], list[str]]
+    """The command line for a PLY to read, a number of Gaussians, and a PLY to write."""
+
+    def reduce(self, source: Path, count: int, timeout: float | None = None) -> tuple[Gaussians, Usage]:
+        """Run the program on a PLY, to keep ``count`` Gaussians: the smaller scene, and the cost with reading and
+        writing. No file is left beside the PLY. Raises ProgramFailed if it fails, takes longer than ``timeout`` seconds
+        or writes no file, and SceneError if its file cannot be read."""
+        with tempfile.TemporaryDirectory(dir=source.parent) as folder:
+            target = Path(folder) / "small.ply"
+            args = self.command(source, count, target)
+            usage = run_measured(args, timeout)
+            if not target.is_file():
+                raise ProgramFailed(f"{shlex.join(args)} ended well but wrote no file")
+            return read_ply(target), usage
+
+
+class SplatTransform:
+    """splat-transform on the CPU.
+
+    Attributes:
+        version: such as "3.7.0".
+        missing: the reason why it cannot be run; empty if it can.
+        modes: its modes of decimation: ``--decimate``, and from version 3 on ``--decimate-adaptive``.
+
+    Args:
+        program: the path of the program; by default ``npx --no-install splat-transform`` searches it.
+    """
+
+    def __init__(self, program: str | None = None):
+        self.command = [program] if program else ["npx", "--no-install", PEER]
+        self.version = self.missing = ""
+        self.modes: tuple[Reducer, ...] = ()
+        try:
+            found = subprocess.run(
+                [*self.command, "--version"], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=120
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            self.missing = f"{self.command[0]}: {error.__class__.__name__}"
+            return
+        version = re.search(r"(?:^|\s)v((\d{1,6})\.[\w.+-]{1,40})(?=\s|$)", found.stdout + found.stderr)
+        if found.returncode != 0 or version is None:
+            self.missing = f"{' '.join(self.command)} ended with {found.returncode}; is Node's package installed?"
+            return
+        self.version = version[1]
+        label = f"{PEER} {self.version}"
+        if int(version[2]) < 3:
+            self.modes = (self._mode(label, "--decimate"),)
+        else:
+            adaptive = self._mode(f"{label} adaptive", "--decimate-adaptive")
+            self.modes = (self._mode(f"{label} -d", "--decimate"), adaptive)
+
+    def _mode(self, label: str, option: str) -> Reducer:
+        def command(source: Path, count: int, target: Path) -> list[str]:
+            return [*self.command, "-w", "-g", "cpu", str(source), option, str(count), str(target)]
+
+        return Reducer(label, command)

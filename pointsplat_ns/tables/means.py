@@ -10,8 +10,7 @@ from statistics import fmean
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.tables.cells import CELLS, About, Cell, CellJournal
-from pointsplat_ns.tables.paper import DATASETS
-from pointsplat_ns.tables.ways import DENSE_WAY
+from pointsplat_ns.tables.ways import DATASETS, DENSE_WAY
 from pointsplat_ns.tradeoff.machine import is_busy
 from pointsplat_ns.tradeoff.points import Point, Quality
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import fnmatch
+import functools
 import logging
 import math
 import shlex
-import time
+import subprocess
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from statistics import fmean
 
 import torch
 
@@ -19,7 +19,6 @@ from pointsplat_ns import __version__
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.system.source_version import source_commit
 from pointsplat_ns.tables.cells import About, Cell, CellJournal, distributions, identity
 from pointsplat_ns.tables.making import Maker, Tools
 from pointsplat_ns.tables.scene import OpenedScene, TableScene
@@ -67,7 +66,6 @@ class Measuring:
             )
         self.missing: dict[str, str] = {}
         """Reasons for missing cells, by key."""
-        self._seconds: dict[str, list[float]] = {}
 
     def run(self) -> None:
         """Measure all cells. A cell that cannot be made is left out, with the reason in :attr:`missing`. After Ctrl-C,
@@ -83,13 +81,13 @@ class Measuring:
                 for other in self._work:
                     if other is not work:
                         other.close()
-                self._measure(work, way, share, done, [later.name for _, later, _ in wanted[done + 1 :]])
+                self._measure(work, way, share, done, len(wanted))
         finally:
             for work in self._work:
                 work.close()
 
-    def _measure(self, work: _SceneWork, way: Way, share: float, done: int, later: list[str]) -> None:
-        furthest, of = 0.0, done + 1 + len(later)
+    def _measure(self, work: _SceneWork, way: Way, share: float, done: int, of: int) -> None:
+        furthest = 0.0
 
         def show(what: str, part: float) -> None:
             # Making a scene has several tasks that each start at 0; the total must not fall.
@@ -97,7 +95,7 @@ class Measuring:
             furthest = max(furthest, 0.7 * part if what else 0.7 + 0.3 * part)
             self.progress("measuring", (done + furthest) / of)
 
-        key, start = work.key(way, share), time.perf_counter()
+        key = work.key(way, share)
         before = work.journal.cells.get((way.name, share))
         try:
             with one_at_a_time(self.progress):
@@ -106,16 +104,8 @@ class Measuring:
             self.missing[key] = str(error)
             logger.warning("%s: left out: %s", key, error)
             return
-        self._seconds.setdefault(way.name, []).append(time.perf_counter() - start)
         again = "" if before is None else f"; {_difference(before, cell)}"
-        left = f" ({done + 1} of {of}; {self._minutes(later)} min left)" if later else ""
-        logger.info("%s: %s%s%s", key, _figures(cell.point), again, left)
-
-    def _minutes(self, later: list[str]) -> int:
-        """Expected minutes for more cells, from the means of the same way, or of all ways."""
-        usual = fmean(seconds for measured in self._seconds.values() for seconds in measured)
-        expected = sum(fmean(self._seconds[name]) if name in self._seconds else usual for name in later)
-        return max(1, math.ceil(expected / 60))
+        logger.info("%s: %s%s (%d of %d)", key, _figures(cell.point), again, done + 1, of)
 
 
 class _SceneWork:
@@ -235,3 +225,31 @@ def _difference(before: Cell, now: Cell) -> str:
     if before.made_with != now.made_with:
         return f"before, it was made with {before.made_with}"
     return f"before, it was {_figures(before.point)}"
+
+
+@functools.cache
+def source_commit() -> str:
+    """The git commit of the package's source, 12 digits, with ``+`` where the package was changed since; empty if it
+    runs from no checkout, as when installed.
+
+    Example:
+        >>> source_commit() == "" or len(source_commit().rstrip("+")) == 12
+        True
+    """
+    # Whose checkout it is matters: an installed package may lie within somebody else's.
+    if _git("ls-files", "--error-unmatch", "__init__.py") is None:
+        return ""
+    commit, changes = _git("rev-parse", "HEAD"), _git("status", "--porcelain", "--", ".")
+    if not commit or changes is None:
+        return ""
+    return commit.strip()[:12] + ("+" if changes.strip() else "")
+
+
+def _git(*words: str) -> str | None:
+    """Output of a git command in the package's folder; None if it fails or is not there."""
+    try:
+        command = ["git", "-C", str(Path(__file__).parents[1]), *words]
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=20.0)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout if done.returncode == 0 else None

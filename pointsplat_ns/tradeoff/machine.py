@@ -11,8 +11,8 @@ from pathlib import Path
 
 import torch
 
-from pointsplat_ns.system.cores import cores
 from pointsplat_ns.system.progress import Progress
+from pointsplat_ns.system.threads import cores
 
 LOCK = "pointsplat-measuring.lock"
 """Name of the lock's file, in the folder for temporary files."""

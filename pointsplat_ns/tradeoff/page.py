@@ -1,8 +1,10 @@
-"""Writes the tradeoff of a scene as one HTML file: an interactive front, pictures to compare, a recommendation."""
+"""Writes the tradeoff of a scene as one HTML file: an interactive front, pictures to compare, a recommendation,
+and a flight through scenes, whose files are kept in the folder of the sweep."""
 
 from __future__ import annotations
 
 import functools
+import json
 import math
 from collections.abc import Callable
 from itertools import count, takewhile
@@ -12,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.files import replacing, three_digits
-from pointsplat_ns.pages.flight import SCRIPTS
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import read_text, replacing, three_digits, write_json
+from pointsplat_ns.pages.flight import SCRIPTS, FlightFrame
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.pages.pictures import ERROR_GAIN, error_colors, error_map, fit, read_png
+from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.tradeoff.flights import read_flight_beside
 from pointsplat_ns.tradeoff.front import (
     COSTS,
     METRICS,
@@ -33,6 +36,10 @@ from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, picture_
 
 MAX_BYTES = 10_000_000
 """Largest size of the page in bytes, so that it fits into mails and opens quickly."""
+
+FLIGHT_BYTES = 4_000_000
+"""Largest size of a page's scenes in bytes; the rest of the page is for its pictures."""
+
 
 Picture = Callable[[], np.ndarray]
 
@@ -116,7 +123,22 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
     has_photos = quality_of(sweep.points[0], "photos", "psnr") is not None
     has_lpips = any(quality_of(point, "renders", "lpips") is not None for point in sweep.points)
     rows = [{"key": point.key, "label": point.label, "cells": _cells(point, sweep.points[0])} for point in sweep.points]
-    columns = [name for name in _TITLES if (has_photos or "photos" not in name) and (has_lpips or "lpips" not in name)]
+    titles = {
+        "share": "kept",
+        "gaussians": "Gaussians",
+        "sh_degree": "SH",
+        "bytes": "MB",
+        "speed": "times as fast",
+        "frame_ms": "ms a frame",
+        **{
+            f"{reference}_{metric}": f"{title}, {reference}"
+            for reference in REFERENCES
+            for metric, title in zip(METRICS, ("PSNR dB", "SSIM", "LPIPS"), strict=True)
+        },
+        "seconds": "made in, s",
+        "peak_bytes": "peak memory, GB",
+    }
+    columns = [name for name in titles if (has_photos or "photos" not in name) and (has_lpips or "lpips" not in name)]
     if all(point.peak_bytes is None for point in sweep.points):
         columns.remove("peak_bytes")
     return {
@@ -128,7 +150,7 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
         or fastest_above(sweep.points, above_db, sweep.times_trusted)
         or sweep.points[0],
         "rows": rows,
-        "columns": [(name, _TITLES[name]) for name in columns],
+        "columns": [(name, titles[name]) for name in columns],
         "amplified": ERROR_GAIN,
         "full_level": math.ceil(255 / ERROR_GAIN),
         "within_db": within_db,
@@ -174,24 +196,6 @@ def _group(point: Point) -> str:
     return group if point.drawn == "exact" else f"{group}, drawn {point.drawn}"
 
 
-_TITLES = {
-    "share": "kept",
-    "gaussians": "Gaussians",
-    "sh_degree": "SH",
-    "bytes": "MB",
-    "speed": "times as fast",
-    "frame_ms": "ms a frame",
-    **{
-        f"{reference}_{metric}": f"{title}, {reference}"
-        for reference in REFERENCES
-        for metric, title in zip(METRICS, ("PSNR dB", "SSIM", "LPIPS"), strict=True)
-    },
-    "seconds": "made in, s",
-    "peak_bytes": "peak memory, GB",
-}
-"""Titles of the table's columns, by name."""
-
-
 def _cells(point: Point, dense: Point) -> dict[str, tuple[float | None, str]]:
     """A point for the table: by column, a number to sort by (None: unknown) and its text."""
     speed, ms = speed_of(point, dense), point.frame_ms
@@ -211,3 +215,39 @@ def _cells(point: Point, dense: Point) -> dict[str, tuple[float | None, str]]:
             text = "–" if value is None else "identical" if value == math.inf else f"{value:.{digits}f}"
             cells[f"{reference}_{metric}"] = (value, text)
     return cells
+
+
+def keep_flight(frame: FlightFrame, scene: Gaussians, name: str, path: Path) -> bool:
+    """Write a scene for the page to a file at :func:`~pointsplat_ns.tradeoff.points.flight_path`, under a name, if it
+    is small enough. Returns whether it was written."""
+    if ply_bytes(len(scene), scene.sh_degree) > 20 * FLIGHT_BYTES:  # SPZ in a page has at least a tenth of the bytes
+        return False
+    packed = frame.packed(scene, name)
+    if len(packed["spz"]) > 0.99 * FLIGHT_BYTES:  # the rest is for the views
+        return False
+    write_json(frame.data([packed]), path)
+    return True
+
+
+def read_flight_beside(path: Path, dense: Path) -> dict[str, Any] | None:
+    """Read a scene of :func:`keep_flight`, with the dense scene, of another file, on the left if both fit; None if
+    there is no such file, or it holds something else."""
+    flight = _read(path)
+    beside = _read(dense) if dense != path else None
+    if flight is None or beside is None:
+        return flight
+    scenes = [*beside["scenes"], *flight["scenes"]]
+    return {**flight, "scenes": scenes} if sum(len(scene["spz"]) for scene in scenes) <= FLIGHT_BYTES else flight
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        flight = json.loads(read_text(path, FLIGHT_BYTES))
+    except (OSError, ValueError, RecursionError):
+        return None
+    keys = {"scenes", "views", "aspect", "up", "sure", "near", "background", "antialiased", "drag"}
+    scenes = flight["scenes"] if isinstance(flight, dict) and flight.keys() == keys else None
+    known = (
+        isinstance(scenes, list) and scenes and all(isinstance(s, dict) and type(s.get("spz")) is str for s in scenes)
+    )
+    return flight if known else None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -20,12 +19,12 @@ from pointsplat_ns.looking.view_source import COMPARED_VIEWS
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pruning import method_named
 from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.tradeoff.flights import keep_flight
 from pointsplat_ns.tradeoff.front import recommend
 from pointsplat_ns.tradeoff.journal import POINTS, Journal
 from pointsplat_ns.tradeoff.machine import busy_note, machine_text
 from pointsplat_ns.tradeoff.measuring import Measurer, Subject
 from pointsplat_ns.tradeoff.outputs import OUTPUTS, write_outputs
+from pointsplat_ns.tradeoff.page import keep_flight
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, picture_path, speed_of
 from pointsplat_ns.tradeoff.settings import DENSE, DRAWN, REPAIRS, Setting, check_drawn, check_repairs
 from pointsplat_ns.tradeoff.walk import WALK, Enough, Plan, drawings, walk
@@ -117,7 +116,6 @@ class Sweep:
         if self.journal.dense is not None:
             self.measurer.dense_ms = self.journal.dense.frame_ms
         self._drop_points_without_pictures()
-        self._seconds: list[float] = []
 
     def _identity(self) -> dict[str, str | int]:
         """Values that comparable points have in common."""
@@ -157,9 +155,7 @@ class Sweep:
     def measure_dense(self, of: int | None = None) -> Point:
         """The dense scene's point; ``of`` as for :meth:`measure`."""
         if self.journal.dense is None:
-            start = time.perf_counter()
-            point = self.measurer.measure_dense(self._shower(0, of))
-            self._take(point, self.subject.dense, time.perf_counter() - start, of)
+            self._take(self.measurer.measure_dense(self._shower(0, of)), self.subject.dense)
         assert self.journal.dense is not None
         return self.journal.dense
 
@@ -167,9 +163,8 @@ class Sweep:
         """The point of a setting, measured if it is missing. ``of`` is the largest number of points in the end; None if
         it is not known."""
         if setting not in self.journal.points:
-            start = time.perf_counter()
             point = self.measurer.measure(setting, self._shower(1 + len(self.journal.points), of))
-            self._take(point, self.scene(setting), time.perf_counter() - start, of)
+            self._take(point, self.scene(setting))
             if not (self.folder / OUTPUTS[0]).exists():  # the first useful results, early
                 write_outputs(self.result(), self.folder)
         return self.journal.points[setting]
@@ -253,19 +248,14 @@ class Sweep:
 
         return show
 
-    def _take(self, point: Point, scene: Gaussians, seconds: float, of: int | None) -> None:
-        """Keep a point, its scene for the page, and log its figures and the time left."""
+    def _take(self, point: Point, scene: Gaussians) -> None:
+        """Keep a point and its scene for the page, and log its figures."""
         if self._frame is not None:
             keep_flight(self._frame, scene, point.label, flight_path(self.folder, point.key))
         self.journal.add(point)
-        self._seconds.append(seconds)
-        done, dense = 1 + len(self.journal.points), self.journal.dense
+        dense = self.journal.dense
         figures = [] if point.by == DENSE else [f"{point.against_dense.psnr:.1f} dB against the dense scene"]
         figures += [f"{point.against_photos.psnr:.2f} dB against photos"] if point.against_photos is not None else []
         figures += [str(speed_of(point, dense))] if dense is not None and point is not dense else []
         figures += [f"{point.frame_ms:.3g} ms a frame", bytes_text(point.bytes)]
-        left = ""
-        if of is not None and done < of:
-            minutes = (of - done) * sum(self._seconds) / len(self._seconds) / 60
-            left = f" ({done} of at most {of}; {max(1, math.ceil(minutes))} min left at most)"
-        logger.info("%s: %s%s", point.label, ", ".join(figures), left)
+        logger.info("%s: %s", point.label, ", ".join(figures))

@@ -16,8 +16,7 @@ from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from pointsplat_ns.compression.budget_search import BUDGETS
-from pointsplat_ns.compression.count_search import SearchSettings, find_count
+from pointsplat_ns.compression.budget_search import BUDGETS, find_count
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.metrics import MOST_PSNR
@@ -25,9 +24,6 @@ from pointsplat_ns.pruning import ply_bytes, resolve_keep
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import Setting
 from pointsplat_ns.tradeoff.walk import Plan
-
-SEARCH = SearchSettings(precision=1.1)
-"""Search for PSNR and times. It is coarse, because each try makes, repairs and renders a scene."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +188,9 @@ class Search:
         if most < 1:
             return None
         first = most if most < self.plan.count else resolve_keep(self.plan.count, BUDGETS.first_share)
-        found = find_count(psnr, wanted, at_least=True, first=first, most=most, slope=self._slope, settings=SEARCH)
+        found = find_count(
+            psnr, wanted, at_least=True, first=first, most=most, slope=self._slope, settings=BUDGETS.repaired
+        )
         if found.count is None:
             return None
         self._slope = found.slope
@@ -207,7 +205,7 @@ class Search:
         least = min(count, max(1, round(1e-3 * self.plan.count)))  # fewer draw almost nothing
         found = find_count(
             lambda count: math.log(self._point(replace(way, count=count)).frame_ms), math.log(limit), at_least=False,
-            first=count, most=count, least=least, slope=1.0, settings=SEARCH,
+            first=count, most=count, least=least, slope=1.0, settings=BUDGETS.repaired,
         )  # fmt: skip
         if found.count is None:
             point = self._point(replace(way, count=least))

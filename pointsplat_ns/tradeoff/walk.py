@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pointsplat_ns.compression.acceptance import ACCEPTANCE
-from pointsplat_ns.compression.count_search import SearchSettings, find_count
+from pointsplat_ns.compression.budget_search import SearchSettings, find_count
 from pointsplat_ns.pruning import resolve_keep
 from pointsplat_ns.tradeoff.front import loss_of, recommend
 from pointsplat_ns.tradeoff.points import Point

@@ -1,4 +1,4 @@
-"""The web server of the viewer: fixed routes, for pages that it served itself.
+"""The web server of the viewer: fixed routes, for pages that it served itself, and scene files dropped on its page.
 
 Nothing of a request is a path. Pages of other sites, and names that resolve to this machine, are refused.
 """
@@ -7,21 +7,28 @@ from __future__ import annotations
 
 import http
 import io
+import shutil
 import socket
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import BinaryIO, cast
 from urllib.parse import parse_qsl, urlsplit
 
-from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.io.formats import FORMATS
+
+LARGEST = 4_000_000_000
+"""Largest file that may be dropped, bytes."""
+
+READABLE_NAMES = (*(kind.suffix for kind in FORMATS if kind.read and kind.suffix.startswith(".")), ".ckpt")
+"""Ends of the names of files that may be dropped."""
+
 
 LOCAL = ("localhost", "127.0.0.1", "::1")
 """Names of this machine."""
-
-IDLE_SECONDS = 30
-"""Time without a byte from a client after which its connection is closed."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +131,7 @@ def refusal(method: str, headers: Mapping[str, str], hosts: tuple[str, ...] | No
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
-    timeout = IDLE_SECONDS
+    timeout = 30  # s without a byte from a client, after which its connection is closed
     server_version, sys_version = "pointsplat", ""
 
     def do_GET(self) -> None:
@@ -200,3 +207,26 @@ class _Body(io.RawIOBase):
             raise ValueError("the body is cut off")
         self.left -= len(data)
         return data
+
+
+def received(request: Request, folder: Path) -> tuple[Path, str]:
+    """Write the body of a request into an empty folder: the file, and its name for people.
+
+    The client's name (``name`` in the options) decides the end of the file's name, which has to be one of
+    :data:`READABLE_NAMES`, and is shown to people. It is no path. Raises SceneError if no scene has such a name, the
+    file is empty, or there is no room for it, and ValueError if the client sends less than it said.
+    """
+    given = request.options["name"]
+    name = "".join(sign if sign.isprintable() else "?" for sign in given.replace("\\", "/").rpartition("/")[2])[:80]
+    suffix = next((suffix for suffix in READABLE_NAMES if given.lower().endswith(suffix)), None)
+    if suffix is None:
+        raise SceneError(f"{name}: not a scene; expected a file of {', '.join(READABLE_NAMES)}")
+    if request.length == 0:
+        raise SceneError(f"{name}: an empty file; expected a scene")
+    if shutil.disk_usage(folder).free < 1.1 * request.length:
+        raise SceneError(f"{name}: {request.length / 1e6:.0f} MB; the disk here has less room")
+    path = folder / f"scene{suffix}"
+    with path.open("wb") as stream:
+        while data := request.body.read(1 << 20):
+            stream.write(data)
+    return path, name

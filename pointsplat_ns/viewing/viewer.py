@@ -25,26 +25,27 @@ from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pages.flight import KNOWN_VIEWS, FlightFrame
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.system.memory import share_freed_memory
-from pointsplat_ns.viewing.dropped import LARGEST, READABLE_NAMES, received
-from pointsplat_ns.viewing.painter import Camera, PictureRequest
+from pointsplat_ns.viewing.painter import Camera, PictureRequest, Watcher
 from pointsplat_ns.viewing.selection import Selection
-from pointsplat_ns.viewing.server import Answer, Request, Route, Server
-from pointsplat_ns.viewing.watcher import Watcher
+from pointsplat_ns.viewing.server import LARGEST, READABLE_NAMES, Answer, Request, Route, Server, received
 from pointsplat_ns.views import RasterizeMode
 
-MOST_PAGES = 8
-"""Largest number of open pages; the one that was heard of least recently gives way."""
 
-WAIT_SECONDS = 20.0
-"""Longest wait of a page's request for the next picture."""
+@dataclass(frozen=True)
+class ViewerSettings:
+    """Limits of the viewer."""
 
-END_SECONDS = 5.0
-"""Longest wait for each thing that is being drawn, merged or read when the viewer is closed."""
+    most_pages: int = 8
+    """Largest number of open pages; the one that was heard of least recently gives way."""
+    wait_seconds: float = 20.0
+    """Longest wait of a page's request for the next picture."""
+    end_seconds: float = 5.0
+    """Longest wait for each thing that is being drawn, merged or read when the viewer is closed."""
+    largest_side: int = 4096
+    """Largest longer side of a picture, pixels."""
 
-LARGEST_SIDE = 4096
-"""Largest longer side of a picture, pixels."""
 
-HTML = "text/html; charset=utf-8"
+VIEWER = ViewerSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,7 @@ class _Stage:
         """What a page asked for, and the longer side of the picture, pixels. Errors are those of Python if it is not
         what the page of this server sends."""
         camera, views = wanted["camera"], self.frame.views
-        width, height = (min(max(int(wanted[name]), 1), LARGEST_SIDE) for name in ("width", "height"))
+        width, height = (min(max(int(wanted[name]), 1), VIEWER.largest_side) for name in ("width", "height"))
         eye, right, down, ahead = (_vector(camera[name]) for name in ("eye", "right", "down", "ahead"))
         turn = torch.stack([right, down, ahead])
         if not bool(((turn @ turn.T - torch.eye(3, dtype=torch.float64)).abs() < 1e-3).all()):
@@ -167,7 +168,7 @@ class Viewer:
         }
         if read is not None:
             self._drop_page = page("drop.html", ("drop.js",), connects=True, suffixes=READABLE_NAMES).encode("utf-8")
-            routes |= {"/drop": Route(self._drop, LARGEST), "/other": Route(lambda _: Answer(self._drop_page, HTML))}
+            routes |= {"/drop": Route(self._drop, LARGEST), "/other": Route(lambda _: _html(self._drop_page))}
         if scenes:
             self._show(scenes)
         self._server = Server(host, port, routes)
@@ -190,11 +191,11 @@ class Viewer:
         self._server.close()
         # Threads that are in torch when the program ends abort it: they are waited for, and these locks are kept.
         for lock in (self._looking, self._dropping):
-            lock.acquire(timeout=END_SECONDS)
+            lock.acquire(timeout=VIEWER.end_seconds)
         for watcher in list(self._watchers.values()):
-            watcher.close(END_SECONDS)
+            watcher.close(VIEWER.end_seconds)
         if self._stage is not None:
-            self._stage.close(END_SECONDS)
+            self._stage.close(VIEWER.end_seconds)
 
     def __enter__(self) -> Viewer:
         return self
@@ -217,7 +218,7 @@ class Viewer:
                 watcher.tell()
 
     def _page(self, request: Request) -> Answer:
-        return Answer(self._drop_page if self._stage is None else self._stage.html, HTML)
+        return _html(self._drop_page if self._stage is None else self._stage.html)
 
     def _look(self, request: Request) -> Answer:
         """Take the camera, window and budgets of a page."""
@@ -238,7 +239,7 @@ class Viewer:
             return Answer(status=HTTPStatus.CONFLICT)
         watcher = self._watcher(str(wanted["client"]))
         number = int(wanted["number"])
-        shown, texts = watcher.next(number, int(wanted["texts"]), WAIT_SECONDS)
+        shown, texts = watcher.next(number, int(wanted["texts"]), VIEWER.wait_seconds)
         state = {
             "number": shown.number,
             "look": shown.look,
@@ -257,7 +258,7 @@ class Viewer:
             raise ValueError("no name of a page")
         with self._lock:
             if client not in self._watchers:
-                while len(self._watchers) >= MOST_PAGES:
+                while len(self._watchers) >= VIEWER.most_pages:
                     oldest = min(self._watchers, key=lambda name: self._watchers[name].seen)
                     self._watchers.pop(oldest).close()
                 self._watchers[client] = Watcher()
@@ -280,6 +281,10 @@ class Viewer:
             except (OSError, MemoryError) as error:
                 return _refused(f"the file cannot be read here ({one_line(error)})")
         return Answer(status=HTTPStatus.NO_CONTENT)
+
+
+def _html(page: bytes) -> Answer:
+    return Answer(page, "text/html; charset=utf-8")
 
 
 def _refused(text: str) -> Answer:

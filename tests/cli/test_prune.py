@@ -204,7 +204,7 @@ def test_export_writes_the_scene_of_a_splatfacto_run_as_it_is(splatfacto_run, tm
 def test_export_knows_the_scenes_of_a_run_by_the_names_that_its_training_gave_them(
     supervision, make_refined_run, trained_walls, tmp_path
 ):
-    from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
+    from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
     from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import find_scenes
 
     shutil.copytree(trained_walls / "wall-b", tmp_path / "both" / "wall-b")

@@ -39,7 +39,7 @@ def run(*args) -> None:
 def test_cells_are_printed_as_they_are_measured_and_tables_written(ply, tmp_path, capsys):
     run("tables", ply, "-o", tmp_path / "tables", *FEW)
     said = capsys.readouterr().out
-    assert "room/paper-0.7/10%: " in said and "(2 of 8; 1 min left)" in said
+    assert "room/paper-0.7/10%: " in said and "(2 of 8)" in said
     assert "scenes: 8 cells of room" in said
     for name in ("tables.md", "tables.tex", "tables.json", "figure4.png"):
         assert (tmp_path / "tables" / name).stat().st_size > 1000

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from pointsplat_ns.compression.count_search import SearchSettings, find_count
+from pointsplat_ns.compression.budget_search import SearchSettings, find_count
 
 MOST = 100_000
 MEASURES = {

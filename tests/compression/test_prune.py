@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from making import ball, same
-from pointsplat_ns.compression.distributions import opacity_quantiles, plot_distributions, size_quantiles
+from pointsplat_ns.compression.pictures import opacity_quantiles, plot_distributions, size_quantiles
 from pointsplat_ns.compression.prune import Pruned, prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError

@@ -10,7 +10,7 @@ import pytest
 from lab.speed import commands, rasterizer
 from peers import peer
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.tables.splat_transform import Reducer
+from pointsplat_ns.tables.making import Reducer
 
 
 def test_variants_are_timed_stage_by_stage_with_their_errors(tmp_path, capsys):

@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 
 from making import parsed_by_ns_train
-from pointsplat_ns.nerfstudio_plugin.commands import (
+from pointsplat_ns.nerfstudio_plugin.running import (
     evaluate_command,
     run_folder,
     train_refiner_command,

@@ -11,7 +11,7 @@ import torch
 
 import pointsplat_ns as ps
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
-from pointsplat_ns.nerfstudio_plugin.paper_datasets import paper_dataset
+from pointsplat_ns.nerfstudio_plugin.measure_tables import paper_dataset
 from pointsplat_ns.tables import outputs
 from pointsplat_ns.tradeoff import machine
 

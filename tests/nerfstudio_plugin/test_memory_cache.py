@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from pointsplat_ns.nerfstudio_plugin.memory_cache import CacheKey, MemoryCache
+from pointsplat_ns.nerfstudio_plugin.frames import CacheKey, MemoryCache
 
 
 @dataclass(frozen=True)

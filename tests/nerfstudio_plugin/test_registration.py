@@ -126,7 +126,7 @@ def test_an_input_error_ends_a_command_with_one_line_and_status_1():
     # Run without nerfstudio, whose import takes seconds; method_configs.methods installs this same hook.
     code = (
         "from pointsplat_ns.errors import DataError\n"
-        "from pointsplat_ns.nerfstudio_plugin.excepthook import errors_in_one_line\n"
+        "from pointsplat_ns.nerfstudio_plugin.registration import errors_in_one_line\n"
         "errors_in_one_line()\nerrors_in_one_line()\n"
         "raise {}\n"
     )

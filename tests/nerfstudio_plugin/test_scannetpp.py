@@ -16,7 +16,7 @@ from nerfstudio.data.utils import colmap_parsing_utils as colmap
 from captures import BAD, FRAMES, HELD_OUT, SEEDS, Capture, Lens
 from making import pipeline_of
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.nerfstudio_plugin.paper_datasets import paper_dataset
+from pointsplat_ns.nerfstudio_plugin.measure_tables import paper_dataset
 from pointsplat_ns.nerfstudio_plugin.scannetpp import SeededScanNetppDataParserConfig
 
 FISHEYE = Lens("OPENCV_FISHEYE", (0.02, -0.01, 0.003, -0.001), focal=(30.0, 30.5))

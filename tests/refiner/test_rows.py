@@ -2,9 +2,8 @@ import pytest
 import torch
 
 from making import move_zero_layers, normal_scene
-from pointsplat_ns.refiner import Refiner, preset
-from pointsplat_ns.refiner import rows as rows_module
-from pointsplat_ns.refiner.rows import MAX_ELEMENTS, by_rows, rows_at_a_time
+from pointsplat_ns.refiner import Refiner, preset, sparse_ops
+from pointsplat_ns.refiner.sparse_ops import MAX_ELEMENTS, by_rows, rows_at_a_time
 
 
 @pytest.mark.parametrize("width,multiple", [(64, 1), (192, 1024), (3 * 512, 1024), (10 * MAX_ELEMENTS, 7)])
@@ -37,7 +36,7 @@ def test_the_refiner_gives_the_same_scene_and_gradients_whatever_goes_at_once(si
     refiner = move_zero_layers(Refiner(preset(size, patch=100)).double())
     scenes, grads = [], []
     for cells in (2**30, 2**13):
-        monkeypatch.setattr(rows_module, "MAX_ELEMENTS", cells)
+        monkeypatch.setattr(sparse_ops, "MAX_ELEMENTS", cells)
         refiner.zero_grad()
         torch.manual_seed(1)
         refined = refiner.train()(scene)

@@ -11,7 +11,7 @@ import torch
 
 from pointsplat_ns.metrics import structural_similarity
 from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
-from pointsplat_ns.system.declarations import Pointer, functions_of, structs_of
+from pointsplat_ns.system.kernels import Pointer, functions_of, structs_of
 
 SHARED = """
 struct Hidden {

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from pointsplat_ns.system import native_code
-from pointsplat_ns.system.native_code import NativeCodeError
+from pointsplat_ns.system import kernels
+from pointsplat_ns.system.kernels import NativeCodeError
 
 TWO = 'extern "C" int answer() { return 2; }\n'
 
@@ -23,12 +23,12 @@ pytestmark = pytest.mark.skipif(
 def build(tmp_path, monkeypatch):
     """Builds and loads a text, without what this process remembers."""
     cache = tmp_path / "cache"
-    monkeypatch.setenv(native_code.CACHE_VARIABLE, str(cache))
+    monkeypatch.setenv(kernels.CACHE_VARIABLE, str(cache))
 
     def load(text: str) -> ctypes.CDLL:
         source = tmp_path / "some.cpp"
         source.write_text(text, "utf-8")
-        return native_code.load_native.__wrapped__(source)
+        return kernels.load_native.__wrapped__(source)
 
     load.cache = cache
     return load
@@ -38,10 +38,10 @@ def test_what_was_built_is_loaded_and_a_changed_source_is_built_anew(build, monk
     assert build(TWO).answer() == 2
     (library,) = build.cache.iterdir()
     assert re.fullmatch(r"some-[0-9a-f]{20}\.so", library.name) and build.cache.stat().st_mode & 0o777 == 0o700
-    monkeypatch.setattr(native_code, "_build", lambda *args: pytest.fail("built again"))
+    monkeypatch.setattr(kernels, "_build", lambda *args: pytest.fail("built again"))
     assert build(TWO).answer() == 2
     monkeypatch.undo()
-    monkeypatch.setenv(native_code.CACHE_VARIABLE, str(build.cache))
+    monkeypatch.setenv(kernels.CACHE_VARIABLE, str(build.cache))
     assert build(TWO.replace("2", "3")).answer() == 3 and len(list(build.cache.iterdir())) == 2
 
 

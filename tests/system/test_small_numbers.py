@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModel
-from pointsplat_ns.system.small_numbers import takes_tiny_as_zero, tiny_as_zero
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import takes_tiny_as_zero, tiny_as_zero
 
 supported = torch.set_flush_denormal(True)
 torch.set_flush_denormal(False)

@@ -100,7 +100,7 @@ def test_weights_that_know_the_scene_do_not_test_it(measured, weights, tmp_path)
 
 
 def test_of_several_weights_those_of_the_nearest_budget_are_taken(weights):
-    from pointsplat_ns.tables.refiners import Refiners
+    from pointsplat_ns.tables.making import Refiners
 
     paths = [weights(f"keep{keep}", {"by": "paper", "keep": keep}) for keep in (0.1, 0.3, 500)]
     refiners = Refiners(paths)

@@ -9,7 +9,7 @@ import pytest
 import pointsplat_ns as ps
 from making import box_room
 from pointsplat_ns.system.programs import ProgramFailed
-from pointsplat_ns.tables.splat_transform import Reducer, SplatTransform
+from pointsplat_ns.tables.making import Reducer, SplatTransform
 
 
 def test_each_mode_makes_a_smaller_scene(peer, tmp_path):

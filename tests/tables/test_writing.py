@@ -8,11 +8,9 @@ import re
 import pytest
 
 from pointsplat_ns.tables import outputs
-from pointsplat_ns.tables.figure import medians
-from pointsplat_ns.tables.layout import Layout, Table
+from pointsplat_ns.tables.layout import Layout, Table, latex_table, markdown_table
 from pointsplat_ns.tables.means import read_groups
-from pointsplat_ns.tables.outputs import write_tables
-from pointsplat_ns.tables.writing import latex_table, markdown_table
+from pointsplat_ns.tables.outputs import medians, write_tables
 from table_cells import write_scene
 
 SMALL = Table(

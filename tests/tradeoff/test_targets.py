@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from pointsplat_ns.compression.budget_search import BUDGETS
 from pointsplat_ns.errors import BudgetError
-from pointsplat_ns.tradeoff.targets import SEARCH, Search, Targets
+from pointsplat_ns.tradeoff.targets import Search, Targets
 from pointsplat_ns.tradeoff.walk import Plan
 from trades import Trade
 
@@ -21,7 +22,7 @@ def test_the_smallest_file_of_a_quality_is_found_in_few_tries(db, gain):
     found = search(trade, Targets(db=db)).run()
     tries = len(trade.asked)
     assert found.point.against_dense.psnr >= db
-    assert trade.smallest(db) <= found.point.bytes <= SEARCH.precision * trade.smallest(db)
+    assert trade.smallest(db) <= found.point.bytes <= BUDGETS.repaired.precision * trade.smallest(db)
     assert tries <= 20
 
 
@@ -48,7 +49,7 @@ def test_a_limit_of_size_alone_gives_the_best_file_that_fits():
 
 def test_a_limit_of_time_alone_gives_the_most_that_is_fast_enough():
     found = search(Trade(), Targets(ms=21.0)).run()  # 20,000 Gaussians
-    assert 20_000 / SEARCH.precision <= found.setting.count <= 20_000
+    assert 20_000 / BUDGETS.repaired.precision <= found.setting.count <= 20_000
     assert found.setting.repair == "quick"
     assert "the next better" in found.why and "ms a frame where 21 are allowed" in found.why
 

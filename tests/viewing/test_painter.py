@@ -13,10 +13,10 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball
+from pointsplat_ns.viewing.film import to_uint8
 from pointsplat_ns.viewing.painter import Camera, Painter, PictureRequest, paint
 from pointsplat_ns.viewing.schedule import Step
 from pointsplat_ns.viewing.selection import ReducedScene
-from pointsplat_ns.viewing.split_screen import to_uint8
 
 
 @pytest.fixture(scope="module")

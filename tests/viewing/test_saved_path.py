@@ -11,8 +11,8 @@ import torch
 
 import pointsplat_ns as ps
 from pointsplat_ns.geometry.cameras import viewmats_to_opengl
-from pointsplat_ns.viewing import saved_path
-from pointsplat_ns.viewing.saved_path import read_path
+from pointsplat_ns.viewing import camera_path
+from pointsplat_ns.viewing.camera_path import read_path
 
 TURNED = [[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
 
@@ -108,7 +108,7 @@ def test_anything_else_is_refused_in_one_line(content, message, tmp_path):
 def test_missing_and_huge_files_are_refused(tmp_path, monkeypatch):
     with pytest.raises(ps.SceneError, match="no such file; expected a camera path"):
         read_path(tmp_path / "nothing.json")
-    monkeypatch.setattr(saved_path, "LIMITS", saved_path.PathLimits(bytes=10))
+    monkeypatch.setattr(camera_path, "LIMITS", camera_path.PathLimits(bytes=10))
     with pytest.raises(ps.DataError, match="expected a camera path of at most"):
         read_path(written(saved(), tmp_path))
 

@@ -21,7 +21,7 @@ from PIL import Image
 
 import pointsplat_ns as ps
 from making import ball
-from pointsplat_ns.viewing import dropped
+from pointsplat_ns.viewing import server
 from pointsplat_ns.viewing import viewer as viewing
 from pointsplat_ns.viewing.server import LOCAL, refusal
 from pointsplat_ns.viewing.viewer import Viewer
@@ -160,7 +160,7 @@ def test_bodies_have_a_size_that_is_said_and_not_too_large(viewer):
     assert post(viewer, "/look", b"x", Transfer_Encoding="chunked")[0] == 411
 
 
-@pytest.mark.parametrize("suffix", [name for name in dropped.READABLE_NAMES if name not in (".ckpt", ".ksplat")])
+@pytest.mark.parametrize("suffix", [name for name in server.READABLE_NAMES if name not in (".ckpt", ".ksplat")])
 def test_a_dropped_scene_of_any_format_is_shown(suffix, empty, tmp_path):
     assert b"Drop a file here" in answer(empty, "GET", "/")[1]
     ps.save(ball(300), tmp_path / f"a{suffix}")
@@ -202,7 +202,7 @@ def test_hostile_files_are_one_line_and_nothing_stays(name, data, words, empty, 
 
 def test_too_large_and_cut_off_files_are_refused(empty, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    status, body, _ = post(empty, "/drop?name=a.ply", b"x", Content_Length=str(dropped.LARGEST + 1))
+    status, body, _ = post(empty, "/drop?name=a.ply", b"x", Content_Length=str(server.LARGEST + 1))
     assert status == 413 and b"expected at most 4,000,000,000" in body
     host, port = empty.url.removeprefix("http://").split(":")
     with socket.create_connection((host, int(port)), timeout=30) as client:
@@ -210,7 +210,7 @@ def test_too_large_and_cut_off_files_are_refused(empty, tmp_path, monkeypatch):
         client.sendall(request.encode() + b"Content-Length: 100\r\n\r\nhalf")
         client.shutdown(socket.SHUT_WR)
         assert b" 400 " in client.recv(1000).partition(b"\r\n")[0] + b" "
-    monkeypatch.setattr(dropped.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 10}))
+    monkeypatch.setattr(server.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 10}))
     assert b"the disk here has less room" in post(empty, "/drop?name=a.ply", b"x" * 20)[1]
     assert list(tmp_path.iterdir()) == []
 
@@ -243,8 +243,8 @@ def test_closing_twice_frees_the_port_and_ends_waiting_pages(tmp_path):
         time.sleep(0.01)
     viewer.close()
     viewer.close()
-    waiting.join(5.0)  # s; a page would wait for WAIT_SECONDS
-    assert viewing.WAIT_SECONDS > 5.0 and not waiting.is_alive()
+    waiting.join(5.0)  # s; a page would wait for VIEWER.wait_seconds
+    assert viewing.VIEWER.wait_seconds > 5.0 and not waiting.is_alive()
     with socket.socket() as again:
         again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         again.bind(("127.0.0.1", int(viewer.url.rpartition(":")[2])))

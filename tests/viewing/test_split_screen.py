@@ -8,8 +8,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import cloud
-from pointsplat_ns.viewing.film import FilmScenes, render_frame
-from pointsplat_ns.viewing.split_screen import Wipe, to_uint8, with_labels, with_line
+from pointsplat_ns.viewing.film import FilmScenes, Wipe, render_frame, to_uint8, with_labels, with_line
 
 
 @pytest.fixture(scope="module")

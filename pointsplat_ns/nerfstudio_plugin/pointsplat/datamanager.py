@@ -19,11 +19,10 @@ from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io.discovery import Supervision, shown_scene
-from pointsplat_ns.nerfstudio_plugin.frames import to_device
-from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache, free_memory_share
+from pointsplat_ns.nerfstudio_plugin.datamanager import SpiralSource
+from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache, free_memory_share, to_device
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import SampledPoses
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import find_scenes
-from pointsplat_ns.nerfstudio_plugin.spirals import SpiralSource
 
 
 @dataclass

@@ -27,7 +27,7 @@ from pointsplat_ns.looking.poses import BACKGROUND
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.sizes import RESOLUTION, subsampled
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
-from pointsplat_ns.nerfstudio_plugin.memory_cache import CacheKey, MemoryCache
+from pointsplat_ns.nerfstudio_plugin.frames import CacheKey, MemoryCache
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import RasterizeMode
 

@@ -26,7 +26,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
 )
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import LOSSES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
-from pointsplat_ns.nerfstudio_plugin.pointsplat.results import REFINER_NAME
+from pointsplat_ns.nerfstudio_plugin.pointsplat.report import REFINER_NAME
 from pointsplat_ns.nerfstudio_plugin.pointsplat.training_state import TrainingState
 from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system import processes

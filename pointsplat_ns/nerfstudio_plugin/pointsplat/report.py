@@ -1,16 +1,88 @@
-"""Prints the evaluation of a refiner as a table, and writes it as a page. nerfstudio is not imported."""
+"""Reads the evaluation of a refiner, prints it as a table, and writes it as a page. nerfstudio is not imported."""
 
 from __future__ import annotations
 
+import json
+import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from pointsplat_ns.nerfstudio_plugin.pointsplat.report_page import COLUMNS, Block, number_text, write_report_page
-from pointsplat_ns.nerfstudio_plugin.pointsplat.results import VARIANTS, read_evaluation
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.io.files import read_text
+from pointsplat_ns.pages.html import page
 from pointsplat_ns.system.terminal import print_table
+
+REFINER_NAME = "refiner.safetensors"
+"""File of the trained network in the run's folder, for ``pointsplat compact --refiner``."""
+
+VARIANTS = ("dense", "pruned", "refined")
+"""The variants of each scene that an evaluation compares."""
+
+
+COLUMNS = (("psnr", "PSNR dB", 2), ("ssim", "SSIM", 3), ("lpips", "LPIPS", 3), ("gaussians", "splats", 0),
+           ("megabytes", "MB", 2), ("fps", "fps", 1))  # fmt: skip
+"""Columns of the table: a value of each variant, the title, digits to show."""
+
 
 PHOTOS = "photos"
 """The reference of evaluations that name none."""
+
+
+class Block(NamedTuple):
+    """A scene, or an average over scenes."""
+
+    name: str
+    seen: str
+    """Whether the refiner was trained on them: "yes", "never", or empty where both are averaged."""
+    variants: dict[str, dict[str, Any]]
+    """By variant: values such as ``psnr``."""
+    is_average: bool = False
+
+    @property
+    def title(self) -> str:
+        """Name for people."""
+        if self.is_average:
+            return {"yes": "average, trained on", "never": "average, never seen"}.get(self.seen, "average")
+        return f"{self.name} (never seen)" if self.seen == "never" else self.name
+
+
+def read_evaluation(path: Path) -> dict[str, Any]:
+    """The results in a file that ``ns-eval`` wrote for a pointsplat run; a DataError if it is none."""
+    try:
+        results = json.loads(read_text(path))["results"]
+        _check(results)
+        json.dumps(results, ensure_ascii=False).encode("utf-8")  # halves of characters could not be shown
+        return results
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); expected what ns-eval wrote") from error
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise DataError(f"{path}: not an evaluation of a pointsplat run; expected what ns-eval wrote") from error
+
+
+def _check(results: dict[str, Any]) -> None:
+    """Check all that :mod:`~pointsplat_ns.nerfstudio_plugin.pointsplat.report` shows. Errors are those of Python where
+    something is missing or of another type."""
+    blocks = list(results["scenes"].values())
+    if not blocks:
+        raise ValueError("no scene")
+    for scene in blocks:
+        scene["seen_in_training"]
+    results.get("settings", {}).get("keep")
+    other = results.get("against_dense_renders")
+    parts = [results] if other is None else [results, other]
+    for part in parts:
+        blocks += [part[name] for name in ("average", "average_seen", "average_unseen") if name in part]
+    for block in blocks:
+        for value in (
+            block[variant][name]
+            for variant in VARIANTS
+            for name in ("psnr", "ssim", "lpips", "gaussians", "megabytes", "fps")
+        ):
+            if value is not None:
+                float(value + 0)  # a text has no sum with a number, and 10^400 is no float
+    for part in [*parts, *results["scenes"].values()]:
+        if not isinstance(part.get("reference", ""), str):
+            raise TypeError("reference")
 
 
 def report(evaluation: str | Path, html: str | Path | None = None) -> None:
@@ -98,3 +170,82 @@ def _blocks(results: dict[str, Any], part: dict[str, Any]) -> list[Block]:
         averages = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
         blocks += [Block("average", seen, part[key], is_average=True) for seen, key in averages if key in part]
     return blocks
+
+
+def write_report_page(title: str, settings: str, parts: list[tuple[str, list[Block]]], note: str, output: Path) -> None:
+    """Write one self-contained HTML file with charts and a table of every scene and variant.
+
+    Args:
+        title: name of the evaluation.
+        settings: text that says how the scenes were pruned and refined.
+        parts: what the scenes were compared with, and the scenes.
+        note: a line for the reader; empty for none.
+        output: the file to write.
+    """
+    from pointsplat_ns.io.files import replacing
+
+    charts = (("psnr", "PSNR, dB", 2), ("ssim", "SSIM", 3), ("lpips", "LPIPS, less is better", 3))
+    shown = [
+        {
+            "reference": reference,
+            "charts": [chart for name, text, digits in charts if (chart := _chart(name, text, digits, blocks))],
+            "rows": [_rows(block) for block in blocks],
+        }
+        for reference, blocks in parts
+    ]
+    columns = [text for _, text, _ in COLUMNS]
+    text = page(
+        "report.html", title=title, settings=settings, parts=shown, columns=columns, variants=VARIANTS, note=note
+    )
+    with replacing(output) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def _chart(name: str, title: str, digits: int, blocks: list[Block]) -> dict[str, Any] | None:
+    """One row of marks for each block, with places in percent of the width; None where nothing was measured."""
+    values = [_value(block.variants[variant][name]) for block in blocks for variant in VARIANTS]
+    known = [value for value in values if value is not None]
+    if not known:
+        return None
+    low, high = min(known), max(known)
+    pad = max(0.06 * (high - low), 0.01)
+    low, high = low - pad, high + pad
+
+    def place(value: float) -> float:
+        return round(100 * (value - low) / (high - low), 3)
+
+    rows = []
+    for block in blocks:
+        marks = [
+            {"variant": variant, "at": place(value), "text": number_text(value, digits)}
+            for variant in VARIANTS
+            if (value := _value(block.variants[variant][name])) is not None
+        ]
+        rows.append({"name": block.title, "is_average": block.is_average, "marks": marks})
+    ticks = [{"at": place(tick), "text": f"{tick:g}"} for tick in _ticks(low, high)]
+    return {"title": title, "rows": rows, "ticks": ticks}
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Up to six round numbers from ``low`` to ``high``."""
+    rough = (high - low) / 5
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough)
+    return [number * step for number in range(math.ceil(low / step), math.floor(high / step) + 1)]
+
+
+def _rows(block: Block) -> dict[str, Any]:
+    """A block for the table: one row of texts for each variant."""
+    values = block.variants
+    cells = {v: [number_text(_value(values[v][name]), digits) for name, _, digits in COLUMNS] for v in VARIANTS}
+    return {"name": block.title, "cells": cells}
+
+
+def _value(value: Any) -> float | None:
+    """A number to show; None for those that are missing, not finite, or mean nothing."""
+    return float(value) if value is not None and abs(value) < 1e12 else None
+
+
+def number_text(value: float | None, digits: int, unknown: str = "–") -> str:
+    """A number with so many decimals; ``unknown`` for None."""
+    return unknown if value is None else f"{value:,.{digits}f}"

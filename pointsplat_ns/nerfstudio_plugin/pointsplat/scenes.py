@@ -24,8 +24,7 @@ from pointsplat_ns.io.files import one_line
 from pointsplat_ns.io.inert_yaml import Tagged
 from pointsplat_ns.io.runs import Run, open_run
 from pointsplat_ns.io.splatfacto import read_checkpoint
-from pointsplat_ns.nerfstudio_plugin.frames import Frames
-from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
+from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, PlyScene, SampledPoses, Split
 from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND
 from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset

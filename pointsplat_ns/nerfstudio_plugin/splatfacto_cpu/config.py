@@ -17,8 +17,8 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from pointsplat_ns.io.splatfacto import NAMES
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
 from pointsplat_ns.nerfstudio_plugin.optimizers import FallingRateConfig, FusedAdamConfig
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig, SplatfactoCpuPipelineConfig
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import SplatfactoCpuTrainer
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import SplatfactoCpuPipelineConfig, SplatfactoCpuTrainer
 from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainerConfig
 
 SPLATFACTO_STEPS = 30_000

@@ -10,8 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -24,21 +22,17 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.model_components.lib_bilagrid import BilateralGrid
 from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, SplatfactoModelConfig, random_quat_tensor
-from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torchmetrics.image import PeakSignalNoiseRatio
 
-from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
 from pointsplat_ns.geometry.neighbours import nearest
-from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.metrics import structural_similarity
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.nerfstudio_plugin.cameras import need_pinhole
-from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
 from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND, RasterizerOptions
 from pointsplat_ns.rasterizer.rendering import Colors
 from pointsplat_ns.system.kernels import Kernels
@@ -316,55 +310,6 @@ def _finite_seeds(seeds: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor] 
         CONSOLE.log("no seed points are left; training starts from random ones")
         return None
     return points[finite].clone(), colors.clone()
-
-
-@dataclass
-class SplatfactoCpuPipelineConfig(VanillaPipelineConfig):
-    """nerfstudio's pipeline, with an evaluation that is always valid JSON"""
-
-    _target: type = field(default_factory=lambda: SplatfactoCpuPipeline)
-
-    def setup(self, **kwargs) -> Any:
-        """Build the pipeline, and let torch read nerfstudio's checkpoints, which happens right after this."""
-        allow_splatfacto_checkpoints()
-        return super().setup(**kwargs)
-
-
-class SplatfactoCpuPipeline(VanillaPipeline):
-    """nerfstudio's pipeline. A metric that cannot be computed is null in its evaluation, never NaN."""
-
-    datamanager: LazyImageDatamanager
-    latest_losses: Mapping[str, Tensor] = MappingProxyType({})
-    """The parts of the loss of the latest training step."""
-
-    def get_train_loss_dict(self, step: int):
-        """As nerfstudio's, and keeps the parts of the loss."""
-        outputs, losses, metrics = super().get_train_loss_dict(step)
-        self.latest_losses = {name: value.detach() for name, value in losses.items()}
-        return outputs, losses, metrics
-
-    def get_average_eval_image_metrics(
-        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
-    ) -> dict[str, Any]:
-        """Mean metrics over the held-out frames; a DataError if no frame is held out.
-
-        Given a ``step``, by the trainer, whose log takes only finite numbers, other metrics are left out. Without it,
-        as in ``ns-eval``, they are None, and ``lpips_note`` says why LPIPS is missing. The standard deviation of a
-        single image is None.
-        """
-        if not self.datamanager.eval_dataset:
-            raise DataError(
-                f"{self.datamanager.get_datapath()}: no frame is held out, so there is nothing to evaluate on; "
-                "expected at least one: change the dataparser's split"
-            )
-        self.model.lpips = lpips = LpipsMetric()  # a new one, so that its reason is of this evaluation
-        metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
-        if step is not None:
-            return {name: value for name, value in metrics.items() if math.isfinite(value)}
-        report: dict[str, Any] = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
-        if lpips.reason is not None:
-            report |= {"lpips": None, "lpips_note": lpips.reason}
-        return report
 
 
 def _sigmoid(values: Tensor) -> Tensor:

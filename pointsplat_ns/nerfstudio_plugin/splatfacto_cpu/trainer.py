@@ -2,27 +2,88 @@
 
 from __future__ import annotations
 
+import math
+import random
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.pipelines.base_pipeline import Pipeline, VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from pointsplat_ns.errors import DataError, PointSplatError
+from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
+from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
 from pointsplat_ns.nerfstudio_plugin.optimizers import all_finite
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.early_look import EarlyLook
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuPipeline
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.resuming import restore_training_state, training_state
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import LpipsMetric
 from pointsplat_ns.nerfstudio_plugin.stopping import STATE, StoppableTrainer
-from pointsplat_ns.system.small_numbers import tiny_as_zero
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainerConfig
+
+
+_LISTS = ("train_unseen_cameras", "eval_unseen_cameras")
+"""Attributes of the datamanager: the frames that are still to come before any is repeated."""
+
+
+@dataclass
+class SplatfactoCpuPipelineConfig(VanillaPipelineConfig):
+    """nerfstudio's pipeline, with an evaluation that is always valid JSON"""
+
+    _target: type = field(default_factory=lambda: SplatfactoCpuPipeline)
+
+    def setup(self, **kwargs) -> Any:
+        """Build the pipeline, and let torch read nerfstudio's checkpoints, which happens right after this."""
+        allow_splatfacto_checkpoints()
+        return super().setup(**kwargs)
+
+
+class SplatfactoCpuPipeline(VanillaPipeline):
+    """nerfstudio's pipeline. A metric that cannot be computed is null in its evaluation, never NaN."""
+
+    datamanager: LazyImageDatamanager
+    latest_losses: Mapping[str, Tensor] = MappingProxyType({})
+    """The parts of the loss of the latest training step."""
+
+    def get_train_loss_dict(self, step: int):
+        """As nerfstudio's, and keeps the parts of the loss."""
+        outputs, losses, metrics = super().get_train_loss_dict(step)
+        self.latest_losses = {name: value.detach() for name, value in losses.items()}
+        return outputs, losses, metrics
+
+    def get_average_eval_image_metrics(
+        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
+    ) -> dict[str, Any]:
+        """Mean metrics over the held-out frames; a DataError if no frame is held out.
+
+        Given a ``step``, by the trainer, whose log takes only finite numbers, other metrics are left out. Without it,
+        as in ``ns-eval``, they are None, and ``lpips_note`` says why LPIPS is missing. The standard deviation of a
+        single image is None.
+        """
+        if not self.datamanager.eval_dataset:
+            raise DataError(
+                f"{self.datamanager.get_datapath()}: no frame is held out, so there is nothing to evaluate on; "
+                "expected at least one: change the dataparser's split"
+            )
+        self.model.lpips = lpips = LpipsMetric()  # a new one, so that its reason is of this evaluation
+        metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
+        if step is not None:
+            return {name: value for name, value in metrics.items() if math.isfinite(value)}
+        report: dict[str, Any] = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
+        if lpips.reason is not None:
+            report |= {"lpips": None, "lpips_note": lpips.reason}
+        return report
 
 
 class CheckingOptimizers(Optimizers):
@@ -142,3 +203,60 @@ class SplatfactoCpuTrainer(StoppableTrainer):
         state = None if path is None else torch.load(path, map_location="cpu", weights_only=True, mmap=True).get(STATE)
         if state is not None:  # those of nerfstudio's own methods have none
             restore_training_state(self.pipeline, state)
+
+
+def training_state(pipeline: Pipeline) -> dict[str, Any]:
+    """Random numbers to come, the order of the frames, and what densification has gathered, as plain values and tensors
+    that torch loads with ``weights_only``."""
+    manager: Any = pipeline.datamanager
+    kind, keys, *rest = np.random.get_state()
+    state: dict[str, Any] = {
+        "torch": torch.get_rng_state(),
+        "python": random.getstate(),
+        "numpy": [kind, torch.from_numpy(np.asarray(keys, np.int64)), *rest],
+        "densification": dict(pipeline.model.strategy_state),
+        **{name: list(getattr(manager, name)) for name in _LISTS},
+    }
+    if hasattr(manager, "random_generator"):  # of the order of the training frames
+        state["frames"] = manager.random_generator.getstate()
+    return state
+
+
+def restore_training_state(pipeline: Pipeline, state: Mapping[str, Any]) -> None:
+    """Put back what :func:`training_state` gave. Of another number of photos, their order is left alone."""
+    manager: Any = pipeline.datamanager
+    torch.set_rng_state(state["torch"])
+    random.setstate(state["python"])
+    kind, keys, *rest = state["numpy"]
+    np.random.set_state((kind, keys.numpy().astype(np.uint32), *rest))
+    model = pipeline.model
+    for name, value in state["densification"].items():
+        model.strategy_state[name] = value.clone().to(model.device) if isinstance(value, torch.Tensor) else value
+    numbers = (len(manager.train_dataset), len(manager.eval_dataset))
+    lists = [state[name] for name in _LISTS]
+    if all(0 <= index < number for number, indices in zip(numbers, lists, strict=True) for index in indices):
+        for name, indices in zip(_LISTS, lists, strict=True):
+            setattr(manager, name, list(indices))
+        if "frames" in state and hasattr(manager, "random_generator"):
+            manager.random_generator.setstate(state["frames"])
+
+
+@contextmanager
+def tiny_as_zero() -> Iterator[None]:
+    """Let this thread, and those it starts, take floats below the smallest normal one (1e-38) as 0 while the context is
+    open.
+
+    Many processors take ten times as long for such numbers. Adam's averages are full of them where a Gaussian has not
+    been seen for 800 steps: they fall by a tenth with each.
+    """
+    before = takes_tiny_as_zero()
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(before)
+
+
+def takes_tiny_as_zero() -> bool:
+    """Whether this thread takes floats below the smallest normal one as 0."""
+    return not torch.tensor(1e-30).mul(1e-10).item()

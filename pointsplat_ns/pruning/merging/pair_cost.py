@@ -41,8 +41,7 @@ from pointsplat_ns.pruning.merging.projections import DIRECTIONS, MIN_DIVISOR_32
 from pointsplat_ns.pruning.merging.replacement import growth
 from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
 from pointsplat_ns.pruning.merging.state import CHANNELS, State
-from pointsplat_ns.system.declarations import Struct
-from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
 from pointsplat_ns.system.threads import in_threads, most_threads
 
 MOST_NEIGHBOURS, MOST_AXES = 32, 16

@@ -19,8 +19,7 @@ from pointsplat_ns.rasterizer.alpha import CLAMPED
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, Quality
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
 from pointsplat_ns.rasterizer.tiles import Footprints, TileList
-from pointsplat_ns.system.declarations import Struct
-from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
 
 
 class KernelInputs(NamedTuple):

@@ -13,8 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.rasterizer.spherical_harmonics import Color
-from pointsplat_ns.system.declarations import Struct
-from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
 
 
 class CompiledColor(torch.autograd.Function):

@@ -15,8 +15,7 @@ from torch.autograd.function import once_differentiable
 from pointsplat_ns.rasterizer import ewa
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, COMPENSATION_MIN
 from pointsplat_ns.rasterizer.ewa import Lens
-from pointsplat_ns.system.declarations import Struct
-from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
 
 
 def _camera(view: Tensor, centre: Tensor, lens: Lens) -> Struct:

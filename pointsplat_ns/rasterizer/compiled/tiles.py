@@ -14,8 +14,7 @@ from torch import Tensor
 from pointsplat_ns.rasterizer import ellipses as in_torch
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, SLACK
 from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, Pairs, Region
-from pointsplat_ns.system.declarations import Struct
-from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, on_threads
 
 
 def _grid(grid: Grid) -> Struct:

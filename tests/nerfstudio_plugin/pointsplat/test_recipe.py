@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from making import parsed_by_ns_train
-from pointsplat_ns.nerfstudio_plugin.pointsplat.recipe import (
+from pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner import (
     KEEP,
     TRAIN_SEEDS,
     UNSEEN_SEEDS,

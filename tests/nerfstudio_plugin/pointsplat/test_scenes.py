@@ -17,7 +17,7 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its 
 from making import run_of, without_data
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io.runs import open_run
-from pointsplat_ns.nerfstudio_plugin.memory_cache import MemoryCache
+from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene, dataparser_of
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig

@@ -11,7 +11,7 @@ import torch
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import fast_config, pipeline_of
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES
-from pointsplat_ns.nerfstudio_plugin.pointsplat.results import REFINER_NAME
+from pointsplat_ns.nerfstudio_plugin.pointsplat.report import REFINER_NAME
 from pointsplat_ns.refiner import read_refiner
 from pointsplat_ns.refiner.weights import read_metadata
 

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.nerfstudio_plugin.replica.dataparser import fuse_depth, voxel_thin
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_depth, read_photo
-from pointsplat_ns.nerfstudio_plugin.replica.seed_points import fuse_depth, voxel_thin
 from replica_scenes import CAMERA, line_of, write_scene
 
 

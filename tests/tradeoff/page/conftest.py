@@ -10,8 +10,7 @@ import pytest
 
 import pointsplat_ns as ps
 from pointsplat_ns.pages.flight import FlightFrame
-from pointsplat_ns.tradeoff.flights import keep_flight
-from pointsplat_ns.tradeoff.page import write_page
+from pointsplat_ns.tradeoff.page import keep_flight, write_page
 from pointsplat_ns.tradeoff.points import Tradeoff, flight_path
 from sweeps import measured_room, room_views
 

@@ -20,7 +20,7 @@ from html_parts import hashed, names_nothing_outside, parts_of, policy_of
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.pages import pictures
 from pointsplat_ns.pages.flight import FlightFrame
-from pointsplat_ns.tradeoff import flights
+from pointsplat_ns.tradeoff import page
 from pointsplat_ns.tradeoff import page as page_module
 from pointsplat_ns.tradeoff.page import write_page
 from pointsplat_ns.tradeoff.points import Quality, flight_path, picture_path
@@ -158,7 +158,7 @@ def test_the_dense_scene_is_beside_the_recommended_one_if_both_fit(sweep, tmp_pa
     measured, folder = sweep
     shutil.copytree(folder, tmp_path / "copy")
     room = ps.example_room()
-    flights.keep_flight(FlightFrame.of(room, room_views()), room[::5], "dense", flight_path(tmp_path / "copy", "dense"))
+    page.keep_flight(FlightFrame.of(room, room_views()), room[::5], "dense", flight_path(tmp_path / "copy", "dense"))
 
     def names(recommended: str) -> list[str]:
         page = write_page(replace(measured, recommended=recommended), tmp_path / "copy", tmp_path / "page.html")
@@ -166,7 +166,7 @@ def test_the_dense_scene_is_beside_the_recommended_one_if_both_fit(sweep, tmp_pa
 
     assert names("0.1_coverage") == ["dense", "a tenth"] and names("dense") == ["dense"]
     size = flight_path(tmp_path / "copy", "dense").stat().st_size
-    monkeypatch.setattr(flights, "MAX_BYTES", size)
+    monkeypatch.setattr(page, "FLIGHT_BYTES", size)
     assert names("0.1_coverage") == ["a tenth"] and names("dense") == ["dense"]
 
 
@@ -182,14 +182,14 @@ def test_what_is_no_scene_to_fly_through_is_left_out(sweep, tmp_path, content):
 def test_scenes_that_take_too_much_of_a_page_are_not_kept(tmp_path, monkeypatch):
     room = ps.example_room()[::20]
     stage, path = FlightFrame.of(room, room_views()), tmp_path / "new" / "scene.json"
-    monkeypatch.setattr(flights, "MAX_BYTES", 15_000)  # its PLY has 330 kB, and its SPZ in base64 80 kB
-    assert not flights.keep_flight(stage, room, "room", path) and not path.parent.exists()
-    monkeypatch.setattr(flights, "MAX_BYTES", 60_000)
-    assert not flights.keep_flight(stage, room, "room", path) and not path.parent.exists()
-    monkeypatch.setattr(flights, "MAX_BYTES", 120_000)
-    assert flights.keep_flight(stage, room, "room", path) and flights.read_flight_beside(path, path)["drag"] == "look"
-    monkeypatch.setattr(flights, "MAX_BYTES", 60_000)
-    assert flights.read_flight_beside(path, path) is None
+    monkeypatch.setattr(page, "FLIGHT_BYTES", 15_000)  # its PLY has 330 kB, and its SPZ in base64 80 kB
+    assert not page.keep_flight(stage, room, "room", path) and not path.parent.exists()
+    monkeypatch.setattr(page, "FLIGHT_BYTES", 60_000)
+    assert not page.keep_flight(stage, room, "room", path) and not path.parent.exists()
+    monkeypatch.setattr(page, "FLIGHT_BYTES", 120_000)
+    assert page.keep_flight(stage, room, "room", path) and page.read_flight_beside(path, path)["drag"] == "look"
+    monkeypatch.setattr(page, "FLIGHT_BYTES", 60_000)
+    assert page.read_flight_beside(path, path) is None
 
 
 def test_a_missing_picture_is_one_line_with_its_path(sweep, tmp_path):
