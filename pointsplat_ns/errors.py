@@ -50,7 +50,7 @@ class SceneError(PointSplatError):
         ... except ps.SceneError as error:
         ...     print(error)
         nowhere.ply: no such file; expected a scene (.compressed.ply, .ply, .spz, .sog, lod-meta.json, meta.json, \
-.ksplat, .splat), a Splatfacto .ckpt, or a Splatfacto run (its folder or config.yml)
+.ksplat, .splat, .glb), a Splatfacto .ckpt, or a Splatfacto run (its folder or config.yml)
     """
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Container
 from pathlib import Path
 
 import numpy as np
@@ -33,10 +34,10 @@ _COLUMNS = {
 def read_ply(path: Path | str) -> Gaussians:
     """Read a 3DGS PLY: binary of either byte order, or ASCII; properties in any order and of any type.
 
-    The SH degree follows from the number of ``f_rest`` properties; of degree 4, the bands up to 3 are read. Other
-    properties and elements, and bytes after the last element, are not read; a warning says so. Gaussians that cannot be
-    drawn (NaN, or Inf where it is not valid) are dropped, and their number is logged; all-zero rows are kept (a zero
-    quaternion is the identity).
+    The SH degree follows from the number of ``f_rest`` properties; of degree 4, the bands up to 3 are read. 2D
+    Gaussians, which have no ``scale_2``, become flat ones. Other properties and elements, and bytes after the last
+    element, are not read; a warning says so. Gaussians that cannot be drawn (NaN, or Inf where it is not valid) are
+    dropped, and their number is logged; all-zero rows are kept (a zero quaternion is the identity).
 
     Raises:
         SceneError: if the file is not a PLY, is truncated, or lacks a property.
@@ -143,6 +144,11 @@ def _gaussian_element(header: Header, path: Path) -> Element:
     return vertex
 
 
+def _is_flat(names: Container[str]) -> bool:
+    """Whether vertex properties are those of 2D Gaussians, whose third axis is their normal and has no size."""
+    return "scale_2" not in names and all(name in names for name in ("scale_0", "scale_1", "opacity"))
+
+
 def _report_unread(header: Header, vertex: Element, path: Path) -> None:
     """Warn of what a file holds beside the Gaussians."""
     known = {name for names in _COLUMNS.values() for name in names}
@@ -169,10 +175,9 @@ def _num_rest(vertex: Element, path: Path) -> int:
     present = {name for name, _ in vertex.properties}
     if "packed_position" in present:
         raise SceneError(f"{path}: a compressed PLY (property 'packed_position'); expected a plain one")
-    if {"scale_0", "scale_1", "opacity"} <= present and "scale_2" not in present:
-        raise SceneError(
-            f"{path}: lacks the vertex property 'scale_2', as 2D Gaussians (2DGS) do; expected 3D Gaussians"
-        )
+    if _is_flat(present):
+        logger.warning("%s: 2D Gaussians (no 'scale_2'), read as flat 3D ones", path)
+        present.add("scale_2")
     rest = sorted(int(name[7:]) for name in present if re.fullmatch(r"f_rest_(0|[1-9]\d{0,5})", name))
     counts = [3 * ((degree + 1) ** 2 - 1) for degree in range(5)]
     required = _column_names(rest[-1] + 1 if rest and rest[-1] + 1 in counts else 0)
@@ -193,9 +198,11 @@ def _scene(rows: np.ndarray, k: int, in_file: int) -> Gaussians:
     that the file has."""
     from numpy.lib.recfunctions import structured_to_unstructured
 
+    flat = _is_flat(rows.dtype.names or ())
     columns = {
         **{name: _COLUMNS[name] for name in ("means", "scales", "quats", "opacities", "features_dc")},
         # Channel-major in the file, channel last in a scene.
+        "scales": _COLUMNS["scales"][: 2 if flat else 3],
         "features_rest": [f"f_rest_{channel * in_file + i}" for i in range(k) for channel in range(3)],
     }
     tables = {name: np.empty((len(rows), len(fields)), np.float32) for name, fields in columns.items()}
@@ -207,5 +214,7 @@ def _scene(rows: np.ndarray, k: int, in_file: int) -> Gaussians:
             for name, fields in columns.items():
                 if fields:
                     tables[name][chunk] = structured_to_unstructured(rows[chunk][fields], np.float32)
+    if flat:
+        tables["scales"] = np.column_stack([tables["scales"], np.full(len(rows), -np.inf, np.float32)])
     tensors = {name: torch.from_numpy(table) for name, table in tables.items()}
     return Gaussians(**{**tensors, "features_rest": tensors["features_rest"].reshape(len(rows), k, 3)})

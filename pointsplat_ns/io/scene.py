@@ -79,7 +79,7 @@ def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False) 
 
     ``.ply`` is the 3DGS PLY: a float32 scene is read back unchanged to the bit. The others keep fewer bits:
     ``.compressed.ply``, ``.spz`` (version 3), ``.sog``, ``meta.json`` (the same in a folder), ``.splat``; ``.glb`` is
-    glTF, which :func:`pointsplat_ns.load` does not read. Gaussians that cannot be drawn (NaN, or Inf where it is not
+    glTF, exact to rounding. Gaussians that cannot be drawn (NaN, or Inf where it is not
     valid) are left out, and their number is logged. The write is atomic and replaces an existing file.
 
     Args:

@@ -44,7 +44,7 @@ TRIGGERS: dict[str, tuple[Callable[[], object], str]] = {
     "exists already": (lambda: Path("room_pruned.ply").touch(), "prune room.ply"),
     "cannot write a ksplat": (room, "convert room.ply room.ksplat"),
     "a folder without config.yml": (lambda: Path("rooms").mkdir(), "prune rooms"),
-    "'scale_2'": (flat, "info flat.ply"),
+    "2D Gaussians": (flat, "info flat.ply"),
     "dropped 1 of 4": (odd, "convert room.ply other.ply"),
     "not a Splatfacto run": (room, "convert room.ply other.ply --original-frame"),
     "keep is 'half'": (room, "prune room.ply --keep half"),

@@ -57,7 +57,7 @@ def test_a_run_no_folder_and_a_folder_without_scenes_are_refused(make_run, tmp_p
 def test_files_of_every_format_are_scenes_and_a_sog_folder_is_one_scene(tmp_path):
     for name in ("a.spz", "b.sog", "c.splat", "d.compressed.ply", "e.glb", "folder/meta.json"):
         save(cloud(50, 0, 1), tmp_path / name)
-    assert [scene.name for scene in find_scenes(tmp_path)] == ["a", "b", "c", "d"]
+    assert [scene.name for scene in find_scenes(tmp_path)] == ["a", "b", "c", "d", "e"]
     assert is_folder_of_scenes(tmp_path) and not is_folder_of_scenes(tmp_path / "folder")
     assert not is_folder_of_scenes(tmp_path / "a.spz")
 

@@ -239,12 +239,26 @@ def columns(*without):
     return [(name, "f4") for name in column_names(3) if name not in without]
 
 
+def test_2d_gaussians_are_read_as_flat_ones(tmp_path, caplog):
+    scene = normal_scene(20_000, 1)  # more than one chunk
+    write_ply(scene, tmp_path / "a.ply")
+    rows = PlyData.read(tmp_path / "a.ply")["vertex"].data
+    kept = [name for name in rows.dtype.names if name != "scale_2"]
+    PlyData([PlyElement.describe(np.array(rows[kept].tolist(), [(name, "<f4") for name in kept]), "vertex")]).write(
+        tmp_path / "flat.ply"
+    )
+    flat = read_ply(tmp_path / "flat.ply")
+    assert "2D Gaussians" in caplog.text and "scale_2" in caplog.text
+    assert torch.equal(flat.scales[:, :2], scene.scales[:, :2]) and float(flat.stds[:, 2].max()) < 1e-30
+    assert torch.equal(flat.quats, scene.quats) and torch.equal(flat.features_rest, scene.features_rest)
+
+
 @pytest.mark.parametrize(
     ("element", "properties", "fragments"),
     [
         *(
             ("vertex", columns(name), [f"lacks the vertex property '{name}'"])
-            for name in ("x", "z", "f_dc_1", "f_rest_0", "f_rest_7", "opacity", "scale_2", "rot_0", "rot_3")
+            for name in ("x", "z", "f_dc_1", "f_rest_0", "f_rest_7", "opacity", "scale_1", "rot_0", "rot_3")
         ),
         ("vertex", columns("f_rest_44", "f_rest_43"), ["has 43 f_rest properties", "0, 9, 24, 45 or 72"]),
         ("vertex", [*columns()[:3], ("red", "u1")], ["lacks the vertex property 'f_dc_0' and 10 more"]),

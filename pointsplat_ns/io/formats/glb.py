@@ -1,24 +1,156 @@
-"""glTF with ``KHR_gaussian_splatting``, as a binary ``.glb``: uncompressed, written only.
+"""glTF with ``KHR_gaussian_splatting``, an extension that Khronos has ratified, as a binary ``.glb``: uncompressed.
 
-Each attribute is a float32 array of its own, sizes and opacities not as logarithms and logits. The extension is a
-review draft of Khronos. Colours as bytes are added for programs that know only points.
+Each attribute is an array of its own, sizes and opacities not as logarithms and logits. Written are float32 numbers,
+and colours as bytes for programs that know only points; read are all types that the extension allows.
 """
 
 from __future__ import annotations
 
 import json
 import struct
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.formats.coding import Array, bytes_of_logits, finite_sizes, shares_of_dc, to_bytes, unit_quats
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
+from pointsplat_ns.io.files import keep_usable, logger, require_file, require_memory
+from pointsplat_ns.io.formats.coding import (
+    Array,
+    bytes_of_logits,
+    damage_named,
+    finite_sizes,
+    load_bytes,
+    log_of_sizes,
+    scene_of,
+    shares_of_dc,
+    to_bytes,
+    unit_quats,
+)
 from pointsplat_ns.system.progress import Progress, silent
 
 JSON_BYTES = 8192
 """The description is filled up with spaces to this size, so that a file's size follows from the number of Gaussians."""
 
 _EXTENSION = "KHR_gaussian_splatting"
+
+_TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5126: np.float32}
+_COLUMNS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+
+
+def read_glb(path: Path | str) -> Gaussians:
+    """Read all Gaussians of a ``.glb``, as :func:`~pointsplat_ns.io.read_scene` does. The transforms of nodes are not
+    applied, which is logged. Raises SceneError if there are no Gaussians, they are compressed or lie in other files, or
+    the file is damaged."""
+    path = require_file(path, "a .glb file")
+    with damage_named(path, "glTF"):
+        content, binary = _chunks(load_bytes(path), path)
+        found = [
+            (primitive, primitive["extensions"][_EXTENSION])
+            for mesh in content.get("meshes", [])
+            for primitive in mesh["primitives"]
+            if _EXTENSION in primitive.get("extensions", {})
+        ]
+        if not found:
+            raise SceneError(f"{path}: no Gaussians; expected a glTF with {_EXTENSION}")
+        if any({"matrix", "translation", "rotation", "scale"} & node.keys() for node in content.get("nodes", [])):
+            logger.warning("%s: the transforms of its nodes are not applied", path)
+        parts = []
+        for primitive, about in found:
+            others = [*about.get("extensions", {})]
+            if others or about.get("kernel", "ellipse") != "ellipse":
+                wanted = ", ".join([*others, f"the kernel {about.get('kernel')}"])
+                raise SceneError(f"{path}: its Gaussians need {wanted}; expected {_EXTENSION} alone, of ellipses")
+            if about.get("colorSpace", "srgb_rec709_display") != "srgb_rec709_display":
+                logger.warning("%s: colours of the space %s are read as sRGB", path, about["colorSpace"])
+            parts.append(_primitive(primitive["attributes"], content, binary, path))
+    rest = max(part.features_rest.shape[1] for part in parts)
+    filled = [part.features_rest.new_zeros(len(part), rest, 3) for part in parts]
+    for part, target in zip(parts, filled, strict=True):
+        target[:, : part.features_rest.shape[1]] = part.features_rest
+    parts = [part.replace(features_rest=target) for part, target in zip(parts, filled, strict=True)]
+    return keep_usable(Gaussians.cat(parts), path)
+
+
+def _chunks(data: bytes, path: Path) -> tuple[dict[str, Any], memoryview]:
+    """The description and the binary chunk of a ``.glb``."""
+    if data[:4] != b"glTF" or len(data) < 20 or struct.unpack_from("<I", data, 4) != (2,):
+        raise SceneError(f"{path}: not a .glb file of version 2 (starts with {data[:8]!r})")
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    if kind != b"JSON" or 20 + size > len(data):
+        raise SceneError(f"{path}: truncated; a description of {size} bytes is expected at byte 20")
+    content = json.loads(data[20 : 20 + size])
+    if not isinstance(content, dict):
+        raise ValueError("its description is no object")
+    if 28 + size > len(data):
+        return content, memoryview(b"")
+    length, kind = struct.unpack_from("<I4s", data, 20 + size)
+    if kind != b"BIN\0" or 28 + size + length > len(data):
+        raise SceneError(
+            f"{path}: truncated; {length} bytes expected at byte {28 + size}, found {len(data) - 28 - size}"
+        )
+    return content, memoryview(data)[28 + size : 28 + size + length]
+
+
+def _primitive(attributes: dict[str, int], content: dict[str, Any], binary: memoryview, path: Path) -> Gaussians:
+    """The Gaussians of one primitive, by the accessors of its attributes."""
+
+    def values(name: str, columns: int) -> Array:
+        return _numbers(attributes[name], columns, content, binary, path)
+
+    degree = max(d for d in range(MAX_SH_DEGREE + 1) if d == 0 or f"{_EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes)
+    means = values("POSITION", 3)
+    require_memory(path, 8 * len(means) * (11 + 3 * (degree + 1) ** 2))
+    alphas = values(f"{_EXTENSION}:OPACITY", 1).clip(0, 1)
+    with np.errstate(divide="ignore"):
+        logits = np.log(alphas) - np.log1p(-alphas)
+    coefficients = [
+        values(f"{_EXTENSION}:SH_DEGREE_{d}_COEF_{index}", 3) for d in range(degree + 1) for index in range(2 * d + 1)
+    ]
+    if {len(array) for array in coefficients} != {len(means)}:
+        raise ValueError("attributes of different lengths")
+    return scene_of(
+        means,
+        log_of_sizes(values(f"{_EXTENSION}:SCALE", 3)),
+        values(f"{_EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]],
+        logits,
+        coefficients[0],
+        np.stack(coefficients[1:], axis=1) if degree else np.empty((len(means), 0, 3)),
+    )
+
+
+def _numbers(index: int, columns: int, content: dict[str, Any], binary: memoryview, path: Path) -> Array:
+    """The values (N, columns) of an accessor, float64."""
+    accessor = _entry(content["accessors"], index)
+    if "sparse" in accessor or "bufferView" not in accessor:
+        raise SceneError(f"{path}: a sparse accessor; expected its numbers in the file's binary chunk")
+    view = _entry(content["bufferViews"], accessor["bufferView"])
+    if view["buffer"] != 0 or "uri" in content["buffers"][0]:
+        raise SceneError(f"{path}: its numbers lie in another file; expected them in its binary chunk")
+    dtype = np.dtype(_TYPES[accessor["componentType"]]).newbyteorder("<")
+    if _COLUMNS[accessor["type"]] != columns:
+        raise ValueError(f"an accessor of {accessor['type']}, expected {columns} numbers each")
+    count, row = accessor["count"], columns * dtype.itemsize
+    stride = view.get("byteStride", row)
+    within, begin, length = accessor.get("byteOffset", 0), view.get("byteOffset", 0), view["byteLength"]
+    sizes = (count, stride, within, begin, length)
+    if not all(isinstance(size, int) and size >= 0 for size in sizes) or stride < row:
+        raise ValueError(f"sizes {sizes} of an accessor")
+    needed = within + stride * (count - 1) + row if count else 0
+    if needed > length or begin + length > len(binary):
+        raise SceneError(f"{path}: truncated; an accessor of {count} entries reaches beyond its {length} bytes")
+    array = np.ndarray((count, columns), dtype, binary, begin + within, (stride, dtype.itemsize))
+    values = array.astype(np.float64)
+    if accessor.get("normalized") and dtype.kind in "iu":
+        values = (values / np.iinfo(dtype).max).clip(-1)
+    return values
+
+
+def _entry(entries: Any, index: Any) -> dict[str, Any]:
+    if not isinstance(index, int) or not 0 <= index < len(entries):
+        raise ValueError(f"entry {index!r} of {len(entries)}")
+    return entries[index]
 
 
 def glb_bytes(count: int, sh_degree: int) -> int:

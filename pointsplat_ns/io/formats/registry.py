@@ -19,7 +19,7 @@ from pointsplat_ns.io.formats.compressed_ply import (
     is_compressed,
     read_compressed_ply,
 )
-from pointsplat_ns.io.formats.glb import encode_glb, glb_bytes
+from pointsplat_ns.io.formats.glb import encode_glb, glb_bytes, read_glb
 from pointsplat_ns.io.formats.ksplat import read_ksplat
 from pointsplat_ns.io.formats.sog import encode_sog, read_sog, write_sog_folder
 from pointsplat_ns.io.formats.sog_images import META
@@ -96,7 +96,8 @@ FORMATS = (
     Format("SOG folder", META, read_sog, write_sog_folder, encode=encode_sog, order=morton_order),
     Format("ksplat", ".ksplat", read_ksplat),
     Format("splat", ".splat", read_splat, _writer(encode_splat), bytes_of=splat_bytes, order=drawing_order),
-    Format("glTF", ".glb", write=_writer(encode_glb), bytes_of=glb_bytes),
+    Format("glTF", ".glb", read_glb, _writer(encode_glb), (b"glTF",), glb_bytes),
+    Format("LCC", ".lcc"), Format("LCC", ".lcc2"),
 )  # fmt: skip
 """All formats of files that hold nothing but a scene."""
 
@@ -111,7 +112,7 @@ def format_named(name: str) -> Format | None:
 
 def format_to_read(path: Path) -> Format | None:
     """The format of a file or SOG folder, streamed or not, by its first bytes, else by its name; None if neither is
-    known. Raises SceneError if the file cannot be read, or its format is written only."""
+    known. Raises SceneError if the file cannot be read, or its format is known and not read."""
     if path.is_dir():
         return next((format_named(name) for name in (STREAM_META, META) if (path / name).is_file()), None)
     named = format_named(path.name)
@@ -123,7 +124,7 @@ def format_to_read(path: Path) -> Format | None:
     if named is None or named.starts and not start.startswith(named.starts):
         named = next((kind for kind in FORMATS if kind.starts and start.startswith(kind.starts)), named)
     if named is not None and named.read is None:
-        raise SceneError(f"{path}: {named.name} files are written, not read; expected one of {READABLE}")
+        raise SceneError(f"{path}: {named.name} files are not read; expected one of {READABLE}")
     return named
 
 
