@@ -21,14 +21,14 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from pointsplat_ns.api import compact, example_room, load, lod, plot_views, prune, refine
+    from pointsplat_ns.api import compact, example_room, load, lod, plot_views, prune
     from pointsplat_ns.compression.compact import Compacted
     from pointsplat_ns.compression.levels import Levels
     from pointsplat_ns.compression.pictures import plot_comparison, plot_distributions
     from pointsplat_ns.compression.placing import place
     from pointsplat_ns.compression.scene_info import SceneInfo, info
     from pointsplat_ns.compression.scene_task import SceneResult
-    from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
+    from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, refine
     from pointsplat_ns.errors import BudgetError, DataError, MissingPackageError, PointSplatError, SceneError
     from pointsplat_ns.filming import open_viewer, render_path
     from pointsplat_ns.folders import compact_folder
@@ -49,14 +49,14 @@ if TYPE_CHECKING:
     from pointsplat_ns.views import View, Views
 
 _PUBLIC = {
-    "pointsplat_ns.api": ("compact", "example_room", "load", "lod", "plot_views", "prune", "refine"),
+    "pointsplat_ns.api": ("compact", "example_room", "load", "lod", "plot_views", "prune"),
     "pointsplat_ns.compression.compact": ("Compacted",),
     "pointsplat_ns.compression.levels": ("Levels",),
     "pointsplat_ns.compression.pictures": ("plot_comparison", "plot_distributions"),
     "pointsplat_ns.compression.placing": ("place",),
     "pointsplat_ns.compression.scene_info": ("SceneInfo", "info"),
     "pointsplat_ns.compression.scene_task": ("SceneResult",),
-    "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner"),
+    "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner", "refine"),
     "pointsplat_ns.pages.scene_page": ("write_page",),
     "pointsplat_ns.looking.sampling": ("sample_views",),
     "pointsplat_ns.errors": ("BudgetError", "DataError", "MissingPackageError", "PointSplatError", "SceneError"),

@@ -16,7 +16,13 @@ from pointsplat_ns.compression.level_stream import Chunks, check_stream_folder
 from pointsplat_ns.compression.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
 from pointsplat_ns.compression.pictures import plot_views as draw_views
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
-from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, open_refiner_run, scenes_of_run
+from pointsplat_ns.compression.trained_refiner import (
+    TrainedRefiner,
+    load_refiner,
+    open_refiner_run,
+    refine,
+    scenes_of_run,
+)
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
@@ -142,31 +148,6 @@ def prune(
     request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune)
     _, pruned, _, _ = prune_source(scene, request, views, resolution, up, progress)
     return pruned
-
-
-def refine(scene: Gaussians, refiner: TrainedRefiner | None = None) -> Gaussians:
-    """Refine a pruned scene by one forward pass of a trained network.
-
-    The network was trained on scenes pruned with ``refiner.settings``. :func:`compact` compares renders before it
-    accepts the result.
-
-    Args:
-        scene: K Gaussians.
-        refiner: from :func:`load_refiner`; by default the shipped one.
-
-    Returns:
-        K Gaussians on the device of the given scene.
-
-    Raises:
-        SceneError: if the SH degree exceeds the network's.
-
-    Example:
-        >>> import pointsplat_ns as ps
-        >>> small = ps.prune(ps.example_room()[::10], keep="10%")
-        >>> len(ps.refine(small, ps.load_refiner())) == len(small)
-        True
-    """
-    return (refiner or load_refiner())(scene)
 
 
 def compact(

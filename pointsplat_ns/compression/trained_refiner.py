@@ -96,6 +96,31 @@ def load_refiner(path: Path | str | None = None, device: torch.device | str | No
     return TrainedRefiner(network.to(device).eval(), settings, path)
 
 
+def refine(scene: Gaussians, refiner: TrainedRefiner | None = None) -> Gaussians:
+    """Refine a pruned scene by one forward pass of a trained network.
+
+    The network was trained on scenes pruned with ``refiner.settings``. :func:`pointsplat_ns.compact` compares renders
+    before it accepts the result.
+
+    Args:
+        scene: K Gaussians.
+        refiner: from :func:`load_refiner`; by default the shipped one.
+
+    Returns:
+        K Gaussians on the device of the given scene.
+
+    Raises:
+        SceneError: if the SH degree exceeds the network's.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> small = ps.prune(ps.example_room()[::10], keep="10%")
+        >>> len(ps.refine(small, ps.load_refiner())) == len(small)
+        True
+    """
+    return (refiner or load_refiner())(scene)
+
+
 SHIPPED = "shipped"
 """Name of the shipped refiner, in place of a path."""
 
