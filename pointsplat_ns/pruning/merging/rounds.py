@@ -3,7 +3,7 @@
 Everything is computed on one thread each, in pieces that several threads take: the result is the same bits on any
 number of threads, and no thread waits for another within an operation.
 
-Memory: besides the scene itself about 0.3 kB a Gaussian. SH coefficients are read twice, in pieces: for the principal
+Memory: besides the scene itself at most 0.6 kB a Gaussian. SH coefficients are read twice, in pieces: for the principal
 axes of colours, and at the end for the means of members.
 """
 
