@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
-import types
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -164,9 +162,7 @@ def plain_page(monkeypatch) -> list[Path]:
         output.write_text(" ".join(point.key for point in sweep.points))
         return output
 
-    page = types.ModuleType("pointsplat_ns.tradeoff.page")
-    page.write_page = write_page
-    monkeypatch.setitem(sys.modules, "pointsplat_ns.tradeoff.page", page)
+    monkeypatch.setattr("pointsplat_ns.tradeoff.page.write_page", write_page)
     return asked
 
 

@@ -58,7 +58,7 @@ def test_a_sweep_is_written_beside_the_scene_and_printed(ply, capsys):
     said = capsys.readouterr().out
     assert f"room: 3 points, 48 x 36 pixels, {content['views_origin']}" in said and content["machine"] in said
     for point in content["points"]:
-        rows = {re.split(r" *\*?  +", line.strip())[0]: line for line in said.splitlines()}
+        rows = {re.split(r" \*? *│", line.strip(" │"))[0].strip(): line for line in said.splitlines()}
         row = rows[point["label"]]
         assert f"{point['gaussians']:,}" in row and f"{point['speed']['median']:.1f} (" in row
     assert content["why"] in said and str(folder / "tradeoff.html") in said

@@ -5,11 +5,15 @@ from __future__ import annotations
 import ctypes
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
 import torch
 
+import pointsplat_ns
+from pointsplat_ns.geometry import neighbours
 from pointsplat_ns.metrics import structural_similarity
+from pointsplat_ns.pruning.merging import matching, pair_cost, regrouping, replacement
 from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
 from pointsplat_ns.system.kernels import Pointer, functions_of, structs_of
 
@@ -41,7 +45,9 @@ void pointsplat_run(const Task* task, const int64_t* rows,
 
 }  // extern "C"
 """
-SOURCES = [module.KERNELS.source for module in (blending, colors, projection, tiles, structural_similarity)]
+MODULES = (blending, colors, projection, tiles, structural_similarity)
+MERGING = (neighbours, matching, pair_cost, regrouping, replacement)
+SOURCES = [module.KERNELS.source for module in MODULES + MERGING]
 COMPILER = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
 
 
@@ -58,7 +64,8 @@ def test_structs_are_laid_out_as_the_compiler_lays_them_out(source, tmp_path):
         ]
     check = tmp_path / "check.cpp"
     check.write_text("\n".join(lines) + "\n", "utf-8")
-    subprocess.run([COMPILER, "-std=c++17", "-fsyntax-only", str(check)], check=True)
+    shared = Path(pointsplat_ns.__file__).parent / "system" / "include"
+    subprocess.run([COMPILER, "-std=c++17", "-fsyntax-only", f"-I{shared}", str(check)], check=True)
 
 
 def test_what_is_shared_is_declared_with_its_types():

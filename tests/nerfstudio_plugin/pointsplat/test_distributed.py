@@ -104,8 +104,8 @@ def normalise(norm: nn.Module, x: torch.Tensor, weights: torch.Tensor) -> dict[s
 
 def feedback(file: Path) -> list[torch.Tensor]:
     """What the network that sets the steps of repairs learns in two updates of two repairs."""
-    settings = feedback_training.FeedbackTrainingSettings(steps=(6,), side=32)
-    with mock.patch.object(feedback_training, "TRAINING", settings):
+    settings = feedback_training.FeedbackTrainingSettings(steps=(6,))
+    with mock.patch.multiple(feedback_training, TRAINING=settings, RESOLUTION=(32, 24)):
         scene = feedback_training.TrainingScene.of("ball", ball(800), ["30%"], view_batches=1)
         network = feedback_training.train_feedback([scene], 2, at_once=2, output=file)
     return [value.detach() for value in network.parameters()]
