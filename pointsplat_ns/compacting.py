@@ -109,7 +109,7 @@ def compact_source(
         if goal is None:
             from pointsplat_ns.compression.compact import compact_scene
 
-            photos = None if request.photos is None else training_photos(run_of(scene, None))
+            photos = None if request.photos is None else _training_photos(run_of(scene, None))
             result = compact_scene(dense, request, source, report, photos)
         else:
             from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
@@ -180,7 +180,7 @@ def run_of(scene: Source, views: ViewsInput) -> Path | None:
     return Path(named) if isinstance(named, (str, Path)) else None
 
 
-def training_photos(run: Path | None) -> Photos:
+def _training_photos(run: Path | None) -> Photos:
     """The training photos of a run's dataset.
 
     Raises:

@@ -8,9 +8,7 @@ step. The scene that is closest to those is the result.
 
 from __future__ import annotations
 
-import math
 import random
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count as counted
@@ -18,6 +16,7 @@ from itertools import count as counted
 import torch
 
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings, Example, optimised
+from pointsplat_ns.compression.repair import Steps, rate_factor
 from pointsplat_ns.compression.requests import PhotoBudget
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
@@ -101,33 +100,24 @@ def photo_repair(
     """
     if len(photos) < 2:
         raise DataError(f"{len(photos)} photos to train on; expected at least two, one of them to compare with")
-    start = time.perf_counter()
+    run, checked = Steps(budget), 0
     unseen = list(range(0, len(photos), SETTINGS.unseen_every))[: SETTINGS.most_unseen]
     used = sorted({*range(len(photos))} - {*unseen})
     best, before = scene, _psnr(scene, photos, unseen)
-    after, steps, done, checked, interrupted = before, 0, 0.0, 0, False
+    after = before
+
+    def compare(scene: Gaussians) -> None:
+        nonlocal best, after, checked
+        if int(run.done * SETTINGS.checks) > checked:
+            checked = int(run.done * SETTINGS.checks)
+            if (psnr := _psnr(scene, photos, unseen)) > after:
+                best, after = scene, psnr
+
     adam = Adam(scene, AdamSettings(faster=SETTINGS.faster))
-    scenes = optimised(scene, adam, _examples(photos, used, dense, views), lambda _: (_factor(done), None))
-    try:
-        while done < 1:
-            scene = next(scenes)
-            steps += 1
-            done = budget.share_done(steps, time.perf_counter() - start)
-            if int(done * SETTINGS.checks) > checked:
-                checked = int(done * SETTINGS.checks)
-                if (psnr := _psnr(scene, photos, unseen)) > after:
-                    best, after = scene, psnr
-            if progress is not None:
-                progress(min(done, 1.0))
-    except KeyboardInterrupt:
-        interrupted = True
-    return PhotoRepaired(best, before, after, len(used), len(unseen), steps, time.perf_counter() - start, interrupted)
-
-
-def _factor(done: float) -> float:
-    """Factor on the learning rates when a share of the steps, in [0, 1], is done."""
-    last = SETTINGS.last_factor
-    return last + (1 - last) * 0.5 * (1 + math.cos(math.pi * done))
+    examples = _examples(photos, used, dense, views)
+    scenes = optimised(scene, adam, examples, lambda _: (rate_factor(run.done, SETTINGS.last_factor), None))
+    run.take(scenes, compare, progress)
+    return PhotoRepaired(best, before, after, len(used), len(unseen), run.count, run.seconds, run.interrupted)
 
 
 @torch.no_grad()

@@ -9,13 +9,10 @@ import torch
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import DenseReference, views_text
-from pointsplat_ns.looking.settings import DEFAULTS as LOOKING
 from pointsplat_ns.looking.sizes import subsampled
+from pointsplat_ns.looking.view_source import COMPARED_VIEWS
 from pointsplat_ns.pruning.merging.settings import DEFAULTS as MERGING
 from pointsplat_ns.views import Views, spread_indices
-
-MOST_VIEWS = 12
-"""Largest number of views of a figure."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +39,12 @@ def quality_of(dense: Gaussians, scene: Gaussians, views: Views) -> Quality:
     """Compare a scene with the dense scene in subsampled pictures (:mod:`~pointsplat_ns.looking.sizes`). On a statue, a
     bathroom and flowers the PSNR is within 0.03 dB of that of the whole pictures.
 
-    Of the views, which are at full size, at most :data:`MOST_VIEWS` are used, and none that the finish of merging
-    compared, unless there are no others.
+    Of the views, which are at full size, at most :data:`~pointsplat_ns.looking.view_source.COMPARED_VIEWS` are used,
+    and none that the finish of merging compared, unless there are no others.
     """
     finish = spread_indices(len(views), MERGING.finish_views)
     if others := sorted({*range(len(views))} - {*finish}):
         views = views[torch.tensor(others)]
-    views = views.spread(MOST_VIEWS)
-    side = max(views.width, views.height)
-    psnr, _ = DenseReference(dense, subsampled(views, side, min(side, LOOKING.smallest_side))).psnr(scene)
+    views = views.spread(COMPARED_VIEWS)
+    psnr, _ = DenseReference(dense, subsampled(views, max(views.width, views.height))).psnr(scene)
     return Quality(psnr, len(views), views.width, views.height)

@@ -63,31 +63,69 @@ def repair(
     Raises:
         DataError: if there is no free space for a camera.
     """
-    start = time.perf_counter()
+    run = Steps(budget)
     if network == "shipped":
         network = shipped_feedback_refiner(scene.device)
     feedback, first_factor = Feedback(scene, len(dense)), initial_rate_factor(psnr)
-    steps, done, interrupted = 0, 0.0, False
 
     def choose(scene: Gaussians) -> tuple[float, Tensor | None]:
         factors = None
         if network is not None:
-            expected = budget.steps_in_all(steps, done) or REPAIR.most_steps
+            expected = budget.steps_in_all(run.count, run.done) or REPAIR.most_steps
             with torch.no_grad(), one_thread():  # the same rounding for any number of threads
-                factors = network(feedback.features(scene, done, expected))
-        return first_factor * rate_factor(done), factors
+                factors = network(feedback.features(scene, run.done, expected))
+        return first_factor * rate_factor(run.done), factors
 
-    scenes = optimised(scene, feedback, _examples(dense, views), choose)
-    try:
-        while done < 1 and not budget.empty:
-            scene = next(scenes)
-            steps += 1
-            done = budget.share_done(steps, time.perf_counter() - start)
-            if progress is not None:
-                progress(min(done, 1.0))
-    except KeyboardInterrupt:
-        interrupted = True
-    return Repaired(scene, steps, time.perf_counter() - start, interrupted)
+    def keep(after: Gaussians) -> None:
+        nonlocal scene
+        scene = after
+
+    run.take(optimised(scene, feedback, _examples(dense, views), choose), keep, progress)
+    return Repaired(scene, run.count, run.seconds, run.interrupted)
+
+
+@dataclass
+class Steps:
+    """The steps of an optimisation within a budget, counted and timed."""
+
+    budget: RepairBudget
+    count: int = 0
+    done: float = 0.0
+    """Used share of the budget; 1 or more at the end."""
+    interrupted: bool = False
+    """Whether Ctrl-C ended the steps early."""
+
+    def __post_init__(self) -> None:
+        self._start = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since this object was made."""
+        return time.perf_counter() - self._start
+
+    def take(
+        self,
+        scenes: Iterator[Gaussians],
+        each: Callable[[Gaussians], None],
+        progress: Callable[[float], None] | None = None,
+    ) -> None:
+        """Take steps until the budget is used, or Ctrl-C.
+
+        Args:
+            scenes: the scene after each step, without end.
+            each: called with it.
+            progress: called with the share done, in [0, 1].
+        """
+        try:
+            while self.done < 1 and not self.budget.empty:
+                scene = next(scenes)
+                self.count += 1
+                self.done = self.budget.share_done(self.count, self.seconds)
+                each(scene)
+                if progress is not None:
+                    progress(min(self.done, 1.0))
+        except KeyboardInterrupt:
+            self.interrupted = True
 
 
 def _examples(dense: Gaussians, views: ViewSource) -> Iterator[Example]:
@@ -98,9 +136,10 @@ def _examples(dense: Gaussians, views: ViewSource) -> Iterator[Example]:
         yield Example(view, target)
 
 
-def rate_factor(done: float) -> float:
-    """Factor on the learning rates when a share of the steps, in [0, 1], is done: a falling half cosine."""
-    return REPAIR.last_factor + (1 - REPAIR.last_factor) * 0.5 * (1 + math.cos(math.pi * done))
+def rate_factor(done: float, last: float = REPAIR.last_factor) -> float:
+    """Factor on the learning rates when a share of the steps, in [0, 1], is done: a half cosine that falls from 1 to
+    ``last``."""
+    return last + (1 - last) * 0.5 * (1 + math.cos(math.pi * done))
 
 
 def initial_rate_factor(psnr: float) -> float:

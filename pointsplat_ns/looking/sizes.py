@@ -69,16 +69,17 @@ def middle_sized(views: Views, settings: LookingSettings = DEFAULTS) -> Views:
     return views.resized(sides[len(sides) // 2])
 
 
-def subsampled(views: Views, side: int, drawn_side: int) -> Views:
+def subsampled(views: Views, side: int, drawn_side: int | None = None) -> Views:
     """Every k-th pixel of pictures of another size, k = ``side / drawn_side``.
 
     Args:
         views: C views of any size.
         side: longer side of the whole pictures, pixels. If it is larger than the views' own, the pictures are as large
             as those of a camera that is nearer.
-        drawn_side: longer side of what is drawn, pixels; at most that of ``views``.
+        drawn_side: longer side of what is drawn, pixels; at most that of ``views``. By default ``side``, and at most
+            ``smallest_side`` of the settings.
     """
-    drawn = views.resized(drawn_side)
+    drawn = views.resized(min(side, DEFAULTS.smallest_side) if drawn_side is None else drawn_side)
     return replace(drawn, eps2d=views.eps2d * (max(drawn.width, drawn.height) / side) ** 2)
 
 
@@ -96,20 +97,12 @@ class RendersOfSizes:
     Args:
         dense: N Gaussians.
         views: C views of the scene.
-        sides: longer sides of the whole pictures, pixels; by default :func:`sides_of`.
-        settings: ``smallest_side``: the longer side of what is drawn.
+        sides: longer sides of the whole pictures, pixels.
     """
 
     @torch.no_grad()
-    def __init__(
-        self,
-        dense: Gaussians,
-        views: Views,
-        sides: Sequence[int] | None = None,
-        settings: LookingSettings = DEFAULTS,
-    ):
-        sides = sides or sides_of(views.width, views.height, settings)
-        drawn = [subsampled(views, side, min(side, settings.smallest_side)) for side in sides]
+    def __init__(self, dense: Gaussians, views: Views, sides: Sequence[int]):
+        drawn = [subsampled(views, side) for side in sides]
         self.references = [DenseReference(dense, of_side, both_backgrounds=True) for of_side in drawn]
         """Renders of the dense scene, for each side."""
 

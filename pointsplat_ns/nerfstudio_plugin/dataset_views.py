@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor
@@ -60,8 +60,7 @@ def dataset_photos(path: Path | str, split: Split, count: int) -> tuple[Views, l
     scene, frames = _open(path, split)
     poses = _views_of(scene, frames, split)
     shown = [frames[index] for index in spread_indices(len(frames), count)]
-    photos = [data["image"][..., :3] for _, data in shown]
-    photos = [photo.float() / 255 if photo.dtype == torch.uint8 else photo.float() for photo in photos]
+    photos = [_colours(data) for _, data in shown]
     height, width = photos[0].shape[:2]
     if any(photo.shape[:2] != (height, width) for photo in photos):
         raise DataError(f"{scene.run.data}: photos of the {split} split have several sizes; expected one")
@@ -78,7 +77,9 @@ def dataset_photos(path: Path | str, split: Split, count: int) -> tuple[Views, l
 def training_photos(path: Path | str) -> Photos:
     """The training photos of a run's dataset, read when they are asked for. Arguments and errors are those of
     :func:`dataset_views`; a photo that cannot be used is a DataError when it is asked for."""
-    scene, frames = _open(path, "train")
+    from pointsplat_ns.nerfstudio_plugin.frames import free_memory_share
+
+    scene, frames = _open(path, "train", free_memory_share())
     _views_of(scene, frames, "train")
     return TrainingPhotos(scene, frames)
 
@@ -97,12 +98,17 @@ class TrainingPhotos(Sequence[Example]):
 
         camera, data = self._frames[index]
         view = views_of_cameras(camera.to("cpu"), self._scene.background, self._scene.rasterize_mode)[0]
-        photo = data["image"][..., :3]
-        return Example(view, photo.float() / 255 if photo.dtype == torch.uint8 else photo.float(), data.get("mask"))
+        return Example(view, _colours(data), data.get("mask"))
 
 
-def _open(path: Path | str, split: Split) -> tuple[TrainedScene, Frames]:
-    """The scene of a run, and the frames of a split."""
+def _colours(data: dict[str, Any]) -> Tensor:
+    """The photo (H, W, 3) in [0, 1] of a frame."""
+    photo = data["image"][..., :3]
+    return photo.float() / 255 if photo.dtype == torch.uint8 else photo.float()
+
+
+def _open(path: Path | str, split: Split, cache_bytes: int = 0) -> tuple[TrainedScene, Frames]:
+    """The scene of a run, and the frames of a split, of which ``cache_bytes`` are kept."""
     run = open_run(path)  # before nerfstudio is imported, which takes seconds
     try:
         need("nerfstudio", "reading the photos and poses of a run")
@@ -110,10 +116,10 @@ def _open(path: Path | str, split: Split) -> tuple[TrainedScene, Frames]:
         raise DataError(str(error)) from error
     import_nerfstudio()
 
-    from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache, free_memory_share
+    from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
     from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
-    scene = TrainedScene(scene_name(run), run, MemoryCache(free_memory_share()))
+    scene = TrainedScene(scene_name(run), run, MemoryCache(cache_bytes))
     return scene, scene.train_frames if split == "train" else scene.eval_frames
 
 

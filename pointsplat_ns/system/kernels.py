@@ -143,8 +143,8 @@ class NativeCodeError(Exception):
 
 @functools.cache
 def load_native(source: Path) -> ctypes.CDLL:
-    """Compile a C++ file, which may include headers (``.h``) that lie beside it, unless that was done before, and load
-    it.
+    """Compile a C++ file, which may include headers (``.h``) that lie beside it or in ``include``, unless that was done
+    before, and load it.
 
     The library lies in a folder of the user's, which others cannot write to, named by a hash of the source, the
     compiler and the processor. Where no such folder can be had it is built anew for each process. Raises
@@ -177,14 +177,11 @@ def _compiler() -> str:
     return found
 
 
+@functools.cache
 def _target(compiler: str) -> tuple[str, bytes]:
     """The flag for this processor, and what the compiler then defines: its version and what the processor can do."""
     # Flags for code of this very processor: compilers know one or the other.
-    for machine in (
-        "-march=native",
-        "-mcpu=native",
-        "",
-    ):
+    for machine in ("-march=native", "-mcpu=native", ""):
         arguments = [compiler, *filter(None, [machine]), "-dM", "-E", "-x", "c++", os.devnull]
         ran = _run(arguments)
         if ran.returncode == 0:
@@ -208,7 +205,6 @@ def _build(compiler: str, machine: str, source: Path, library: Path) -> None:
 
 def _run(arguments: list[str]) -> subprocess.CompletedProcess[bytes]:
     try:
-        # For a compiler.
         return subprocess.run(arguments, capture_output=True, stdin=subprocess.DEVNULL, timeout=120.0, check=False)
     except (OSError, subprocess.SubprocessError) as error:
         raise NativeCodeError(f"{arguments[0]}: {_first_line(str(error))}") from error

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import random
 
 import pytest
 import torch
 
 import pointsplat_ns as ps
+from making import FewViews
 from pointsplat_ns.compression import photo_repair as module
 from pointsplat_ns.compression.compact import compact_scene
 from pointsplat_ns.compression.optimiser import Example, gradients_of
@@ -17,20 +17,11 @@ from pointsplat_ns.compression.photo_repair import every_kth_pixel, photo_repair
 from pointsplat_ns.compression.requests import PHOTO_STEPS, CompactRequest, PhotoBudget, RepairBudget
 from pointsplat_ns.errors import BudgetError, DataError, SceneError
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import EPS2D
 
 CPU = torch.device("cpu")
-
-
-class Few(ViewSource):
-    """Fresh views of 48 x 36 pixels."""
-
-    def sampled(self, seed: int = 0):
-        for number in itertools.count(1):
-            yield from sample_views(self._scene, 8, 48, 36, seed=number)
 
 
 @pytest.fixture(autouse=True)
@@ -53,7 +44,7 @@ def photos(hollow_ball):
 
 def test_photos_teach_what_the_dense_scene_does_not_know(hollow_ball, pruned, photos):
     before, shares = [value.clone() for value in pruned.tensors()], []
-    trained = photo_repair(pruned, hollow_ball, photos, Few(hollow_ball), PhotoBudget("quick"), shares.append)
+    trained = photo_repair(pruned, hollow_ball, photos, FewViews(hollow_ball), PhotoBudget("quick"), shares.append)
     assert trained.after > trained.before + 1
     assert (trained.used, trained.unseen, trained.steps) == (15, 3, 40) and not trained.interrupted
     assert len(trained.scene) == 300 and bool(trained.scene.usable().all())
@@ -66,7 +57,7 @@ def test_unseen_photos_and_held_back_pixels_are_in_no_step(hollow_ball, pruned, 
     monkeypatch.setattr(
         module, "every_kth_pixel", lambda photo, *rest: taken.append(id(photo)) or every_kth_pixel(photo, *rest)
     )
-    photo_repair(pruned, hollow_ball, photos, Few(hollow_ball), PhotoBudget("quick"))
+    photo_repair(pruned, hollow_ball, photos, FewViews(hollow_ball), PhotoBudget("quick"))
     unseen = {id(photo) for photo in photos[::8]}
     assert taken[:3] == [id(photo) for photo in photos[::8]]  # compared before the first step
     # 30 of 40 steps take a photo, 1 of 4 a render of the dense scene; the rest are comparisons.
@@ -76,7 +67,7 @@ def test_unseen_photos_and_held_back_pixels_are_in_no_step(hollow_ball, pruned, 
 def test_the_scene_that_is_best_in_unseen_photos_is_the_result(hollow_ball, pruned, photos, monkeypatch):
     """Steps that are far too long harm: the scene stays as it was."""
     monkeypatch.setattr(module, "SETTINGS", dataclasses.replace(module.SETTINGS, faster=1e4, last_factor=1.0))
-    trained = photo_repair(pruned, hollow_ball, photos, Few(hollow_ball), PhotoBudget("quick"))
+    trained = photo_repair(pruned, hollow_ball, photos, FewViews(hollow_ball), PhotoBudget("quick"))
     assert trained.scene is pruned and trained.after == trained.before
 
 
@@ -85,18 +76,18 @@ def test_ctrl_c_gives_the_best_scene_so_far(hollow_ball, pruned, photos):
         if share > 0.6:
             raise KeyboardInterrupt
 
-    trained = photo_repair(pruned, hollow_ball, photos, Few(hollow_ball), PhotoBudget("quick"), stop)
+    trained = photo_repair(pruned, hollow_ball, photos, FewViews(hollow_ball), PhotoBudget("quick"), stop)
     assert trained.interrupted and trained.steps == 25 and trained.after > trained.before + 0.5
 
 
 def test_seconds_end_it(hollow_ball, pruned, photos):
-    trained = photo_repair(pruned, hollow_ball, photos, Few(hollow_ball), PhotoBudget(seconds=0.3))
+    trained = photo_repair(pruned, hollow_ball, photos, FewViews(hollow_ball), PhotoBudget(seconds=0.3))
     assert trained.steps >= 1 and trained.seconds >= 0.3
 
 
 def test_one_photo_is_too_few(hollow_ball, pruned, photos):
     with pytest.raises(DataError, match="1 photos to train on; expected at least two"):
-        photo_repair(pruned, hollow_ball, photos[:1], Few(hollow_ball), PhotoBudget("quick"))
+        photo_repair(pruned, hollow_ball, photos[:1], FewViews(hollow_ball), PhotoBudget("quick"))
 
 
 @pytest.mark.parametrize("generator", [None, random.Random(3)])
@@ -126,7 +117,7 @@ def test_masked_pixels_neither_pull_nor_count(hollow_ball, pruned, photos):
 def test_compact_says_what_photos_brought(hollow_ball, photos):
     request = CompactRequest.of(keep=0.2, repair=RepairBudget("quick"), photos=True)
     request = dataclasses.replace(request, repair=RepairBudget("instant"))
-    result = compact_scene(hollow_ball, request, Few(hollow_ball, resolution=(64, 48)), photos=photos)
+    result = compact_scene(hollow_ball, request, FewViews(hollow_ball, resolution=(64, 48)), photos=photos)
     assert result.last.name == "photos" and result.photo_psnr == result.last.photos.after
     assert "trained on 15 photos by 40 steps in" in result.verdict
     assert "dB PSNR in 3 photos that no step used" in result.verdict

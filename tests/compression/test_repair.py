@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import pointsplat_ns.compression.repair as repair_module
-from making import same
+from making import FewViews, same
 from pointsplat_ns.api import example_room
 from pointsplat_ns.compression.feedback import Feedback
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings, gradients_of, nonzero_rms, optimised
@@ -21,14 +21,6 @@ from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
-
-
-class Few(ViewSource):
-    """Fresh views of 48 x 36 pixels."""
-
-    def others(self, seed: int = 0):
-        for number in itertools.count(1):
-            yield from sample_views(self._scene, 8, 48, 36, seed=number)
 
 
 @pytest.fixture(autouse=True)
@@ -45,7 +37,7 @@ def pruned(hollow_ball):
 def test_repair_comes_closer_in_views_that_it_has_not_seen(hollow_ball, pruned, ball_views):
     before = [value.clone() for value in pruned.tensors()]
     shares = []
-    repaired = repair(pruned, hollow_ball, Few(hollow_ball), RepairBudget("quick"), shares.append, network=None)
+    repaired = repair(pruned, hollow_ball, FewViews(hollow_ball), RepairBudget("quick"), shares.append, network=None)
     reference = DenseReference(hollow_ball, ball_views)
     assert reference.psnr(repaired.scene)[0] > reference.psnr(pruned)[0] + 1
     assert len(repaired.scene) == 300 and bool(repaired.scene.usable().all())
@@ -76,18 +68,18 @@ def test_how_many_steps_there_will_be_is_known_or_estimated():
 
 def test_an_effort_gives_the_same_result_each_time(hollow_ball, pruned, monkeypatch):
     monkeypatch.setitem(STEPS, "quick", 5)
-    first, second = (repair(pruned, hollow_ball, Few(hollow_ball), RepairBudget("quick")) for _ in range(2))
+    first, second = (repair(pruned, hollow_ball, FewViews(hollow_ball), RepairBudget("quick")) for _ in range(2))
     assert same(first.scene, second.scene) and not same(first.scene, pruned)
 
 
 def test_no_effort_takes_no_step_and_a_time_takes_that_long(hollow_ball, pruned, monkeypatch):
     for budget in (RepairBudget("instant"), RepairBudget("thorough", 0.0)):
         assert budget.empty
-        repaired = repair(pruned, hollow_ball, Few(hollow_ball), budget)
+        repaired = repair(pruned, hollow_ball, FewViews(hollow_ball), budget)
         assert repaired.steps == 0 and same(repaired.scene, pruned)
     clock = itertools.count()  # a second each time that anybody looks
     monkeypatch.setattr(repair_module.time, "perf_counter", lambda: float(next(clock)))
-    assert repair(pruned, hollow_ball, Few(hollow_ball), RepairBudget("thorough", 7.0)).steps == 7
+    assert repair(pruned, hollow_ball, FewViews(hollow_ball), RepairBudget("thorough", 7.0)).steps == 7
 
 
 def test_learning_rates_fall_to_nearly_nothing(hollow_ball, pruned, monkeypatch):
@@ -98,7 +90,7 @@ def test_learning_rates_fall_to_nearly_nothing(hollow_ball, pruned, monkeypatch)
         return {name: torch.zeros_like(value) for name, value in pruned.items()}
 
     monkeypatch.setattr(Feedback, "moves", moves)
-    repair(pruned, hollow_ball, Few(hollow_ball), RepairBudget("quick"))
+    repair(pruned, hollow_ball, FewViews(hollow_ball), RepairBudget("quick"))
     assert shares[0] == 1 and shares == sorted(shares, reverse=True) and 0.02 <= shares[-1] < 0.03
 
 
@@ -106,7 +98,7 @@ def test_what_is_nearly_right_takes_steps_in_proportion_to_its_error(hollow_ball
     monkeypatch.setitem(STEPS, "quick", 1)
     shifts = []
     for psnr in (0.0, 35.0, 55.0, math.inf):
-        after = repair(pruned, hollow_ball, Few(hollow_ball), RepairBudget("quick"), psnr=psnr).scene
+        after = repair(pruned, hollow_ball, FewViews(hollow_ball), RepairBudget("quick"), psnr=psnr).scene
         shifts.append(float((after.features_dc - pruned.features_dc).abs().max()))
     assert shifts[0] == shifts[1] > 0 == shifts[3]
     assert shifts[2] == pytest.approx(0.1 * shifts[0], rel=1e-3)
@@ -117,7 +109,9 @@ def test_one_distant_gaussian_does_not_change_the_steps_of_the_others(hollow_bal
     monkeypatch.setitem(STEPS, "quick", 3)
     lone = pruned[:1].replace(means=torch.tensor([[far, 0.0, -far]]))
     joined = Gaussians(*(torch.cat(pair) for pair in zip(pruned.tensors(), lone.tensors(), strict=True)))
-    alone, beside = (repair(s, hollow_ball, Few(hollow_ball), RepairBudget("quick")).scene for s in (pruned, joined))
+    alone, beside = (
+        repair(s, hollow_ball, FewViews(hollow_ball), RepairBudget("quick")).scene for s in (pruned, joined)
+    )
     assert bool(beside.usable().all())
     for name, value in alone.items():
         moved = (value - getattr(pruned, name)).norm()
@@ -130,7 +124,7 @@ def test_an_interruption_loses_nothing(hollow_ball, pruned):
         if share > 0.2:
             raise KeyboardInterrupt
 
-    repaired = repair(pruned, hollow_ball, Few(hollow_ball), RepairBudget("quick"), stop)
+    repaired = repair(pruned, hollow_ball, FewViews(hollow_ball), RepairBudget("quick"), stop)
     assert repaired.interrupted and repaired.steps == 7  # 7/32 is the first share above 0.2
     assert bool(repaired.scene.usable().all()) and not same(repaired.scene, pruned)
 

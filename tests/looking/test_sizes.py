@@ -63,7 +63,7 @@ def test_views_of_a_middle_size(views):
 
 
 def test_the_scene_itself_is_not_wrong_at_any_size_and_a_wider_one_is(scene, views):
-    renders = RendersOfSizes(scene, views)
+    renders = RendersOfSizes(scene, views, sides_of(640, 480))
     assert renders.psnrs(scene) == [100.0] * 3
     wider = renders.psnrs(scene.replace(scales=scene.scales + 0.1))
     assert all(5 < psnr < 60 for psnr in wider)
@@ -73,7 +73,7 @@ def test_the_scene_itself_is_not_wrong_at_any_size_and_a_wider_one_is(scene, vie
 def test_an_error_of_opacity_alone_counts_before_the_background_that_shows_it(scene, views):
     """Black Gaussians before black: their opacity does not show, and it does before white."""
     black = scene.replace(features_dc=torch.full_like(scene.features_dc, -10.0), features_rest=scene.features_rest * 0)
-    renders = RendersOfSizes(black, views)
+    renders = RendersOfSizes(black, views, sides_of(640, 480))
     assert renders.psnr(black.replace(opacities=black.opacities - 1)) < 50
 
 

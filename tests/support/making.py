@@ -4,6 +4,7 @@ imports."""
 from __future__ import annotations
 
 import ast
+import itertools
 import math
 import os
 import shlex
@@ -17,6 +18,8 @@ import numpy as np
 import torch
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.system.kernels import on_threads
 from pointsplat_ns.system.threads import fixed_threads
 
@@ -387,3 +390,13 @@ def decoded(path: Path) -> list[np.ndarray]:
     with av.open(str(path)) as container:
         frames = [frame.reformat(format="rgb24", **ranges) for frame in container.decode(video=0)]
     return [frame.to_ndarray() for frame in frames]
+
+
+class FewViews(ViewSource):
+    """Fresh views of 48 x 36 pixels."""
+
+    def sampled(self, seed: int = 0):
+        for number in itertools.count(1):
+            yield from sample_views(self._scene, 8, 48, 36, seed=number)
+
+    others = sampled

@@ -6,7 +6,7 @@ import lzma
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -99,6 +99,20 @@ def scene_of(
     (N,), and SH coefficients (N, 3) and (N, K, 3)."""
     columns = (means, scales, quats, np.reshape(opacities, (-1, 1)), dc, rest)
     return Gaussians(*(torch.from_numpy(np.array(column, np.float32, order="C")) for column in columns))
+
+
+def joined(parts: Sequence[Gaussians], degree: int | None = None) -> Gaussians:
+    """All Gaussians of several scenes, in order, with SH up to a degree, by default the largest of theirs. Bands that a
+    scene does not have are zero."""
+    if degree is None:
+        degree = max((part.sh_degree for part in parts), default=0)
+    filled = [Gaussians.empty(degree)]
+    for part in parts:
+        rest = part.features_rest.new_zeros(len(part), (degree + 1) ** 2 - 1, 3)
+        known = min(rest.shape[1], part.features_rest.shape[1])
+        rest[:, :known] = part.features_rest[:, :known]
+        filled.append(part.replace(features_rest=rest))
+    return Gaussians.cat(filled)
 
 
 def logits_of_bytes(levels: Array) -> Array:

@@ -21,6 +21,7 @@ from pointsplat_ns.io.formats.coding import (
     bytes_of_logits,
     damage_named,
     finite_sizes,
+    joined,
     load_bytes,
     log_of_sizes,
     scene_of,
@@ -65,12 +66,7 @@ def read_glb(path: Path | str) -> Gaussians:
             if about.get("colorSpace", "srgb_rec709_display") != "srgb_rec709_display":
                 logger.warning("%s: colours of the space %s are read as sRGB", path, about["colorSpace"])
             parts.append(_primitive(primitive["attributes"], content, binary, path))
-    rest = max(part.features_rest.shape[1] for part in parts)
-    filled = [part.features_rest.new_zeros(len(part), rest, 3) for part in parts]
-    for part, target in zip(parts, filled, strict=True):
-        target[:, : part.features_rest.shape[1]] = part.features_rest
-    parts = [part.replace(features_rest=target) for part, target in zip(parts, filled, strict=True)]
-    return keep_usable(Gaussians.cat(parts), path)
+    return keep_usable(joined(parts), path)
 
 
 def _chunks(data: bytes, path: Path) -> tuple[dict[str, Any], memoryview]:

@@ -22,7 +22,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.quaternions import rotation_matrices
 from pointsplat_ns.io.files import keep_usable, read_text, replacing, require_file, require_memory, unusable_kept
-from pointsplat_ns.io.formats.coding import damage_named
+from pointsplat_ns.io.formats.coding import damage_named, joined
 from pointsplat_ns.io.formats.sog import read_sog, sog_parts
 from pointsplat_ns.io.formats.sog_images import META
 from pointsplat_ns.system.progress import Progress, silent
@@ -73,9 +73,7 @@ def read_sog_stream(path: Path | str, level: int = 0) -> Gaussians:
             parts.append(read_sog(file))
         if count not in (None, len(parts[-1])):
             raise SceneError(f"{file}: {len(parts[-1])} Gaussians; {STREAM_META} names {count} of level {level}")
-    degree = max((part.sh_degree for part in parts), default=0)
-    scene = Gaussians.cat([Gaussians.empty(degree), *(_of_degree(part, degree) for part in parts)])
-    return keep_usable(scene, path)
+    return keep_usable(joined(parts), path)
 
 
 def stream_parts(path: Path) -> list[Path]:
@@ -170,7 +168,7 @@ def _part_of(progress: Progress, index: int, count: int) -> Callable[[str, float
 
 def _bound(parts: Sequence[Gaussians]) -> dict[str, list[float]]:
     """The box of the boxes of all Gaussians, of one standard deviation along their axes, as other programs write it."""
-    scene = Gaussians.cat([_of_degree(part, 0) for part in parts])
+    scene = joined(parts, 0)
     half = (rotation_matrices(scene.quats).abs() @ scene.stds[..., None])[..., 0]
     low, high = (scene.means - half).amin(dim=0), (scene.means + half).amax(dim=0)
     limit = torch.finfo(torch.float32).max
@@ -181,14 +179,6 @@ def _bound(parts: Sequence[Gaussians]) -> dict[str, list[float]]:
 def _with_seven_digits(values: Tensor) -> list[float]:
     """Numbers with the digits that float32 has."""
     return [float(f"{value:.7g}") for value in values.tolist()]
-
-
-def _of_degree(scene: Gaussians, degree: int) -> Gaussians:
-    """A scene with as many SH bands as asked for; those that it does not have are zero."""
-    rest = scene.features_rest.new_zeros(len(scene), (degree + 1) ** 2 - 1, 3)
-    known = min(rest.shape[1], scene.features_rest.shape[1])
-    rest[:, :known] = scene.features_rest[:, :known]
-    return scene.replace(features_rest=rest)
 
 
 def _meta(path: Path) -> dict[str, Any]:

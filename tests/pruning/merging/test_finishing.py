@@ -8,7 +8,7 @@ import pytest
 
 from making import ball
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.sizes import RendersOfSizes
+from pointsplat_ns.looking.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.pruning.merging.finishing import Finish, best_finish, top_of_parabola
 from pointsplat_ns.pruning.merging.settings import DEFAULTS
 
@@ -41,7 +41,7 @@ def test_not_a_number_is_never_chosen():
 @pytest.mark.parametrize("change", [-0.08, -0.04, 0.03, 0.0])
 def test_the_size_change_that_undoes_a_known_one_is_found(change):
     dense = ball(500)
-    reference = RendersOfSizes(dense, sample_views(dense, 3, width=96, height=72))
+    reference = RendersOfSizes(dense, sample_views(dense, 3, width=96, height=72), sides_of(96, 72))
 
     def psnr_of(trial: float) -> float:
         return reference.psnr(dense.replace(scales=dense.scales + trial - change))
