@@ -10,10 +10,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from gsplat.strategy import DefaultStrategy
+from gsplat.strategy.base import Strategy
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
@@ -23,17 +24,18 @@ from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.model_components.lib_bilagrid import BilateralGrid
 from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, SplatfactoModelConfig, random_quat_tensor
 from nerfstudio.utils.colors import get_color
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torchmetrics.image import PeakSignalNoiseRatio
 
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.geometry.cameras import viewmats_from_opengl
-from pointsplat_ns.geometry.neighbours import nearest
 from pointsplat_ns.metrics import structural_similarity
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.nerfstudio_plugin.cameras import need_pinhole
 from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND, RasterizerOptions
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.capped import CappedStrategy
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.seeds import at_most, distance_to_others, finite_seeds, random_seeds
 from pointsplat_ns.rasterizer.rendering import Colors
 from pointsplat_ns.system.kernels import Kernels
 from pointsplat_ns.system.threads import one_thread
@@ -58,9 +60,60 @@ class LpipsMetric:
 
 @dataclass
 class SplatfactoCpuModelConfig(RasterizerOptions, SplatfactoModelConfig):
-    """Splatfacto's config and the options of the rasterizer"""
+    """Splatfacto's config, the options of the rasterizer, and those of densification with a cap"""
 
     _target: type = field(default_factory=lambda: SplatfactoCpuModel)
+    strategy: Literal["default", "mcmc"] = "default"
+    """Densification: Splatfacto's, or 3DGS-MCMC, which trains a given number of Gaussians. If max_gs_num is set, it is
+    always mcmc."""
+    max_gs_num: int | None = None
+    """Number of Gaussians of the trained scene, with mcmc; by default 1,000,000."""
+    noise_lr: float = 5e5
+    """Factor on the noise of mcmc, which is also in proportion to the learning rate of the means."""
+    mcmc_opacity_reg: float = 0.01
+    """Weight of the mean opacity in the loss of mcmc."""
+    mcmc_scale_reg: float = 0.01
+    """Weight of the mean size in the loss of mcmc."""
+
+    @property
+    def cap(self) -> int | None:
+        """Number of Gaussians to train; None if there is no cap. Raises PointSplatError if it is below 1."""
+        if self.strategy == "default" and self.max_gs_num is None:
+            return None
+        most = 1_000_000 if self.max_gs_num is None else self.max_gs_num
+        if most < 1:
+            raise PointSplatError(f"--pipeline.model.max-gs-num {most}: expected at least 1")
+        return most
+
+    def densification(self, num_photos: int) -> Strategy:
+        """The strategy of a training on that many photos."""
+        if (most := self.cap) is not None:
+            return CappedStrategy(
+                most=most,
+                first_step=self.warmup_length,
+                grown_by=(self.warmup_length + self.stop_split_at) // 2,
+                last_step=self.stop_split_at,
+                every=self.refine_every,
+                least_opacity=self.cull_alpha_thresh,
+                noise=self.noise_lr,
+            )
+        return DefaultStrategy(
+            prune_opa=self.cull_alpha_thresh,
+            grow_grad2d=self.densify_grad_thresh,
+            grow_scale3d=self.densify_size_thresh,
+            grow_scale2d=self.split_screen_size,
+            prune_scale3d=self.cull_scale_thresh,
+            prune_scale2d=self.cull_screen_size,
+            refine_scale2d_stop_iter=self.stop_screen_size_at,
+            refine_start_iter=self.warmup_length,
+            refine_stop_iter=self.stop_split_at,
+            reset_every=self.reset_alpha_every * self.refine_every,
+            refine_every=self.refine_every,
+            pause_refine_after_reset=num_photos + self.refine_every,
+            absgrad=self.use_absgrad,
+            revised_opacity=False,
+            verbose=True,
+        )
 
     def kernels(self) -> dict[str, Kernels]:
         """Compiled kernels of the rasterizer and of the loss."""
@@ -82,8 +135,9 @@ class SplatfactoCpuModel(SplatfactoModel):
         Splatfacto's own method is not called: it puts seed points on CUDA and downloads LPIPS.
         """
         config = self.config
-        self.seed_points = None if config.random_init else _finite_seeds(self.seed_points)
-        self.gauss_params = self._seed_parameters(*(self.seed_points or _random_seeds(config)))
+        self.seed_points = None if config.random_init else finite_seeds(self.seed_points)
+        seeds = at_most(config.cap, *(self.seed_points or random_seeds(config)))
+        self.gauss_params = self._seed_parameters(*seeds)
         self.camera_optimizer: CameraOptimizer = config.camera_optimizer.setup(
             num_cameras=self.num_train_data, device="cpu"
         )
@@ -99,23 +153,7 @@ class SplatfactoCpuModel(SplatfactoModel):
             if config.background_color == "random"
             else get_color(config.background_color)
         )
-        self.strategy = DefaultStrategy(
-            prune_opa=config.cull_alpha_thresh,
-            grow_grad2d=config.densify_grad_thresh,
-            grow_scale3d=config.densify_size_thresh,
-            grow_scale2d=config.split_screen_size,
-            prune_scale3d=config.cull_scale_thresh,
-            prune_scale2d=config.cull_screen_size,
-            refine_scale2d_stop_iter=config.stop_screen_size_at,
-            refine_start_iter=config.warmup_length,
-            refine_stop_iter=config.stop_split_at,
-            reset_every=config.reset_alpha_every * config.refine_every,
-            refine_every=config.refine_every,
-            pause_refine_after_reset=self.num_train_data + config.refine_every,
-            absgrad=config.use_absgrad,
-            revised_opacity=False,
-            verbose=True,
-        )
+        self.strategy = config.densification(self.num_train_data)
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
 
     def ssim(self, image: Tensor, other: Tensor) -> Tensor:
@@ -135,7 +173,7 @@ class SplatfactoCpuModel(SplatfactoModel):
             features_dc = torch.logit(colors / 255, eps=0.5 / 255)  # half a step of an 8-bit colour: finite logits
         values = {
             "means": points,
-            "scales": _distance_to_others(points, 3).log().repeat(1, 3),
+            "scales": distance_to_others(points, 3).log().repeat(1, 3),
             "quats": quats,
             "features_dc": features_dc,
             "features_rest": torch.zeros(num, num_rest, 3),
@@ -266,50 +304,21 @@ class SplatfactoCpuModel(SplatfactoModel):
             rasterize_mode=self.config.rasterize_mode,
         )
 
+    def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
+        """As Splatfacto's, and in trainings with a cap the paper's weights on opacity and size, which free Gaussians
+        that are not needed where they are."""
+        losses = super().get_loss_dict(outputs, batch, metrics_dict)
+        if self.training and self.config.cap is not None:
+            losses["opacity_reg"] = self.config.mcmc_opacity_reg * _sigmoid(self.opacities).mean()
+            losses["size_reg"] = self.config.mcmc_scale_reg * torch.exp(self.scales).mean()
+        return losses
+
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """As Splatfacto's, without LPIPS if it cannot be computed (``self.lpips.reason`` then says why)."""
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         return {k: v for k, v in metrics.items() if "lpips" not in k or math.isfinite(v)}, images
-
-
-def _random_seeds(config: SplatfactoModelConfig) -> tuple[Tensor, Tensor]:
-    """Positions (N, 3) in a cube around the origin, and no colours (0, 3), as Splatfacto starts without seed points."""
-    return (torch.rand(config.num_random, 3) - 0.5) * config.random_scale, torch.zeros(0, 3)
-
-
-def _distance_to_others(points: Tensor, k: int) -> Tensor:
-    """Mean distance (N, 1) from each point (N, 3) to its ``k`` nearest other positions, float32 and positive.
-
-    Points at the same position count once, so that no distance is zero. With fewer than ``k`` other positions, the
-    distance to the farthest is repeated; with none, the result is 0.01 scene units.
-    """
-    places, place_of = torch.unique(points, dim=0, return_inverse=True)
-    if len(places) < 2:
-        return torch.full((len(points), 1), 0.01)
-    distances = nearest(places, k + 1)[0][:, 1:]
-    missing = distances[:, -1:].expand(-1, k - distances.shape[1])
-    # Distinct positions can be so close that the distance is zero in float32.
-    distances = torch.cat([distances, missing], dim=1).clamp(min=torch.finfo(torch.float32).tiny).float()
-    return distances.mean(dim=1, keepdim=True)[place_of]
-
-
-def _finite_seeds(seeds: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor] | None:
-    """Positions and colours as float32 without rows that are not finite; None if nothing is left."""
-    if seeds is None:
-        return None
-    points, colors = (value.detach().float().cpu() for value in seeds)
-    finite = points.isfinite().all(dim=1)
-    if len(colors) > 0:
-        finite &= colors.isfinite().all(dim=1)
-        colors = colors[finite]
-    if not finite.all():
-        CONSOLE.log(f"{int((~finite).sum())} of {len(points)} seed points are not finite and were dropped")
-    if not finite.any():
-        CONSOLE.log("no seed points are left; training starts from random ones")
-        return None
-    return points[finite].clone(), colors.clone()
 
 
 def _sigmoid(values: Tensor) -> Tensor:

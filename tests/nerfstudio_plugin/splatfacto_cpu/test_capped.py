@@ -1,0 +1,213 @@
+"""Densification with a cap: its formulas against plain twins, and whole trainings that end with that many Gaussians."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import pytest
+import torch
+
+from making import equal
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.geometry.quaternions import rotation_matrices
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.capped import (
+    CappedStrategy,
+    drawn,
+    grown_number,
+    position_noise,
+    replaced,
+    shared_opacity,
+)
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import fitted_schedules, splatfacto_cpu_config
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig
+
+SEED = 20
+
+
+def by_binomials(opacity: float, copies: int) -> tuple[float, float]:
+    """Opacity and factor of the scales by the paper's equation 9, whose binomials are summed without rounding."""
+    shared = -math.expm1(math.log1p(-opacity) / copies)
+    exact = Fraction(shared)
+    total = sum(
+        math.comb(i - 1, k) * (-1) ** k * exact ** (k + 1) * Fraction(1 / math.sqrt(k + 1))
+        for i in range(1, copies + 1)
+        for k in range(i)
+    )
+    return shared, opacity / float(total)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("copies", [1, 2, 3, 10, 51])
+@pytest.mark.parametrize("opacity", [1e-12, 1e-4, 0.005, 0.3, 0.9, 0.999, 0.999999])
+def test_opacity_and_size_are_shared_as_the_paper_has_it(opacity, copies, dtype):
+    logit = torch.tensor([math.log(opacity) - math.log1p(-opacity)], dtype=dtype)
+    scales = torch.tensor([[-60.0, 0.0, 20.0]], dtype=dtype)
+    given = float(torch.sigmoid(logit.double()))  # what the dtype makes of the opacity
+    opacities, shared = shared_opacity(logit, scales, torch.tensor([copies]))
+    expected, factor = by_binomials(given, copies)
+    # The root of 1/(k + 1) is rounded in float64, and binomials of 50 multiply that by a thousand.
+    tolerance = {torch.float32: 2e-6, torch.float64: 1e-11}[dtype]
+    assert opacities.dtype == shared.dtype == dtype
+    assert float(torch.sigmoid(opacities.double())) == pytest.approx(expected, rel=tolerance)
+    moves = shared.double() - scales.double()
+    # A float32 of 60 is rounded to 4e-6.
+    assert moves.tolist()[0] == pytest.approx([math.log(factor)] * 3, abs=5e-6 if dtype == torch.float32 else 1e-11)
+
+
+def test_a_ray_through_the_centre_and_the_sum_over_all_rays_keep_their_light():
+    generator = torch.Generator().manual_seed(SEED)
+    logits = 4 * torch.randn(50, generator=generator, dtype=torch.float64)
+    copies = torch.randint(2, 9, (50,), generator=generator)
+    opacities, scales = shared_opacity(logits, torch.zeros(50, 3, dtype=torch.float64), copies)
+    before, after = torch.sigmoid(logits), torch.sigmoid(opacities)
+    torch.testing.assert_close((1 - after) ** copies, 1 - before, rtol=1e-12, atol=1e-15)
+    x = torch.linspace(-12, 12, 4001, dtype=torch.float64)
+    width = scales.exp()[:, :1]
+    left = before * math.sqrt(2 * math.pi)
+    right = torch.trapezoid(1 - (1 - after[:, None] * (-0.5 * (x / width) ** 2).exp()) ** copies[:, None], x, dim=1)
+    torch.testing.assert_close(right, left, rtol=1e-10, atol=0)
+
+
+@pytest.mark.parametrize("logit", [-math.inf, -1e4, -200.0, 40.0, 1e4, math.inf])
+def test_opacities_of_0_and_1_are_shared_as_finite_ones(logit):
+    opacities, scales = shared_opacity(torch.tensor([logit]), torch.zeros(1, 3), torch.tensor([7]))
+    assert opacities.isfinite().all() and scales.isfinite().all()
+    assert float(opacities) < (0 if logit < 0 else 16)
+
+
+def test_noise_is_the_covariance_times_normal_numbers_and_falls_with_opacity():
+    generator = torch.Generator().manual_seed(SEED)
+    scales = torch.randn(6, 3, generator=generator, dtype=torch.float64)
+    quats = torch.randn(6, 4, generator=generator, dtype=torch.float64)
+    opacities = torch.logit(torch.tensor([1e-6, 0.005, 0.02, 0.05, 0.5, 0.999], dtype=torch.float64))[:, None]
+    torch.manual_seed(SEED)
+    moves = position_noise(scales, quats, opacities)
+    torch.manual_seed(SEED)
+    normal = torch.randn(6, 3, 1, dtype=torch.float64)[..., 0]
+    for i, matrix in enumerate(rotation_matrices(quats)):
+        covariance = matrix @ torch.diag((2 * scales[i]).exp()) @ matrix.T
+        share = 1 / (1 + math.exp(100 * (float(torch.sigmoid(opacities[i])) - 0.005)))
+        torch.testing.assert_close(moves[i], share * covariance @ normal[i], rtol=1e-9, atol=1e-60)
+    torch.manual_seed(SEED)
+    single = position_noise(scales.float(), quats.float(), opacities.float())
+    assert single.dtype == torch.float32 and single.isfinite().all()
+
+
+def test_indices_are_drawn_in_proportion_to_weights_and_never_of_weight_0():
+    torch.manual_seed(SEED)
+    found = torch.bincount(drawn(torch.tensor([0.0, 1.0, 0.0, 3.0, 0.0]), 40_000), minlength=5) / 40_000
+    assert found[[0, 2, 4]].sum() == 0
+    assert float(found[3]) == pytest.approx(0.75, abs=0.01)  # 4.6 standard deviations
+
+
+def test_the_number_grows_by_5_percent_or_as_fast_as_needed_and_is_reached_exactly():
+    assert grown_number(1000, 5000, 100) == 1050
+    assert grown_number(990, 1000, 100) == grown_number(1000, 1000, 3) == grown_number(10, 1000, 0) == 1000
+    number = 10
+    for later in range(7, -1, -1):
+        before, number = number, grown_number(number, 1000, later)
+        assert 1.5 < number / before < 2.2, "the same factor each time, up to whole numbers"
+    assert number == 1000
+
+
+def test_averages_of_an_optimiser_follow_their_gaussians_and_those_that_moved_start_anew():
+    old = torch.nn.Parameter(torch.arange(12.0).view(4, 3))
+    optimizer = torch.optim.Adam([old], lr=0.0)
+    old.grad = old.detach().clone() + 1
+    optimizer.step()
+    before = optimizer.state[old]["exp_avg"].clone()
+    rows, changed = torch.tensor([0, 1, 1, 3, 1]), torch.tensor([1, 2, 4])
+    new = replaced(optimizer, old, old.detach()[rows], rows, changed)
+    assert optimizer.param_groups[0]["params"] == [new] and list(optimizer.state) == [new]
+    for name in ("exp_avg", "exp_avg_sq"):
+        assert not optimizer.state[new][name][changed].any() and optimizer.state[new][name][[0, 3]].all()
+    assert torch.equal(optimizer.state[new]["exp_avg"][[0, 3]], before[[0, 3]])
+    new.grad = torch.ones_like(new)
+    optimizer.step()
+
+
+def test_the_picture_hardly_changes_where_gaussians_move_to_others():
+    """A transparent Gaussian is moved, one is added; both to the only opaque ones."""
+    params = torch.nn.ParameterDict(
+        {
+            "means": torch.nn.Parameter(torch.tensor([[0.0, 0, 0], [5.0, 0, 0], [1.0, 0, 0]])),
+            "scales": torch.nn.Parameter(torch.zeros(3, 3)),
+            "quats": torch.nn.Parameter(torch.ones(3, 4)),
+            "opacities": torch.nn.Parameter(torch.tensor([[3.0], [-9.0], [-20.0]])),
+        }
+    )
+    optimizers = {name: torch.optim.Adam([value], lr=0.0) for name, value in params.items()}
+    strategy = CappedStrategy(most=4, first_step=0, grown_by=10, last_step=100, every=5, least_opacity=0.005, noise=0.0)
+    seen, nothing = ({"radii": torch.tensor([[[size, size]]])} for size in (3, 0))
+    torch.manual_seed(SEED)
+    for step, info in ((4, seen), (5, nothing)):
+        strategy.step_post_backward(params, optimizers, {}, step, info)
+        assert len(params["means"]) == 3, "neither between densifications, nor in a step that was skipped"
+    strategy.step_post_backward(params, optimizers, {}, 5, seen)
+    assert params["means"].tolist() == [[0.0, 0, 0]] * 4, "all are where the only opaque one is"
+    left = (1 - torch.sigmoid(params["opacities"].detach())).prod()
+    assert float(left) == pytest.approx(1 - float(torch.sigmoid(torch.tensor(3.0))), rel=1e-5)
+    strategy.step_post_backward(params, optimizers, {}, 95, seen)
+    strategy.step_post_backward(params, optimizers, {}, 100, seen)
+    assert len(params["means"]) == 4
+
+
+@pytest.fixture
+def capped_config(wall_scene, wall_config):
+    def config_of(folder, steps: int, most: int, seeds: int = 300):
+        config = wall_config(wall_scene, folder, steps)
+        config.pipeline.model.max_gs_num = most
+        config.pipeline.datamanager.dataparser.num_seed_points = seeds
+        return config
+
+    return config_of
+
+
+@pytest.mark.parametrize("most", [60, 1000], ids=["fewer than seeds", "more than seeds"])
+def test_a_training_ends_with_exactly_so_many_gaussians(capped_config, run_training, tmp_path, most):
+    trainer, losses = run_training(capped_config(tmp_path, 60, most))
+    model = trainer.pipeline.model
+    assert model.num_points == most
+    assert sum(losses[-5:]) < 0.6 * sum(losses[:5])
+    assert all(value.isfinite().all() for value in model.gauss_params.values())
+    for name, optimizer in trainer.optimizers.optimizers.items():
+        if name in model.gauss_params:
+            assert optimizer.param_groups[0]["params"][0] is model.gauss_params[name]
+            assert optimizer.state[model.gauss_params[name]]["exp_avg"].shape == model.gauss_params[name].shape
+
+
+def test_a_capped_training_that_was_cut_off_goes_on_as_if_it_had_not_been(capped_config, run_training, tmp_path):
+    config = capped_config(tmp_path, 32, 400)
+    config.steps_per_save, config.save_only_latest_checkpoint = 12, False
+    whole, losses = run_training(config)
+    rest = capped_config(tmp_path / "rest", 32 - 13, 400)
+    rest.load_dir, rest.load_step = config.get_checkpoint_dir(), 12
+    resumed, last_losses = run_training(rest)
+    assert whole.pipeline.model.num_points == 400
+    assert last_losses == losses[13:], "to the bit, over step 20, which densifies"
+    assert equal(dict(resumed.pipeline.model.gauss_params), dict(whole.pipeline.model.gauss_params))
+
+
+def test_a_capped_training_is_the_same_on_any_number_of_threads(capped_config, run_training, tmp_path):
+    means = []
+    for threads in (1, 2):
+        config = capped_config(tmp_path / str(threads), 25, 400)
+        config.threads, config.early_look = threads, False
+        means.append(run_training(config)[0].pipeline.model.means)
+    assert torch.equal(*means)
+
+
+def test_max_gs_num_alone_asks_for_a_cap_and_the_schedule_follows_the_length():
+    config = splatfacto_cpu_config()
+    assert config.pipeline.model.cap is None
+    assert SplatfactoCpuModelConfig(strategy="mcmc").cap == 1_000_000
+    config.pipeline.model.max_gs_num = 50_000
+    assert config.pipeline.model.cap == 50_000
+    config.max_num_iterations = 3000
+    strategy = fitted_schedules(config).pipeline.model.densification(10)
+    assert isinstance(strategy, CappedStrategy) and strategy.every == 43
+    assert strategy.first_step < strategy.grown_by < strategy.last_step < 3000
+    config.pipeline.model.max_gs_num = 0
+    with pytest.raises(PointSplatError, match="max-gs-num 0: expected at least 1"):
+        _ = config.pipeline.model.cap
