@@ -73,10 +73,8 @@ class CappedStrategy(Strategy):
         with one_thread():  # sums that decide what is drawn must not depend on the number of threads
             if step % self.every == 0 and self.first_step < step < self.last_step:
                 self._densify(params, optimizers, step)
-            scale = self.noise * optimizers["means"].param_groups[0]["lr"]
-            params["means"] += scale * position_noise(
-                **{name: params[name] for name in ("scales", "quats", "opacities")}
-            )
+            noise = position_noise(params["scales"], params["quats"], params["opacities"])
+            params["means"].add_(noise, alpha=self.noise * optimizers["means"].param_groups[0]["lr"])
 
     def _densify(
         self, params: MutableMapping[str, torch.nn.Parameter], optimizers: Mapping[str, Optimizer], step: int
