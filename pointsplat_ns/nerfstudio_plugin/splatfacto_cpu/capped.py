@@ -46,10 +46,10 @@ class CappedStrategy(Strategy):
     """There is no densification from this step on."""
     every: int
     """Number of steps from one densification to the next."""
-    least_opacity: float
-    """Gaussians of at most this opacity move."""
     noise: float
     """Factor on the noise, times the learning rate of the means."""
+    least_opacity: float = 0.005
+    """Gaussians of at most this opacity move, as in the paper."""
     absgrad: bool = False
     """Whether the rasterizer has to keep the absolute gradients of projected centres."""
 

@@ -12,7 +12,6 @@ from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
-from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 from pointsplat_ns.io.splatfacto import NAMES
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
@@ -61,9 +60,10 @@ def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainer
     length = max(1, config.first_step() + config.max_num_iterations)
     share = min(1.0, length / SPLATFACTO_STEPS)
     config = copy.deepcopy(config)
-    defaults = SplatfactoModelConfig()
+    defaults = SplatfactoCpuModelConfig()
     model = config.pipeline.model
-    steps = ("warmup_length", "resolution_schedule", "sh_degree_interval", "stop_split_at", "stop_screen_size_at")
+    steps = ["warmup_length", "resolution_schedule", "sh_degree_interval", "stop_split_at", "stop_screen_size_at"]
+    steps += ["stop_relocation_at"]
     fitted: dict[str, float] = {name: max(1, round(share * getattr(defaults, name))) for name in steps}
     fitted["refine_every"] = min(defaults.refine_every, max(25, round(length / 70)))
     haste = min(8.0, 1 / math.sqrt(share))

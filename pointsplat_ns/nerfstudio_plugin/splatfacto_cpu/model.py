@@ -68,6 +68,8 @@ class SplatfactoCpuModelConfig(RasterizerOptions, SplatfactoModelConfig):
     always mcmc."""
     max_gs_num: int | None = None
     """Number of Gaussians of the trained scene, with mcmc; by default 1,000,000."""
+    stop_relocation_at: int = 25_000
+    """Step at which mcmc stops to move Gaussians to others. Their number is reached at stop_split_at."""
     noise_lr: float = 5e5
     """Factor on the noise of mcmc, which is also in proportion to the learning rate of the means."""
     mcmc_opacity_reg: float = 0.01
@@ -91,10 +93,9 @@ class SplatfactoCpuModelConfig(RasterizerOptions, SplatfactoModelConfig):
             return CappedStrategy(
                 most=most,
                 first_step=self.warmup_length,
-                grown_by=(self.warmup_length + self.stop_split_at) // 2,
-                last_step=self.stop_split_at,
+                grown_by=self.stop_split_at,
+                last_step=self.stop_relocation_at,
                 every=self.refine_every,
-                least_opacity=self.cull_alpha_thresh,
                 noise=self.noise_lr,
             )
         return DefaultStrategy(

@@ -138,7 +138,7 @@ def test_the_picture_hardly_changes_where_gaussians_move_to_others():
         }
     )
     optimizers = {name: torch.optim.Adam([value], lr=0.0) for name, value in params.items()}
-    strategy = CappedStrategy(most=4, first_step=0, grown_by=10, last_step=100, every=5, least_opacity=0.005, noise=0.0)
+    strategy = CappedStrategy(most=4, first_step=0, grown_by=10, last_step=100, every=5, noise=0.0)
     seen, nothing = ({"radii": torch.tensor([[[size, size]]])} for size in (3, 0))
     torch.manual_seed(SEED)
     for step, info in ((4, seen), (5, nothing)):
