@@ -1,0 +1,66 @@
+"""Prunes a run by a score and trains the rest on its photos: LightGaussian's and PUP-3DGS's recipe.
+
+python -m lab.training.score_and_train lightgaussian 120 RUN --keep 5000 -o small.ply
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+import pointsplat_ns as ps
+from lab.common.printing import start
+from pointsplat_ns.compacting import read_source
+from pointsplat_ns.compression.photo_repair import photo_repair
+from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.requests import PhotoBudget, PruneRequest
+from pointsplat_ns.nerfstudio_plugin.dataset_views import training_photos
+
+
+@dataclass(frozen=True)
+class CpuBudget(PhotoBudget):
+    """Training until this process has used a number of CPU seconds."""
+
+    until: float = 0.0
+    started: float = 0.0
+
+    @property
+    def empty(self) -> bool:
+        """Whether none are left."""
+        return self.started >= self.until
+
+    def share_done(self, steps: int, seconds: float) -> float:
+        """Used share of the CPU seconds since the training began."""
+        return (time.process_time() - self.started) / (self.until - self.started)
+
+
+def main(
+    by: tyro.conf.Positional[Literal["lightgaussian", "pup"]],
+    seconds: tyro.conf.Positional[float],
+    run: tyro.conf.Positional[Path],
+    keep: int,
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+) -> None:
+    """Prune a run by a score, and train the rest on its photos as ``compact --photos`` does.
+
+    Args:
+        by: the score.
+        seconds: CPU seconds of this process in all.
+        run: the run.
+        keep: number of Gaussians.
+        output: the PLY to write.
+    """
+    dense, views = read_source(run, None, None)
+    pruned = prune_scene(dense, PruneRequest(keep, by), views).scene
+    budget = CpuBudget(until=seconds, started=time.process_time())
+    trained = photo_repair(pruned, dense, training_photos(run), views, budget)
+    print(f"{trained.steps} steps: {trained.before:.2f} -> {trained.after:.2f} dB in photos that no step used")
+    ps.save(trained.scene, output)
+
+
+if __name__ == "__main__":
+    start(main)

@@ -1,0 +1,102 @@
+"""lab/training/with_photos.py: which ways are measured, for how long each, and what the record says."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+
+from lab.training import with_photos as program
+from lab.training import with_photos_record as record
+from lab.training.score_and_train import CpuBudget
+from lab.training.with_photos import CAP_LONG, CAP_SHORT, COMPACTED, DENSE, METHODS, SCORES
+
+
+def row(keep: float, method: str, psnr: float = 25.0, seconds: float = 60.0, scene: str = "fox"):
+    return {
+        **{"scene": scene, "at": "photos", "keep": keep, "method": method, "count": round(1000 * keep), "photos": 5},
+        **{"width": 360, "height": 640, "steps": 2000, "cpu_seconds": seconds, "psnr": psnr, "ssim": 0.9},
+        "needs_dense": method not in (DENSE, CAP_SHORT, CAP_LONG),
+    }
+
+
+class Tried(program.Capture):
+    """A capture of which nothing is trained: a start takes 10 CPU seconds, a step 0.1 at a cap and 0.5 without."""
+
+    def __init__(self, folder):
+        super().__init__("fox", ["--data", "fox"], 2000, folder, None)
+        self.asked: list[tuple] = []
+
+    def train(self, label, steps, cap=None):
+        self.asked.append((label, steps, cap))
+        return self.folder, 10.0 + steps * (0.5 if cap is None else 0.1)
+
+    def reduced(self, words, count):
+        self.asked.append((*words[3:], count))
+        return self.folder, 60.0
+
+    def row(self, keep, method, scene, seconds, with_dense):
+        assert scene == self.folder
+        return row(keep, method, seconds=seconds) | {"needs_dense": with_dense}
+
+
+def test_all_ways_are_measured_and_trainings_with_a_cap_take_as_long_as_the_others(tmp_path):
+    capture = Tried(tmp_path)
+    rows = list(program.measured(capture, (0.1,), []))
+    assert [found["method"] for found in rows] == list(METHODS)
+    assert capture.asked[0] == ("dense", 2000, None) and rows[0]["cpu_seconds"] == 1010
+    assert ("compact", "--photos", 100) in capture.asked
+    assert ("lightgaussian", "60.0", 100) in capture.asked and ("pup", "60.0", 100) in capture.asked
+    short, long = rows[-2:]
+    assert short["cpu_seconds"] == pytest.approx(60, abs=0.1) and long["cpu_seconds"] == pytest.approx(1070, abs=0.1)
+    assert capture.asked[-1] == ("cap-100-10599", 10599, 100)
+    assert [found["needs_dense"] for found in rows] == [False] + [True] * 5 + [False] * 2
+
+
+def test_rows_that_are_there_are_not_measured_again(tmp_path):
+    rows = list(program.measured(Tried(tmp_path), (0.1,), []))
+    capture = Tried(tmp_path)
+    assert list(program.measured(capture, (0.1,), rows)) == [] and capture.asked == []
+    assert [found["method"] for found in program.measured(capture, (0.1,), rows[:-1])] == [CAP_LONG]
+    assert capture.asked[-1] == ("cap-100-10599", 10599, 100)
+
+
+def test_training_on_photos_ends_when_its_process_has_used_its_cpu_seconds():
+    now = time.process_time()
+    budget = CpuBudget(until=now + 100, started=now - 100)
+    assert budget.share_done(3, 0.0) == pytest.approx(0.5, abs=0.05) and not budget.empty
+    assert CpuBudget(until=now - 1, started=now).empty
+
+
+ROWS = [
+    *(row(1.0, DENSE, 30.0, 700.0, scene) for scene in ("fox", "vr_project")),
+    *(row(0.1, COMPACTED, psnr, 60.0, scene) for scene, psnr in (("fox", 28.0), ("vr_project", 27.0))),
+    row(0.1, SCORES["pup"], 26.5),
+    row(0.1, CAP_LONG, 26.0, 755.0, "vr_project"),
+]
+
+
+def test_the_page_has_leads_over_captures_and_seconds_with_the_dense_training():
+    lines = record.page(ROWS).splitlines()
+    assert f"| {DENSE} | -2.50 (-3.00 to -2.00), 2 |" in lines
+    assert f"| {SCORES['pup']} | +1.50 (+1.50 to +1.50), 1 |" in lines
+    assert f"| {CAP_LONG} | +1.00 (+1.00 to +1.00), 1 |" in lines
+    assert f"| 10 % | {COMPACTED} | 100 | 60 | 760 | 28.00 | 0.900 | - |" in lines
+    assert f"| 10 % | {CAP_LONG} | 100 | 755 | 755 | 26.00 | 0.900 | - |" in lines
+    assert not any(line.startswith(f"| {COMPACTED} |") for line in lines)
+
+
+def test_the_record_is_written_and_gives_the_same_page_again(tmp_path):
+    (tmp_path / "found.json").write_text(json.dumps({"settings": {"lpips": False}, "rows": ROWS}))
+    record.main((tmp_path / "found.json",), tmp_path)
+    assert (tmp_path / "with_photos.md").read_text() == record.page(ROWS)
+    record.main((tmp_path / "with_photos.json",), tmp_path)
+    assert (tmp_path / "with_photos.md").read_text() == record.page(ROWS)
+
+
+def test_the_record_that_is_committed_has_the_page_of_its_rows():
+    files = [record.ROOT / "docs" / "record" / f"with_photos.{kind}" for kind in ("json", "md")]
+    if not any(path.exists() for path in files):
+        pytest.skip("nothing is recorded yet")
+    assert files[1].read_text("utf-8") == record.page(record.read(files[:1], "with_photos.py")[0])
