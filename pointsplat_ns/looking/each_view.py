@@ -7,7 +7,6 @@ from typing import TypeVar
 
 import torch
 
-from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.system.threads import in_threads
 from pointsplat_ns.views import View
 
@@ -15,7 +14,7 @@ T = TypeVar("T")
 
 
 def each_view(
-    views: Sequence[View], count: int, function: Callable[[View], T], settings: LookingSettings = DEFAULTS
+    views: Sequence[View], count: int, function: Callable[[View], T], max_count_at_once: int = 2_000_000
 ) -> Iterator[T]:
     """The results of a function for each view, in order. Several views are computed at once.
 
@@ -23,9 +22,10 @@ def each_view(
         views: any number of views.
         count: number of Gaussians that are rendered in each view.
         function: function of a view; it runs without gradients.
-        settings: ``max_count_at_once``.
+        max_count_at_once: largest number of Gaussians, summed over the views that are rendered at once, because each
+            render takes memory. At least two views are rendered at once.
     """
-    at_once = max(2, settings.max_count_at_once // max(1, count))
+    at_once = max(2, max_count_at_once // max(1, count))
     for first in range(0, len(views), at_once):
         results: dict[int, T] = {}
 

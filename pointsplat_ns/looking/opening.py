@@ -70,15 +70,15 @@ def opening_views(
     box = UprightBox.of(surface, up.direction)
     if known is not None:
         width, height = known.width, known.height
-    few = few_in_units(scene, settings.opening_count, centre, diagonal)
-    turns = around(settings.opening_turns_outside)
+    few = few_in_units(scene, settings.pictured_count, centre, diagonal)
+    turns = around(settings.opening_turns)
     outside = whole_views(surface, box.up, turns, settings.opening_elevation, width, height)
-    of_outside = shown(few, outside, settings.opening_side)
+    of_outside = shown(few, outside, settings.pictured_side)
     if known is None:
         inside = _inside(surface, box, photos, width, height)
     else:
         inside = views_in_units(known, centre, diagonal)
-    of_inside = shown(few, inside, settings.opening_side)
+    of_inside = shown(few, inside, settings.pictured_side)
     most_outside, most_inside = (int(rows.sum(1).max()) if len(rows) else 0 for rows in (of_outside, of_inside))
     ratio = most_inside / max(most_outside, 1)
     whole = most_inside == 0 or not (room or ratio > settings.opening_inside)
@@ -113,7 +113,7 @@ def _inside(surface: Surface, box: UprightBox, photos: PhotoPlaces | None, width
     places = places[surface.clearance(places) > settings.min_clearance][: settings.places]
     visible, enclosure = surface.visible_from(places)
     places, visible = places[enclosure >= settings.min_enclosure], visible[enclosure >= settings.min_enclosure]
-    count = settings.opening_turns_inside
+    count = settings.opening_turns
     turn = around(count).repeat(len(places))
     pitch = math.radians(settings.opening_pitch)
     eyes = places.repeat_interleave(count, dim=0)

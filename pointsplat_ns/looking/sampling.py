@@ -38,7 +38,7 @@ def sample_views(
     A scene whose points are visible from enclosed places in it is a room: cameras stand in free space at the height of
     eyes and look about level. In other scenes, cameras stand around the content as well. Of many candidates, the next
     view is the one with the largest coverage gain: it shows points that earlier views have not shown, in the middle of
-    the picture rather than at its edge. A small depth image tests that nothing is in the way. Views complete each
+    the picture rather than at its edge. Views complete each
     other, so ask for all of them at once.
 
     If the Gaussians tell where photos were taken (:mod:`pointsplat_ns.looking.traces`), half of the cameras stand near
@@ -102,7 +102,6 @@ def views_about(
     known = None if up is None else Up(up)
     upright, inside = which_way_up(scene, centre, diagonal, surface, photos, known)
     box = UprightBox.of(surface, upright.direction)
-    probe = in_units(thinned(scene, settings.probe_count), centre, diagonal)
     fine, widths = None, None
     if sharp:
         fine = in_units(thinned(scene, settings.blur_count), centre, diagonal)
@@ -111,7 +110,7 @@ def views_about(
     generator = torch.Generator().manual_seed(seed)
 
     def found(inside: bool, photos: PhotoPlaces | None, count: int) -> Tensor:
-        search = Search(probe, fine, widths, surface, box, inside, width, height, generator, photos, settings)
+        search = Search(fine, widths, surface, box, inside, width, height, generator, photos, settings)
         return search.views(count)
 
     near_photos = torch.empty(0, 4, 4, dtype=torch.float64)
@@ -201,7 +200,7 @@ def is_room(surface: Surface, box: UprightBox) -> bool:
     are visible from outside are visible from them as well."""
     settings = surface.settings
     generator = torch.Generator().manual_seed(0)
-    places = box.places(settings.box_draws * settings.places, generator, settings)
+    places = box.places(settings.box_draws * settings.places, generator)
     places = places[surface.clearance(places) > settings.min_clearance][: settings.places]
     if len(places) == 0:
         return False

@@ -18,17 +18,15 @@ from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces, explained_energy
 from pointsplat_ns.looking.upright import UprightBox, level_directions
-from pointsplat_ns.rasterizer import pixels_of, render_depth
+from pointsplat_ns.rasterizer import pixels_of
 
 
 @dataclass
 class Search:
     """A search for views, all of it in units of the content."""
 
-    probe: Gaussians
-    """Some of the scene's Gaussians, for the depth images that test a view."""
     fine: Gaussians | None
-    """More of them, for the pictures that measure blur; None if views may be blurred."""
+    """Some of the scene's Gaussians, for the pictures that measure blur; None if views may be blurred."""
     widths: Tensor | None
     """Widths (n,) of these Gaussians, not enlarged."""
     surface: Surface
@@ -65,7 +63,7 @@ class Search:
             while len(taken) < wanted and refused < settings.max_refused and bool((owner >= 0).any()):
                 total_gains = gains @ (1 / (settings.half_gain_coverage + coverage))
                 best = int(total_gains.masked_fill(owner < 0, -1.0).argmax())
-                if self._is_free(viewmats[best]):
+                if self._blur(viewmats[best]) <= self.max_blur:
                     taken.append(viewmats[best])
                     coverage += gains[best] / values
                     owner[owner == owner[best].item()] = -1  # one view a place
@@ -128,17 +126,10 @@ class Search:
         places, visible, evidence = places[best], visible[best], evidence[best]
         owner = torch.arange(len(places)).repeat_interleave(settings.turns_inside)
         values = visible * points.trace_factors * evidence
-        distances = torch.cdist(places.float(), points.points.float())
-        near = 1 / (1 + (distances / settings.photo_target_distance).square())
-        chances = (values * near + 1e-12)[owner]
+        chances = (values + 1e-12)[owner]
         target = torch.multinomial(chances, 1, generator=self.generator)[:, 0] if len(owner) else owner
         viewmats = look_at(places[owner], points.points[target], self.box.up)
-        gains = self._gains(viewmats, visible[owner])
-        valued = gains * values[owner]
-        mean_values = valued.sum(1) / gains.sum(1).clamp_min(1e-6)
-        good = mean_values.quantile(settings.good_view_quantile) if len(owner) else 0.0
-        kept = mean_values >= settings.min_photo_value * good
-        return viewmats[kept], owner[kept], valued[kept]
+        return viewmats, owner, self._gains(viewmats, visible[owner]) * values[owner]
 
     def _outside(self) -> Tensor:
         """Places (P, 3) around the content, above the ground."""
@@ -184,18 +175,6 @@ class Search:
         subtended = points.widths / z.clamp_min(1e-6)
         sharp = 1 / (1 + (subtended / settings.half_gain_angle).square())
         return in_picture * sharp / (1 + (z / settings.half_gain_distance).square())
-
-    def _is_free(self, viewmat: Tensor) -> bool:
-        """Whether a view (4, 4) shows enough, hardly any surface that is very near, and no blur."""
-        settings = self.settings
-        clearance = settings.min_clearance if self.photos is None else settings.min_clearance_photos
-        min_alpha = settings.min_alpha_inside if self.inside else settings.min_alpha_outside
-        view = views_of(viewmat[None], self.width, self.height, UNITS, settings).resized(settings.probe_side)[0]
-        depth, alpha = render_depth(self.probe, view)
-        too_near = (alpha > settings.opaque_alpha) & (depth < clearance)
-        if float(alpha.mean()) < min_alpha or float(too_near.float().mean()) >= settings.max_near_pixels:
-            return False
-        return self._blur(viewmat) <= self.max_blur
 
     def _blur(self, viewmat: Tensor) -> float:
         """Blur of a view (4, 4): median over its pixels of the angle that Gaussians' standard deviations subtend,

@@ -20,7 +20,7 @@ class LookingSettings:
         48
     """
 
-    # Content (content.py) and renders (each_view.py)
+    # Content (content.py)
 
     content_quantiles: tuple[float, float] = (0.05, 0.95)
     """Quantiles of opacity, or of surface points, along each axis, between which the content lies."""
@@ -31,10 +31,6 @@ class LookingSettings:
     max_area_quantile: float = 0.99
     """Quantile that bounds the area of Gaussians where areas are weights, so that a few giants do not count for all; 1
     turns the bound off."""
-
-    max_count_at_once: int = 2_000_000
-    """Largest number of Gaussians, summed over the views that are rendered at once. Each render takes memory. At least
-    two views are rendered at once."""
 
     # Cameras (poses.py)
 
@@ -83,9 +79,6 @@ class LookingSettings:
     """Number of Gaussians that are compared by size, as a multiple of ``evidence_count``, because one size says less
     than one vector of SH."""
 
-    min_evidence_opacity: float = 0.1
-    """Smallest opacity of a compared Gaussian, in [0, 1]."""
-
     candidate_places: int = 2_000
     """Number of candidate places."""
 
@@ -124,9 +117,9 @@ class LookingSettings:
     surface_points: int = 12_288
     """Number of points that are drawn from a scene."""
 
-    min_surface_opacity: float = 0.1
-    """Smallest opacity of the Gaussians that points are drawn from, if there are any: a haze hides nothing; 0 turns the
-    rule off."""
+    min_opacity: float = 0.1
+    """Smallest opacity of the Gaussians that points are drawn from, if there are any, and of those that are compared
+    with candidate places: a haze hides nothing; 0 turns the rule off."""
 
     surface_exponent: float = 0.5
     """Exponent of opacity times area in the chance of a Gaussian to get a point. 0 counts Gaussians, which are many
@@ -136,10 +129,8 @@ class LookingSettings:
     """Bound of the distance of a point from the centre of its Gaussian along each axis, standard deviations."""
 
     direction_rows: int = 40
-    """Number of rows of the grid of directions around a place, even. Cells have equal solid angles."""
-
-    direction_columns: int = 80
-    """Number of columns of the grid of directions around a place, even: 4.5 degrees each."""
+    """Number of rows of the grid of directions around a place, even; it has twice as many columns, of 4.5 degrees.
+    Cells have equal solid angles."""
 
     relative_depth_tolerance: float = 0.05
     """A point is visible if it is at most this share, plus ``depth_tolerance``, farther than the nearest point of its
@@ -153,9 +144,6 @@ class LookingSettings:
     air."""
 
     # Up (upright.py)
-
-    upright_points: int = 4_096
-    """Largest number of points from which up is estimated."""
 
     content_radius: float = 6.0
     """Radius, around the centre of the content, within which points belong to the content, units."""
@@ -174,10 +162,6 @@ class LookingSettings:
 
     slab_thickness: float = 0.1
     """Thickness of the slabs in which points are counted by height, units; two neighbours hold one level surface."""
-
-    min_uprightness: float = 0.07
-    """Smallest uprightness of the best direction. Scenes without any level or vertical surface reach less; z is then
-    up. 0 turns the rule off."""
 
     usual_axis_factors: tuple[float, float] = (1.3, 1.64)
     """Factors of the uprightness of the world's z and y axes; (0, 0) turns the rule off. Most scenes stand along y, as
@@ -204,17 +188,8 @@ class LookingSettings:
     seen_from_above_elevation: float = 30.0
     """Elevation of these cameras, degrees."""
 
-    seen_from_above_count: int = 20_000
-    """Largest number of Gaussians in their pictures."""
-
-    seen_from_above_side: int = 128
-    """Longer side of their pictures, pixels."""
-
     box_yaw_step: float = 5.0
     """Angle between the upright boxes that are tried, degrees."""
-
-    min_box_half_side: float = 2.5
-    """Smallest half side of the box that places are drawn from, units; 0 turns the rule off."""
 
     # Cameras that show the whole, and the views of an opening (whole.py, opening.py)
 
@@ -228,23 +203,20 @@ class LookingSettings:
     """Smallest sum of blend weights over the pixels of a picture that counts what is shown, for it to show a Gaussian,
     pixels."""
 
-    opening_count: int = 20_000
-    """Largest number of Gaussians in the pictures of views that compete to be the first."""
+    pictured_count: int = 20_000
+    """Largest number of Gaussians in the pictures that count what is shown."""
 
-    opening_side: int = 128
+    pictured_side: int = 128
     """Longer side of these pictures, pixels."""
 
-    opening_turns_outside: int = 12
-    """Number of cameras around the content that compete."""
+    opening_turns: int = 12
+    """Number of cameras around the content, and of views from each enclosed place, that compete to be the first."""
 
     opening_elevation: float = 20.0
-    """Elevation of these cameras, degrees."""
-
-    opening_turns_inside: int = 12
-    """Number of views from each enclosed place."""
+    """Elevation of the cameras around the content, degrees."""
 
     opening_pitch: float = -8.0
-    """Pitch of these cameras, degrees; above 0 is up."""
+    """Pitch of views from enclosed places, degrees; above 0 is up."""
 
     opening_candidates: int = 24
     """Number of views from enclosed places, of those that show most surface, that compete. With 16, a bathroom opens on
@@ -319,19 +291,10 @@ class LookingSettings:
     photo_place_deviation: float = 0.4
     """Standard deviation of candidates from photo places along each axis, units: the distance between these."""
 
-    photo_target_distance: float = 1.0
-    """Distance at which points are half as likely to be looked at as near ones, units; infinity turns the rule off."""
-
-    min_photo_value: float = 0.6
-    """Smallest value of the points that a view shows, relative to that of a good view; 0 turns the rule off."""
-
-    good_view_quantile: float = 0.9
-    """Quantile of the candidates that counts as a good view."""
-
     # Coverage gain of a view (search.py)
 
     gain_points: int = 4_096
-    """Number of points that views compete for."""
+    """Number of points that views compete for, and largest number of those from which up is estimated."""
 
     half_gain_distance: float = 4.0
     """Distance at which a point counts half, because it is small in the picture, units; infinity turns the rule off."""
@@ -346,31 +309,12 @@ class LookingSettings:
 
     # Tests of a view (search.py)
 
-    probe_count: int = 5_000
-    """Largest number of Gaussians in the depth images that test a view."""
-
-    probe_side: int = 32
-    """Longer side of the depth images that test a view, pixels."""
-
     min_clearance: float = 0.5
     """Smallest distance of a camera from surfaces, units; 0 turns the rule off."""
 
     min_clearance_photos: float = 0.1
     """Smallest distance of a camera near photo places from surfaces, units; 0 turns the rule off. Photos may show a
     small part of the content from nearby."""
-
-    opaque_alpha: float = 0.5
-    """Alpha above which a pixel of a depth image shows a surface, in [0, 1]."""
-
-    max_near_pixels: float = 0.05
-    """Share of pixels with a surface below the smallest distance from which on a view is refused; above 1 turns the
-    rule off."""
-
-    min_alpha_inside: float = 0.7
-    """Smallest mean alpha of a view in a room, in [0, 1]; 0 turns the rule off."""
-
-    min_alpha_outside: float = 0.05
-    """Smallest mean alpha of any other view, in [0, 1]: an object may stand before nothing; 0 turns the rule off."""
 
     blur_count: int = 40_000
     """Largest number of Gaussians in the pictures that measure blur. 5,000 are too few: large ones then hide the
@@ -432,9 +376,6 @@ class LookingSettings:
 
     coverage_views: int = 96
     """Number of sampled views that say, together with the given ones, what is visible at all."""
-
-    coverage_seed: int = 96
-    """Seed of the sampled views that coverage adds."""
 
 
 DEFAULTS = LookingSettings()

@@ -89,7 +89,7 @@ class Surface:
         Returns:
             Whether each point is visible (P, M), and the share (P,) of all directions in which there is a surface.
         """
-        rows, columns = self.settings.direction_rows, self.settings.direction_columns
+        rows, columns = self.settings.direction_rows, 2 * self.settings.direction_rows
         offsets = self.points.float() - places.float()[:, None]  # [P, M, 3]
         distances = offsets.norm(dim=2).clamp_min(1e-6)
         row = ((offsets[..., 2] / distances + 1) * (rows / 2)).long().clamp(0, rows - 1)
@@ -106,7 +106,7 @@ def _chances(scene: Gaussians, settings: LookingSettings) -> Tensor:
     """Relative chances (N,) of the Gaussians to be drawn, float64. If no Gaussian has an area, all that are clear have
     the same."""
     usable, alphas = scene.usable(), scene.alphas.detach().double()
-    clear = usable & (alphas >= min(settings.min_surface_opacity, float(alphas[usable].max())))
+    clear = usable & (alphas >= min(settings.min_opacity, float(alphas[usable].max())))
     log_areas = F.logsigmoid(scene.opacities[:, 0].double()) + scene.scales.double().topk(2).values.sum(1)
     logs = settings.surface_exponent * log_areas.clamp_min(torch.finfo(torch.float64).min)
     ranked = logs[clear].sort().values

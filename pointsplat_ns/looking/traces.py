@@ -100,7 +100,7 @@ class PhotoEvidence:
         drawn = torch.randperm(len(scene), generator=generator)[: settings.evidence_draws * count]
         some = scene[drawn.to(scene.device)].to("cpu")
         sh = unit_sh(some.features_rest, settings)
-        opaque = some.usable() & (some.alphas > settings.min_evidence_opacity)
+        opaque = some.usable() & (some.alphas > settings.min_opacity)
         with_sh = opaque & (sh != 0).any(2).any(1)
         if bool(with_sh.any()):
             chosen = with_sh.nonzero()[:count, 0]

@@ -28,8 +28,7 @@ class Up:
     direction: Tensor
     """(3,) float64, of length 1."""
     sure: bool = True
-    """Whether it was named, or the scene has level or vertical surfaces and more of it is seen from above than from
-    below."""
+    """Whether it was named, or clearly more of the scene is seen from above than from below."""
 
     def __str__(self) -> str:
         """The name of the axis, or the direction.
@@ -96,16 +95,16 @@ class UprightBox:
         narrowest = int((high - low)[:, :2].prod(1).argmin())
         return UprightBox(frames[narrowest], low[narrowest], high[narrowest])
 
-    def places(self, count: int, generator: torch.Generator, settings: LookingSettings = DEFAULTS) -> Tensor:
-        """Positions (count, 3), units, drawn evenly from the box. A short side is lengthened."""
-        middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low).clamp_min(settings.min_box_half_side)
+    def places(self, count: int, generator: torch.Generator) -> Tensor:
+        """Positions (count, 3), units, drawn evenly from the box."""
+        middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
         share = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
         return (middle + share * half) @ self.frame
 
     def places_at_eyes(self, generator: torch.Generator, settings: LookingSettings = DEFAULTS) -> Tensor:
         """Positions (P, 3), units, at the height of eyes."""
         low, high = settings.eye_heights
-        places = self.places(settings.box_draws * settings.places, generator, settings)
+        places = self.places(settings.box_draws * settings.places, generator)
         heights = self.heights(places)
         return places[(heights > low) & (heights < high)]
 
@@ -129,46 +128,13 @@ def _across(axes: Tensor) -> Tensor:
 def upright_axis(surface: Surface, photos: PhotoPlaces | None = None) -> Tensor:
     """The axis (3,) along which a scene stands, float64, of length 1 and of either sign.
 
-    It is the y axis or the z axis of the world if one of them fits about as well as the best direction, and the z axis
-    if the scene gives no evidence.
+    It is the y axis or the z axis of the world if one of them fits about as well as the best direction.
 
     Args:
         surface: points of the scene, and the settings.
         photos: photo places in units of the content, if known.
     """
-    content = _content(surface)
-    axis = _axis(content, photos) if len(content.points) > 1 else None
-    return torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) if axis is None else axis
-
-
-def pointing_up(surface: Surface, axis: Tensor, from_above: float = 0.0) -> Up:
-    """``axis`` (3,) or its opposite, whichever points up.
-
-    More is seen from above than from below. If about the same is seen, z is up, or -y, as in scenes that have the axes
-    of their first camera.
-
-    Args:
-        surface: points of the scene, and the settings.
-        axis: (3,) as :func:`upright_axis` gives it.
-        from_above: as :func:`~pointsplat_ns.looking.whole.seen_from_above` gives it for ``axis``.
-    """
-    settings = surface.settings
-    clear = abs(from_above) >= settings.min_seen_from_above
-    sign = 1 if (from_above if clear else _usual(axis)) >= 0 else -1
-    upright = float(uprightness(axis[None], _content(surface))) >= settings.min_uprightness
-    return Up(sign * axis, clear and upright)
-
-
-def _content(surface: Surface) -> Surface:
-    """Some of the points near the content; of all points if none is near."""
-    near = surface.points.norm(dim=1) < surface.settings.content_radius
-    near = near if bool(near.any()) else torch.ones_like(near)
-    return surface[near.nonzero()[: surface.settings.upright_points, 0]]
-
-
-def _axis(content: Surface, photos: PhotoPlaces | None) -> Tensor | None:
-    """The upright axis (3,), of either sign; None without evidence."""
-    settings = content.settings
+    content, settings = _content(surface), surface.settings
 
     def scores_of(axes: Tensor) -> Tensor:
         scores = uprightness(axes, content)
@@ -186,12 +152,34 @@ def _axis(content: Surface, photos: PhotoPlaces | None) -> Tensor | None:
         scores = scores_of(found)
         found = found[scores.topk(settings.refined_directions).indices]
     best = float(scores.max())
-    if best < settings.min_uprightness:
-        return None
     usual = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
     factors = settings.usual_axis_factors if photos is None else settings.usual_axis_factors_with_photos
     scores = usual.new_tensor(factors) * scores_of(usual)
     return usual[scores.argmax()] if float(scores.max()) >= best else found[0]
+
+
+def pointing_up(surface: Surface, axis: Tensor, from_above: float = 0.0) -> Up:
+    """``axis`` (3,) or its opposite, whichever points up.
+
+    More is seen from above than from below. If about the same is seen, z is up, or -y, as in scenes that have the axes
+    of their first camera.
+
+    Args:
+        surface: points of the scene, and the settings.
+        axis: (3,) as :func:`upright_axis` gives it.
+        from_above: as :func:`~pointsplat_ns.looking.whole.seen_from_above` gives it for ``axis``.
+    """
+    settings = surface.settings
+    clear = abs(from_above) >= settings.min_seen_from_above
+    sign = 1 if (from_above if clear else _usual(axis)) >= 0 else -1
+    return Up(sign * axis, clear)
+
+
+def _content(surface: Surface) -> Surface:
+    """Some of the points near the content; of all points if none is near."""
+    near = surface.points.norm(dim=1) < surface.settings.content_radius
+    near = near if bool(near.any()) else torch.ones_like(near)
+    return surface[near.nonzero()[: surface.settings.gain_points, 0]]
 
 
 def levelness(axes: Tensor, photos: PhotoPlaces) -> Tensor:

@@ -83,11 +83,11 @@ def seen_from_above(scene: Gaussians, centre: Tensor, diagonal: float, surface: 
         axis: (3,) of length 1.
     """
     settings, turns = surface.settings, around(surface.settings.seen_from_above_turns)
-    few = few_in_units(scene, settings.seen_from_above_count, centre, diagonal)
+    few = few_in_units(scene, settings.pictured_count, centre, diagonal)
 
     def most(up: Tensor) -> int:
         views = whole_views(surface, up, turns, settings.seen_from_above_elevation)
-        return int(shown(few, views, settings.seen_from_above_side).sum(1).max())
+        return int(shown(few, views, settings.pictured_side).sum(1).max())
 
     return math.log((most(axis) + 1) / (most(-axis) + 1))
 

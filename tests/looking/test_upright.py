@@ -44,13 +44,13 @@ def test_z_or_minus_y_is_up_where_the_scene_stands_along_it(axis):
     assert pointing_up(surface, upright_axis(surface)).direction.tolist() == list(axis)
 
 
-def test_up_is_z_without_evidence():
+def test_up_is_a_guess_without_evidence():
     scene = ball(3000, log_size=math.log(0.05))
     surface = Surface.of(scene, *content_size(scene))
     cloud = 3 * torch.randn(surface.points.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     shapeless = replace(surface, points=cloud, flatness=torch.zeros_like(surface.flatness))
     up = pointing_up(shapeless, upright_axis(shapeless))
-    assert torch.equal(up.direction, UP) and not up.sure
+    assert float(up.direction.norm()) == pytest.approx(1) and not up.sure
 
 
 @pytest.mark.parametrize("turn", TURNS)
