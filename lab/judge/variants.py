@@ -77,7 +77,6 @@ LOOKING = {
     "surface_exponent_0": dict(surface_exponent=0.0),
     "surface_exponent_1": dict(surface_exponent=1.0),
     "no_usual_axes": dict(usual_axis_factors=(0.0, 0.0)),
-    "no_usual_axes_with_photos": dict(usual_axis_factors_with_photos=(0.0, 0.0)),
     "no_photo_level": dict(photo_level_weight=0.0),
     "no_seen_from_above": dict(min_seen_from_above=float("inf")),
     "never_a_room": dict(min_enclosed_places=2.0),

@@ -38,10 +38,6 @@ COMMANDS = (
 """The commands. Each is a function in a module of the same name, which is imported when the command runs."""
 
 
-_STEERING = re.compile(r"\x1b\[(?:[\d;]*m|\?25[lh]|\d*[AK])|[^\t\n\r\x20-\x7e\xa0-\U0010ffff]+")
-"""Colours and the moves of progress bars, which are ours; any other control characters, which are not."""
-
-
 class _Shown:
     """A text stream that shows control characters, such as those in the name of a file, instead of sending them."""
 
@@ -49,7 +45,9 @@ class _Shown:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        self._stream.write(_STEERING.sub(lambda m: m[0] if m[0].startswith("\x1b[") else printable(m[0]), text))
+        # Colours and the moves of progress bars, which are ours; then any other control characters, which are not.
+        steering = r"\x1b\[(?:[\d;]*m|\?25[lh]|\d*[AK])|[^\t\n\r\x20-\x7e\xa0-\U0010ffff]+"
+        self._stream.write(re.sub(steering, lambda m: m[0] if m[0].startswith("\x1b[") else printable(m[0]), text))
         return len(text)
 
     def __getattr__(self, name: str) -> Any:

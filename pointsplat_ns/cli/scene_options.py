@@ -179,17 +179,14 @@ Megabytes = Annotated[float, _spec("MB", parse_megabytes)]
 
 def quantities() -> ConstructorRegistry:
     """A context in which tyro reads numbers as :func:`~pointsplat_ns.system.quantities.parse_number` does."""
-    registry = ConstructorRegistry()
+    registry, rules = ConstructorRegistry(), {int: _spec("INT", parse_count), float: _spec("FLOAT", _float)}
 
     @registry.primitive_rule
     def number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-        return _RULES.get(info.type)
+        return rules.get(info.type)
 
     return registry
 
 
 def _float(text: str) -> float:
     return float(text) if text.lower().lstrip("+-") in ("nan", "inf") else parse_number(text)  # commands refuse them
-
-
-_RULES = {int: _spec("INT", parse_count), float: _spec("FLOAT", _float)}

@@ -13,9 +13,6 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import Closeness, Reference
 from pointsplat_ns.rasterizer import render_depth
 
-FARTHER = (2, 4, 8)
-"""Factors on the distance of the compared views, at which errors are measured too."""
-
 
 @dataclass(frozen=True)
 class RenderErrors:
@@ -39,7 +36,7 @@ class Displacement:
 
 
 def far_references(reference: Reference) -> dict[int, Reference]:
-    """Target images at each multiple of the distance in :data:`FARTHER`, as far as the compared views have enough
+    """Target images at each multiple of the distance (2, 4, 8), as far as the compared views have enough
     pixels.
 
     The scene covers a smaller part of the picture there, so a target is a near render with each square of ``times`` x
@@ -48,7 +45,7 @@ def far_references(reference: Reference) -> dict[int, Reference]:
     scene.
     """
     views, found = reference.views, {}
-    for times in FARTHER:
+    for times in (2, 4, 8):
         if times > min(views.width, views.height):
             continue
         shrink = views.Ks.new_tensor([[1 / times], [1 / times], [1.0]])

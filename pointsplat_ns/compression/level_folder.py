@@ -17,9 +17,6 @@ from pointsplat_ns.io import content_hash, write_ply
 from pointsplat_ns.io.discovery import LEVELS_NAME
 from pointsplat_ns.io.files import replacing, write_json
 
-FORMAT = {"format": "pointsplat-lod", "version": 1}
-"""Format of the manifest. The version rises with each change that readers of the old version misread."""
-
 MANIFEST, PICTURE = LEVELS_NAME, "lod.png"
 
 
@@ -83,7 +80,7 @@ def write_levels(
             rows.append({**_file_facts(scene_name, scene_part), "parents": parents_facts, **facts[index]})
         if images:
             _draw(images, captions, part_of(PICTURE))
-        write_json({**FORMAT, **about, "levels": rows}, manifest)
+        write_json({"format": "pointsplat-lod", "version": 1, **about, "levels": rows}, manifest)
         for name in (MANIFEST, *(() if images else (PICTURE,))):
             (folder / name).unlink(missing_ok=True)
 

@@ -21,13 +21,6 @@ from pointsplat_ns.io.formats.sog_stream import Node, write_sog_stream
 from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.system.progress import Progress, silent
 
-SIDES = 8
-"""Leaves along the diagonal of the content, by default."""
-
-LEAST = 8192
-"""Gaussians of the finest level in a leaf, up to which it is not cut for its extent. The tree has one entry for a leaf,
-and viewers choose a level for each, so that leaves of few Gaussians cost more than they save."""
-
 
 @dataclass(frozen=True)
 class Chunks:
@@ -93,7 +86,7 @@ def partition(levels: Sequence[Gaussians], parents: Sequence[Tensor], chunks: Ch
         ancestors.insert(0, torch.where(of >= 0, ancestors[0][of.clamp_min(0)], -1))
     kept = ancestors[0] >= 0
     weights = torch.bincount(ancestors[0][kept], minlength=len(coarsest))
-    extent = content_size(coarsest)[1] / SIDES if chunks.extent is None else chunks.extent
+    extent = content_size(coarsest)[1] / 8 if chunks.extent is None else chunks.extent
     leaf_of = torch.empty(len(coarsest), dtype=torch.int64)
     leaves = 0
 
@@ -101,7 +94,9 @@ def partition(levels: Sequence[Gaussians], parents: Sequence[Tensor], chunks: Ch
         nonlocal leaves
         points, weight = coarsest.means[members], weights[members]
         total, sides = int(weight.sum()), points.amax(dim=0) - points.amin(dim=0) if len(members) else torch.zeros(3)
-        too_wide = float(sides.max()) > extent and total > LEAST
+        # The tree has one entry for a leaf, and viewers choose a level for each: leaves of few Gaussians cost more than
+        # they save, so one of at most 8,192 is not cut for its extent.
+        too_wide = float(sides.max()) > extent and total > 8192
         if len(members) > 1 and (total > chunks.count or too_wide):
             order = points[:, int(sides.argmax())].argsort(stable=True)
             half = int((weight[order].cumsum(0) < total / 2).sum()) + 1

@@ -29,9 +29,6 @@ if TYPE_CHECKING:
 SH_CHOICES = ("all", "auto", "0", "1", "2", "3")
 """Values of the option ``sh``."""
 
-COMPACT_KEEP = 0.1
-"""Share of the Gaussians that ``compact`` keeps by default."""
-
 Effort = Literal["instant", "quick", "thorough"]
 
 STEPS: dict[Effort, int] = {"instant": 0, "quick": 48, "thorough": 400}
@@ -94,9 +91,6 @@ class PhotoBudget(RepairBudget):
     def steps(self) -> int:
         """Number of steps of the effort."""
         return PHOTO_STEPS[self.effort]
-
-
-NO_REPAIR = RepairBudget("instant")
 
 
 @dataclass(frozen=True)
@@ -163,7 +157,7 @@ class CompactRequest:
     prune: PruneRequest
     refiner: TrainedRefiner | None = None
     """None for no refinement."""
-    repair: RepairBudget = NO_REPAIR
+    repair: RepairBudget = RepairBudget("instant")
     """Length of the repair."""
     photos: PhotoBudget | None = None
     """Length of the optimisation against photos; None for none."""
@@ -176,13 +170,13 @@ class CompactRequest:
         by: str | None = None,
         sh: str = "all",
         clean: bool = False,
-        repair: RepairBudget = NO_REPAIR,
+        repair: RepairBudget = RepairBudget("instant"),
         photos: bool = False,
     ) -> CompactRequest:
         """A request from options that may be missing: ``keep`` and ``by`` are then those of the refiner's training;
-        without a refiner, :data:`COMPACT_KEEP` and merging. With ``photos``, a number of seconds is for the steps on
+        without a refiner, a tenth and merging. With ``photos``, a number of seconds is for the steps on
         photos, and the repair is quick. Errors are those of :class:`PruneRequest`."""
-        usual_keep, usual_by, weight = COMPACT_KEEP, "merge", None
+        usual_keep, usual_by, weight = 0.1, "merge", None
         if refiner is not None:
             usual_keep, usual_by, weight = refiner.settings.keep, refiner.settings.by, refiner.settings.opacity_weight
         by = usual_by if by is None else by

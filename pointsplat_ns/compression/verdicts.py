@@ -11,13 +11,6 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.compact import Compacted, Stage
     from pointsplat_ns.compression.photo_repair import PhotoRepaired
 
-_REASONS = {
-    Reason.NO_GAIN: "it does not help",
-    Reason.SMALL_GAIN: f"it brings less than {ACCEPTANCE.min_gain:g} dB",
-    Reason.MOST_VIEWS: "it is farther in most views",
-    Reason.OTHER_SIZES: "it harms pictures of another size",
-}
-
 
 def verdict_of(result: Compacted) -> str:
     """One line of text for each stage after pruning; one line if there are no such stages."""
@@ -46,9 +39,15 @@ def _line(stage: Stage, result: Compacted) -> str:
     if stage.reason is None:
         share = "" if stage.strength == 1 else f", {stage.strength:.0%} of the change kept"
         return f"{done}{cost}{share}: {figures}"
+    reasons = {
+        Reason.NO_GAIN: "it does not help",
+        Reason.SMALL_GAIN: f"it brings less than {ACCEPTANCE.min_gain:g} dB",
+        Reason.MOST_VIEWS: "it is farther in most views",
+        Reason.OTHER_SIZES: "it harms pictures of another size",
+    }
     if stage.name == "refine" and after.errors == before.errors:
         return f"not {done}, it changes nothing: {before.psnr:.1f} dB PSNR against the dense scene ({before.where})"
-    return f"not {done}{cost}, {_REASONS[stage.reason]}: {figures}"
+    return f"not {done}{cost}, {reasons[stage.reason]}: {figures}"
 
 
 def _photo_line(trained: PhotoRepaired, kept: bool) -> str:

@@ -5,12 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_BITS = 20
-"""Bits of the grid per axis: 60 of the 63 in a key."""
-
-_SAMPLE = 2**14
-"""Number of positions that the scene's extent is estimated from, evenly spread over the order of the scene."""
-
 
 def spread_bits(x: Tensor) -> Tensor:
     """Move bit k of every integer to bit 3k, for k below 21, in five steps of half the distance each.
@@ -39,7 +33,7 @@ def interleave(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
 def unit_cells(means: Tensor) -> Tensor:
     """Positions (N, 3), float32, scaled so that most lie in a cube of side 1/2 around 1/2; those far outside are
     clamped to [0, 1]. So the few distant Gaussians of most scenes do not coarsen the grid of the others."""
-    some = means[:: max(1, len(means) // _SAMPLE)].double()
+    some = means[:: max(1, len(means) // 2**14)].double()
     n = len(some)
     ranked = some.sort(dim=0).values
     low, high = ranked[(n - 1) // 100], ranked[n - 1 - (n - 1) // 100]
@@ -50,5 +44,5 @@ def unit_cells(means: Tensor) -> Tensor:
 
 def curve_keys(cells: Tensor, offset: float = 0.0) -> Tensor:
     """Morton codes (N,) int64 of points (N, 3) in the unit cube, shifted by ``offset`` along each axis."""
-    grid = (cells.T + offset).clamp_(0, 1).mul_(2**_BITS - 1).long()
+    grid = (cells.T + offset).clamp_(0, 1).mul_(2**20 - 1).long()  # 60 of the 63 bits in a key
     return interleave(*(spread_bits(axis) for axis in grid))

@@ -27,9 +27,6 @@ RESULTS_NAME, LEVELS_NAME, SWEEP_NAME = "pointsplat-scenes.json", "lod.json", "t
 RESULT_NAMES = frozenset((RESULTS_NAME, LEVELS_NAME, SWEEP_NAME))
 """A folder with one of these files is not searched for scenes."""
 
-RESULT_ENDS = ("_pruned", "_compact")
-"""Ends of the names that commands give by default to what they make of a file."""
-
 
 @dataclass(frozen=True)
 class FoundScene:
@@ -44,16 +41,16 @@ class FoundScene:
 
 def find_scenes(folder: Path | str) -> list[FoundScene]:
     """Every scene below a folder, sorted by name: files that hold Gaussians, and the newest trained run of each
-    experiment, which has the name of the experiment's folder. Results of earlier commands (:data:`RESULT_NAMES`,
-    :data:`RESULT_ENDS`) are passed over. Raises SceneError if there is no such folder, it is a run, or there is no
-    scene below it."""
+    experiment, which has the name of the experiment's folder. Results of earlier commands are passed over: files of
+    the names that these give by default, and folders with one of :data:`RESULT_NAMES`. Raises SceneError if there is no
+    such folder, it is a run, or there is no scene below it."""
     folder = Path(folder)
     if not is_folder_of_scenes(folder):
         raise SceneError(f"{folder}: expected a folder with scenes below it")
     files = _files_with_gaussians(folder, is_scene_file)
     stems = {_stem(path) for path in files}
     for path in tuple(files):
-        sources = {_stem(path).removesuffix(end) for end in RESULT_ENDS} - {_stem(path)}
+        sources = {_stem(path).removesuffix(end) for end in ("_pruned", "_compact")} - {_stem(path)}
         if sources & stems:
             logger.warning("passed over %s: a result of %s", path, *sources)
             files.remove(path)

@@ -15,7 +15,15 @@ from pointsplat_ns.views import Views
 
 
 @torch.no_grad()
-def coverage(scene: Gaussians, views: Views, times: int = 2, settings: LookingSettings = DEFAULTS) -> float:
+def coverage(
+    scene: Gaussians,
+    views: Views,
+    times: int = 2,
+    side: int = 160,
+    min_pixels: float = 0.05,
+    samples: int = 96,
+    settings: LookingSettings = DEFAULTS,
+) -> float:
     """Share of the visible content that enough of the views show.
 
     The visible content are the Gaussians that any of these views shows, or any of the views that are sampled all around
@@ -25,16 +33,25 @@ def coverage(scene: Gaussians, views: Views, times: int = 2, settings: LookingSe
         scene: N Gaussians on the CPU.
         views: C views.
         times: number of views that must show a Gaussian.
-        settings: ``coverage_side``, ``min_covered_pixels``, ``coverage_views`` and ``max_area_quantile``.
+        side: longer side of the pictures in which a Gaussian is shown, pixels.
+        min_pixels: smallest sum of its blend weights over the pixels of a picture.
+        samples: number of sampled views.
+        settings: ``max_area_quantile``, and those of sampled views.
 
     Returns:
         A share in [0, 1]; 0 if nothing is visible.
     """
-    counts = _views_that_show(scene, views, settings)
+
+    def views_that_show(views: Views) -> Tensor:  # number (N,) int64 for each Gaussian
+        counts = torch.zeros(len(scene), dtype=torch.int64)
+        for pixels in each_view(list(views.resized(side)), len(scene), lambda view: pixels_of(scene, view)):
+            counts += pixels >= min_pixels
+        return counts
+
+    counts = views_that_show(views)
     visible = counts > 0
     try:
-        others = sample_views(scene, settings.coverage_views, seed=96, settings=settings)
-        visible |= _views_that_show(scene, others, settings) > 0
+        visible |= views_that_show(sample_views(scene, samples, seed=96, settings=settings)) > 0
     except DataError:
         pass  # no place in the scene is free
     stds = scene.stds.double().nan_to_num(0.0, 0.0, 0.0).sort(dim=1).values
@@ -44,12 +61,3 @@ def coverage(scene: Gaussians, views: Views, times: int = 2, settings: LookingSe
         mass = mass.clamp_max(ranked[int(settings.max_area_quantile * (len(ranked) - 1))])
     total = float(mass.sum())
     return float(mass[counts >= times].sum()) / total if total > 0 else 0.0
-
-
-def _views_that_show(scene: Gaussians, views: Views, settings: LookingSettings) -> Tensor:
-    """Number of views that show each Gaussian, (N,) int64."""
-    counts = torch.zeros(len(scene), dtype=torch.int64)
-    small = list(views.resized(settings.coverage_side))
-    for pixels in each_view(small, len(scene), lambda view: pixels_of(scene, view)):
-        counts += pixels >= settings.min_covered_pixels
-    return counts

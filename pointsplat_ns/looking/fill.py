@@ -9,12 +9,9 @@ from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.rasterizer.projection import project_scene
 from pointsplat_ns.views import Views
 
-COUNTED = 100_000
-"""Maximum number of Gaussians that are projected; of larger scenes, every k-th stands for k."""
-
 
 @torch.no_grad()
-def fill(scene: Gaussians, views: Views) -> float:
+def fill(scene: Gaussians, views: Views, max_count: int = 100_000) -> float:
     """Mean number of Gaussians that are drawn per pixel (overdraw).
 
     Counted as viewers on GPUs draw: each Gaussian is a rectangle along the axes of its ellipse. It reaches sqrt(8)
@@ -24,8 +21,9 @@ def fill(scene: Gaussians, views: Views) -> float:
     Args:
         scene: N Gaussians.
         views: at least one view.
+        max_count: maximum number of Gaussians that are projected; of larger scenes, every k-th stands for k.
     """
-    each = max(-(-len(scene) // COUNTED), 1)
+    each = max(-(-len(scene) // max_count), 1)
     sample = scene[::each]
     pixels = 0.0
     for view in views:

@@ -115,7 +115,7 @@ def _inside(surface: Surface, box: UprightBox, photos: PhotoPlaces | None, width
     places, visible = places[enclosure >= settings.min_enclosure], visible[enclosure >= settings.min_enclosure]
     count = settings.opening_turns
     turn = around(count).repeat(len(places))
-    pitch = math.radians(settings.opening_pitch)
+    pitch = math.radians(settings.pitch_mean)
     eyes = places.repeat_interleave(count, dim=0)
     targets = eyes + math.cos(pitch) * level_directions(up, turn.to(up)) + math.sin(pitch) * up
     views = views_of(look_at(eyes, targets, up), width, height, UNITS, settings)

@@ -10,9 +10,6 @@ from torch import Tensor
 from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.views import Views
 
-BACKGROUND = (0.0, 0.0, 0.0)
-"""Background of sampled views, RGB: black."""
-
 
 def look_at(positions: Tensor, targets: Tensor, up: Tensor | None = None) -> Tensor:
     """World-to-camera matrices of cameras that look at targets.
@@ -55,7 +52,7 @@ def views_of(viewmats: Tensor, width: int, height: int, diagonal: float, setting
     focal = 0.5 * max(width, height) / math.tan(math.radians(settings.field_of_view) / 2)
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=viewmats.dtype)
     Ks = K.repeat(len(viewmats), 1, 1)
-    return Views(viewmats, Ks, width, height, torch.tensor(BACKGROUND), near_plane=settings.near_plane * diagonal)
+    return Views(viewmats, Ks, width, height, torch.zeros(3), near_plane=settings.near_plane * diagonal)
 
 
 def in_pictures(views: Views, points: Tensor, min_depth: float = 0.0) -> Tensor:

@@ -53,13 +53,9 @@ class Search:
         coverage = torch.zeros(len(points.points))
         values = torch.ones(len(coverage)) if self.photos is None else points.trace_factors
         taken: list[Tensor] = []
-        fruitless, rounds = 0, 0
-        max_rounds = settings.extra_rounds + settings.round_factor * math.ceil(count / settings.round_views)
-        while len(taken) < count and fruitless < settings.max_fruitless_rounds and rounds < max_rounds:
-            rounds += 1
+        for _ in range(settings.round_factor * math.ceil(count / settings.round_views)):
             viewmats, owner, gains = self._candidates()
-            before, refused = len(taken), 0
-            wanted = min(count, before + settings.round_views)
+            wanted, refused = min(count, len(taken) + settings.round_views), 0
             while len(taken) < wanted and refused < settings.max_refused and bool((owner >= 0).any()):
                 total_gains = gains @ (1 / (settings.half_gain_coverage + coverage))
                 best = int(total_gains.masked_fill(owner < 0, -1.0).argmax())
@@ -71,7 +67,8 @@ class Search:
                 else:
                     owner[best] = -1
                     refused += 1
-            fruitless = 0 if len(taken) > before else fruitless + 1
+            if len(taken) == count:
+                break
             if len(taken) < wanted:  # blurred views are better than few places
                 self.max_blur *= settings.blur_growth
         return torch.stack(taken) if taken else torch.empty(0, 4, 4, dtype=torch.float64)
@@ -132,15 +129,14 @@ class Search:
         return viewmats, owner, self._gains(viewmats, visible[owner]) * values[owner]
 
     def _outside(self) -> Tensor:
-        """Places (P, 3) around the content, above the ground."""
+        """Places (P, 3) around the content."""
         settings, up = self.settings, self.box.up
         turn, lift, far = torch.rand(3, settings.draws * settings.places, generator=self.generator, dtype=torch.float64)
         low, high = (math.sin(math.radians(angle)) for angle in settings.elevations)
         lift = low + (high - low) * lift
         level = (1 - lift.square()).sqrt()[:, None] * level_directions(up, 2 * math.pi * turn)
         near, farthest = settings.distances
-        places = (level + lift[:, None] * up) * (near + (farthest - near) * far)[:, None]
-        return places[self.box.heights(places) > settings.min_height_outside]
+        return (level + lift[:, None] * up) * (near + (farthest - near) * far)[:, None]
 
     def _ahead(self, eyes: Tensor) -> Tensor:
         """Targets (V, 3) of cameras at ``eyes`` (V, 3) in a room, turned evenly at each place."""
@@ -149,8 +145,7 @@ class Search:
         first = torch.rand(len(eyes) // turns, generator=self.generator, dtype=torch.float64)
         turn = 2 * math.pi * (first[:, None] + torch.arange(turns) / turns).reshape(-1)
         normal = torch.randn(len(eyes), generator=self.generator, dtype=torch.float64)
-        pitch = settings.pitch_mean + settings.pitch_deviation * normal
-        pitch = torch.deg2rad(pitch.clamp(*settings.pitch_bounds))
+        pitch = torch.deg2rad(settings.pitch_mean + settings.pitch_deviation * normal)
         return eyes + pitch.cos()[:, None] * level_directions(up, turn) + pitch.sin()[:, None] * up
 
     def _at_content(self, visible: Tensor) -> Tensor:

@@ -109,9 +109,6 @@ class LookingSettings:
     size_share_exponent: float = 8
     """Exponent of the evidence by size in the share of a place."""
 
-    min_place_share: float = 0.01
-    """Places with a smaller share, relative to the largest one, are left out."""
-
     # Surface points (surface.py)
 
     surface_points: int = 12_288
@@ -166,11 +163,8 @@ class LookingSettings:
     usual_axis_factors: tuple[float, float] = (1.3, 1.64)
     """Factors of the uprightness of the world's z and y axes; (0, 0) turns the rule off. Most scenes stand along y, as
     COLMAP's first camera does, or along z, as nerfstudio's do; and in a room, walls are as flat as the floor. Of 23
-    scenes with known up, 17 are found within 10 degrees; 14 without these factors."""
-
-    usual_axis_factors_with_photos: tuple[float, float] = (1.05, 1.05)
-    """Factors of the uprightness of the world's z and y axes in scenes with photo places, which are better evidence;
-    (0, 0) turns the rule off."""
+    scenes with known up, 17 are found within 10 degrees; 14 without these factors. Photo places are better evidence:
+    with them, both factors are 1.05."""
 
     photo_level_weight: float = 0.1
     """Weight of the levelness of photo places in the uprightness; 0 turns it off. For a desk that was walked around,
@@ -214,9 +208,6 @@ class LookingSettings:
 
     opening_elevation: float = 20.0
     """Elevation of the cameras around the content, degrees."""
-
-    opening_pitch: float = -8.0
-    """Pitch of views from enclosed places, degrees; above 0 is up."""
 
     opening_candidates: int = 24
     """Number of views from enclosed places, of those that show most surface, that compete. With 16, a bathroom opens on
@@ -262,19 +253,13 @@ class LookingSettings:
     """Smallest and largest height of cameras in a room, as shares of its height; (0, 1) turns the rule off."""
 
     pitch_mean: float = -10.0
-    """Mean pitch of cameras in a room, degrees; above 0 is up."""
+    """Mean pitch of cameras in a room, and pitch of those that compete to be the first, degrees; above 0 is up."""
 
     pitch_deviation: float = 8.0
     """Standard deviation of the pitch, degrees."""
 
-    pitch_bounds: tuple[float, float] = (-30.0, 10.0)
-    """Smallest and largest pitch, degrees."""
-
     elevations: tuple[float, float] = (-5.0, 60.0)
     """Smallest and largest elevation of cameras outside of the content, seen from its centre, degrees."""
-
-    min_height_outside: float = 0.05
-    """Smallest height of cameras outside of the content, as a share of the height of its box."""
 
     distances: tuple[float, float] = (5.5, 9.5)
     """Smallest and largest distance of cameras outside of the content from its centre, units."""
@@ -343,14 +328,8 @@ class LookingSettings:
     max_refused: int = 32
     """Number of refused candidates in a row after which a round ends. In trained scenes three were the most."""
 
-    max_fruitless_rounds: int = 4
-    """Number of rounds in a row without a view after which the search ends."""
-
-    round_factor: float = 2.0
-    """The search ends after this multiple of the rounds that it needs if no view is refused, plus ``extra_rounds``."""
-
-    extra_rounds: int = 2
-    """Number of rounds that are added to those of ``round_factor``."""
+    round_factor: int = 3
+    """The search ends after this multiple of the rounds that it needs if no view is refused."""
 
     # Sizes of pictures (sizes.py)
 
@@ -365,17 +344,6 @@ class LookingSettings:
     opposite_background_every: int = 5
     """Of the sampled views of a scene without known views, one of this many has the opposite background, because nobody
     knows before which one the scene is shown; 0 turns the rule off. Odd, so that both sizes of pictures have both."""
-
-    # Coverage (coverage.py)
-
-    coverage_side: int = 160
-    """Longer side of the pictures in which coverage is counted, pixels."""
-
-    min_covered_pixels: float = 0.05
-    """Smallest sum of blend weights over the pixels of a picture, for the picture to show a Gaussian, pixels."""
-
-    coverage_views: int = 96
-    """Number of sampled views that say, together with the given ones, what is visible at all."""
 
 
 DEFAULTS = LookingSettings()

@@ -24,9 +24,6 @@ from pointsplat_ns.views import Views
 RESOLUTION = (1920, 1080)
 """Width and height of sampled views, pixels: the size that most people look at."""
 
-MAX_SIDE = 16384
-"""Largest width or height of a resolution, pixels."""
-
 
 def parse_resolution(text: str | tuple[int, int] | None) -> tuple[int, int] | None:
     """Width and height of pictures, pixels, as in "1920x1080"; None stays None.
@@ -41,7 +38,7 @@ def parse_resolution(text: str | tuple[int, int] | None) -> tuple[int, int] | No
     if text is None:
         return None
     parts = text.lower().split("x") if isinstance(text, str) else [str(part) for part in text]
-    if len(parts) != 2 or not all(part.strip().isdecimal() and 1 <= int(part) <= MAX_SIDE for part in parts):
+    if len(parts) != 2 or not all(part.strip().isdecimal() and 1 <= int(part) <= 16384 for part in parts):
         raise PointSplatError(f"resolution is {text!r}; expected width and height in pixels, such as 1920x1080")
     return int(parts[0]), int(parts[1])
 

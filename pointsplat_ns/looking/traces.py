@@ -158,8 +158,7 @@ def photo_places(scene: Gaussians, settings: LookingSettings = DEFAULTS) -> Phot
     if best < needed:
         return None
     shares = (found.clamp_min(0) / best) ** exponent
-    chosen = shares > settings.min_place_share
-    return PhotoPlaces(places[chosen], shares[chosen] / shares[chosen].sum())
+    return PhotoPlaces(places, shares / shares.sum())
 
 
 def unit_sh(sh: Tensor, settings: LookingSettings = DEFAULTS) -> Tensor:

@@ -151,11 +151,10 @@ def upright_axis(surface: Surface, photos: PhotoPlaces | None = None) -> Tensor:
         found = torch.cat([found, _nearby(found, math.radians(degrees))])
         scores = scores_of(found)
         found = found[scores.topk(settings.refined_directions).indices]
-    best = float(scores.max())
     usual = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
-    factors = settings.usual_axis_factors if photos is None else settings.usual_axis_factors_with_photos
-    scores = usual.new_tensor(factors) * scores_of(usual)
-    return usual[scores.argmax()] if float(scores.max()) >= best else found[0]
+    factors = settings.usual_axis_factors if photos is None else (1.05, 1.05)
+    usual_scores = usual.new_tensor(factors) * scores_of(usual)
+    return usual[usual_scores.argmax()] if bool(usual_scores.max() >= scores.max()) else found[0]
 
 
 def pointing_up(surface: Surface, axis: Tensor, from_above: float = 0.0) -> Up:

@@ -30,9 +30,6 @@ logger = logging.getLogger("pointsplat_ns")
 SCRIPTS = ("spz.js", "splats.js", "camera.js", "flight.js")
 """Scripts of a flight, for :func:`~pointsplat_ns.pages.html.page` with ``with_workers``."""
 
-VIEWS = 6
-"""Maximum number of views in a page."""
-
 KNOWN_VIEWS = 24
 """Maximum number of known views from which those of a page are chosen."""
 
@@ -61,7 +58,7 @@ class FlightFrame:
         known = None if views is None or len(views) == 0 else views.spread(KNOWN_VIEWS)
         if up is None and known is not None:
             up = _up_of(known, estimated_up(scene))
-        opening = opening_views(scene.detach(), VIEWS, up=up, known=known)
+        opening = opening_views(scene.detach(), 6, up=up, known=known)
         centre, size = content_size(scene)
         return FlightFrame(centre, size, opening.up, views_in_units(opening.views, centre, size), opening.whole)
 

@@ -56,10 +56,6 @@ class BareCount(int):
     """A count that was typed as digits alone, such as 10: it may be meant as a percentage."""
 
 
-FEWEST, MANY = 100, 5000
-"""A bare count below the first is refused in scenes of the second number of Gaussians or more."""
-
-
 Keep = float | int | Megabytes | WithinPsnr
 
 
@@ -102,7 +98,7 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3) -> int:
     if isinstance(keep, Integral):
         if not 1 <= keep <= n:
             raise BudgetError(f"keep is {int(keep)} Gaussians; expected 1 to {n}, the number in the scene")
-        if isinstance(keep, BareCount) and keep < FEWEST and n >= MANY:
+        if isinstance(keep, BareCount) and keep < 100 and n >= 5000:
             raise BudgetError(
                 f"keep is {int(keep)}, of {n:,} Gaussians; did you mean {int(keep)}%? Write {int(keep)}gaussians for "
                 "so few"

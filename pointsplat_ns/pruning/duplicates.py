@@ -16,13 +16,6 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
 from pointsplat_ns.system.pieces import CHUNK
 
-NODES = 16
-"""Number of nodes of the quadrature in :func:`stacked`: enough for 4 digits."""
-
-_INTEGERS = {2: torch.int16, 4: torch.int32, 8: torch.int64}
-_FACTOR = 0x2545F4914F6CDD1D
-"""Odd; of the generator xorshift* (Vigna 2016, ACM TOMS 42(4))."""
-
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
@@ -96,7 +89,7 @@ def stacked(alphas: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
         [0.75, 0.075]
     """
     found, growth = alphas.clone(), torch.zeros_like(alphas)
-    nodes, weights = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(NODES))
+    nodes, weights = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(16))  # 4 digits
     for these in (alphas > ALPHA_MIN).nonzero()[:, 0].split(CHUNK):
         a, n = alphas[these], counts[these].double()
         found[these] = (-torch.expm1(n * torch.log1p(-a))).clamp_max(ALPHA_MAX)
@@ -133,9 +126,10 @@ def _first_equal(scene: Gaussians, members: Tensor) -> Tensor:
 def _hashes(columns: list[Tensor], rows: Tensor) -> Tensor:
     """Hashes (m,) int64 of rows (m,) of tensors (N, D): of their bits, modulo 2^64."""
     result = torch.zeros(len(rows), dtype=torch.int64)
+    integers = {2: torch.int16, 4: torch.int32, 8: torch.int64}
     for values in columns:
-        for column in values.view(_INTEGERS[values.element_size()]).unbind(1):
-            result = (result ^ (result >> 29)).add_(column[rows]).mul_(_FACTOR)
+        for column in values.view(integers[values.element_size()]).unbind(1):
+            result = (result ^ (result >> 29)).add_(column[rows]).mul_(0x2545F4914F6CDD1D)  # xorshift*'s
     return result
 
 

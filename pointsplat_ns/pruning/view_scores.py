@@ -19,12 +19,6 @@ from pointsplat_ns.rasterizer.pixel_walk import PixelBlock, sum_over_pixels
 from pointsplat_ns.rasterizer.projection import Projected, project
 from pointsplat_ns.views import Views
 
-LIGHTGAUSSIAN_BETA = 0.1
-"""Exponent of the normalised volume (LightGaussian, section 3.2)."""
-
-LIGHTGAUSSIAN_LARGEST = 0.9
-"""Rank of the normalising volume, as a share of all Gaussians sorted by descending volume."""
-
 MIN_EIGENVALUE = 1e-9
 """Lower bound of the eigenvalues of a Hessian block of unit diagonal (PUP-3DGS). Parameters that no view determines
 have eigenvalues of 0, whose computed values and logarithms are rounding errors. With this bound the score depends on
@@ -32,7 +26,7 @@ the other eigenvalues."""
 
 
 def lightgaussian_score(
-    scene: Gaussians, views: Views, beta: float = LIGHTGAUSSIAN_BETA, progress: Callable[[float], None] | None = None
+    scene: Gaussians, views: Views, beta: float = 0.1, progress: Callable[[float], None] | None = None
 ) -> Tensor:
     """LightGaussian's global significance (arXiv 2311.17245, eq. 3 and 4).
 
@@ -43,7 +37,7 @@ def lightgaussian_score(
     Args:
         scene: N Gaussians.
         views: at least one view.
-        beta: exponent of the volume, at least 0.
+        beta: exponent of the volume, at least 0 (section 3.2).
         progress: called with the share done, in [0, 1].
 
     Returns:
@@ -71,7 +65,7 @@ def lightgaussian_score(
         if bool(usable.any()):
             logs = log_volume(scene)
             ranked = logs[usable].sort(descending=True).values
-            relative = logs - ranked[min(int(LIGHTGAUSSIAN_LARGEST * len(ranked)), len(ranked) - 1)]
+            relative = logs - ranked[min(int(0.9 * len(ranked)), len(ranked) - 1)]
             # -Inf - -Inf is NaN: a flat Gaussian among flat ones has a relative volume of 1
             total *= torch.exp(beta * relative.nan_to_num(nan=0.0, posinf=0.0).clamp_max(0.0))
     return torch.where(usable, total, math.nan)

@@ -21,9 +21,6 @@ from pointsplat_ns.rasterizer.tiles import Footprints
 from pointsplat_ns.system.threads import one_thread, suitable_threads
 from pointsplat_ns.views import View, Views
 
-BYTES_PER_WEIGHT = 32
-"""Bytes that a pair of tile and Gaussian takes where only its weight is asked for."""
-
 
 def render(
     scene: Gaussians,
@@ -153,7 +150,7 @@ def _weighed(scene: Gaussians, view: View) -> Tensor:
     )  # fmt: skip
     inputs = kernels.inputs_of(*shape, seen.means2d[:, :0], Quality())
     weights = torch.zeros_like(seen.opacities)
-    for region in footprints.regions(MEMORY_BUDGET // BYTES_PER_WEIGHT):
+    for region in footprints.regions(MEMORY_BUDGET // 32):  # bytes of a pair of tile and Gaussian
         weights += kernels.weigh_region(footprints, footprints.tiles(region), inputs)
     return scene.means.new_zeros(len(scene)).index_copy_(0, seen.ids, weights)
 

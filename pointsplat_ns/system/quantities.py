@@ -6,9 +6,6 @@ import math
 import re
 from decimal import Decimal
 
-_FACTORS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9}
-_NUMBER = re.compile(r"([+-]?(?:\d{1,3}(?:,\d{3})+|\d+)?(?:\.\d*)?(?:e[+-]?\d{1,3})?) ?([kmg]?)", re.IGNORECASE)
-
 
 def parse_number(text: str) -> float:
     """A number, with k, M or G for thousands, millions or billions. Raises ValueError if it is none.
@@ -17,10 +14,11 @@ def parse_number(text: str) -> float:
         >>> parse_number("1e3"), parse_number("1.5M"), parse_number("1,000"), parse_number("0.3")
         (1000.0, 1500000.0, 1000.0, 0.3)
     """
-    found = _NUMBER.fullmatch(text.strip())
+    form = r"([+-]?(?:\d{1,3}(?:,\d{3})+|\d+)?(?:\.\d*)?(?:e[+-]?\d{1,3})?) ?([kmg]?)"
+    found = re.fullmatch(form, text.strip(), re.IGNORECASE)
     if found is None or not re.match(r"[+-]?[\d.]*\d", found[1]):
         raise ValueError(f"{text!r} is no number; expected one such as 0.5, 1000, 1,000, 1e3, 10k or 1.5M")
-    number = float(Decimal(found[1].replace(",", "")) * _FACTORS[found[2].lower()])
+    number = float(Decimal(found[1].replace(",", "")) * {"": 1, "k": 10**3, "m": 10**6, "g": 10**9}[found[2].lower()])
     if math.isinf(number):
         raise ValueError(f"{text!r} is too large")
     return number

@@ -34,9 +34,6 @@ from pointsplat_ns.tradeoff.front import (
 )
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, picture_path, speed_of
 
-MAX_BYTES = 10_000_000
-"""Largest size of the page in bytes, so that it fits into mails and opens quickly."""
-
 FLIGHT_BYTES = 4_000_000
 """Largest size of a page's scenes in bytes; the rest of the page is for its pictures."""
 
@@ -76,7 +73,7 @@ def write_page(sweep: Tradeoff, folder: Path, output: Path, progress: bool | Pro
         )  # fmt: skip
 
     empty = filled([""] * len(sources), " " * 100)  # the note on how pictures were compressed is shorter
-    text = filled(*fit(sources, MAX_BYTES - len(empty.encode("utf-8")), progress))
+    text = filled(*fit(sources, 10_000_000 - len(empty.encode("utf-8")), progress))
     with replacing(output) as part:
         part.write_text(text, encoding="utf-8")
     return output

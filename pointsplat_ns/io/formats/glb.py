@@ -36,9 +36,6 @@ JSON_BYTES = 8192
 
 _EXTENSION = "KHR_gaussian_splatting"
 
-_TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5126: np.float32}
-_COLUMNS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-
 
 def read_glb(path: Path | str) -> Gaussians:
     """Read all Gaussians of a ``.glb``, as :func:`~pointsplat_ns.io.read_scene` does. The transforms of nodes are not
@@ -124,8 +121,9 @@ def _numbers(index: int, columns: int, content: dict[str, Any], binary: memoryvi
     view = _entry(content["bufferViews"], accessor["bufferView"])
     if view["buffer"] != 0 or "uri" in content["buffers"][0]:
         raise SceneError(f"{path}: its numbers lie in another file; expected them in its binary chunk")
-    dtype = np.dtype(_TYPES[accessor["componentType"]]).newbyteorder("<")
-    if _COLUMNS[accessor["type"]] != columns:
+    types = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5126: np.float32}
+    dtype = np.dtype(types[accessor["componentType"]]).newbyteorder("<")
+    if {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]] != columns:
         raise ValueError(f"an accessor of {accessor['type']}, expected {columns} numbers each")
     count, row = accessor["count"], columns * dtype.itemsize
     stride = view.get("byteStride", row)

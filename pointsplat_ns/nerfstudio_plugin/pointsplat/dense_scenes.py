@@ -23,7 +23,6 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import content_hash
 from pointsplat_ns.io.ply import read_ply
-from pointsplat_ns.looking.poses import BACKGROUND
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.sizes import RESOLUTION, subsampled
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
@@ -106,7 +105,7 @@ class DenseScene:
     @property
     def background(self) -> Tensor:
         """Background colour (3,) in [0, 1]."""
-        return torch.tensor(BACKGROUND)
+        return torch.zeros(3)
 
     def read_dense(self) -> Gaussians:
         """Read the Gaussians from the file, onto the CPU."""

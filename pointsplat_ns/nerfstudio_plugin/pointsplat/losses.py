@@ -19,9 +19,6 @@ PIXEL_LOSSES: dict[str, Callable[[Tensor], Tensor]] = {
 }
 """Pixel losses by name, as functions of the difference (H, W, 3) of two images."""
 
-LOSSES = (*PIXEL_LOSSES, "lpips")
-"""Names of all terms that the loss may have."""
-
 
 class PhotoLoss:
     """A pixel loss, one of :data:`PIXEL_LOSSES`, plus weighted LPIPS. If LPIPS cannot be computed, the pixel loss

@@ -24,7 +24,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
     only_finite,
     summarize_by_reference,
 )
-from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import LOSSES
+from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PIXEL_LOSSES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.report import REFINER_NAME
 from pointsplat_ns.nerfstudio_plugin.pointsplat.training_state import TrainingState
@@ -112,7 +112,7 @@ class PointSplatPipeline(VanillaPipeline):
         index, frames = self.datamanager.next_train(step)
         outputs, losses, metrics = self.model.losses(index, frames)
         faults = [f"the {name} loss is {v.item()}" for name, v in losses.items() if not v.isfinite()]
-        means = distributed.means_over_ranks({**losses, "psnr": metrics["psnr"]}, (*LOSSES, "psnr"))
+        means = distributed.means_over_ranks({**losses, "psnr": metrics["psnr"]}, (*PIXEL_LOSSES, "lpips", "psnr"))
         if self.world_size > 1:
             losses = {name: distributed.with_value(value, means[name]) for name, value in losses.items()}
         metrics |= {"psnr": means["psnr"], "scene": index, "faults": faults}

@@ -19,14 +19,12 @@ MIN_DIVISOR = 1e-300
 MAX_LOG_SCALE = 40.0
 """Bound of the absolute value of log-scales: products of four standard deviations and their squares stay in float64."""
 
-MAX_LOG_ASPECT = 11.5
-"""Axes shorter than exp(-this) (1e-5) of the longest are set to that length, which float64 still tells from zero."""
-
 
 def covariances(log_scales: Tensor, quats: Tensor) -> Tensor:
     """Covariances (N, 6) of Gaussians with log-scales (N, 3), +-Inf allowed, and quaternions (N, 4), float64."""
     logs = log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
-    logs = torch.maximum(logs, logs.amax(dim=1, keepdim=True) - MAX_LOG_ASPECT)
+    # an axis is at least exp(-11.5), 1e-5, of the longest, which float64 still tells from zero
+    logs = torch.maximum(logs, logs.amax(dim=1, keepdim=True) - 11.5)
     axes = rotation_matrices(quats) * logs.exp()[:, None]
     return pack(axes @ axes.transpose(1, 2))
 

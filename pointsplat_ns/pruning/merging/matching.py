@@ -14,9 +14,6 @@ from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import CHUNK
 from pointsplat_ns.system.threads import in_threads, most_threads
 
-_SCATTER = 2654435761
-"""Odd, so that multiplying by it modulo 2^32 permutes the numbers of pairs (Knuth's multiplicative hashing)."""
-
 
 def cheapest_pairs(
     near: Tensor, costs: Tensor, most: int, passes: int = DEFAULTS.matching_passes, compiled: bool | None = None
@@ -103,7 +100,8 @@ def _keys(rows: Tensor, costs: Tensor) -> Tensor:
     negative are ordered as the float is."""
     k = costs.shape[1]
     numbers = rows[:, None] * k + torch.arange(k)
-    return (costs[rows].view(torch.int32).long() << 32) | ((numbers * _SCATTER) & 0xFFFFFFFF)
+    # Multiplying by an odd number modulo 2^32 permutes the numbers of pairs (Knuth's multiplicative hashing).
+    return (costs[rows].view(torch.int32).long() << 32) | ((numbers * 2654435761) & 0xFFFFFFFF)
 
 
 def _by_kernels(near: Tensor, costs: Tensor, passes: int) -> tuple[Tensor, Tensor, Tensor]:

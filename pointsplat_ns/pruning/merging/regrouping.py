@@ -32,12 +32,6 @@ from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import CHUNK, in_pieces
 from pointsplat_ns.system.threads import in_threads, most_threads
 
-MEMBERS_AT_ONCE = CHUNK // 4
-"""Number of members that choose their groups at once: each is compared with several."""
-
-_OCCURRENCES = torch.tensor([1.0, 2.0, 2.0, 1.0, 2.0, 1.0], dtype=torch.float64)
-"""How often each of the six numbers of a symmetric matrix occurs in it."""
-
 
 @dataclass(frozen=True, eq=False)
 class Members:
@@ -162,7 +156,8 @@ def best_groups(
     variance = (groups.cov[:, (0, 3, 5)].mean(1)).clamp_min(MIN_DIVISOR)
     shapes = unpack(groups.cov / variance[:, None]) + 1e-6 * torch.eye(3, dtype=torch.float64)  # invertible if flat
     inverse = torch.linalg.inv(shapes)
-    inverse = inverse[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)] * (_OCCURRENCES / variance[:, None])
+    occurrences = inverse.new_tensor([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])  # of the six numbers of a symmetric matrix
+    inverse = inverse[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)] * (occurrences / variance[:, None])
     log_determinants = torch.logdet(shapes) + 3 * variance.log()
     fits = Fits(groups.means, inverse, log_determinants, groups.colours, 1 / (2 * settings.regrouping_contrast**2))
     near = nearest_of(groups.means, members.means, group, settings.regrouping_candidates, compiled)
@@ -174,7 +169,7 @@ def best_groups(
         def choose(rows: Tensor) -> None:
             result[rows] = fits.best_of(members, rows, torch.cat([group[rows, None], near[rows].long()], dim=1))
 
-        in_threads(choose, torch.arange(len(members)).split(MEMBERS_AT_ONCE))
+        in_threads(choose, torch.arange(len(members)).split(CHUNK // 4))  # each is compared with several groups
     heaviest = torch.zeros(count, dtype=torch.float64).scatter_reduce_(0, group, members.masses, "amax")
     return torch.where(members.masses >= heaviest[group], group, result)
 
