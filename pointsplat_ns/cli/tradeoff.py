@@ -24,7 +24,6 @@ def tradeoff(
     poses: Poses = None,
     resolution: Resolution = None,
     up: Up = None,
-    drawn: tuple[Literal["exact", "fast", "half"], ...] = ("exact", "fast", "half"),
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: Megabytes | None = None,
@@ -55,7 +54,6 @@ def tradeoff(
             timed in the pictures of comparisons. By default the size of the photos, if there are any, else 1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is
             estimated. Write --up=-y for a negative axis.
-        drawn: qualities of frames: exact for all scenes; fast, and half (fast at half the resolution), for a few.
         target_db: search for the smallest scene with at least this PSNR against the dense scene's renders. By default
             there is no search.
         target_ms: longest time of a frame, milliseconds; by default no limit. Without --target-db, search for the best
@@ -76,7 +74,7 @@ def tradeoff(
     with fixed_threads(threads):
         found = ps.measure_tradeoff(
             scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, poses=poses,
-            resolution=resolution, up=up, drawn=drawn, target_db=target_db, target_ms=target_ms, target_mb=target_mb,
+            resolution=resolution, up=up, target_db=target_db, target_ms=target_ms, target_mb=target_mb,
             force=force, progress=True,
         )  # fmt: skip
     if json_output:

@@ -30,6 +30,9 @@ class Chunks:
     """Gaussians of the finest level in a leaf, at most, and in a file that gets no further leaf."""
     extent: float | None = None
     """Largest side of a leaf, scene units; by default an eighth of the diagonal of the content."""
+    least: int = 8192
+    """Gaussians of the finest level in a leaf, up to which it is not cut for its extent. The tree has one entry for a
+    leaf, and viewers choose a level for each, so that leaves of few Gaussians cost more than they save."""
 
     def __post_init__(self) -> None:
         if self.count < 1 or (self.extent is not None and not self.extent > 0):
@@ -94,9 +97,7 @@ def partition(levels: Sequence[Gaussians], parents: Sequence[Tensor], chunks: Ch
         nonlocal leaves
         points, weight = coarsest.means[members], weights[members]
         total, sides = int(weight.sum()), points.amax(dim=0) - points.amin(dim=0) if len(members) else torch.zeros(3)
-        # The tree has one entry for a leaf, and viewers choose a level for each: leaves of few Gaussians cost more than
-        # they save, so one of at most 8,192 is not cut for its extent.
-        too_wide = float(sides.max()) > extent and total > 8192
+        too_wide = float(sides.max()) > extent and total > chunks.least
         if len(members) > 1 and (total > chunks.count or too_wide):
             order = points[:, int(sides.argmax())].argsort(stable=True)
             half = int((weight[order].cumsum(0) < total / 2).sum()) + 1

@@ -38,7 +38,6 @@ def measure_tradeoff(
     poses: str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
     up: str | None = None,
-    drawn: tuple[str, ...] = ("exact", "fast", "half"),
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: float | None = None,
@@ -65,8 +64,6 @@ def measure_tradeoff(
         resolution: as for :func:`pointsplat_ns.prune`. Scenes are judged and timed in the pictures that
             :func:`pointsplat_ns.compact` compares in, of 784 x 441 pixels for 1920 x 1080; photos are reduced to them.
         up: as for :func:`pointsplat_ns.prune`.
-        drawn: how frames may be drawn: "exact", of all scenes; "fast" and "half" (so, and at half the resolution), of a
-            few where that may pay. A search for targets draws exactly.
         target_db: least PSNR against the dense scene's renders, over the pixels that it covers, dB.
         target_ms: longest time of a frame, milliseconds.
         target_mb: largest file, in units of 10^6 bytes.
@@ -93,7 +90,7 @@ def measure_tradeoff(
         >>> found.point(found.recommended).bytes <= 10_000
         True
     """
-    options = Options(points, within, tuple(by), tuple(repairs), views, tuple(drawn))
+    options = Options(points, within, tuple(by), tuple(repairs), views)
     targets, size = targets_of(target_db, target_ms, target_mb), parse_resolution(resolution)
     upward = up_named(up)
     path, folder = Path(scene), Path(folder)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Literal
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
@@ -26,7 +24,6 @@ def render(
     scene: Gaussians,
     views: View | Views,
     quality: QualityName = "exact",
-    reduced: int = 1,
     backend: Literal["torch", "gsplat", "auto"] = "torch",
 ) -> Tensor:
     """Render a scene from one view or several, over the views' background. Differentiable in the scene.
@@ -36,7 +33,6 @@ def render(
         views: a :class:`~pointsplat_ns.View`, or :class:`~pointsplat_ns.Views`, whose pictures are then drawn one after
             the other.
         quality: "exact", or faster and less accurate, "balanced" or "fast", as for :func:`pointsplat_ns.rasterization`.
-        reduced: draw this factor fewer pixels a side, and enlarge the picture (bicubic): faster, and blurred.
         backend: "torch", or gsplat where it can be used ("auto"), as for :func:`pointsplat_ns.rasterization`. gsplat
             leaves out tests of what it is given.
 
@@ -44,8 +40,7 @@ def render(
         Colours in [0, 1]: (H, W, 3) for a view, (C, H, W, 3) for C views.
 
     Raises:
-        ValueError: if a camera is not finite or has no focal length, there is no such quality, or ``reduced`` is less
-            than 1.
+        ValueError: if a camera is not finite or has no focal length, or there is no such quality.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -57,11 +52,7 @@ def render(
     if isinstance(views, Views):
         if len(views) == 0:
             return scene.means.new_zeros(0, views.height, views.width, 3)
-        return torch.stack([render(scene, view, quality, reduced, backend) for view in views])
-    if reduced < 1:
-        raise ValueError(f"reduced is {reduced}; expected 1 or more")
-    if reduced > 1:
-        return _enlarged(render(scene, _smaller(views, reduced), quality, backend=backend), views)
+        return torch.stack([render(scene, view, quality, backend) for view in views])
     return render_with_alpha(scene, views, quality, backend)[0]
 
 
@@ -99,19 +90,6 @@ def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tupl
         **options,
     )
     return image[0], alpha[0]
-
-
-def _smaller(view: View, factor: int) -> View:
-    """The same view with a factor fewer pixels a side, rounded up."""
-    width, height = -(-view.width // factor), -(-view.height // factor)
-    stretch = view.K.new_tensor([[width / view.width], [height / view.height], [1.0]])
-    return replace(view, K=view.K * stretch, width=width, height=height)
-
-
-def _enlarged(picture: Tensor, view: View) -> Tensor:
-    """A picture (h, w, 3) at the size of a view, (H, W, 3)."""
-    channels_first = picture.permute(2, 0, 1)[None]
-    return F.interpolate(channels_first, (view.height, view.width), mode="bicubic")[0].permute(1, 2, 0).clamp(0, 1)
 
 
 def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:

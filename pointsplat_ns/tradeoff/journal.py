@@ -76,8 +76,8 @@ class Form:
 
 POINTS = "points.json"
 
-POINTS_FORM = Form("pointsplat-tradeoff-points", 2, "points", "a sweep")
-"""Points of version 1 were timed without the dense scene beside them, so their times are not comparable."""
+POINTS_FORM = Form("pointsplat-tradeoff-points", 3, "points", "a sweep")
+"""Points of version 1 were timed without the dense scene beside them, some of version 2 drawn in other qualities."""
 
 
 class Journal:

@@ -24,10 +24,10 @@ from pointsplat_ns.looking.closeness import DenseReference, views_text
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.metrics import MOST_PSNR, SSIM_WINDOW, ImageError, finite_psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
+from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.threads import fixed_threads
 from pointsplat_ns.tradeoff.machine import OtherPrograms
 from pointsplat_ns.tradeoff.points import Quality, picture_path
-from pointsplat_ns.tradeoff.settings import Drawn, draw
 from pointsplat_ns.views import View, Views, spread_indices
 
 ROUNDS = 3
@@ -109,15 +109,13 @@ class Judge:
             self._write([self.photos[i] for i in self.pictured], "photo")
 
     @torch.no_grad()
-    def judge(
-        self, scene: Gaussians, key: str, progress: Callable[[float], None], timed: bool = True, drawn: Drawn = "exact"
-    ) -> Judged:
-        """Render a scene, write pictures of it under the key of its point, and time it if ``timed``. Frames are drawn
-        as ``drawn``, those of the dense scene always exactly. ``progress`` is called with the share done."""
+    def judge(self, scene: Gaussians, key: str, progress: Callable[[float], None], timed: bool = True) -> Judged:
+        """Render a scene, write pictures of it under the key of its point, and time it if ``timed``. ``progress`` is
+        called with the share done."""
         images = []
         passes = 1 + 2 * ROUNDS * timed
         for view in self.views:
-            images.append(draw(scene, view, drawn))
+            images.append(render(scene, view))
             progress(len(images) / (passes * len(self.views)))
         self._write([images[i] for i in self.pictured], key)
         photos = None
@@ -125,22 +123,18 @@ class Judge:
             pairs = [(image, photo.to(image)) for image, photo in zip(images, self.photos, strict=True)]
             similarity = fmean(float(ssim(*pair)) for pair in pairs)
             photos = Quality(fmean(finite_psnr(*pair) for pair in pairs), similarity, self._perceived(pairs))
-        times = self._time(scene, drawn) if timed else {}
+        times = self._time(scene) if timed else {}
         progress(1.0)
         close = self.reference.closeness_of(images)
         assert close.ssim is not None
         perceived = self._perceived(zip(images, self.reference.renders, strict=True))
         return Judged(Quality(min(close.psnr, MOST_PSNR), close.ssim, perceived), photos, **times)
 
-    def _time(self, scene: Gaussians, drawn: Drawn) -> dict[str, float]:
+    def _time(self, scene: Gaussians) -> dict[str, float]:
         """The times of :class:`Judged`: ``dense_ms`` times the measured ratio of frames."""
         others = OtherPrograms()
         with fixed_threads(torch.get_num_threads()):  # the same number for all frames
-            pairs = [
-                (_timed(self.dense, view, "exact"), _timed(scene, view, drawn))
-                for _ in range(ROUNDS)
-                for view in self.views
-            ]
+            pairs = [(_timed(self.dense, view), _timed(scene, view)) for _ in range(ROUNDS) for view in self.views]
         rounds = np.array(pairs).reshape(ROUNDS, len(self.views), 2)  # seconds
         dense_ms, clock_ms = (1000 * float(np.median(rounds.min(axis=0)[:, which])) for which in (0, 1))
         if self.dense_ms is None:
@@ -172,11 +166,11 @@ class Judge:
                 write_picture(image, path)
 
 
-def _timed(scene: Gaussians, view: View, drawn: Drawn) -> float:
+def _timed(scene: Gaussians, view: View) -> float:
     """Seconds of drawing a view."""
     _wait_for(scene.device)
     start = time.perf_counter()
-    draw(scene, view, drawn)
+    render(scene, view)
     _wait_for(scene.device)
     return time.perf_counter() - start
 

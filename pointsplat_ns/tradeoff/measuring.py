@@ -190,7 +190,6 @@ class Measurer:
 
     def made(self, setting: Setting, show: Progress = silent) -> MadeScene:
         """The scene of a setting. The latest scenes are kept, with no more Gaussians in all than the dense scene."""
-        setting = setting.scene
         if setting not in self._kept:
             self._kept[setting] = make(self.dense, setting, self.subject.new_views, show, self.subject.refiner)
             while len(self._kept) > 1 and sum(len(kept.scene) for kept in self._kept.values()) > len(self.dense):
@@ -209,10 +208,10 @@ class Measurer:
 
     def _point(self, setting: Setting, made: MadeScene, key: str, label: str, command: str, show: Progress) -> Point:
         size, scene = through_file(made.scene, self.subject.suffix)
-        judged = self.judge.judge(scene, key, lambda share: show("", share), self.timed, setting.drawn)
+        judged = self.judge.judge(scene, key, lambda share: show("", share), self.timed)
         return point_of(
             made, judged, key=key, label=label, command=command, by=setting.by, share=setting.count / len(self.dense),
-            repair=setting.repair, bytes=size, drawn=setting.drawn,
+            repair=setting.repair, bytes=size,
         )  # fmt: skip
 
 

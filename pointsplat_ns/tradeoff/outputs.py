@@ -129,5 +129,4 @@ def _plain_logarithmic(axis: Axes) -> None:
 def _group(point: Point, dense: Point) -> str:
     """Name of the points of one marker and colour."""
     words = [point.by] + ([] if point.repair == "none" else [point.repair])
-    words += [] if point.drawn == "exact" else [f"drawn {point.drawn}"]
     return ", ".join(words + ([] if point.sh_degree == dense.sh_degree else [f"SH degree {point.sh_degree}"]))

@@ -41,7 +41,9 @@ FLIGHT_BYTES = 4_000_000
 Picture = Callable[[], np.ndarray]
 
 
-def write_page(sweep: Tradeoff, folder: Path, output: Path, progress: bool | Progress = False) -> Path:
+def write_page(
+    sweep: Tradeoff, folder: Path, output: Path, progress: bool | Progress = False, max_bytes: int = 10_000_000
+) -> Path:
     """Write one self-contained HTML file with the points of a sweep, which needs no other file; returns its path.
 
     It plots quality against cost with the Pareto front. A slider along the front shows every view beside the dense
@@ -52,7 +54,7 @@ def write_page(sweep: Tradeoff, folder: Path, output: Path, progress: bool | Pro
 
     Raises:
         DataError: if there is no point or no view, a picture is missing, damaged or of another size than the views, or
-            the page does not fit into 10 MB.
+            the page does not fit into ``max_bytes``: it should fit into mails and open quickly.
         SceneError: if the file cannot be written.
     """
     if not sweep.points:
@@ -73,7 +75,7 @@ def write_page(sweep: Tradeoff, folder: Path, output: Path, progress: bool | Pro
         )  # fmt: skip
 
     empty = filled([""] * len(sources), " " * 100)  # the note on how pictures were compressed is shorter
-    text = filled(*fit(sources, 10_000_000 - len(empty.encode("utf-8")), progress))
+    text = filled(*fit(sources, max_bytes - len(empty.encode("utf-8")), progress))
     with replacing(output) as part:
         part.write_text(text, encoding="utf-8")
     return output
@@ -189,8 +191,7 @@ def _group(point: Point) -> str:
     """Name of the points of one colour."""
     if point.by == "dense":
         return "the dense scene"
-    group = f"{point.by}, " + ("not repaired" if point.repair == "none" else f"repaired ({point.repair})")
-    return group if point.drawn == "exact" else f"{group}, drawn {point.drawn}"
+    return f"{point.by}, " + ("not repaired" if point.repair == "none" else f"repaired ({point.repair})")
 
 
 def _cells(point: Point, dense: Point) -> dict[str, tuple[float | None, str]]:

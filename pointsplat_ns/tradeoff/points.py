@@ -56,8 +56,6 @@ class Point:
     """Cores that other programs used during the timing; None if they were not measured."""
     clock_ms: float | None = None
     """Median time of one frame over views by the clock, in milliseconds; None if it was not measured."""
-    drawn: str = "exact"
-    """Quality of its frames, for pictures and times: ``exact``, ``fast``, ``half``."""
 
 
 class Speed(NamedTuple):
@@ -90,7 +88,7 @@ class Tradeoff:
         >>> import pointsplat_ns as ps
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     ps.save(ps.example_room()[::200][:300], f"{folder}/room.ply")
-        ...     options = {"points": 2, "views": 2, "resolution": "64x48", "drawn": ("exact",)}
+        ...     options = {"points": 2, "views": 2, "resolution": "64x48"}
         ...     found = ps.measure_tradeoff(f"{folder}/room.ply", f"{folder}/trade", **options)
         >>> [point.key for point in found.points], found.point("10pct_sh1").gaussians
         (['dense', '10pct_sh1'], 30)

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
-
-from torch import Tensor
 
 from pointsplat_ns.compression.repair import Effort
 from pointsplat_ns.compression.trained_refiner import SHIPPED
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sizes import size_text
 from pointsplat_ns.pruning import method_named, ply_bytes
-from pointsplat_ns.rasterizer import render
 from pointsplat_ns.tradeoff.points import Point
-from pointsplat_ns.views import View
 
 Repair = Literal["none", "refiner", "quick", "thorough"]
 """Kinds of repair: none; the refiner alone; 48 steps; 400 steps."""
@@ -33,12 +28,6 @@ def repairs_of(effort: Effort) -> tuple[Repair, Repair]:
     return "none", next(repair for repair, known in EFFORTS.items() if known == effort)
 
 
-Drawn = Literal["exact", "fast", "half"]
-"""Quality of frames: exact; with ``quality="fast"``, which skips nearly transparent Gaussians; or fast at half the
-resolution, enlarged."""
-
-DRAWN: tuple[Drawn, ...] = get_args(Drawn)
-
 DENSE = "dense"
 """Key and method of the dense scene."""
 
@@ -52,12 +41,6 @@ class Setting:
     sh_degree: int
     repair: Repair = "none"
     by: str = "merge"
-    drawn: Drawn = "exact"
-
-    @property
-    def scene(self) -> Setting:
-        """The setting of the same scene, drawn exactly."""
-        return replace(self, drawn="exact")
 
     @property
     def bytes(self) -> int:
@@ -66,15 +49,9 @@ class Setting:
 
 
 def setting_of(point: Point) -> Setting:
-    """The setting of a point other than the dense scene. Raises PointSplatError if its repair, method or quality of
-    frames is unknown."""
-    repair, drawn = check_repairs((point.repair,))[0], check_drawn((point.drawn,))[0]
-    return Setting(point.gaussians, point.sh_degree, repair, method_named(point.by).name, drawn)
-
-
-def draw(scene: Gaussians, view: View, drawn: Drawn) -> Tensor:
-    """Render a view (H, W, 3)."""
-    return render(scene, view, "exact" if drawn == "exact" else "fast", 2 if drawn == "half" else 1)
+    """The setting of a point other than the dense scene. Raises PointSplatError if its repair or method is unknown."""
+    [repair] = check_repairs((point.repair,))
+    return Setting(point.gaussians, point.sh_degree, repair, method_named(point.by).name)
 
 
 @dataclass(frozen=True)
@@ -106,7 +83,6 @@ class Naming:
         words = [f"{100 * setting.count / self.count:.4g}pct", f"sh{setting.sh_degree}"]
         words += [] if setting.repair == "none" else [setting.repair]
         words += [] if setting.by == "merge" else [setting.by]
-        words += [] if setting.drawn == "exact" else [setting.drawn]
         return "_".join(words)
 
     def label(self, setting: Setting) -> str:
@@ -115,12 +91,10 @@ class Naming:
         words += [] if setting.sh_degree == self.sh_degree else [f"SH degree {setting.sh_degree}"]
         repaired = "refined" if setting.repair == "refiner" else f"repaired ({setting.repair})"
         words += [] if setting.repair == "none" else [repaired]
-        words += {"exact": [], "fast": ["drawn fast"], "half": ["drawn at half the size"]}[setting.drawn]
         return ", ".join(words)
 
     def command(self, setting: Setting) -> str:
-        """The command that makes the scene, with a comment on the quality of its frames unless exact. It has the count,
-        because percentages are rounded."""
+        """The command that makes the scene. It has the count, because percentages are rounded."""
         program = "prune" if setting.repair == "none" else "compact"
         words = ["pointsplat", program, str(self.path), "--keep", str(setting.count)]
         if self.poses is not None:
@@ -134,11 +108,7 @@ class Naming:
         if program == "compact":
             words += ["--refiner", SHIPPED] if setting.repair == "refiner" else []
             words += ["--effort", EFFORTS[setting.repair]]
-        command = shlex.join([*words, "-o", f"{self.name}_{self.key(setting.scene)}.ply"])
-        if setting.drawn == "exact":
-            return command
-        reduced = ", reduced=2" if setting.drawn == "half" else ""
-        return f'{command}  # drawn by ps.render(scene, views, quality="fast"{reduced})'
+        return shlex.join([*words, "-o", f"{self.name}_{self.key(setting)}.ply"])
 
 
 def check_repairs(repairs: tuple[str, ...]) -> tuple[Repair, ...]:
@@ -148,11 +118,3 @@ def check_repairs(repairs: tuple[str, ...]) -> tuple[Repair, ...]:
     if unknown or not repairs:
         raise PointSplatError(f"repairs are {', '.join(repairs) or 'empty'}; expected some of {', '.join(REPAIRS)}")
     return tuple(repair for repair in REPAIRS if repair in repairs)
-
-
-def check_drawn(drawn: tuple[str, ...]) -> tuple[Drawn, ...]:
-    """Qualities of frames, each once, in the order of :data:`DRAWN`. Raises PointSplatError if one is unknown."""
-    unknown = [way for way in drawn if way not in DRAWN]
-    if unknown:
-        raise PointSplatError(f"frames drawn {', '.join(unknown)}; expected some of {', '.join(DRAWN)}")
-    return tuple(way for way in DRAWN if way in drawn)

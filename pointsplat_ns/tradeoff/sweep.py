@@ -26,8 +26,8 @@ from pointsplat_ns.tradeoff.measuring import Measurer, Subject
 from pointsplat_ns.tradeoff.outputs import OUTPUTS, write_outputs
 from pointsplat_ns.tradeoff.page import keep_flight
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, picture_path, speed_of
-from pointsplat_ns.tradeoff.settings import DENSE, DRAWN, REPAIRS, Setting, check_drawn, check_repairs
-from pointsplat_ns.tradeoff.walk import WALK, Enough, Plan, drawings, walk
+from pointsplat_ns.tradeoff.settings import DENSE, REPAIRS, Setting, check_repairs
+from pointsplat_ns.tradeoff.walk import Enough, Plan, walk
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -44,8 +44,6 @@ class Options:
     repairs: tuple[str, ...] = ("none", "quick")
     views: int = COMPARED_VIEWS
     """Largest number of views."""
-    drawn: tuple[str, ...] = DRAWN
-    """Qualities of frames; few scenes are measured with other qualities than exact."""
 
     def __post_init__(self) -> None:
         if self.points < 2:
@@ -59,13 +57,11 @@ class Options:
         for method in self.methods:
             method_named(method)
         check_repairs(self.repairs)
-        check_drawn(self.drawn)
 
     def plan(self, dense: Gaussians) -> Plan:
-        """The plan of a scene. All scenes are drawn exactly; ``drawn`` has the other qualities."""
+        """The plan of a scene."""
         methods = tuple(dict.fromkeys(self.methods))
-        drawn = tuple(way for way in check_drawn(self.drawn) if way != "exact")
-        return Plan(len(dense), dense.sh_degree, methods, check_repairs(self.repairs), self.within, drawn)
+        return Plan(len(dense), dense.sh_degree, methods, check_repairs(self.repairs), self.within)
 
 
 def check_folder(folder: Path, force: bool) -> None:
@@ -110,7 +106,6 @@ class Sweep:
         self.subject, self.folder, self.options, self.progress = subject, folder, options, progress
         self.measurer = Measurer(subject, options.views, progress, folder)
         self.plan = options.plan(subject.dense)
-        self.most = options.points + (WALK.drawings if self.plan.drawn else 0)
         self.machine = machine_text(subject.dense.device)
         self.journal = Journal(folder, self._identity())
         if self.journal.dense is not None:
@@ -135,17 +130,16 @@ class Sweep:
 
     def run(self) -> Tradeoff:
         """Measure the points of the walk, and write the results; on Ctrl-C or another signal, those so far."""
-        dense, points = self.measure_dense(self.most), self.journal.points
+        most, points = self.options.points, self.journal.points
+        dense = self.measure_dense(most)
 
         def measure(setting: Setting) -> Point:
-            exact = sum(measured.drawn == "exact" for measured in points)
-            if setting not in points and setting.drawn == "exact" and 1 + exact >= self.options.points:
+            if setting not in points and 1 + len(points) >= most:
                 raise Enough
-            return self.measure(setting, self.most)
+            return self.measure(setting, most)
 
         try:
             walk(self.plan, measure, dense, self.measurer.cut_psnr)
-            drawings(self.plan, dict(points), dense, measure)
             self.progress("measuring", 1.0)
         except (KeyboardInterrupt, SystemExit):
             self.finish_early()
@@ -188,7 +182,7 @@ class Sweep:
         assert dense is not None
         settings = sorted(
             self.journal.points,
-            key=lambda s: (-s.count, -s.sh_degree, REPAIRS.index(s.repair), s.by, DRAWN.index(s.drawn)),
+            key=lambda s: (-s.count, -s.sh_degree, REPAIRS.index(s.repair), s.by),
         )
         points = (dense, *(self.journal.points[setting] for setting in settings))
         busy = busy_note([p.others_cores for p in points if p.others_cores is not None])

@@ -13,8 +13,6 @@ the loss in dB (:func:`~pointsplat_ns.tradeoff.front.loss_of`), which is the sam
 6. Repeatedly: of all gaps between neighbours on a way (the dense scene is the upper end of each), the gap with the
    largest difference of losses is halved in the logarithm of the count, until all gaps are flat or close
    (:class:`WalkSettings`).
-
-Then :func:`drawings` measures some of these scenes with faster frames.
 """
 
 from __future__ import annotations
@@ -29,9 +27,9 @@ import numpy as np
 from pointsplat_ns.compression.acceptance import ACCEPTANCE
 from pointsplat_ns.compression.budget_search import SearchSettings, find_count
 from pointsplat_ns.pruning import resolve_keep
-from pointsplat_ns.tradeoff.front import loss_of, recommend
+from pointsplat_ns.tradeoff.front import loss_of
 from pointsplat_ns.tradeoff.points import Point
-from pointsplat_ns.tradeoff.settings import DRAWN, Drawn, Repair, Setting, setting_of
+from pointsplat_ns.tradeoff.settings import Repair, Setting
 
 
 @dataclass(frozen=True)
@@ -46,13 +44,6 @@ class WalkSettings:
     """Difference of losses in dB below which a gap is flat: another choice of views changes a loss by as much."""
     close: float = 1.1
     """Ratio of counts below which a gap is not halved."""
-    fast_tries: int = 3
-    """Largest number of scenes with fast frames."""
-
-    @property
-    def drawings(self) -> int:
-        """Largest number of settings that :func:`drawings` measures."""
-        return self.fast_tries + 2
 
 
 WALK = WalkSettings()
@@ -76,7 +67,6 @@ class Plan:
     repairs: tuple[Repair, ...] = ("none", "quick")
     within: float = 0.5
     """The wanted loss, dB."""
-    drawn: tuple[Drawn, ...] = DRAWN
 
 
 def walk(plan: Plan, measure: Measure, dense: Point, cut_psnr: Callable[[int], float]) -> None:
@@ -129,34 +119,6 @@ def _search(way: Setting, counts: list[int], loss: Callable[[Setting], float], p
     first = next((count for count in known if gain(count) >= -plan.within), known[-1])
     close = SearchSettings(precision=WALK.close)
     find_count(gain, -plan.within, at_least=True, first=first, most=plan.count, least=known[0], settings=close)
-
-
-def drawings(plan: Plan, measured: Mapping[Setting, Point], dense: Point, measure: Measure) -> None:
-    """Measure settings with other qualities of frames after the walk; at most ``WALK.drawings``. ``measured`` are all
-    points of the walk.
-
-    Of the scenes within the wanted loss, the scene with the fewest Gaussians is drawn fast. If that loses too much,
-    larger scenes are tried. Half the resolution blurs pictures, which matters least for small scenes: the best scenes
-    of a tenth and three tenths are drawn that way.
-    """
-    exact = {setting: point for setting, point in measured.items() if setting.drawn == "exact"}
-    fewest, _ = recommend([dense, *exact.values()], plan.within, trusted=False)
-    if "fast" in plan.drawn and fewest is not dense:
-        way, tries = replace(setting_of(fewest), drawn="fast"), iter(range(WALK.fast_tries))
-
-        def gain(count: int) -> float:
-            if next(tries, None) is None:
-                raise Enough
-            return -loss_of(measure(replace(way, count=count)), dense)
-
-        close = SearchSettings(precision=WALK.close)
-        with suppress(Enough):
-            find_count(gain, -plan.within, True, way.count, plan.count, least=way.count, settings=close)
-    if "half" in plan.drawn:
-        for count in sorted({resolve_keep(plan.count, share) for share in (WALK.trial, WALK.others[0])}):
-            scenes = [setting for setting in exact if setting.count == count]
-            if scenes:
-                measure(replace(min(scenes, key=lambda setting: loss_of(exact[setting], dense)), drawn="half"))
 
 
 def _loss_at(size: int, losses: Mapping[Setting, float]) -> float:

@@ -92,7 +92,7 @@ def test_lod_tradeoff_and_tables_print_their_files(ply, as_json, plain_page, no_
     monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, **options: views[:count])
     monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
     monkeypatch.setattr(machine, "LOCK", str(tmp_path / "lock"))
-    few = ("--views", "2", "--repairs", "none", "--drawn", "exact", "--points", "2")
+    few = ("--views", "2", "--repairs", "none", "--points", "2")
     assert as_json("tradeoff", ply, *few) == {
         "output": "room_tradeoff",
         **json.loads(Path("room_tradeoff/tradeoff.json").read_text("utf-8")),

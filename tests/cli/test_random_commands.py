@@ -31,7 +31,7 @@ SECONDS = 300
 
 FAST = {
     "compact": "--effort instant",
-    "tradeoff": "--points 2 --views 1 --repairs none --drawn exact",
+    "tradeoff": "--points 2 --views 1 --repairs none",
     "tables": "--fine-tune 1 --views 1 --side 16 --keeps 0.5",
     "render": "--width 16 --height 12 --seconds 0.1",
 }

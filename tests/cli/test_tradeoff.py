@@ -19,7 +19,7 @@ from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.tradeoff import judging, machine, outputs
 
-FEW = ("--views", "2", "--repairs", "none", "--drawn", "exact")
+FEW = ("--views", "2", "--repairs", "none")
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def ply(tmp_path, views, plain_page, no_lpips, monkeypatch) -> Path:
     times are as counts are."""
     monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, **options: views[:count])
     monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
-    monkeypatch.setattr(judging, "_timed", lambda scene, view, drawn: 1e-5 * len(scene))
+    monkeypatch.setattr(judging, "_timed", lambda scene, view: 1e-5 * len(scene))
     monkeypatch.setattr(machine, "LOCK", str(tmp_path / "lock"))
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     ps.save(box_room(0, 400), tmp_path / "room.ply")

@@ -10,7 +10,6 @@ import torch
 import pointsplat_ns as ps
 from making import ball
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression import level_stream
 from pointsplat_ns.compression.level_stream import Chunks, Node, partition
 from pointsplat_ns.io.formats.sog_stream import read_sog_stream
 
@@ -52,9 +51,8 @@ def test_leaves_have_at_most_as_many_gaussians_as_asked_for(levels):
     assert len(leaves_of(partition(levels.scenes, parents, Chunks(400)))) == 1
 
 
-def test_wide_leaves_of_many_gaussians_are_cut(levels, monkeypatch):
-    monkeypatch.setattr(level_stream, "LEAST", 40)
-    leaves = leaves_of(partition(levels.scenes, parents_of(levels), Chunks(extent=0.5)))
+def test_wide_leaves_of_many_gaussians_are_cut(levels):
+    leaves = leaves_of(partition(levels.scenes, parents_of(levels), Chunks(extent=0.5, least=40)))
     for leaf in leaves:
         means = levels[-1].scene.means[leaf.rows[-1]]
         assert len(leaf.rows[0]) <= 40 or float((means.amax(dim=0) - means.amin(dim=0)).max()) <= 0.5

@@ -6,7 +6,6 @@ import dataclasses
 
 import pytest
 import torch
-import torch.nn.functional as F
 
 import pointsplat_ns as ps
 from making import assert_same_on_any_threads, box_room
@@ -28,29 +27,15 @@ def views(room):
     return ps.sample_views(room, 2, 48, 36)
 
 
-def test_a_reduced_picture_is_that_of_smaller_views_enlarged(room, views):
-    small = ps.render(room, views.resized(24)).permute(0, 3, 1, 2)
-    wanted = F.interpolate(small, (36, 48), mode="bicubic").clamp(0, 1).permute(0, 2, 3, 1)
-    got = ps.render(room, views, reduced=2)
-    assert torch.equal(got, wanted)
-    assert bool((ps.psnr(got, ps.render(room, views)) > 20).all()), "the same picture, where it should be"
-
-
-@pytest.mark.parametrize("reduced", [2, 3, 1000])
-def test_sizes_that_do_not_divide_keep_the_size_of_the_picture(room, reduced):
-    assert ps.render(room, ps.sample_views(room, 1, 37, 23)[0], reduced=reduced).shape == (23, 37, 3)
-
-
 def test_quality_is_handed_on(room, views):
     exact, fast = (ps.render(room, views[0], quality=quality) for quality in ("exact", "fast"))
     psnr = float(ps.psnr(fast, exact))
     assert 30 < psnr < 60, "nearly the same, and not the same"
 
 
-@pytest.mark.parametrize("options, said", [({"reduced": 0}, "reduced is 0"), ({"quality": "magic"}, "quality")])
-def test_options_that_mean_nothing_are_refused(room, views, options, said):
-    with pytest.raises(ValueError, match=said):
-        ps.render(room, views, **options)
+def test_an_unknown_quality_is_refused(room, views):
+    with pytest.raises(ValueError, match="quality"):
+        ps.render(room, views, quality="magic")
 
 
 def test_a_view_goes_to_the_device_of_the_scene_in_the_precision_that_a_render_takes(room, views, monkeypatch):

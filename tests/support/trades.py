@@ -34,7 +34,6 @@ def point(
         frame_ms_low=0.9 * ms,
         frame_ms_high=1.2 * ms,
         seconds=0.0 if dense else 3.0,
-        drawn=setting.drawn,
     )
 
 
@@ -53,8 +52,6 @@ class Trade:
     """dB that repairs bring."""
     cuts: dict[int, float] = field(default_factory=lambda: {0: 28.0, 1: 31.0, 2: 35.0})
     """PSNR of the dense scene without higher SH bands, dB."""
-    drawings: dict[str, float] = field(default_factory=lambda: {"fast": 43.0, "half": 30.0})
-    """PSNR of the dense scene drawn in other ways, dB."""
     asked: list[Setting] = field(default_factory=list)
     """What was measured, in order."""
 
@@ -69,7 +66,6 @@ class Trade:
         merged = self.at_all + self.slope * math.log2(setting.count / self.count) + self.gains.get(setting.repair, 0.0)
         errors = [10 ** (-merged / 10)]
         errors += [10 ** (-self.cut(setting.sh_degree) / 10)] if setting.sh_degree < self.sh_degree else []
-        errors += [] if setting.drawn == "exact" else [10 ** (-self.drawings[setting.drawn] / 10)]
         return -10 * math.log10(sum(errors))
 
     def cut(self, degree: int) -> float:

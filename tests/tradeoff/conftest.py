@@ -46,12 +46,12 @@ def plain_plots(monkeypatch) -> None:
 
 @pytest.fixture()
 def new_sweep(room, room_views, plain_page, plain_plots, no_lpips, monkeypatch) -> Callable[..., Sweep]:
-    """A function (folder, options) that begins a sweep of the room, drawn exactly, whose repairs take two steps."""
+    """A function (folder, options) that begins a sweep of the room whose repairs take two steps."""
     monkeypatch.setitem(repair.STEPS, "quick", 2)
 
     def begin(folder: Path, held_out=None, progress=lambda what, share: None, **options) -> Sweep:
         dense = ps.load(room)
         subject = Subject(dense, room, "room", "sum", lambda: ViewSource(dense, given=room_views), held_out)
-        return Sweep(subject, folder, Options(**{"drawn": ("exact",), **options}), progress)
+        return Sweep(subject, folder, Options(**options), progress)
 
     return begin

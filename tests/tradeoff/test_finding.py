@@ -29,7 +29,7 @@ def quick(room_views, no_lpips, monkeypatch):
     monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, **options: room_views[:count])
     for module in (settings, folders):
         monkeypatch.setattr(module, "repairs_of", lambda effort: ("none",))
-    monkeypatch.setattr(judging, "_timed", lambda scene, view, drawn: 1e-5 * len(scene))
+    monkeypatch.setattr(judging, "_timed", lambda scene, view: 1e-5 * len(scene))
 
 
 @pytest.fixture()

@@ -24,13 +24,10 @@ SETTINGS = [
     Setting(40, 1, "refiner"),
     Setting(40, 0, "quick", "paper"),
     Setting(40, 1, by="coverage"),
-    Setting(40, 1, drawn="fast"),
 ]
 
 
-@pytest.mark.parametrize(
-    "setting", SETTINGS, ids=lambda setting: f"{setting.count} {setting.repair} {setting.by} {setting.drawn}"
-)
+@pytest.mark.parametrize("setting", SETTINGS, ids=lambda setting: f"{setting.count} {setting.repair} {setting.by}")
 def test_a_command_makes_the_scene_that_was_measured(setting, room, room_views, tmp_path, monkeypatch):
     """With a scene whose path has a space, and few and small views."""
     monkeypatch.setitem(repair.STEPS, "quick", 2)
@@ -42,11 +39,11 @@ def test_a_command_makes_the_scene_that_was_measured(setting, room, room_views, 
     naming = Naming(path, "room", len(dense), dense.sh_degree)
     made = make(dense, setting, lambda: ViewSource(dense), lambda what, share: None)
     assert (len(made.scene), made.scene.sh_degree) == (setting.count, setting.sh_degree)
-    program, *words = shlex.split(naming.command(setting), comments=True)
+    program, *words = shlex.split(naming.command(setting))
     assert program == "pointsplat"
     main(words)
-    assert same_bits(ps.load(f"room_{naming.key(setting.scene)}.ply"), made.scene)
-    assert Path(f"room_{naming.key(setting.scene)}.ply").stat().st_size == setting.bytes
+    assert same_bits(ps.load(f"room_{naming.key(setting)}.ply"), made.scene)
+    assert Path(f"room_{naming.key(setting)}.ply").stat().st_size == setting.bytes
 
 
 def test_a_command_names_the_resolution_that_was_asked_for():
@@ -57,16 +54,14 @@ def test_a_command_names_the_resolution_that_was_asked_for():
 def test_keys_differ_and_fit_into_names_of_files():
     naming = Naming(Path("room.ply"), "room", 100_000, 3)
     repairs = [Setting(10_000, 3, repair) for repair in REPAIRS]
-    drawn = [Setting(10_000, 3, drawn=way) for way in ("fast", "half")]
-    settings = [*repairs, *drawn, Setting(10_000, 2), Setting(10_020, 3), Setting(10_000, 3, by="log-volume")]
+    settings = [*repairs, Setting(10_000, 2), Setting(10_020, 3), Setting(10_000, 3, by="log-volume")]
     keys = [naming.key(setting) for setting in settings]
     assert len(set(keys)) == len(keys)
     assert all(character.isalnum() or character in "._-" for key in keys for character in key)
 
 
 def test_a_point_knows_its_setting():
-    settings = [*SETTINGS, Setting(40, 1, "quick", drawn="half")]
-    assert [setting_of(point(setting, 30.0)) for setting in settings] == settings
+    assert [setting_of(point(setting, 30.0)) for setting in SETTINGS] == SETTINGS
 
 
 def test_repairs_are_put_in_order_and_unknown_ones_refused():

@@ -158,24 +158,10 @@ def test_a_busy_machine_is_said_to_be_one(new_sweep, tmp_path, monkeypatch, othe
     assert any("times are not to be trusted" in note for note in result.notes) == said
 
 
-def test_scenes_drawn_otherwise_come_on_top_and_are_not_made_again(new_sweep, tmp_path, monkeypatch):
-    made, make = [], measuring.make
-    monkeypatch.setattr(measuring, "make", lambda *args: (made.append(args[1]), make(*args))[1])
-    options = {"points": 3, "repairs": ("none",), "drawn": ("exact", "half")}
-    first = new_sweep(tmp_path, **options).run().points
-    ways = [(p.gaussians, p.drawn) for p in first[1:]]
-    assert ways == [(120, "exact"), (120, "half"), (40, "exact"), (40, "half")]
-    assert [(s.count, s.drawn) for s in made] == [(40, "exact"), (120, "exact")]
-    assert first[1].bytes == first[2].bytes and first[1].against_dense != first[2].against_dense
-    assert first[2].command == f'{first[1].command}  # drawn by ps.render(scene, views, quality="fast", reduced=2)'
-    assert new_sweep(tmp_path, **options).run().points == first and len(made) == 2, "nothing is measured twice"
-
-
-@pytest.mark.parametrize("drawn", [("exact",), ("exact", "fast", "half")])
-def test_progress_never_goes_back_and_ends(new_sweep, tmp_path, drawn):
+def test_progress_never_goes_back_and_ends(new_sweep, tmp_path):
     shares = []
     keep = lambda what, share: shares.append(share) if what == "measuring" else None  # noqa: E731
-    new_sweep(tmp_path, progress=keep, points=3, drawn=drawn).run()
+    new_sweep(tmp_path, progress=keep, points=3).run()
     assert shares == sorted(shares) and shares[-1] == 1.0
 
 
@@ -205,7 +191,6 @@ def test_results_without_points_are_not_overwritten(tmp_path):
         ({"methods": ()}, "no method is named"),
         ({"methods": ("magic",)}, "no method is called 'magic'"),
         ({"repairs": ("magic",)}, "repairs are magic"),
-        ({"drawn": ("exact", "magic")}, "frames drawn magic; expected some of exact, fast, half"),
     ],
 )
 def test_options_that_mean_nothing_are_refused(options, said):

@@ -11,7 +11,7 @@ import pytest
 from pointsplat_ns.tradeoff.front import loss_of, psnr_within
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import Setting
-from pointsplat_ns.tradeoff.walk import WALK, Enough, Plan, drawings, walk
+from pointsplat_ns.tradeoff.walk import WALK, Enough, Plan, walk
 from trades import Trade
 
 
@@ -108,28 +108,3 @@ def test_photos_go_before_renders():
     walk(Plan(trade.count, 3, repairs=("none",)), measure, dense, trade.cut)
     assert max(setting.count for setting in measured) == 30_000
     assert len(measured) > 6
-
-
-def drawn_after(trade: Trade, plan: Plan) -> list[Setting]:
-    """What is drawn in other ways after a whole walk, in order."""
-    found: list[Setting] = []
-
-    def measure(setting: Setting) -> Point:
-        found.append(setting)
-        return trade.measure(setting)
-
-    drawings(plan, walked(trade, plan), trade.dense, measure)
-    assert len(found) <= WALK.drawings and len(set(found)) == len(found)
-    return found
-
-
-PLAIN = Trade(gains={}, cuts={0: 1.0, 1: 1.0, 2: 1.0})
-
-
-def test_the_smallest_scene_within_the_loss_is_drawn_fast_and_larger_ones_until_one_is_within_it():
-    plan = Plan(100_000, 3, repairs=("none",), drawn=("fast",))
-    exact = [setting for setting, p in walked(PLAIN, plan).items() if p.against_dense.psnr >= psnr_within(plan.within)]
-    first, *others = drawn_after(PLAIN, plan)
-    assert first == replace(min(exact, key=lambda setting: setting.count), drawn="fast")
-    assert others and all(setting.count > first.count for setting in others)
-    assert any(PLAIN.psnr(setting) >= psnr_within(plan.within) for setting in others)
