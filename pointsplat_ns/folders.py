@@ -9,7 +9,7 @@ from pathlib import Path
 from pointsplat_ns.compression.compact import compact_scene
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import CompactRequest, Effort, RepairBudget
-from pointsplat_ns.compression.scene_folder import WHOLE, Command, Shard, output_folder, run_on_folder
+from pointsplat_ns.compression.scene_folder import Command, Shard, output_folder, run_on_folder
 from pointsplat_ns.compression.scene_task import Options, SceneResult, SmallerScene
 from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.io.formats import format_like, format_named
@@ -97,7 +97,7 @@ def compact_folder(
     """
     folder = Path(folder)
     target = output_folder(folder, "compact") if output is None else Path(output)
-    part = WHOLE if shard is None else Shard.of(shard)
+    part = Shard() if shard is None else Shard.of(shard)
     rank, world_size = torchrun_rank()
     connect_torchrun()
     device = str(torchrun_device())

@@ -17,7 +17,7 @@ from pointsplat_ns.io import content_hash, write_ply
 from pointsplat_ns.io.discovery import LEVELS_NAME
 from pointsplat_ns.io.files import replacing, write_json
 
-MANIFEST, PICTURE = LEVELS_NAME, "lod.png"
+PICTURE = "lod.png"
 
 
 def file_names(index: int) -> tuple[str, str]:
@@ -32,7 +32,7 @@ def check_folder(folder: Path, count: int, force: bool) -> None:
         raise SceneError(f"{folder}: levels are several files; expected the name of a folder")
     if folder.exists() and not folder.is_dir():
         raise SceneError(f"{folder}: is a file; expected the name of a folder")
-    for name in (MANIFEST, PICTURE, *(name for index in range(count) for name in file_names(index))):
+    for name in (LEVELS_NAME, PICTURE, *(name for index in range(count) for name in file_names(index))):
         if (folder / name).exists() and not force:
             raise SceneError(f"{folder / name}: exists already; name another folder, or overwrite it with --force")
 
@@ -69,7 +69,7 @@ def write_levels(
         def part_of(name: str) -> Path:
             return stack.enter_context(replacing(folder / name))
 
-        manifest = part_of(MANIFEST)  # entered first, left last
+        manifest = part_of(LEVELS_NAME)  # entered first, left last
         for index, (scene, parents) in enumerate(levels):
             scene_name, parents_name = file_names(index)
             scene_part, parents_part = part_of(scene_name), part_of(parents_name)
@@ -81,7 +81,7 @@ def write_levels(
         if images:
             _draw(images, captions, part_of(PICTURE))
         write_json({"format": "pointsplat-lod", "version": 1, **about, "levels": rows}, manifest)
-        for name in (MANIFEST, *(() if images else (PICTURE,))):
+        for name in (LEVELS_NAME, *(() if images else (PICTURE,))):
             (folder / name).unlink(missing_ok=True)
 
 

@@ -48,9 +48,9 @@ class Shard:
         ['b', 'e']
     """
 
-    index: int
+    index: int = 1
     """From 1 on."""
-    count: int
+    count: int = 1
 
     def __post_init__(self) -> None:
         if not 1 <= self.index <= self.count:
@@ -71,9 +71,6 @@ class Shard:
     def part(self, items: Sequence) -> list:
         """The items of this part: every ``count``-th one."""
         return list(items[self.index - 1 :: self.count])
-
-
-WHOLE = Shard(1, 1)
 
 
 @dataclass(frozen=True)
@@ -97,7 +94,7 @@ def run_on_folder(
     output: Path,
     command: Command,
     jobs: int = 1,
-    shard: Shard = WHOLE,
+    shard: Shard = Shard(),
     force: bool = False,
     progress: Progress = silent,
 ) -> list[SceneResult]:

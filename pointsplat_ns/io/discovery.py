@@ -24,9 +24,6 @@ Supervision = Literal["auto", "photos", "dense"]
 RESULTS_NAME, LEVELS_NAME, SWEEP_NAME = "pointsplat-scenes.json", "lod.json", "tradeoff.json"
 """Files in folders that commands write: of results of many scenes, of levels, of a sweep."""
 
-RESULT_NAMES = frozenset((RESULTS_NAME, LEVELS_NAME, SWEEP_NAME))
-"""A folder with one of these files is not searched for scenes."""
-
 
 @dataclass(frozen=True)
 class FoundScene:
@@ -42,8 +39,8 @@ class FoundScene:
 def find_scenes(folder: Path | str) -> list[FoundScene]:
     """Every scene below a folder, sorted by name: files that hold Gaussians, and the newest trained run of each
     experiment, which has the name of the experiment's folder. Results of earlier commands are passed over: files of
-    the names that these give by default, and folders with one of :data:`RESULT_NAMES`. Raises SceneError if there is no
-    such folder, it is a run, or there is no scene below it."""
+    the names that these give by default, and whole folders of results. Raises SceneError if there is no such folder, it
+    is a run, or there is no scene below it."""
     folder = Path(folder)
     if not is_folder_of_scenes(folder):
         raise SceneError(f"{folder}: expected a folder with scenes below it")
@@ -167,12 +164,13 @@ def shown_scene(names: list[str], eval_scenes: Iterable[str]) -> str:
 def _files_with_gaussians(root: Path, wanted: Callable[[str], bool]) -> list[Path]:
     """Files at or below a path that hold a scene and whose names are ``wanted``, sorted.
 
-    Folders of runs, hidden folders and :data:`RESULT_NAMES`'s are not searched. A PLY may also hold points or a mesh,
+    Folders of runs, hidden folders and results of commands are not searched. A PLY may also hold points or a mesh,
     so its header is read. Pipes, sockets and devices may have no end, and are not opened.
     """
     paths = [root] if root.is_file() and wanted(root.name) else []
     for place, inner, files in os.walk(root):
-        if CONFIG_NAME in files or (RESULT_NAMES.intersection(files) and Path(place) != root):
+        results = {RESULTS_NAME, LEVELS_NAME, SWEEP_NAME}.intersection(files)
+        if CONFIG_NAME in files or (results and Path(place) != root):
             inner.clear()
             continue
         inner[:] = sorted(name for name in inner if not name.startswith("."))

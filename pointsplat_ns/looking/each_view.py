@@ -10,12 +10,12 @@ import torch
 from pointsplat_ns.system.threads import in_threads
 from pointsplat_ns.views import View
 
-T = TypeVar("T")
+Result = TypeVar("Result")
 
 
 def each_view(
-    views: Sequence[View], count: int, function: Callable[[View], T], max_count_at_once: int = 2_000_000
-) -> Iterator[T]:
+    views: Sequence[View], count: int, function: Callable[[View], Result], max_count_at_once: int = 2_000_000
+) -> Iterator[Result]:
     """The results of a function for each view, in order. Several views are computed at once.
 
     Args:
@@ -27,10 +27,10 @@ def each_view(
     """
     at_once = max(2, max_count_at_once // max(1, count))
     for first in range(0, len(views), at_once):
-        results: dict[int, T] = {}
+        results: dict[int, Result] = {}
 
         @torch.no_grad()
-        def work(index: int, results: dict[int, T] = results) -> None:
+        def work(index: int, results: dict[int, Result] = results) -> None:
             results[index] = function(views[index])
 
         these = range(first, min(first + at_once, len(views)))

@@ -18,15 +18,6 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.morton import curve_keys, unit_cells
 from pointsplat_ns.pruning.scores import log_area
 
-RUN = 12
-"""Number of Gaussians in a neighbourhood. Measured on three scenes from 8 to 512: fewer are better when 50 % are kept,
-and worse at 10 %, where some runs then keep no Gaussian; 12 to 32 differ little."""
-
-OFFSETS = (0.0, 0.137, -0.0713, 0.0529, -0.1811)
-"""Scores are averaged over five curves, each shifted by one of these shares of the grid, so that the borders between
-runs lie at different places. At 50 % this gains one dB over a single curve on two of three scenes, and nothing on the
-third. The numbers are arbitrary, but not simple fractions."""
-
 
 def coverage_score(scene: Gaussians) -> Tensor:
     """Share of a neighbourhood's mass held by a Gaussian and its neighbours of less mass, (N,) float64 in (0, 1].
@@ -46,17 +37,26 @@ def coverage_score(scene: Gaussians) -> Tensor:
     part = scene if whole else scene[usable]
     if len(part) == 0:
         return torch.full_like(usable, math.nan, dtype=torch.float64)
+    # Measured on three scenes from 8 to 512 in a neighbourhood: fewer are better when 50 % are kept, and worse at 10 %,
+    # where some runs then keep no Gaussian; 12 to 32 differ little.
+    run = 12
+
+    # Each curve is shifted by one of these shares of the grid, so that runs have other borders. At 50 % this gains one
+    # dB over a single curve on two of three scenes, and nothing on the third. The numbers are arbitrary, but not simple
+    # fractions.
+    offsets = (0.0, 0.137, -0.0713, 0.0529, -0.1811)
+
     # The root of the area is the geometric mean of the two largest axes. Area itself keeps blobs and loses detail;
     # powers of 0.25 to 0.65 differ little.
     mass = F.logsigmoid(part.opacities[:, 0].double()) + 0.5 * log_area(part)
     mass = mass.float()  # float32 is enough to compare logarithms of masses, and half the memory
     cells = unit_cells(part.means)
     scores = torch.zeros_like(mass)
-    for i, offset in enumerate(OFFSETS):
+    for i, offset in enumerate(offsets):
         order = curve_keys(cells, offset).argsort(stable=True)
-        first = i * RUN // len(OFFSETS)  # where the first whole run begins
-        scores.index_add_(0, order, mass_shares(mass[order], RUN, first))
-    scores = scores.double() / len(OFFSETS)
+        first = i * run // len(offsets)  # where the first whole run begins
+        scores.index_add_(0, order, mass_shares(mass[order], run, first))
+    scores = scores.double() / len(offsets)
     return scores if whole else torch.full_like(usable, math.nan, dtype=torch.float64).masked_scatter_(usable, scores)
 
 

@@ -15,7 +15,7 @@ Progress = Callable[[str, float], None]
 LINE_SECONDS = 30.0
 """Seconds from one line to the next in a log. What is done sooner writes none."""
 
-T = TypeVar("T")
+Item = TypeVar("Item")
 
 
 def silent(what: str, share: float) -> None:
@@ -104,7 +104,7 @@ def _clock(seconds: float) -> str:
     return f"{minutes}:{rest:02d}"
 
 
-def tracked(items: Iterable[T], what: str, total: int, progress: bool | Progress = True) -> Iterator[T]:
+def tracked(items: Iterable[Item], what: str, total: int, progress: bool | Progress = True) -> Iterator[Item]:
     """Iterate over the items, with a bar that shows how many of ``total`` are done."""
     with progress_bar(progress) as show:
         report = functools.partial(show, what)

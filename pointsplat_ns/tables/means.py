@@ -10,7 +10,7 @@ from statistics import fmean
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.tables.cells import CELLS, About, Cell, CellJournal
-from pointsplat_ns.tables.ways import DATASETS, DENSE_WAY
+from pointsplat_ns.tables.ways import DENSE_WAY, PROTOCOL
 from pointsplat_ns.tradeoff.machine import is_busy
 from pointsplat_ns.tradeoff.points import Point, Quality
 
@@ -63,7 +63,7 @@ class Group:
     def dataset(self) -> str:
         """The dataset of the paper that has all scenes; empty if there is none."""
         datasets = {scene.about.dataset for scene in self.scenes}
-        return datasets.pop() if len(datasets) == 1 and datasets <= {*DATASETS} else ""
+        return datasets.pop() if len(datasets) == 1 and datasets <= {*PROTOCOL.datasets} else ""
 
     @property
     def has_photos(self) -> bool:
@@ -114,7 +114,9 @@ def read_groups(folder: Path) -> list[Group]:
     if not scenes:
         raise SceneError(f"{folder}: no scene with cells in it; nothing has been measured yet")
     groups = [Group(name, tuple(members)) for name, members in sorted(scenes.items())]
-    return sorted(groups, key=lambda group: DATASETS.index(group.dataset) if group.dataset else len(DATASETS))
+    return sorted(
+        groups, key=lambda group: PROTOCOL.datasets.index(group.dataset) if group.dataset else len(PROTOCOL.datasets)
+    )
 
 
 def _mean(values: Sequence[Quality]) -> Quality:

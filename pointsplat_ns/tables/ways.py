@@ -22,6 +22,8 @@ class Protocol:
     """Share of the Gaussians in Tables 3 and 4."""
     opacity_weights: tuple[float, ...] = (0.1, 0.3, 0.5, 0.7, 0.9)
     """Lambda in Table 3."""
+    datasets: tuple[str, ...] = ("ScanNet++", "Replica")
+    """In the order of the paper's columns."""
     figure_share: float = 0.5
     """Share of the Gaussians in Figure 4."""
     seed: int = 0
@@ -165,9 +167,6 @@ def cell_key(scene: str, way: Way, share: float) -> str:
     """
     return f"{scene}/{way.name}/{100 * share:g}%"
 
-
-DATASETS = ("ScanNet++", "Replica")
-"""Datasets in the order of the paper's columns."""
 
 _TABLES: dict[int, dict[tuple[str, float], tuple[float, ...]]] = {
     1: {

@@ -18,11 +18,6 @@ Reference = Literal["renders", "photos"]
 """Targets of a comparison: renders of the dense scene, or held-out photos."""
 Metric = Literal["psnr", "ssim", "lpips"]
 Cost = Literal["frame_ms", "gaussians", "bytes"]
-
-REFERENCES: tuple[Reference, ...] = ("renders", "photos")
-METRICS: tuple[Metric, ...] = ("psnr", "ssim", "lpips")
-COSTS: tuple[Cost, ...] = ("frame_ms", "gaussians", "bytes")
-
 PHOTO_PSNR = 27.0
 """Assumed PSNR in dB of a trained scene against held-out photos: about that of 3DGS on the captures of papers."""
 

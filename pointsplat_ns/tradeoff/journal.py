@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Identity = Mapping[str, str | int]
 """Values that all records of a journal have in common, by name."""
 
-T = TypeVar("T")
+Record = TypeVar("Record")
 
 MOST_BYTES = 16_000_000
 """Largest size of a journal, bytes; a thousand points take one megabyte."""
@@ -47,7 +47,7 @@ class Form:
         content = {"format": self.name, "version": self.version, "of": dict(identity), self.records: rows}
         write_json(content, path)
 
-    def read(self, path: Path, restored: Callable[[dict[str, Any]], T]) -> tuple[dict[str, Any], list[T]]:
+    def read(self, path: Path, restored: Callable[[dict[str, Any]], Record]) -> tuple[dict[str, Any], list[Record]]:
         """Read the identity and the records of a file, which is not trusted. ``restored`` makes a record from the
         result of :func:`dataclasses.asdict`; see :func:`check_types`. Raises SceneError if the file is not such a
         journal, or damaged."""

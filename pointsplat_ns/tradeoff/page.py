@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from itertools import count, takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -22,9 +22,9 @@ from pointsplat_ns.pages.pictures import ERROR_GAIN, error_colors, error_map, fi
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.front import (
-    COSTS,
-    METRICS,
-    REFERENCES,
+    Cost,
+    Metric,
+    Reference,
     fastest_above,
     fastest_first,
     fastest_within,
@@ -131,8 +131,8 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
         "frame_ms": "ms a frame",
         **{
             f"{reference}_{metric}": f"{title}, {reference}"
-            for reference in REFERENCES
-            for metric, title in zip(METRICS, ("PSNR dB", "SSIM", "LPIPS"), strict=True)
+            for reference in get_args(Reference)
+            for metric, title in zip(get_args(Metric), ("PSNR dB", "SSIM", "LPIPS"), strict=True)
         },
         "seconds": "made in, s",
         "peak_bytes": "peak memory, GB",
@@ -143,8 +143,8 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
     return {
         "sweep": sweep,
         "views": views,
-        "references": REFERENCES if has_photos else REFERENCES[:1],
-        "metrics": METRICS if has_lpips else METRICS[:2],
+        "references": get_args(Reference) if has_photos else get_args(Reference)[:1],
+        "metrics": get_args(Metric) if has_lpips else get_args(Metric)[:2],
         "recommended": fastest_within(sweep.points, within_db, sweep.times_trusted)
         or fastest_above(sweep.points, above_db, sweep.times_trusted)
         or sweep.points[0],
@@ -162,11 +162,11 @@ def _data(sweep: Tradeoff) -> dict[str, Any]:
     """Data for the scripts, except pictures. An infinite number is the text "Infinity"."""
 
     def qualities(point: Point, reference: Any) -> dict[str, float | str | None]:
-        values = {metric: quality_of(point, reference, metric) for metric in METRICS}
+        values = {metric: quality_of(point, reference, metric) for metric in get_args(Metric)}
         return {metric: "Infinity" if value == math.inf else value for metric, value in values.items()}
 
     def fronts(reference: Any, metric: Any) -> dict[str, list[str]]:
-        return {cost: [p.key for p in pareto_front(sweep.points, cost, reference, metric)] for cost in COSTS}
+        return {cost: [p.key for p in pareto_front(sweep.points, cost, reference, metric)] for cost in get_args(Cost)}
 
     return {
         "points": [
@@ -177,12 +177,12 @@ def _data(sweep: Tradeoff) -> dict[str, Any]:
                 "group": _group(point),
                 "low": point.frame_ms_low,
                 "high": point.frame_ms_high,
-                **{cost: getattr(point, cost) for cost in COSTS},
-                **{reference: qualities(point, reference) for reference in REFERENCES},
+                **{cost: getattr(point, cost) for cost in get_args(Cost)},
+                **{reference: qualities(point, reference) for reference in get_args(Reference)},
             }
             for point in sweep.points
         ],
-        "fronts": {ref: {metric: fronts(ref, metric) for metric in METRICS} for ref in REFERENCES},
+        "fronts": {ref: {metric: fronts(ref, metric) for metric in get_args(Metric)} for ref in get_args(Reference)},
         "fastest": [point.key for point in fastest_first(sweep.points, sweep.times_trusted)],
     }
 
@@ -207,8 +207,8 @@ def _cells(point: Point, dense: Point) -> dict[str, tuple[float | None, str]]:
         "seconds": (point.seconds, f"{point.seconds:.1f}"),
         "peak_bytes": (point.peak_bytes, "–" if point.peak_bytes is None else f"{point.peak_bytes / 1e9:.2f}"),
     }
-    for reference in REFERENCES:
-        for metric, digits in zip(METRICS, (2, 3, 3), strict=True):
+    for reference in get_args(Reference):
+        for metric, digits in zip(get_args(Metric), (2, 3, 3), strict=True):
             value = quality_of(point, reference, metric)
             text = "–" if value is None else "identical" if value == math.inf else f"{value:.{digits}f}"
             cells[f"{reference}_{metric}"] = (value, text)

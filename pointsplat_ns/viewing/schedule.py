@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-R = TypeVar("R")
+Request = TypeVar("Request")
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ SCHEDULE = ScheduleSettings()
 
 
 @dataclass(frozen=True)
-class Step(Generic[R]):
+class Step(Generic[Request]):
     """A picture to draw."""
 
-    request: R
+    request: Request
     number: int
     """Number of the request, ascending."""
     side: int
@@ -50,14 +50,14 @@ class Step(Generic[R]):
     """Whether it is the picture of full size with all Gaussians. A step of a moving camera may be that too."""
 
 
-class Schedule(Generic[R]):
+class Schedule(Generic[Request]):
     """The steps from the newest request to its full picture, whose longer side has ``full_side`` pixels. Several
     threads may use it; one of them draws."""
 
     def __init__(self, full_side: int = 960, clock: Callable[[], float] = time.monotonic):
         self._full_side, self._clock = full_side, clock
         self._changed = threading.Condition()
-        self._request: R | None = None
+        self._request: Request | None = None
         self._number = 0
         self._asked = 0.0
         self._drawn = 0
@@ -67,7 +67,7 @@ class Schedule(Generic[R]):
         self._effort = 0.1
         """Share of the full picture's work in a picture of a moving camera."""
 
-    def submit(self, request: R, full_side: int | None = None) -> None:
+    def submit(self, request: Request, full_side: int | None = None) -> None:
         """Replace the request; ``full_side`` may change the size of the full picture."""
         with self._changed:
             self._full_side = full_side or self._full_side
@@ -81,7 +81,7 @@ class Schedule(Generic[R]):
             self._closed = True
             self._changed.notify_all()
 
-    def next(self, timeout: float | None = None) -> Step[R] | None:
+    def next(self, timeout: float | None = None) -> Step[Request] | None:
         """The next step to draw; waits until there is one, at most ``timeout`` seconds. None after that, or if the
         schedule is closed."""
         end = None if timeout is None else time.monotonic() + timeout
@@ -99,11 +99,11 @@ class Schedule(Generic[R]):
                 self._changed.wait(min(waits) if waits else None)
             return None
 
-    def outdated(self, step: Step[R]) -> bool:
+    def outdated(self, step: Step[Request]) -> bool:
         """Whether to stop drawing a step."""
         return self._closed or (step.number != self._number and not step.moving)
 
-    def done(self, step: Step[R], seconds: float) -> None:
+    def done(self, step: Step[Request], seconds: float) -> None:
         """Report that a step was drawn, and its duration."""
         with self._changed:
             if step.moving:
@@ -122,7 +122,7 @@ class Schedule(Generic[R]):
         """The smallest effort: the smallest side, and the smallest share of the Gaussians."""
         return (self._moving_side() / self._full_side) ** 2 * SCHEDULE.least_share
 
-    def _step(self) -> Step[R]:
+    def _step(self) -> Step[Request]:
         assert self._request is not None
         full, smallest = self._full_side, self._moving_side()
         if self._drawn == 0:

@@ -37,15 +37,12 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.pruning.merging import projections as planes
-from pointsplat_ns.pruning.merging.projections import DIRECTIONS, MIN_DIVISOR_32, Projections, area_of, directions_of
+from pointsplat_ns.pruning.merging.projections import DIRECTIONS, LIMITS, Projections, area_of, directions_of
 from pointsplat_ns.pruning.merging.replacement import growth
 from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
-from pointsplat_ns.pruning.merging.state import CHANNELS, State
+from pointsplat_ns.pruning.merging.state import State
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
 from pointsplat_ns.system.threads import in_threads, most_threads
-
-MOST_NEIGHBOURS, MOST_AXES = 32, 16
-"""Largest numbers of neighbours and of colour axes that the kernel is made for."""
 
 GAUSSIANS_AT_ONCE = 1 << 14
 """Number of Gaussians whose pairs are computed at once: about 50 MB."""
@@ -70,7 +67,8 @@ def pair_costs(
     Returns:
         (n, k): squared colour units times solid angle, with the surroundings of the first of each pair.
     """
-    fits = near.shape[1] <= MOST_NEIGHBOURS and state.colours.shape[1] <= MOST_AXES and near.dtype == torch.int32
+    # the largest numbers of neighbours and of colour axes that the kernel is made for
+    fits = near.shape[1] <= 32 and state.colours.shape[1] <= 16 and near.dtype == torch.int32
     if fits and dtype == torch.float32 and KERNELS.usable(compiled):
         return _by_kernels(state, near, settings)
     n = len(state)
@@ -146,7 +144,7 @@ def costs_in_plane(projections: Projections, i: Tensor, j: Tensor, settings: Mer
     )
     products = _colour_products(first, second, ci, cj, surroundings, settings)
     colour_change, cover_change = _changes(first, second, merged, both, oik, ojk, products)
-    holes = CHANNELS * settings.background_contrast**2 * torch.exp(-settings.background_decay * cover)
+    holes = 3 * settings.background_contrast**2 * torch.exp(-settings.background_decay * cover)
     return colour_change.div_(cover.clamp_min(settings.min_cover).square()).addcmul_(cover_change, holes)
 
 
@@ -159,7 +157,7 @@ def overlap_of_sum(uu: Tensor, uv: Tensor, vv: Tensor, areas: Tensor, u: Tensor,
         areas: product of both areas.
         u, v: from one centre to the other.
     """
-    inverse = (uu * vv).addcmul_(uv, uv, value=-1).clamp_min_(MIN_DIVISOR_32).reciprocal_()
+    inverse = (uu * vv).addcmul_(uv, uv, value=-1).clamp_min_(LIMITS.min_divisor).reciprocal_()
     distance = (vv * u).addcmul_(uv, v, value=-2).mul_(u).addcmul_(uu * v, v).mul_(inverse).clamp_min_(0)
     return distance.mul_(-0.5).exp_().mul_(inverse.sqrt_()).mul_(areas)
 
@@ -169,13 +167,13 @@ def _surroundings(first: Flat, second: Flat, oij: Tensor, ci: Tensor, cj: Tensor
     on_first = second.alpha * oij / first.area
     cover = first.alpha / 2 + on_first.sum(1, keepdim=True)
     colour = torch.baddbmm((first.alpha / 2 * ci)[:, None], on_first[:, None], cj)[:, 0]
-    return cover, colour / cover.clamp_min(MIN_DIVISOR_32)
+    return cover, colour / cover.clamp_min(LIMITS.min_divisor)
 
 
 def _replacement(first: Flat, second: Flat, u: Tensor, v: Tensor, both: Tensor, settings: MergeSettings) -> Replacement:
     """The replacement of each pair, whose centres are (u, v) apart and which covers ``both`` twice."""
     mi, mj = first.alpha * first.area, second.alpha * second.area
-    wi = mi / (mi + mj).clamp_min_(MIN_DIVISOR_32)
+    wi = mi / (mi + mj).clamp_min_(LIMITS.min_divisor)
     wj = 1 - wi
     wu, wv = wi * wj * u, wi * wj * v
     uu = (wu * u).addcmul_(wi, first.uu).addcmul_(wj, second.uu)
@@ -194,7 +192,7 @@ def _colour_products(
     first: Flat, second: Flat, ci: Tensor, cj: Tensor, surroundings: Tensor, settings: MergeSettings
 ) -> tuple[Tensor, Tensor, Tensor]:
     """<f_i, f_i> (m, 1), <f_j, f_j> and <f_i, f_j> (m, k), each with the contrast 3 c_0^2 that is assumed."""
-    assumed = CHANNELS * settings.min_contrast**2
+    assumed = 3 * settings.min_contrast**2
     rr = surroundings.square().sum(1, keepdim=True)
     ir = (ci * surroundings).sum(1, keepdim=True)
     ij, jr = (torch.stack([ci, surroundings], dim=1) @ cj.mT).unbind(1)
@@ -230,8 +228,9 @@ def _by_kernels(state: State, near: Tensor, settings: MergeSettings) -> Tensor:
     """As :func:`pair_costs`, float32."""
     count, library = len(state), KERNELS.library
     costs = torch.empty(near.shape, dtype=torch.float32)
+    limits = KERNELS.structs["Limits"](**vars(LIMITS))
     task = KERNELS.structs["Costs"](
-        planes=_planes(), limits=_limits(), contrasts=_contrasts(settings), centre=tuple(state.centre.tolist()),
+        planes=_planes(), limits=limits, contrasts=_contrasts(settings), centre=tuple(state.centre.tolist()),
         size=state.size, means=state.means, cov=state.cov, alphas=state.alphas, colours=state.colours.contiguous(),
         weights=state.weights, count=count, axes=state.colours.shape[1], neighbours=near.shape[1],
         table=torch.empty(count, 12, dtype=torch.float32), near=near.contiguous(), costs=costs,
@@ -246,17 +245,10 @@ def _planes() -> Struct:
     return KERNELS.structs["Planes"](**{name: tuple(table.flatten().tolist()) for name, table in tables.items()})
 
 
-def _limits() -> Struct:
-    return KERNELS.structs["Limits"](
-        max_coordinate=planes.MAX_COORDINATE, max_width=planes.MAX_WIDTH, min_width=planes.MIN_WIDTH,
-        roundness=planes.ROUNDNESS, min_divisor=planes.MIN_DIVISOR_32,
-    )  # fmt: skip
-
-
 def _contrasts(settings: MergeSettings) -> Struct:
     names = ("min_contrast", "background_contrast", "background_decay", "min_cover", "max_opacity", "growth_exponent")
     values = {name: getattr(settings, name) for name in (*names, "max_growth_ratio")}
-    return KERNELS.structs["Contrasts"](channels=CHANNELS, **values)
+    return KERNELS.structs["Contrasts"](channels=3, **values)
 
 
 def _as_torch() -> bool:

@@ -24,18 +24,25 @@ DIRECTIONS = torch.nn.functional.normalize(
 )
 """Unit vectors (13, 3)."""
 
-MIN_WIDTH, MAX_WIDTH = 1e-6, 1e3
-"""Bounds of standard deviations, units of the content's size."""
 
-MAX_COORDINATE = 1e3
-"""Bound of the absolute value of coordinates, units of the content's size."""
+@dataclass(frozen=True)
+class Limits:
+    """Bounds of projections, in units of the content's size."""
 
-ROUNDNESS = 1e-5
-"""Variance that is added to a projection along both axes, as a share of its summed variances, so that float32 tells
-thin projections from lines: widths are at least 0.3 % of lengths."""
+    max_coordinate: float = 1e3
+    """Bound of the absolute value of coordinates."""
+    max_width: float = 1e3
+    """Largest standard deviation."""
+    min_width: float = 1e-6
+    """Smallest standard deviation."""
+    roundness: float = 1e-5
+    """Variance that is added to a projection along both axes, as a share of its summed variances, so that float32 tells
+    thin projections from lines: widths are at least 0.3 % of lengths."""
+    min_divisor: float = 1e-30
+    """Lower bound of float32 denominators, which keeps quotients finite; the smallest normal float32 is 1e-38."""
 
-MIN_DIVISOR_32 = 1e-30
-"""Lower bound of float32 denominators, which keeps quotients finite; the smallest normal float32 is 1e-38."""
+
+LIMITS = Limits()
 
 
 def _projection_matrices() -> tuple[Tensor, Tensor]:
@@ -70,10 +77,10 @@ TRIPLES = _perpendicular_triples()
 def in_content_units(state: State, rows: Tensor) -> tuple[Tensor, Tensor]:
     """Means (m, 3) and covariances (m, 6) of some Gaussians in units of the content's size, around its centre, within
     the bounds."""
-    means = ((state.means[rows] - state.centre) / state.size).clamp_(-MAX_COORDINATE, MAX_COORDINATE)
+    means = ((state.means[rows] - state.centre) / state.size).clamp_(-LIMITS.max_coordinate, LIMITS.max_coordinate)
     cov = state.cov[rows] / state.size**2
     total = cov[:, 0] + cov[:, 3] + cov[:, 5]
-    cov *= (MAX_WIDTH**2 / total.clamp_min(MAX_WIDTH**2))[:, None]
+    cov *= (LIMITS.max_width**2 / total.clamp_min(LIMITS.max_width**2))[:, None]
     return means, cov
 
 
@@ -105,7 +112,7 @@ class Projections:
         means, cov = in_content_units(state, rows)
         centres = (means @ PLANE_AXES[direction]).to(self.table)
         flat = (cov @ TO_PLANE[direction]).to(self.table)
-        added = ROUNDNESS * (flat[:, 0] + flat[:, 2]) + MIN_WIDTH**2
+        added = LIMITS.roundness * (flat[:, 0] + flat[:, 2]) + LIMITS.min_width**2
         flat[:, 0] += added
         flat[:, 2] += added
         self.table[rows, :6] = torch.cat([centres, flat, area_of(*flat.unbind(1))[:, None]], dim=1)
@@ -113,4 +120,4 @@ class Projections:
 
 def area_of(uu: Tensor, uv: Tensor, vv: Tensor) -> Tensor:
     """Areas of projections with these covariances, in units of 2 pi: root of the determinant."""
-    return (uu * vv).addcmul_(uv, uv, value=-1).clamp_min_(MIN_DIVISOR_32).sqrt_()
+    return (uu * vv).addcmul_(uv, uv, value=-1).clamp_min_(LIMITS.min_divisor).sqrt_()

@@ -13,9 +13,6 @@ from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.settings import MergeSettings
 from pointsplat_ns.system.pieces import CHUNK, in_pieces
 
-CHANNELS = 3
-"""Number of colour channels: contrasts are per channel, costs are sums over channels."""
-
 
 @dataclass(frozen=True, eq=False)
 class State:

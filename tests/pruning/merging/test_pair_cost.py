@@ -16,7 +16,7 @@ from pointsplat_ns.pruning.merging.pair_cost import KERNELS, costs_in_plane, pai
 from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.projections import (
     DIRECTIONS,
-    MAX_WIDTH,
+    LIMITS,
     PLANE_AXES,
     TO_PLANE,
     Projections,
@@ -129,7 +129,7 @@ def test_sizes_are_in_units_of_the_scene_and_bounded_where_they_are_wide_beyond_
         features_rest=torch.zeros(4, 0, 3),
     )
     _, cov = in_content_units(state_of(scene, size=2.0), torch.arange(4))
-    expected = torch.tensor([0.25, 10.0, 250.0, MAX_WIDTH], dtype=torch.float64)
+    expected = torch.tensor([0.25, 10.0, 250.0, LIMITS.max_width], dtype=torch.float64)
     torch.testing.assert_close(cov[:, 0].sqrt(), expected, rtol=1e-6, atol=0.0)  # sizes are given in float32
 
 
