@@ -27,7 +27,7 @@ PAGE = """# What each setting of merging is worth
 `lab/judge/ablation.py` writes this page from [ablation.json](ablation.json), which it measured. Each variant turns a
 rule off, or moves a setting to a value beside its default.
 
-- A change is PSNR of the variant minus PSNR of the defaults, dB: mean (smallest to largest) over scenes. Below 0, the
+- A change is PSNR of the variant minus PSNR of the defaults, dB: mean (smallest…largest) over scenes. Below 0, the
   default is better.
 - Splats are judged in at most {views} views of a camera path that was written by hand, {width} pixels wide.
 - Captures are judged in the poses of at most {views} held-out photos, at the size of the photos: once merged without
@@ -69,7 +69,7 @@ class Summary:
     def cell(self, keep: float) -> str:
         """Mean, smallest and largest change at a budget."""
         same = self.changes.get(keep)
-        return f"{fmean(same):+.2f} ({min(same):+.2f} to {max(same):+.2f})" if same else "-"
+        return f"{fmean(same):+.2f} ({min(same):+.2f}…{max(same):+.2f})" if same else "-"
 
     @property
     def count(self) -> str:

@@ -177,12 +177,12 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
         ),
         "## Scenes\n\n" + SCENES + "\n\n" + _scene_table(rows, figures),
     ]
+    widest = max((at for at in figures.ats if at != PHOTOS), default=None)
     for at in figures.ats:
         title = "Held-out photos" if at == PHOTOS else f"{at} pixels wide"
-        parts.append(
-            f"## {title}\n\n{_count(figures.scenes(at))}. PSNR against renders of the dense scene:\n\n"
-            + _mean_table(figures, at, "covered_psnr", 2)
-        )
+        parts.append(f"## {title}\n\n{_count(figures.scenes(at))}.")
+        if at in (PHOTOS, widest):
+            parts.append("PSNR against renders of the dense scene:\n\n" + _mean_table(figures, at, "covered_psnr", 2))
         if at == PHOTOS:
             parts.append("PSNR against the photos:\n\n" + _mean_table(figures, at, "photo_psnr", 2))
         for column, where in AHEAD.items():
@@ -225,7 +225,10 @@ def _scene_table(rows: list[Row], figures: Figures) -> str:
             missing.append(f"{scene} at {', '.join(gaps)}")
         where = "held-out photos" if at else "camera path"
         lines.append([scene, f"{same[0]['gaussians']:,}", where, group_of(scene) or "other"])
-    table = markdown(["scene", "Gaussians", "views", "list"], lines)
+    heads, lists = ["scene", "Gaussians", "views", "list"], {line[-1] for line in lines}
+    if len(lists) == 1:
+        heads, lines = heads[:-1], [line[:-1] for line in lines]
+    table = markdown(heads, lines) + (f'\n\nAll are of the list "{lists.pop()}".' if len(lists) == 1 else "")
     return table + (f"\n\nNot measured: {'; '.join(missing)}." if missing else "")
 
 
@@ -247,13 +250,9 @@ def _lead_table(figures: Figures, at: int | str, column: str) -> str:
     lines = []
     for keep in figures.keeps:
         if keep in ours and keep in repaired:
-            cells = [
-                text
-                for mean, least, scene in (ours[keep], repaired[keep])
-                for text in (f"{mean:+.2f}", f"{least:+.2f} ({scene})")
-            ]
-            lines.append([_share(keep), *cells])
-    heads = ["kept", f"`prune` over {PEER}", "worst", "`compact` over `prune`", "worst"]
+            leads = (ours[keep], repaired[keep])
+            lines.append([_share(keep), *(f"{mean:+.2f} ({least:+.2f} {scene})" for mean, least, scene in leads)])
+    heads = ["kept", f"`prune` over {PEER}", "`compact` over `prune`"]
     return markdown(heads, lines) if lines else ""
 
 

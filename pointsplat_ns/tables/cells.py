@@ -24,7 +24,7 @@ from pointsplat_ns.tradeoff.points import Point
 
 CELLS = "cells.json"
 
-FORM = Form("pointsplat-tables-cells", 1, "cells", "a scene's tables")
+FORM = Form("pointsplat-tables-cells", 2, "cells", "a scene's tables")
 
 
 @dataclass(frozen=True)

@@ -72,8 +72,8 @@ def test_the_page_has_means_leads_costs_and_failures():
     assert ["fox", "1,000", "held-out photos", "tuning"] in lines
     means = ["23.50 (18.00 pc_playbot)", "25.00 (20.00 pc_playbot)", "27.50 (24.00 pc_playbot)"]
     assert ["10 %", *means] in lines
-    assert ["10 %", "+1.50", "+1.00 (rock)", "+2.50", "+1.00 (rock)"] in lines
-    assert ["10 %", "+0.00", "+0.00 (fox)", "+0.00", "+0.00 (fox)"] in lines  # against photos
+    assert ["10 %", "+1.50 (+1.00 rock)", "+2.50 (+1.00 rock)"] in lines
+    assert ["10 %", "+0.00 (+0.00 fox)", "+0.00 (+0.00 fox)"] in lines  # against photos
     assert ["splats", "10 %", " / ".join(["2 (2)"] * 3), " / ".join(["1.23 (1.23)"] * 3)] in lines
     assert ["- rock, 3 %: splat-transform 3.7.0 -d"] in lines
     assert text.count("LPIPS against") == 2 and "PSNR against the photos" in text

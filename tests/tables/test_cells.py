@@ -69,7 +69,7 @@ def set_point(**changes):
         lambda content: content.pop("cells"),
         lambda content: content.pop("of"),
         lambda content: content.update(format="pointsplat-tradeoff-points"),
-        lambda content: content.update(version=2),
+        lambda content: content.update(version=1),
         lambda content: content.update(cells=3),
         lambda content: content["of"].pop("group"),
         lambda content: content["of"].update(views="many"),

@@ -55,9 +55,7 @@ struct ProjectionGradient {
 };
 
 }  // extern "C"
-
 namespace {
-
 constexpr float LARGEST = std::numeric_limits<float>::max();
 
 struct Position {
