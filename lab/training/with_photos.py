@@ -1,7 +1,7 @@
 """Who has the photos: which way to a small scene is best at an equal number of Gaussians and equal CPU seconds?
 
     python -m lab.training.with_photos fox --steps 2000 --keep 0.1 0.3 --json with_photos.json \\
-        --train "--data scannetpp/fox scannetpp-seeded"
+        --train "splatfacto-cpu --data scannetpp/fox scannetpp-seeded"
     python -m lab.training.with_photos_record with_photos.json
 
 A dense scene is trained by ``ns-train splatfacto-cpu``, and made smaller by each way. The results are compared with the
@@ -63,7 +63,7 @@ class Capture:
 
     Args:
         name: of the capture.
-        arguments: of ``ns-train splatfacto-cpu``: the data, its dataparser and their options.
+        arguments: of ``ns-train``: splatfacto-cpu, the data, its dataparser and their options.
         steps: number of steps of the dense training.
         folder: for all runs and scenes.
         lpips: the network of LPIPS, if there is one.
@@ -81,11 +81,11 @@ class Capture:
         """A new training, with a cap or without: its run and its CPU seconds."""
         run = run_folder(self.folder, self.name, SCENE_METHOD, label)
         shutil.rmtree(run, ignore_errors=True)
-        words = [*_TRAIN, SCENE_METHOD, "--output-dir", str(self.folder), "--experiment-name", self.name]
+        words = [*_TRAIN, self.arguments[0], "--output-dir", str(self.folder), "--experiment-name", self.name]
         words += ["--timestamp", label, "--max-num-iterations", str(steps), "--vis", "tensorboard"]
         words += ["--early-look", "False", "--steps-per-eval-image", "0", "--steps-per-save", str(steps)]
         words += [] if cap is None else ["--pipeline.model.max-gs-num", str(cap)]
-        return run, _cpu_seconds([*words, *self.arguments])
+        return run, _cpu_seconds([*words, *self.arguments[1:]])
 
     def capped(self, count: int, seconds: float, per_step: float, starting: float) -> tuple[Path, float]:
         """A training with a cap of about so many CPU seconds, given those of a step and of the start."""
@@ -168,7 +168,7 @@ def main(
 
     Args:
         name: of the capture.
-        train: arguments of ns-train splatfacto-cpu: the data, its dataparser and their options.
+        train: arguments of ns-train: splatfacto-cpu, the data, its dataparser and their options.
         steps: number of steps of the dense training.
         keep: shares of the Gaussians to keep.
         folder: for trainings and scenes.
@@ -177,7 +177,10 @@ def main(
     lpips = lpips_or_none(True)
     results = Results(json_path, {"lpips": lpips is not None}, json_path is not None)
     folder.mkdir(parents=True, exist_ok=True)
-    capture = Capture(name, shlex.split(train), steps, folder.resolve(), lpips)
+    arguments = shlex.split(train)
+    if arguments[:1] != [SCENE_METHOD]:
+        raise SystemExit(f"--train {train}; expected it to begin with {SCENE_METHOD}")
+    capture = Capture(name, arguments, steps, folder.resolve(), lpips)
     if results.of(name) and not capture.dense.is_dir():
         raise SystemExit(f"{json_path} has rows of {name}, but {capture.dense} is missing; expected the same --folder")
     for row in measured(capture, keep, results.of(name)):

@@ -25,7 +25,7 @@ class Tried(program.Capture):
     """A capture of which nothing is trained: a start takes 10 CPU seconds, a step 0.1 at a cap and 0.5 without."""
 
     def __init__(self, folder):
-        super().__init__("fox", ["--data", "fox"], 2000, folder, None)
+        super().__init__("fox", ["splatfacto-cpu", "--data", "fox"], 2000, folder, None)
         self.asked: list[tuple] = []
 
     def train(self, label, steps, cap=None):

