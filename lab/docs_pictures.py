@@ -21,7 +21,7 @@ from torch import Tensor
 
 import pointsplat_ns as ps
 from lab.common.printing import save_figure, start
-from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.sampling import estimated_up
 
 SHOWN = 0

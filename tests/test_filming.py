@@ -15,7 +15,7 @@ from PIL import Image
 import pointsplat_ns as ps
 from making import ball, decoded, run_of
 from pointsplat_ns.cli import main
-from pointsplat_ns.geometry.cameras import viewmats_to_opengl
+from pointsplat_ns.geometry.transforms import viewmats_to_opengl
 from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.viewing.film import to_uint8
 

@@ -23,7 +23,7 @@ from lab.common.printing import markdown, number, start
 from lab.common.results import Row, grouped, write_json
 from lab.common.scenes import name_of
 from lab.common.timing import seconds_of
-from pointsplat_ns.geometry.quaternions import zero_as_identity
+from pointsplat_ns.geometry.transforms import zero_as_identity
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.spz import SH_BITS, write_spz
 from pointsplat_ns.looking.closeness import DenseReference

@@ -33,7 +33,7 @@ from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.regrouping import Members, best_groups, moments
 from pointsplat_ns.pruning.merging.replacement import replace_pairs
 from pointsplat_ns.pruning.merging.state import initial_state
-from pointsplat_ns.pruning.merging.viewpoints import sampled_viewpoints
+from pointsplat_ns.pruning.merging.visibility import sampled_viewpoints
 from pointsplat_ns.rasterizer import pixels_of
 
 Part = Callable[[bool], object]

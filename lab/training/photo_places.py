@@ -23,7 +23,7 @@ import pointsplat_ns as ps
 from lab.common.printing import markdown, save_figure, start
 from lab.common.scenes import name_of
 from pointsplat_ns.gaussians import MAX_SH_DEGREE
-from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.looking.traces import PhotoEvidence, photo_places
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.closeness import DenseReference, views_text
 from pointsplat_ns.looking.content import content_size, in_units
 from pointsplat_ns.looking.each_view import each_view

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.quaternions import quaternions_of
+from pointsplat_ns.geometry.transforms import quaternions_of
 from pointsplat_ns.io.runs import Run, may_be_run, open_run
 from pointsplat_ns.looking.sampling import estimated_up
 from pointsplat_ns.looking.upright import axis_named

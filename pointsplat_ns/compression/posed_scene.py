@@ -10,7 +10,7 @@ import torch
 
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.io.camera_files import read_views, transforms_beside
 from pointsplat_ns.io.runs import CONFIG_NAME, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.quaternions import SHORTEST
+from pointsplat_ns.geometry.transforms import SHORTEST
 from pointsplat_ns.io.files import unusable_kept
 from pointsplat_ns.io.formats import FORMATS, Format, format_name
 from pointsplat_ns.io.formats.sog import sog_bytes_like

@@ -14,8 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.morton import curve_keys, unit_cells
-from pointsplat_ns.geometry.quaternions import rotation_matrices
+from pointsplat_ns.geometry.transforms import curve_keys, rotation_matrices, unit_cells
 from pointsplat_ns.looking.content import UNITS, positions_in_units
 from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.looking.traces import trace_factors, unit_sh

@@ -9,7 +9,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.geometry.cameras import viewmats_from_opengl, viewmats_to_opengl
+from pointsplat_ns.geometry.transforms import viewmats_from_opengl, viewmats_to_opengl
 from pointsplat_ns.views import EPS2D, NEAR_PLANE, RasterizeMode, Views
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from pointsplat_ns.compression.optimiser import Example
 from pointsplat_ns.compression.photo_repair import Photos
 from pointsplat_ns.errors import DataError, MissingPackageError, need
-from pointsplat_ns.geometry.cameras import viewmats_from_opengl
+from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.io.runs import open_run, scene_name
 from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstudio
 from pointsplat_ns.views import Views, spread_indices

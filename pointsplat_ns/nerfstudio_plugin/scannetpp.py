@@ -15,7 +15,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.geometry.cameras import flip_camera_axes
+from pointsplat_ns.geometry.transforms import flip_camera_axes
 from pointsplat_ns.io.files import read_text
 
 

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.morton import curve_keys, unit_cells
+from pointsplat_ns.geometry.transforms import curve_keys, unit_cells
 from pointsplat_ns.pruning.scores import log_area
 
 

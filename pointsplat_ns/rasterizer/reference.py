@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pointsplat_ns.geometry.quaternions import SHORTEST
+from pointsplat_ns.geometry.transforms import SHORTEST
 from pointsplat_ns.rasterizer.constants import (
     ALPHA_MAX,
     ALPHA_MIN,

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.gaussians import SH_C0
-from pointsplat_ns.geometry.quaternions import SHORTEST
+from pointsplat_ns.geometry.transforms import SHORTEST
 from pointsplat_ns.rasterizer.precision import full_precision
 
 # Normalisation constants of the real spherical harmonics (Sloan, "Efficient Spherical Harmonic
@@ -75,7 +75,7 @@ def _basis_backward(unit: Tensor, grad: Tensor, degree: int) -> Tensor:
 def unit_rows(vectors: Tensor) -> tuple[Tensor, Tensor]:
     """Unit vectors (D, M) of the columns of (D, M), and the inverse of their lengths (M).
 
-    A zero vector, or one shorter than :data:`~pointsplat_ns.geometry.quaternions.SHORTEST`, becomes zero, and so does
+    A zero vector, or one shorter than :data:`~pointsplat_ns.geometry.transforms.SHORTEST`, becomes zero, and so does
     its inverse length: it has no gradient. The length is taken after division by the largest component, so that neither
     1e-30 nor 1e30 under- or overflows.
     """

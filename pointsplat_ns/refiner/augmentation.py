@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import SH_C0, Gaussians
-from pointsplat_ns.geometry.quaternions import rotation_matrices, zero_as_identity
+from pointsplat_ns.geometry.transforms import rotation_matrices, zero_as_identity
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
 

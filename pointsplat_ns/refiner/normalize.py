@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.quaternions import zero_as_identity
+from pointsplat_ns.geometry.transforms import zero_as_identity
 from pointsplat_ns.refiner.sparse_ops import permute
 
 
@@ -116,7 +116,7 @@ def canonical_quats(quats: Tensor) -> tuple[Tensor, Tensor]:
     """Unit quaternions (N, 4) of one sign, and their signed lengths (N, 1), of finite wxyz of any length.
 
     A quaternion and its negative are the same rotation; the first non-zero component of the result is positive.
-    Quaternions shorter than :data:`~pointsplat_ns.geometry.quaternions.SHORTEST` become the identity, with a length of
+    Quaternions shorter than :data:`~pointsplat_ns.geometry.transforms.SHORTEST` become the identity, with a length of
     1. Components are divided by the largest before squaring, so that 1e-30 does not underflow and 1e30 does not
     overflow.
     """

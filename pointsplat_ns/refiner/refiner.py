@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.quaternions import zero_as_identity
+from pointsplat_ns.geometry.transforms import zero_as_identity
 from pointsplat_ns.refiner.config import RefinerConfig
 from pointsplat_ns.refiner.encoder import make_encoder
 from pointsplat_ns.refiner.heads import ResidualHeads

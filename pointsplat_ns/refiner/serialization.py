@@ -13,7 +13,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from pointsplat_ns.geometry.morton import interleave, spread_bits
+from pointsplat_ns.geometry.transforms import interleave, spread_bits
 from pointsplat_ns.refiner.sparse_ops import by_rows, permute, rows_at_a_time
 
 

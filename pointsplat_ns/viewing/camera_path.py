@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.cameras import viewmats_from_opengl
+from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.io.camera_files.cameras import finite
 from pointsplat_ns.io.files import logger, one_line, require_file
 from pointsplat_ns.looking.content import content_box

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.views import Views

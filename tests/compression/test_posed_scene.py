@@ -13,7 +13,7 @@ import pointsplat_ns as ps
 from making import ball, run_of
 from pointsplat_ns.compression.posed_scene import LONGEST_SIDE, check_views_show, read_posed
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.geometry.transforms import invert_rigid
 from posing import inria, nerfstudio, written
 
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from pointsplat_ns.geometry.morton import curve_keys, unit_cells
+from pointsplat_ns.geometry.transforms import curve_keys, unit_cells
 
 
 def test_the_curve_interleaves_the_bits_of_the_grid():

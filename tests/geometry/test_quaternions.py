@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from pointsplat_ns.geometry.quaternions import (
+from pointsplat_ns.geometry.transforms import (
     SHORTEST,
     quaternions_of,
     rotation_components,

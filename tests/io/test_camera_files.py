@@ -15,8 +15,7 @@ import torch
 from PIL import Image
 
 import pointsplat_ns as ps
-from pointsplat_ns.geometry.cameras import invert_rigid, viewmats_to_opengl
-from pointsplat_ns.geometry.quaternions import rotation_matrices
+from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices, viewmats_to_opengl
 from pointsplat_ns.io.camera_files import cameras, is_camera_file, read_views, registry, transforms_beside
 from pointsplat_ns.io.camera_files.cameras import Limits
 from posing import inria, name_of, nerfstudio, write_colmap_binary, write_colmap_text, written

@@ -10,7 +10,7 @@ import torch
 
 from making import EYES, ball, normal_scene, photographed
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.settings import DEFAULTS
 from pointsplat_ns.looking.traces import correlation, log_norms, photo_places, trace_factors

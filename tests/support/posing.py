@@ -6,8 +6,7 @@ import json
 import struct
 from pathlib import Path
 
-from pointsplat_ns.geometry.cameras import invert_rigid, viewmats_to_opengl
-from pointsplat_ns.geometry.quaternions import quaternions_of
+from pointsplat_ns.geometry.transforms import invert_rigid, quaternions_of, viewmats_to_opengl
 from pointsplat_ns.views import Views
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from pointsplat_ns.geometry.cameras import viewmats_to_opengl
+from pointsplat_ns.geometry.transforms import viewmats_to_opengl
 from pointsplat_ns.viewing import camera_path
 from pointsplat_ns.viewing.camera_path import read_path
 

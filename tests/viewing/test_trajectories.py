@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from pointsplat_ns.geometry.cameras import invert_rigid
+from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.viewing.trajectories import along, fitted, orbit, up_of, walk
 

@@ -17,8 +17,7 @@ from typing import BinaryIO, NamedTuple
 import torch
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.geometry.cameras import invert_rigid
-from pointsplat_ns.geometry.quaternions import rotation_matrices
+from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices
 from pointsplat_ns.io.camera_files.cameras import LIMITS, Camera, CameraFile, Motion, need_count
 from pointsplat_ns.io.files import logger, one_line
 

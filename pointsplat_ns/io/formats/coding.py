@@ -18,8 +18,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import SH_C0, Gaussians
-from pointsplat_ns.geometry.morton import interleave, spread_bits
-from pointsplat_ns.geometry.quaternions import zero_as_identity
+from pointsplat_ns.geometry.transforms import interleave, spread_bits, zero_as_identity
 from pointsplat_ns.io.files import one_line, require_memory
 
 SATURATED = 0.25

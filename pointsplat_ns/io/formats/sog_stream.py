@@ -20,7 +20,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.quaternions import rotation_matrices
+from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.io.files import keep_usable, read_text, replacing, require_file, require_memory, unusable_kept
 from pointsplat_ns.io.formats.coding import damage_named, joined
 from pointsplat_ns.io.formats.sog import read_sog, sog_parts

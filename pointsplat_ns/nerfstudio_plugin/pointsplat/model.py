@@ -23,7 +23,7 @@ from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.cameras import viewmats_from_opengl
+from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.metrics import psnr
 from pointsplat_ns.nerfstudio_plugin.cameras import eps2d_of, near_plane_of, need_pinhole
 from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache

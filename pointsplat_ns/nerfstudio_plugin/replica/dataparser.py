@@ -15,7 +15,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.geometry.cameras import flip_camera_axes
+from pointsplat_ns.geometry.transforms import flip_camera_axes
 from pointsplat_ns.nerfstudio_plugin.replica.layout import ReplicaScene, load_replica, read_depth, read_photo
 from pointsplat_ns.system.progress import tracked
 

@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 from torch.optim import Optimizer
 
-from pointsplat_ns.geometry.quaternions import rotation_matrices
+from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.system.threads import one_thread
 
 GROWTH = 1.05

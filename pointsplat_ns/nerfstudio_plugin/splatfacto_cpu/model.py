@@ -28,7 +28,7 @@ from torch import Tensor
 from torchmetrics.image import PeakSignalNoiseRatio
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.geometry.cameras import viewmats_from_opengl
+from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.metrics import structural_similarity
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.metrics.structural_similarity import mean_ssim

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.quaternions import rotation_matrices
+from pointsplat_ns.geometry.transforms import rotation_matrices
 
 MIN_DIVISOR = 1e-300
 """Lower bound of float64 denominators, which keeps quotients finite; the smallest normal float64 is 2e-308."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.quaternions import quaternions_of
+from pointsplat_ns.geometry.transforms import quaternions_of
 from pointsplat_ns.pruning.merging.covariance import MIN_DIVISOR, unpack
 from pointsplat_ns.pruning.merging.groups import Groups
 from pointsplat_ns.pruning.merging.participants import Participants

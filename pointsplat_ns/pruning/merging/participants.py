@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.morton import curve_keys, unit_cells
+from pointsplat_ns.geometry.transforms import curve_keys, unit_cells
 from pointsplat_ns.looking.content import content_size, in_units
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 

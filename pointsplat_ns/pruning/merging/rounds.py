@@ -34,8 +34,7 @@ from pointsplat_ns.pruning.merging.replacement import replace_pairs
 from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
 from pointsplat_ns.pruning.merging.state import State, initial_state
 from pointsplat_ns.pruning.merging.tree import Tree
-from pointsplat_ns.pruning.merging.viewpoints import Viewpoints, sampled_viewpoints
-from pointsplat_ns.pruning.merging.visibility import visibility_weights
+from pointsplat_ns.pruning.merging.visibility import Viewpoints, sampled_viewpoints, visibility_weights
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import Views
 

@@ -20,7 +20,7 @@ class MergeSettings:
         6
     """
 
-    # Viewpoints (viewpoints.py)
+    # Viewpoints (visibility.py)
 
     min_count_rendered: int = 2_000
     """Smallest number of Gaussians for which views are sampled. A smaller scene without given views is merged with

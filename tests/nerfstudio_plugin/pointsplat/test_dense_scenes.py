@@ -12,7 +12,7 @@ import torch
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 from making import box_room, pipeline_of, without_data
 from pointsplat_ns.errors import DataError, SceneError
-from pointsplat_ns.geometry.cameras import viewmats_from_opengl
+from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.io.discovery import find_plys
 from pointsplat_ns.looking.sampling import sample_views

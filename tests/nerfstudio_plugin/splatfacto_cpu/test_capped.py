@@ -10,7 +10,7 @@ import torch
 
 from making import equal
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.geometry.quaternions import rotation_matrices
+from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.capped import (
     CappedStrategy,
     drawn,

@@ -18,7 +18,7 @@ from nerfstudio.utils import writer
 from PIL import Image
 
 from pointsplat_ns.errors import DataError, SceneError
-from pointsplat_ns.geometry.cameras import viewmats_from_opengl
+from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import fitted_schedules, splatfacto_cpu_config
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModel, SplatfactoCpuModelConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import SplatfactoCpuTrainer

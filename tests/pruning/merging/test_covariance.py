@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from pointsplat_ns.geometry.quaternions import rotation_matrices
+from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.pruning.merging.covariance import (
     covariances,
     overlap,

@@ -14,8 +14,12 @@ from pointsplat_ns.looking.content import content_size, in_units, views_in_units
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.pruning.merging import DEFAULTS, merge, visibility
 from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.viewpoints import Viewpoints, sampled_viewpoints
-from pointsplat_ns.pruning.merging.visibility import covered_per_area, visibility_weights
+from pointsplat_ns.pruning.merging.visibility import (
+    Viewpoints,
+    covered_per_area,
+    sampled_viewpoints,
+    visibility_weights,
+)
 from pointsplat_ns.views import Views
 
 

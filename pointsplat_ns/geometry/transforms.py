@@ -1,0 +1,135 @@
+"""Rotations, poses of cameras, and positions along a space-filling curve.
+
+gsplat, COLMAP and the Replica files have cameras with OpenCV's axes (x right, y down, z forward); nerfstudio has
+OpenGL's (x right, y up, z back).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def flip_camera_axes(camera_to_worlds: Tensor) -> Tensor:
+    """Camera-to-world matrices (..., 3 or 4, 4) with OpenGL axes from OpenCV ones, or the other way round: the second
+    and third columns change their sign."""
+    return camera_to_worlds * camera_to_worlds.new_tensor([1.0, -1.0, -1.0, 1.0])
+
+
+def invert_rigid(matrices: Tensor) -> Tensor:
+    """Inverses (C, 4, 4) of rigid motions (C, 3 or 4, 4): the rotation's inverse is its transpose. Differentiable."""
+    rotation = matrices[:, :3, :3].transpose(1, 2)
+    translation = -rotation @ matrices[:, :3, 3:]
+    last_row = matrices.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(matrices), 1, 4)
+    return torch.cat([torch.cat([rotation, translation], dim=2), last_row], dim=1)
+
+
+def viewmats_from_opengl(camera_to_worlds: Tensor) -> Tensor:
+    """World-to-camera matrices with OpenCV axes (C, 4, 4), as rasterizers take them, from nerfstudio's camera-to-world
+    (C, 3, 4), which have OpenGL axes. Differentiable."""
+    return invert_rigid(flip_camera_axes(camera_to_worlds))
+
+
+def viewmats_to_opengl(viewmats: Tensor) -> Tensor:
+    """The inverse of :func:`viewmats_from_opengl`: (C, 4, 4) to (C, 3, 4)."""
+    return flip_camera_axes(invert_rigid(viewmats))[:, :3]
+
+
+SHORTEST = torch.finfo(torch.float32).tiny
+"""Smallest normal number of float32. A quaternion whose largest component is below it is taken for zero, in any
+precision: float32 has no inverse of its length, so its direction would depend on the precision."""
+
+
+def rotation_components(unit: Tensor) -> Tensor:
+    """Rotation matrices (3, 3, M) of unit quaternions (4, M), each entry contiguous; zero gives the identity."""
+    w, x, y, z = unit
+    x2, y2, z2 = 2 * unit[1:]
+    xx, yy, zz, xy, xz, yz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2
+    wx, wy, wz = w * x2, w * y2, w * z2
+    rows = [1 - (yy + zz), xy - wz, xz + wy, xy + wz, 1 - (xx + zz), yz - wx, xz - wy, yz + wx, 1 - (xx + yy)]
+    return torch.stack(rows).view(3, 3, -1)
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Rotation matrices of quaternions of any length.
+
+    Args:
+        quats: (N, 4) wxyz, finite; zero is the identity, and so are those shorter than :data:`SHORTEST`.
+
+    Returns:
+        (N, 3, 3), of the same dtype.
+
+    Example:
+        >>> rotation_matrices(torch.tensor([[0.0, 0.0, 0.0, 2.0]])).tolist()  # half a turn about z
+        [[[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]]
+    """
+    wide = zero_as_identity(quats).double()  # squares of 1e-30 underflow in float32
+    unit = (wide / wide.norm(dim=1, keepdim=True)).to(quats.dtype)
+    return rotation_components(unit.T).permute(2, 0, 1)
+
+
+def quaternions_of(matrices: Tensor) -> Tensor:
+    """Quaternions (..., 4) wxyz, float64, of rotation matrices (..., 3, 3).
+
+    The entries of a matrix are products of the components of q. They give 4 q q^T, of which the row with the largest
+    diagonal is the best multiple of q (Shepperd 1978, Journal of Guidance and Control 1(3)).
+    """
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrices.double().unbind(-2))
+    rows = [
+        torch.stack([1 + a + e + i, h - f, c - g, d - b], dim=-1),
+        torch.stack([h - f, 1 + a - e - i, b + d, c + g], dim=-1),
+        torch.stack([c - g, b + d, 1 - a + e - i, f + h], dim=-1),
+        torch.stack([d - b, c + g, f + h, 1 - a - e + i], dim=-1),
+    ]
+    products = torch.stack(rows, dim=-2)  # [..., 4, 4]
+    best = products.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None].expand(*products.shape[:-2], 1, 4)
+    return torch.nn.functional.normalize(products.gather(-2, best)[..., 0, :], dim=-1)
+
+
+def zero_as_identity(quats: Tensor) -> Tensor:
+    """Quaternions (N, 4), with the identity in place of each that is zero or shorter than :data:`SHORTEST`."""
+    largest = quats.detach().abs().amax(dim=1, keepdim=True)
+    # In float32, because half precision would round the bound to 0.
+    return torch.where(largest.float() < SHORTEST, quats.new_tensor([1.0, 0.0, 0.0, 0.0]), quats)
+
+
+def spread_bits(x: Tensor) -> Tensor:
+    """Move bit k of every integer to bit 3k, for k below 21, in five steps of half the distance each.
+
+    Args:
+        x: int64 of any shape; bits from 21 on are dropped.
+    """
+    x = x & 0x1FFFFF
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        x |= x << shift
+        x &= mask
+    return x
+
+
+def interleave(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    """The Morton code of three coordinates whose bits are spread; x has the highest bit."""
+    return (x << 2).bitwise_or_(y << 1).bitwise_or_(z)
+
+
+def unit_cells(means: Tensor) -> Tensor:
+    """Positions (N, 3), float32, scaled so that most lie in a cube of side 1/2 around 1/2; those far outside are
+    clamped to [0, 1]. So the few distant Gaussians of most scenes do not coarsen the grid of the others."""
+    some = means[:: max(1, len(means) // 2**14)].double()
+    n = len(some)
+    ranked = some.sort(dim=0).values
+    low, high = ranked[(n - 1) // 100], ranked[n - 1 - (n - 1) // 100]
+    side = 2 * (high - low).amax()
+    cells = (means.double() - 0.5 * (low + high)).div_(side.clamp_min(torch.finfo(torch.float64).tiny))
+    return cells.float().clamp_(-0.5, 0.5).add_(0.5)
+
+
+def curve_keys(cells: Tensor, offset: float = 0.0) -> Tensor:
+    """Morton codes (N,) int64 of points (N, 3) in the unit cube, shifted by ``offset`` along each axis."""
+    grid = (cells.T + offset).clamp_(0, 1).mul_(2**20 - 1).long()  # 60 of the 63 bits in a key
+    return interleave(*(spread_bits(axis) for axis in grid))
