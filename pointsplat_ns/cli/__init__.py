@@ -33,7 +33,7 @@ COMMANDS = (
         "report",
         "rooms",
     ),
-    *("make-refiner", "make-feedback", "demo"),
+    *("train", "make-refiner", "make-feedback", "demo"),
 )
 """The commands. Each is a function in a module of the same name, which is imported when the command runs."""
 

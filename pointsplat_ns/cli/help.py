@@ -54,6 +54,10 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("and a page with charts", "pointsplat report evaluation.json --html evaluation.html"),
     ),
     "rooms": (("two rooms of 40 photos", "pointsplat rooms -o rooms --seeds 0 1 --frames 40"),),
+    "train": (
+        ("50,000 Gaussians from photos with poses", "pointsplat train my_capture --keep 50000"),
+        ("sooner: fewer pixels, fewer steps", "pointsplat train my_capture --keep 50k --scale 0.5 --steps 3000"),
+    ),
     "make-refiner": (
         ("a refiner for rooms", "pointsplat make-refiner"),
         ("a small one of four rooms", "pointsplat make-refiner -o outputs/mine --rooms 4 --steps 300"),

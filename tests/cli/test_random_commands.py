@@ -37,7 +37,7 @@ FAST = {
 }
 """Options that come first, so that a command which can work does not work long."""
 
-LONG = {"demo", "make-refiner", "make-feedback", "rooms"}
+LONG = {"train", "demo", "make-refiner", "make-feedback", "rooms"}
 """Commands that cannot be made short."""
 
 OTHERS = [
