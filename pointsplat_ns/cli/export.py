@@ -8,8 +8,9 @@ from typing import Annotated
 
 import tyro
 
-from pointsplat_ns.cli.printing import Json, print_json, scene_result, seconds_text, written_size
+from pointsplat_ns.cli.printing import Json, print_json, scene_result, written_size
 from pointsplat_ns.cli.scene_options import claim_outputs
+from pointsplat_ns.system.quantities import seconds_text
 
 
 def export(

@@ -12,6 +12,7 @@ from typing import IO, TYPE_CHECKING, Annotated, Any
 import tyro
 
 from pointsplat_ns.cli.scene_options import file_bytes
+from pointsplat_ns.system.quantities import seconds_text
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.quality import Quality
@@ -87,19 +88,6 @@ def written_size(where: Path) -> str:
     from pointsplat_ns.io.files import bytes_text
 
     return bytes_text(file_bytes(where))
-
-
-def seconds_text(seconds: float) -> str:
-    """A duration with the digits that matter.
-
-    Example:
-        >>> seconds_text(3.14), seconds_text(31.4), seconds_text(314)
-        ('3.1 s', '31 s', '5 min 14 s')
-    """
-    minutes, rest = divmod(round(seconds), 60)
-    if seconds >= 100:
-        return f"{minutes} min {rest} s"
-    return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
 
 
 def print_distributions(before: Gaussians, after: Gaussians) -> None:

@@ -8,8 +8,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from pointsplat_ns.cli.printing import Json, print_json, seconds_text
+from pointsplat_ns.cli.printing import Json, print_json
 from pointsplat_ns.cli.scene_options import Poses, Scene, check_poses, claim_file, claim_folder
+from pointsplat_ns.system.quantities import seconds_text
 
 
 def render(

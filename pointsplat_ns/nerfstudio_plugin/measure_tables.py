@@ -24,6 +24,7 @@ from pointsplat_ns.tables.measuring import Measuring
 from pointsplat_ns.tables.outputs import OUTPUTS, write_tables
 from pointsplat_ns.tables.scene import OpenedScene, TableOptions, TableScene
 from pointsplat_ns.tables.ways import PROTOCOL
+from pointsplat_ns.tradeoff.journal import check_folder
 from pointsplat_ns.tradeoff.judging import JudgedViews
 
 
@@ -97,7 +98,7 @@ def measure_tables(
         raise PointSplatError("no scene is named; expected Splatfacto runs, or files of scenes")
     opened = [_table_scene(Path(path)) for path in scenes]
     opened = _grouped(opened, groups)
-    _check_folder(folder, opened, force)
+    check_folder(folder, f"*/{CELLS}", OUTPUTS, force, [folder / scene.name / CELLS for scene in opened])
     tools = Tools(options, Refiners([Path(path) for path in refiners]), splat_transform)
     with progress_bar(progress) as report:
         measuring = Measuring(opened, folder, shares, tools, only, report)
@@ -108,23 +109,6 @@ def measure_tables(
                 write_tables(folder, shares, measuring.missing)
             raise
         return write_tables(folder, shares, measuring.missing)
-
-
-def _check_folder(folder: Path, scenes: Sequence[TableScene], force: bool) -> None:
-    """Raise a SceneError if tables may not be written to a folder: it is a file, or holds tables without the cells that
-    they are of. With ``force``, older cells of the scenes are removed."""
-    if folder.exists() and not folder.is_dir():
-        raise SceneError(f"{folder}: is a file; expected the name of a folder")
-    if force:
-        for scene in scenes:
-            (folder / scene.name / CELLS).unlink(missing_ok=True)
-    elif not any(folder.glob(f"*/{CELLS}")):
-        for name in OUTPUTS:
-            if (folder / name).exists():
-                raise SceneError(
-                    f"{folder / name}: exists already, without the cells that it is of; name another folder, or "
-                    "overwrite it with --force"
-                )
 
 
 def _grouped(scenes: Sequence[TableScene], groups: Sequence[str]) -> list[TableScene]:

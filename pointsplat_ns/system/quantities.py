@@ -1,4 +1,4 @@
-"""Counts and sizes as people write them: 1e3, 10k, 1.5M, 1,000, 12kB, 1GB."""
+"""Counts, sizes and durations as people write them: 1e3, 10k, 1.5M, 1,000, 12kB, 1GB, 5 min 14 s."""
 
 from __future__ import annotations
 
@@ -46,3 +46,18 @@ def parse_megabytes(text: str) -> float:
     """
     text = text.strip()
     return parse_number(text[:-1]) / 1e6 if text.lower().endswith("b") else parse_number(text)
+
+
+def seconds_text(seconds: float) -> str:
+    """A duration with the digits that matter.
+
+    Example:
+        >>> seconds_text(3.14), seconds_text(31.4), seconds_text(314), seconds_text(3140), seconds_text(7000)
+        ('3.1 s', '31 s', '5 min 14 s', '52 min', '1 h 57 min')
+    """
+    if seconds < 100:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    if seconds < 600:
+        return f"{round(seconds) // 60} min {round(seconds) % 60} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"

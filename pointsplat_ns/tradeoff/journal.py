@@ -74,6 +74,33 @@ class Form:
                 )
 
 
+def check_folder(folder: Path, records: str, outputs: Sequence[str], force: bool, older: Sequence[Path]) -> None:
+    """Check, before the long computations, that results may be written to a folder.
+
+    Args:
+        folder: need not exist.
+        records: pattern of the journals in it, which a command goes on from.
+        outputs: names of the results.
+        force: remove ``older`` instead.
+        older: journals that start over.
+
+    Raises:
+        SceneError: if the folder is a file, or holds results without journals.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise SceneError(f"{folder}: is a file; expected the name of a folder")
+    if force:
+        for path in older:
+            path.unlink(missing_ok=True)
+    elif not any(folder.glob(records)):
+        for name in outputs:
+            if (folder / name).exists():
+                raise SceneError(
+                    f"{folder / name}: exists already, without {Path(records).name} to go on from; name another "
+                    "folder, or overwrite it with --force"
+                )
+
+
 POINTS = "points.json"
 
 POINTS_FORM = Form("pointsplat-tradeoff-points", 3, "points", "a sweep")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from pointsplat_ns.errors import DataError, PointSplatError, SceneError
+from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.looking.sizes import size_text
@@ -62,23 +62,6 @@ class Options:
         """The plan of a scene."""
         methods = tuple(dict.fromkeys(self.methods))
         return Plan(len(dense), dense.sh_degree, methods, check_repairs(self.repairs), self.within)
-
-
-def check_folder(folder: Path, force: bool) -> None:
-    """Check, before the long computations, that a sweep may write to a folder; with ``force``, remove an older sweep.
-    Raises SceneError if it is a file, or holds results but no points to go on from."""
-    if folder.exists() and not folder.is_dir():
-        raise SceneError(f"{folder}: is a file; expected the name of a folder")
-    if force:
-        for name in (POINTS, *OUTPUTS):
-            (folder / name).unlink(missing_ok=True)
-        return
-    for name in OUTPUTS:
-        if (folder / name).exists() and not (folder / POINTS).exists():
-            raise SceneError(
-                f"{folder / name}: exists already, without {POINTS} to go on from; name another folder, or overwrite "
-                "it with --force"
-            )
 
 
 @contextmanager

@@ -15,11 +15,11 @@ from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.tradeoff import judging, measuring, sweep
-from pointsplat_ns.tradeoff.journal import POINTS
+from pointsplat_ns.tradeoff.journal import POINTS, check_folder
 from pointsplat_ns.tradeoff.outputs import OUTPUTS, PAGE, PLOTS, TABLE
 from pointsplat_ns.tradeoff.points import picture_path
 from pointsplat_ns.tradeoff.settings import Setting
-from pointsplat_ns.tradeoff.sweep import Options, check_folder
+from pointsplat_ns.tradeoff.sweep import Options
 
 
 def names(folder):
@@ -176,8 +176,8 @@ def test_points_of_another_scene_are_refused_before_anything_is_measured(new_swe
 def test_results_without_points_are_not_overwritten(tmp_path):
     (tmp_path / TABLE).write_text("precious")
     with pytest.raises(SceneError, match="exists already, without points.json"):
-        check_folder(tmp_path, force=False)
-    check_folder(tmp_path, force=True)
+        check_folder(tmp_path, POINTS, OUTPUTS, False, [tmp_path / TABLE])
+    check_folder(tmp_path, POINTS, OUTPUTS, True, [tmp_path / TABLE])
     assert names(tmp_path) == []
 
 

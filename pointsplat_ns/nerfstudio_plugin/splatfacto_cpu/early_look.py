@@ -16,6 +16,7 @@ from torch.nn.functional import interpolate
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.metrics import psnr
+from pointsplat_ns.system.quantities import seconds_text
 
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras
@@ -70,7 +71,7 @@ class EarlyLook:
         # Time that rises with the number of pixels, from 1 now to ``at_full``.
         rise = (at_full - 1) / max(1 - factor**-2, 1e-9)
         time_left = per_step * sum(1 + rise * (self._factor_at(later) ** -2 - factor**-2) for later in left)
-        CONSOLE.log(f"{speed}: the {len(left):,} steps left take about {duration(time_left)}")
+        CONSOLE.log(f"{speed}: the {len(left):,} steps left take about {seconds_text(time_left)}")
 
     @torch.no_grad()
     def _seconds_to_render(self, factor: int) -> float:
@@ -119,7 +120,7 @@ class EarlyLook:
             return
         cost = time.perf_counter() - start
         self._spent, self._dearest = self._spent + cost, max(self._dearest, cost)
-        elapsed = duration(time.perf_counter() - self._start)
+        elapsed = seconds_text(time.perf_counter() - self._start)
         CONSOLE.log(f"{path}: a held-out photo and its render after {elapsed}, {float(psnr(image, photo)):.1f} dB")
 
     @torch.no_grad()
@@ -153,16 +154,3 @@ def picture_steps(count: int) -> list[int]:
         steps.append(after)
         after *= 2
     return [*steps, count]
-
-
-def duration(seconds: float) -> str:
-    """A duration in words.
-
-    Example:
-        >>> duration(8.4), duration(200), duration(7000), duration(100_000)
-        ('8 s', '3 min', '1 h 57 min', '27 h 47 min')
-    """
-    minutes = round(seconds / 60)
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
