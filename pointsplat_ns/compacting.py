@@ -22,7 +22,7 @@ from pointsplat_ns.views import Views
 if TYPE_CHECKING:
     from pointsplat_ns.compression.compact import Compacted
     from pointsplat_ns.compression.photo_repair import Photos
-    from pointsplat_ns.compression.quality import Quality
+    from pointsplat_ns.compression.quality import FullSizePsnr
     from pointsplat_ns.compression.requests import Effort
     from pointsplat_ns.tradeoff.targets import Targets
 
@@ -57,7 +57,7 @@ def prune_source(
     up: str | None = None,
     progress: bool | Progress = False,
     compared: bool = False,
-) -> tuple[Gaussians, Gaussians, float, Quality | None]:
+) -> tuple[Gaussians, Gaussians, float, FullSizePsnr | None]:
     """Read a scene and prune it; notes are logged. Arguments as of :func:`pointsplat_ns.prune`.
 
     Returns:
@@ -77,7 +77,7 @@ def prune_source(
     return dense, pruned.scene, seconds, quality
 
 
-def _quality(dense: Gaussians, scene: Gaussians, views: Callable[[], Views]) -> Quality | None:
+def _quality(dense: Gaussians, scene: Gaussians, views: Callable[[], Views]) -> FullSizePsnr | None:
     """How close a scene is to the dense scene at full size; None if there is no place to look from."""
     from pointsplat_ns.compression.quality import quality_of
 
@@ -96,7 +96,7 @@ def compact_source(
     up: str | None = None,
     progress: bool | Progress = False,
     compared: bool = False,
-) -> tuple[Gaussians, Compacted, Quality | None]:
+) -> tuple[Gaussians, Compacted, FullSizePsnr | None]:
     """Read a scene and compact it, or search for a goal; verdicts and notes are logged. Arguments as of
     :func:`pointsplat_ns.compact`. A search uses only the method and the refiner of the request, and decides the rest.
 

@@ -15,7 +15,7 @@ from pointsplat_ns.cli.scene_options import file_bytes
 from pointsplat_ns.system.quantities import seconds_text
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.quality import Quality
+    from pointsplat_ns.compression.quality import FullSizePsnr
     from pointsplat_ns.gaussians import Gaussians
 
 Json = Annotated[bool, tyro.conf.arg(name="json")]
@@ -67,7 +67,13 @@ def scene_result(before: int | None, scene: Gaussians, seconds: float, where: Pa
 
 
 def print_result(
-    by: str, also: list[str], before: int, scene: Gaussians, seconds: float, where: Path | None, quality: Quality | None
+    by: str,
+    also: list[str],
+    before: int,
+    scene: Gaussians,
+    seconds: float,
+    where: Path | None,
+    quality: FullSizePsnr | None,
 ) -> None:
     """Print what was done by a method and ``also`` after it (refined, repaired), counts, size of the file (that of a
     PLY in a dry run) and time, and how close the result is to the dense scene."""

@@ -10,7 +10,7 @@ from pointsplat_ns.cli.scene_options import Megabytes, Output, Poses, Resolution
 from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
-    from pointsplat_ns.tradeoff.points import Quality, Tradeoff
+    from pointsplat_ns.tradeoff.points import ImageMetrics, Tradeoff
 
 
 def tradeoff(
@@ -120,5 +120,5 @@ def _print_table(found: Tradeoff) -> None:
     )
 
 
-def _psnr(quality: Quality | None) -> str:
+def _psnr(quality: ImageMetrics | None) -> str:
     return "-" if quality is None else f"{quality.psnr:.2f}"

@@ -14,7 +14,7 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import UNITS, content_box, content_size, in_units, thinned
 from pointsplat_ns.looking.poses import views_of
-from pointsplat_ns.looking.search import Search
+from pointsplat_ns.looking.search import ViewSearch
 from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces, log_widths, photo_places
@@ -110,7 +110,7 @@ def views_about(
     generator = torch.Generator().manual_seed(seed)
 
     def found(inside: bool, photos: PhotoPlaces | None, count: int) -> Tensor:
-        search = Search(fine, widths, surface, box, inside, width, height, generator, photos, settings)
+        search = ViewSearch(fine, widths, surface, box, inside, width, height, generator, photos, settings)
         return search.views(count)
 
     near_photos = torch.empty(0, 4, 4, dtype=torch.float64)

@@ -22,7 +22,7 @@ from pointsplat_ns.rasterizer import pixels_of
 
 
 @dataclass
-class Search:
+class ViewSearch:
     """A search for views, all of it in units of the content."""
 
     fine: Gaussians | None

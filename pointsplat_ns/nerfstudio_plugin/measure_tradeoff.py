@@ -24,7 +24,7 @@ from pointsplat_ns.tradeoff.measuring import Subject
 from pointsplat_ns.tradeoff.outputs import OUTPUTS
 from pointsplat_ns.tradeoff.points import Tradeoff
 from pointsplat_ns.tradeoff.sweep import Options, Sweep, removed_without_points
-from pointsplat_ns.tradeoff.targets import Search, targets_of
+from pointsplat_ns.tradeoff.targets import TargetSearch, targets_of
 from pointsplat_ns.views import Views
 
 
@@ -107,7 +107,7 @@ def measure_tradeoff(
             return sweep.run()
         sweep.measure_dense()
         try:
-            found = Search(
+            found = TargetSearch(
                 targets, sweep.plan, sweep.measure, sweep.measurer.cut_psnr, sweep.measurer.judged_views.where
             ).run()
         except BudgetError:

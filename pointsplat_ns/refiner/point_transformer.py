@@ -98,7 +98,7 @@ class Block(nn.Module):
         return x * (torch.rand(len(x), 1, device=x.device, dtype=x.dtype) < keep).to(x.dtype).div_(keep)
 
 
-class Stage(nn.Module):
+class TransformerStage(nn.Module):
     """Blocks of one level, each along another curve."""
 
     def __init__(self, channels: int, heads: int, config: RefinerConfig, drop_paths: list[float]):
@@ -151,7 +151,7 @@ class PointTransformer(nn.Module):
 
         rates = _split(_ramp(config.drop_path, sum(config.enc_depths)), config.enc_depths)
         self.encoder = nn.ModuleList(
-            Stage(c, h, config, r) for c, h, r in zip(enc, config.enc_heads, rates, strict=True)
+            TransformerStage(c, h, config, r) for c, h, r in zip(enc, config.enc_heads, rates, strict=True)
         )
         self.pools = nn.ModuleList(Pool(a, b, norm) for a, b in zip(enc[:-1], enc[1:], strict=True))
 
@@ -160,7 +160,7 @@ class PointTransformer(nn.Module):
             Unpool(a, skip, out, norm) for a, skip, out in zip((*dec, enc[-1])[1:], enc[:-1], dec, strict=True)
         )
         self.decoder = nn.ModuleList(
-            Stage(c, h, config, r) for c, h, r in zip(dec, config.dec_heads, rates, strict=True)
+            TransformerStage(c, h, config, r) for c, h, r in zip(dec, config.dec_heads, rates, strict=True)
         )
 
     def forward(self, x: Tensor, structure: Structure) -> Tensor:

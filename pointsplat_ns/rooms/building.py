@@ -32,7 +32,7 @@ class Light:
 
 
 @dataclass(frozen=True)
-class Frame:
+class LocalFrame:
     """Coordinates of a piece of furniture: origin (x, y) on the floor, turned about z by quarter turns."""
 
     x: float
@@ -49,10 +49,10 @@ class Frame:
         x, y, z = self.vector(p)
         return self.x + x, self.y + y, z
 
-    def moved(self, x: float, y: float, quarters: int = 0) -> "Frame":
+    def moved(self, x: float, y: float, quarters: int = 0) -> "LocalFrame":
         """A frame whose origin is (x, y) in this one, turned further by so many quarters."""
         x, y, _ = self.point((x, y, 0))
-        return Frame(x, y, self.quarters + quarters)
+        return LocalFrame(x, y, self.quarters + quarters)
 
 
 @dataclass
@@ -65,7 +65,7 @@ class Builder:
 
     def box(
         self,
-        at: Frame,
+        at: LocalFrame,
         center: Vec,
         size: Vec,
         material: Material,

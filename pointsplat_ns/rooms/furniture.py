@@ -9,7 +9,7 @@ import colorsys
 import numpy as np
 
 from pointsplat_ns.rooms import textures as tex
-from pointsplat_ns.rooms.building import Builder, Frame, Material, Vec
+from pointsplat_ns.rooms.building import Builder, LocalFrame, Material, Vec
 
 
 def hsv(hue: float, saturation: float, value: float) -> tex.Color:
@@ -42,7 +42,7 @@ class Palette:
         return Material(tex.plain(self.accent(), 0.15, 0.12), gloss=0.35, shininess=float(self.rng.uniform(40, 110)))
 
 
-def bookshelf(b: Builder, at: Frame, pal: Palette, size: Vec) -> None:
+def bookshelf(b: Builder, at: LocalFrame, pal: Palette, size: Vec) -> None:
     w, d, h = size
     b.box(at, (0, 0.01, h / 2), (w, 0.02, h), pal.wood)
     for side in (-1, 1):
@@ -57,7 +57,7 @@ def bookshelf(b: Builder, at: Frame, pal: Palette, size: Vec) -> None:
         b.box(at, ((fill - w) / 2 + 0.03, 0.4 * d, 0.03 + k * step + tall / 2), (fill, 0.72 * d, tall), row)
 
 
-def sofa(b: Builder, at: Frame, pal: Palette, size: Vec) -> None:
+def sofa(b: Builder, at: LocalFrame, pal: Palette, size: Vec) -> None:
     w, d, h = size
     cloth, third = pal.cloth(), (w - 0.36) / 3
     b.box(at, (0, d / 2, 0.19), (w, d, 0.38), cloth)
@@ -69,7 +69,7 @@ def sofa(b: Builder, at: Frame, pal: Palette, size: Vec) -> None:
         b.box(at, (k * third, 0.11 + d / 2, 0.44), (third - 0.02, d - 0.24, 0.12), cloth if k else pal.cloth())
 
 
-def wardrobe(b: Builder, at: Frame, pal: Palette, size: Vec) -> None:
+def wardrobe(b: Builder, at: LocalFrame, pal: Palette, size: Vec) -> None:
     w, d, h = size
     b.box(at, (0, d / 2, h / 2), (w, d, h), pal.wood)
     for side in (-1, 1):
@@ -77,7 +77,7 @@ def wardrobe(b: Builder, at: Frame, pal: Palette, size: Vec) -> None:
         b.box(at, (side * 0.06, d + 0.03, h / 2), (0.02, 0.04, 0.2), pal.metal, round=True)
 
 
-def dresser(b: Builder, at: Frame, pal: Palette, size: Vec) -> None:
+def dresser(b: Builder, at: LocalFrame, pal: Palette, size: Vec) -> None:
     w, d, h = size
     front = pal.lacquer()
     b.box(at, (0, d / 2, h / 2), (w, d, h), pal.wood)
@@ -88,7 +88,7 @@ def dresser(b: Builder, at: Frame, pal: Palette, size: Vec) -> None:
     ornament(b, at.moved(-w / 4, d / 2), pal, h)
 
 
-def television(b: Builder, at: Frame, pal: Palette, size: Vec) -> None:
+def television(b: Builder, at: LocalFrame, pal: Palette, size: Vec) -> None:
     w, d, h = size
     b.box(at, (0, d / 2, h / 2), (w, d, h), pal.wood)
     black = Material(tex.plain((0.02, 0.02, 0.02)), gloss=0.3, shininess=90.0)
@@ -97,7 +97,7 @@ def television(b: Builder, at: Frame, pal: Palette, size: Vec) -> None:
     b.box(at, (0, 0.14, h + 0.03), (0.3 * w, 0.16, 0.06), black)
 
 
-def chair(b: Builder, at: Frame, pal: Palette) -> None:
+def chair(b: Builder, at: LocalFrame, pal: Palette) -> None:
     """Its back is at -y."""
     cloth = pal.cloth()
     for x, y in ((-0.18, -0.18), (-0.18, 0.18), (0.18, -0.18), (0.18, 0.18)):
@@ -106,7 +106,7 @@ def chair(b: Builder, at: Frame, pal: Palette) -> None:
     b.box(at, (0, -0.2, 0.72), (0.42, 0.04, 0.46), cloth)
 
 
-def table(b: Builder, at: Frame, pal: Palette, size: Vec) -> None:
+def table(b: Builder, at: LocalFrame, pal: Palette, size: Vec) -> None:
     w, d, h = size
     b.box(at, (0, 0, h - 0.02), (w, d, 0.04), pal.wood)
     for x, y in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
@@ -115,7 +115,7 @@ def table(b: Builder, at: Frame, pal: Palette, size: Vec) -> None:
     b.box(at, (-0.22 * w, 0.05, h + 0.02), (0.3, 0.22, 0.04), Material(tex.picture(pal.accents), gloss=0.1))
 
 
-def ornament(b: Builder, at: Frame, pal: Palette, z: float) -> None:
+def ornament(b: Builder, at: LocalFrame, pal: Palette, z: float) -> None:
     """A bowl of fruit or a striped ball, standing at height ``z``."""
     if pal.rng.random() < 0.4:
         ball = Material(tex.stripes([pal.accent(), pal.pale], 0.07), gloss=0.4, shininess=90.0)
@@ -126,7 +126,7 @@ def ornament(b: Builder, at: Frame, pal: Palette, z: float) -> None:
         b.box(at, (x, y, z + 0.11), (0.1, 0.1, 0.1), fruit, round=True)
 
 
-def plant(b: Builder, at: Frame, pal: Palette, size: Vec) -> None:
+def plant(b: Builder, at: LocalFrame, pal: Palette, size: Vec) -> None:
     w, d, h = size
     pot = Material(tex.stripes([pal.accent(), pal.pale], 0.06, horizontal=True), gloss=0.2)
     b.box(at, (0, d / 2, 0.18), (0.6 * w, 0.6 * w, 0.36), pot)

@@ -9,7 +9,7 @@ import numpy as np
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.rooms import furniture as fur
 from pointsplat_ns.rooms import textures as tex
-from pointsplat_ns.rooms.building import Builder, Frame, Light, Material, Vec
+from pointsplat_ns.rooms.building import Builder, Light, LocalFrame, Material, Vec
 from pointsplat_ns.rooms.furniture import Palette, hsv
 from pointsplat_ns.rooms.light import BakedRoom, bake
 from pointsplat_ns.rooms.raycast import Solids
@@ -64,12 +64,12 @@ class _Plan:
     taken: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
     """Lower and upper corners of boxes."""
 
-    def wall(self, number: int) -> tuple[Frame, float]:
+    def wall(self, number: int) -> tuple[LocalFrame, float]:
         """The middle of a wall's foot, facing into the room, and the wall's length."""
         x, y = ((0, -0.5), (0.5, 0), (0, 0.5), (-0.5, 0))[number]
-        return Frame(x * self.size[0], y * self.size[1], number), self.size[number % 2]
+        return LocalFrame(x * self.size[0], y * self.size[1], number), self.size[number % 2]
 
-    def take(self, at: Frame, size: Vec, low: float = 0.0) -> bool:
+    def take(self, at: LocalFrame, size: Vec, low: float = 0.0) -> bool:
         """Take a box of a size that stands at a frame's origin, its foot at a height; False if it is not free."""
         ends = np.array([at.point((x, y, low)) for x in (-size[0] / 2, size[0] / 2) for y in (0.02, size[1])])
         lower, upper = ends.min(0), ends.max(0) + (0, 0, size[2])
@@ -78,7 +78,7 @@ class _Plan:
         self.taken.append((lower, upper))
         return True
 
-    def spot(self, size: Vec, low: float = 0.0, tries: int = 60) -> Frame | None:
+    def spot(self, size: Vec, low: float = 0.0, tries: int = 60) -> LocalFrame | None:
         """Take space for something of a size at a random wall; None if none was free."""
         for _ in range(tries):
             at, length = self.wall(int(self.rng.integers(4)))
@@ -90,7 +90,7 @@ class _Plan:
 
 def _furnish(b: Builder, pal: Palette, plan: _Plan) -> None:
     """Build the shell of a room, windows, a door, furniture, pictures and a lamp."""
-    rng, height, middle = plan.rng, plan.size[2], Frame(0, 0, 0)
+    rng, height, middle = plan.rng, plan.size[2], LocalFrame(0, 0, 0)
     b.box(middle, (0, 0, height / 2), plan.size, Material(tex.plain(pal.wall, 0.07, 0.4)))
     darker = (0.78 * pal.wall[0], 0.78 * pal.wall[1], 0.78 * pal.wall[2])
     b.materials[int(rng.integers(4))] = Material(tex.stripes([pal.wall, darker], float(rng.uniform(0.08, 0.16))))
@@ -112,7 +112,7 @@ def _furnish(b: Builder, pal: Palette, plan: _Plan) -> None:
         b.box(spot, (0.38, 0.06, 1.0), (0.12, 0.06, 0.04), pal.metal, round=True)
     _middle(b, pal, plan)
     # Width, depth and height of a piece, and the height to leave free above it, metres.
-    pieces: list[tuple[Callable[[Builder, Frame, Palette, Vec], None], Vec, float]] = [
+    pieces: list[tuple[Callable[[Builder, LocalFrame, Palette, Vec], None], Vec, float]] = [
         (fur.sofa, (1.9, 0.88, 0.8), 0.0),
         (fur.television, (1.4, 0.4, 0.45), 0.7) if rng.random() < 0.5 else (fur.wardrobe, (1.1, 0.55, 2.0), 0.0),
         (fur.dresser, (1.0, 0.45, 0.8), 0.2),
@@ -131,7 +131,7 @@ def _furnish(b: Builder, pal: Palette, plan: _Plan) -> None:
             b.box(spot, (0, 0.015, low + h / 2), (w, 0.03, h), pal.wood, front=art)
 
 
-def _window(b: Builder, at: Frame, pal: Palette, width: float) -> None:
+def _window(b: Builder, at: LocalFrame, pal: Palette, width: float) -> None:
     """A window of a width, 1.25 m high, with a sill and curtains."""
     height, z = 1.25, 0.95 + 1.25 / 2
     panes = Material(tex.window(hsv(0.57, 0.45, 0.9), hsv(0.28, 0.45, 0.55), 2 if width < 1.5 else 3), emission=1.7)
@@ -149,7 +149,7 @@ def _window(b: Builder, at: Frame, pal: Palette, width: float) -> None:
 def _middle(b: Builder, pal: Palette, plan: _Plan) -> None:
     """The rug, and on it a table with chairs, a low table or nothing."""
     rng, (width, depth, _) = plan.rng, plan.size
-    at = Frame(float(rng.uniform(-0.25, 0.25)), float(rng.uniform(-0.2, 0.2)), 0)
+    at = LocalFrame(float(rng.uniform(-0.25, 0.25)), float(rng.uniform(-0.2, 0.2)), 0)
     rug = (float(rng.uniform(0.35, 0.45)) * width, float(rng.uniform(0.35, 0.45)) * depth, 0.012)
     b.box(at, (0, 0, 0.006), rug, Material(tex.rug([pal.accent(), pal.pale, pal.accents[3]])))
     kind = int(rng.integers(3))

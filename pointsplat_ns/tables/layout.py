@@ -24,7 +24,7 @@ from pointsplat_ns.tables.ways import (
     cell_key,
     published,
 )
-from pointsplat_ns.tradeoff.points import Quality
+from pointsplat_ns.tradeoff.points import ImageMetrics
 
 NO_FIGURE = "-"
 """Text of an empty cell."""
@@ -173,7 +173,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:g} %"
 
 
-def _quality(quality: Quality | None) -> Row:
+def _quality(quality: ImageMetrics | None) -> Row:
     if quality is None:
         return (NO_FIGURE,) * 3
     psnr = NO_FIGURE if math.isinf(quality.psnr) else f"{quality.psnr:.2f}"

@@ -12,7 +12,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.tables.cells import CELLS, About, Cell, CellJournal
 from pointsplat_ns.tables.ways import DENSE_WAY, PROTOCOL
 from pointsplat_ns.tradeoff.machine import is_busy
-from pointsplat_ns.tradeoff.points import Point, Quality
+from pointsplat_ns.tradeoff.points import ImageMetrics, Point
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +35,9 @@ class SceneCells:
 class Mean:
     """A row of a table: means over the scenes with this cell."""
 
-    photos: Quality | None
+    photos: ImageMetrics | None
     """None unless all scenes have held-out photos."""
-    renders: Quality
+    renders: ImageMetrics
     gaussians: float
     megabytes: float
     fps: float | None
@@ -119,9 +119,9 @@ def read_groups(folder: Path) -> list[Group]:
     )
 
 
-def _mean(values: Sequence[Quality]) -> Quality:
+def _mean(values: Sequence[ImageMetrics]) -> ImageMetrics:
     lpips = [value.lpips for value in values if value.lpips is not None]
-    return Quality(
+    return ImageMetrics(
         fmean(value.psnr for value in values),
         fmean(value.ssim for value in values),
         fmean(lpips) if len(lpips) == len(values) else None,

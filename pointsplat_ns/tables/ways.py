@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pointsplat_ns.pruning.scores import DEFAULT_OPACITY_WEIGHT
-from pointsplat_ns.tradeoff.points import Quality
+from pointsplat_ns.tradeoff.points import ImageMetrics
 from pointsplat_ns.tradeoff.settings import DENSE, Repair
 
 
@@ -219,14 +219,14 @@ _TABLES: dict[int, dict[tuple[str, float], tuple[float, ...]]] = {
 """PSNR (dB), SSIM and LPIPS on ScanNet++, then on Replica, by table, way and share."""
 
 
-def published(table: int, dataset: str, way: str, share: float) -> Quality | None:
+def published(table: int, dataset: str, way: str, share: float) -> ImageMetrics | None:
     """The paper's figures of a row, by its way and share, against held-out photos in table 1, 3 or 4; None if there are
     none.
 
     Example:
         >>> published(1, "Replica", "pointsplat", 0.1)
-        Quality(psnr=29.81, ssim=0.902, lpips=0.276)
+        ImageMetrics(psnr=29.81, ssim=0.902, lpips=0.276)
     """
     figures = _TABLES[table].get((way, share), ())
     found = {"ScanNet++": figures[:3], "Replica": figures[3:]}.get(dataset)
-    return Quality(*found) if found else None
+    return ImageMetrics(*found) if found else None

@@ -16,15 +16,15 @@ from pointsplat_ns.tradeoff.machine import busy_note
 from pointsplat_ns.tradeoff.measuring import Measurer, Subject, through_file
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import Repair, Setting
-from pointsplat_ns.tradeoff.targets import Search, Targets
+from pointsplat_ns.tradeoff.targets import Targets, TargetSearch
 from pointsplat_ns.tradeoff.walk import Plan
 
 
 def find_scene(
     subject: Subject, targets: Targets, by: str, repairs: tuple[Repair, ...], progress: Progress
 ) -> Compacted:
-    """Find the cheapest scene that meets targets by :class:`~pointsplat_ns.tradeoff.targets.Search`, with a method of
-    pruning and the repairs to try.
+    """Find the cheapest scene that meets targets by :class:`~pointsplat_ns.tradeoff.targets.TargetSearch`, with a
+    method of pruning and the repairs to try.
 
     Scenes are judged in the views of :func:`~pointsplat_ns.tradeoff.measuring.views_to_judge`, after writing and
     reading them in the subject's format. Frames are timed only for a target of time. Ctrl-C ends the search with the
@@ -47,7 +47,7 @@ def find_scene(
     kind = format_to_write(subject.suffix)
     size = kind.bytes_of or _estimated(subject)
     plan = Plan(len(dense), dense.sh_degree, (by,), repairs)
-    search = Search(
+    search = TargetSearch(
         targets, plan, measure, measurer.cut_psnr, measurer.judged_views.where, size, exact=kind.suffix == ".ply"
     )
     interrupted = False

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 from pointsplat_ns.io.files import bytes_text
-from pointsplat_ns.tradeoff.points import Point, Quality, speed_of
+from pointsplat_ns.tradeoff.points import ImageMetrics, Point, speed_of
 
 Reference = Literal["renders", "photos"]
 """Targets of a comparison: renders of the dense scene, or held-out photos."""
@@ -24,7 +24,7 @@ PHOTO_PSNR = 27.0
 
 def quality_of(point: Point, reference: Reference, metric: Metric) -> float | None:
     """A metric of a point; None where it was not measured. A PSNR may be infinite."""
-    quality: Quality | None = point.against_dense if reference == "renders" else point.against_photos
+    quality: ImageMetrics | None = point.against_dense if reference == "renders" else point.against_photos
     value = None if quality is None else getattr(quality, metric)
     return None if value is None or math.isnan(value) else value
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io.files import one_line, read_text, write_json
-from pointsplat_ns.tradeoff.points import Point, Quality
+from pointsplat_ns.tradeoff.points import ImageMetrics, Point
 from pointsplat_ns.tradeoff.settings import DENSE, Setting, setting_of
 
 if TYPE_CHECKING:
@@ -150,10 +150,10 @@ def restored_point(values: dict[str, Any]) -> Point:
     return point
 
 
-def _quality(values: dict[str, Any] | None) -> Quality | None:
+def _quality(values: dict[str, Any] | None) -> ImageMetrics | None:
     if values is None:
         return None
-    quality = Quality(**{**values, "psnr": math.inf if values["psnr"] is None else values["psnr"]})
+    quality = ImageMetrics(**{**values, "psnr": math.inf if values["psnr"] is None else values["psnr"]})
     check_types(quality)
     return quality
 
@@ -176,7 +176,7 @@ def _has_type(value: Any, kind: str) -> bool:
         "str": lambda value: isinstance(value, str),
         "int": _is_count,
         "float": lambda value: type(value) in (int, float) and not math.isnan(value),
-        "Quality": lambda value: isinstance(value, Quality),
+        "ImageMetrics": lambda value: isinstance(value, ImageMetrics),
         "Point": lambda value: isinstance(value, Point),
         "tuple[int, ...]": lambda value: isinstance(value, tuple) and all(map(_is_count, value)),
     }

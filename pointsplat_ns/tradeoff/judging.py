@@ -27,7 +27,7 @@ from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.threads import fixed_threads
 from pointsplat_ns.tradeoff.machine import OtherPrograms
-from pointsplat_ns.tradeoff.points import Quality, picture_path
+from pointsplat_ns.tradeoff.points import ImageMetrics, picture_path
 from pointsplat_ns.views import View, Views, spread_indices
 
 ROUNDS = 3
@@ -74,8 +74,8 @@ class Judged:
     """Figures of a scene; each is a field of :class:`~pointsplat_ns.tradeoff.points.Point`. Times are NaN where nothing
     was timed."""
 
-    against_dense: Quality
-    against_photos: Quality | None
+    against_dense: ImageMetrics
+    against_photos: ImageMetrics | None
     frame_ms: float = math.nan
     frame_ms_low: float = math.nan
     frame_ms_high: float = math.nan
@@ -122,13 +122,13 @@ class Judge:
         if self.photos is not None:
             pairs = [(image, photo.to(image)) for image, photo in zip(images, self.photos, strict=True)]
             similarity = fmean(float(ssim(*pair)) for pair in pairs)
-            photos = Quality(fmean(finite_psnr(*pair) for pair in pairs), similarity, self._perceived(pairs))
+            photos = ImageMetrics(fmean(finite_psnr(*pair) for pair in pairs), similarity, self._perceived(pairs))
         times = self._time(scene) if timed else {}
         progress(1.0)
         close = self.reference.closeness_of(images)
         assert close.ssim is not None
         perceived = self._perceived(zip(images, self.reference.renders, strict=True))
-        return Judged(Quality(min(close.psnr, MOST_PSNR), close.ssim, perceived), photos, **times)
+        return Judged(ImageMetrics(min(close.psnr, MOST_PSNR), close.ssim, perceived), photos, **times)
 
     def _time(self, scene: Gaussians) -> dict[str, float]:
         """The times of :class:`Judged`: ``dense_ms`` times the measured ratio of frames."""

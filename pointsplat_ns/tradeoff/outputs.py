@@ -11,7 +11,7 @@ from pointsplat_ns.io.discovery import SWEEP_NAME
 from pointsplat_ns.io.files import replacing, write_json
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.tradeoff.front import Cost, Reference, pareto_front, quality_of
-from pointsplat_ns.tradeoff.points import Point, Quality, Tradeoff, speed_of
+from pointsplat_ns.tradeoff.points import ImageMetrics, Point, Tradeoff, speed_of
 from pointsplat_ns.tradeoff.settings import DENSE
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def _row(point: Point, dense: Point) -> dict[str, object]:
     for field in dataclasses.fields(point):
         value = getattr(point, field.name)
         if field.name in ("against_dense", "against_photos"):
-            for number in dataclasses.fields(Quality):
+            for number in dataclasses.fields(ImageMetrics):
                 row[f"{field.name}_{number.name}"] = None if value is None else getattr(value, number.name)
         else:
             row[field.name] = value

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 
 @dataclass(frozen=True)
-class Quality:
+class ImageMetrics:
     """Means over views: PSNR in dB, SSIM, and LPIPS, which is None without its weights."""
 
     psnr: float
@@ -36,10 +36,10 @@ class Point:
     """Kind of repair: ``none``, ``refiner``, ``quick``, ``thorough``."""
     bytes: int
     """Size of the file."""
-    against_dense: Quality
+    against_dense: ImageMetrics
     """Quality against renders of the dense scene. The PSNR is that of the mean squared error of all views, over the
     pixels that the dense scene covers; the dense scene's own is infinite."""
-    against_photos: Quality | None
+    against_photos: ImageMetrics | None
     """Quality against held-out photos; None where there are none."""
     frame_ms: float
     """Time of one frame, in milliseconds: the dense scene's time at the start of the sweep, times the median over views

@@ -95,7 +95,7 @@ class Found:
     """One line of text: the figures of the scene, and the targets that the next cheaper scene misses."""
 
 
-class Search:
+class TargetSearch:
     """Searches for the cheapest scene that meets targets.
 
     Args:
@@ -268,7 +268,11 @@ class Search:
             obstacles.append(f"takes {ms:.3g} ms a frame, over --target-ms {self.targets.ms:g}")
         obstacle = " and ".join(obstacles) or "is either too large or too slow"
         limits = replace(self.targets, db=None)
-        within = Search(limits, self.plan, self._point, self._cut_psnr, self.where, self._size, self._exact).run().point
+        within = (
+            TargetSearch(limits, self.plan, self._point, self._cut_psnr, self.where, self._size, self._exact)
+            .run()
+            .point
+        )
         return (
             f"no scene meets all targets: what reaches {self.targets.db:g} dB {obstacle}; the best within the limits "
             f"has {within.against_dense.psnr:.2f} dB ({within.label}), so ask for less than that"

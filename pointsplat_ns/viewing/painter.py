@@ -15,13 +15,13 @@ from torch import Tensor
 
 from pointsplat_ns.io.files import logger, one_line
 from pointsplat_ns.viewing.film import Wipe, to_uint8, with_line
-from pointsplat_ns.viewing.schedule import Schedule, Step
+from pointsplat_ns.viewing.schedule import DrawingStep, Schedule
 from pointsplat_ns.viewing.selection import ReducedScene
 from pointsplat_ns.views import RasterizeMode, View
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class ViewerCamera:
     """A camera without a size of pictures."""
 
     viewmat: Tensor  # [4, 4] float64, world to camera, OpenCV axes
@@ -46,7 +46,7 @@ class Camera:
 class PictureRequest:
     """Request for a picture: camera, scenes and dividing line."""
 
-    camera: Camera
+    camera: ViewerCamera
     first: ReducedScene
     second: ReducedScene | None
     line: float
@@ -54,7 +54,7 @@ class PictureRequest:
     modes: tuple[RasterizeMode, RasterizeMode]
 
 
-def paint(step: Step[PictureRequest]) -> Iterator[np.ndarray | None]:
+def paint(step: DrawingStep[PictureRequest]) -> Iterator[np.ndarray | None]:
     """Draw a step band by band: yield None after each band, and the picture (H, W, 3) uint8 at the end."""
     request, view = step.request, step.request.camera.view(step.side)
     first = request.first.part(step.share)
@@ -77,8 +77,8 @@ class Painter:
 
     def __init__(
         self,
-        show: Callable[[np.ndarray, Step[PictureRequest], float], None],
-        paint: Callable[[Step[PictureRequest]], Iterator[np.ndarray | None]] = paint,
+        show: Callable[[np.ndarray, DrawingStep[PictureRequest], float], None],
+        paint: Callable[[DrawingStep[PictureRequest]], Iterator[np.ndarray | None]] = paint,
     ):
         self.schedule: Schedule[PictureRequest] = Schedule()
         """The steps to draw."""
@@ -104,7 +104,7 @@ class Painter:
                 self.schedule.done(step, seconds)
                 self._show(pixels, step, seconds)
 
-    def _drawn(self, step: Step[PictureRequest]) -> np.ndarray | None:
+    def _drawn(self, step: DrawingStep[PictureRequest]) -> np.ndarray | None:
         """The picture of a step; None if the step is outdated."""
         pixels = None
         for part in self._paint(step):
@@ -164,7 +164,7 @@ class Watcher:
             self._changed.notify_all()
         self._painter.close(timeout)
 
-    def _show(self, pixels: np.ndarray, step: Step[PictureRequest], seconds: float) -> None:
+    def _show(self, pixels: np.ndarray, step: DrawingStep[PictureRequest], seconds: float) -> None:
         from PIL import Image
 
         stream = io.BytesIO()

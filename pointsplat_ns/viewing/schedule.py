@@ -33,7 +33,7 @@ SCHEDULE = ScheduleSettings()
 
 
 @dataclass(frozen=True)
-class Step(Generic[Request]):
+class DrawingStep(Generic[Request]):
     """A picture to draw."""
 
     request: Request
@@ -81,7 +81,7 @@ class Schedule(Generic[Request]):
             self._closed = True
             self._changed.notify_all()
 
-    def next(self, timeout: float | None = None) -> Step[Request] | None:
+    def next(self, timeout: float | None = None) -> DrawingStep[Request] | None:
         """The next step to draw; waits until there is one, at most ``timeout`` seconds. None after that, or if the
         schedule is closed."""
         end = None if timeout is None else time.monotonic() + timeout
@@ -99,11 +99,11 @@ class Schedule(Generic[Request]):
                 self._changed.wait(min(waits) if waits else None)
             return None
 
-    def outdated(self, step: Step[Request]) -> bool:
+    def outdated(self, step: DrawingStep[Request]) -> bool:
         """Whether to stop drawing a step."""
         return self._closed or (step.number != self._number and not step.moving)
 
-    def done(self, step: Step[Request], seconds: float) -> None:
+    def done(self, step: DrawingStep[Request], seconds: float) -> None:
         """Report that a step was drawn, and its duration."""
         with self._changed:
             if step.moving:
@@ -122,13 +122,15 @@ class Schedule(Generic[Request]):
         """The smallest effort: the smallest side, and the smallest share of the Gaussians."""
         return (self._moving_side() / self._full_side) ** 2 * SCHEDULE.least_share
 
-    def _step(self) -> Step[Request]:
+    def _step(self) -> DrawingStep[Request]:
         assert self._request is not None
         full, smallest = self._full_side, self._moving_side()
         if self._drawn == 0:
             side = min(max(round(full * math.sqrt(self._effort)), smallest), full)
             share = max(min(self._effort / (smallest / full) ** 2, 1.0), SCHEDULE.least_share)
-            return Step(self._request, self._number, side, share, moving=True, whole=side == full and share == 1.0)
+            return DrawingStep(
+                self._request, self._number, side, share, moving=True, whole=side == full and share == 1.0
+            )
         # A picture of a middle size comes first if the full side is more than four times the side of the last picture.
         side = full if full <= 4.0 * self._drawn or self._drawn > smallest else round(math.sqrt(full * smallest))
-        return Step(self._request, self._number, side, 1.0, moving=False, whole=side == full)
+        return DrawingStep(self._request, self._number, side, 1.0, moving=False, whole=side == full)

@@ -25,7 +25,7 @@ from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pages.flight import KNOWN_VIEWS, FlightFrame
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.system.memory import share_freed_memory
-from pointsplat_ns.viewing.painter import Camera, PictureRequest, Watcher
+from pointsplat_ns.viewing.painter import PictureRequest, ViewerCamera, Watcher
 from pointsplat_ns.viewing.selection import Selection
 from pointsplat_ns.viewing.server import LARGEST, READABLE_NAMES, Answer, Request, Route, Server, received
 from pointsplat_ns.views import RasterizeMode
@@ -104,7 +104,7 @@ class _Stage:
         viewmat[:3, :3], viewmat[:3, 3] = turn, -turn @ place
         share = math.tan(0.5 * min(max(float(camera["fov"]), 0.01), 3.1)) * height / max(width, height)
         near = views.near_plane * self.frame.size / UNITS
-        drawn = Camera(viewmat, 2 * math.atan(share), width / height, views.background, near)
+        drawn = ViewerCamera(viewmat, 2 * math.atan(share), width / height, views.background, near)
         kept = wanted["kept"]
         for selection, percent in zip(self.selections, kept, strict=True):
             if int(percent) != selection.percent:

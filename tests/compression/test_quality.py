@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from making import box_room
-from pointsplat_ns.compression.quality import Quality, quality_of
+from pointsplat_ns.compression.quality import FullSizePsnr, quality_of
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 
@@ -27,7 +27,7 @@ def test_the_figure_is_that_of_whole_pictures_over_covered_pixels(dense):
 
 
 def test_the_quality_is_said_with_the_views_and_their_size(dense):
-    assert str(Quality(31.249, 8, 1920, 1080)) == "31.2 dB PSNR against the dense scene (8 views, 1920 x 1080)"
+    assert str(FullSizePsnr(31.249, 8, 1920, 1080)) == "31.2 dB PSNR against the dense scene (8 views, 1920 x 1080)"
     same = quality_of(dense, dense, sample_views(dense, 1, 64, 48))
     assert str(same) == "no difference from the dense scene (1 view, 64 x 48)"
 

@@ -14,7 +14,7 @@ from torch import Tensor
 import pointsplat_ns as ps
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.pruning import ply_bytes
-from pointsplat_ns.tradeoff.points import Point, Quality, Tradeoff, picture_path
+from pointsplat_ns.tradeoff.points import ImageMetrics, Point, Tradeoff, picture_path
 
 BUDGETS = (("coverage", 0.9), ("coverage", 0.5), ("opacity", 0.6), ("coverage", 0.1))
 SEED = 14
@@ -40,10 +40,10 @@ def photo_like(image: Tensor, generator: torch.Generator) -> Tensor:
     return (image**0.95 + 0.02 * torch.randn(image.shape, generator=generator)).clamp(0, 1)
 
 
-def quality(images: Sequence[Tensor], references: Sequence[Tensor]) -> Quality:
+def quality(images: Sequence[Tensor], references: Sequence[Tensor]) -> ImageMetrics:
     """Means over views. LPIPS is left out: it needs weights."""
     pairs = list(zip(images, references, strict=True))
-    return Quality(
+    return ImageMetrics(
         statistics.fmean(float(ps.psnr(a, b)) for a, b in pairs),
         statistics.fmean(float(ps.ssim(a, b)) for a, b in pairs),
     )

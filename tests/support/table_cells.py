@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pointsplat_ns.tables.cells import BINS, About, Cell, CellJournal
 from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_4, Way, all_cells, cell_key
-from pointsplat_ns.tradeoff.points import Point, Quality
+from pointsplat_ns.tradeoff.points import ImageMetrics, Point
 
 IDENTITY = {"file": "abc", "machine": "a machine", "most views": 3}
 
@@ -31,8 +31,8 @@ def cell(name: str, way: Way, share: float, psnr: float, photos: float | None) -
         sh_degree=3,
         repair="none",
         bytes=round(248_000 * share),
-        against_dense=Quality(psnr, 0.9, 0.1),
-        against_photos=None if photos is None else Quality(photos, 0.8, 0.2),
+        against_dense=ImageMetrics(psnr, 0.9, 0.1),
+        against_photos=None if photos is None else ImageMetrics(photos, 0.8, 0.2),
         frame_ms=10 * share,
         frame_ms_low=9 * share,
         frame_ms_high=12 * share,

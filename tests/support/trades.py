@@ -6,7 +6,7 @@ import math
 from bisect import bisect_left
 from dataclasses import dataclass, field
 
-from pointsplat_ns.tradeoff.points import Point, Quality
+from pointsplat_ns.tradeoff.points import ImageMetrics, Point
 from pointsplat_ns.tradeoff.settings import DENSE, Naming, Setting
 
 
@@ -28,8 +28,8 @@ def point(
         sh_degree=setting.sh_degree,
         repair=setting.repair,
         bytes=setting.bytes,
-        against_dense=Quality(psnr, 0.9),
-        against_photos=None if photos is None else Quality(photos, 0.8, 0.2),
+        against_dense=ImageMetrics(psnr, 0.9),
+        against_photos=None if photos is None else ImageMetrics(photos, 0.8, 0.2),
         frame_ms=ms,
         frame_ms_low=0.9 * ms,
         frame_ms_high=1.2 * ms,

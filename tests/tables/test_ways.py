@@ -19,7 +19,7 @@ from pointsplat_ns.tables.ways import (
     published,
     selected,
 )
-from pointsplat_ns.tradeoff.points import Quality
+from pointsplat_ns.tradeoff.points import ImageMetrics
 
 CELLS = all_cells(PROTOCOL.shares)
 
@@ -63,11 +63,11 @@ def test_every_figure_of_the_paper_has_a_row():
 @pytest.mark.parametrize(
     "table, dataset, way, share, expected",
     [
-        (1, "ScanNet++", "dense", 1.0, Quality(29.73, 0.925, 0.165)),
-        (1, "Replica", "splatformer", 0.1, Quality(8.37, 0.388, 0.677)),
-        (1, "ScanNet++", "pup-tuned", 0.3, Quality(30.85, 0.931, 0.172)),
-        (3, "Replica", "pointsplat-0.9", 0.1, Quality(26.58, 0.882, 0.290)),
-        (4, "ScanNet++", "pointsplat-iii", 0.1, Quality(22.76, 0.847, 0.385)),
+        (1, "ScanNet++", "dense", 1.0, ImageMetrics(29.73, 0.925, 0.165)),
+        (1, "Replica", "splatformer", 0.1, ImageMetrics(8.37, 0.388, 0.677)),
+        (1, "ScanNet++", "pup-tuned", 0.3, ImageMetrics(30.85, 0.931, 0.172)),
+        (3, "Replica", "pointsplat-0.9", 0.1, ImageMetrics(26.58, 0.882, 0.290)),
+        (4, "ScanNet++", "pointsplat-iii", 0.1, ImageMetrics(22.76, 0.847, 0.385)),
         (4, "Replica", "pointsplat-iii", 0.1, None),
         (1, "Replica", "merge", 0.1, None),
     ],

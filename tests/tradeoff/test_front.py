@@ -19,7 +19,7 @@ from pointsplat_ns.tradeoff.front import (
     psnr_within,
     recommend,
 )
-from pointsplat_ns.tradeoff.points import Point, Quality
+from pointsplat_ns.tradeoff.points import ImageMetrics, Point
 from pointsplat_ns.tradeoff.settings import DENSE, Setting
 from trades import point
 
@@ -30,8 +30,8 @@ def made(key: str, ms: float, renders: float, photos: float, size: int = 100) ->
     setting = replace(ALL, count=size) if key == "dense" else Setting(size, 3)
     return replace(
         point(setting, renders, ms, photos, of=100, key=key),
-        against_dense=Quality(renders, 1 - 1 / renders),
-        against_photos=Quality(photos, 1 - 1 / photos, 1 / photos),
+        against_dense=ImageMetrics(renders, 1 - 1 / renders),
+        against_photos=ImageMetrics(photos, 1 - 1 / photos, 1 / photos),
         bytes=size,
     )
 
@@ -56,7 +56,7 @@ def test_front_is_what_nothing_beats_cheapest_first(cost, reference, metric):
 
 
 def test_front_takes_the_better_of_two_that_cost_the_same_and_the_first_of_two_equal_ones():
-    better = replace(POINTS[4], key="better", against_dense=Quality(31.0, 0.97))
+    better = replace(POINTS[4], key="better", against_dense=ImageMetrics(31.0, 0.97))
     again = replace(POINTS[4], key="again")
     assert keys(pareto_front([*POINTS, again], "bytes", "renders", "psnr"))[0] == "tenth"
     front = keys(pareto_front([*POINTS, better], "bytes", "renders", "psnr"))
@@ -65,7 +65,7 @@ def test_front_takes_the_better_of_two_that_cost_the_same_and_the_first_of_two_e
 
 def test_front_leaves_out_points_without_the_metric():
     assert pareto_front(POINTS, "bytes", "renders", "lpips") == []
-    unknown = replace(POINTS[4], against_dense=Quality(math.nan, 0.9))
+    unknown = replace(POINTS[4], against_dense=ImageMetrics(math.nan, 0.9))
     assert keys(pareto_front([*POINTS[:4], unknown], "bytes", "renders", "psnr")) == ["third", "half", "dense"]
 
 

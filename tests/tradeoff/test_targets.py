@@ -6,13 +6,15 @@ import pytest
 
 from pointsplat_ns.compression.budget_search import BUDGETS
 from pointsplat_ns.errors import BudgetError
-from pointsplat_ns.tradeoff.targets import Search, Targets
+from pointsplat_ns.tradeoff.targets import Targets, TargetSearch
 from pointsplat_ns.tradeoff.walk import Plan
 from trades import Trade
 
 
-def search(trade: Trade, targets: Targets, repairs=("none", "quick")) -> Search:
-    return Search(targets, Plan(trade.count, trade.sh_degree, repairs=repairs), trade.measure, trade.cut, "3 views")
+def search(trade: Trade, targets: Targets, repairs=("none", "quick")) -> TargetSearch:
+    return TargetSearch(
+        targets, Plan(trade.count, trade.sh_degree, repairs=repairs), trade.measure, trade.cut, "3 views"
+    )
 
 
 @pytest.mark.parametrize("db", [20.0, 27.0, 30.5, 36.0, 41.0])

@@ -14,8 +14,8 @@ import torch
 import pointsplat_ns as ps
 from making import ball
 from pointsplat_ns.viewing.film import to_uint8
-from pointsplat_ns.viewing.painter import Camera, Painter, PictureRequest, paint
-from pointsplat_ns.viewing.schedule import Step
+from pointsplat_ns.viewing.painter import Painter, PictureRequest, ViewerCamera, paint
+from pointsplat_ns.viewing.schedule import DrawingStep
 from pointsplat_ns.viewing.selection import ReducedScene
 
 
@@ -25,21 +25,21 @@ def scene() -> ps.Gaussians:
 
 
 @pytest.fixture(scope="module")
-def camera(scene) -> Camera:
+def camera(scene) -> ViewerCamera:
     view = ps.sample_views(scene, 1)[0]
     fov = 2 * math.atan(0.5 * view.height / float(view.K[1, 1]))
-    return Camera(view.viewmat, fov, 4 / 3, view.background, view.near_plane)
+    return ViewerCamera(view.viewmat, fov, 4 / 3, view.background, view.near_plane)
 
 
 def request(
-    camera: Camera, scene: ps.Gaussians, second: ps.Gaussians | None = None, line: float = 1.0
+    camera: ViewerCamera, scene: ps.Gaussians, second: ps.Gaussians | None = None, line: float = 1.0
 ) -> PictureRequest:
     other = None if second is None else ReducedScene(second, "all")
     return PictureRequest(camera, ReducedScene(scene, "all"), other, line, ("classic", "classic"))
 
 
-def step(of: PictureRequest, side: int = 400, moving: bool = False) -> Step[PictureRequest]:
-    return Step(of, 1, side, 1.0, moving, whole=not moving)
+def step(of: PictureRequest, side: int = 400, moving: bool = False) -> DrawingStep[PictureRequest]:
+    return DrawingStep(of, 1, side, 1.0, moving, whole=not moving)
 
 
 def test_picture_is_the_render_of_its_view(scene, camera):
@@ -61,17 +61,17 @@ def test_two_scenes_meet_at_the_line(scene, camera):
 
 @pytest.mark.parametrize(("aspect", "size"), [(2.0, (200, 100)), (0.5, (100, 200)), (1e9, (200, 10)), (0.0, (10, 200))])
 def test_picture_has_the_shape_of_the_window(aspect, size, camera):
-    view = Camera(camera.viewmat, camera.fov, aspect, camera.background, camera.near_plane).view(200)
+    view = ViewerCamera(camera.viewmat, camera.fov, aspect, camera.background, camera.near_plane).view(200)
     assert (view.width, view.height) == size
     assert 2 * math.atan(0.5 * view.height / float(view.K[1, 1])) == pytest.approx(camera.fov)
 
 
 def test_newer_request_ends_a_whole_picture_between_two_bands(scene, camera):
-    shown: queue.Queue[Step[PictureRequest]] = queue.Queue()
+    shown: queue.Queue[DrawingStep[PictureRequest]] = queue.Queue()
     in_band, moved = threading.Event(), threading.Event()
     given_up = []
 
-    def slow(of: Step[PictureRequest]) -> Iterator[np.ndarray | None]:
+    def slow(of: DrawingStep[PictureRequest]) -> Iterator[np.ndarray | None]:
         if not of.moving and of.number == 1:
             try:
                 while True:
@@ -99,7 +99,7 @@ def test_newer_request_ends_a_whole_picture_between_two_bands(scene, camera):
 def test_camera_without_a_place_does_not_end_the_drawing(scene, camera, caplog):
     shown: queue.Queue[np.ndarray] = queue.Queue()
     painter = Painter(lambda pixels, of, seconds: shown.put(pixels))
-    nowhere = Camera(torch.full((4, 4), torch.nan, dtype=torch.float64), 1.0, 1.0, torch.zeros(3), 0.01)
+    nowhere = ViewerCamera(torch.full((4, 4), torch.nan, dtype=torch.float64), 1.0, 1.0, torch.zeros(3), 0.01)
     try:
         painter.schedule.submit(request(nowhere, scene))
         assert shown.get(timeout=30).shape == (1, 1, 3)

@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from pointsplat_ns.viewing import schedule as module
-from pointsplat_ns.viewing.schedule import SCHEDULE, Schedule, ScheduleSettings, Step
+from pointsplat_ns.viewing.schedule import SCHEDULE, DrawingStep, Schedule, ScheduleSettings
 
 
 class Clock:
@@ -28,7 +28,7 @@ def schedule(clock) -> Schedule[str]:
     return Schedule(960, clock)
 
 
-def drawn(schedule: Schedule[str], clock: Clock, seconds: float = SCHEDULE.moving_seconds) -> Step[str]:
+def drawn(schedule: Schedule[str], clock: Clock, seconds: float = SCHEDULE.moving_seconds) -> DrawingStep[str]:
     """Draw the next step in so many seconds."""
     step = schedule.next(timeout=0)
     assert step is not None
@@ -37,7 +37,7 @@ def drawn(schedule: Schedule[str], clock: Clock, seconds: float = SCHEDULE.movin
     return step
 
 
-def rest(schedule: Schedule[str], clock: Clock, seconds: float = SCHEDULE.moving_seconds) -> list[Step[str]]:
+def rest(schedule: Schedule[str], clock: Clock, seconds: float = SCHEDULE.moving_seconds) -> list[DrawingStep[str]]:
     """Draw everything that a camera at rest gets."""
     clock.now += SCHEDULE.rest_seconds
     steps = []
@@ -99,7 +99,7 @@ def test_whole_picture_has_all_gaussians_and_comes_soon_where_it_is_cheap(schedu
 def test_time_of_moving_pictures_settles(schedule, clock, whole, fixed):
     """A picture takes some time for its pixels and some for its Gaussians, however small it is."""
 
-    def seconds(step: Step[str]) -> float:
+    def seconds(step: DrawingStep[str]) -> float:
         return whole * (fixed * step.share + (1 - fixed) * (step.side / 960) ** 2 * step.share)
 
     taken = []
@@ -142,7 +142,7 @@ def test_close_wakes_who_waits_and_outdates_what_is_drawn(schedule):
 def test_who_waits_is_woken_by_a_request_and_by_rest(monkeypatch):
     monkeypatch.setattr(module, "SCHEDULE", ScheduleSettings(rest_seconds=0.05))
     schedule: Schedule[str] = Schedule(960)
-    found: list[Step[str]] = []
+    found: list[DrawingStep[str]] = []
 
     def draw() -> None:
         while (step := schedule.next()) is not None:

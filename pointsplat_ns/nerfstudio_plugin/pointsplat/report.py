@@ -28,7 +28,7 @@ PHOTOS = "photos"
 """The reference of evaluations that name none."""
 
 
-class Block(NamedTuple):
+class ReportBlock(NamedTuple):
     """A scene, or an average over scenes."""
 
     name: str
@@ -158,21 +158,23 @@ def _note(results: dict[str, Any]) -> str:
     return f"no LPIPS: {results['lpips_note']}" if "lpips_note" in results else ""
 
 
-def _blocks(results: dict[str, Any], part: dict[str, Any]) -> list[Block]:
+def _blocks(results: dict[str, Any], part: dict[str, Any]) -> list[ReportBlock]:
     """The scenes of a part, then the averages if there are several scenes."""
     reference = part.get("reference", PHOTOS)
     blocks = [
-        Block(name, "yes" if scene["seen_in_training"] else "never", scene)
+        ReportBlock(name, "yes" if scene["seen_in_training"] else "never", scene)
         for name, scene in results["scenes"].items()
         if scene.get("reference", PHOTOS) == reference
     ]
     if len(blocks) > 1:
         averages = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
-        blocks += [Block("average", seen, part[key], is_average=True) for seen, key in averages if key in part]
+        blocks += [ReportBlock("average", seen, part[key], is_average=True) for seen, key in averages if key in part]
     return blocks
 
 
-def write_report_page(title: str, settings: str, parts: list[tuple[str, list[Block]]], note: str, output: Path) -> None:
+def write_report_page(
+    title: str, settings: str, parts: list[tuple[str, list[ReportBlock]]], note: str, output: Path
+) -> None:
     """Write one self-contained HTML file with charts and a table of every scene and variant.
 
     Args:
@@ -201,7 +203,7 @@ def write_report_page(title: str, settings: str, parts: list[tuple[str, list[Blo
         part.write_text(text, encoding="utf-8")
 
 
-def _chart(name: str, title: str, digits: int, blocks: list[Block]) -> dict[str, Any] | None:
+def _chart(name: str, title: str, digits: int, blocks: list[ReportBlock]) -> dict[str, Any] | None:
     """One row of marks for each block, with places in percent of the width; None where nothing was measured."""
     values = [_value(block.variants[variant][name]) for block in blocks for variant in VARIANTS]
     known = [value for value in values if value is not None]
@@ -234,7 +236,7 @@ def _ticks(low: float, high: float) -> list[float]:
     return [number * step for number in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
-def _rows(block: Block) -> dict[str, Any]:
+def _rows(block: ReportBlock) -> dict[str, Any]:
     """A block for the table: one row of texts for each variant."""
     values = block.variants
     cells = {v: [number_text(_value(values[v][name]), digits) for name, _, digits in COLUMNS] for v in VARIANTS}

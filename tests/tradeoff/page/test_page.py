@@ -23,7 +23,7 @@ from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.tradeoff import page
 from pointsplat_ns.tradeoff import page as page_module
 from pointsplat_ns.tradeoff.page import write_page
-from pointsplat_ns.tradeoff.points import Quality, flight_path, picture_path
+from pointsplat_ns.tradeoff.points import ImageMetrics, flight_path, picture_path
 from sweeps import room_views
 
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(1)>\"'&</title>"
@@ -125,7 +125,7 @@ def header_of(path: Path) -> list[str]:
 
 def test_table_says_what_is_infinite_and_what_is_unknown(make_page, sweep):
     first, second, *others = sweep[0].points
-    unknown = replace(second, against_photos=None, against_dense=Quality(math.nan, 0.9))
+    unknown = replace(second, against_photos=None, against_dense=ImageMetrics(math.nan, 0.9))
     text = make_page(points=(first, unknown, *others)).read_text("utf-8")
     rows = dict(re.findall(r'<tr data-key="([^"]*)">(.*?)</tr>', text, flags=re.DOTALL))
     assert '<td data-value="inf">identical</td>' in rows["dense"]
