@@ -23,19 +23,19 @@ from pointsplat_ns.nerfstudio_plugin.dataset_views import training_photos
 
 @dataclass(frozen=True)
 class CpuBudget(PhotoBudget):
-    """Training until this process has used a number of CPU seconds."""
+    """Training for a number of CPU seconds."""
 
-    until: float = 0.0
+    cpu_seconds: float = 0.0
     started: float = 0.0
 
     @property
     def empty(self) -> bool:
-        """Whether none are left."""
-        return self.started >= self.until
+        """Whether there are none."""
+        return self.cpu_seconds <= 0
 
     def share_done(self, steps: int, seconds: float) -> float:
-        """Used share of the CPU seconds since the training began."""
-        return (time.process_time() - self.started) / (self.until - self.started)
+        """Used share of the CPU seconds."""
+        return (time.process_time() - self.started) / self.cpu_seconds
 
 
 def main(
@@ -49,14 +49,14 @@ def main(
 
     Args:
         by: the score.
-        seconds: CPU seconds of this process in all.
+        seconds: CPU seconds of the training.
         run: the run.
         keep: number of Gaussians.
         output: the PLY to write.
     """
     dense, views = read_source(run, None, None)
     pruned = prune_scene(dense, PruneRequest(keep, by), views).scene
-    budget = CpuBudget(until=seconds, started=time.process_time())
+    budget = CpuBudget(cpu_seconds=seconds, started=time.process_time())
     trained = photo_repair(pruned, dense, training_photos(run), views, budget)
     print(f"{trained.steps} steps: {trained.before:.2f} -> {trained.after:.2f} dB in photos that no step used")
     ps.save(trained.scene, output)

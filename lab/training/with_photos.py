@@ -6,9 +6,9 @@
 
 A dense scene is trained by ``ns-train splatfacto-cpu``, and made smaller by each way. The results are compared with the
 held-out photos, at the size of the photos. Each way is a process of its own, whose CPU seconds count, with starting and
-reading. ``compact --photos`` says how many seconds the others get: pruning by a score and
-training on photos for as long; training from the start with a cap for as long, and for as long as the dense training
-and ``compact --photos`` together. Finished rows and trainings are not repeated.
+reading. ``compact --photos`` says how many seconds the others get: training on photos after pruning by a score takes as
+long; so does a training with a cap from the start, and a second one takes as long as the dense training besides.
+Finished rows are not measured again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from pointsplat_ns.nerfstudio_plugin.running import SCENE_METHOD, run_folder
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.programs import run_measured
 
-DENSE, CAP_SHORT, CAP_LONG = "dense", "cap, as long as compact --photos", "cap, as long as both"
+DENSE, CAP_SHORT, CAP_LONG = "dense", "cap, short", "cap, long"
 """Names of the dense scene and of trainings with a cap: without and with the seconds of the dense training."""
 
 COMPACTED = "compact --photos"
@@ -48,8 +48,8 @@ WAYS: dict[str, list[str]] = {
 }
 """What users of the program give to make a run smaller, but for the run and the budget."""
 
-SCORES = {"lightgaussian": "LightGaussian's score, trained on", "pup": "PUP-3DGS's score, trained on"}
-"""Methods of prune that training on photos follows, and the names of these ways."""
+SCORES = {"lightgaussian": "LightGaussian, trained on", "pup": "PUP-3DGS, trained on"}
+"""Scores of prune that training on photos follows, and the names of these ways."""
 
 METHODS = (DENSE, *WAYS, *SCORES.values(), CAP_SHORT, CAP_LONG)
 """All ways, in the order of the tables."""

@@ -26,10 +26,12 @@ of the training with a cap are chosen on them.
 - CPU s are CPU seconds of a process on one thread, with starting, reading and writing. "With dense" adds those of the
   dense training, which all ways need but the training with a cap.
 - `{COMPACTED}` merges, repairs and trains on the training photos for 400 steps.
-- "{SCORES["lightgaussian"]}" and "{SCORES["pup"]}" drop Gaussians by `prune --by`, and train the rest on the photos as
-  `{COMPACTED}` does, until they have used as many CPU seconds. The methods' own schedules are longer.
-- "cap" is `ns-train splatfacto-cpu --pipeline.model.max-gs-num` from the start. "{CAP_SHORT}" has about the CPU seconds
-  of `{COMPACTED}` alone, "{CAP_LONG}" those of the dense training too.
+- "{SCORES["lightgaussian"]}" and "{SCORES["pup"]}" keep the Gaussians with the highest scores and train
+  them on the photos as `{COMPACTED}` does, for as many CPU seconds as `{COMPACTED}` takes in all. The methods' own
+  schedules are longer.
+- "cap" is `ns-train splatfacto-cpu --pipeline.model.max-gs-num` from the start. "{CAP_SHORT}" takes about the CPU
+  seconds of `{COMPACTED}`; "{CAP_LONG}" those of `{COMPACTED}` and of the dense training.
+- The machine was busy: CPU seconds of equal work differ by up to a half.
 - OpenSplat's `--max-gaussians` is not measured.
 """
 
