@@ -43,7 +43,7 @@ class CleaningSettings:
     """Maximum number of views for comparisons with the dense scene."""
 
 
-SETTINGS = CleaningSettings()
+CLEANING = CleaningSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +139,7 @@ def clean_scene(dense: Gaussians, at_least: int, views: ViewSource, progress: Pr
 def _reference(dense: Gaussians, views: ViewSource) -> DenseReference | None:
     """Renders of the dense scene; None if there are no views."""
     try:
-        return DenseReference(dense, views.scored(SETTINGS.checked_views))
+        return DenseReference(dense, views.scored(CLEANING.checked_views))
     except DataError:
         return None
 
@@ -172,15 +172,15 @@ def _views_all_around(scene: Gaussians) -> Views:
     none."""
     # Without SH, so that places do not depend on where photos were taken.
     without_sh = scene.replace(features_rest=scene.features_rest[:, :0])
-    places = invert_rigid(sample_views(without_sh, SETTINGS.places, seed=SETTINGS.seed).viewmats)[:, :3, 3]
+    places = invert_rigid(sample_views(without_sh, CLEANING.places, seed=CLEANING.seed).viewmats)[:, :3, 3]
     rotations = _six_directions().to(places)
     viewmats = torch.eye(4).to(places).repeat(len(places), 6, 1, 1)
     viewmats[..., :3, :3] = rotations
     viewmats[..., :3, 3] = -torch.einsum("dij,pj->pdi", rotations, places)
-    half = SETTINGS.side / 2  # a field of view of 90 degrees
+    half = CLEANING.side / 2  # a field of view of 90 degrees
     K = torch.tensor([[half, 0.0, half], [0.0, half, half], [0.0, 0.0, 1.0]])
     viewmats = viewmats.flatten(0, 1)
-    return Views(viewmats, K.repeat(len(viewmats), 1, 1), SETTINGS.side, SETTINGS.side, torch.zeros(3))
+    return Views(viewmats, K.repeat(len(viewmats), 1, 1), CLEANING.side, CLEANING.side, torch.zeros(3))
 
 
 def _six_directions() -> Tensor:

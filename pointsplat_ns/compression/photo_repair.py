@@ -51,7 +51,7 @@ class PhotoSettings:
     """Longer side of the pictures of a step, about, pixels: of larger photos every k-th pixel is taken."""
 
 
-SETTINGS = PhotoSettings()
+PHOTO_REPAIR = PhotoSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,21 +101,21 @@ def photo_repair(
     if len(photos) < 2:
         raise DataError(f"{len(photos)} photos to train on; expected at least two, one of them to compare with")
     run, checked = Steps(budget), 0
-    unseen = list(range(0, len(photos), SETTINGS.unseen_every))[: SETTINGS.most_unseen]
+    unseen = list(range(0, len(photos), PHOTO_REPAIR.unseen_every))[: PHOTO_REPAIR.most_unseen]
     used = sorted({*range(len(photos))} - {*unseen})
     best, before = scene, _psnr(scene, photos, unseen)
     after = before
 
     def compare(scene: Gaussians) -> None:
         nonlocal best, after, checked
-        if int(run.done * SETTINGS.checks) > checked:
-            checked = int(run.done * SETTINGS.checks)
+        if int(run.done * PHOTO_REPAIR.checks) > checked:
+            checked = int(run.done * PHOTO_REPAIR.checks)
             if (psnr := _psnr(scene, photos, unseen)) > after:
                 best, after = scene, psnr
 
-    adam = Adam(scene, AdamSettings(faster=SETTINGS.faster))
+    adam = Adam(scene, AdamSettings(faster=PHOTO_REPAIR.faster))
     examples = _examples(photos, used, dense, views)
-    scenes = optimised(scene, adam, examples, lambda _: (rate_factor(run.done, SETTINGS.last_factor), None))
+    scenes = optimised(scene, adam, examples, lambda _: (rate_factor(run.done, PHOTO_REPAIR.last_factor), None))
     run.take(scenes, compare, progress)
     return PhotoRepaired(best, before, after, len(used), len(unseen), run.count, run.seconds, run.interrupted)
 
@@ -125,7 +125,7 @@ def _psnr(scene: Gaussians, photos: Photos, indices: list[int]) -> float:
     """Mean PSNR in some photos, dB, in every k-th of their pixels."""
     psnrs = []
     for index in indices:
-        view, photo, mask = every_kth_pixel(photos[index], SETTINGS.side, scene.device)
+        view, photo, mask = every_kth_pixel(photos[index], PHOTO_REPAIR.side, scene.device)
         apart, counted = render(scene, view).double() - photo, 1.0
         if mask is not None:
             apart, counted = apart * mask, float(mask.double().mean())
@@ -138,8 +138,8 @@ def _examples(photos: Photos, used: list[int], dense: Gaussians, views: ViewSour
     generator, others = random.Random(0), views.sampled()
     order = (index for _ in counted() for index in generator.sample(used, len(used)))
     for step in counted(1):
-        if step % SETTINGS.dense_every:
-            yield every_kth_pixel(photos[next(order)], SETTINGS.side, dense.device, generator)
+        if step % PHOTO_REPAIR.dense_every:
+            yield every_kth_pixel(photos[next(order)], PHOTO_REPAIR.side, dense.device, generator)
         else:
             view = next(others)
             with torch.no_grad():

@@ -13,7 +13,7 @@ from torch import Tensor
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.threads import most_threads
 
-CHUNK = 1 << 17
+QUERIES_AT_ONCE = 1 << 17
 """Number of points asked for at once, to save memory."""
 
 LANES = 8
@@ -90,7 +90,7 @@ def _others_by_scipy(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
     tree = cKDTree(array, balanced_tree=False)
     near = torch.full((n, k), -1, dtype=torch.int32)
     ranks = list(range(1, min(k + 1, n) + 1))
-    for these in torch.arange(n).split(CHUNK):
+    for these in torch.arange(n).split(QUERIES_AT_ONCE):
         _, found = tree.query(array[these[0] : these[-1] + 1], k=ranks, workers=most_threads())
         indices = torch.from_numpy(found)
         # The point itself is the first, or, among coincident ones, anywhere or missing: the first takes its place.
@@ -119,7 +119,7 @@ def nearest_of(points: Tensor, queries: Tensor, near: Tensor, k: int, compiled: 
 
     tree = cKDTree(points.numpy(), balanced_tree=False)
     found = torch.empty(len(queries), k, dtype=torch.int32)
-    for rows in torch.arange(len(queries)).split(CHUNK):
+    for rows in torch.arange(len(queries)).split(QUERIES_AT_ONCE):
         indices = tree.query(queries[rows].numpy(), k=list(range(1, k + 1)), workers=most_threads())[1]
         found[rows] = torch.from_numpy(indices).to(torch.int32)
     return found

@@ -46,7 +46,7 @@ LIMITS = PathLimits()
 
 
 FPS = 24.0
-LONGEST_SIDE = 960
+FILM_SIDE = 960
 """Largest longer side of pictures from the poses of photos, without a given size, pixels."""
 
 
@@ -152,7 +152,7 @@ def _frames(seconds: float, fps: float) -> int:
 
 def _reduced(views: Views) -> tuple[int, int]:
     """Width and height of photos, their longer side at most 960 pixels."""
-    factor = min(1.0, LONGEST_SIDE / max(views.width, views.height))
+    factor = min(1.0, FILM_SIDE / max(views.width, views.height))
     return round(views.width * factor), round(views.height * factor)
 
 

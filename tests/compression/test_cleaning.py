@@ -30,7 +30,7 @@ ROOM, PLANTED = 2500, 12
 def few_places() -> Iterator[None]:
     """Four places instead of sixteen, in a quarter of the time, for tests of what does not depend on their number."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cleaning, "SETTINGS", CleaningSettings(places=4))
+        patch.setattr(cleaning, "CLEANING", CleaningSettings(places=4))
         yield
 
 
@@ -102,7 +102,7 @@ def test_nothing_of_a_clean_room_is_touched():
 
 @pytest.mark.parametrize("kind", JUNK)
 def test_what_is_behind_walls_goes_and_no_view_changes(kind, room, views, monkeypatch):
-    monkeypatch.setattr(cleaning, "SETTINGS", CleaningSettings())
+    monkeypatch.setattr(cleaning, "CLEANING", CleaningSettings())
     scene = Gaussians.cat([room, JUNK[kind]])
     assert junk_of(scene) == ([], list(range(ROOM, ROOM + PLANTED)))
     assert DenseReference(scene, views).psnr(room)[0] == math.inf  # views that chose nothing

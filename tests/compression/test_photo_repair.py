@@ -66,7 +66,7 @@ def test_unseen_photos_and_held_back_pixels_are_in_no_step(hollow_ball, pruned, 
 
 def test_the_scene_that_is_best_in_unseen_photos_is_the_result(hollow_ball, pruned, photos, monkeypatch):
     """Steps that are far too long harm: the scene stays as it was."""
-    monkeypatch.setattr(module, "SETTINGS", dataclasses.replace(module.SETTINGS, faster=1e4, last_factor=1.0))
+    monkeypatch.setattr(module, "PHOTO_REPAIR", dataclasses.replace(module.PHOTO_REPAIR, faster=1e4, last_factor=1.0))
     trained = photo_repair(pruned, hollow_ball, photos, FewViews(hollow_ball), PhotoBudget("quick"))
     assert trained.scene is pruned and trained.after == trained.before
 
