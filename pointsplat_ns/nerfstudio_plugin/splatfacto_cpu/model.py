@@ -190,7 +190,14 @@ class SplatfactoCpuModel(SplatfactoModel):
         return torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in values.items()})
 
     def load_state_dict(self, dict: Mapping[str, Any], **kwargs):  # type: ignore[override]  # as nerfstudio's
-        """As Splatfacto's, but ignores the LPIPS weights in nerfstudio's own checkpoints."""
+        """As Splatfacto's, but ignores the LPIPS weights in nerfstudio's own checkpoints. Raises PointSplatError if it
+        has more Gaussians than the cap."""
+        num, most = len(dict["gauss_params.means" if "gauss_params.means" in dict else "means"]), self.config.cap
+        if most is not None and num > most:
+            raise PointSplatError(
+                f"the checkpoint has {num:,} Gaussians; expected at most {most:,}, as --pipeline.model.max-gs-num "
+                "says; pointsplat compact makes a run smaller"
+            )
         return super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
 
     def get_training_callbacks(

@@ -190,6 +190,15 @@ def test_a_capped_training_that_was_cut_off_goes_on_as_if_it_had_not_been(capped
     assert equal(dict(resumed.pipeline.model.gauss_params), dict(whole.pipeline.model.gauss_params))
 
 
+def test_a_training_does_not_go_on_from_more_gaussians_than_its_cap(capped_config, run_training, tmp_path):
+    config = capped_config(tmp_path, 3, 200)
+    run_training(config)
+    rest = capped_config(tmp_path / "rest", 3, 199)
+    rest.load_dir = config.get_checkpoint_dir()
+    with pytest.raises(PointSplatError, match="has 200 Gaussians; expected at most 199, as --pipeline"):
+        run_training(rest)
+
+
 def test_a_capped_training_is_the_same_on_any_number_of_threads(capped_config, run_training, tmp_path):
     means = []
     for threads in (1, 2):
