@@ -21,7 +21,7 @@ def convert(
     scale: float = 1.0,
     original_frame: bool = False,
     spz_version: Literal[3, 4] = 3,
-    spz_sh_bits: tuple[int, int] = (6, 5),
+    spz_sh_bits: tuple[int, int] | None = None,
     force: bool = False,
     json_output: Json = False,
 ) -> None:
@@ -39,7 +39,7 @@ def convert(
         original_frame: for a Splatfacto run: undo nerfstudio's rotation, shift and scale of its data.
         spz_version: version of an .spz file. 4 is newer, and fewer viewers read it.
         spz_sh_bits: bits of SH coefficients in an .spz file, for degree 1 and for the others, up to 8. More bits give a
-            larger file and a better picture.
+            larger file and a better picture. By default 6 and 5; SH from an .spz file stay as they are.
         force: overwrite an existing file.
         json_output: print the result as JSON, and nothing else on standard output.
     """

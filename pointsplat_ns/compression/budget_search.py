@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import Format
+from pointsplat_ns.io.formats.rounding import tolerance_of
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.pruning.sh_bands import cut_sh
 from pointsplat_ns.system.progress import silent
@@ -151,9 +152,13 @@ class BudgetSettings:
     """Usual gain of merged scenes for each e-fold of the count, dB."""
     psnr: SearchSettings = SearchSettings(tolerance=0.1)
     """Search for a PSNR in dB: it ends within 0.1 dB above the target."""
-    size: SearchSettings = SearchSettings(tolerance=-math.log(0.95), tries=3)
+    size: SearchSettings = SearchSettings(tolerance=-math.log(0.95), tries=4)
     """Search for the logarithm of a file's size: it ends at 95 % of the limit. Each try makes a scene, so tries are
     few."""
+    first_bytes: float = 15.0
+    """Bytes of a Gaussian at the first try for a size."""
+    unknown_psnr: float = 30.0
+    """PSNR, in dB, that scenes are taken to have where there are no views to measure it in, for rounding."""
     repaired: SearchSettings = SearchSettings(precision=1.1)
     """Search for PSNR and times of repaired scenes: coarse, because each try makes, repairs and renders a scene."""
 
@@ -174,13 +179,49 @@ class FoundQuality:
     """PSNR in dB by count, for every count tried."""
 
 
+@dataclass(frozen=True)
+class FileLimit:
+    """A limit of the size of a compressed file, and how far the numbers of its scene are rounded to meet it."""
+
+    kind: Format
+    """A format with ``encode``."""
+    most: int
+    """Bytes."""
+    tolerance: float = 0.0
+    """Least tolerance of rounding (:mod:`~pointsplat_ns.io.formats.rounding`)."""
+
+    def bytes_of(self, scene: Gaussians) -> int:
+        """Bytes of a scene's file, without unusable Gaussians."""
+        assert self.kind.encode is not None
+        return len(self.kind.encode(_as_written(scene), silent))
+
+    def rounded(self, scene: Gaussians) -> Gaussians:
+        """A scene rounded as far as its file needs to meet the limit, on its device. It is rounded at least by the
+        tolerance. If it exceeds the limit at eight times that, the last is returned."""
+        if not self.tolerance or self.kind.rounded is None:
+            return scene
+        for step in range(7):
+            smaller = self.kind.rounded(_as_written(scene), self.tolerance * 2 ** (step / 2))
+            if self.bytes_of(smaller) <= self.most:
+                break
+        return smaller.to(scene.device)
+
+
+def _as_written(scene: Gaussians) -> Gaussians:
+    scene = scene.detach().to("cpu", torch.float32)
+    return scene[scene.usable()]
+
+
 @dataclass(frozen=True, eq=False)
 class FoundSize:
     """The largest scene found whose file fits a limit."""
 
     scene: Gaussians
+    """The scene before its numbers are rounded."""
     size: int
-    """Bytes of its file."""
+    """Bytes of its file, rounded."""
+    limit: FileLimit
+    """The limit, and the rounding with which the file meets it."""
     tried: dict[int, int]
     """Bytes by count, for every count tried."""
 
@@ -228,12 +269,23 @@ def smallest_within(
 def largest_within(
     full: Gaussians,
     make: Callable[[int], Gaussians],
-    kind: Format,
-    limit: int,
+    limit: FileLimit,
     progress: Callable[[float], None],
+    psnr_of: Callable[[Gaussians], float] | None = None,
 ) -> FoundSize:
-    """Search for the largest scene of a method whose file, of a compressed format, has at most ``limit`` bytes;
-    ``make`` gives the scene of a count below that of ``full``. Raises BudgetError if not even one Gaussian fits."""
+    """Search for the largest scene of a method whose file meets a limit. The numbers of each scene are rounded by its
+    PSNR, unless all Gaussians fit without.
+
+    Args:
+        full: the largest scene.
+        make: gives the scene of a count below that of ``full``.
+        limit: of the file; its tolerance is not used.
+        progress: called with the share done.
+        psnr_of: gives the PSNR of a scene, dB; None where there are no views.
+
+    Raises:
+        BudgetError: if not even one Gaussian fits.
+    """
     n = len(full)
     tried: dict[int, int] = {}
     best: FoundSize | None = None
@@ -241,26 +293,29 @@ def largest_within(
     def measure(count: int) -> float:
         nonlocal best
         scene = full if count == n else make(count)
-        tried[count] = _size(scene, kind)
-        if tried[count] <= limit:
-            best = FoundSize(scene, tried[count], tried)
+        psnr = BUDGETS.unknown_psnr if psnr_of is None else psnr_of(scene)
+        found = replace(limit, tolerance=tolerance_of(psnr) if limit.kind.rounded else 0.0)
+        small = (
+            _as_written(scene)
+            if limit.kind.rounded is None
+            else limit.kind.rounded(_as_written(scene), found.tolerance)
+        )
+        tried[count] = limit.bytes_of(small)
+        if tried[count] <= limit.most:
+            best = FoundSize(scene, tried[count], found, tried)
+            if count == n and found.tolerance and (size := limit.bytes_of(full)) <= limit.most:
+                best = FoundSize(full, size, replace(limit, tolerance=0.0), tried)
         progress(len(tried) / (len(tried) + 2))
         return math.log(tried[count])
 
-    find_count(measure, math.log(limit), at_least=False, first=n, most=n, slope=1.0, settings=BUDGETS.size)
+    first = round(limit.most / BUDGETS.first_bytes)
+    find_count(measure, math.log(limit.most), at_least=False, first=first, most=n, slope=1.0, settings=BUDGETS.size)
     if best is None:
         raise BudgetError(
-            f"keep is {limit / 1e6:g}MB{kind.suffix}, too small for one Gaussian; expected at least "
+            f"keep is {limit.most / 1e6:g}MB{limit.kind.suffix}, too small for one Gaussian; expected at least "
             f"{tried[1] / 1e6:g}MB"
         )
     return best
-
-
-def _size(scene: Gaussians, kind: Format) -> int:
-    """Bytes of a scene's file, without unusable Gaussians."""
-    assert kind.encode is not None
-    scene = scene.detach().to("cpu", torch.float32)
-    return len(kind.encode(scene[scene.usable()], silent))
 
 
 def needed_sh_degree(dense: Gaussians, views: Views, psnr: float = BUDGETS.sh_psnr) -> tuple[int, float]:

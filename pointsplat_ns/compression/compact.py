@@ -1,5 +1,5 @@
-"""Compacts a scene in three stages: prune, refine, repair. Each change is accepted by comparing renders with those of
-the dense scene."""
+"""Compacts a scene in stages: prune, refine, repair, and round for a file of limited size. Refinement and repair are
+accepted by comparing renders with those of the dense scene."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pointsplat_ns.compression.acceptance import Comparison, Reason, accept_change
+from pointsplat_ns.compression.budget_search import FileLimit
 from pointsplat_ns.compression.photo_repair import PHOTO_REPAIR, PhotoRepaired, Photos, photo_repair
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import repair
@@ -28,7 +29,7 @@ from pointsplat_ns.views import Views
 class Stage:
     """One stage of compaction: its scene and its figures."""
 
-    name: Literal["prune", "refine", "repair", "photos"]
+    name: Literal["prune", "refine", "repair", "photos", "round"]
     scene: Gaussians
     """The scene after the share ``strength`` of the stage; after the whole stage, if it is left out."""
     after: Closeness | None
@@ -66,7 +67,7 @@ class Compacted:
     """
 
     stages: tuple[Stage, ...]
-    """Pruning, then refinement and repair where they were tried. Scenes are on the device of the dense scene."""
+    """Pruning, then refinement, repair and rounding where they were tried. Scenes are on the dense scene's device."""
     notes: tuple[str, ...]
     """Lines of text: SH bands dropped, PSNR reached, origin of the views."""
     reference: DenseReference | None
@@ -197,7 +198,7 @@ def compact_scene(
     need_usable(dense)
     request.check_sh_degree(dense)
     views = views or ViewSource(dense)
-    pruned = prune_scene(dense, request.prune, views, progress)
+    pruned = prune_scene(dense, request.prune, views, progress, rounding=False)
     at_work = dense.to(request.device)
     judge, before, uncompared = None, None, ""
     try:
@@ -213,6 +214,8 @@ def compact_scene(
     stopped = any(stage.interrupted for stage in stages)
     if photos is not None and request.photos is not None and not request.photos.empty and not stopped:
         stages.append(_on_photos(_last_kept(stages), at_work, request.photos, photos, judge, views, progress))
+    if pruned.limit is not None and pruned.limit.tolerance:
+        stages.append(_round(_last_kept(stages), pruned.limit, judge))
     notes = pruned.notes
     if views.origin and views.text not in notes:
         notes = (views.text, *notes)
@@ -273,6 +276,13 @@ def _repair(
     scene = change.scene if change.reason is None else repaired.scene.to(last.scene.device)
     figures = (repaired.steps, repaired.seconds, repaired.interrupted)
     return Stage("repair", scene, change.closeness, last.after, change.strength, change.reason, *figures)
+
+
+def _round(last: Stage, limit: FileLimit, judge: Comparison | None) -> Stage:
+    """The last scene, rounded for a file of limited size."""
+    scene = limit.rounded(last.scene)
+    after = None if judge is None else judge.reference.closeness(scene.to(judge.device))
+    return Stage("round", scene, after, last.after)
 
 
 def _on_photos(

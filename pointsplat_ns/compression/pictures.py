@@ -55,7 +55,13 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str) -> st
     names, titles, scenes = ["dense"], [_title("dense", dense, None)], []
     for stage in result.stages:
         if stage.after is not None:
-            name = {"prune": "pruned", "refine": "refined", "repair": "repaired"}[stage.name]
+            name = {
+                "prune": "pruned",
+                "refine": "refined",
+                "repair": "repaired",
+                "photos": "trained",
+                "round": "rounded",
+            }[stage.name]
             share = f" at {stage.strength:.0%}" if stage.name == "refine" and stage.strength != 1 else ""
             names.append(name + (share if stage.accepted else " (left out)"))
             titles.append(_title(names[-1], stage.scene, stage.after))

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.compression.requests import PruneRequest
-from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.io.formats import format_to_write
+from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.pruning import (
     Megabytes,
@@ -33,6 +34,7 @@ from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
+    from pointsplat_ns.compression.budget_search import FileLimit
     from pointsplat_ns.compression.cleaning import Cleaning
 
 SCORED_VIEWS = 40
@@ -48,13 +50,20 @@ class Pruned:
     """Lines of text: SH bands dropped, PSNR reached, origin of the views."""
     views: Views | None = None
     """The views that merging looked from; None if it did not, or for another method."""
+    limit: FileLimit | None = None
+    """The limit of a compressed file, and the rounding that meets it; None for another budget."""
 
 
 def prune_scene(
-    dense: Gaussians, request: PruneRequest, views: ViewSource | None = None, progress: Progress = silent
+    dense: Gaussians,
+    request: PruneRequest,
+    views: ViewSource | None = None,
+    progress: Progress = silent,
+    rounding: bool = True,
 ) -> Pruned:
-    """Make a scene smaller, by default with views sampled in free space. Raises BudgetError if the budget cannot be
-    met, SceneError if no Gaussian of the scene can be drawn, and DataError if views are needed and there are none."""
+    """Make a scene smaller, by default with views sampled in free space. Its numbers are rounded for the size of a
+    compressed file, unless ``rounding`` is False. Raises BudgetError if the budget cannot be met, SceneError if no
+    Gaussian of the scene can be drawn, and DataError if views are needed and there are none."""
     if len(dense) == 0:
         raise BudgetError(f"keep is {request.keep} but the scene holds no Gaussians; expected at least one")
     need_usable(dense)
@@ -63,7 +72,7 @@ def prune_scene(
     seen: list[Views] = []  # the views of each scene that was merged
     full = _with_sh(dense, request.sh, views, progress, notes)
     count = request.count_of(len(full), full.sh_degree)
-    start, cleaning = full, None
+    start, cleaning, limit = full, None, None
     if request.clean:
         from pointsplat_ns.compression.cleaning import clean_scene
 
@@ -78,7 +87,11 @@ def prune_scene(
         make = _pruner(start, request, views, report, seen)
         if cleaning is not None:
             make = _refilling(make, cleaning, full, len(start))
-        scene = _search(dense, start, make, request, views, functools.partial(progress, "trying counts"), notes)
+        searching = functools.partial(progress, "trying counts")
+        if isinstance(request.budget, Megabytes):
+            scene, limit = _for_size(dense, start, make, request.budget, views, searching, notes)
+        else:
+            scene = _for_psnr(dense, make, request.budget, views, searching, notes)
     if request.fine_tune:
         from pointsplat_ns.compression.fine_tune import fine_tune
 
@@ -87,7 +100,9 @@ def prune_scene(
         notes.append(f"fine-tuned {request.fine_tune} steps against the dense scene's renders in {len(tuned)} views")
     if views.origin:
         notes.insert(0, views.text)
-    return Pruned(scene, tuple(notes), seen[-1] if seen else None)
+    if limit is not None and rounding:
+        scene = limit.rounded(scene)
+    return Pruned(scene, tuple(notes), seen[-1] if seen else None, limit)
 
 
 def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress, notes: list[str]) -> Gaussians:
@@ -147,32 +162,46 @@ def _refilling(
     return lambda count: make(count) if count <= most else cleaning.apply(full, count)
 
 
-def _search(
+def _for_psnr(
     dense: Gaussians,
-    start: Gaussians,
     make: Callable[[int], Gaussians],
-    request: PruneRequest,
+    budget: object,
     views: ViewSource,
     progress: Callable[[float], None],
     notes: list[str],
 ) -> Gaussians:
-    """The scene of a budget that needs a search: a PSNR against ``dense``, or the size of a compressed file. ``start``
-    is the largest scene allowed; ``make`` gives the scene of a count. Adds a line to ``notes``."""
-    budget = request.budget
-    if isinstance(budget, WithinPsnr):
-        from pointsplat_ns.compression.budget_search import smallest_within
+    """The smallest scene with a PSNR against ``dense``; ``make`` gives the scene of a count. Adds a line to
+    ``notes``."""
+    from pointsplat_ns.compression.budget_search import smallest_within
 
-        compared = views.compared()
-        reached = smallest_within(dense, make, compared, budget.value, progress)
-        notes.append(
-            f"{len(reached.tried)} sizes tried: {reached.psnr:.1f} dB PSNR against the dense scene, "
-            f"{reached.worst:.1f} dB in the worst of {len(compared)} views"
-        )
-        return reached.scene
-    from pointsplat_ns.compression.budget_search import largest_within
+    assert isinstance(budget, WithinPsnr)
+    compared = views.compared()
+    reached = smallest_within(dense, make, compared, budget.value, progress)
+    notes.append(
+        f"{len(reached.tried)} sizes tried: {reached.psnr:.1f} dB PSNR against the dense scene, "
+        f"{reached.worst:.1f} dB in the worst of {len(compared)} views"
+    )
+    return reached.scene
 
-    assert isinstance(budget, Megabytes)
-    kind = format_to_write(budget.suffix)
-    found = largest_within(start, make, kind, check_size(budget, len(dense)), progress)
-    notes.append(f"{len(found.tried)} sizes tried: {bytes_text(found.size)} as {kind.name}")
-    return found.scene
+
+def _for_size(
+    dense: Gaussians,
+    start: Gaussians,
+    make: Callable[[int], Gaussians],
+    budget: Megabytes,
+    views: ViewSource,
+    progress: Callable[[float], None],
+    notes: list[str],
+) -> tuple[Gaussians, FileLimit]:
+    """The largest scene whose compressed file has a size, before rounding, and the rounding; ``start`` is the largest
+    scene allowed, ``make`` gives the scene of a count. Adds a line to ``notes``."""
+    from pointsplat_ns.compression.budget_search import FileLimit, largest_within
+
+    limit = FileLimit(format_to_write(budget.suffix), check_size(budget, len(dense)))
+    try:
+        reference = DenseReference(dense, views.compared())
+        found = largest_within(start, make, limit, progress, lambda scene: reference.psnr(scene)[0])
+    except DataError:  # no views
+        found = largest_within(start, make, limit, progress)
+    notes.append(f"{len(found.tried)} sizes tried: {bytes_text(found.size)} as {limit.kind.name}")
+    return found.scene, found.limit

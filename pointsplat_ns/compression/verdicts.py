@@ -25,6 +25,9 @@ def verdict_of(result: Compacted) -> str:
 def _line(stage: Stage, result: Compacted) -> str:
     if stage.photos is not None:
         return _photo_line(stage.photos, kept=stage.accepted)
+    if stage.name == "round":
+        figures = "" if stage.before is None or stage.after is None else f": {_figures(stage.before, stage.after)}"
+        return f"rounded for the size of the file{figures}"
     done = "refined by the network" if stage.name == "refine" else "repaired"
     before, after = stage.before, stage.after
     if stage.reason is Reason.NOT_FINITE:

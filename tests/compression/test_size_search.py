@@ -3,7 +3,7 @@
 import pytest
 
 from making import cloud
-from pointsplat_ns.compression.budget_search import largest_within
+from pointsplat_ns.compression.budget_search import FileLimit, largest_within
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError
@@ -12,8 +12,8 @@ from pointsplat_ns.io.formats.spz import encode_spz
 
 
 def search(full, limit, encode=encode_spz):
-    kind = Format("SPZ", ".spz", encode=encode)
-    return largest_within(full, lambda count: full[:count], kind, limit, lambda share: None)
+    limit = FileLimit(Format("SPZ", ".spz", encode=encode), limit)
+    return largest_within(full, lambda count: full[:count], limit, lambda share: None)
 
 
 def test_the_file_fits_and_is_not_much_smaller():
@@ -49,3 +49,30 @@ def test_prune_counts_bytes_of_the_format_that_is_named(tmp_path, suffix):
     format_to_write(path).write(small, path, lambda what, share: None)
     assert path.stat().st_size <= 20_000
     assert len(small) < 2000 or suffix == ".sog"
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".sog"])
+def test_a_size_rounds_as_far_as_the_scene_has_errors_already(suffix):
+    full, limit = cloud(4000), FileLimit(format_to_write(suffix), 40_000)
+    found = {
+        psnr: largest_within(full, lambda count: full[:count], limit, lambda share: None, lambda scene, psnr=psnr: psnr)
+        for psnr in (25.0, 35.0)
+    }
+    assert found[25.0].limit.tolerance == pytest.approx(10**0.5 * found[35.0].limit.tolerance)
+    assert len(found[25.0].scene) > 1.1 * len(found[35.0].scene)
+    for one in found.values():
+        small = one.limit.rounded(one.scene)
+        assert len(small) == len(one.scene) and 0.9 * 40_000 < one.limit.bytes_of(small) == one.size <= 40_000
+
+
+def test_a_scene_that_has_become_larger_is_rounded_further():
+    scene, kind = cloud(2000), format_to_write(".spz")
+    size = FileLimit(kind, 10**9).bytes_of(kind.rounded(scene, 0.002))
+    limit = FileLimit(kind, int(0.9 * size), tolerance=0.002)
+    assert limit.bytes_of(limit.rounded(scene)) <= limit.most < size
+
+
+def test_all_are_kept_unrounded_if_all_fit():
+    full, limit = cloud(500), FileLimit(format_to_write(".sog"), 10**6)
+    found = largest_within(full, lambda count: full[:count], limit, lambda share: None)
+    assert found.scene is full and found.limit.rounded(full) is full

@@ -38,7 +38,7 @@ def test_the_palette_grows_with_the_scene_up_to_what_an_index_reaches():
 def test_few_rows_are_kept_as_they_are():
     rows = rows_of(500, 9)
     book, index = palette(rows, lambda share: None)
-    assert len(book) == 1024 and torch.equal(book[index], rows)
+    assert len(book) == 512 and torch.equal(book[index], rows)
 
 
 def test_many_rows_are_stood_for_by_near_ones():

@@ -65,36 +65,47 @@ def palette_size(count: int) -> int:
     return size
 
 
-def palette(rows: Tensor, progress: Callable[[float], None], size: int | None = None) -> tuple[Tensor, Tensor]:
-    """Rows that stand for finite float32 rows (N, D), by k-means in levels: rows are split into clusters, each gets its
-    share of the palette, and is split in turn. That takes a small part of the time of k-means with as many clusters at
-    once. ``progress`` is called with the share done; ``size`` is a multiple of 64, by default :func:`palette_size`.
+def palette(
+    rows: Tensor, progress: Callable[[float], None], size: int | None = None, weights: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Rows that stand for finite float32 rows (N, D), by k-means in levels: rows are split into clusters, each gets a
+    part of the palette, as large as its squared error, and is split in turn. That takes a small part of the time of
+    k-means with as many clusters at once. If there are no more different rows than entries, they are the palette.
+
+    Args:
+        rows: finite float32 rows (N, D).
+        progress: called with the share done.
+        size: entries, a multiple of 64, by default :func:`palette_size`.
+        weights: how much the squared error of each row counts (N,), above 0; None for 1.
 
     Returns:
         The palette (P, D), P a multiple of 64, and the index (N,) of the entry for each row.
     """
     n, size = len(rows), size or palette_size(len(rows))
     branches, deepest = 64, 6  # clusters that rows are split into, and how often
-    if n <= size:
-        return torch.cat([rows, rows.new_zeros(size - n, rows.shape[1])]), torch.arange(n)
+    if (found := _different(rows, size)) is not None:
+        return found
+    weights = torch.ones(n) if weights is None else weights.float()
     generator = torch.Generator().manual_seed(0)  # the same input gives the same bits
     book, index = rows.new_zeros(size, rows.shape[1]), torch.empty(n, dtype=torch.int64)
     waiting = [(torch.arange(n), size, 0)]
     used = done = 0
     while waiting:
         members, k, depth = waiting.pop()
-        part = rows[members]
+        part, weight = rows[members], weights[members]
         if k > branches and depth < deepest:
-            sample = part[torch.randperm(len(part), generator=generator)[:_SAMPLE]]
-            of = _assign(part, _means(sample, branches, generator))
+            sample = torch.randperm(len(part), generator=generator)[:_SAMPLE]
+            centres = _means(part[sample], weight[sample], branches, generator)
+            of = _assign(part, centres)
             counts = torch.bincount(of, minlength=branches)
             groups = members[of.argsort(stable=True)].split(counts.tolist())
-            share = _apportion(counts, k).tolist()
+            error = weight.double() * (part - centres[of]).double().square().sum(dim=1)
+            share = _apportion(counts, error.new_zeros(branches).index_add_(0, of, error), k).tolist()
             waiting += [(group, own, depth + 1) for group, own in zip(groups, share, strict=True) if own]
             continue
         # Rows that clusters do not tell apart, as where nearly all are equal, are cut into pieces of one size.
         if k <= branches:
-            centres = _means(part, k, generator)
+            centres = _means(part, weight, k, generator)
             of = _assign(part, centres)
         else:
             of = _piece_of(part, k)
@@ -115,10 +126,28 @@ def _piece_of(rows: Tensor, k: int) -> Tensor:
     return pieces
 
 
-def _apportion(counts: Tensor, size: int) -> Tensor:
-    """``size`` entries shared out in proportion to counts: at least one where there are members, never more."""
-    share = torch.minimum((counts.double() * size / counts.sum()).floor().long().clamp_min(1), counts)
-    order = counts.argsort(descending=True, stable=True)
+def _different(rows: Tensor, most: int) -> tuple[Tensor, Tensor] | None:
+    """The rows themselves and the index of each, if at most ``most`` differ; zeros fill the rest up to a multiple of
+    64."""
+    sums = rows.double() @ torch.linspace(1.0, 2.0, rows.shape[1], dtype=torch.float64).square()
+    if len(sums[: 2 * most].unique()) > most:
+        return None
+    ordered, order = sums.sort(stable=True)
+    _, inverse, counts = ordered.unique_consecutive(return_inverse=True, return_counts=True)
+    index = torch.empty_like(order).scatter_(0, order, inverse)
+    book = rows[order[counts.cumsum(0) - counts]]
+    if len(book) > most or not torch.equal(book[index], rows):
+        return None
+    filled = 64 * max(-(-len(book) // 64), 1)
+    return torch.cat([book, book.new_zeros(filled - len(book), rows.shape[1])]), index
+
+
+def _apportion(counts: Tensor, errors: Tensor, size: int) -> Tensor:
+    """``size`` entries shared out in proportion to errors, float64: at least one where there are members, never
+    more."""
+    errors = torch.where(errors.sum() > 0, errors, counts.double())
+    share = torch.minimum((errors * size / errors.sum()).floor().long().clamp_min(1), counts)
+    order = errors.argsort(descending=True, stable=True)
     while (left := size - int(share.sum())) != 0:
         can = order[(share[order] < counts[order]) if left > 0 else (share[order] > 1)][: abs(left)]
         if not len(can):
@@ -127,17 +156,17 @@ def _apportion(counts: Tensor, size: int) -> Tensor:
     return share
 
 
-def _means(rows: Tensor, k: int, generator: torch.Generator) -> Tensor:
-    """Centres (at most k, D) of k-means over rows (N, D)."""
+def _means(rows: Tensor, weights: Tensor, k: int, generator: torch.Generator) -> Tensor:
+    """Centres (at most k, D) of weighted k-means over rows (N, D)."""
     if len(rows) <= k:
         return rows
-    centres = rows[torch.randperm(len(rows), generator=generator)[:k]].clone()
+    centres = rows[torch.multinomial(weights.double(), k, generator=generator)].clone()
     for _ in range(6):
         index = _assign(rows, centres)
-        count = torch.bincount(index, minlength=k)
-        total = torch.zeros_like(centres).index_add_(0, index, rows)
-        filled = count > 0
-        centres[filled] = total[filled] / count[filled, None]
+        sums = weights.new_zeros(k).index_add_(0, index, weights)
+        total = torch.zeros_like(centres).index_add_(0, index, rows * weights[:, None])
+        filled = sums > 0
+        centres[filled] = total[filled] / sums[filled, None]
     return centres
 
 

@@ -36,6 +36,7 @@ from pointsplat_ns.io.formats.coding import (
     unit_quats,
 )
 from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette, palette_size
+from pointsplat_ns.io.formats.rounding import ROUNDING, multiples, rounded_shapes, steps_of, weights
 from pointsplat_ns.io.formats.sog_images import META, Images, webp
 from pointsplat_ns.io.ply_header import warn_antialiased
 from pointsplat_ns.system.progress import Progress, silent
@@ -219,11 +220,8 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
         images[name] = (np.column_stack(columns).astype(np.uint8), width, height)
         return [name]
 
-    means = scene.means.double().numpy()
-    logs = np.sign(means) * np.log1p(np.abs(means))
-    mins, maxs = (logs.min(axis=0), logs.max(axis=0)) if n else (np.zeros(3), np.zeros(3))
-    span = np.where(maxs > mins, maxs - mins, 1.0)
-    steps = np.rint((logs - mins) / span * 65535).astype(np.int64)
+    levels, mins, maxs = _levels_of(scene)
+    steps = np.rint(levels).astype(np.int64)
     scales, scale_index = codebook(scene.scales.clamp_min(-30.0))  # as of flat axes
     colors, color_index = codebook(scene.features_dc)
     largest, others = smallest_three(unit_quats(scene))
@@ -250,6 +248,38 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
         progress("compressing", done / len(images))
         files[name] = webp(*image)
     return {META: json.dumps(meta).encode(), **files}
+
+
+def _levels_of(scene: Gaussians) -> tuple[Array, Array, Array]:
+    """Positions as logarithms, (N, 3) float64 from 0 to 65,535, and the logarithms that are these two, (3,) each."""
+    means = scene.means.double().numpy()
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    mins, maxs = (logs.min(axis=0), logs.max(axis=0)) if len(means) else (np.zeros(3), np.zeros(3))
+    return (logs - mins) / np.where(maxs > mins, maxs - mins, 1.0) * 65535, mins, maxs
+
+
+def rounded_for_sog(scene: Gaussians, tolerance: float) -> Gaussians:
+    """A scene that takes fewer bytes as SOG: its numbers are rounded (:mod:`~pointsplat_ns.io.formats.rounding`), and
+    its SH above degree 0 are those of a palette with one entry for 32 Gaussians. Arguments as of
+    :func:`~pointsplat_ns.io.formats.rounding.rounded`."""
+    if not tolerance or not len(scene):
+        return scene
+    steps = steps_of(scene, tolerance)
+    levels, mins, maxs = _levels_of(scene)
+    of_level = torch.from_numpy((maxs - mins) / 65535) * (1 + scene.means.double().abs())  # world units
+    coarse = multiples(torch.from_numpy(levels), (steps.means / of_level.clamp_min(1e-300)).clamp_min(1)).numpy()
+    outermost = (levels <= 0) | (levels >= 65535)  # they stay, so that levels keep their meaning
+    logs = mins + (maxs - mins) * np.where(outermost, levels, coarse.clip(0, 65535)) / 65535
+    means = torch.from_numpy(np.sign(logs) * np.expm1(np.abs(logs))).float()
+    rest = scene.features_rest
+    if scene.sh_degree:
+        entries = 64 * max(len(scene) // (64 * ROUNDING.rows_per_entry), 1)
+        book, index = palette(
+            rest.flatten(1), lambda share: None, min(entries, palette_size(len(scene))), weights(scene)
+        )
+        numbers, number = codebook(book)
+        rest = numbers[number.long()][index].reshape(rest.shape)
+    return rounded_shapes(scene, steps).replace(means=means, features_rest=rest)
 
 
 def _pack_sh(
