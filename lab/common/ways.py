@@ -40,10 +40,11 @@ def count_of(keep: float, gaussians: int) -> int:
     return max(1, round(keep * gaussians))
 
 
-def _pointsplat(way: Way) -> Reducer:
+def pointsplat_command(way: Way, source: Path, keep: str, target: Path) -> list[str]:
+    """The command line of one of our ways."""
     name, *options = WAYS[way]
+    return [*_PROGRAM, name, str(source), "--keep", keep, *options, "-o", str(target)]
 
-    def command(source: Path, count: int, target: Path) -> list[str]:
-        return [*_PROGRAM, name, str(source), "--keep", str(count), *options, "-o", str(target)]
 
-    return Reducer(way, command)
+def _pointsplat(way: Way) -> Reducer:
+    return Reducer(way, lambda source, count, target: pointsplat_command(way, source, str(count), target))

@@ -16,7 +16,7 @@ import torch
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import Format
-from pointsplat_ns.io.formats.rounding import tolerance_of
+from pointsplat_ns.io.formats.rounding import Rounding, rounding_for
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.pruning.sh_bands import cut_sh
 from pointsplat_ns.system.progress import silent
@@ -157,6 +157,8 @@ class BudgetSettings:
     few."""
     first_bytes: float = 15.0
     """Bytes of a Gaussian at the first try for a size."""
+    room: float = 0.8
+    """Share of a limit below which a file's numbers are rounded less."""
     unknown_psnr: float = 30.0
     """PSNR, in dB, that scenes are taken to have where there are no views to measure it in, for rounding."""
     repaired: SearchSettings = SearchSettings(precision=1.1)
@@ -187,8 +189,8 @@ class FileLimit:
     """A format with ``encode``."""
     most: int
     """Bytes."""
-    tolerance: float = 0.0
-    """Least tolerance of rounding (:mod:`~pointsplat_ns.io.formats.rounding`)."""
+    rounding: Rounding | None = None
+    """The rounding of a scene of this quality; None for no rounding."""
 
     def bytes_of(self, scene: Gaussians) -> int:
         """Bytes of a scene's file, without unusable Gaussians."""
@@ -196,15 +198,23 @@ class FileLimit:
         return len(self.kind.encode(_as_written(scene), silent))
 
     def rounded(self, scene: Gaussians) -> Gaussians:
-        """A scene rounded as far as its file needs to meet the limit, on its device. It is rounded at least by the
-        tolerance. If it exceeds the limit at eight times that, the last is returned."""
-        if not self.tolerance or self.kind.rounded is None:
+        """A scene rounded so that its file meets the limit, on its device: coarser if the file is too large, finer if
+        there is much room. If it is too large at six steps coarser, that is returned."""
+        if self.rounding is None or self.kind.rounded is None:
             return scene
-        for step in range(7):
-            smaller = self.kind.rounded(_as_written(scene), self.tolerance * 2 ** (step / 2))
-            if self.bytes_of(smaller) <= self.most:
+        written = _as_written(scene)
+        best = self.kind.rounded(written, self.rounding)
+        size = self.bytes_of(best)
+        finer = size <= BUDGETS.room * self.most
+        for step in range(1, 7):
+            if not finer and size <= self.most:
                 break
-        return smaller.to(scene.device)
+            other = self.kind.rounded(written, self.rounding.finer(step if finer else -step))
+            size = self.bytes_of(other)
+            if finer and size > self.most:
+                break
+            best = other
+        return best.to(scene.device)
 
 
 def _as_written(scene: Gaussians) -> Gaussians:
@@ -218,10 +228,8 @@ class FoundSize:
 
     scene: Gaussians
     """The scene before its numbers are rounded."""
-    size: int
-    """Bytes of its file, rounded."""
     limit: FileLimit
-    """The limit, and the rounding with which the file meets it."""
+    """The limit, and a rounding with which the file meets it."""
     tried: dict[int, int]
     """Bytes by count, for every count tried."""
 
@@ -279,7 +287,7 @@ def largest_within(
     Args:
         full: the largest scene.
         make: gives the scene of a count below that of ``full``.
-        limit: of the file; its tolerance is not used.
+        limit: of the file, without rounding.
         progress: called with the share done.
         psnr_of: gives the PSNR of a scene, dB; None where there are no views.
 
@@ -293,18 +301,15 @@ def largest_within(
     def measure(count: int) -> float:
         nonlocal best
         scene = full if count == n else make(count)
-        psnr = BUDGETS.unknown_psnr if psnr_of is None else psnr_of(scene)
-        found = replace(limit, tolerance=tolerance_of(psnr) if limit.kind.rounded else 0.0)
-        small = (
-            _as_written(scene)
-            if limit.kind.rounded is None
-            else limit.kind.rounded(_as_written(scene), found.tolerance)
-        )
-        tried[count] = limit.bytes_of(small)
+        written, found = _as_written(scene), limit
+        if limit.kind.rounded is not None:
+            rounding = rounding_for(psnr_of(scene) if psnr_of else BUDGETS.unknown_psnr)
+            written, found = limit.kind.rounded(written, rounding), replace(limit, rounding=rounding)
+        tried[count] = limit.bytes_of(written)
         if tried[count] <= limit.most:
-            best = FoundSize(scene, tried[count], found, tried)
-            if count == n and found.tolerance and (size := limit.bytes_of(full)) <= limit.most:
-                best = FoundSize(full, size, replace(limit, tolerance=0.0), tried)
+            best = FoundSize(scene, found, tried)
+            if count == n and found.rounding and limit.bytes_of(full) <= limit.most:
+                best = FoundSize(full, limit, tried)
         progress(len(tried) / (len(tried) + 2))
         return math.log(tried[count])
 

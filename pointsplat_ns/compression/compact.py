@@ -214,7 +214,7 @@ def compact_scene(
     stopped = any(stage.interrupted for stage in stages)
     if photos is not None and request.photos is not None and not request.photos.empty and not stopped:
         stages.append(_on_photos(_last_kept(stages), at_work, request.photos, photos, judge, views, progress))
-    if pruned.limit is not None and pruned.limit.tolerance:
+    if pruned.limit is not None and pruned.limit.rounding:
         stages.append(_round(_last_kept(stages), pruned.limit, judge))
     notes = pruned.notes
     if views.origin and views.text not in notes:

@@ -203,5 +203,5 @@ def _for_size(
         found = largest_within(start, make, limit, progress, lambda scene: reference.psnr(scene)[0])
     except DataError:  # no views
         found = largest_within(start, make, limit, progress)
-    notes.append(f"{len(found.tried)} sizes tried: {bytes_text(found.size)} as {limit.kind.name}")
+    notes.append(f"{len(found.tried)} sizes tried for {bytes_text(limit.most)} as {limit.kind.name}")
     return found.scene, found.limit

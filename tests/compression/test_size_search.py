@@ -8,6 +8,7 @@ from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.io.formats import Format, format_to_write
+from pointsplat_ns.io.formats.rounding import Rounding
 from pointsplat_ns.io.formats.spz import encode_spz
 
 
@@ -20,8 +21,9 @@ def test_the_file_fits_and_is_not_much_smaller():
     full = cloud(4000)
     for limit in (5000, 20_000, 60_000):
         found = search(full, limit)
-        assert 0.95 * limit <= found.size <= limit
-        assert found.size == len(encode_spz(found.scene)) == found.tried[len(found.scene)]
+        size = found.tried[len(found.scene)]
+        assert 0.95 * limit <= size <= limit
+        assert size == len(encode_spz(found.scene))
 
 
 def test_all_are_kept_if_all_fit():
@@ -38,7 +40,7 @@ def test_a_budget_for_less_than_one_gaussian_is_refused():
 def test_a_size_that_jumps_ends_the_search_with_what_fits():
     # Beyond 50 Gaussians the file is ten times as large.
     found = search(cloud(100), 600, lambda scene, _: bytes(10 * len(scene) * (10 if len(scene) > 50 else 1)))
-    assert found.size <= 600 and 1 <= len(found.scene) <= 50
+    assert found.tried[len(found.scene)] <= 600 and 1 <= len(found.scene) <= 50
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply", ".splat", ".glb", ".ply"])
@@ -58,18 +60,23 @@ def test_a_size_rounds_as_far_as_the_scene_has_errors_already(suffix):
         psnr: largest_within(full, lambda count: full[:count], limit, lambda share: None, lambda scene, psnr=psnr: psnr)
         for psnr in (25.0, 35.0)
     }
-    assert found[25.0].limit.tolerance == pytest.approx(10**0.5 * found[35.0].limit.tolerance)
+    assert found[25.0].limit.rounding.tolerance == pytest.approx(10**0.5 * found[35.0].limit.rounding.tolerance)
     assert len(found[25.0].scene) > 1.1 * len(found[35.0].scene)
     for one in found.values():
         small = one.limit.rounded(one.scene)
-        assert len(small) == len(one.scene) and 0.9 * 40_000 < one.limit.bytes_of(small) == one.size <= 40_000
+        assert (
+            len(small) == len(one.scene) and 0.9 * 40_000 < one.limit.bytes_of(small) == one.tried[len(small)] <= 40_000
+        )
 
 
-def test_a_scene_that_has_become_larger_is_rounded_further():
-    scene, kind = cloud(2000), format_to_write(".spz")
-    size = FileLimit(kind, 10**9).bytes_of(kind.rounded(scene, 0.002))
-    limit = FileLimit(kind, int(0.9 * size), tolerance=0.002)
-    assert limit.bytes_of(limit.rounded(scene)) <= limit.most < size
+def test_a_scene_is_rounded_further_if_it_is_too_large_and_less_if_there_is_room():
+    scene, kind, usual = cloud(2000), format_to_write(".spz"), Rounding(0.002)
+    size = FileLimit(kind, 10**9).bytes_of(kind.rounded(scene, usual))
+    for most in (int(0.9 * size), size, int(1.05 * size)):
+        found = FileLimit(kind, most, usual).bytes_of(FileLimit(kind, most, usual).rounded(scene))
+        assert 0.8 * most < found <= most
+    roomy = FileLimit(kind, int(1.5 * size), usual)
+    assert size < roomy.bytes_of(roomy.rounded(scene)) <= roomy.most
 
 
 def test_all_are_kept_unrounded_if_all_fit():

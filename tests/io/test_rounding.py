@@ -9,7 +9,7 @@ import pointsplat_ns as ps
 from making import cloud
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
-from pointsplat_ns.io.formats.rounding import ROUNDING, multiples, rounded, steps_of, tolerance_of, weights
+from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, multiples, rounded, rounding_for, steps_of, weights
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.pruning.merging.covariance import covariances, unpack
 from pointsplat_ns.rasterizer import render
@@ -41,7 +41,7 @@ def values(scene: Gaussians) -> torch.Tensor:
 
 @pytest.mark.parametrize("psnr", [20.0, 40.0, 80.0, math.inf])
 def test_the_tolerance_is_a_share_of_the_error_that_there_is(psnr):
-    assert tolerance_of(psnr) == pytest.approx(ROUNDING.share * 10 ** (-min(psnr, 45.0) / 20))
+    assert rounding_for(psnr).tolerance == pytest.approx(ROUNDING.share * 10 ** (-min(psnr, 45.0) / 20))
 
 
 @pytest.mark.parametrize("step", [1e-300, 1e-9, 0.3, 7.0, 1e30])
@@ -85,16 +85,16 @@ def test_extremes_stay_finite_and_usable():
     )
     for suffix in (".spz", ".sog"):
         for tolerance in (1e-12, 0.01, 1.0, 1e6):
-            small = format_to_write(suffix).rounded(scene, tolerance)
+            small = format_to_write(suffix).rounded(scene, Rounding(tolerance))
             assert len(small) == 6 and bool(small.usable().all()), (suffix, tolerance)
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog"])
 def test_no_tolerance_changes_nothing_and_a_small_one_little(suffix):
     scene, kind = cloud(300), format_to_write(suffix)
-    assert kind.rounded(scene, 0.0) is scene
-    assert len(kind.rounded(scene[:0], 0.1)) == 0
-    near = kind.rounded(scene, 1e-9)
+    assert kind.rounded(scene, Rounding(0.0)) is scene
+    assert len(kind.rounded(scene[:0], Rounding(0.1))) == 0
+    near = kind.rounded(scene, Rounding(1e-9))
     assert torch.allclose(near.means, scene.means, atol=1e-3)  # SOG's own steps
     assert torch.allclose(near.alphas, scene.alphas, atol=1 / 255)
 
@@ -104,7 +104,7 @@ def test_files_become_smaller_and_keep_what_was_rounded(suffix, tmp_path):
     room, kind = ps.example_room()[::20], format_to_write(suffix)
     sizes, tolerances = [], (0.0, 0.01, 0.04)
     for tolerance in tolerances:
-        small = kind.rounded(room, tolerance)
+        small = kind.rounded(room, Rounding(tolerance))
         kind.write(small, tmp_path / f"a{suffix}", SILENT)
         kind.write(ps.load(tmp_path / f"a{suffix}"), tmp_path / f"b{suffix}", SILENT)
         first, second = ((tmp_path / f"{name}{suffix}").stat().st_size for name in "ab")
@@ -123,5 +123,5 @@ def test_a_tolerance_beats_fewer_bits_for_all(tmp_path):
         return len(data), sum(float((render(scene, view) - render(room, view)).square().mean()) for view in views)
 
     size, error = written(encode_spz(room, sh_bits=(3, 3)))
-    smaller, less = written(encode_spz(rounded(room, 0.01)))
+    smaller, less = written(encode_spz(rounded(room, Rounding(0.01))))
     assert smaller < size and less < error

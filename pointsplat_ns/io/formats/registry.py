@@ -21,12 +21,12 @@ from pointsplat_ns.io.formats.compressed_ply import (
 )
 from pointsplat_ns.io.formats.glb import encode_glb, glb_bytes, read_glb
 from pointsplat_ns.io.formats.ksplat import read_ksplat
-from pointsplat_ns.io.formats.rounding import rounded
+from pointsplat_ns.io.formats.rounding import Rounding
 from pointsplat_ns.io.formats.sog import encode_sog, read_sog, rounded_for_sog, write_sog_folder
 from pointsplat_ns.io.formats.sog_images import META
 from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
 from pointsplat_ns.io.formats.splat import drawing_order, encode_splat, read_splat, splat_bytes
-from pointsplat_ns.io.formats.spz import encode_spz, read_spz
+from pointsplat_ns.io.formats.spz import encode_spz, read_spz, rounded_for_spz
 from pointsplat_ns.io.ply import ply_bytes, read_ply, write_ply
 from pointsplat_ns.io.ply_header import read_header
 from pointsplat_ns.system.progress import Progress
@@ -49,9 +49,8 @@ class Format:
     """Exact size of a file, bytes, by the number of Gaussians and their SH degree; None if it depends on the scene."""
     encode: Callable[[Gaussians, Progress], bytes] | None = None
     """The bytes of a file of a scene, where only they tell its size."""
-    rounded: Callable[[Gaussians, float], Gaussians] | None = None
-    """A scene whose numbers are rounded, so that a file of it is smaller, by the scene and a tolerance
-    (:mod:`~pointsplat_ns.io.formats.rounding`)."""
+    rounded: Callable[[Gaussians, Rounding], Gaussians] | None = None
+    """A scene whose numbers are rounded, so that a file of it is smaller."""
     order: Callable[[Gaussians], Tensor] | None = None
     """Indices (N,) of a scene's Gaussians in the order in which they are written, if that is another."""
 
@@ -94,7 +93,9 @@ FORMATS = (
         "3DGS PLY", ".ply", _read_any_ply, lambda scene, path, _: write_ply(scene, path), (b"ply\n", b"ply\r"),
         ply_bytes,
     ),
-    Format("SPZ", ".spz", read_spz, _writer(encode_spz), (b"\x1f\x8b", b"NGSP"), encode=encode_spz, rounded=rounded),
+    Format(
+        "SPZ", ".spz", read_spz, _writer(encode_spz), (b"\x1f\x8b", b"NGSP"), encode=encode_spz, rounded=rounded_for_spz
+    ),
     Format(
         "SOG", ".sog", read_sog, _writer(encode_sog), (b"PK\x03\x04",), encode=encode_sog, rounded=rounded_for_sog,
         order=morton_order,

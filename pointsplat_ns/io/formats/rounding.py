@@ -38,11 +38,31 @@ class RoundingSettings:
     """Contrast of a Gaussian with what is around it, a share of the colour range."""
     thinnest: float = 0.1
     """Least standard deviation along an axis, as a share of that along the longest: thinner ones are drawn thicker."""
-    rows_per_entry: int = 32
+    rows_per_entry: float = 32.0
     """Gaussians for each entry of a palette of SH."""
 
 
 ROUNDING = RoundingSettings()
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """How far the numbers of a scene are rounded."""
+
+    tolerance: float
+    """Error of the colour of a Gaussian of usual weight, as a share of the colour range; 0 for no rounding."""
+    rows_per_entry: float = ROUNDING.rows_per_entry
+    """Gaussians for each entry of a palette of SH."""
+
+    def finer(self, steps: int) -> Rounding:
+        """So many steps finer, each with half of the squared error; coarser where ``steps`` is negative."""
+        return Rounding(self.tolerance * 2 ** (-0.5 * steps), self.rows_per_entry * 2.0**-steps)
+
+
+def rounding_for(psnr: float) -> Rounding:
+    """The rounding of a scene of some PSNR, dB."""
+    return Rounding(ROUNDING.share * 10 ** (-min(psnr, ROUNDING.best_psnr) / 20))
+
 
 _UNIFORM = math.sqrt(12)  # steps of rounding for a root mean squared error of 1
 
@@ -58,11 +78,6 @@ class Steps:
     """World units."""
     quats: Tensor
     """Of quaternions of length 1."""
-
-
-def tolerance_of(psnr: float) -> float:
-    """Tolerance for a scene of some PSNR (dB), as a share of the colour range."""
-    return ROUNDING.share * 10 ** (-min(psnr, ROUNDING.best_psnr) / 20)
 
 
 def weights(scene: Gaussians) -> Tensor:
@@ -88,16 +103,12 @@ def steps_of(scene: Gaussians, tolerance: float) -> Steps:
     )
 
 
-def rounded(scene: Gaussians, tolerance: float) -> Gaussians:
-    """A scene of which every number is a multiple of the largest power of two that its step allows.
-
-    Args:
-        scene: N usable Gaussians, float32 on the CPU.
-        tolerance: see :func:`tolerance_of`; 0 changes nothing.
-    """
-    if not tolerance or not len(scene):
+def rounded(scene: Gaussians, rounding: Rounding) -> Gaussians:
+    """A scene of N usable Gaussians, float32 on the CPU, of which every number is a multiple of the largest power of
+    two that its step allows."""
+    if not rounding.tolerance or not len(scene):
         return scene
-    steps = steps_of(scene, tolerance)
+    steps = steps_of(scene, rounding.tolerance)
     return rounded_shapes(scene, steps).replace(
         means=multiples(scene.means.double(), steps.means).float(),
         features_rest=multiples(scene.features_rest.double(), steps.sh[:, None]).float(),

@@ -36,7 +36,7 @@ from pointsplat_ns.io.formats.coding import (
     unit_quats,
 )
 from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette, palette_size
-from pointsplat_ns.io.formats.rounding import ROUNDING, multiples, rounded_shapes, steps_of, weights
+from pointsplat_ns.io.formats.rounding import Rounding, multiples, rounded_shapes, steps_of, weights
 from pointsplat_ns.io.formats.sog_images import META, Images, webp
 from pointsplat_ns.io.ply_header import warn_antialiased
 from pointsplat_ns.system.progress import Progress, silent
@@ -258,13 +258,13 @@ def _levels_of(scene: Gaussians) -> tuple[Array, Array, Array]:
     return (logs - mins) / np.where(maxs > mins, maxs - mins, 1.0) * 65535, mins, maxs
 
 
-def rounded_for_sog(scene: Gaussians, tolerance: float) -> Gaussians:
+def rounded_for_sog(scene: Gaussians, rounding: Rounding) -> Gaussians:
     """A scene that takes fewer bytes as SOG: its numbers are rounded (:mod:`~pointsplat_ns.io.formats.rounding`), and
-    its SH above degree 0 are those of a palette with one entry for 32 Gaussians. Arguments as of
+    its SH above degree 0 are entries of a palette. Arguments as of
     :func:`~pointsplat_ns.io.formats.rounding.rounded`."""
-    if not tolerance or not len(scene):
+    if not rounding.tolerance or not len(scene):
         return scene
-    steps = steps_of(scene, tolerance)
+    steps = steps_of(scene, rounding.tolerance)
     levels, mins, maxs = _levels_of(scene)
     of_level = torch.from_numpy((maxs - mins) / 65535) * (1 + scene.means.double().abs())  # world units
     coarse = multiples(torch.from_numpy(levels), (steps.means / of_level.clamp_min(1e-300)).clamp_min(1)).numpy()
@@ -273,7 +273,7 @@ def rounded_for_sog(scene: Gaussians, tolerance: float) -> Gaussians:
     means = torch.from_numpy(np.sign(logs) * np.expm1(np.abs(logs))).float()
     rest = scene.features_rest
     if scene.sh_degree:
-        entries = 64 * max(len(scene) // (64 * ROUNDING.rows_per_entry), 1)
+        entries = 64 * max(int(len(scene) / (64 * rounding.rows_per_entry)), 1)
         book, index = palette(
             rest.flatten(1), lambda share: None, min(entries, palette_size(len(scene))), weights(scene)
         )

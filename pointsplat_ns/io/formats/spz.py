@@ -34,6 +34,7 @@ from pointsplat_ns.io.formats.coding import (
     to_bytes,
     unit_quats,
 )
+from pointsplat_ns.io.formats.rounding import Rounding, rounded
 from pointsplat_ns.io.ply_header import warn_antialiased
 from pointsplat_ns.system.progress import Progress, silent
 
@@ -138,6 +139,15 @@ def encode_spz(
     head += struct.pack("<I12x", 32)  # where the table of sizes begins
     table = b"".join(struct.pack("<QQ", len(s), len(p)) for s, p in zip(streams, parts, strict=True))
     return b"".join([head, table, *streams])
+
+
+def rounded_for_spz(scene: Gaussians, rounding: Rounding) -> Gaussians:
+    """A scene that takes fewer bytes as SPZ: its numbers are rounded (:mod:`~pointsplat_ns.io.formats.rounding`), those
+    of SH to at most 8 bits. Arguments as of :func:`~pointsplat_ns.io.formats.rounding.rounded`."""
+    small = rounded(scene, rounding)
+    if small is scene:
+        return scene
+    return small.replace(features_rest=(128 * small.features_rest).round().clamp(-128, 127) / 128)
 
 
 def write_spz(
