@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest
-from pointsplat_ns.errors import BudgetError, DataError, SceneError
+from pointsplat_ns.errors import BudgetError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import up_named
-from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.views import Views
 
@@ -65,6 +64,7 @@ def prune_source(
         there are no views.
     """
     from pointsplat_ns.compression.prune import prune_scene
+    from pointsplat_ns.compression.quality import quality_of_pruned
 
     dense, source = read_source(scene, views, resolution, up)
     start = time.perf_counter()
@@ -72,19 +72,9 @@ def prune_source(
         pruned = prune_scene(dense, request, source, report)
         seconds, quality = time.perf_counter() - start, None
         if compared:
-            quality = _quality(dense, pruned.scene, lambda: source.known(MERGED_FROM) or pruned.views or source.whole())
+            quality = quality_of_pruned(dense, pruned, source)
     log(pruned.notes)
     return dense, pruned.scene, seconds, quality
-
-
-def _quality(dense: Gaussians, scene: Gaussians, views: Callable[[], Views]) -> FullSizePsnr | None:
-    """How close a scene is to the dense scene at full size; None if there is no place to look from."""
-    from pointsplat_ns.compression.quality import quality_of
-
-    try:
-        return quality_of(dense, scene, views())
-    except DataError:
-        return None
 
 
 def compact_source(
@@ -104,6 +94,8 @@ def compact_source(
         The dense scene, the result, and if ``compared`` how close both are at full size, in the views that no repair
         uses; None if there are no views.
     """
+    from pointsplat_ns.compression.quality import quality_if_seen
+
     dense, source = read_source(scene, views, resolution, up)
     with progress_bar(progress) as report:
         if goal is None:
@@ -120,7 +112,7 @@ def compact_source(
             size, upward = parse_resolution(resolution), up_named(up)
             subject = subject_of(dense, run_of(scene, views), given, request.refiner, goal.suffix, size, upward)
             result = find_scene(subject, goal.targets, request.prune.by, repairs_of(goal.effort), report)
-        quality = _quality(dense, result.scene, source.whole) if compared else None
+        quality = quality_if_seen(dense, result.scene, source.whole) if compared else None
     log((*result.notes, *result.verdict.splitlines(), *result.target.splitlines()))
     return dense, result, quality
 

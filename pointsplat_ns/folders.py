@@ -1,4 +1,4 @@
-"""The public function for all scenes of a folder."""
+"""Commands on all scenes of a folder."""
 
 from __future__ import annotations
 
@@ -7,19 +7,23 @@ from dataclasses import replace
 from pathlib import Path
 
 from pointsplat_ns.compression.compact import compact_scene
+from pointsplat_ns.compression.placing import place
 from pointsplat_ns.compression.prune import prune_scene
-from pointsplat_ns.compression.requests import CompactRequest, Effort, RepairBudget
+from pointsplat_ns.compression.quality import quality_of_pruned
+from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
 from pointsplat_ns.compression.scene_folder import Command, Shard, output_folder, run_on_folder
 from pointsplat_ns.compression.scene_task import Options, SceneResult, SmallerScene
 from pointsplat_ns.compression.trained_refiner import refiner_at
-from pointsplat_ns.io.formats import format_like, format_named
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.formats import format_like, format_named, format_to_write
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
-from pointsplat_ns.pruning import Keep, Megabytes
+from pointsplat_ns.pruning import Keep, Megabytes, cut_sh
 from pointsplat_ns.system.processes import connect_torchrun, gathered, torchrun_device, torchrun_rank
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 from pointsplat_ns.tradeoff.finding import find_scene
@@ -98,7 +102,6 @@ def compact_folder(
     folder = Path(folder)
     target = output_folder(folder, "compact") if output is None else Path(output)
     part = Shard() if shard is None else Shard.of(shard)
-    rank, world_size = torchrun_rank()
     connect_torchrun()
     device = str(torchrun_device())
     trained = _refiner_on(refiner, device)
@@ -119,12 +122,74 @@ def compact_folder(
         options = {**options, "keep": None, "target_db": target_db, "target_ms": target_ms, "target_mb": target_mb}
         make = functools.partial(_found, refiner, device, targets, request.prune.by, repairs_of(effort), size)
     else:
-        sized = isinstance(keep, str) and format_named(keep.strip()) is None  # a size is then in the result's format
-        make = functools.partial(_compacted, refiner, device, replace(request, refiner=None), sized, size)
-    with progress_bar(progress if rank == 0 else False) as report:
-        results = run_on_folder(
-            folder, target, Command("compact", make, options), jobs, part.within(rank, world_size), force, report
+        make = functools.partial(
+            _compacted, refiner, device, replace(request, refiner=None), _in_each_format(keep), size
         )
+    return _run(folder, target, Command("compact", make, options), jobs, part, force, progress)
+
+
+def prune_folder(
+    folder: Path,
+    output: Path,
+    keep: Keep | str,
+    *,
+    by: str = "merge",
+    sh: str = "all",
+    opacity_weight: float | None = None,
+    clean: bool = False,
+    fine_tune: int = 0,
+    resolution: tuple[int, int] | str | None = None,
+    jobs: int = 1,
+    shard: str | None = None,
+    force: bool = False,
+    progress: bool | Progress = False,
+) -> list[SceneResult]:
+    """Prune every scene of a folder by :func:`prune`; folders, sizes and results as of :func:`compact_folder`."""
+    request, size = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune), parse_resolution(resolution)
+    options: Options = {
+        "keep": str(request.budget),
+        "by": by,
+        "sh": sh,
+        "opacity_weight": opacity_weight,
+        "clean": clean,
+        "fine_tune": fine_tune,
+        "resolution": None if size is None else size_text(size),
+    }
+    command = Command("prune", functools.partial(_pruned, request, _in_each_format(keep), size), options)
+    return _run(folder, output, command, jobs, Shard() if shard is None else Shard.of(shard), force, progress)
+
+
+def convert_folder(
+    folder: Path,
+    output: Path,
+    suffix: str,
+    *,
+    sh: str = "all",
+    up: str | None = None,
+    scale: float = 1.0,
+    original_frame: bool = False,
+    jobs: int = 1,
+    shard: str | None = None,
+    force: bool = False,
+    progress: bool | Progress = False,
+) -> list[SceneResult]:
+    """Write every scene of a folder in another format, named by its suffix, such as ".spz"; otherwise as
+    :func:`compact_folder`. Raises SceneError if the format is not written as one file."""
+    if not suffix.startswith(".") or format_to_write(suffix).suffix != suffix:
+        raise SceneError(f"{suffix}: no suffix of scene files that are written; expected one such as .spz")
+    options: Options = {"format": suffix, "sh": sh, "up": up, "scale": scale, "original_frame": original_frame}
+    command = Command("convert", functools.partial(_converted, sh, up, scale, original_frame), options, suffix)
+    return _run(folder, output, command, jobs, Shard() if shard is None else Shard.of(shard), force, progress)
+
+
+def _run(
+    folder: Path, output: Path, command: Command, jobs: int, shard: Shard, force: bool, progress: bool | Progress
+) -> list[SceneResult]:
+    """The results of all processes of ``torchrun``, sorted by name."""
+    rank, world_size = torchrun_rank()
+    connect_torchrun()
+    with progress_bar(progress if rank == 0 else False) as report:
+        results = run_on_folder(folder, output, command, jobs, shard.within(rank, world_size), force, report)
     return sorted(gathered(results), key=lambda result: result.name)
 
 
@@ -142,17 +207,53 @@ def _compacted(
     """Compact one scene of a folder. The request has no refiner, because each process loads its own."""
     dense, options = read_scene(path), request.prune
     source = ViewSource(dense, run=path, dataset_views=dataset_views, resolution=resolution)
-    if isinstance(options.budget, int) and len(dense) < options.budget:
-        note, same = f"kept whole, with fewer Gaussians than --keep {options.budget}", options.sh == "all"
-        kept = dense if same else prune_scene(dense, replace(options, keep=1.0), source).scene
-        return SmallerScene(kept, len(dense), None, note, same)
-    if sized and isinstance(options.budget, Megabytes):
-        options = replace(options, keep=replace(options.budget, suffix=format_like(path).suffix))
+    if (whole := _kept_whole(dense, options, source)) is not None:
+        return whole
+    options = _in_format_of(path, options) if sized else options
     request = replace(request, prune=options, refiner=_refiner_on(refiner, device))
     result = compact_scene(dense, request, source)
     if result.interrupted:
         raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the repair of one scene
     return SmallerScene(result.scene, len(dense), result.psnr)
+
+
+def _in_each_format(keep: Keep | str | None) -> bool:
+    """Whether a size is that of each result in its own format, as it names none."""
+    return isinstance(keep, str) and format_named(keep.strip()) is None
+
+
+def _kept_whole(dense: Gaussians, request: PruneRequest, source: ViewSource) -> SmallerScene | None:
+    """A scene that has fewer Gaussians than the budget; None for others."""
+    if not isinstance(request.budget, int) or len(dense) >= request.budget:
+        return None
+    note, same = f"kept whole, with fewer Gaussians than --keep {request.budget}", request.sh == "all"
+    kept = dense if same else prune_scene(dense, replace(request, keep=1.0), source).scene
+    return SmallerScene(kept, len(dense), None, note, same)
+
+
+def _in_format_of(path: Path, request: PruneRequest) -> PruneRequest:
+    """A request whose size, if its budget is one, is that of the format of a scene's result."""
+    if not isinstance(request.budget, Megabytes):
+        return request
+    return replace(request, keep=replace(request.budget, suffix=format_like(path).suffix))
+
+
+def _pruned(request: PruneRequest, sized: bool, resolution: tuple[int, int] | None, path: Path) -> SmallerScene:
+    """Prune one scene of a folder."""
+    dense = read_scene(path)
+    source = ViewSource(dense, run=path, dataset_views=dataset_views, resolution=resolution)
+    if (whole := _kept_whole(dense, request, source)) is not None:
+        return whole
+    pruned = prune_scene(dense, _in_format_of(path, request) if sized else request, source)
+    quality = quality_of_pruned(dense, pruned, source)
+    return SmallerScene(pruned.scene, len(dense), None if quality is None else quality.psnr)
+
+
+def _converted(sh: str, up: str | None, scale: float, original_frame: bool, path: Path) -> SmallerScene:
+    """One scene of a folder for another format."""
+    dense = read_scene(path)
+    cut = dense if sh == "all" else cut_sh(dense, int(sh))
+    return SmallerScene(place(cut, up, scale, path if original_frame else None), len(dense), None)
 
 
 def _found(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from pointsplat_ns.cli.folders import compact_folder
+from pointsplat_ns.cli.folders import run_folder
 from pointsplat_ns.cli.printing import (
     Json,
     end_if_interrupted,
@@ -29,6 +30,7 @@ from pointsplat_ns.cli.scene_options import (
     check_poses,
     claim_outputs,
     in_format_of,
+    need_no_folder_options,
     output_beside,
     scene_written,
     warn_if_larger,
@@ -127,17 +129,20 @@ def compact(
     from pointsplat_ns.system.threads import fixed_threads
 
     if is_folder_of_scenes(scene):
-        if photos:
-            raise ps.SceneError(f"{scene}: a folder of scenes; --photos is for one run")
+        from pointsplat_ns.compression.scene_folder import output_folder
+
+        run = functools.partial(
+            ps.compact_folder, keep=keep, refiner=refiner, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds,
+            target_db=target_db, target_ms=target_ms, target_mb=target_mb, resolution=resolution,
+            jobs=1 if jobs is None else jobs, shard=shard, force=force,
+        )  # fmt: skip
+        one = {"--poses": poses, "--up": up, "--picture": picture, "--html": html, "--photos": photos}
         with fixed_threads(threads):
-            compact_folder(
-                scene, output, poses, up, picture, html, dry_run, json_output, keep=keep, refiner=refiner, by=by, sh=sh,
-                clean=clean, effort=effort, seconds=seconds, target_db=target_db, target_ms=target_ms,
-                target_mb=target_mb, resolution=resolution, jobs=1 if jobs is None else jobs, shard=shard, force=force,
-            )  # fmt: skip
+            run_folder(
+                scene, output or output_folder(scene, "compact"), run, {**one, "--dry-run": dry_run}, json_output
+            )
         return
-    if jobs is not None or shard is not None:
-        raise ps.SceneError(f"{scene}: one scene; --jobs and --shard are for a folder of scenes")
+    need_no_folder_options(scene, jobs, shard)
     from pointsplat_ns.compacting import compact_source, goal_of
     from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
     from pointsplat_ns.io.formats import format_to_write

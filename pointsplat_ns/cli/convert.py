@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
+from pointsplat_ns.cli.folders import run_folder
 from pointsplat_ns.cli.printing import Json, print_json, scene_result, written_size
-from pointsplat_ns.cli.scene_options import Scene, claim_outputs
+from pointsplat_ns.cli.scene_options import Scene, claim_outputs, need_no_folder_options
 from pointsplat_ns.system.quantities import seconds_text
 
 
@@ -22,16 +24,19 @@ def convert(
     original_frame: bool = False,
     spz_version: Literal[3, 4] = 3,
     spz_sh_bits: tuple[int, int] | None = None,
+    to: str | None = None,
     force: bool = False,
+    jobs: int | None = None,
+    shard: str | None = None,
     json_output: Json = False,
 ) -> None:
-    """Write a scene in another format. What each format keeps and loses stands in docs/formats.md.
+    """Write a scene in another format, or all scenes of a folder. What formats lose stands in docs/formats.md.
 
     Args:
         scene: a file of any format (.ply, .compressed.ply, .spz, .sog or its folder, .splat, .ksplat), a Splatfacto
-            checkpoint, or a run (its folder or config.yml).
+            checkpoint, a run (its folder or config.yml), or a folder of scenes.
         output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog, meta.json (a SOG as a
-            folder), .splat or .glb.
+            folder), .splat or .glb. For a folder of scenes, another folder.
         sh: SH bands to keep: all, or up to a degree.
         up: the new up axis: x, y, z, -x, -y or -z. By default nothing is turned. The old up direction is estimated;
             -y:z names it as -y. Write --up=-y for a negative axis.
@@ -40,15 +45,34 @@ def convert(
         spz_version: version of an .spz file. 4 is newer, and fewer viewers read it.
         spz_sh_bits: bits of SH coefficients in an .spz file, for degree 1 and for the others, up to 8. More bits give a
             larger file and a better picture. By default 6 and 5; SH from an .spz file stay as they are.
-        force: overwrite an existing file.
+        to: for a folder: the format of all results, such as .spz; by default none.
+        force: overwrite existing files.
+        jobs: for a folder: number of processes that share its scenes and the cores; by default 1.
+        shard: for a folder: only a part of its scenes; 2/5 is the second of five; by default all.
         json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.io.formats.spz import write_spz
+    from pointsplat_ns.io.scene import is_folder_of_scenes
     from pointsplat_ns.pruning import cut_sh
     from pointsplat_ns.system.progress import progress_bar
 
+    if is_folder_of_scenes(scene):
+        from pointsplat_ns.folders import convert_folder
+
+        if to is None:
+            raise ps.SceneError(f"{scene}: a folder of scenes; expected their new format, such as --to .spz")
+        run = functools.partial(
+            convert_folder, suffix=to, sh=sh, up=up, scale=scale, original_frame=original_frame,
+            jobs=1 if jobs is None else jobs, shard=shard, force=force,
+        )  # fmt: skip
+        one = {"--spz-version": None if spz_version == 3 else spz_version, "--spz-sh-bits": spz_sh_bits}
+        run_folder(scene, output, run, one, json_output)
+        return
+    need_no_folder_options(scene, jobs, shard)
+    if to is not None:
+        raise ps.SceneError(f"{scene}: one scene; --to is for a folder of scenes, the name of {output} says its format")
     claim_outputs(output, force)
     start = time.perf_counter()
     before = ps.load(scene)

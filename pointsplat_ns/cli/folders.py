@@ -1,7 +1,8 @@
-"""``pointsplat compact`` on a folder of scenes."""
+"""Commands on a folder of scenes."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,38 +14,38 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_task import SceneResult
 
 
-def compact_folder(
-    folder: Path,
-    output: Path | None,
-    poses: Path | None,
-    up: str | None,
-    picture: Path | None,
-    html: Path | None,
-    dry_run: bool,
-    json_output: bool,
-    **options,
+def run_folder(
+    folder: Path, output: Path, run: Callable[..., list[SceneResult]], refused: Mapping[str, object], json_output: bool
 ) -> None:
-    """Compact every scene of a folder, with further options of :func:`pointsplat_ns.compact_folder`, and print a table
-    of them, or JSON. Raises SceneError if an option is given that is for one scene only, and PointSplatError if a scene
-    fails, after all the others."""
+    """Run a command on a folder, and print a table of its scenes, or JSON.
+
+    Args:
+        folder: of scenes.
+        output: folder of the results.
+        run: from both folders and ``progress`` to the results.
+        refused: options that are for one scene only, by name; False and None stand for options not given.
+        json_output: whether to print JSON.
+
+    Raises:
+        SceneError: if an option is given that is for one scene only.
+        PointSplatError: if a scene fails, after all the others.
+    """
     import pointsplat_ns as ps
-    from pointsplat_ns.compression.scene_folder import TABLE_NAME, output_folder
+    from pointsplat_ns.compression.scene_folder import TABLE_NAME
     from pointsplat_ns.system.processes import torchrun_rank
 
-    refused = {"--poses": poses, "--up": up, "--picture": picture, "--html": html, "--dry-run": dry_run or None}
     for name, given in refused.items():
-        if given is not None:
+        if given is not None and given is not False:
             raise ps.SceneError(f"{name} is for one scene; {folder} is a folder of scenes")
-    target = output or output_folder(folder, "compact")
-    results = ps.compact_folder(folder, target, progress=True, **options)
+    results = run(folder, output, progress=True)
     if torchrun_rank()[0] > 0:
         return  # the first process speaks for all
     failed = sum(result.status == "failed" for result in results)
     if json_output:
-        print_json({"output": target, "scenes": [asdict(result) for result in results]})
+        print_json({"output": output, "scenes": [asdict(result) for result in results]})
     else:
         _print_table(results)
-        print(f"{target}: {len(results) - failed} of {len(results)} scenes, and the table {TABLE_NAME}")
+        print(f"{output}: {len(results) - failed} of {len(results)} scenes, and the table {TABLE_NAME}")
     if failed:
         raise ps.PointSplatError(f"{failed} of {len(results)} scenes failed; the same command tries them again")
 

@@ -24,10 +24,10 @@ def info(
     json_output: Json = False,
 ) -> None:
     """Look at scenes: format and size, counts, SH, up, fill, opacities, sizes, bounds, rows that look wrong, and what
-    files of other formats would weigh. Several make a table.
+    files of other formats would weigh. Several, and all scenes of a folder, make a table.
 
     Args:
-        scenes: files of any format, Splatfacto checkpoints, or runs (their folder or config.yml).
+        scenes: files of any format, Splatfacto checkpoints, runs (their folder or config.yml), or folders of scenes.
         views: a .png file for a sheet of the views that other commands use without --poses, for one scene; by default
             none.
         resolution: size of views, pixels. By default the size of the photos for the sheet, if there are any, else
@@ -41,6 +41,7 @@ def info(
     from pointsplat_ns.errors import PointSplatError
 
     claim_outputs(None, force, views)
+    scenes = tuple(path for scene in scenes for path in _scenes_of(scene))
     if not scenes or (views is not None and len(scenes) > 1):
         raise PointSplatError(f"{len(scenes)} scenes; expected {'one' if views else 'at least one'}")
     found: list[SceneInfo] = []
@@ -65,6 +66,14 @@ def info(
         print(sheet)
     if failed:
         raise PointSplatError(f"{len(failed)} of {len(scenes)} scenes cannot be read")
+
+
+def _scenes_of(path: Path) -> list[Path]:
+    """A scene itself, or the scenes of a folder."""
+    from pointsplat_ns.io.discovery import find_scenes
+    from pointsplat_ns.io.scene import is_folder_of_scenes
+
+    return [scene.path for scene in find_scenes(path)] if is_folder_of_scenes(path) else [path]
 
 
 def _print_table(found: list[SceneInfo]) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import asdict
 from pathlib import Path
 
+from pointsplat_ns.cli.folders import run_folder
 from pointsplat_ns.cli.printing import (
     Json,
     print_distributions,
@@ -22,7 +24,7 @@ from pointsplat_ns.cli.scene_options import (
     check_poses,
     claim_outputs,
     in_format_of,
-    need_one_scene,
+    need_no_folder_options,
     output_beside,
     scene_written,
     warn_if_larger,
@@ -44,19 +46,23 @@ def prune(
     plot: Path | None = None,
     dry_run: bool = False,
     force: bool = False,
+    jobs: int | None = None,
+    shard: str | None = None,
     threads: int | None = None,
     verbose: bool = False,
     json_output: Json = False,
 ) -> None:
-    """Make a scene smaller: merge neighbours, or keep the most important Gaussians. No photos are needed.
+    """Make a scene smaller, or all scenes of a folder: merge neighbours, or keep the most important Gaussians. No
+    photos are needed.
 
     If anything has to be rendered, cameras are those of --poses, else those of the run's dataset; if there are none,
     they are sampled in free space.
 
     Args:
-        scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
+        scene: a file of any format, a Splatfacto checkpoint, a run (its folder or config.yml), or a folder of scenes.
         output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog, .splat or .glb. By
-            default beside the scene: room_pruned.ply for room.ply, pruned.ply in the folder of a run.
+            default beside the scene: room_pruned.ply for room.ply, pruned.ply in the folder of a run. For a folder of
+            scenes, another folder; by default rooms_pruned beside rooms. Each result there has the format of its scene.
         keep: size of the result: a ratio (0.3), a percentage (30%), a count (50000 or 50k), the size of the file (12MB
             or 800kB; for .spz and .sog the count is searched for, which takes two or three times as long), or auto:35,
             the smallest scene whose renders reach 35 dB PSNR against those of the dense scene (auto alone means 35).
@@ -76,6 +82,8 @@ def prune(
         plot: a .png file for a plot of the distributions of opacity and volume, before and after; by default none.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
+        jobs: for a folder: number of processes that share its scenes and the cores; by default 1.
+        shard: for a folder: only a part of its scenes; 2/5 is the second of five; by default all.
         threads: number of threads. By default it adapts to the work and to other programs. Another number may
             change results by rounding.
         verbose: print more: what was chosen for the scene, and the distributions of opacities and sizes.
@@ -84,9 +92,22 @@ def prune(
     import pointsplat_ns as ps
     from pointsplat_ns.compacting import prune_source
     from pointsplat_ns.compression.requests import PruneRequest
+    from pointsplat_ns.io.scene import is_folder_of_scenes
     from pointsplat_ns.system.threads import fixed_threads
 
-    need_one_scene(scene)
+    if is_folder_of_scenes(scene):
+        from pointsplat_ns.compression.scene_folder import output_folder
+        from pointsplat_ns.folders import prune_folder
+
+        run = functools.partial(
+            prune_folder, keep=keep, by=by, sh=sh, opacity_weight=opacity_weight, clean=clean, fine_tune=fine_tune,
+            resolution=resolution, jobs=1 if jobs is None else jobs, shard=shard, force=force,
+        )  # fmt: skip
+        one = {"--poses": poses, "--up": up, "--plot": plot, "--dry-run": dry_run}
+        with fixed_threads(threads):
+            run_folder(scene, output or output_folder(scene, "pruned"), run, one, json_output)
+        return
+    need_no_folder_options(scene, jobs, shard)
     check_poses(poses)
     output = output or output_beside(scene, "pruned")
     written = None if dry_run else output

@@ -35,6 +35,14 @@ def output_beside(scene: Path, suffix: str) -> Path:
     return scene.with_name(f"{scene.stem}_{suffix}.ply")
 
 
+def need_no_folder_options(scene: Path, jobs: int | None, shard: str | None) -> None:
+    """Raise a SceneError if options are given that are for a folder of scenes."""
+    from pointsplat_ns.errors import SceneError
+
+    if jobs is not None or shard is not None:
+        raise SceneError(f"{scene}: one scene; --jobs and --shard are for a folder of scenes")
+
+
 def need_one_scene(path: Path) -> None:
     """Raise a SceneError if the path is a folder of scenes."""
     from pointsplat_ns.errors import SceneError
@@ -42,8 +50,8 @@ def need_one_scene(path: Path) -> None:
 
     if is_folder_of_scenes(path):
         raise SceneError(
-            f"{path}: a folder without config.yml, so no run; expected {ACCEPTED}; of the commands, compact takes a "
-            "folder of scenes"
+            f"{path}: a folder without config.yml, so no run; expected {ACCEPTED}; compact, prune, "
+            "convert and info take a folder of scenes"
         )
 
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 
+from pointsplat_ns.compression.prune import Pruned
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import DenseReference, views_text
 from pointsplat_ns.looking.sizes import subsampled
-from pointsplat_ns.looking.view_source import COMPARED_VIEWS
+from pointsplat_ns.looking.view_source import COMPARED_VIEWS, MERGED_FROM, ViewSource
 from pointsplat_ns.pruning.merging.settings import DEFAULTS as MERGING
 from pointsplat_ns.views import Views, spread_indices
 
@@ -48,3 +51,17 @@ def quality_of(dense: Gaussians, scene: Gaussians, views: Views) -> FullSizePsnr
     views = views.spread(COMPARED_VIEWS)
     psnr, _ = DenseReference(dense, subsampled(views, max(views.width, views.height))).psnr(scene)
     return FullSizePsnr(psnr, len(views), views.width, views.height)
+
+
+def quality_if_seen(dense: Gaussians, scene: Gaussians, views: Callable[[], Views]) -> FullSizePsnr | None:
+    """:func:`quality_of` in some views; None if there is no place to look from."""
+    try:
+        return quality_of(dense, scene, views())
+    except DataError:
+        return None
+
+
+def quality_of_pruned(dense: Gaussians, pruned: Pruned, source: ViewSource) -> FullSizePsnr | None:
+    """:func:`quality_of` in known views, else in those that merging looked from; None if there is no place to look
+    from."""
+    return quality_if_seen(dense, pruned.scene, lambda: source.known(MERGED_FROM) or pruned.views or source.whole())

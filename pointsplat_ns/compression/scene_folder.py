@@ -82,6 +82,8 @@ class Command:
     make: Callable[[Path], SmallerScene]
     options: Options
     """All options that ``make`` depends on."""
+    suffix: str | None = None
+    """Suffix of the results; None for the format of each scene."""
 
     @property
     def description(self) -> dict[str, object]:
@@ -121,7 +123,7 @@ def run_on_folder(
     """
     if jobs < 1:
         raise DataError(f"jobs is {jobs}; expected 1 or more")
-    everything = _tasks(folder, output)
+    everything = _tasks(folder, output, command.suffix)
     tasks = shard.part(everything)
     _check_and_describe(output, command, force)
     results: dict[str, SceneResult] = {}
@@ -145,11 +147,11 @@ def output_folder(folder: Path, suffix: str) -> Path:
     return place.with_name(f"{place.name}_{suffix}")
 
 
-def _tasks(folder: Path, output: Path) -> list[SceneTask]:
+def _tasks(folder: Path, output: Path, suffix: str | None) -> list[SceneTask]:
     if os.path.realpath(folder) == os.path.realpath(output):
         raise SceneError(f"{output}: holds the scenes themselves; name another folder for the results")
     return [
-        SceneTask(scene.name, scene.path, output / f"{scene.name}{format_like(scene.path).suffix}")
+        SceneTask(scene.name, scene.path, output / f"{scene.name}{suffix or format_like(scene.path).suffix}")
         for scene in find_scenes(folder)
     ]
 

@@ -1,4 +1,4 @@
-"""pointsplat compact on a folder of scenes: what it writes and says, and what it refuses."""
+"""Commands on a folder of scenes: what they write and say, and what they refuse."""
 
 from __future__ import annotations
 
@@ -106,6 +106,31 @@ def test_a_scene_with_fewer_gaussians_than_asked_for_is_kept_whole_and_the_table
     assert copied == (sh == "all") and len(ps.load(tmp_path / "small" / "few.sog")) == 121
 
 
+def test_prune_and_convert_take_a_folder_and_go_on_where_they_were(folder, tmp_path, capsys):
+    run("prune", folder, "--keep", "50%", "--by", "opacity")
+    run("convert", folder, tmp_path / "spz", "--to", ".spz", "--sh", "0")
+    said = capsys.readouterr().out
+    assert said.count("2 of 2 scenes, and the table scenes.csv") == 2 and said.count("done") == 4
+    for seed in (1, 2):
+        dense = ps.load(folder / f"room{seed}.ply")
+        pruned = ps.load(folder.with_name("rooms_pruned") / f"room{seed}.ply")
+        assert same(pruned, ps.prune(dense, "50%", by="opacity"))
+        converted = ps.load(tmp_path / "spz" / f"room{seed}.spz")
+        assert len(converted) == len(dense) and converted.sh_degree == 0
+    run("prune", folder, "--keep", "0.5", "--by", "opacity")
+    run("convert", folder, tmp_path / "spz", "--to", ".spz", "--sh", "0", "--json")
+    said = capsys.readouterr().out
+    assert said.count("done before") == 4
+    with pytest.raises(SystemExit):
+        run("convert", folder, tmp_path / "spz", "--to", ".sog", "--sh", "0")
+    assert "holds results of other options (format: .spz, now .sog)" in capsys.readouterr().err
+
+
+def test_info_makes_a_table_of_a_folder(folder, capsys):
+    run("info", folder, "--json")
+    assert [Path(row["file"]).name for row in json.loads(capsys.readouterr().out)] == ["room1.ply", "room2.ply"]
+
+
 @pytest.mark.parametrize(
     "words, said",
     [
@@ -119,8 +144,16 @@ def test_a_scene_with_fewer_gaussians_than_asked_for_is_kept_whole_and_the_table
         (("compact", "rooms", "-o", "rooms"), "rooms: holds the scenes themselves"),
         (("compact", "rooms/room1.ply", "--jobs", "2"), "one scene; --jobs and --shard are for a folder"),
         (("compact", "empty"), "empty: no scene below it"),
-        (("prune", "rooms"), "rooms: a folder without config.yml, so no run; expected a scene"),
-        (("lod", "rooms"), "of the commands, compact takes a folder of scenes"),
+        (("prune", "rooms", "--poses", "a.json"), "--poses is for one scene; rooms is a folder of scenes"),
+        (("prune", "rooms/room1.ply", "--shard", "1/2"), "one scene; --jobs and --shard are for a folder"),
+        (("compact", "rooms", "--photos"), "--photos is for one scene"),
+        (("convert", "rooms", "out"), "rooms: a folder of scenes; expected their new format, such as --to .spz"),
+        (("convert", "rooms", "out", "--to", "spz"), "spz: no suffix of scene files that are written"),
+        (("convert", "rooms", "out", "--to", ".ksplat"), "cannot write a ksplat file"),
+        (("convert", "rooms", "out", "--to", ".spz", "--spz-version", "4"), "--spz-version is for one scene"),
+        (("convert", "rooms/room1.ply", "a.spz", "--to", ".spz"), "one scene; --to is for a folder of scenes"),
+        (("info", "empty"), "empty: no scene below it"),
+        (("lod", "rooms"), "take a folder of scenes"),
     ],
 )
 def test_what_does_not_fit_a_folder_is_refused_in_one_line(words, said, folder, tmp_path, monkeypatch, capsys):

@@ -197,9 +197,9 @@ def test_one_gaussian_is_compacted_and_none_are_refused(scene, short_search):
         assert len(result.scene) == 1 and same(result.scene, one) and not result.accepted
         [note] = result.notes
         assert note.startswith("views: poses sampled in free space, up is ") and result.before.psnr == math.inf
-    faint = one.replace(opacities=torch.tensor([[-4.0]]))  # no place sees a covered picture of it
+    faint = one.replace(opacities=torch.tensor([[-4.0]]))
     result = compacted(faint, trained(tiny_refiner("scales", 0.3), 1), None)
-    assert same(result.scene, faint) and "cannot be compared" in result.verdict and result.notes == ()
+    assert same(result.scene, faint) and not result.accepted
     for nothing in (scene[:0], scene.map(lambda value: value * math.nan)):
         with pytest.raises(SceneError, match="can be drawn"):
             compacted(nothing, trained(tiny_refiner()), None)
