@@ -47,7 +47,7 @@ class LookingSettings:
 
     energy_exponent: float = 0.75
     """Exponent of the mean energy of the SH in a trace factor; 0 turns it off. Fitted, together with that of the
-    flatness, to the poses of four captures."""
+    flatness, to the poses of four captures. At 10 %, fox loses 0.9 dB without it, 2.0 without trace factors."""
 
     flatness_exponent: float = 1.0
     """Exponent of the mean flatness in a trace factor; 0 turns it off."""
