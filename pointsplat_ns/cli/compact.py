@@ -33,7 +33,6 @@ from pointsplat_ns.cli.scene_options import (
     need_no_folder_options,
     output_beside,
     scene_written,
-    warn_if_larger,
 )
 
 if TYPE_CHECKING:
@@ -162,7 +161,6 @@ def compact(
         )
     if not dry_run:
         ps.save(result.scene, output, progress=True)
-        warn_if_larger(keep, output)
     with scene_written(written):
         shown = None if picture is None else ps.plot_comparison(dense, result, picture)
         if html is not None:

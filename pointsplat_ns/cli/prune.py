@@ -27,7 +27,6 @@ from pointsplat_ns.cli.scene_options import (
     need_no_folder_options,
     output_beside,
     scene_written,
-    warn_if_larger,
 )
 
 
@@ -120,7 +119,6 @@ def prune(
         )
     if not dry_run:
         ps.save(small, output, progress=True)
-        warn_if_larger(keep, output)
     if plot is not None:
         with scene_written(written):
             ps.plot_distributions({"before": dense, "after": small}, plot)

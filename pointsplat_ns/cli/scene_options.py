@@ -139,19 +139,6 @@ def in_format_of(keep: str, output: Path) -> str:
     return keep.strip() + format_to_write(output).budget_suffix if is_size else keep
 
 
-def warn_if_larger(keep: str | None, output: Path) -> None:
-    """Warn if a file is larger than its budget: a repaired scene may compress less well than the pruned one."""
-    from pointsplat_ns.io.files import bytes_text, logger
-    from pointsplat_ns.pruning import Megabytes, parse_keep
-
-    budget = None if keep is None else parse_keep(keep)
-    if isinstance(budget, Megabytes) and file_bytes(output) > budget.value * 1e6:
-        logger.warning(
-            "%s: %s, more than %s, which held before the repair; try a smaller --keep",
-            output, bytes_text(file_bytes(output)), budget,
-        )  # fmt: skip
-
-
 def file_bytes(path: Path) -> int:
     """Size of a scene's file in bytes; for the meta.json of a SOG folder, of all parts together."""
     return sum(part.stat().st_size for part in map(path.with_name, _file_names(path)) if part.exists())

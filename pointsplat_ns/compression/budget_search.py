@@ -190,7 +190,7 @@ class FileLimit:
     most: int
     """Bytes."""
     rounding: Rounding | None = None
-    """The rounding of a scene of this quality; None for no rounding."""
+    """The rounding of a scene of this quality; None for none, as long as the file meets the limit."""
 
     def bytes_of(self, scene: Gaussians) -> int:
         """Bytes of a scene's file, without unusable Gaussians."""
@@ -200,16 +200,20 @@ class FileLimit:
     def rounded(self, scene: Gaussians) -> Gaussians:
         """A scene rounded so that its file meets the limit, on its device: coarser if the file is too large, finer if
         there is much room. If it is too large at six steps coarser, that is returned."""
-        if self.rounding is None or self.kind.rounded is None:
+        if self.kind.rounded is None:
             return scene
-        written = _as_written(scene)
-        best = self.kind.rounded(written, self.rounding)
+        written, rounding = _as_written(scene), self.rounding
+        if rounding is None:
+            if self.bytes_of(written) <= self.most:
+                return scene
+            rounding = rounding_for(math.inf)
+        best = self.kind.rounded(written, rounding)
         size = self.bytes_of(best)
         finer = size <= BUDGETS.room * self.most
         for step in range(1, 7):
             if not finer and size <= self.most:
                 break
-            other = self.kind.rounded(written, self.rounding.finer(step if finer else -step))
+            other = self.kind.rounded(written, rounding.finer(step if finer else -step))
             size = self.bytes_of(other)
             if finer and size > self.most:
                 break

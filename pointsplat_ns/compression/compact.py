@@ -214,8 +214,9 @@ def compact_scene(
     stopped = any(stage.interrupted for stage in stages)
     if photos is not None and request.photos is not None and not request.photos.empty and not stopped:
         stages.append(_on_photos(_last_kept(stages), at_work, request.photos, photos, judge, views, progress))
-    if pruned.limit is not None and pruned.limit.rounding:
-        stages.append(_round(_last_kept(stages), pruned.limit, judge))
+    if pruned.limit is not None:
+        rounded = _round(_last_kept(stages), pruned.limit, judge)
+        stages += [] if rounded is None else [rounded]
     notes = pruned.notes
     if views.origin and views.text not in notes:
         notes = (views.text, *notes)
@@ -278,9 +279,11 @@ def _repair(
     return Stage("repair", scene, change.closeness, last.after, change.strength, change.reason, *figures)
 
 
-def _round(last: Stage, limit: FileLimit, judge: Comparison | None) -> Stage:
-    """The last scene, rounded for a file of limited size."""
+def _round(last: Stage, limit: FileLimit, judge: Comparison | None) -> Stage | None:
+    """The last scene, rounded for a file of limited size; None if it fits as it is."""
     scene = limit.rounded(last.scene)
+    if scene is last.scene:
+        return None
     after = None if judge is None else judge.reference.closeness(scene.to(judge.device))
     return Stage("round", scene, after, last.after)
 

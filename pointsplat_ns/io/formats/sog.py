@@ -274,9 +274,8 @@ def rounded_for_sog(scene: Gaussians, rounding: Rounding) -> Gaussians:
     rest = scene.features_rest
     if scene.sh_degree:
         entries = 64 * max(int(len(scene) / (64 * rounding.rows_per_entry)), 1)
-        book, index = palette(
-            rest.flatten(1), lambda share: None, min(entries, palette_size(len(scene))), weights(scene)
-        )
+        entries = min(entries, palette_size(len(scene)))
+        book, index = palette(rest.flatten(1), lambda share: None, entries, weights(scene))
         numbers, number = codebook(book)
         rest = numbers[number.long()][index].reshape(rest.shape)
     return rounded_shapes(scene, steps).replace(means=means, features_rest=rest)
@@ -287,7 +286,8 @@ def _pack_sh(
 ) -> dict[str, Any]:
     """Add the palette and its indices to ``images``; returns what ``meta.json`` says of them."""
     rest = scene.features_rest.shape[1]
-    rows, index = palette(scene.features_rest.flatten(1), functools.partial(progress, "a palette of SH"))
+    report = functools.partial(progress, "a palette of SH")
+    rows, index = palette(scene.features_rest.flatten(1), report, weights=weights(scene))
     levels, level_index = codebook(rows)
     labels = np.column_stack([index.numpy() & 255, index.numpy() >> 8, np.zeros(len(index))])
     images["shN_centroids.webp"] = (level_index.reshape(-1, 3).numpy(), _ACROSS * rest, len(rows) // _ACROSS)
