@@ -17,6 +17,7 @@ from pointsplat_ns.system.quantities import seconds_text
 if TYPE_CHECKING:
     from pointsplat_ns.compression.quality import FullSizePsnr
     from pointsplat_ns.gaussians import Gaussians
+    from pointsplat_ns.io.ply import PlyRows
 
 Json = Annotated[bool, tyro.conf.arg(name="json")]
 
@@ -51,7 +52,7 @@ def end_if_interrupted(interrupted: bool) -> None:
         raise KeyboardInterrupt
 
 
-def scene_result(before: int | None, scene: Gaussians, seconds: float, where: Path | None) -> dict[str, Any]:
+def scene_result(before: int | None, scene: Gaussians | PlyRows, seconds: float, where: Path | None) -> dict[str, Any]:
     """The JSON values of a result, from ``before`` Gaussians in the dense scene, if there is one. Without a written
     file, as in a dry run, ``bytes`` are those of a PLY."""
     from pointsplat_ns.pruning import ply_bytes
@@ -70,13 +71,13 @@ def print_result(
     by: str,
     also: list[str],
     before: int,
-    scene: Gaussians,
+    scene: Gaussians | PlyRows,
     seconds: float,
     where: Path | None,
-    quality: FullSizePsnr | None,
+    quality: FullSizePsnr | str | None,
 ) -> None:
     """Print what was done by a method and ``also`` after it (refined, repaired), counts, size of the file (that of a
-    PLY in a dry run) and time, and how close the result is to the dense scene."""
+    PLY in a dry run) and time, and how close the result is to the dense scene, or why that is not known."""
     from pointsplat_ns.io.files import bytes_text
     from pointsplat_ns.pruning import ply_bytes
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pointsplat_ns.cli.folders import run_folder
 from pointsplat_ns.cli.printing import (
@@ -16,6 +17,7 @@ from pointsplat_ns.cli.printing import (
 )
 from pointsplat_ns.cli.scene_options import (
     Bands,
+    Megabytes,
     Output,
     Poses,
     Resolution,
@@ -28,6 +30,10 @@ from pointsplat_ns.cli.scene_options import (
     output_beside,
     scene_written,
 )
+
+if TYPE_CHECKING:
+    from pointsplat_ns.compression.requests import PruneRequest
+    from pointsplat_ns.io.ply import PlyRows
 
 
 def prune(
@@ -47,6 +53,7 @@ def prune(
     force: bool = False,
     jobs: int | None = None,
     shard: str | None = None,
+    memory: Megabytes | None = None,
     threads: int | None = None,
     verbose: bool = False,
     json_output: Json = False,
@@ -83,6 +90,8 @@ def prune(
         force: overwrite existing files.
         jobs: for a folder: number of processes that share its scenes and the cores; by default 1.
         shard: for a folder: only a part of its scenes; 2/5 is the second of five; by default all.
+        memory: how much memory may be taken, such as 8GB; by default what is free. A PLY that needs more is merged in
+            parts, with files beside the output; a command that was killed goes on.
         threads: number of threads. By default it adapts to the work and to other programs. Another number may
             change results by rounding.
         verbose: print more: what was chosen for the scene, and the distributions of opacities and sizes.
@@ -90,7 +99,9 @@ def prune(
     """
     import pointsplat_ns as ps
     from pointsplat_ns.compacting import prune_source
+    from pointsplat_ns.compression.prune_file import rows_to_prune
     from pointsplat_ns.compression.requests import PruneRequest
+    from pointsplat_ns.errors import SceneError
     from pointsplat_ns.io.scene import is_folder_of_scenes
     from pointsplat_ns.system.threads import fixed_threads
 
@@ -102,7 +113,7 @@ def prune(
             prune_folder, keep=keep, by=by, sh=sh, opacity_weight=opacity_weight, clean=clean, fine_tune=fine_tune,
             resolution=resolution, jobs=1 if jobs is None else jobs, shard=shard, force=force,
         )  # fmt: skip
-        one = {"--poses": poses, "--up": up, "--plot": plot, "--dry-run": dry_run}
+        one = {"--poses": poses, "--up": up, "--plot": plot, "--dry-run": dry_run, "--memory": memory}
         with fixed_threads(threads):
             run_folder(scene, output or output_folder(scene, "pruned"), run, one, json_output)
         return
@@ -113,6 +124,13 @@ def prune(
     claim_outputs(written, force, plot)
     keep = in_format_of(keep, output)
     request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune)
+    rows = rows_to_prune(scene, request, None if memory is None else 1e6 * memory)
+    if rows is not None:
+        if dry_run or plot is not None:
+            raise SceneError(f"{scene}: does not fit into memory; expected neither --dry-run nor --plot")
+        with fixed_threads(threads):
+            _prune_in_parts(rows, output, request, memory, poses, resolution, json_output)
+        return
     with fixed_threads(threads):
         dense, small, seconds, quality = prune_source(
             scene, request, poses, resolution, up, progress=True, compared=True
@@ -131,3 +149,30 @@ def prune(
         print_distributions(dense, small)
     if plot is not None:
         print(f"{plot}: opacity and volume, before and after")
+
+
+def _prune_in_parts(
+    rows: PlyRows,
+    output: Path,
+    request: PruneRequest,
+    memory: float | None,
+    poses: Path | None,
+    resolution: str | None,
+    json_output: bool,
+) -> None:
+    """Prune a scene that does not fit into memory, and print the result."""
+    from pointsplat_ns.compression.prune_file import prune_file
+    from pointsplat_ns.io.ply import PlyRows
+    from pointsplat_ns.looking.sizes import parse_resolution
+    from pointsplat_ns.system.progress import progress_bar
+
+    size, limit = parse_resolution(resolution), None if memory is None else 1e6 * memory
+    with progress_bar() as report:
+        before, seconds = prune_file(rows, output, request, limit, poses, size, report)
+    small = PlyRows.open(output)
+    assert small is not None
+    if json_output:
+        print_json({**scene_result(before, small, seconds, output), "psnr": None, "plot": None})
+        return
+    unknown = "not compared with the dense scene: it does not fit into memory"
+    print_result(request.by, [], before, small, seconds, output, unknown)

@@ -6,6 +6,8 @@ OpenGL's (x right, y up, z back).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -117,16 +119,29 @@ def interleave(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     return (x << 2).bitwise_or_(y << 1).bitwise_or_(z)
 
 
-def unit_cells(means: Tensor) -> Tensor:
-    """Positions (N, 3), float32, scaled so that most lie in a cube of side 1/2 around 1/2; those far outside are
-    clamped to [0, 1]. So the few distant Gaussians of most scenes do not coarsen the grid of the others."""
+class Cube(NamedTuple):
+    """A cube in space."""
+
+    centre: Tensor  # [3] float64
+    side: Tensor  # scalar, float64, above 0
+
+
+def bulk_cube(means: Tensor) -> Cube:
+    """The cube around the bulk of positions (N, 3), twice as wide as 98 % of them along the widest axis: the few
+    distant Gaussians of most scenes do not coarsen the grid of the others."""
     some = means[:: max(1, len(means) // 2**14)].double()
     n = len(some)
     ranked = some.sort(dim=0).values
     low, high = ranked[(n - 1) // 100], ranked[n - 1 - (n - 1) // 100]
     side = 2 * (high - low).amax()
-    cells = (means.double() - 0.5 * (low + high)).div_(side.clamp_min(torch.finfo(torch.float64).tiny))
-    return cells.float().clamp_(-0.5, 0.5).add_(0.5)
+    return Cube(0.5 * (low + high), side.clamp_min(torch.finfo(torch.float64).tiny))
+
+
+def unit_cells(means: Tensor, cube: Cube | None = None) -> Tensor:
+    """Positions (N, 3), float32, in a cube that becomes the unit cube, by default :func:`bulk_cube`; those outside are
+    clamped to [0, 1]."""
+    cube = cube or bulk_cube(means)
+    return (means.double() - cube.centre).div_(cube.side).float().clamp_(-0.5, 0.5).add_(0.5)
 
 
 def curve_keys(cells: Tensor, offset: float = 0.0) -> Tensor:

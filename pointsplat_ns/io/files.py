@@ -120,7 +120,7 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None) -> It
         target = target_of(path)
         mode = _mode_of(target)
         target.parent.mkdir(parents=True, exist_ok=True)
-        _require_space(path, target.parent, size)
+        require_space(path, target.parent, size)
         part = (folder or target.parent) / _part_name(target.name)
         if mode is not None:
             part.touch(0o600)  # nobody else reads it before it is complete
@@ -179,7 +179,7 @@ def target_of(path: Path) -> Path:
     return target
 
 
-def _require_space(path: Path, folder: Path, size: int) -> None:
+def require_space(path: Path, folder: Path, size: int) -> None:
     """Raise a SceneError if the disk has less than ``size`` bytes. A file that is replaced stays until the end."""
     disk = shutil.disk_usage(folder)
     if disk.total and size > disk.free:  # some network file systems tell nothing
@@ -303,10 +303,17 @@ def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:
     """
     if _everything.get():
         return scene
-    usable = scene.usable()
-    dropped = len(scene) - int(usable.sum())
+    usable = usable_part(scene)
+    dropped = len(scene) - len(usable)
     if dropped:
         logger.warning("%s: dropped %d of %d Gaussians with NaN or infinite values", path, dropped, len(scene))
+    return usable
+
+
+def usable_part(scene: Gaussians) -> Gaussians:
+    """As :func:`keep_usable`, always, and without a warning."""
+    usable = scene.usable()
+    if not bool(usable.all()):
         scene = scene[usable]
     if bool(scene.opacities.isinf().any()) or bool(scene.scales.isinf().any()):
         opacities = scene.opacities.nan_to_num(posinf=30.0, neginf=-30.0)

@@ -9,16 +9,20 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Container
+from collections.abc import Container, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
+from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians, sh_degree_of
 from pointsplat_ns.io.files import keep_usable, logger, one_line, replacing, require_file, require_memory
 from pointsplat_ns.io.ply_header import Element, Header, read_header, warn_render_mode
+
+MAX_REST = (MAX_SH_DEGREE + 1) ** 2 - 1
+"""Number of SH coefficients per channel beyond the constant one that are read."""
 
 _COLUMNS = {
     "means": ["x", "y", "z"],
@@ -46,16 +50,10 @@ def read_ply(path: Path | str) -> Gaussians:
 
     path = require_file(path, "a 3DGS PLY file")
     try:
-        with path.open("rb") as stream:
-            header = read_header(stream, path)
-        vertex = _gaussian_element(header, path)
-        in_file = _num_rest(vertex, path)
-        k = min(in_file, (MAX_SH_DEGREE + 1) ** 2 - 1)
+        header, vertex, in_file = _checked(path)
+        k = min(in_file, MAX_REST)
         require_memory(path, vertex.count * 4 * (14 + 3 * k))  # float32 numbers
-        _report_unread(header, vertex, path)
-        if in_file > k:
-            logger.warning("%s: SH degree 4, read up to degree %d", path, MAX_SH_DEGREE)
-        warn_render_mode(header, path)
+        _report_unread(header, vertex, in_file, path)
         with _GaussiansAlone(path, header) as stream:
             # Binary rows are mapped, not read: only the Gaussians below take memory.
             rows = PlyData.read(stream, mmap="r")["vertex"].data
@@ -66,6 +64,80 @@ def read_ply(path: Path | str) -> Gaussians:
         wanted = f"{vertex.count} Gaussians of {len(vertex.properties)} numbers"
         raise SceneError(f"{path}: damaged PLY ({one_line(error)}); expected {wanted}") from error
     return keep_usable(scene, path)
+
+
+@dataclass(frozen=True)
+class PlyRows:
+    """The Gaussians of a binary 3DGS PLY, read from the file in pieces: the whole need not fit into memory."""
+
+    path: Path
+    count: int
+    """Number of Gaussians in the file, those that cannot be drawn included."""
+    rest: int
+    """Number of SH coefficients per channel beyond the constant one that are read."""
+    _dtype: np.dtype
+    """Properties of a row."""
+    _start: int
+    """Where the first row begins, bytes."""
+    _in_file: int
+    """Number of SH coefficients per channel beyond the constant one in the file."""
+
+    @classmethod
+    def open(cls, path: Path | str) -> PlyRows | None:
+        """The rows of a file, its header checked as by :func:`read_ply`; None for an ASCII file, which has no rows of
+        one length. Raises SceneError as :func:`read_ply` does."""
+        path = require_file(path, "a 3DGS PLY file")
+        header, vertex, in_file = _checked(path)
+        if not header.order:
+            return None
+        _report_unread(header, vertex, in_file, path)
+        dtype = np.dtype([(name, header.order + np.dtype(kind).str[1:]) for name, kind in vertex.properties])
+        start = header.size + sum(_least_bytes(element, header) for element in header.before("vertex"))
+        return cls(path, vertex.count, min(in_file, MAX_REST), dtype, start, in_file)
+
+    def __len__(self) -> int:
+        return self.count
+
+    @property
+    def sh_degree(self) -> int:
+        """SH degree of the Gaussians as read."""
+        return sh_degree_of(self.rest)
+
+    def read(self, start: int, stop: int) -> Gaussians:
+        """The Gaussians of rows ``start`` to ``stop`` - 1, float32, those that cannot be drawn included. Raises
+        SceneError if the file cannot be read or has become shorter."""
+        return self._of([(start, stop - start)])
+
+    def pick(self, rows: Sequence[int]) -> Gaussians:
+        """The Gaussians of single rows, as :meth:`read` gives them."""
+        return self._of([(row, 1) for row in rows])
+
+    def _of(self, parts: Sequence[tuple[int, int]]) -> Gaussians:
+        """The Gaussians of parts of the file: first row, and number of rows."""
+        size, found = self._dtype.itemsize, []
+        try:
+            with self.path.open("rb") as stream:
+                for start, count in parts:
+                    stream.seek(self._start + start * size)
+                    found.append(stream.read(count * size))
+        except OSError as error:
+            raise SceneError(f"{self.path}: cannot be read ({error.strerror or one_line(error)})") from error
+        data = b"".join(found) if len(found) > 1 else found[0]
+        if len(data) < size * sum(count for _, count in parts):
+            raise SceneError(f"{self.path}: truncated while it was read; expected {self.count} Gaussians")
+        return _scene(np.frombuffer(data, self._dtype), self.rest, self._in_file)
+
+
+def _checked(path: Path) -> tuple[Header, Element, int]:
+    """The header of a file, the element that holds the Gaussians, and :func:`_num_rest` of it. Raises SceneError if it
+    is not a 3DGS PLY, or cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            header = read_header(stream, path)
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
+    vertex = _gaussian_element(header, path)
+    return header, vertex, _num_rest(vertex, path)
 
 
 def write_ply(scene: Gaussians, path: Path | str) -> None:
@@ -80,24 +152,31 @@ def write_ply(scene: Gaussians, path: Path | str) -> None:
     from plyfile import PlyData, PlyElement
 
     scene = keep_usable(scene.detach().to("cpu", torch.float32), path)
+    names = _column_names(3 * scene.features_rest.shape[1])
+    rows = row_table(scene).view([(name, "<f4") for name in names]).reshape(len(scene))
+    with replacing(path, ply_bytes(len(scene), scene.sh_degree)) as part:
+        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(part))
+
+
+def row_table(scene: Gaussians) -> np.ndarray:
+    """The rows of a 3DGS PLY, (N, 17 + 3 K) little-endian float32, of a float32 scene on the CPU."""
     rest = scene.features_rest.transpose(1, 2).reshape(len(scene), 3 * scene.features_rest.shape[1])
     values = [scene.means, torch.zeros_like(scene.means), scene.features_dc, rest]
     values += [scene.opacities, scene.scales, scene.quats]
-    names = _column_names(rest.shape[1])
-    table = torch.cat(values, dim=1).numpy().astype("<f4", copy=False)
-    rows = np.ascontiguousarray(table).view([(name, "<f4") for name in names]).reshape(len(scene))
-    with replacing(path, ply_bytes(len(scene), scene.sh_degree)) as part:
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(part))
+    return np.ascontiguousarray(torch.cat(values, dim=1).numpy().astype("<f4", copy=False))
+
+
+def header_bytes(count: int, sh_degree: int) -> bytes:
+    """The header of a 3DGS PLY of ``count`` Gaussians, whose :func:`row_table` follows."""
+    names = _column_names(3 * ((sh_degree + 1) ** 2 - 1))
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    return "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""]).encode("ascii")
 
 
 def ply_bytes(count: int, sh_degree: int) -> int:
     """Size of the 3DGS PLY of ``count`` Gaussians, bytes: an ASCII header, then 17 numbers a Gaussian (normals
     included) and three for each SH coefficient beyond the constant one, as float32."""
-    rest = 3 * ((sh_degree + 1) ** 2 - 1)
-    names = _column_names(rest)
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [f"property float {name}" for name in names] + ["end_header"]
-    return sum(len(line) + 1 for line in lines) + 4 * len(names) * count
+    return len(header_bytes(count, sh_degree)) + 4 * (17 + 3 * ((sh_degree + 1) ** 2 - 1)) * count
 
 
 def _column_names(rest: int) -> list[str]:
@@ -149,8 +228,11 @@ def _is_flat(names: Container[str]) -> bool:
     return "scale_2" not in names and all(name in names for name in ("scale_0", "scale_1", "opacity"))
 
 
-def _report_unread(header: Header, vertex: Element, path: Path) -> None:
-    """Warn of what a file holds beside the Gaussians."""
+def _report_unread(header: Header, vertex: Element, in_file: int, path: Path) -> None:
+    """Warn of what a file holds beside the Gaussians that are read."""
+    if in_file > MAX_REST:
+        logger.warning("%s: SH degree 4, read up to degree %d", path, MAX_SH_DEGREE)
+    warn_render_mode(header, path)
     known = {name for names in _COLUMNS.values() for name in names}
     others = [name for name, _ in vertex.properties if name not in known and not name.startswith("f_rest_")]
     unread = [f"the vertex properties {', '.join(others[:4])}{'...' if len(others) > 4 else ''}"] if others else []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import torch
 import pointsplat_ns as ps
 from making import ball, normal_scene, same
 from pointsplat_ns.cli import main
+from pointsplat_ns.compression import prune_file
 from pointsplat_ns.compression.trained_refiner import open_refiner_run, scenes_of_run
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.io.camera_files import read_views
@@ -283,3 +285,47 @@ def test_poses_in_another_frame_are_refused_before_the_work(posed, tmp_path, cap
     written(content, poses)
     error = refusal(capsys, tmp_path / "small.ply", "prune", room, "--poses", poses)
     assert f"{poses}: 0 of 5 cameras see anything of the scene" in error and "dataparser_transforms.json" in error
+
+
+def test_a_scene_that_does_not_fit_is_merged_in_parts(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(prune_file, "BASE_BYTES", 0)
+    monkeypatch.setattr(prune_file, "LEAST", 100)
+    scene, small = tmp_path / "scene.ply", tmp_path / "small.ply"
+    write_ply(normal_scene(900, degree=1, seed=SEED), scene)
+    run("prune", scene, "--keep", "10%", "--sh", "0", "--memory", "200kB", "-o", small, "--json")
+    said = json.loads(capsys.readouterr().out)
+    assert (said["gaussians_before"], said["gaussians"], said["sh_degree"]) == (900, 90, 0)
+    assert len(read_ply(small)) == 90
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.ply", "small.ply"]
+    run("prune", scene, "--keep", "10%", "--memory", "8GB", "-o", tmp_path / "whole.ply")
+    assert "not compared" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--memory", "1kB"), "is too small; expected at least"),
+        (("--memory", "200kB", "--by", "opacity"), r"with --by opacity; expected more memory"),
+        (("--memory", "200kB", "--clean", "--keep", "auto:30"), "with --clean, --keep auto:30"),
+        (("--memory", "200kB", "--dry-run"), "neither --dry-run nor --plot"),
+    ],
+)
+def test_what_needs_the_whole_scene_is_refused_under_a_limit_of_memory(options, named, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(prune_file, "BASE_BYTES", 0)
+    monkeypatch.setattr(prune_file, "LEAST", 100)
+    write_ply(normal_scene(900, degree=1, seed=SEED), tmp_path / "scene.ply")
+    error = refusal(capsys, tmp_path / "small.ply", "prune", tmp_path / "scene.ply", *options)
+    assert re.search(named, error)
+
+
+def test_a_limit_of_memory_needs_a_binary_ply_and_writes_one(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(prune_file, "BASE_BYTES", 0)
+    scene = normal_scene(900, degree=1, seed=SEED)
+    ps.save(scene, tmp_path / "scene.spz")
+    assert "expected a binary 3DGS PLY" in refusal(
+        capsys, tmp_path / "small.ply", "prune", tmp_path / "scene.spz", "--memory", "1GB"
+    )
+    write_ply(scene, tmp_path / "scene.ply")
+    assert "`pointsplat convert` changes" in refusal(
+        capsys, tmp_path / "small.spz", "prune", tmp_path / "scene.ply", "--memory", "200kB"
+    )

@@ -34,10 +34,18 @@ def cheapest_pairs(
     Returns:
         First and second members, (E,) int64 each; at least one pair if there is any neighbour and ``most`` is not 0.
     """
-    suited = near.dtype == torch.int32 and KERNELS.usable_for(compiled, costs)
-    first, second, price = (_by_kernels if suited else _candidates)(near, costs, passes)
+    first, second, price = candidate_pairs(near, costs, passes, compiled)
     chosen = price.sort(stable=True).indices[:most]
     return first[chosen], second[chosen]
+
+
+def candidate_pairs(
+    near: Tensor, costs: Tensor, passes: int = DEFAULTS.matching_passes, compiled: bool | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The pairs of all passes, of which :func:`cheapest_pairs` takes the cheapest: first and second members, (E,) int64
+    each, and costs, (E,) float32. Arguments as there."""
+    suited = near.dtype == torch.int32 and KERNELS.usable_for(compiled, costs)
+    return (_by_kernels if suited else _candidates)(near, costs, passes)
 
 
 def _candidates(near: Tensor, costs: Tensor, passes: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,20 +33,30 @@ class State:
         return len(self.means)
 
 
-def initial_state(participants: Participants, weights: Tensor, settings: MergeSettings) -> State:
+class ColourAxes(NamedTuple):
+    """Axes on which colours are compared."""
+
+    middle: Tensor  # [3 (d+1)^2] float32, mean of the coefficients, colour units
+    axes: Tensor  # [3 (d+1)^2, C] float32, orthogonal, each of length 1
+
+
+def initial_state(
+    participants: Participants, weights: Tensor, settings: MergeSettings, axes: ColourAxes | None = None
+) -> State:
     """The state before the first round.
 
     Args:
         participants: n Gaussians of a scene.
         weights: (n,) visibility weight of each per unit of area.
         settings: ``colour_axes`` and ``max_colour``.
+        axes: of the colours; by default the principal axes of the participants.
     """
     scene, members = participants.scene, participants.members
     return State(
         means=scene.means[members].double(),
         cov=in_pieces(lambda rows: covariances_of(scene, rows), members, 6),
         alphas=torch.sigmoid(scene.opacities[members, 0]).double(),
-        colours=_principal_colours(scene, members, settings),
+        colours=_on_axes(scene, members, axes or principal_axes(scene, members, settings), settings),
         weights=weights.float(),
         counts=torch.ones(len(members), dtype=torch.int32),
         centre=participants.centre.double(),
@@ -58,24 +69,33 @@ def bounded_colours(coefficients: Tensor, settings: MergeSettings) -> Tensor:
     return (coefficients.float() * SH_C0).clamp_(-settings.max_colour, settings.max_colour)
 
 
-def _principal_colours(scene: Gaussians, members: Tensor, settings: MergeSettings) -> Tensor:
-    """Colours (n, C) on the principal axes of all SH coefficients, around their mean. By Parseval's theorem, the
-    coefficients of every band contribute to the mean square over directions as the constant does."""
+def _coefficients(scene: Gaussians, rows: Tensor, settings: MergeSettings) -> Tensor:
+    """All SH coefficients (m, 3 (d+1)^2) of rows (m,), in colour units."""
+    parts = scene.features_dc[rows], scene.features_rest[rows].reshape(len(rows), -1)
+    return bounded_colours(torch.cat(parts, dim=1), settings)
 
-    def coefficients(rows: Tensor) -> Tensor:
-        parts = scene.features_dc[rows], scene.features_rest[rows].reshape(len(rows), -1)
-        return bounded_colours(torch.cat(parts, dim=1), settings)
 
+def principal_axes(scene: Gaussians, members: Tensor, settings: MergeSettings) -> ColourAxes:
+    """Principal axes of all SH coefficients of members (n,). By Parseval's theorem, the coefficients of every band
+    contribute to the mean square over directions as the constant does."""
     pieces = members.split(CHUNK)
     width = 3 + 3 * scene.features_rest.shape[1]
-    shift = coefficients(pieces[0]).mean(0)  # near the mean, so that float32 holds the squares
+    shift = _coefficients(scene, pieces[0], settings).mean(0)  # near the mean, so that float32 holds the squares
     total, products = torch.zeros(width, dtype=torch.float64), torch.zeros(width, width, dtype=torch.float64)
     for rows in pieces:
-        values = coefficients(rows) - shift
+        values = _coefficients(scene, rows, settings) - shift
         total += values.sum(0)
         products += values.T @ values
     mean = total / len(members)
     covariance = products - len(members) * mean[:, None] * mean
     axes = torch.linalg.eigh(covariance).eigenvectors[:, -settings.colour_axes :].float()
-    middle = (shift + mean).float()
-    return in_pieces(lambda rows: (coefficients(rows) - middle) @ axes, members, axes.shape[1], dtype=torch.float32)
+    return ColourAxes((shift + mean).float(), axes)
+
+
+def _on_axes(scene: Gaussians, members: Tensor, axes: ColourAxes, settings: MergeSettings) -> Tensor:
+    """Colours (n, C) of members (n,) on axes, around their middle."""
+
+    def on_axes(rows: Tensor) -> Tensor:
+        return (_coefficients(scene, rows, settings) - axes.middle) @ axes.axes
+
+    return in_pieces(on_axes, members, axes.axes.shape[1], dtype=torch.float32)

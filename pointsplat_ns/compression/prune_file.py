@@ -1,0 +1,185 @@
+"""Pruning of a PLY that is larger than memory: which files are, and merging them cell by cell."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from pointsplat_ns.compression.posed_scene import check_views_show, views_for
+from pointsplat_ns.compression.requests import PruneRequest
+from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import bytes_text
+from pointsplat_ns.io.formats import format_to_read
+from pointsplat_ns.io.formats.compressed_ply import is_compressed
+from pointsplat_ns.io.ply import PlyRows
+from pointsplat_ns.io.ply_header import read_header
+from pointsplat_ns.looking.sizes import RESOLUTION
+from pointsplat_ns.looking.view_source import MERGED_FROM
+from pointsplat_ns.pruning import found_by_trying
+from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
+from pointsplat_ns.pruning.merging.settings import DEFAULTS
+from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.views import Views
+
+WHOLE_BYTES = 600
+"""Memory that merging takes for each Gaussian of a scene in memory, beside the scene itself, bytes."""
+
+CELL_BYTES = 400
+"""The same for each Gaussian of a cell: what follows from the whole scene is known before."""
+
+BASE_BYTES = 900_000_000
+"""Memory of the interpreter, torch and a thinned scene, bytes."""
+
+MOST, LEAST = 4_000_000, 100_000
+"""Largest and smallest number of Gaussians in a cell. More memory than the first needs changes nothing: so a result
+does not depend on the memory that happens to be free."""
+
+
+def rows_to_prune(scene: Path, request: PruneRequest, memory: float | None = None) -> PlyRows | None:
+    """The rows of a PLY that has to be merged in cells; None if it is pruned in memory: it fits, or options need it
+    whole.
+
+    Args:
+        scene: path of a scene.
+        request: options of pruning.
+        memory: bytes that may be taken; by default what is free.
+
+    Raises:
+        SceneError: if the file is damaged, or ``memory`` is given and it is no binary 3DGS PLY.
+        PointSplatError: if ``memory`` is given and too small for the scene with these options.
+    """
+    import psutil
+
+    rows = _binary_ply(scene)
+    if rows is None:
+        if memory is not None:
+            raise SceneError(
+                f"{scene}: is read as a whole; expected a binary 3DGS PLY for a limit of memory, which "
+                "`pointsplat convert` makes"
+            )
+        return None
+    size = rows.count * (_row_bytes(rows) + WHOLE_BYTES) + BASE_BYTES
+    limit = psutil.virtual_memory().available if memory is None else memory
+    if size <= limit:
+        return None
+    asked = {
+        f"--by {request.by}": request.method.score is not None,
+        "--sh auto": request.sh == "auto",
+        "--clean": request.clean,
+        "--fine-tune": request.fine_tune > 0,
+        f"--keep {request.keep}": found_by_trying(request.budget),
+    }
+    needing = [name for name, given in asked.items() if given]
+    if needing and memory is not None:
+        raise PointSplatError(
+            f"{scene}: {rows.count:,} Gaussians take {bytes_text(size)} of memory with {', '.join(needing)}; expected "
+            "more memory, or merging without these options, which goes by parts"
+        )
+    if needing:
+        return None
+    return rows
+
+
+def prune_file(
+    rows: PlyRows,
+    output: Path,
+    request: PruneRequest,
+    memory: float | None = None,
+    poses: Path | None = None,
+    resolution: tuple[int, int] | None = None,
+    progress: Progress = silent,
+) -> tuple[int, float]:
+    """Merge a PLY cell by cell. A call that was killed goes on where it was, from a hidden folder beside the output.
+
+    Args:
+        rows: the scene, as of :func:`rows_to_prune`.
+        output: the PLY to write.
+        request: options of pruning.
+        memory: bytes that may be taken; more than the largest cell takes change nothing.
+        poses: a file of cameras; by default views are sampled.
+        resolution: width and height of views, pixels.
+        progress: called with what is being done, and the share done of it.
+
+    Returns:
+        The number of Gaussians before, those that cannot be drawn left out, and seconds.
+
+    Raises:
+        PointSplatError: if the memory is too small.
+        SceneError: if a file cannot be read or written, or the disk has no room for what lies between.
+        BudgetError: if the budget does not fit the scene.
+        DataError: if the cameras are not usable.
+    """
+    start = time.perf_counter()
+    if output.suffix.lower() != ".ply" or output.name.lower().endswith(".compressed.ply"):
+        raise SceneError(
+            f"{output}: is written as a whole; expected a .ply for a scene larger than memory, which "
+            "`pointsplat convert` changes"
+        )
+    if request.sh.isdigit():
+        rows = replace(rows, rest=min(rows.rest, (int(request.sh) + 1) ** 2 - 1))
+    most = _most_in_cell(rows, memory)
+    known = None if poses is None else views_for(rows.path, poses)
+    if known is not None and resolution is not None:
+        known = known.resized(max(resolution))
+    status = rows.path.stat()
+    work = {
+        "scene": str(rows.path.resolve()), "bytes": status.st_size, "changed": status.st_mtime_ns, "rest": rows.rest,
+        "keep": str(request.keep), "most": most, "views": _digest(known), "resolution": list(resolution or RESOLUTION),
+        "settings": repr(DEFAULTS),
+    }  # fmt: skip
+
+    def views(sample: Gaussians) -> Views | None:
+        if known is None:
+            return None
+        check_views_show(sample, known, str(poses))
+        return known.spread(MERGED_FROM)
+
+    def count_of(n: int) -> int:
+        count = request.count_of(n, rows.sh_degree)
+        assert count is not None
+        return count
+
+    count_of(rows.count)  # errors before the work
+    scratch = Scratch(output.with_name(f".{output.name}.cells"), work, rows.count * (_row_bytes(rows) + 350))
+    before, _ = merge_file(rows, count_of, output, most, scratch, views, resolution or RESOLUTION, progress)
+    scratch.remove()
+    return before, time.perf_counter() - start
+
+
+def _binary_ply(scene: Path) -> PlyRows | None:
+    """The rows of a binary 3DGS PLY; None for any other scene."""
+    if not scene.is_file():
+        return None
+    kind = format_to_read(scene)
+    if kind is None or not kind.suffix.endswith(".ply"):
+        return None
+    with scene.open("rb") as stream:
+        if is_compressed(read_header(stream, scene)):
+            return None
+    return PlyRows.open(scene)
+
+
+def _row_bytes(rows: PlyRows) -> int:
+    return 4 * (14 + 3 * rows.rest)
+
+
+def _most_in_cell(rows: PlyRows, memory: float | None) -> int:
+    """Largest number of Gaussians in a cell. Raises PointSplatError if the memory is too small."""
+    if memory is None:
+        return MOST
+    each = _row_bytes(rows) + CELL_BYTES
+    if memory < BASE_BYTES + LEAST * each:
+        raise PointSplatError(
+            f"memory of {bytes_text(memory)} is too small; expected at least {bytes_text(BASE_BYTES + LEAST * each)}"
+        )
+    return min(MOST, int((memory - BASE_BYTES) / each))
+
+
+def _digest(views: Views | None) -> str:
+    if views is None:
+        return ""
+    numbers = views.viewmats.double().numpy().tobytes() + views.Ks.double().numpy().tobytes()
+    return hashlib.sha256(numbers + repr((views.width, views.height)).encode()).hexdigest()

@@ -1,0 +1,180 @@
+"""Merging cell by cell: the count, the seams, kills, and what is the same as in memory."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from making import assert_same_on_any_threads, box_room, cloud, same_bits
+from pointsplat_ns.errors import BudgetError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io import read_ply, write_ply
+from pointsplat_ns.io.ply import PlyRows, header_bytes, row_table
+from pointsplat_ns.looking.closeness import DenseReference
+from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.pruning.merging import DEFAULTS, MergeSettings, merge
+from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
+from pointsplat_ns.pruning.merging.cells.partition import divided
+
+
+def rows_of(scene: Gaussians, folder: Path) -> PlyRows:
+    write_ply(scene, folder / "scene.ply")
+    rows = PlyRows.open(folder / "scene.ply")
+    assert rows is not None
+    return rows
+
+
+BLIND = replace(DEFAULTS, min_count_rendered=10**9)
+"""Settings without sampled views, to be quick."""
+
+
+def merged(rows: PlyRows, k: int, most: int, folder: Path, settings: MergeSettings = BLIND) -> Gaussians:
+    """The scene of ``k`` Gaussians from cells of at most ``most``."""
+    scratch = Scratch(folder / f"cells-{k}-{most}", {})
+    found = merge_file(rows, lambda n: k, folder / "small.ply", most, scratch, settings=settings)
+    assert found == (rows.count, k)
+    return read_ply(folder / "small.ply")
+
+
+@pytest.mark.parametrize("k", [5, 400, 2999])
+def test_the_count_is_exact_for_any_budget_and_number_of_cells(k, tmp_path):
+    rows = rows_of(cloud(3000, seed=4, sh_degree=1), tmp_path)
+    for most in (5000, 700):
+        assert len(merged(rows, k, most, tmp_path)) == k
+
+
+def test_fewer_gaussians_than_cells_are_refused(tmp_path):
+    with pytest.raises(BudgetError, match="cannot merge 5 parts of a scene into 4 Gaussians; expected 5"):
+        merged(rows_of(cloud(3000), tmp_path), 4, 700, tmp_path)
+
+
+def test_exact_copies_and_faint_gaussians_do_not_change_the_count(tmp_path):
+    scene = cloud(1000, seed=3)
+    faint = scene.replace(opacities=torch.full((1000, 1), -20.0))
+    rows = rows_of(Gaussians.cat([scene, scene[:500], scene[:500], faint]), tmp_path)
+    for k in (200, 1600, 2900):
+        assert len(merged(rows, k, 800, tmp_path)) == k
+
+
+def test_what_is_not_merged_stays_as_it_is_to_the_bit(tmp_path):
+    scene = cloud(900, seed=5, sh_degree=2)
+    kept = merged(rows_of(scene, tmp_path), 900, 300, tmp_path)
+    order, wanted = (s.means[:, 0].argsort() for s in (kept, scene))
+    assert same_bits(kept[order], scene[wanted])
+
+
+def test_cells_hold_equally_many_gaussians_even_at_one_position(tmp_path):
+    scene = cloud(4000, seed=2)
+    scene.means[::2] = 0.25  # half of them at one point
+    cells = divided(rows_of(scene, tmp_path), 1000, Scratch(tmp_path / "cells", {}), lambda share: None)
+    assert sum(cells.counts) == 4000 and max(cells.counts) <= 1010
+    read = Gaussians.cat([cells.read(cell) for cell in range(len(cells))])
+    order, wanted = (s.features_dc.double().sum(1).argsort() for s in (read, scene))
+    assert same_bits(read[order], scene[wanted])
+
+
+def test_cells_lose_no_more_than_the_whole_and_leave_no_seam(tmp_path):
+    scene = box_room(seed=3, count=12_000, size=0.08)
+    rows, k = rows_of(scene, tmp_path), 1200
+    whole, parts = merge(scene, k).scene, merged(rows, k, 3000, tmp_path, DEFAULTS)
+    reference = DenseReference(scene, sample_views(scene, 6, width=160, height=120, seed=9))
+    assert reference.psnr(parts)[0] > reference.psnr(whole)[0] - 0.3  # other sampled views differ by as much
+    # Density beside borders: share of the dense Gaussians near a border, and of those that remain.
+    cells = divided(rows, 3000, Scratch(tmp_path / "cells", {}), lambda share: None)
+    cell = [torch.full((count,), number) for number, count in enumerate(cells.counts)]
+    dense = Gaussians.cat([cells.read(number) for number in range(len(cells))])
+    near = torch.cdist(dense.means, dense.means).topk(12, largest=False).indices
+    own = torch.cat(cell)
+    beside = (own[near] != own[:, None]).any(1)
+    nearest = {name: torch.cdist(s.means, dense.means).argmin(1) for name, s in (("whole", whole), ("parts", parts))}
+    share = {name: float(beside[rows].float().mean()) for name, rows in nearest.items()}
+    assert float(beside.float().mean()) > 0.05
+    assert abs(share["parts"] - share["whole"]) < 0.25 * share["whole"] + 0.01, share
+
+
+def test_any_number_of_threads_gives_the_same_bits(tmp_path):
+    rows = rows_of(cloud(3000, seed=8), tmp_path)
+    number = iter(range(9))
+
+    def work() -> list[torch.Tensor]:
+        folder = tmp_path / str(next(number))
+        folder.mkdir()
+        return merged(rows, 500, 1000, folder).tensors()
+
+    assert_same_on_any_threads(work)
+
+
+KILLED = """
+import os, signal, sys
+from dataclasses import replace
+from pathlib import Path
+from pointsplat_ns.pruning.merging import DEFAULTS
+from pointsplat_ns.io.ply import PlyRows, header_bytes, row_table
+from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
+here, at = Path(sys.argv[1]), int(sys.argv[2])
+left = [at]
+def heard(event, args):
+    if event == "os.rename" and "cells" in str(args[1]):
+        left[0] -= 1
+        if left[0] == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+sys.addaudithook(heard)
+rows = PlyRows.open(here / "scene.ply")
+blind = replace(DEFAULTS, min_count_rendered=10**9)
+merge_file(rows, lambda n: 300, here / "small.ply", 1000, Scratch(here / "cells", {"a": 1}), settings=blind)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="kills a process")
+def test_killed_and_started_again_it_goes_on_to_the_same_bytes(tmp_path):
+    rows = rows_of(cloud(3000, seed=6), tmp_path)
+    merged(rows, 300, 1000, tmp_path)
+    wanted = (tmp_path / "small.ply").read_bytes()
+    (tmp_path / "small.ply").unlink()
+    for at in (2, 4, 7, 9, 3):
+        done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), str(at)], capture_output=True, text=True)
+        assert done.returncode in (0, -9), done.stderr
+        if done.returncode == 0:
+            break
+        assert not (tmp_path / "small.ply").exists()
+    steps = len(list((tmp_path / "cells").iterdir()))
+    assert steps > 8  # it did not begin anew each time
+    done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), "0"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "small.ply").read_bytes() == wanted
+
+
+def test_other_work_begins_anew_and_damaged_steps_are_told(tmp_path):
+    first = Scratch(tmp_path / "cells", {"keep": 1})
+    first.tensors("a", lambda: {"x": torch.ones(3)})
+    assert Scratch(tmp_path / "cells", {"keep": 1}).known("a")["x"].tolist() == [1, 1, 1]
+    Scratch(tmp_path / "cells", {"keep": 2})
+    with pytest.raises(SceneError, match=r"cells: damaged .*remove it"):
+        first.known("a")
+
+
+def test_gaussians_that_cannot_be_drawn_are_dropped_and_counted_once(tmp_path, caplog):
+    scene = cloud(2000, seed=1)
+    scene.means[::10] = torch.nan
+    write_all(scene, tmp_path / "scene.ply")
+    rows = PlyRows.open(tmp_path / "scene.ply")
+    assert rows is not None
+    with caplog.at_level("WARNING"):
+        found = merge_file(
+            rows, lambda n: n // 2, tmp_path / "small.ply", 700, Scratch(tmp_path / "cells", {}), settings=BLIND
+        )
+    assert found == (1800, 900) and len(read_ply(tmp_path / "small.ply")) == 900
+    assert [r.getMessage() for r in caplog.records if "dropped" in r.getMessage()] == [
+        f"{tmp_path / 'scene.ply'}: dropped 200 of 2000 Gaussians with NaN or infinite values"
+    ]
+
+
+def write_all(scene: Gaussians, path: Path) -> None:
+    """Write a PLY with all Gaussians of a scene, those that cannot be drawn too."""
+    path.write_bytes(header_bytes(len(scene), scene.sh_degree) + row_table(scene).tobytes())
