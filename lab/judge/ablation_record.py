@@ -22,6 +22,9 @@ FOLDER = ROOT / "docs" / "record"
 POSES = "photos, poses given"
 """In place of a width: the poses of held-out photos, where merging is given those of the training photos."""
 
+LITTLE = 0.1
+"""Change in dB below which a variant has no row."""
+
 PAGE = """# What each setting of merging is worth
 
 `lab/judge/ablation.py` writes this page from [ablation.json](ablation.json), which it measured. Each variant turns a
@@ -32,12 +35,10 @@ rule off, or moves a setting to a value beside its default.
 - Splats are judged in at most {views} views of a camera path that was written by hand, {width} pixels wide.
 - Captures are judged in the poses of at most {views} held-out photos, at the size of the photos: once merged without
   poses, once with the poses of the training photos.
-- PSNR is against renders of the dense scene. All squared error is divided by the share of the pixels that the dense
-  scene covers.
+- PSNR is that of [the judge](judge.md).
 - CPU is CPU seconds of merging, relative to the defaults.
 - Variants come in the order of their mean changes. `other_views` shows how much is chance.
-- What a setting does stands under its field in `pointsplat_ns/pruning/merging/settings.py` and
-  `pointsplat_ns/looking/settings.py`.
+- Fields of `pruning/merging/settings.py` and `looking/settings.py` say what they do.
 """
 
 
@@ -130,7 +131,7 @@ def _scene_table(rows: list[Row], keeps: list[float]) -> str:
 
 
 def _variant_table(found: list[Summary], keeps: list[float], table: str, settings: dict[str, Any]) -> str:
-    still = [summary for summary in found if not any(map(any, summary.changes.values()))]
+    still = [each for each in found if all(abs(change) < LITTLE for same in each.changes.values() for change in same)]
     lines = []
     for summary in found:
         if summary in still:
@@ -146,7 +147,9 @@ def _variant_table(found: list[Summary], keeps: list[float], table: str, setting
         text = markdown(heads, lines)
     else:
         text = f"Scenes and poses: {counts.pop()}.\n\n" + markdown(heads[:-1], [line[:-1] for line in lines])
-    return text + (f"\n\nWithout any effect: {', '.join(f'`{summary.name}`' for summary in still)}." if still else "")
+    return text + (
+        f"\n\nWithin {LITTLE:g} dB in each: {', '.join(f'`{summary.name}`' for summary in still)}." if still else ""
+    )
 
 
 def _share(keep: float) -> str:

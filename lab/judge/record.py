@@ -53,7 +53,6 @@ PAGE = """# What smaller scenes lose
   dense scene covers, so an empty background does not raise it.
 - {peer} stands for the best of its modes: {modes}.
   The mode is chosen anew for each scene, budget, width and measure.
-- A scene counts at a budget once all three ways are measured.
 - Figures are means over scenes, with the worst scene in brackets.
 """
 
@@ -188,7 +187,7 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
         for column, where in AHEAD.items():
             if table := _lead_table(figures, at, column):
                 parts.append(f"Leads in dB {where}:\n\n{table}")
-        if at in (LPIPS_WIDTH, PHOTOS) and (table := _mean_table(figures, at, "dense_lpips", 3)):
+        if at == LPIPS_WIDTH and (table := _mean_table(figures, at, "dense_lpips", 3)):
             parts.append(f"LPIPS against renders of the dense scene, lower is better:\n\n{table}")
     if table := _unlearned_table(rows, figures):
         parts.append("## Scenes that the network was not trained on\n\n" + UNLEARNED + "\n\n" + table)
