@@ -177,7 +177,7 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
         "## Scenes\n\n" + SCENES + "\n\n" + _scene_table(rows, figures),
     ]
     widest = max((at for at in figures.ats if at != PHOTOS), default=None)
-    for at in figures.ats:
+    for at in (at for at in figures.ats if at == PHOTOS or at >= LPIPS_WIDTH):
         title = "Held-out photos" if at == PHOTOS else f"{at} pixels wide"
         parts.append(f"## {title}\n\n{_count(figures.scenes(at))}.")
         if at in (PHOTOS, widest):
@@ -270,7 +270,7 @@ def _cost_table(figures: Figures) -> str:
     lines = []
     at = {photos: next((at for at in figures.ats if (at == PHOTOS) == photos), None) for photos in (False, True)}
     for kind, where in (("splats", at[False]), ("captures", at[True])):
-        for keep in figures.keeps:
+        for keep in (0.5, 0.1):
             means = [mean for way in WAYS if (mean := figures.means.get((where, keep, way))) is not None]
             if len(means) == len(WAYS):
                 seconds, memory = (

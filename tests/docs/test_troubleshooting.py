@@ -43,7 +43,7 @@ TRIGGERS: dict[str, tuple[Callable[[], object], str]] = {
     "truncated": (cut, "info room.ply"),
     "exists already": (lambda: Path("room_pruned.ply").touch(), "prune room.ply"),
     "cannot write a ksplat": (room, "convert room.ply room.ksplat"),
-    "a folder without config.yml": (lambda: Path("rooms").mkdir(), "prune rooms"),
+    "a folder without config.yml": (lambda: Path("rooms").mkdir(), "lod rooms"),
     "2D Gaussians": (flat, "info flat.ply"),
     "dropped 1 of 4": (odd, "convert room.ply other.ply"),
     "not a Splatfacto run": (room, "convert room.ply other.ply --original-frame"),
