@@ -30,7 +30,7 @@ WHOLE_BYTES = 600
 CELL_BYTES = 400
 """The same for each Gaussian of a cell: what follows from the whole scene is known before."""
 
-BASE_BYTES = 900_000_000
+BASE_BYTES = 1_050_000_000
 """Memory of the interpreter, torch and a thinned scene, bytes."""
 
 MOST, LEAST = 4_000_000, 100_000
@@ -61,8 +61,8 @@ def rows_to_prune(scene: Path, request: PruneRequest, memory: float | None = Non
                 "`pointsplat convert` makes"
             )
         return None
-    size = rows.count * (_row_bytes(rows) + WHOLE_BYTES) + BASE_BYTES
-    limit = psutil.virtual_memory().available if memory is None else memory
+    size = rows.count * (_row_bytes(rows) + WHOLE_BYTES)
+    limit = psutil.virtual_memory().available if memory is None else memory - BASE_BYTES
     if size <= limit:
         return None
     asked = {
@@ -80,7 +80,7 @@ def rows_to_prune(scene: Path, request: PruneRequest, memory: float | None = Non
         )
     if needing:
         return None
-    return rows
+    return PlyRows.open(scene)
 
 
 def prune_file(
@@ -159,7 +159,7 @@ def _binary_ply(scene: Path) -> PlyRows | None:
     with scene.open("rb") as stream:
         if is_compressed(read_header(stream, scene)):
             return None
-    return PlyRows.open(scene)
+    return PlyRows.open(scene, warn=False)
 
 
 def _row_bytes(rows: PlyRows) -> int:

@@ -83,14 +83,15 @@ class PlyRows:
     """Number of SH coefficients per channel beyond the constant one in the file."""
 
     @classmethod
-    def open(cls, path: Path | str) -> PlyRows | None:
-        """The rows of a file, its header checked as by :func:`read_ply`; None for an ASCII file, which has no rows of
-        one length. Raises SceneError as :func:`read_ply` does."""
+    def open(cls, path: Path | str, warn: bool = True) -> PlyRows | None:
+        """The rows of a file, its header checked as by :func:`read_ply`, which may ``warn``; None for an ASCII file,
+        which has no rows of one length. Raises SceneError as :func:`read_ply` does."""
         path = require_file(path, "a 3DGS PLY file")
         header, vertex, in_file = _checked(path)
         if not header.order:
             return None
-        _report_unread(header, vertex, in_file, path)
+        if warn:
+            _report_unread(header, vertex, in_file, path)
         dtype = np.dtype([(name, header.order + np.dtype(kind).str[1:]) for name, kind in vertex.properties])
         start = header.size + sum(_least_bytes(element, header) for element in header.before("vertex"))
         return cls(path, vertex.count, min(in_file, MAX_REST), dtype, start, in_file)

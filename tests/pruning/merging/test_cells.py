@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from making import assert_same_on_any_threads, box_room, cloud, same_bits
+from pointsplat_ns.compression import prune_file
 from pointsplat_ns.errors import BudgetError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, write_ply
@@ -19,11 +20,13 @@ from pointsplat_ns.io.ply import PlyRows, header_bytes, row_table
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.pruning.merging import DEFAULTS, MergeSettings, merge
-from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
+from pointsplat_ns.pruning.merging.cells import Scratch, merge_file, partition
 from pointsplat_ns.pruning.merging.cells.partition import divided
+from pointsplat_ns.system.memory import PeakMemory
 
 
 def rows_of(scene: Gaussians, folder: Path) -> PlyRows:
+    folder.mkdir(exist_ok=True)
     write_ply(scene, folder / "scene.ply")
     rows = PlyRows.open(folder / "scene.ply")
     assert rows is not None
@@ -178,3 +181,20 @@ def test_gaussians_that_cannot_be_drawn_are_dropped_and_counted_once(tmp_path, c
 def write_all(scene: Gaussians, path: Path) -> None:
     """Write a PLY with all Gaussians of a scene, those that cannot be drawn too."""
     path.write_bytes(header_bytes(len(scene), scene.sh_degree) + row_table(scene).tobytes())
+
+
+def test_memory_is_that_of_a_cell_and_not_of_the_scene(tmp_path, monkeypatch):
+    if PeakMemory().bytes() is None:
+        pytest.skip("this system does not tell the most memory that was held")
+    monkeypatch.setattr(partition, "PIECE", 1 << 13)
+    monkeypatch.setattr(partition, "SAMPLE", 1 << 12)
+    count, most, sh_bytes = 150_000, 10_000, 236
+    rows = rows_of(cloud(count, seed=7, sh_degree=3), tmp_path)
+    merged(rows_of(cloud(2000, seed=7), tmp_path / "first"), 200, 1000, tmp_path / "first")  # imports, kernels
+    peak = PeakMemory()
+    before = peak.bytes()
+    assert len(merged(rows, 15_000, most, tmp_path)) == 15_000
+    after = peak.bytes()
+    assert before is not None and after is not None
+    # Of a cell, 8 times as much, with what the C library and mapped files hold; of one cell for all, 215 MB.
+    assert after - before < 14 * most * (prune_file.CELL_BYTES + sh_bytes)
