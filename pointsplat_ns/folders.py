@@ -23,7 +23,7 @@ from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
-from pointsplat_ns.pruning import Keep, Megabytes, cut_sh
+from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, cut_sh
 from pointsplat_ns.system.processes import connect_torchrun, gathered, torchrun_device, torchrun_rank
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 from pointsplat_ns.tradeoff.finding import find_scene
@@ -232,8 +232,8 @@ def _kept_whole(dense: Gaussians, request: PruneRequest, source: ViewSource) -> 
 
 
 def _in_format_of(path: Path, request: PruneRequest) -> PruneRequest:
-    """A request whose size, if its budget is one, is that of the format of a scene's result."""
-    if not isinstance(request.budget, Megabytes):
+    """A request whose size or PSNR, if its budget is one, is that of the format of a scene's result."""
+    if not isinstance(request.budget, (Megabytes, WithinPsnr)):
         return request
     return replace(request, keep=replace(request.budget, suffix=format_like(path).suffix))
 

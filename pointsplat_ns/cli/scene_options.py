@@ -131,12 +131,12 @@ def check_poses(poses: Path | None) -> None:
 
 
 def in_format_of(keep: str, output: Path) -> str:
-    """A budget for :func:`~pointsplat_ns.pruning.parse_keep`: a size without a format, such as 5MB, gets the format of
-    the output."""
+    """A budget for :func:`~pointsplat_ns.pruning.parse_keep`: a size or a PSNR without a format, such as 5MB, gets the
+    format of the output."""
     from pointsplat_ns.io.formats import format_to_write
 
-    is_size = re.search(r"\d *[kmg]?b$", keep.strip(), re.IGNORECASE) and not keep.strip().startswith("auto")
-    return keep.strip() + format_to_write(output).budget_suffix if is_size else keep
+    without = re.search(r"\d *[kmg]?b$|^auto$|^auto:[\d.]+(db)?$", keep.strip(), re.IGNORECASE)
+    return keep.strip() + format_to_write(output).budget_suffix if without else keep
 
 
 def file_bytes(path: Path) -> int:

@@ -173,6 +173,8 @@ class FoundQuality:
     """The smallest scene found that reaches a PSNR."""
 
     scene: Gaussians
+    count: int
+    """The count that was asked for."""
     psnr: float
     """PSNR of ``scene`` over the pixels that the dense scene covers, dB; inf if nothing differs."""
     worst: float
@@ -187,8 +189,8 @@ class FileLimit:
 
     kind: Format
     """A format with ``encode``."""
-    most: int
-    """Bytes."""
+    most: float
+    """Bytes; inf for a rounding without a limit."""
     rounding: Rounding | None = None
     """The rounding of a scene of this quality; None for none, as long as the file meets the limit."""
 
@@ -204,10 +206,12 @@ class FileLimit:
             return scene
         written, rounding = _as_written(scene), self.rounding
         if rounding is None:
-            if self.bytes_of(written) <= self.most:
+            if self.most == math.inf or self.bytes_of(written) <= self.most:
                 return scene
             rounding = rounding_for(math.inf)
         best = self.kind.rounded(written, rounding)
+        if self.most == math.inf:
+            return best.to(scene.device)
         size = self.bytes_of(best)
         finer = size <= BUDGETS.room * self.most
         for step in range(1, 7):
@@ -266,7 +270,7 @@ def smallest_within(
         scene = make(count)
         tried[count], worst = reference.psnr(scene)
         if tried[count] >= psnr:
-            best = FoundQuality(scene, tried[count], worst, tried)
+            best = FoundQuality(scene, count, tried[count], worst, tried)
         if progress is not None:
             progress(len(tried) / (len(tried) + 2))
         return tried[count]

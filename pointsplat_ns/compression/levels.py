@@ -237,9 +237,7 @@ def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
 
 
 def _text(level: Keep) -> str:
-    if isinstance(level, WithinPsnr):
-        return f"auto:{level.value:g}"
-    return str(level) if isinstance(level, Megabytes) else repr(level)
+    return str(level) if isinstance(level, (Megabytes, WithinPsnr)) else repr(level)
 
 
 def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int) -> list[int]:

@@ -17,6 +17,7 @@ from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.io.formats import format_to_write
+from pointsplat_ns.io.formats.rounding import rounding_for
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.pruning import (
@@ -91,7 +92,7 @@ def prune_scene(
         if isinstance(request.budget, Megabytes):
             scene, limit = _for_size(dense, start, make, request.budget, views, searching, notes)
         else:
-            scene = _for_psnr(dense, make, request.budget, views, searching, notes)
+            scene, limit = _for_psnr(dense, make, request.budget, views, searching, notes)
     if request.fine_tune:
         from pointsplat_ns.compression.fine_tune import fine_tune
 
@@ -169,19 +170,26 @@ def _for_psnr(
     views: ViewSource,
     progress: Callable[[float], None],
     notes: list[str],
-) -> Gaussians:
-    """The smallest scene with a PSNR against ``dense``; ``make`` gives the scene of a count. Adds a line to
-    ``notes``."""
-    from pointsplat_ns.compression.budget_search import smallest_within
+) -> tuple[Gaussians, FileLimit | None]:
+    """The smallest scene with a PSNR against ``dense`` and, if a format rounds its numbers, the limit of its file: the
+    scene has the PSNR when it is rounded. ``make`` gives the scene of a count. Adds a line to ``notes``."""
+    from pointsplat_ns.compression.budget_search import FileLimit, smallest_within
 
     assert isinstance(budget, WithinPsnr)
-    compared = views.compared()
-    reached = smallest_within(dense, make, compared, budget.value, progress)
+    compared, kind = views.compared(), format_to_write(budget.suffix)
+    limit = None if kind.rounded is None else FileLimit(kind, math.inf, rounding_for(budget.value))
+    whole: dict[int, Gaussians] = {}
+
+    def rounded(count: int) -> Gaussians:
+        whole[count] = make(count)
+        return whole[count] if limit is None else limit.rounded(whole[count])
+
+    reached = smallest_within(dense, rounded, compared, budget.value, progress)
     notes.append(
         f"{len(reached.tried)} sizes tried: {reached.psnr:.1f} dB PSNR against the dense scene, "
         f"{reached.worst:.1f} dB in the worst of {len(compared)} views"
     )
-    return reached.scene
+    return whole[reached.count], limit
 
 
 def _for_size(

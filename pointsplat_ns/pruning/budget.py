@@ -50,6 +50,11 @@ class WithinPsnr:
     """A budget: the smallest scene whose renders reach this PSNR (dB) against the dense scene's own."""
 
     value: float
+    suffix: str = ".ply"
+    """Suffix of the file format, for which numbers are rounded."""
+
+    def __str__(self) -> str:
+        return f"auto:{self.value:g}" + (self.suffix if self.suffix != ".ply" else "")
 
 
 class BareCount(int):
@@ -146,7 +151,8 @@ def _count_that_fits(n: int, keep: Megabytes, sh_degree: int) -> int:
 
 def parse_keep(text: str) -> Keep:
     """Parse a budget: ``0.3`` and ``30%`` are ratios; ``50000``, ``50k`` and ``12 Gaussians`` are counts; ``12MB`` and
-    ``800kB.spz`` are sizes; ``auto`` and ``auto:35`` are the PSNR (dB) that renders must reach against the dense scene.
+    ``800kB.spz`` are sizes; ``auto``, ``auto:35`` and ``auto:35.sog`` are the PSNR (dB) that renders must reach against
+    the dense scene.
 
     Raises:
         BudgetError: if it is none of these. The range of a ratio, count or size is checked by :func:`resolve_keep`.
@@ -157,13 +163,11 @@ def parse_keep(text: str) -> Keep:
     """
     text = text.strip()
     try:
-        if text == "auto":
-            return WithinPsnr(AUTO_PSNR)
-        if text.startswith("auto:"):
-            psnr = float(text[5:].removesuffix("dB"))
+        if auto := re.fullmatch(r"auto(?::(.+?)(?:dB)?)?(\.[a-z]\S*)?", text):
+            psnr = AUTO_PSNR if auto[1] is None else float(auto[1])
             if not 0 < psnr < math.inf:
                 raise ValueError
-            return WithinPsnr(psnr)
+            return WithinPsnr(psnr, auto[2] or ".ply")
         if size := re.fullmatch(r"(.*\d *[kmg]?b)(\.\S+)?", text, re.IGNORECASE):
             return Megabytes(parse_megabytes(size[1]), (size[2] or ".ply").lower())
         if text.endswith("%"):

@@ -95,7 +95,6 @@ def test_prune_scores_as_it_is_told(ply, tmp_path):
 def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
     output = tmp_path / "out.ply"
     assert "gone.ply: no such file" in refusal(capsys, output, "prune", tmp_path / "gone.ply")
-    assert "without config.yml" in refusal(capsys, output, "prune", tmp_path)
     assert "another method" in refusal(capsys, output, "prune", refined_run)
     half = tmp_path / "half.ply"
     half.write_bytes(ply.read_bytes()[:-100])

@@ -14,6 +14,7 @@ from pointsplat_ns.compression.prune import Pruned, prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import ViewSource
@@ -66,6 +67,12 @@ def test_a_score_that_looks_at_the_scene_is_computed_once_and_chooses(by, scene,
     result = pruned(scene, views, WithinPsnr(20.0), by)
     assert calls == [1]
     assert same(result.scene, scene[select(method.score(scene, views), len(result.scene))])
+
+
+def test_a_psnr_for_a_format_is_reached_by_its_rounded_scene_in_fewer_bytes(scene, views):
+    plain, small = (pruned(scene, views, WithinPsnr(22.0, suffix), "coverage").scene for suffix in (".ply", ".spz"))
+    assert len(encode_spz(small)) < len(encode_spz(plain))
+    assert DenseReference(scene, views).psnr(small)[0] >= 22.0
 
 
 def test_a_size_counts_the_bands_that_are_left(scene):

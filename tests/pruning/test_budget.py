@@ -81,6 +81,8 @@ def test_a_budget_that_fits_no_count_of_the_scene_is_refused(n, keep, message):
         ("auto", WithinPsnr(35.0)),
         ("auto:40", WithinPsnr(40.0)),
         ("auto:32.5dB", WithinPsnr(32.5)),
+        ("auto:32.5.sog", WithinPsnr(32.5, ".sog")),
+        ("auto.spz", WithinPsnr(35.0, ".spz")),
     ],
 )
 def test_a_typed_budget_keeps_its_kind(text, keep):
