@@ -27,8 +27,8 @@ of the training with a cap are chosen on them.
   dense training, which all ways need but the training with a cap.
 - `{COMPACTED}` merges, repairs and trains on the training photos for 400 steps.
 - "{SCORES["lightgaussian"]}" and "{SCORES["pup"]}" keep the Gaussians with the highest scores and train
-  them on the photos as `{COMPACTED}` does, for as many CPU seconds as `{COMPACTED}` takes in all. The methods' own
-  schedules are longer.
+  them on the photos as `{COMPACTED}` does, for at most as many CPU seconds as `{COMPACTED}` takes in all. The methods'
+  own schedules are longer.
 - "cap" is `ns-train splatfacto-cpu --pipeline.model.max-gs-num` from the start. "{CAP_SHORT}" takes about the CPU
   seconds of `{COMPACTED}`; "{CAP_LONG}" those of `{COMPACTED}` and of the dense training.
 - The machine was busy: CPU seconds of equal work differ by up to a half.
