@@ -106,7 +106,7 @@ def draw(rows: list[Row], path: Path) -> None:
     from matplotlib.figure import Figure
 
     scenes = list(grouped(rows, lambda row: row["scene"]).items())
-    columns = min(4, len(scenes))
+    columns, sizes = min(4, len(scenes)), sorted({row["megabytes"] for row in rows})
     lines = -(-len(scenes) // columns)
     figure = Figure(figsize=(3.6 * columns, 2.9 * lines), layout="constrained")
     colours = {"prune": "tab:blue", "compact": "tab:green", PEER: "tab:red"}
@@ -119,7 +119,9 @@ def draw(rows: list[Row], path: Path) -> None:
                 [row["bytes"] / 1e6 for row in points], [row["covered_psnr"] for row in points], label=way,
                 color=colours[name], linestyle="-" if suffix == ".sog" else "--", marker=".",
             )  # fmt: skip
-        axes.set(title=scene, xscale="log", xlabel="MB", ylabel="dB")
+        axes.set(title=scene, xscale="log", xlim=(0.8 * sizes[0], 1.25 * sizes[-1]), xlabel="MB", ylabel="dB")
+        axes.set_xticks(sizes, [f"{size:g}" for size in sizes])
+        axes.minorticks_off()
         axes.grid(alpha=0.3)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     save_figure(figure, path)
