@@ -59,7 +59,7 @@ def test_a_cells_command_measures_it_again(ply, tmp_path, capsys, monkeypatch):
 def test_damaged_cells_and_unknown_names_are_one_line(ply, tmp_path, capsys):
     journal = tmp_path / "tables" / "room" / CELLS
     journal.parent.mkdir(parents=True)
-    journal.write_text('{"format": "pointsplat-tables-cells", "version": 1, "cells": [{}]}')
+    journal.write_text('{"format": "pointsplat-tables-cells", "version": 2, "cells": [{}]}')
     for words, expected in (
         ((), f"error: {journal}: not the cells of a scene's tables (lacks 'of')"),
         (("--force", "--only", "fox/*"), "error: fox/*: no such cell; expected a name such as fox/merge/10%"),
