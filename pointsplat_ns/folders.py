@@ -101,7 +101,6 @@ def compact_folder(
     """
     folder = Path(folder)
     target = output_folder(folder, "compact") if output is None else Path(output)
-    part = Shard() if shard is None else Shard.of(shard)
     connect_torchrun()
     device = str(torchrun_device())
     trained = _refiner_on(refiner, device)
@@ -125,7 +124,7 @@ def compact_folder(
         make = functools.partial(
             _compacted, refiner, device, replace(request, refiner=None), _in_each_format(keep), size
         )
-    return _run(folder, target, Command("compact", make, options), jobs, part, force, progress)
+    return _run(folder, target, Command("compact", make, options), jobs, shard, force, progress)
 
 
 def prune_folder(
@@ -156,7 +155,7 @@ def prune_folder(
         "resolution": None if size is None else size_text(size),
     }
     command = Command("prune", functools.partial(_pruned, request, _in_each_format(keep), size), options)
-    return _run(folder, output, command, jobs, Shard() if shard is None else Shard.of(shard), force, progress)
+    return _run(folder, output, command, jobs, shard, force, progress)
 
 
 def convert_folder(
@@ -179,17 +178,18 @@ def convert_folder(
         raise SceneError(f"{suffix}: no suffix of scene files that are written; expected one such as .spz")
     options: Options = {"format": suffix, "sh": sh, "up": up, "scale": scale, "original_frame": original_frame}
     command = Command("convert", functools.partial(_converted, sh, up, scale, original_frame), options, suffix)
-    return _run(folder, output, command, jobs, Shard() if shard is None else Shard.of(shard), force, progress)
+    return _run(folder, output, command, jobs, shard, force, progress)
 
 
 def _run(
-    folder: Path, output: Path, command: Command, jobs: int, shard: Shard, force: bool, progress: bool | Progress
+    folder: Path, output: Path, command: Command, jobs: int, shard: str | None, force: bool, progress: bool | Progress
 ) -> list[SceneResult]:
     """The results of all processes of ``torchrun``, sorted by name."""
+    part = Shard() if shard is None else Shard.of(shard)
     rank, world_size = torchrun_rank()
     connect_torchrun()
     with progress_bar(progress if rank == 0 else False) as report:
-        results = run_on_folder(folder, output, command, jobs, shard.within(rank, world_size), force, report)
+        results = run_on_folder(folder, output, command, jobs, part.within(rank, world_size), force, report)
     return sorted(gathered(results), key=lambda result: result.name)
 
 

@@ -22,14 +22,13 @@ import tyro
 from lab.common.printing import console, save_figure, table
 from lab.common.results import Results, Row, grouped
 from lab.common.ways import Way, pointsplat_command
+from lab.judge.record import OURS
 from lab.judge.scenes import JudgedScene, check, load, losses
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_scene
 from pointsplat_ns.system.programs import run_measured
 from pointsplat_ns.system.progress import tracked
 from pointsplat_ns.tables.making import PEER, SplatTransform
-
-OURS = ("prune", "compact")
 
 
 def files_of(
@@ -77,8 +76,7 @@ def peer_file(peer: SplatTransform, source: Path, gaussians: int, limit: int, ta
 
 
 def leads(rows: list[Row]) -> list[tuple[str, float, str, float]]:
-    """Scene, megabytes, measure and dB: how far each of our ways is above the best file of splat-transform, and
-    ``compact`` above ``prune``."""
+    """Scene, megabytes, measure and dB: how far each of our ways is above the best file of splat-transform."""
     found = []
     for (scene, size, _), group in grouped(rows, lambda row: (row["scene"], row["megabytes"], row["at"])).items():
         best: dict[str, float] = {}

@@ -178,18 +178,21 @@ def _for_psnr(
     assert isinstance(budget, WithinPsnr)
     compared, kind = views.compared(), format_to_write(budget.suffix)
     limit = None if kind.rounded is None else FileLimit(kind, math.inf, rounding_for(budget.value))
-    whole: dict[int, Gaussians] = {}
+    whole: dict[int, Gaussians] = {}  # by count, where the scenes that are compared are rounded
 
-    def rounded(count: int) -> Gaussians:
-        whole[count] = make(count)
-        return whole[count] if limit is None else limit.rounded(whole[count])
+    def made(count: int) -> Gaussians:
+        scene = make(count)
+        if limit is None:
+            return scene
+        whole[count] = scene
+        return limit.rounded(scene)
 
-    reached = smallest_within(dense, rounded, compared, budget.value, progress)
+    reached = smallest_within(dense, made, compared, budget.value, progress)
     notes.append(
         f"{len(reached.tried)} sizes tried: {reached.psnr:.1f} dB PSNR against the dense scene, "
         f"{reached.worst:.1f} dB in the worst of {len(compared)} views"
     )
-    return whole[reached.count], limit
+    return whole.get(reached.count, reached.scene), limit
 
 
 def _for_size(

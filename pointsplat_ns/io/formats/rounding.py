@@ -28,7 +28,7 @@ from pointsplat_ns.io.formats.coding import from_smallest_three, smallest_three,
 
 @dataclass(frozen=True)
 class RoundingSettings:
-    """How far numbers are rounded. What each is worth: ``python -m lab.judge.bytes``."""
+    """How far numbers are rounded. ``python -m lab.judge.bytes`` judges them all together."""
 
     share: float = 0.55
     """Tolerance as a share of the error that a scene has already, by its PSNR."""
