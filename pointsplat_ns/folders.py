@@ -16,14 +16,14 @@ from pointsplat_ns.compression.scene_task import Options, SceneResult, SmallerSc
 from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.formats import format_like, format_named, format_to_write
+from pointsplat_ns.io.formats import format_like, format_to_write
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
-from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, cut_sh
+from pointsplat_ns.pruning import Keep, cut_sh
 from pointsplat_ns.system.processes import connect_torchrun, gathered, torchrun_device, torchrun_rank
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 from pointsplat_ns.tradeoff.finding import find_scene
@@ -121,9 +121,7 @@ def compact_folder(
         options = {**options, "keep": None, "target_db": target_db, "target_ms": target_ms, "target_mb": target_mb}
         make = functools.partial(_found, refiner, device, targets, request.prune.by, repairs_of(effort), size)
     else:
-        make = functools.partial(
-            _compacted, refiner, device, replace(request, refiner=None), _in_each_format(keep), size
-        )
+        make = functools.partial(_compacted, refiner, device, replace(request, refiner=None), size)
     return _run(folder, target, Command("compact", make, options), jobs, shard, force, progress)
 
 
@@ -154,7 +152,7 @@ def prune_folder(
         "fine_tune": fine_tune,
         "resolution": None if size is None else size_text(size),
     }
-    command = Command("prune", functools.partial(_pruned, request, _in_each_format(keep), size), options)
+    command = Command("prune", functools.partial(_pruned, request, size), options)
     return _run(folder, output, command, jobs, shard, force, progress)
 
 
@@ -200,7 +198,6 @@ def _compacted(
     refiner: str | Path | None,
     device: str,
     request: CompactRequest,
-    sized: bool,
     resolution: tuple[int, int] | None,
     path: Path,
 ) -> SmallerScene:
@@ -209,17 +206,11 @@ def _compacted(
     source = ViewSource(dense, run=path, dataset_views=dataset_views, resolution=resolution)
     if (whole := _kept_whole(dense, options, source)) is not None:
         return whole
-    options = _in_format_of(path, options) if sized else options
-    request = replace(request, prune=options, refiner=_refiner_on(refiner, device))
+    request = replace(request, prune=options.in_format(format_like(path)), refiner=_refiner_on(refiner, device))
     result = compact_scene(dense, request, source)
     if result.interrupted:
         raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the repair of one scene
     return SmallerScene(result.scene, len(dense), result.psnr)
-
-
-def _in_each_format(keep: Keep | str | None) -> bool:
-    """Whether a size is that of each result in its own format, as it names none."""
-    return isinstance(keep, str) and format_named(keep.strip()) is None
 
 
 def _kept_whole(dense: Gaussians, request: PruneRequest, source: ViewSource) -> SmallerScene | None:
@@ -231,20 +222,13 @@ def _kept_whole(dense: Gaussians, request: PruneRequest, source: ViewSource) -> 
     return SmallerScene(kept, len(dense), None, note, same)
 
 
-def _in_format_of(path: Path, request: PruneRequest) -> PruneRequest:
-    """A request whose size or PSNR, if its budget is one, is that of the format of a scene's result."""
-    if not isinstance(request.budget, (Megabytes, WithinPsnr)):
-        return request
-    return replace(request, keep=replace(request.budget, suffix=format_like(path).suffix))
-
-
-def _pruned(request: PruneRequest, sized: bool, resolution: tuple[int, int] | None, path: Path) -> SmallerScene:
+def _pruned(request: PruneRequest, resolution: tuple[int, int] | None, path: Path) -> SmallerScene:
     """Prune one scene of a folder."""
     dense = read_scene(path)
     source = ViewSource(dense, run=path, dataset_views=dataset_views, resolution=resolution)
     if (whole := _kept_whole(dense, request, source)) is not None:
         return whole
-    pruned = prune_scene(dense, _in_format_of(path, request) if sized else request, source)
+    pruned = prune_scene(dense, request.in_format(format_like(path)), source)
     quality = quality_of_pruned(dense, pruned, source)
     return SmallerScene(pruned.scene, len(dense), None if quality is None else quality.psnr)
 

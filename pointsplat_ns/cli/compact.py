@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -29,7 +29,6 @@ from pointsplat_ns.cli.scene_options import (
     Up,
     check_poses,
     claim_outputs,
-    in_format_of,
     need_no_folder_options,
     output_beside,
     scene_written,
@@ -152,9 +151,10 @@ def compact(
     written = None if dry_run else output
     claim_outputs(written, force, picture, html)
     check_limit(html_limit)
-    keep = None if keep is None else in_format_of(keep, output)
+    kind = format_to_write(output)
     request = CompactRequest.of(_loaded(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), photos)
-    goal = goal_of(request, keep, target_db, target_ms, target_mb, format_to_write(output).budget_suffix)
+    request = replace(request, prune=request.prune.in_format(kind))
+    goal = goal_of(request, keep, target_db, target_ms, target_mb, kind.budget_suffix)
     with fixed_threads(threads):
         dense, result, quality = compact_source(
             scene, request, goal, poses, resolution, up, progress=True, compared=True

@@ -25,7 +25,6 @@ from pointsplat_ns.cli.scene_options import (
     Up,
     check_poses,
     claim_outputs,
-    in_format_of,
     need_no_folder_options,
     output_beside,
     scene_written,
@@ -102,6 +101,7 @@ def prune(
     from pointsplat_ns.compression.prune_file import rows_to_prune
     from pointsplat_ns.compression.requests import PruneRequest
     from pointsplat_ns.errors import SceneError
+    from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.io.scene import is_folder_of_scenes
     from pointsplat_ns.system.threads import fixed_threads
 
@@ -122,8 +122,7 @@ def prune(
     output = output or output_beside(scene, "pruned")
     written = None if dry_run else output
     claim_outputs(written, force, plot)
-    keep = in_format_of(keep, output)
-    request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune)
+    request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune).in_format(format_to_write(output))
     rows = rows_to_prune(scene, request, None if memory is None else 1e6 * memory)
     if rows is not None:
         if dry_run or plot is not None:

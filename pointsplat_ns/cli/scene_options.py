@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
@@ -128,15 +127,6 @@ def check_poses(poses: Path | None) -> None:
         raise SceneError(
             f"{poses}: a run or a scene; expected {ACCEPTED}; the poses of a run's own dataset need no --poses"
         )
-
-
-def in_format_of(keep: str, output: Path) -> str:
-    """A budget for :func:`~pointsplat_ns.pruning.parse_keep`: a size or a PSNR without a format, such as 5MB, gets the
-    format of the output."""
-    from pointsplat_ns.io.formats import format_to_write
-
-    without = re.search(r"\d *[kmg]?b$|^auto$|^auto:[\d.]+(db)?$", keep.strip(), re.IGNORECASE)
-    return keep.strip() + format_to_write(output).budget_suffix if without else keep
 
 
 def file_bytes(path: Path) -> int:

@@ -31,6 +31,7 @@ from pointsplat_ns.pruning import (
     score_of,
     select,
 )
+from pointsplat_ns.pruning.merging import Merger
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.views import Views
 
@@ -143,12 +144,18 @@ def _pruner(
     progress: Callable[[float], None],
     seen: list[Views],
 ) -> Callable[[int], Gaussians]:
-    """A function from a count to a scene of that many Gaussians. Scores are computed once, for all counts. The views
-    that merging looked from are added to ``seen``."""
+    """A function from a count to a scene of that many Gaussians. Scores, and the rounds of merging that counts share,
+    are computed once. The views that merging looked from are added to ``seen``."""
     method = request.method
     if method.score is None:
-        known = views.known(MERGED_FROM)
-        return lambda count: prune(scene, count, request.by, known, looked=seen.append, resolution=views.resolution)
+        merger = Merger(scene, views.known(MERGED_FROM), views.resolution)
+
+        def made(count: int) -> Gaussians:
+            merged = merger.merged(count)
+            seen.extend([] if merged.views is None else [merged.views])
+            return merged.scene
+
+        return made
     progress(0.0)
     scored = functools.partial(views.scored, SCORED_VIEWS)
     scores = score_of(scene, method, scored, request.opacity_weight, progress)

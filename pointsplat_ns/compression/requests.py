@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -25,6 +25,7 @@ from pointsplat_ns.pruning.methods import check_opacity_weight
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner
+    from pointsplat_ns.io.formats import Format
 
 SH_CHOICES = ("all", "auto", "0", "1", "2", "3")
 """Values of the option ``sh``."""
@@ -133,6 +134,10 @@ class PruneRequest:
         if isinstance(budget, WithinPsnr) and not 0 < budget.value < math.inf:
             raise BudgetError(f"the wanted PSNR is {budget.value} dB; expected a positive number, such as 35")
         object.__setattr__(self, "budget", budget)
+
+    def in_format(self, kind: Format) -> PruneRequest:
+        """The request for files of a format, which a size or a PSNR is for if ``keep`` is text that names none."""
+        return replace(self, keep=parse_keep(self.keep, kind.budget_suffix)) if isinstance(self.keep, str) else self
 
     @property
     def method(self) -> Method:

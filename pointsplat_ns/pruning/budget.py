@@ -149,10 +149,10 @@ def _count_that_fits(n: int, keep: Megabytes, sh_degree: int) -> int:
     return count
 
 
-def parse_keep(text: str) -> Keep:
+def parse_keep(text: str, suffix: str = ".ply") -> Keep:
     """Parse a budget: ``0.3`` and ``30%`` are ratios; ``50000``, ``50k`` and ``12 Gaussians`` are counts; ``12MB`` and
     ``800kB.spz`` are sizes; ``auto``, ``auto:35`` and ``auto:35.sog`` are the PSNR (dB) that renders must reach against
-    the dense scene.
+    the dense scene. A size or a PSNR without a format is for files with ``suffix``.
 
     Raises:
         BudgetError: if it is none of these. The range of a ratio, count or size is checked by :func:`resolve_keep`.
@@ -167,9 +167,9 @@ def parse_keep(text: str) -> Keep:
             psnr = AUTO_PSNR if auto[1] is None else float(auto[1])
             if not 0 < psnr < math.inf:
                 raise ValueError
-            return WithinPsnr(psnr, auto[2] or ".ply")
+            return WithinPsnr(psnr, auto[2] or suffix)
         if size := re.fullmatch(r"(.*\d *[kmg]?b)(\.\S+)?", text, re.IGNORECASE):
-            return Megabytes(parse_megabytes(size[1]), (size[2] or ".ply").lower())
+            return Megabytes(parse_megabytes(size[1]), (size[2] or suffix).lower())
         if text.endswith("%"):
             return parse_number(text[:-1]) / 100
         if count := re.fullmatch(r"(.*\d *[kmg]?) *gaussians?", text, re.IGNORECASE):

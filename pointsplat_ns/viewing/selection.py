@@ -16,7 +16,7 @@ from pointsplat_ns.looking.content import thinned
 from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
 from pointsplat_ns.pruning import resolve_keep, select
 from pointsplat_ns.pruning.coverage import coverage_score
-from pointsplat_ns.pruning.methods import prune
+from pointsplat_ns.pruning.merging import Merger
 
 
 @dataclass(eq=False)
@@ -104,6 +104,10 @@ class Selection:
     def _scores(self) -> Tensor:
         return coverage_score(self.scene)
 
+    @cached_property
+    def _merger(self) -> Merger:
+        return Merger(self.scene, self._source.known(MERGED_FROM))
+
     def _work(self) -> None:
         while True:
             with self._changed:
@@ -137,8 +141,7 @@ class Selection:
                 self._report(False)
 
         report(0.0)
-        views = self._source.known(MERGED_FROM)
-        return ReducedScene(prune(self.scene, self._count(percent), views=views, progress=report), "merged")
+        return ReducedScene(self._merger.merged(self._count(percent), report).scene, "merged")
 
     def _keep(self, percent: int, merged: ReducedScene) -> None:
         """Keep a merged scene, and older ones as long as all together have no more Gaussians than the scene itself."""

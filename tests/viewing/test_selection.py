@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -80,7 +81,7 @@ def test_budget_that_stays_is_merged_as_prune_does(selection, scene, news):
 def test_merging_is_stopped_by_another_budget(selection, scene, news, monkeypatch):
     stopped, begun = threading.Event(), threading.Event()
 
-    def slow(scene, count, views, progress):
+    def slow(merger, count, progress):
         try:
             while True:
                 begun.set()
@@ -89,11 +90,11 @@ def test_merging_is_stopped_by_another_budget(selection, scene, news, monkeypatc
             stopped.set()
             raise
 
-    monkeypatch.setattr(module, "prune", slow)
+    monkeypatch.setattr(module.Merger, "merged", slow)
     selection.choose(30)
     assert begun.wait(30)
     news.wait(lambda: selection.status == "merging, 50 %")
-    monkeypatch.setattr(module, "prune", lambda scene, count, **_: scene[:count])
+    monkeypatch.setattr(module.Merger, "merged", lambda merger, count, progress: SimpleNamespace(scene=scene[:count]))
     selection.choose(10)
     assert stopped.wait(30)
     news.wait(lambda: selection.current.how == "merged")
@@ -104,7 +105,7 @@ def test_failed_merge_leaves_what_was_chosen_and_says_why(selection, news, monke
     def fails(*args, **options):
         raise ps.BudgetError("no such thing")
 
-    monkeypatch.setattr(module, "prune", fails)
+    monkeypatch.setattr(module.Merger, "merged", fails)
     selection.choose(50)
     news.wait(lambda: "no such thing" in selection.current.how)
     assert len(selection.current.scene) == 200

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -119,6 +119,51 @@ def merge_levels(
     return _levels(scene, counts, progress or (lambda share: None), views, resolution, settings)
 
 
+class Merger:
+    """Merges one scene to several counts, each as :func:`merge` does. The views, and all rounds before the last one of
+    a count, are those of every smaller count as well, and are made once.
+
+    The steps that are kept take at most 0.4 kB for each Gaussian of the scene.
+
+    Args:
+        scene, views, resolution, settings: as for :func:`merge`.
+    """
+
+    def __init__(
+        self,
+        scene: Gaussians,
+        views: Views | None = None,
+        resolution: tuple[int, int] = RESOLUTION,
+        settings: MergeSettings = DEFAULTS,
+    ):
+        self._scene, self._options = scene, (views, resolution, settings)
+        self._steps: list[Step] = []  # after rounds that merge as many pairs as they may
+
+    @torch.no_grad()
+    def merged(self, k: int, progress: Callable[[float], None] | None = None) -> Merged:
+        """The result of :func:`merge`, to the bit. Arguments and errors as there."""
+        views, _, settings = self._options
+        if not self._steps and 1 <= k < len(self._scene):
+            dense = self._scene.to(device="cpu")
+            with one_thread_each():
+                copies = Copies(dense, drawable(dense, 1))
+                self._steps.append(first_step(copies.reduced(copies.distinct), *self._options))
+        if not self._steps or not 1 <= k <= len(self._steps[0].state):  # copies or faint Gaussians are among them
+            return merge(self._scene, k, progress, *self._options)
+        report = progress or (lambda share: None)
+        step = next(step for step in reversed(self._steps) if len(step.state) >= k)
+        first = len(step.state)
+        while (n := len(step.state)) > k:
+            shared = step is self._steps[-1] and n - most_pairs(n, settings) >= k
+            with one_thread_each():
+                step = one_round(step, k, settings)
+            self._steps += [step] if shared else []
+            report(0.95 * (first - len(step.state)) / max(first - k, 1))
+        merged = _result(step, self._scene.device, views, True, settings)
+        report(1.0)
+        return merged
+
+
 @torch.no_grad()
 def _levels(
     scene: Gaussians,
@@ -139,31 +184,37 @@ def _levels(
     with one_thread_each():
         copies = Copies(dense, drawable(dense, counts[0]))
     first, last = len(copies), counts[-1]
-    reduced: Reduced | None = None
+    step: Step | None = None
     for k in counts:
         left = max(k, copies.distinct)
-        if reduced is None or left < len(reduced.members):
+        if step is None or left < len(step.reduced.members):
             with one_thread_each():
-                reduced = copies.reduced(left)
-                step = first_step(Participants.of(reduced.scene, reduced.members), views, resolution, settings)
+                step = first_step(copies.reduced(left), views, resolution, settings)
         while len(step.state) > k:
             with one_thread_each():
                 step = one_round(step, k, settings)
             report(0.95 * (first - len(step.state)) / max(first - last, 1))
-        with one_thread_each():
-            groups, result, finish = finished(step, regroup=len(counts) == 1, settings=settings)
+        merged = _result(step, scene.device, views, len(counts) == 1, settings)
         if k == last:
             report(1.0)
-        of_reduced = torch.full((len(reduced.scene),), -1)
-        of_reduced[step.participants.members] = groups.group
-        assignment = of_reduced[reduced.index]
-        yield Merged(result.to(scene.device), assignment.to(scene.device), finish, views or _views_of(step))
+        yield merged
+
+
+def _result(step: Step, device: torch.device, views: Views | None, regroup: bool, settings: MergeSettings) -> Merged:
+    """The result after the last round, on a device; ``views`` are those that were given."""
+    with one_thread_each():
+        groups, scene, finish = finished(step, regroup, settings)
+    of_reduced = torch.full((len(step.reduced.scene),), -1)
+    of_reduced[step.participants.members] = groups.group
+    assignment = of_reduced[step.reduced.index]
+    return Merged(scene.to(device), assignment.to(device), finish, views or _views_of(step))
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
     """Everything that is known between two rounds."""
 
+    reduced: Reduced
     participants: Participants
     viewpoints: Viewpoints | None
     state: State
@@ -180,16 +231,23 @@ def _views_of(step: Step) -> Views | None:
     return views_in_scene_units(sampled.viewmats, sampled.width, sampled.height, whole.centre, whole.size)
 
 
-def first_step(
+def looked_at(
     participants: Participants, views: Views | None, resolution: tuple[int, int], settings: MergeSettings
-) -> Step:
-    """The step before the first round; ``views`` and ``resolution`` as for :func:`merge`."""
+) -> tuple[Viewpoints | None, Tensor]:
+    """The viewpoints, None for a small scene without known views, and the visibility weights (n,) of participants;
+    ``views`` and ``resolution`` as for :func:`merge`."""
     viewpoints: Viewpoints | None = None
     if views is not None:
         viewpoints = Viewpoints(views_in_units(views, participants.centre, participants.size))
     elif len(participants) >= settings.min_count_rendered:
         viewpoints = sampled_viewpoints(participants.in_units(participants.scene), *resolution, settings)
-    weights = visibility_weights(participants, viewpoints, settings)
+    return viewpoints, visibility_weights(participants, viewpoints, settings)
+
+
+def first_step(reduced: Reduced, views: Views | None, resolution: tuple[int, int], settings: MergeSettings) -> Step:
+    """The step before the first round; ``views`` and ``resolution`` as for :func:`merge`."""
+    participants = Participants.of(reduced.scene, reduced.members)
+    viewpoints, weights = looked_at(participants, views, resolution, settings)
     state = initial_state(participants, weights, settings)
     tree = Tree.of_single(len(participants))
 
@@ -198,14 +256,19 @@ def first_step(
         return participants.scene if whole else participants.scene[participants.members]
 
     reference = _reference(participants, viewpoints, len(state), dense, settings)
-    return Step(participants, viewpoints, state, tree, reference)
+    return Step(reduced, participants, viewpoints, state, tree, reference)
+
+
+def most_pairs(n: int, settings: MergeSettings) -> int:
+    """Largest number of pairs that a round merges of ``n`` Gaussians."""
+    return max(1, int(n * settings.round_share))
 
 
 def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
     """The step after some more pairs are merged; at least ``k`` Gaussians remain."""
     participants, viewpoints = step.participants, step.viewpoints
     n = len(step.state)
-    most = max(1, min(n - k, int(n * settings.round_share)))
+    most = min(n - k, most_pairs(n, settings))
     near = other_neighbours(step.state.means, settings.neighbours)
     first, second = cheapest_pairs(near, pair_costs(step.state, near, settings), most, settings.matching_passes)
     state, shares = replace_pairs(step.state, first, second, settings)
@@ -216,7 +279,7 @@ def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
         return scene_maker(participants, groups, settings)(0.0)
 
     reference = step.reference or _reference(participants, viewpoints, len(state), remaining, settings)
-    return Step(participants, viewpoints, state, tree, reference)
+    return replace(step, state=state, tree=tree, reference=reference)
 
 
 def finished(step: Step, regroup: bool, settings: MergeSettings) -> tuple[Groups, Gaussians, Finish]:

@@ -12,7 +12,7 @@ import torch
 from making import ball, cloud, same
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.merging import DEFAULTS, Finish, Merged, merge, merge_levels
+from pointsplat_ns.pruning.merging import DEFAULTS, Finish, Merged, Merger, merge, merge_levels
 from pointsplat_ns.pruning.merging import covariance as algebra
 from pointsplat_ns.pruning.merging.merged_scene import deepened
 from pointsplat_ns.rasterizer import rasterization
@@ -229,6 +229,18 @@ def test_the_invisible_go_first_and_the_least_opaque_of_them_before():
     merged = merge(scene, 30)
     assert bool((merged.assignment[:20] == -1).all()) and same(merged.scene, scene[20:])
     assert same(merge(scene, 33).scene, Gaussians.cat([scene[:3], scene[20:]]))
+
+
+def test_a_merger_gives_what_merging_alone_gives_in_any_order_of_counts():
+    faint = wall(8, seed=1).replace(opacities=torch.full((64, 1), -9.0))
+    scene = Gaussians.cat([wall(), wall()[:50], faint])  # the 50 are copies
+    merger = Merger(scene, settings=RENDERED)
+    for k in (400, 90, 1000, 399, 1, 1620, 1660, len(scene)):
+        merged, alone = merger.merged(k), merge(scene, k, settings=RENDERED)
+        assert same(merged.scene, alone.scene) and torch.equal(merged.assignment, alone.assignment)
+    for k in (0, len(scene) + 1):
+        with pytest.raises(BudgetError):
+            merger.merged(k)
 
 
 @pytest.mark.parametrize("counts", [[0], [-1], [51], [10, 10], [10, 20], [5, 0]])
