@@ -1,7 +1,5 @@
 """Shared test data: a tiny scene whose every pixel is known."""
 
-from __future__ import annotations
-
 import json
 import math
 import warnings

@@ -1,7 +1,5 @@
 """The public API: the ten lines, what each name is and says, and that the command line does nothing else."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import doctest

@@ -1,7 +1,5 @@
 """Films of scenes, as users make them."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

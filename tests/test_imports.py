@@ -1,7 +1,5 @@
 """What importing the package costs, and what its parts import. ``make lint`` checks the direction of all imports."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -4,8 +4,6 @@ The environment has nothing but what the package asks for without an extra and w
 what is installed here.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

@@ -4,8 +4,6 @@ Both are built from a copy of the tracked files. The environment is a new one th
 one, but not its installation of this package.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -3,8 +3,6 @@
 Without compiled kernels, two threads add up gradients in another order than one.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Compiled kernels that do not do what torch does are found out when they are first asked for, and not used."""
 
-from __future__ import annotations
-
 import shutil
 
 import pytest

@@ -1,7 +1,5 @@
 """pointsplat compact: what it writes and says, and what it refuses."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

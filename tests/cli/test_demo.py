@@ -1,7 +1,5 @@
 """The demo: a result before anything is trained, then the whole method in small."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import json
 import shlex

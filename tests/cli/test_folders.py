@@ -1,7 +1,5 @@
 """Commands on a folder of scenes: what they write and say, and what they refuse."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """What ``--help`` shows beyond the options, exit statuses, and completion in shells."""
 
-from __future__ import annotations
-
 import inspect
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Ctrl-C and SIGTERM: the command and all that it started end at once, with the usual status, and leave nothing."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

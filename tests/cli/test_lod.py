@@ -1,7 +1,5 @@
 """pointsplat lod: that it writes what ps.lod gives, where, and what it prints."""
 
-from __future__ import annotations
-
 import inspect
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Whatever goes wrong around a command ends it with one line and exit status 1."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

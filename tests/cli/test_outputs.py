@@ -1,7 +1,5 @@
 """What commands are going to write: held from before the work, never lost to another process, never half there."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Pipes in place of files, which have no end: no command waits for one, wherever it is named or found."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``--json``: standard output has one JSON value, which says what was written; and what a pipe gets otherwise."""
 
-from __future__ import annotations
-
 import json
 import logging
 import re

@@ -1,7 +1,5 @@
 """pointsplat prune and export: what they write, and what they say of input that cannot be used."""
 
-from __future__ import annotations
-
 import json
 import logging
 import re

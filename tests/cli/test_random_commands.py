@@ -1,7 +1,5 @@
 """Random command lines over odd files (hypothesis, always the same examples) end with a result or with one line."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import inspect

@@ -1,7 +1,5 @@
 """Counts and sizes are read as people write them, by every command."""
 
-from __future__ import annotations
-
 import pytest
 
 from pointsplat_ns import cli

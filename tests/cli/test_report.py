@@ -1,7 +1,5 @@
 """The commands that make data and show results."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

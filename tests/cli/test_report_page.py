@@ -1,7 +1,5 @@
 """pointsplat report --html: an evaluation as a page."""
 
-from __future__ import annotations
-
 import html
 import json
 import re

@@ -1,7 +1,5 @@
 """pointsplat tables: what it prints and refuses, and that being killed costs one cell at most."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """pointsplat tradeoff: that it does what measure_tradeoff does, and what it prints and refuses."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import re

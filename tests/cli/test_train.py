@@ -1,7 +1,5 @@
 """``pointsplat train``: the layout of a capture is recognised, and the run has as many Gaussians as were asked for."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

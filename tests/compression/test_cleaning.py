@@ -1,7 +1,5 @@
 """Cleaning: planted junk goes, what is seen stays, counts are exact, and extremes change nothing."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace

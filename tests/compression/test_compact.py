@@ -1,7 +1,5 @@
 """A scene made smaller and refined: refinement is kept where it helps, left out where it does not, and it is said."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The search for a count: it meets the target, ends near it, and needs few tries, whatever the measure is like."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

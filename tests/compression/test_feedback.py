@@ -1,7 +1,5 @@
 """What a network sees of the gradients, and the steps that follow."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

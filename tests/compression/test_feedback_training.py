@@ -1,7 +1,5 @@
 """Training the network that sets the steps of a repair."""
 
-from __future__ import annotations
-
 import random
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Levels as a streamed SOG: leaves hold the same part of every level, and sizes are kept."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """Levels of detail: how many Gaussians, that they are nested, and that the manifest is true."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

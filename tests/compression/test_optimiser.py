@@ -1,7 +1,5 @@
 """The loss that is optimised, and the unit in which positions move."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

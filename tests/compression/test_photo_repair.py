@@ -1,7 +1,5 @@
 """Training a smaller scene on photos: what it gains where no step looked, which pixels count, and how it ends."""
 
-from __future__ import annotations
-
 import dataclasses
 import random
 

@@ -1,7 +1,5 @@
 """Scenes turned, scaled and brought back to the frame of their data."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

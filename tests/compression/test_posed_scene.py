@@ -1,7 +1,5 @@
 """A scene and the poses of a file are brought into one frame, and checked to be in one before any long work."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

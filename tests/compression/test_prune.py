@@ -1,7 +1,5 @@
 """From what a person asks for to a smaller scene: what is combined, what is noted, what is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

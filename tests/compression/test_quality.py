@@ -1,7 +1,5 @@
 """How good a smaller scene is at full size, measured in some of the pixels."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

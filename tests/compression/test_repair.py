@@ -1,7 +1,5 @@
 """Repair by optimisation: what it gains, what it sees, how long it takes, and how it ends."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

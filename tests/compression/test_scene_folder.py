@@ -1,7 +1,5 @@
 """Every scene of a folder: made once, also where processes are killed, and never over what is somebody else's."""
 
-from __future__ import annotations
-
 import csv
 import functools
 import json

@@ -4,8 +4,6 @@ Two threads that share busy cores wait for one another, so everything is compute
 wait sleep early.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

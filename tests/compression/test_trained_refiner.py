@@ -1,7 +1,5 @@
 """A trained refiner is loaded from a file of weights or from a run, without nerfstudio."""
 
-from __future__ import annotations
-
 import importlib.resources
 import math
 import os

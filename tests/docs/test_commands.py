@@ -4,8 +4,6 @@ Commands are read by the parsers of the programs that they name, with the functi
 make the example room small are really run, on a cut of it.
 """
 
-from __future__ import annotations
-
 import pkgutil
 import re
 import shlex

@@ -1,7 +1,5 @@
 """The notebook runs from top to bottom and shows what it promises."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import nbformat

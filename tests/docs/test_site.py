@@ -1,7 +1,5 @@
 """The documentation is a site without a broken link, which needs nothing from elsewhere."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

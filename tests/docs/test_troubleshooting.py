@@ -1,7 +1,5 @@
 """The messages on the page about troubleshooting are those that the package gives."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

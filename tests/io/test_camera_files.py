@@ -1,7 +1,5 @@
 """Files of cameras are read as their own projects read them; anything else is refused in one line, without harm."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

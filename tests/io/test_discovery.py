@@ -1,7 +1,5 @@
 """Which scenes there are below a folder."""
 
-from __future__ import annotations
-
 import pytest
 
 from making import cloud

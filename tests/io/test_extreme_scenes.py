@@ -1,7 +1,5 @@
 """Scenes of extreme numbers, in files that are as they should be: written and read back, or refused in one line."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

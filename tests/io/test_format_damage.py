@@ -1,7 +1,5 @@
 """Scene files that are cut short, garbled or lie: one SceneError each, and no memory for what is not there."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import json

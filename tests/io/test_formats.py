@@ -1,7 +1,5 @@
 """Scene files of every format: what comes back, that the order is known, and that sizes are as said."""
 
-from __future__ import annotations
-
 import functools
 import json
 import logging

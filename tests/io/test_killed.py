@@ -1,7 +1,5 @@
 """Writers that are killed at every operation on files, write the same file at once, or find the disk full."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A PLY that is read in pieces: the same Gaussians as in whole, and the same refusals."""
 
-from __future__ import annotations
-
 import pytest
 
 import pointsplat_ns as ps

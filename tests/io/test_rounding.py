@@ -54,8 +54,7 @@ def test_multiples_of_a_power_of_two(step):
 
 
 @pytest.mark.parametrize(
-    ("name", "change"),
-    [("means", [0.0, 1.0, 0.0]), ("scales", [0.0, 1.0, 0.0]), ("quats", [0.0, 0.0, 0.0, 1.0])],
+    ("name", "change"), [("means", [0.0, 1.0, 0.0]), ("scales", [0.0, 1.0, 0.0]), ("quats", [0.0, 0.0, 0.0, 1.0])]
 )
 def test_a_step_changes_a_gaussian_by_its_tolerance_over_the_contrast(name, change):
     scene, tolerance = one(), 1e-3

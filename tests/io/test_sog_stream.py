@@ -1,7 +1,5 @@
 """Streamed SOG: what is read of levels, surroundings and rows, and one SceneError for each lie."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The file that a scene is read from, by what it holds."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 

@@ -1,7 +1,5 @@
 """lab/judge/ablation.py: which variants there are, what is measured of them, and what the record says."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

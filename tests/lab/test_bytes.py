@@ -1,7 +1,5 @@
 """lab/judge/bytes.py: files of equal sizes."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """Every reader reads or refuses, in one typed error of one line, what fuzzing it has found worth keeping."""
 
-from __future__ import annotations
-
 import logging
 import mmap
 from contextlib import suppress

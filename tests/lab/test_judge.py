@@ -1,7 +1,5 @@
 """lab/judge: the camera paths that ship, what is measured in their views, and rows that are kept."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

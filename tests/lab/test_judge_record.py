@@ -1,7 +1,5 @@
 """lab/judge/record.py: which rows count, what tables say of them, and what is written."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """lab/robustness/mutants.py on a module of its own: what it catches, what it reports, and what it leaves alone."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

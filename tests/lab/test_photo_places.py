@@ -1,7 +1,5 @@
 """The map of what explains a scene's SH."""
 
-from __future__ import annotations
-
 import torch
 
 from lab.training import photo_places

@@ -1,7 +1,5 @@
 """Every program of the lab starts and stands in its README; what programs share."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

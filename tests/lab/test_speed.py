@@ -1,7 +1,5 @@
 """lab/speed: the rasterizer, and whole commands by the number of Gaussians."""
 
-from __future__ import annotations
-
 import json
 import types
 

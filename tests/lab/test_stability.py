@@ -1,7 +1,5 @@
 """lab/numerics/stability.py: its errors, its limits, and what it writes."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

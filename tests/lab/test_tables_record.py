@@ -1,7 +1,5 @@
 """lab/judge/tables_record.py: the record of the paper's tables is what was measured."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

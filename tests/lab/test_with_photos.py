@@ -1,7 +1,5 @@
 """lab/training/with_photos.py: which ways are measured, for how long each, and what the record says."""
 
-from __future__ import annotations
-
 import json
 import time
 

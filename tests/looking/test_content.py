@@ -1,7 +1,5 @@
 """The content of a scene: its place and size, and fewer Gaussians that cover as much."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Coverage: the share of the visible content that views show."""
 
-from __future__ import annotations
-
 import torch
 
 from making import ball

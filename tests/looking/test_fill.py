@@ -1,7 +1,5 @@
 """Fill against counts by hand."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The views in which a scene is shown first: the subject whole and upright, or most of a room."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Cameras at given places, and what is in their pictures."""
 
-from __future__ import annotations
-
 import torch
 
 from pointsplat_ns.looking.poses import in_pictures

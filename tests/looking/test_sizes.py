@@ -1,7 +1,5 @@
 """Pictures of several sizes: few pixels of a large picture are those of the large picture."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

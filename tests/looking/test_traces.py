@@ -1,7 +1,5 @@
 """Traces of photos in a scene: photo places and trace factors."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

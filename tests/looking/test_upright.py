@@ -1,7 +1,5 @@
 """Which way is up in a scene without cameras, and the upright box around it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Where a scene is looked at from: given views, the poses of its dataset, poses sampled in free space."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The SSIM of the training loss against the one it replaces, and compiled against torch's."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

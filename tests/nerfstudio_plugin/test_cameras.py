@@ -1,7 +1,5 @@
 """nerfstudio's cameras and ours are the same cameras."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 
@@ -43,14 +41,10 @@ def test_a_view_sees_a_point_at_the_pixel_where_nerfstudios_ray_to_it_starts(vie
     torch.testing.assert_close(pixel[:2] / pixel[2], at.flip(0), atol=1e-3, rtol=0)
 
 
-def test_views_have_the_size_of_the_cameras_and_are_drawn_as_asked_for(views):
-    assert (len(views), views.width, views.height, views.rasterize_mode) == (3, 40, 30, "antialiased")
-    assert torch.equal(views.background, BACKGROUND)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_cameras_of_views_are_the_pinhole_cameras_that_the_views_were_made_of_in_float32(views, dtype):
     views = dataclasses.replace(views, viewmats=views.viewmats.to(dtype), Ks=views.Ks.to(dtype))
+    assert (len(views), views.width, views.height, views.rasterize_mode) == (3, 40, 30, "antialiased")
     back = cameras_of_views(views)
     # 1e-6: one inversion of a float32 pose
     torch.testing.assert_close(back.camera_to_worlds, some_cameras().camera_to_worlds, atol=1e-6, rtol=0)
@@ -59,7 +53,7 @@ def test_cameras_of_views_are_the_pinhole_cameras_that_the_views_were_made_of_in
     assert (back.camera_to_worlds.dtype, back.fx.dtype) == (torch.float32, torch.float32)
 
 
-@pytest.mark.parametrize(("near_plane", "eps2d"), [(NEAR_PLANE, EPS2D), (1e-7, 0.0), (0.1, 0.02), (300.0, 1.0)])
+@pytest.mark.parametrize(("near_plane", "eps2d"), [(NEAR_PLANE, EPS2D), (1e-7, 0.0), (300.0, 1.0)])
 def test_near_plane_and_eps2d_go_to_nerfstudios_cameras_and_back(views, near_plane, eps2d):
     cameras = cameras_of_views(dataclasses.replace(views, near_plane=near_plane, eps2d=eps2d))
     for some in (cameras, cameras[1:2], copy.deepcopy(cameras).to("cpu")):

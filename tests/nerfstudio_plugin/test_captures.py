@@ -1,7 +1,5 @@
 """Captures in every layout that people have, read by nerfstudio's dataparsers and trained on by both methods."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -50,9 +48,6 @@ def nerfstudio_data() -> NerfstudioDataParserConfig:
 
 LAYOUTS = {
     "nerfstudio-data": Layout(Lens(), Capture.write_nerfstudio, nerfstudio_data),
-    "nerfstudio-data, lens": Layout(
-        Lens(distortion=(0.12, -0.05, 0.004, -0.003)), Capture.write_nerfstudio, nerfstudio_data
-    ),
     "nerfstudio-data, equidistant fisheye": Layout(
         Lens("OPENCV_FISHEYE", focal=(30.0, 30.5)), Capture.write_nerfstudio, nerfstudio_data
     ),

@@ -1,6 +1,6 @@
 """nerfstudio's datamanager with photos read when they are due."""
 
-from __future__ import annotations
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -50,19 +50,8 @@ def test_more_than_500_photos_need_neither_pinned_memory_nor_room(tmp_path):
         image_filenames=[photo] * 501, cameras=cameras, scene_box=SceneBox(aabb=torch.zeros(2, 3))
     )
 
-    class Parser:
-        includes_time = False
-
-        def get_dataparser_outputs(self, split):
-            return outputs
-
-    class Config:
-        data = tmp_path
-
-        def setup(self):
-            return Parser()
-
-    config = LazyImageDatamanagerConfig(dataparser=Config(), cache_gigabytes=1e-5)
-    manager = config.setup(device="cpu")
+    parser = SimpleNamespace(includes_time=False, get_dataparser_outputs=lambda split: outputs)
+    dataparser = SimpleNamespace(data=tmp_path, setup=lambda: parser)
+    manager = LazyImageDatamanagerConfig(dataparser=dataparser, cache_gigabytes=1e-5).setup(device="cpu")
     indices = [manager.next_train(step)[1]["image_idx"] for step in range(6)]
     assert len(set(indices)) == 6 and manager.frame_cache.num_bytes <= 1e4

@@ -1,7 +1,5 @@
 """Poses and photos of a run's dataset; and that a scene is judged by its held-out photos."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

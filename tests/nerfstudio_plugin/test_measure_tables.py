@@ -1,7 +1,5 @@
 """Tables of trained runs, against their held-out photos; and which runs are of the paper's datasets."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The line of the log that says what draws."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest
@@ -35,22 +33,12 @@ def engine(monkeypatch):
     return line
 
 
-def test_a_training_is_compiled_if_all_that_it_uses_is(engine):
+def test_a_training_is_compiled_if_all_that_it_uses_is_and_else_says_what_it_lacks_and_why(engine):
     assert engine(SplatfactoCpuModelConfig()) == "rasterizer: compiled"
-
-
-@pytest.mark.parametrize("what", USED)
-def test_a_training_says_which_kernels_it_lacks_and_why(what, engine):
-    name = USED[what].__name__.rpartition(".")[2]
-    line = engine(SplatfactoCpuModelConfig(), **{name: "the disk is full"})
-    assert line == f"rasterizer: compiled, but torch does {what}, which is slower: the disk is full"
-
-
-def test_what_a_training_does_not_use_is_not_asked_for(engine):
     assert engine(PointSplatModelConfig(), structural_similarity="the disk is full") == "rasterizer: compiled"
-
-
-def test_one_reason_for_all_is_said_once(engine):
+    for what, module in USED.items():
+        line = engine(SplatfactoCpuModelConfig(), **{module.__name__.rpartition(".")[2]: "the disk is full"})
+        assert line == f"rasterizer: compiled, but torch does {what}, which is slower: the disk is full"
     missing = {module.__name__.rpartition(".")[2]: "there is no C++ compiler" for module in USED.values()}
     slower = "rasterizer: torch, several times slower than compiled kernels: "
     assert engine(SplatfactoCpuModelConfig(), **missing) == slower + "there is no C++ compiler"

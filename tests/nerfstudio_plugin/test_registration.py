@@ -1,11 +1,8 @@
 """How the package enters nerfstudio's commands."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -70,11 +67,9 @@ for name in sys.argv[1:]:
 def test_any_module_may_come_first_and_imports_no_network_no_cuda_and_little_else():
     # nerfstudio imports entry points from inside its own imports, so the order decides what is half imported.
     # (That nerfstudio itself may come first is what every test that parses its command line proves.)
-    modules = (
-        *("replica.dataparser", "splatfacto_cpu.model"),
-        "pointsplat.scenes",  # what dataset_views imports
-    )
-    cases = ["method_configs.methods", *(f"pointsplat_ns.nerfstudio_plugin.{name}" for name in modules), "new modules"]
+    # pointsplat.scenes is what dataset_views imports.
+    modules = (f"pointsplat_ns.nerfstudio_plugin.{name}" for name in ("splatfacto_cpu.model", "pointsplat.scenes"))
+    cases = [*modules, "new modules"]
     result = subprocess.run([sys.executable, "-c", FORKED, *cases], capture_output=True, text=True, timeout=300)
     lines = [line for line in result.stdout.splitlines() if line.split(":")[0] in cases]
     assert lines == [f"{name}: fine" for name in cases], result.stdout + result.stderr
@@ -87,16 +82,6 @@ def test_a_specification_that_fails_to_load_becomes_one_line():
     line = load_specification("some-method", broken)
     assert line == "some-method of pointsplat-ns, which failed to load (ImportError: no module named 'x')"
     assert load_specification("some-method", dict) == {}
-
-
-def test_entry_points_name_what_nerfstudio_expects():
-    names = {
-        group: {entry.name: entry.value for entry in entry_points(group=f"nerfstudio.{group}")}
-        for group in ("method_configs", "dataparser_configs")
-    }
-    assert names["method_configs"]["splatfacto-cpu"] == "method_configs.methods:splatfacto_cpu"
-    assert names["dataparser_configs"]["replica-data"] == "method_configs.dataparsers:replica"
-    assert names["dataparser_configs"]["scannetpp-seeded"] == "method_configs.dataparsers:scannetpp"
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """The ``scannetpp-seeded`` dataparser: a fisheye with masks, bad frames, COLMAP's points."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

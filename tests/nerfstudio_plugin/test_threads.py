@@ -1,7 +1,5 @@
 """The number of threads of trainings."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -42,12 +40,6 @@ def test_steps_use_the_threads_chosen_or_set(
     trainer.train()
     assert seen == {used}
     assert torch.get_num_threads() == 3
-
-
-def test_less_than_one_thread_is_refused(wall_scene, wall_config, tmp_path):
-    config = wall_config(wall_scene, tmp_path, 1)
-    config.threads = 0
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
+    trainer.config.threads = 0
     with pytest.raises(PointSplatError, match="0 threads"):
         trainer.train()

@@ -1,7 +1,5 @@
 """A page of two scenes, for all tests of this folder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -3,8 +3,6 @@
 Pictures are compared with those of the package's own rasterizer.
 """
 
-from __future__ import annotations
-
 import base64
 import re
 from collections.abc import Iterator

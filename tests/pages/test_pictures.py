@@ -1,7 +1,5 @@
 """Pictures of pages: what is read, what an error map shows, how they are made to fit."""
 
-from __future__ import annotations
-
 import base64
 import io
 

@@ -1,7 +1,5 @@
 """The page of one or two scenes as a file: what is in it, how large it is, and what cannot be shown."""
 
-from __future__ import annotations
-
 import base64
 import logging
 import math

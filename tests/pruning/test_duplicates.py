@@ -1,7 +1,5 @@
 """Exact copies of Gaussians."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """A view that is drawn in parts is the view that is drawn at once."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

@@ -3,8 +3,6 @@
 They catch what a comparison of two paths of today cannot: that both have changed, with torch or with us.
 """
 
-from __future__ import annotations
-
 import re
 
 import pytest

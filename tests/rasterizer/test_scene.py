@@ -1,7 +1,5 @@
 """Pictures of whole scenes: drawn faster, they are what the rasterizer gives at that quality, or enlarged."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

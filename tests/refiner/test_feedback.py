@@ -1,7 +1,5 @@
 """The network that sets the steps of a repair, and its files."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from safetensors.torch import save_file

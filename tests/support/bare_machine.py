@@ -7,8 +7,6 @@ second is a list of what each printed, its exit status and the hosts that it tri
 small as in the other tests.
 """
 
-from __future__ import annotations
-
 import importlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Training steps of a refiner that cannot be used."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Container, Iterator
 from contextlib import contextmanager

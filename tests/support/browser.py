@@ -1,7 +1,5 @@
 """A headless Chromium that opens pages from disk."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Iterator
@@ -17,7 +15,7 @@ PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
 @contextmanager
-def chromium() -> Iterator[Chrome]:
+def chromium() -> "Iterator[Chrome]":
     """A browser of its own, closed at the end. The test is skipped where Chromium or its driver is missing."""
     selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
     program = next(filter(None, map(shutil.which, PROGRAMS)), None)
@@ -39,7 +37,7 @@ def chromium() -> Iterator[Chrome]:
         browser.quit()
 
 
-def complaints(browser: Chrome) -> list[str]:
+def complaints(browser: "Chrome") -> list[str]:
     """What the browser has logged since the last call: errors of scripts, and what the policy of a page forbade. What a
     graphics driver says of its speed is left out."""
     messages = (entry["message"] for entry in browser.get_log("browser"))

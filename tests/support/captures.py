@@ -1,7 +1,5 @@
 """One tiny painted room, photographed exactly through any lens, in the layouts that nerfstudio's dataparsers read."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The documentation and the examples of ``--help``: their code, and the parsers of the programs that it names."""
 
-from __future__ import annotations
-
 import functools
 import importlib.metadata
 import inspect

@@ -1,7 +1,5 @@
 """What ns-eval writes for a pointsplat run, made up, and ways of spoiling it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 WRONG: list = [None, [], {}, "text", [1], 10**400, {"psnr": "high"}]

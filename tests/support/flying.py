@@ -1,7 +1,5 @@
 """Pages with scenes to fly through, in a browser."""
 
-from __future__ import annotations
-
 import base64
 import io
 import time

@@ -8,8 +8,6 @@ draws them anew and adds the reason, with the hash of the new file, to ``tests/r
 that hash with the file's, so that neither changes alone.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import math

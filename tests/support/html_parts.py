@@ -1,7 +1,5 @@
 """The parts of a self-contained HTML file, for tests that look at them."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

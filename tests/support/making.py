@@ -1,8 +1,6 @@
 """What several test modules make: scenes, cameras, settings of a training, runs whose data is gone; and what a file
 imports."""
 
-from __future__ import annotations
-
 import ast
 import itertools
 import math

@@ -1,7 +1,5 @@
 """A client of nerfstudio's viewer, as its page is one: it says where its camera stands and gets pictures."""
 
-from __future__ import annotations
-
 import io
 import urllib.request
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A program that stands for splat-transform."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

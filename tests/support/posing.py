@@ -1,7 +1,5 @@
 """Files of cameras as others write them, of views that tests have."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

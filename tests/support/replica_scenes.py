@@ -1,7 +1,5 @@
 """Tiny scenes in the Replica layout."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What tests do to scenes of a folder, also in other processes."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A trade that was really measured: the example room at a few budgets, with its pictures on disk."""
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Cells of tables that are known in advance."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

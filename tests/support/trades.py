@@ -1,7 +1,5 @@
 """Trades that are known in advance: scenes that are not made but calculated."""
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from dataclasses import dataclass, field

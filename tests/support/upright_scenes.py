@@ -1,7 +1,5 @@
 """Scenes of flat Gaussians that stand upright, and turns of the world."""
 
-from __future__ import annotations
-
 import torch
 from scipy.spatial.transform import Rotation
 

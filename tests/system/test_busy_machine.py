@@ -1,7 +1,5 @@
 """The number of threads on a busy machine: by looks at a machine that is made up, and by a real one."""
 
-from __future__ import annotations
-
 import math
 import os
 import threading

@@ -1,7 +1,5 @@
 """Python calls C++ by what the C++ file declares."""
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 import subprocess

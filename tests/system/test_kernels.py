@@ -1,7 +1,5 @@
 """Functions of a C++ file are called on threads of the process, and are compared with torch."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """C++ is built once, into a folder that only its user can write to."""
 
-from __future__ import annotations
-
 import ctypes
 import re
 import shutil

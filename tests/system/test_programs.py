@@ -1,7 +1,5 @@
 """Time and memory of other programs, and that none is left behind."""
 
-from __future__ import annotations
-
 import sys
 import time
 

@@ -1,7 +1,5 @@
 """Numbers below the smallest normal float are 0 where that is asked for, and nowhere else."""
 
-from __future__ import annotations
-
 import threading
 
 import pytest

@@ -1,7 +1,5 @@
 """Pieces of work on several threads, and the cores that there are for them."""
 
-from __future__ import annotations
-
 import os
 import threading
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A small room whose tables are measured within seconds."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tables of a small room, really measured: every way, what cannot be measured, and going on."""
 
-from __future__ import annotations
-
 import json
 import logging
 

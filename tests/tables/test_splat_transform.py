@@ -1,7 +1,5 @@
 """splat-transform, as far as it can be tested without Node."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest

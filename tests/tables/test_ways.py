@@ -1,7 +1,5 @@
 """Names of cells and rows, and the paper's figures."""
 
-from __future__ import annotations
-
 import shlex
 
 import pytest

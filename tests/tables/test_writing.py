@@ -1,7 +1,5 @@
 """Tables as Markdown and LaTeX: their structure, what is in them, and what is never in them."""
 
-from __future__ import annotations
-
 import json
 import re
 

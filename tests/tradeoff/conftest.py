@@ -1,7 +1,5 @@
 """A small room that sweeps measure within seconds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

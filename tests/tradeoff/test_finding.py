@@ -1,7 +1,5 @@
 """The cheapest scene for targets, as ``compact`` finds it: in any format, as it is read from the file."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which points are on the front, what each loses, and which one is recommended."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """points.json: what is put in comes out, and what is not ours is refused."""
 
-from __future__ import annotations
-
 import json
 import math
 

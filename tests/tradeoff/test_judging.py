@@ -1,7 +1,5 @@
 """The judge: figures are those of the metrics, photos are reduced with their views, times are of drawing."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from statistics import fmean

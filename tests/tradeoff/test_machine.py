@@ -1,7 +1,5 @@
 """One measurement at a time; and whether others keep the machine busy."""
 
-from __future__ import annotations
-
 import threading
 
 import pytest

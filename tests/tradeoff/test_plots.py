@@ -1,7 +1,5 @@
 """Plots: the front is what no other point beats, and every kind of point can be drawn."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

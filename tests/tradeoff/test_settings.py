@@ -1,7 +1,5 @@
 """What settings are called, and that their commands are ones that make them."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Sweeps: what is kept of them whatever happens, and that their figures come out the same again."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

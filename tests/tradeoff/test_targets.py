@@ -1,7 +1,5 @@
 """The search for the cheapest scene that meets targets, on trades that are known in advance."""
 
-from __future__ import annotations
-
 import pytest
 
 from pointsplat_ns.compression.budget_search import BUDGETS

@@ -1,7 +1,5 @@
 """The walk: what it tries, what it leaves, where it ends, on trades that are known in advance."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

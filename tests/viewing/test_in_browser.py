@@ -1,7 +1,5 @@
 """``pointsplat view`` as its user has it: a command that is started, a page in headless Chromium, Ctrl-C."""
 
-from __future__ import annotations
-
 import base64
 import io
 import os

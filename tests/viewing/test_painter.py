@@ -1,7 +1,5 @@
 """Pictures are drawn band by band, and one that nobody waits for any more is given up."""
 
-from __future__ import annotations
-
 import math
 import queue
 import threading

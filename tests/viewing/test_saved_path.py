@@ -1,7 +1,5 @@
 """Camera paths as nerfstudio's viewer saves them are read as nerfstudio reads them; anything else is refused."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

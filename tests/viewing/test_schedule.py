@@ -1,7 +1,5 @@
 """What is drawn for a moving camera, by the schedule alone: the clock is turned by hand, and nothing is drawn."""
 
-from __future__ import annotations
-
 import threading
 
 import pytest

@@ -1,7 +1,5 @@
 """A budget acts at once by a score, and is merged once it stays."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The viewer answers its own pages, and nobody else."""
 
-from __future__ import annotations
-
 import html
 import http.client
 import json

@@ -1,7 +1,5 @@
 """Two scenes in one picture: each side is the scene's own render."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

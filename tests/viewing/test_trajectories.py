@@ -1,7 +1,5 @@
 """Camera paths go through the views they are made of, smoothly, upright, and where somebody has looked from."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

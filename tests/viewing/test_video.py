@@ -1,7 +1,5 @@
 """What is written is what was drawn, and nothing is left of what was not finished."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Trainings of the refiner and evaluations that several modules look at."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

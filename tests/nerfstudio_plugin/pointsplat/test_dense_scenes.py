@@ -1,7 +1,5 @@
 """Dense scenes as their own references: which scenes a folder holds, their poses, their pictures, and the memory."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from pathlib import Path
@@ -34,10 +32,7 @@ def rooms(tmp_path_factory) -> Path:
     write_ply(box_room(1), folder / "one.ply")
     (folder / "deep" / "iteration_7").mkdir(parents=True)
     write_ply(box_room(2), folder / "deep" / "iteration_7" / "point_cloud.ply")
-    cloud = (
-        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
-    )
-    (folder / "cloud.ply").write_text(cloud + "0 0 0\n")
+    (folder / "cloud.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
     (folder / "broken.ply").write_text("nothing")
     return folder
 
@@ -49,9 +44,6 @@ def scene_of(rooms: Path, cache_bytes: int = 1 << 24) -> PlyScene:
 def manager_of(folder: Path, **settings):
     settings = {"sampled_poses": 6, "sampled_size": (32, 24), "cache_gigabytes": 0.01, **settings}
     return ScenesDataManagerConfig(data=folder, **settings).setup(test_mode="val")
-
-
-# which scenes there are
 
 
 def test_a_folder_of_ply_files_is_scenes_learned_from_their_own_renders(rooms):
@@ -97,9 +89,6 @@ def test_a_scene_is_known_wherever_its_file_lies_and_changes_with_its_content(ro
     assert PlyScene("one", tmp_path / "one.ply", MemoryCache(0)).identity != moved
 
 
-# poses and pictures
-
-
 def test_sampled_poses_are_the_same_each_time_and_none_is_in_both_splits(rooms, monkeypatch):
     monkeypatch.setattr(dense_scenes, "sample_views", sample_views)  # anew for each
     first, second = scene_of(rooms), scene_of(rooms)
@@ -126,10 +115,7 @@ def test_targets_are_the_dense_scenes_exact_renders_in_8_bits(rooms):
     assert scene.rendered_train[0][1]["image"].dtype == torch.uint8
     with pytest.raises(IndexError):
         scene.rendered_train[6]
-
-
-def test_every_second_training_picture_is_subsampled_from_one_of_the_size_that_people_look_at(rooms):
-    scene = scene_of(rooms)
+    # Every second training picture is subsampled from one of the size that people look at.
     assert [eps2d_of(camera) for camera, _ in scene.rendered_train] == 3 * [EPS2D, EPS2D * (32 / 1920) ** 2]
     assert [eps2d_of(camera) for camera, _ in scene.rendered_eval] == 3 * [EPS2D]
 
@@ -165,6 +151,3 @@ def test_a_run_whose_data_is_gone_is_learned_from_its_own_renders(trained_walls,
         manager_of(tmp_path / "runs")
     manager = manager_of(tmp_path / "runs", supervision="dense")
     assert [scene.has_photos for scene in manager.scenes] == [False, False]
-
-
-# memory

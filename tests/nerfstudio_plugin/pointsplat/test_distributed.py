@@ -1,7 +1,5 @@
 """Two processes that train together do what one does with twice the scenes an update. Run as a program: the two."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -17,7 +15,7 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its 
 from broken_steps import broken
 from making import REPOSITORY, ball, box_room, dense_config, quick_start, views_sampled_once
 from pointsplat_ns.compression import feedback_training
-from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.metrics.lpips import LpipsUnavailable
 from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks, synchronise_batch_norm
@@ -27,7 +25,7 @@ from pointsplat_ns.system.processes import average_gradients, gathered
 
 pytestmark = pytest.mark.xdist_group("distributed")  # one worker trains for all tests of this file
 
-UPDATES = 3
+UPDATES = 2
 ROWS, CHANNELS = 10, 4
 BROKEN = {3}, {6}
 """Places of a broken photo, which the second process meets, and of a broken gradient, which the first does."""
@@ -169,16 +167,12 @@ def together(tmp_path_factory):
     return found, alone
 
 
-def test_losses_and_metrics_are_those_of_one_process_with_twice_the_batch(together):
+def test_losses_gradients_and_weights_are_those_of_one_process_with_twice_the_batch(together):
     found, alone = together
     for key, tolerance in (("losses", 1e-5), ("psnr", 1e-5)):  # float32 sums in another order, through three updates
         wanted = [(a + b) / 2 for a, b in zip(alone[key][::2], alone[key][1::2], strict=True)]
         assert found[0][key] == found[1][key] == pytest.approx(wanted, rel=tolerance)
     assert len(set(alone["losses"])) == 2 * UPDATES
-
-
-def test_gradients_and_weights_are_those_of_one_process_with_twice_the_batch(together):
-    found, alone = together
     for key, tolerance in (("gradients", 1e-3), ("weights", 1e-3)):
         for name, wanted in alone[key].items():
             assert torch.equal(found[0][key][name], found[1][key][name]), name
@@ -188,14 +182,10 @@ def test_gradients_and_weights_are_those_of_one_process_with_twice_the_batch(tog
             assert error < tolerance, (key, name, float(error))
 
 
-def test_each_process_evaluates_its_share_and_all_know_the_whole(together):
+def test_each_process_evaluates_its_share_and_the_first_alone_writes(together):
     found, alone = together
     assert found[0]["report"] == found[1]["report"] and list(found[0]["report"]) == ["a", "b", "c"]
     assert found[0]["report"] == pytest.approx(alone["report"], abs=1e-2)  # dB, of weights that differ by rounding
-
-
-def test_the_first_process_alone_writes(together):
-    found, alone = together
     assert {"refiner.safetensors", f"step-{UPDATES - 1:09d}.ckpt"} <= set(found[0]["files"])
     assert not {"refiner.safetensors"} & set(found[1]["files"]) and not [f for f in found[1]["files"] if "ckpt" in f]
 
@@ -283,6 +273,8 @@ def test_several_processes_on_a_cpu_are_started_by_torchrun(tmp_path):
     config.machine.num_devices = 2
     with pytest.raises(PointSplatError, match="torchrun --nproc-per-node 2 --no-python ns-train pointsplat"):
         config.set_timestamp()
+    with pytest.raises(SceneError, match="2 processes are asked for and 1 are connected"):
+        config.pipeline.setup(device="cpu", test_mode="val", world_size=2)
 
 
 def test_a_process_alone_is_left_as_it_is():

@@ -1,7 +1,5 @@
 """ns-eval: dense, pruned and refined scenes against held-out photos."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math
@@ -55,44 +53,31 @@ def report(evaluated, tmp_path_factory) -> tuple[dict, Path]:
         return evaluated.get_average_eval_image_metrics(output_path=folder, get_std=True), folder
 
 
-@pytest.mark.parametrize(("index", "name", "seen"), [(0, "wall-a", True), (1, "wall-b", False)])
-def test_a_scene_has_its_views_sizes_quality_speed_and_whether_it_was_trained_on(evaluated, report, index, name, seen):
-    scene, block = evaluated.model.pruned_scene(index), report[0]["scenes"][name]
-    assert (block["views"], block["seen_in_training"]) == (2, seen) and block["seconds"].keys() == {"prune", "refine"}
-    assert block["dense"]["gaussians"] == scene.dense_count
-    assert block["pruned"]["gaussians"] == block["refined"]["gaussians"] == len(scene.pruned)
-    assert block["pruned"]["megabytes"] == pytest.approx(scene.pruned.megabytes)
-    assert all(block[v]["fps"] > 0 and 0 < block[v]["ssim"] <= 1 for v in VARIANTS)
-    assert block["dense"]["psnr"] > block["pruned"]["psnr"], "half the Gaussians of a wall leave holes"
-
-
-@pytest.mark.parametrize("name", ["wall-a", "wall-b"])
-def test_every_variant_has_lpips_or_the_report_says_why_not(report, name):
-    values = [report[0]["scenes"][name][variant]["lpips"] for variant in VARIANTS]
-    if LPIPS_WEIGHTS.exists():
-        assert all(0 < value < 2 for value in values) and "lpips_note" not in report[0]
-    else:
-        assert values == [None] * 3 and report[0]["lpips_note"] == "no weights here"
-
-
-def test_averages_are_over_all_scenes_the_seen_and_the_unseen_which_are_the_headline(report):
-    seen, unseen = (report[0]["scenes"][name]["refined"]["psnr"] for name in ("wall-a", "wall-b"))
-    means = {key: report[0][key]["refined"]["psnr"] for key in ("average", "average_seen", "average_unseen")}
+def test_a_report_says_of_each_scene_its_sizes_quality_speed_and_whether_it_was_trained_on(evaluated, report):
+    found, folder = report
+    for index, (name, seen) in enumerate((("wall-a", True), ("wall-b", False))):
+        scene, block = evaluated.model.pruned_scene(index), found["scenes"][name]
+        assert (block["views"], block["seen_in_training"]) == (2, seen)
+        assert block["seconds"].keys() == {"prune", "refine"} and block["dense"]["gaussians"] == scene.dense_count
+        assert block["pruned"]["gaussians"] == block["refined"]["gaussians"] == len(scene.pruned)
+        assert block["pruned"]["megabytes"] == pytest.approx(scene.pruned.megabytes)
+        assert all(block[v]["fps"] > 0 and 0 < block[v]["ssim"] <= 1 for v in VARIANTS)
+        assert block["dense"]["psnr"] > block["pruned"]["psnr"], "half the Gaussians of a wall leave holes"
+        values = [block[variant]["lpips"] for variant in VARIANTS]
+        if LPIPS_WEIGHTS.exists():
+            assert all(0 < value < 2 for value in values) and "lpips_note" not in found
+        else:
+            assert values == [None] * 3 and found["lpips_note"] == "no weights here"
+    seen, unseen = (found["scenes"][name]["refined"]["psnr"] for name in ("wall-a", "wall-b"))
+    means = {key: found[key]["refined"]["psnr"] for key in ("average", "average_seen", "average_unseen")}
     assert means == {"average": pytest.approx((seen + unseen) / 2), "average_seen": seen, "average_unseen": unseen}
-    assert report[0]["psnr"] == unseen and report[0]["psnr_std"] > 0
-
-
-def test_an_evaluation_is_valid_json_names_its_settings_and_leaves_the_model_as_it_was(evaluated, report):
+    assert found["psnr"] == unseen and found["psnr_std"] > 0
     network = {"size": "tiny", "encoder": "dual", "use_appearance": True, "use_position": True, "norm": "scene"}
-    assert report[0]["settings"] == {**network, "keep": 0.5, "by": "paper", "opacity_weight": None}
-    assert json.loads(json.dumps(report[0], allow_nan=False)) == report[0]
-    assert not evaluated.training and not evaluated.model.training
-
-
-def test_every_held_out_photo_is_pictured_beside_dense_pruned_and_refined(report):
-    names = sorted(path.name for path in report[1].iterdir())
-    assert names == [f"wall-{s}_000{i}.png" for s in "ab" for i in (0, 1)]
-    assert cv2.imread(str(report[1] / "wall-a_0000.png")).shape == (48, 4 * 64, 3)
+    assert found["settings"] == {**network, "keep": 0.5, "by": "paper", "opacity_weight": None}
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert not evaluated.training and not evaluated.model.training, "the model is left as it was"
+    assert sorted(path.name for path in folder.iterdir()) == [f"wall-{s}_000{i}.png" for s in "ab" for i in (0, 1)]
+    assert cv2.imread(str(folder / "wall-a_0000.png")).shape == (48, 4 * 64, 3), "photo, dense, pruned, refined"
 
 
 def test_dense_is_judged_as_its_own_run_judges_it(evaluated, trained_walls, no_lpips):

@@ -1,7 +1,5 @@
 """The recipe of ``make-refiner``: its rooms differ, and its commands are ones that ns-train understands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -11,17 +9,13 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner import (
     KEEP,
     TRAIN_SEEDS,
     UNSEEN_SEEDS,
-    card_text,
     refiner_command,
     scene_settings,
 )
 
 
-def test_unseen_rooms_are_not_trained_on():
-    assert not set(TRAIN_SEEDS) & set(UNSEEN_SEEDS)
-
-
 def test_settings_follow_from_the_seed_and_differ_between_seeds():
+    assert not set(TRAIN_SEEDS) & set(UNSEEN_SEEDS)
     every = [scene_settings(seed) for seed in (*TRAIN_SEEDS, *UNSEEN_SEEDS)]
     assert every == [scene_settings(seed) for seed in (*TRAIN_SEEDS, *UNSEEN_SEEDS)]
     for name in ("steps", "seed_points", "densify_grad_thresh"):
@@ -52,18 +46,3 @@ def test_the_refiner_command_holds_the_unseen_rooms_out():
     assert (manager.supervision, manager.seed) == ("dense", 3)
     assert model.keep == KEEP and model.size == "tiny" and model.by == "merge"
     assert model.pruned_folder == Path("o/pruned")
-
-
-def test_the_card_names_rooms_command_and_results():
-    values = {"psnr": 25.0, "ssim": 0.8, "lpips": None, "gaussians": 1234.0}
-    scene = {"seen_in_training": False, "dense": values, "pruned": values, "refined": {**values, "psnr": 26.5}}
-    results = {
-        "scenes": {"room50": scene, "room100": {**scene, "seen_in_training": True}},
-        "average_unseen": scene,
-        "settings": {"size": "tiny"},
-    }
-    about = {"scenes": ["room100"], "command": "pointsplat make-refiner", "keep": 0.1, "steps": 10}
-    text = card_text(about, results, "ns-train pointsplat", 664_563)
-    assert "| room50 | refined | 26.50 | 0.800 | - | 1,234 |" in text
-    assert "room100 |" not in text, "results are of rooms that it was not trained on"
-    assert "`pointsplat make-refiner`" in text and "664,563" in text

@@ -1,7 +1,5 @@
 """Training steps whose loss or gradients are not finite are skipped, counted, and too many stop the training."""
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 from unittest import mock

@@ -1,7 +1,5 @@
 """Training with nerfstudio's trainer: checkpoints, resuming, learning rates."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from unittest import mock
 
@@ -26,9 +24,8 @@ def test_training_lowers_the_loss_on_all_views(trained, trained_walls):
     _, trainer, _ = trained
     untrained = pipeline_of(trained_walls)
     model = trainer.pipeline.eval().model
-    assert view_loss(model, trainer.pipeline.datamanager, 0) < 0.95 * view_loss(
-        untrained.model, untrained.datamanager, 0
-    )
+    before = view_loss(untrained.model, untrained.datamanager, 0)
+    assert view_loss(model, trainer.pipeline.datamanager, 0) < 0.95 * before
 
 
 def test_the_held_out_scene_is_never_trained_on(trained):
@@ -60,13 +57,8 @@ def test_the_network_is_saved_by_itself_at_the_end(trained):
     loaded = read_refiner(path).state_dict()
     expected = trainer.pipeline.model.refiner.state_dict()
     assert loaded.keys() == expected.keys() and all(torch.equal(loaded[n], v) for n, v in expected.items())
-    assert read_metadata(path) == {
-        "step": "9",
-        "scenes": "wall-a",
-        "keep": "0.5",
-        "by": "paper",
-        "opacity_weight": None,
-    }
+    about = {"step": "9", "scenes": "wall-a", "keep": "0.5", "by": "paper", "opacity_weight": None}
+    assert read_metadata(path) == about
     assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000009.ckpt"]
 
 

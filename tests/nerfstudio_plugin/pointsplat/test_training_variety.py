@@ -1,16 +1,16 @@
 """What makes a training vary (budgets, transforms, rates that fit), and pruned scenes kept on disk."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from pathlib import Path
 
 import pytest
 import torch
+from nerfstudio.utils.eval_utils import eval_setup
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
-from making import small_config
+from making import equal, move_zero_layers, small_config
+from pointsplat_ns.compression.trained_refiner import load_refiner
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES
@@ -19,26 +19,52 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes import PrunedKey, 
 from pointsplat_ns.pruning import PruneSettings
 
 
-def test_one_network_learns_at_several_budgets_and_is_evaluated_at_the_first(
-    trained_walls, run_training, tmp_path, no_lpips
-):
-    trainer, _ = run_training(small_config(trained_walls, tmp_path, 12, more_keeps=(0.25, 40.0)))
-    model = trainer.pipeline.model
-    cache = trainer.pipeline.datamanager.cache
-    for keep in (0.5, 0.25, 40.0):
-        assert any(cache.get(PrunedKey(s.name, model.config.prune_settings(keep))) for s in model.scenes), keep
-    model.eval()
-    assert len(model.refine(0)) == round(0.5 * len(model.scenes[0].read_dense()))
+def test_one_network_learns_at_several_budgets_and_is_evaluated_at_the_first(trained_walls, tmp_path):
+    config = small_config(trained_walls, tmp_path, 12, more_keeps=(0.25, 40.0))
+    pipeline = config.pipeline.setup(device="cpu", test_mode="val").train()
+    model, cache = pipeline.model, pipeline.datamanager.cache
+
+    def met(keep: float) -> bool:
+        return any(cache.get(PrunedKey(s.name, model.config.prune_settings(keep))) for s in model.scenes)
+
+    for step in range(40):
+        pipeline.get_train_loss_dict(step)
+        if all(met(keep) for keep in (0.5, 0.25, 40.0)):
+            break
+    assert step < 39
+    assert len(model.eval().refine(0)) == round(0.5 * len(model.scenes[0].read_dense()))
 
 
-def test_transforms_change_what_the_network_sees_and_nothing_else(trained_walls, run_training, tmp_path, no_lpips):
-    """The rate of the first update is 0, and residuals are zero until the second: only then the loss differs."""
-    plain = run_training(small_config(trained_walls, tmp_path / "plain", 3))[1]
-    moved = run_training(small_config(trained_walls, tmp_path / "moved", 3, augment=True))[1]
-    again = run_training(small_config(trained_walls, tmp_path / "again", 3, augment=True))[1]
+def test_transforms_change_what_the_network_sees_and_nothing_else(trained_walls, tmp_path):
+    """While residuals are zero, as at the beginning, the loss is the same."""
+
+    def losses(augment: bool) -> list[float]:
+        config = small_config(trained_walls, tmp_path, 3, augment=augment)
+        pipeline = config.pipeline.setup(device="cpu", test_mode="val").train()
+        zero = float(pipeline.get_train_loss_dict(1)[1]["l1"].detach())
+        torch.manual_seed(3)
+        move_zero_layers(pipeline.model.refiner)
+        return [zero, float(pipeline.get_train_loss_dict(1)[1]["l1"].detach())]
+
+    plain, moved, again = losses(False), losses(True), losses(True)
     assert moved[0] == pytest.approx(plain[0], rel=1e-4)  # undoing a transform rounds: thresholds flip in few pixels
-    assert moved[2] != plain[2]
+    assert moved[1] != plain[1]
     assert moved == again, "the same seed draws the same transforms"
+
+
+@pytest.mark.parametrize(
+    "changes", [{"use_appearance": False, "use_position": False}, {"encoder": "concat"}, {"norm": "batch"}], ids=str
+)
+def test_each_network_trains_and_its_run_opens_again(trained_walls, run_training, tmp_path, no_lpips, changes):
+    config = small_config(trained_walls, tmp_path, 2, **changes)
+    trainer, losses = run_training(config)
+    refiner = trainer.pipeline.model.refiner
+    assert len(losses) == 2 and trainer.pipeline.training_state.skipped.total() == 0
+    again = eval_setup(config.get_base_dir() / "config.yml")[1]
+    for opened in (load_refiner(config.get_base_dir()).network, again.model.refiner):
+        assert opened.config == refiner.config and equal(opened.state_dict(), refiner.state_dict())
+    settings = again.get_average_eval_image_metrics()["settings"]
+    assert all(settings[name] == value for name, value in changes.items())
 
 
 def test_pruned_scenes_are_taken_from_the_folder(trained_walls, tmp_path, monkeypatch):
@@ -76,14 +102,9 @@ def test_files_of_pruned_scenes_that_are_damaged_or_of_another_kind_say_so(tmp_p
 
 def test_a_stored_scene_lies_in_the_folder_and_is_told_apart_by_content_and_settings(tmp_path):
     usual = ("room", "a5" * 32, PruneSettings(0.5, "paper"))
-    others = [
-        ("../../etc/passwd", *usual[1:]),
-        ("room", "5a" * 32, usual[2]),
-        *(
-            ("room", usual[1], PruneSettings(*settings))
-            for settings in ((0.25, "paper"), (0.5, "merge"), (0.5, "paper", 0.7))
-        ),
-    ]
+    settings = ((0.25, "paper"), (0.5, "merge"), (0.5, "paper", 0.7))
+    others = [("../../etc/passwd", *usual[1:]), ("room", "5a" * 32, usual[2])]
+    others += [("room", usual[1], PruneSettings(*some)) for some in settings]
     paths = [stored_path(tmp_path, *key) for key in (usual, usual, *others)]
     assert all(path.parent == tmp_path for path in paths) and paths[0] == paths[1] and len(set(paths)) == 6
 
@@ -113,24 +134,19 @@ def test_a_scene_that_is_trained_again_under_the_same_name_is_pruned_anew(traine
     torch.testing.assert_close(after.means, before.means + 1.0)
 
 
-@pytest.mark.parametrize("factor", [0.0, -1.0, math.nan, math.inf])
-def test_a_factor_of_the_rates_that_is_no_positive_number_is_refused(factor, tmp_path):
-    config = small_config(tmp_path, tmp_path, 1)
-    config.rate_factor = factor
-    with pytest.raises(PointSplatError, match="--rate-factor"):
-        config.setup(local_rank=0, world_size=1)
-
-
-def test_the_factor_multiplies_every_rate(trained_walls, tmp_path):
+def test_the_factor_multiplies_every_rate_and_is_a_positive_number(trained_walls, tmp_path):
     config = small_config(trained_walls, tmp_path, 1)
     config.rate_factor = 3.0
     trainer = config.setup(local_rank=0, world_size=1)
     for name, group in trainer.config.optimizers.items():
         assert group["optimizer"].lr == pytest.approx(3 * RATES[name])
     assert config.optimizers["encoder"]["optimizer"].lr == RATES["encoder"], "the config given is left as it is"
+    for config.rate_factor in (0.0, -1.0, math.nan, math.inf):
+        with pytest.raises(PointSplatError, match="--rate-factor"):
+            config.setup(local_rank=0, world_size=1)
 
 
-@pytest.mark.parametrize("scale", [0.0, 1e-30, 1e-8, 1e-3, 1.0])
+@pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0])
 @pytest.mark.parametrize("name", sorted(PIXEL_LOSSES))
 def test_pixel_losses_at_extremes(name, scale):
     """Value and gradient in float32 against float64; nothing differs, next to nothing differs, everything differs."""

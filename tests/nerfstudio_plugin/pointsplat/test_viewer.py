@@ -1,26 +1,20 @@
 """What nerfstudio's viewer and the exporters get of the model."""
 
-from __future__ import annotations
-
 import copy
-import itertools
-from pathlib import Path
 from unittest import mock
 
 import matplotlib.image
 import numpy as np
-import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.scripts.render import DatasetRender
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
-from making import fast_config, pipeline_of, run_of, same
+from making import fast_config, pipeline_of, same
 from pointsplat_ns.cli.scene_options import claims_until_the_end
-from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io import read_ply, read_scene
-from pointsplat_ns.pruning import prune
+from pointsplat_ns.io import read_ply
 
 
 def test_the_viewer_gets_what_it_reads_of_a_splatfacto_model(evaluated, trained_walls):
@@ -91,46 +85,22 @@ def test_both_exporters_write_the_refined_scene_with_the_photos_gone(trained, tr
     assert len(drawn) > 0 and same(theirs, drawn)
 
 
-def test_the_cli_exports_any_scene_of_the_run(trained, trained_walls, tmp_path):
-    from pointsplat_ns.cli.export import export
-
-    config, trainer, _ = trained
-    with claims_until_the_end():
-        export(config.get_base_dir(), tmp_path / "a.ply", scene="wall-a")
-    assert same(read_ply(tmp_path / "a.ply"), trainer.pipeline.eval().model.refine(0))
-    assert not same(read_ply(tmp_path / "a.ply"), prune(read_scene(run_of(trained_walls, "wall-a")), 0.5))
-    with pytest.raises(SceneError, match="scene 'wall-z': no such scene.*wall-a, wall-b"), claims_until_the_end():
-        export(config.get_base_dir(), tmp_path / "z.ply", scene="wall-z")
-    assert not (tmp_path / "z.ply").exists()
-
-
-def drawn_by_ns_render(config, folder: Path, **options) -> dict[tuple[str, str], list[Path]]:
-    """The files that ``ns-render dataset`` writes of a run that is not trained, by split and output."""
-    from nerfstudio.scripts.render import DatasetRender
-
-    config.save_config()
-    config.get_checkpoint_dir().mkdir()
-    state = config.pipeline.setup(device="cpu", test_mode="inference").state_dict()
-    torch.save({"step": 9, "pipeline": state}, config.get_checkpoint_dir() / "step-000000009.ckpt")
-    DatasetRender(config.get_base_dir() / "config.yml", output_path=folder, split="train+test", **options).main()
-    outputs = itertools.product(("train", "test"), ("gt-rgb", "rgb"))
-    return {(split, name): sorted((folder / split / name).iterdir()) for split, name in outputs}
-
-
 def test_ns_render_draws_the_sampled_views_of_a_scene_without_photos(three_rooms, tmp_path):
     config = fast_config(three_rooms, tmp_path / "runs")
     manager = config.pipeline.datamanager
     manager.supervision, manager.sampled_poses, manager.sampled_size = "dense", 10, (32, 24)
-    written = drawn_by_ns_render(config, tmp_path / "renders", image_format="png")
+    config.save_config()
+    config.get_checkpoint_dir().mkdir()
     pipeline = config.pipeline.setup(device="cpu", test_mode="test")
+    state = {"step": 9, "pipeline": pipeline.state_dict()}
+    torch.save(state, config.get_checkpoint_dir() / "step-000000009.ckpt")
+    folder = tmp_path / "renders"
+    render = DatasetRender(config.get_base_dir() / "config.yml", folder, split="train+test", image_format="png")
+    render.main()
     shown = pipeline.datamanager.scenes[pipeline.datamanager.shown]
     for split, frames in (("train", shown.rendered_train), ("test", shown.rendered_eval)):
-        assert len(frames) == len(written[split, "rgb"]) == len(written[split, "gt-rgb"]) > 1
-        for path, (_, data) in zip(written[split, "gt-rgb"], frames, strict=True):
+        written = sorted((folder / split / "gt-rgb").iterdir())
+        assert len(frames) == len(list((folder / split / "rgb").iterdir())) == len(written) > 1
+        for path, (_, data) in zip(written, frames, strict=True):
             image = data["image"].float() / (255 if data["image"].dtype == torch.uint8 else 1)
             assert np.abs(matplotlib.image.imread(path)[..., :3] - image.numpy()).max() < 1 / 255  # rounded to 8 bits
-
-
-def test_a_training_does_not_save_the_transform_of_one_scene_as_its_own(trained_walls):
-    pipeline = pipeline_of(trained_walls, test_mode="val")
-    assert not hasattr(pipeline.datamanager, "train_dataparser_outputs")

@@ -1,7 +1,5 @@
 """Densification with a cap: its formulas against plain twins, and whole trainings that end with that many Gaussians."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 
@@ -39,8 +37,8 @@ def by_binomials(opacity: float, copies: int) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("copies", [1, 2, 3, 10, 51])
-@pytest.mark.parametrize("opacity", [1e-12, 1e-4, 0.005, 0.3, 0.9, 0.999, 0.999999])
+@pytest.mark.parametrize("copies", [1, 2, 51])
+@pytest.mark.parametrize("opacity", [1e-12, 0.3, 0.999999])
 def test_opacity_and_size_are_shared_as_the_paper_has_it(opacity, copies, dtype):
     logit = torch.tensor([math.log(opacity) - math.log1p(-opacity)], dtype=dtype)
     scales = torch.tensor([[-60.0, 0.0, 20.0]], dtype=dtype)
@@ -56,21 +54,7 @@ def test_opacity_and_size_are_shared_as_the_paper_has_it(opacity, copies, dtype)
     assert moves.tolist()[0] == pytest.approx([math.log(factor)] * 3, abs=5e-6 if dtype == torch.float32 else 1e-11)
 
 
-def test_a_ray_through_the_centre_and_the_sum_over_all_rays_keep_their_light():
-    generator = torch.Generator().manual_seed(SEED)
-    logits = 4 * torch.randn(50, generator=generator, dtype=torch.float64)
-    copies = torch.randint(2, 9, (50,), generator=generator)
-    opacities, scales = shared_opacity(logits, torch.zeros(50, 3, dtype=torch.float64), copies)
-    before, after = torch.sigmoid(logits), torch.sigmoid(opacities)
-    torch.testing.assert_close((1 - after) ** copies, 1 - before, rtol=1e-12, atol=1e-15)
-    x = torch.linspace(-12, 12, 4001, dtype=torch.float64)
-    width = scales.exp()[:, :1]
-    left = before * math.sqrt(2 * math.pi)
-    right = torch.trapezoid(1 - (1 - after[:, None] * (-0.5 * (x / width) ** 2).exp()) ** copies[:, None], x, dim=1)
-    torch.testing.assert_close(right, left, rtol=1e-10, atol=0)
-
-
-@pytest.mark.parametrize("logit", [-math.inf, -1e4, -200.0, 40.0, 1e4, math.inf])
+@pytest.mark.parametrize("logit", [-math.inf, -200.0, 40.0, math.inf])
 def test_opacities_of_0_and_1_are_shared_as_finite_ones(logit):
     opacities, scales = shared_opacity(torch.tensor([logit]), torch.zeros(1, 3), torch.tensor([7]))
     assert opacities.isfinite().all() and scales.isfinite().all()
@@ -190,22 +174,19 @@ def test_a_capped_training_that_was_cut_off_goes_on_as_if_it_had_not_been(capped
     assert equal(dict(resumed.pipeline.model.gauss_params), dict(whole.pipeline.model.gauss_params))
 
 
-def test_a_training_does_not_go_on_from_more_gaussians_than_its_cap(capped_config, run_training, tmp_path):
-    config = capped_config(tmp_path, 3, 200)
-    run_training(config)
-    rest = capped_config(tmp_path / "rest", 3, 199)
-    rest.load_dir = config.get_checkpoint_dir()
-    with pytest.raises(PointSplatError, match="has 200 Gaussians; expected at most 199, as --pipeline"):
-        run_training(rest)
-
-
-def test_a_capped_training_is_the_same_on_any_number_of_threads(capped_config, run_training, tmp_path):
+def test_a_capped_training_is_the_same_on_two_threads_and_does_not_go_on_under_a_lower_cap(
+    capped_config, run_training, tmp_path
+):
     means = []
     for threads in (1, 2):
-        config = capped_config(tmp_path / str(threads), 25, 400)
+        config = capped_config(tmp_path / str(threads), 22, 400)
         config.threads, config.early_look = threads, False
         means.append(run_training(config)[0].pipeline.model.means)
     assert torch.equal(*means)
+    rest = capped_config(tmp_path / "rest", 3, 399)
+    rest.load_dir = config.get_checkpoint_dir()
+    with pytest.raises(PointSplatError, match="has 400 Gaussians; expected at most 399, as --pipeline"):
+        run_training(rest)
 
 
 def test_random_points_of_a_cap_are_uniform_in_contracted_space():

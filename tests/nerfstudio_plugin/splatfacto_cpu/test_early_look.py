@@ -1,7 +1,5 @@
 """How long a training says that it will take, and when it draws pictures."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

@@ -1,7 +1,5 @@
 """Ctrl-C in ``ns-train``."""
 
-from __future__ import annotations
-
 import os
 import signal
 
@@ -25,24 +23,6 @@ def heeded():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.parametrize("when", ["setup", "train"])
-@pytest.mark.parametrize("kind", [SplatfactoCpuTrainer, PointSplatTrainer])
-def test_an_interrupted_training_ends_as_interrupted_and_not_as_finished(kind, when, monkeypatch, capsys):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    def main(**_):
-        trainer = object.__new__(kind)
-        trainer.config, trainer.device, trainer.world_size = splatfacto_cpu_config(), "cpu", 1
-        getattr(trainer, when)()
-
-    monkeypatch.setattr(Trainer, when, interrupted)
-    with pytest.raises(SystemExit) as end:
-        launch(main, num_devices_per_machine=1, config=splatfacto_cpu_config(), device_type="cpu")
-    assert end.value.code == 130
-    assert capsys.readouterr().err.endswith("interrupted\n")
 
 
 def stopped_at(
@@ -94,18 +74,29 @@ def test_a_training_of_a_refiner_stops_in_the_same_way(run_training, monkeypatch
     assert run_training(again)[0]._start_step == 3
 
 
-def test_a_second_signal_ends_it_at_once_and_saves_nothing(
+@pytest.mark.parametrize("kind", [SplatfactoCpuTrainer, PointSplatTrainer])
+def test_ctrl_c_before_the_first_step_ends_nerfstudios_command_as_interrupted(kind, monkeypatch, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    def main(**_):
+        trainer = object.__new__(kind)
+        trainer.config, trainer.device, trainer.world_size = splatfacto_cpu_config(), "cpu", 1
+        trainer.setup()
+
+    monkeypatch.setattr(Trainer, "setup", interrupted)
+    with pytest.raises(SystemExit) as end:
+        launch(main, num_devices_per_machine=1, config=splatfacto_cpu_config(), device_type="cpu")
+    assert end.value.code == 130 and capsys.readouterr().err.endswith("interrupted\n")
+
+
+def test_a_second_signal_and_one_before_the_first_step_end_it_at_once_and_save_nothing(
     wall_scene, wall_config, run_training, monkeypatch, tmp_path
 ):
     config = wall_config(wall_scene, tmp_path, steps=30)
     assert stopped_at(3, config, run_training, monkeypatch, signal.SIGINT, times=2) == 130
     assert not list(config.get_checkpoint_dir().glob("*"))
-
-
-def test_a_training_that_is_stopped_before_its_first_step_saves_nothing(
-    wall_scene, wall_config, run_training, monkeypatch, tmp_path
-):
-    config = wall_config(wall_scene, tmp_path, steps=30)
+    early = wall_config(wall_scene, tmp_path / "early", steps=30)
     stop = SplatfactoCpuTrainer._stop_if_asked
 
     def asked(trainer, step):
@@ -114,8 +105,8 @@ def test_a_training_that_is_stopped_before_its_first_step_saves_nothing(
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
         patch.setattr(SplatfactoCpuTrainer, "_stop_if_asked", asked)
-        run_training(config)
-    assert end.value.code == 130 and not config.get_checkpoint_dir().exists()
+        run_training(early)
+    assert end.value.code == 130 and not early.get_checkpoint_dir().exists()
 
 
 @pytest.mark.parametrize("asked, waits", [(None, True), (signal.SIGINT, False)])

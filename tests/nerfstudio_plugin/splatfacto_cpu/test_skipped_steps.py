@@ -1,7 +1,5 @@
 """Steps of splatfacto-cpu whose loss or gradients are not finite are skipped, counted and named."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Iterator
@@ -82,12 +80,7 @@ def take(trainer, steps) -> list[dict]:
 
 
 @pytest.mark.parametrize(
-    ("kind", "said"),
-    [
-        ("nan", "the main_loss is nan"),
-        ("infinite", "the main_loss is nan"),  # of SSIM, as infinity less infinity
-        ("gradient", "the gradient of the scales is not finite"),
-    ],
+    ("kind", "said"), [("nan", "the main_loss is nan"), ("gradient", "the gradient of the scales is not finite")]
 )
 def test_a_step_that_is_not_finite_changes_nothing_and_is_counted_and_named(started, kind, said):
     take(started, range(2))

@@ -1,9 +1,6 @@
 """The splatfacto-cpu model against nerfstudio's own, and its whole life: train, resume, evaluate, export."""
 
-from __future__ import annotations
-
 import math
-from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -44,17 +41,8 @@ def random_seeds(num: int = 40):
 def camera_at(z: float = 2.0) -> Cameras:
     pose = torch.eye(4)[None, :3].clone()
     pose[0, 2, 3] = z
-    return Cameras(
-        camera_to_worlds=pose,
-        fx=50.0,
-        fy=55.0,
-        cx=21.0,
-        cy=15.0,
-        width=43,
-        height=31,
-        camera_type=CameraType.PERSPECTIVE,
-        metadata={"cam_idx": 1},
-    )
+    kind = {"camera_type": CameraType.PERSPECTIVE, "metadata": {"cam_idx": 1}}
+    return Cameras(pose, 50.0, 55.0, 21.0, 15.0, 43, 31, **kind)
 
 
 def pair(**settings):
@@ -95,7 +83,6 @@ def stock_outputs(model, camera):
         {"rasterize_mode": "antialiased", "output_depth_during_training": True, "background_color": "black"},
         {"use_bilateral_grid": True, "camera_optimizer": CameraOptimizerConfig(mode="SO3xR3")},
     ],
-    ids=["default", "degree0", "antialiased", "bilateral+poses"],
 )
 @pytest.mark.parametrize("training", [True, False])
 def test_outputs_are_those_of_nerfstudio(settings, training):
@@ -138,13 +125,8 @@ def test_state_has_the_keys_and_shapes_of_a_stock_model(settings):
     theirs = build(SplatfactoModelConfig(num_random=40, **settings))
     shapes = [{name: (v.shape, v.dtype) for name, v in model.state_dict().items()} for model in (ours, theirs)]
     assert shapes[0] == shapes[1]
-
-
-def test_a_stock_checkpoint_loads_with_the_lpips_weights_it_carries():
-    theirs = build(SplatfactoModelConfig(num_random=7))
-    state = {**theirs.state_dict(), "lpips.net.net.slice1.0.weight": torch.zeros(64, 3, 11, 11)}
-    ours = build(SplatfactoCpuModelConfig(), random_seeds())
-    ours.load_state_dict(state, strict=True)
+    of_lpips = {"lpips.net.net.slice1.0.weight": torch.zeros(64, 3, 11, 11)}  # as stock checkpoints carry
+    ours.load_state_dict({**theirs.state_dict(), **of_lpips}, strict=True)
     assert torch.equal(ours.means, theirs.means)
     theirs.load_state_dict(ours.state_dict(), strict=True)
 
@@ -156,30 +138,20 @@ def test_seeds_give_the_parameters_that_splatfacto_gives():
         theirs = build(SplatfactoModelConfig(), (points.clone(), colors))
     for name in ("means", "scales", "features_dc", "features_rest", "opacities"):
         torch.testing.assert_close(ours.gauss_params[name], theirs.gauss_params[name])
+    for num in (1, 2, 4):  # few seeds have sizes, too
+        scales = build(SplatfactoCpuModelConfig(), random_seeds(num)).scales
+        assert scales.shape == (num, 3) and scales.isfinite().all()
+        assert num > 1 or torch.allclose(scales.exp(), torch.tensor(0.01))
 
 
-@pytest.mark.parametrize("num", [1, 2, 3, 4])
-def test_few_seeds_have_finite_sizes(num):
-    points, colors = random_seeds(num)
-    scales = build(SplatfactoCpuModelConfig(), (points, colors)).scales
-    assert scales.shape == (num, 3) and scales.isfinite().all()
-    if num == 1:
-        assert torch.allclose(scales.exp(), torch.tensor(0.01))
-
-
-def test_seeds_that_nearly_coincide_or_lie_far_out_have_finite_sizes():
+def test_extreme_seeds_have_finite_sizes_and_those_that_are_not_finite_are_dropped():
     points = torch.tensor([[0.0, 0, 0], [1e-30, 0, 0], [1e6, 0, 0], [1e6 + 1, 0, 0], [-1e18, 0, 0]])
     assert build(SplatfactoCpuModelConfig(), (points, torch.zeros(5, 3))).scales.isfinite().all()
-
-
-def test_seeds_that_are_not_finite_are_dropped_and_none_left_means_random_ones():
     points, colors = random_seeds(6)
-    points[2, 1] = math.nan
-    points[4, 0] = math.inf
+    points[2, 1], points[4, 0] = math.nan, math.inf
     assert build(SplatfactoCpuModelConfig(), (points, colors)).num_points == 4
-    nothing = (torch.full((3, 3), math.nan), colors[:3])
-    assert build(SplatfactoCpuModelConfig(num_random=9), nothing).num_points == 9
-    assert build(SplatfactoCpuModelConfig(num_random=9), (torch.zeros(0, 3), torch.zeros(0, 3))).num_points == 9
+    for nothing in ((torch.full((3, 3), math.nan), colors[:3]), (torch.zeros(0, 3), torch.zeros(0, 3))):
+        assert build(SplatfactoCpuModelConfig(num_random=9), nothing).num_points == 9, "random ones"
 
 
 @pytest.mark.parametrize("level", [0.0, 255.0])
@@ -247,11 +219,6 @@ def trained(wall_scene, wall_config, run_training, tmp_path_factory):
     return config, *run_training(config)
 
 
-def checkpoint_of(config) -> Path:
-    (path,) = config.get_checkpoint_dir().glob("*.ckpt")
-    return path
-
-
 def test_training_lowers_the_loss_and_densifies(trained):
     _, trainer, losses = trained
     assert sum(losses[-5:]) < 0.5 * sum(losses[:5])
@@ -302,7 +269,7 @@ def test_the_last_picture_and_a_viewer_that_is_still_open_do_not_draw_at_the_sam
 
 def test_checkpoint_has_splatfactos_layout_and_loads_weights_only(trained):
     config, trainer, _ = trained
-    state = torch.load(checkpoint_of(config), map_location="cpu", weights_only=True)
+    state = torch.load(next(config.get_checkpoint_dir().glob("*.ckpt")), map_location="cpu", weights_only=True)
     assert set(state) == {"step", "pipeline", "optimizers", "schedulers", "scalers", STATE}
     theirs = build(SplatfactoModelConfig(num_random=5))
     assert set(state["pipeline"]) == {f"_model.{name}" for name in theirs.state_dict()}
@@ -359,12 +326,5 @@ def test_what_is_not_finite_is_null_in_a_report_and_absent_from_the_training_log
     assert report.get("psnr_std") is None, "one image has no standard deviation"
     assert all(isinstance(value, float) and math.isfinite(value) for value in log.values())
     assert "psnr" in log and "psnr_std" not in log
-
-
-def test_evaluating_without_held_out_frames_says_so(trained):
-    _, trainer, _ = trained
-    with (
-        mock.patch.object(trainer.pipeline.datamanager, "eval_dataset", []),
-        pytest.raises(DataError, match="held out"),
-    ):
-        trainer.pipeline.get_average_eval_image_metrics()
+    with mock.patch.object(pipeline.datamanager, "eval_dataset", []), pytest.raises(DataError, match="held out"):
+        pipeline.get_average_eval_image_metrics()

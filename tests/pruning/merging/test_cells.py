@@ -1,7 +1,5 @@
 """Merging cell by cell: the count, the seams, kills, and what is the same as in memory."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Covariances and their projections, also at the extremes, where areas cancel to nothing."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The choice of a size change by renders."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

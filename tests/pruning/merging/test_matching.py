@@ -1,7 +1,5 @@
 """Disjoint pairs of neighbours."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Merging of Gaussians: exact counts, what is preserved, and what must survive at the extremes."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The cost of a pair against an integral over pixels, and at the extremes of float32."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

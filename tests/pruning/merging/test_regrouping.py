@@ -1,7 +1,5 @@
 """Members change to the group that they fit best."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

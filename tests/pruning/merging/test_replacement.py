@@ -1,7 +1,5 @@
 """What pairs become: the same by the kernel and in torch."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Visibility weights: covered pixels per area, by distance, occlusion and traces."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Compiled kernels draw what torch draws, on any number of threads, and where there are none torch draws."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Compiled kernels give the colours that torch gives, with the same gradients."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

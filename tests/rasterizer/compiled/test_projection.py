@@ -1,7 +1,5 @@
 """Compiled kernels project what torch projects, with the same gradients, from ordinary scenes to degenerate ones."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Compiled kernels find the tiles that torch finds."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """A trade that was measured once for all tests of its page."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

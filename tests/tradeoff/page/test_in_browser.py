@@ -1,7 +1,5 @@
 """The page of a trade, opened from disk in headless Chromium and used."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

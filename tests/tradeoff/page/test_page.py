@@ -1,7 +1,5 @@
 """The page of a trade as a file: what is in it, what is not, how large it is."""
 
-from __future__ import annotations
-
 import base64
 import html
 import io

@@ -1,0 +1,258 @@
+"""nerfstudio's commands by both methods, each trained once by ``ns-train``, with the viewer open, on a tiny capture
+taken through a lens."""
+
+import json
+import os
+import signal
+import sys
+import types
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.pipelines.base_pipeline import Pipeline
+from nerfstudio.scripts import eval as evaluate
+from nerfstudio.scripts import exporter, render, train
+from nerfstudio.scripts.viewer import run_viewer
+from nerfstudio.utils import install_checks, writer
+from nerfstudio.utils.eval_utils import eval_setup
+from nerfstudio.viewer.viewer import Viewer
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from captures import Capture, Lens
+from ns_viewer import Look, look
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.io import read_ply
+from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainer
+
+STEPS = {"splatfacto-cpu": 20, "pointsplat": 4}
+VIEWER = ("--viewer.websocket-host", "127.0.0.1", "--viewer.image-format", "png")
+WIDTH, HEIGHT, FIELD_OF_VIEW = 40, 30, 60.0
+
+
+def started(program: types.ModuleType, *words: object) -> None:
+    """Start one of nerfstudio's commands in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [program.__name__, *map(str, words)])
+        patch.setattr(writer, "EVENT_WRITERS", [])  # those of trainings before in this process
+        patch.setattr(install_checks, "check_ffmpeg_installed", lambda: None)  # ns-render wants it even for pictures
+        program.entrypoint()
+
+
+@dataclass
+class Run:
+    """A method, a run of it, and what was seen of it in the viewer while it was trained."""
+
+    method: str
+    folder: Path
+    words: list[str]
+    """What ``ns-train`` was started with, but for the viewer and for ``data``, the last words."""
+    data: list[str]
+    seen: Look
+
+    @property
+    def config(self) -> Path:
+        return self.folder / "config.yml"
+
+    @property
+    def checkpoint(self) -> Path:
+        (path,) = (self.folder / "nerfstudio_models").iterdir()
+        return path
+
+
+def with_the_viewer_open(method: str, capture: Capture, output: Path, words: list[str], data: list[str]) -> Run:
+    """Train, look at the viewer after the second step, and end it by Ctrl-C when the training is complete."""
+    seen: list[Look] = []
+    update, complete = StoppableTrainer._update_viewer_state, Viewer.training_complete
+
+    def looked_at(trainer: StoppableTrainer, step: int) -> None:
+        update(trainer, step)
+        if step == 2:
+            seen.append(look(trainer.viewer_state, capture.poses[0]))
+
+    def interrupted(viewer: Viewer) -> None:
+        complete(viewer)
+        viewer.viser_server.stop()
+        os.kill(os.getpid(), signal.SIGINT)
+
+    options = ["--vis", "viewer+tensorboard", *VIEWER, "--viewer.max-num-display-images", "3"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(StoppableTrainer, "_update_viewer_state", looked_at)
+        patch.setattr(Viewer, "training_complete", interrupted)
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background of a shell it is ignored
+        try:
+            started(train, *words, *options, "--max-num-iterations", STEPS[method], *data)
+        finally:
+            signal.signal(signal.SIGINT, before)
+    (folder,) = (output / "room" / method).iterdir()
+    return Run(method, folder, words, data, *seen)
+
+
+@pytest.fixture(scope="module")
+def capture() -> Capture:
+    return Capture(Lens(distortion=(0.12, -0.05, 0.004, -0.003)))
+
+
+@pytest.fixture(scope="module")
+def trained_by_ns_train(capture, tmp_path_factory) -> Callable[[str], Run]:
+    """A function that gives the run of a method."""
+    folder = tmp_path_factory.mktemp("commands")
+    capture.write_nerfstudio(folder / "capture")
+    runs: dict[str, Run] = {}
+
+    def trained(method: str) -> Run:
+        if method not in runs:
+            words = [method, "--output-dir", folder / method, "--experiment-name", "room"]
+            words += ["--machine.device-type", "cpu", "--logging.steps-per-log", "1"]
+            data: list[str] = []
+            if method == "splatfacto-cpu":
+                words += ["--data", folder / "capture", "--pipeline.model.num-downscales", "0"]
+                data = ["nerfstudio-data", "--load-3D-points", "True", "--train-split-fraction", "0.8"]
+            else:
+                words += ["--data", trained("splatfacto-cpu").folder, "--pipeline.model.size", "tiny"]
+                words += ["--pipeline.model.by", "paper", "--pipeline.model.lpips-weight", "0"]
+                words += ["--pipeline.model.keep", "0.5"]
+            runs[method] = with_the_viewer_open(method, capture, folder / method, [*map(str, words)], data)
+        return runs[method]
+
+    return trained
+
+
+@pytest.fixture(params=STEPS)
+def run(request, trained_by_ns_train) -> Run:
+    return trained_by_ns_train(request.param)
+
+
+def test_training_serves_what_the_model_draws_and_logs_every_loss(run: Run):
+    run.seen.check()
+    (path,) = run.folder.glob("events.out.tfevents.*")
+    losses = EventAccumulator(str(path)).Reload().Scalars("Train Loss")
+    assert [event.step for event in losses] == list(range(STEPS[run.method]))
+    assert all(np.isfinite(event.value) for event in losses)
+
+
+def test_both_options_go_on_from_the_checkpoint_alike(run: Run, tmp_path):
+    states = []
+    for option, value in (("--load-dir", run.checkpoint.parent), ("--load-checkpoint", run.checkpoint)):
+        words = list(run.words)
+        words[words.index("--output-dir") + 1] = str(tmp_path / option)
+        started(train, *words, option, value, "--vis", "tensorboard", "--max-num-iterations", "2", *run.data)
+        (path,) = (tmp_path / option).rglob("*.ckpt")
+        states.append(torch.load(path, weights_only=True))
+    assert [state["step"] for state in states] == [STEPS[run.method] + 1] * 2
+    first = torch.load(run.checkpoint, weights_only=True)["pipeline"]
+    ours, other = (state["pipeline"] for state in states)
+    values = [name for name, value in ours.items() if isinstance(value, torch.Tensor)]
+    assert all(torch.equal(ours[name], other[name]) for name in values)
+    assert any(not torch.equal(ours[name], first[name]) for name in values), "it went on without learning"
+
+
+def test_viewer_serves_its_page_and_what_the_model_draws_until_ctrl_c(run: Run, capture: Capture):
+    viewers: list[Viewer] = []
+    seen: list[Look] = []
+
+    def opened(*args, **options) -> Viewer:
+        viewers.append(Viewer(*args, **options))
+        return viewers[-1]
+
+    def between_looks(_: float) -> None:
+        seen.append(look(viewers[0], capture.poses[0]))
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run_viewer, "ViewerState", opened)
+        patch.setattr(run_viewer, "time", types.SimpleNamespace(sleep=between_looks))
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                started(run_viewer, "--load-config", run.config, *VIEWER)
+        finally:
+            for viewer in viewers:
+                viewer.viser_server.stop()
+    seen[0].check()
+
+
+def test_eval_writes_numbers_and_pictures_of_the_held_out_photo(run: Run, no_lpips, tmp_path):
+    path = tmp_path / "eval.json"
+    started(evaluate, "--load-config", run.config, "--output-path", path, "--render-output-path", tmp_path / "pictures")
+    report = json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    assert report["method_name"] == run.method
+    assert report["results"]["psnr"] > 8 and 0 < report["results"]["ssim"] <= 1
+    assert report["results"]["lpips"] is None and "no network" in report["results"]["lpips_note"]
+    assert any(file.is_file() for file in (tmp_path / "pictures").rglob("*"))
+
+
+def test_export_writes_the_gaussians_that_are_drawn(run: Run, tmp_path):
+    started(exporter, "gaussian-splat", "--load-config", run.config, "--output-dir", tmp_path)
+    _, pipeline, _, _ = eval_setup(run.config, test_mode="inference")
+    seen = pipeline.model.opacities[:, 0] >= -5.5373  # ns-export drops opacities below 1/255
+    written = read_ply(tmp_path / "splat.ply")
+    assert len(written) == int(seen.sum()) > 0 and torch.equal(written.means, pipeline.model.means[seen].detach())
+
+
+def pixels(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path).convert("RGB")) / 255
+
+
+def drawn(run: Run, way: str, folder: Path, *options: object) -> list[np.ndarray]:
+    """The pictures that ``ns-render`` makes."""
+    words = ["--load-config", run.config, "--output-path", folder / "out", "--image-format", "png", *options]
+    started(render, way, *words, "--output-format", "images")
+    pictures = [pixels(path) for path in sorted((folder / "out").iterdir())]
+    assert all(picture.std() > 0.03 for picture in pictures), "a plain picture proves nothing"
+    return pictures
+
+
+@torch.no_grad()
+def drawn_by_the_model(pipeline: Pipeline, camera: Cameras) -> np.ndarray:
+    return pipeline.model.get_outputs_for_camera(camera)["rgb"].numpy()
+
+
+def test_camera_path_draws_what_the_model_draws_and_no_other_lens(run: Run, capture: Capture, tmp_path):
+    pose, file = capture.poses[0], tmp_path / "path.json"
+    cameras = [{"camera_to_world": pose.reshape(-1).tolist(), "fov": FIELD_OF_VIEW, "aspect": WIDTH / HEIGHT}] * 2
+    saved = {"render_width": WIDTH, "render_height": HEIGHT, "seconds": 1, "fps": 2, "camera_path": cameras}
+    file.write_text(json.dumps({**saved, "camera_type": "fisheye"}))
+    with pytest.raises(DataError, match="cameras of kind fisheye: expected perspective"):
+        drawn(run, "camera-path", tmp_path, "--camera-path-filename", file)
+    file.write_text(json.dumps({**saved, "camera_type": "perspective"}))
+    pictures = drawn(run, "camera-path", tmp_path, "--camera-path-filename", file)
+    focal = HEIGHT / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
+    camera = Cameras(torch.from_numpy(pose[None, :3]).float(), focal, focal, WIDTH / 2, HEIGHT / 2)
+    expected = drawn_by_the_model(eval_setup(run.config, test_mode="inference")[1], camera)
+    assert len(pictures) == 2 and pictures[0].shape == (HEIGHT, WIDTH, 3)
+    # 1/255: rounding to 8 bits, down
+    assert all(np.abs(picture - expected).max() <= 1 / 255 + 1e-6 for picture in pictures)
+
+
+@pytest.mark.parametrize(
+    ("way", "options", "count", "apart"),
+    [
+        # two frames between each two of eight photos
+        ("interpolate", "--pose-source train --interpolation-steps 2 --downscale-factor 2", 14, 0.02),
+        ("spiral", "--seconds 0.5 --frame-rate 8 --radius 0.3", 4, 0.005),
+    ],
+)
+def test_interpolate_and_spiral_move(way, options, count, apart, run: Run, tmp_path):
+    pictures = drawn(run, way, tmp_path, *options.split())
+    assert len(pictures) == count and np.abs(pictures[0] - pictures[count // 2 - 1]).mean() > apart
+
+
+def test_dataset_puts_beside_each_render_the_photo_as_its_camera_would_have_taken_it(run: Run, tmp_path):
+    words = ["--load-config", run.config, "--output-path", tmp_path, "--image-format", "png"]
+    started(render, "dataset", *words, "--split", "train+test", "--rendered-output-names", "rgb", "gt-rgb", "depth")
+    _, pipeline, _, _ = eval_setup(run.config, test_mode="test")
+    manager = pipeline.datamanager
+    for split, dataset, count in (("train", manager.train_dataset, 8), ("test", manager.eval_dataset, 2)):
+        names = [sorted((tmp_path / split / kind).iterdir()) for kind in ("rgb", "gt-rgb", "depth")]
+        assert len(names[0]) == len(names[1]) == len(names[2]) == count
+        for index, (render_path, photo_path) in enumerate(zip(*names[:2], strict=True)):
+            photo, picture = pixels(photo_path), pixels(render_path)
+            assert photo.shape == picture.shape != (48, 64, 3), "the lens was not undone"
+            assert np.abs(photo - dataset[index]["image"].numpy()).max() <= 1 / 255 + 1e-6
+            shown = drawn_by_the_model(pipeline, dataset.cameras[index : index + 1])
+            assert np.abs(picture - shown).max() <= 1 / 255 + 1e-6

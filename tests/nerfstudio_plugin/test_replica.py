@@ -1,0 +1,262 @@
+"""The ``replica-data`` dataparser and the Replica layout on disk: what is read, and what each fault says."""
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.nerfstudio_plugin.replica.dataparser import (
+    ReplicaDataParserConfig,
+    fuse_depth,
+    read_eval_list,
+    voxel_thin,
+)
+from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_depth, read_photo
+from replica_scenes import CAMERA, line_of, write_scene
+
+
+@pytest.fixture()
+def row(tmp_path):
+    """Twelve frames, a unit apart."""
+    return write_scene(tmp_path / "room", frames=12, step=1.0)
+
+
+def parse(folder, split="train", **options):
+    return ReplicaDataParserConfig(data=folder, **options).setup().get_dataparser_outputs(split)
+
+
+def numbers(folder, split="train", **options):
+    return [int(path.stem[5:]) for path in parse(folder, split, **options).image_filenames]
+
+
+def test_frames_are_held_out_by_step_by_number_or_by_a_list_file(row, tmp_path):
+    assert numbers(row, "val") == numbers(row, "test") == [0, 10]
+    assert numbers(row) == [1, 2, 3, 4, 5, 6, 7, 8, 9, 11]
+    assert numbers(row, "val", frame_stride=2, eval_every=3) == [0, 6]
+    assert numbers(row, frame_stride=2, eval_every=3) == [2, 4, 8, 10]
+    assert numbers(row, "test", eval_frames=(7, 3)) == [3, 7] and 7 not in numbers(row, eval_frames=(7, 3))
+    listed = tmp_path / "held_out.txt"
+    listed.write_text("# two frames\nframe000005.png\n\n9  # the ninth\n")
+    assert numbers(row, "test", eval_list=listed, frame_stride=4) == [5, 9]
+    listed.write_text("results/frame000005.png\nkitchen\n")
+    with pytest.raises(DataError, match="line 2 is 'kitchen'"):
+        read_eval_list(listed)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"eval_frames": (3, 99)}, "frame 99 is not among the 12 usable frames"),
+        ({"eval_every": 1}, "--eval-every 1"),
+        ({"frame_stride": 0}, "--frame-stride 0"),
+        ({"scale_factor": float("nan")}, "--scale-factor nan"),
+        ({"frame_stride": 12}, "leave 0 for training"),
+        ({"eval_frames": (1,), "eval_list": Path("x")}, "both given"),
+    ],
+)
+def test_options_that_cannot_work_are_refused_in_one_line(row, options, words):
+    with pytest.raises(DataError, match=words):
+        parse(row, **options)
+
+
+def test_cameras_follow_nerfstudio_axes_and_pixel_centres(row):
+    cameras = parse(row, "val").cameras
+    # Facing +z with y down (OpenCV) is facing -(-z) with y up: the y and z columns are negated.
+    expected = torch.tensor([[1.0, 0, 0, 10.0], [0, -1, 0, 0], [0, 0, -1, 0]])
+    assert torch.equal(cameras.camera_to_worlds[1], expected)
+    # nerfstudio's own ray through the middle of the picture goes along the optical axis, +z here.
+    ray = cameras.generate_rays(camera_indices=0, coords=torch.tensor([[3.0, 4.0]]))
+    assert torch.allclose(ray.directions[0], torch.tensor([0.0, 0.0, 1.0]), atol=1e-6)
+
+
+def test_seed_points_come_from_training_frames_alone_always_the_same_and_scale_with_the_cameras(row):
+    outputs = parse(row, eval_frames=(0,), scale_factor=2.0)
+    xyz, rgb = outputs.metadata["points3D_xyz"], outputs.metadata["points3D_rgb"]
+    assert xyz.dtype == torch.float32 and rgb.dtype == torch.uint8
+    assert torch.all(xyz[:, 2] == 4.0)
+    assert float(xyz[:, 0].min()) == pytest.approx(2 * (1 - 1.4))  # frame 1, not frame 0, starts the row
+    assert (rgb[:, 0] > 0).all()  # frame 0 alone has no red
+    assert outputs.dataparser_scale == 2.0 and float(outputs.cameras.camera_to_worlds[0, 0, 3]) == 2.0
+    assert "points3D_xyz" not in parse(row, "val").metadata
+    assert "points3D_xyz" not in parse(row, load_seed_points=False).metadata
+    first, again = (parse(row, num_seed_points=50).metadata for _ in range(2))
+    assert len(first["points3D_xyz"]) <= 50
+    assert all(torch.equal(first[name], again[name]) for name in ("points3D_xyz", "points3D_rgb"))
+    by_hand = parse(row, depth_unit_scale_factor=1e-4).metadata
+    assert by_hand["depth_unit_scale_factor"] == pytest.approx(1e-4)
+    assert torch.allclose(by_hand["points3D_xyz"][:, 2], torch.tensor(0.2))
+
+
+@pytest.fixture()
+def scene(tmp_path):
+    return write_scene(tmp_path / "rooms" / "s")
+
+
+def edit_line(scene: Path, line: int, text: str) -> None:
+    lines = (scene / "traj.txt").read_text().splitlines()
+    lines[line - 1] = text
+    (scene / "traj.txt").write_text("\n".join(lines) + "\n")
+
+
+def test_a_whole_scene_is_read_as_written(scene):
+    loaded = load_replica(scene)
+    assert loaded.numbers == (0, 1, 2, 3)
+    assert loaded.depths is not None and loaded.depths[2].name == "depth000002.png"
+    assert np.allclose(loaded.poses[3, :3, 3], [0.3, 0, 0])
+    assert np.all(read_depth(loaded.depths[0], loaded.params) == 2.0)
+    assert read_photo(loaded.photos[2], loaded.params)[0, 0].tolist() == [20, 50, 200]
+    raw = np.full((6, 8), 1500, np.uint16)
+    raw[0, 0], raw[1, 1] = 0, 65535  # unknown and saturated
+    Image.fromarray(raw).save(loaded.depths[0])
+    depth = read_depth(loaded.depths[0], loaded.params)
+    assert depth[0, 0] == 0 and depth[1, 1] == 0 and depth[2, 2] == 1.5
+    (scene / "cam_params.json").rename(scene.parent / "cam_params.json")
+    for kind in ("frame", "depth"):
+        (scene / "results" / f"{kind}000003.png").rename(scene / "results" / f"{kind}000030.png")
+    moved = load_replica(scene)
+    assert moved.params.fx == 5.0 and moved.numbers == (0, 1, 2, 30), "gaps are fine where counts agree"
+
+
+@pytest.mark.parametrize(
+    ("camera", "expected"),
+    [
+        ({}, (4.0, 3.0)),  # 3.5 of 8: Replica's own way, counted from the first pixel's centre
+        ({"cx": 4.0, "cy": 3.0}, (4.0, 3.0)),  # exactly half: counted from the corner
+        ({"cx": 3.9, "cy": 3.0}, (4.4, 3.5)),  # a calibration: OpenCV's integer centres
+    ],
+)
+def test_the_convention_of_pixel_centres_is_told_by_the_principal_point(tmp_path, camera, expected):
+    params = load_replica(write_scene(tmp_path / "s", camera={**CAMERA, **camera})).params
+    assert params.principal_point("auto") == pytest.approx(expected)
+    assert params.principal_point("half") == (params.cx, params.cy)
+
+
+def one_deeper(scene: Path) -> None:
+    moved = scene.rename(scene.with_name("moved"))
+    scene.mkdir()
+    moved.rename(scene / "t")
+
+
+def removed(name: str):
+    return lambda scene: (scene / name).unlink()
+
+
+def pictured(name: str, **kind):
+    kind = {"mode": "RGB", "size": (8, 6), **kind}
+    return lambda scene: Image.new(**kind).save(scene / "results" / name)
+
+
+def camera(content):
+    text = content if isinstance(content, str) else json.dumps({"camera": {**CAMERA, **content}})
+    return lambda scene: (scene / "cam_params.json").write_text(text)
+
+
+def line(number: int, text: str):
+    return lambda scene: edit_line(scene, number, text)
+
+
+COLUMN_BY_COLUMN = np.eye(4)
+COLUMN_BY_COLUMN[3, :3] = 1, 2, 3
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda scene: scene.rename(scene.with_name("none")), ["no such folder"]),
+        (one_deeper, ["contains the scenes t: name one"]),
+        (removed("traj.txt"), ["traj.txt: not found"]),
+        (removed("cam_params.json"), ["s/cam_params.json", "rooms/cam_params.json"]),
+        (removed("results/frame000002.png"), ["4 poses for 3 photos", "missing: frame000002"]),
+        (removed("results/depth000001.png"), ["1 of 4 photos have no depth image (depth000001.png)"]),
+        (pictured("frame000001.jpg"), ["frame000001.jpg and frame000001.png have the same number"]),
+        (pictured("frame000001.png", size=(9, 6)), ["frame000001.png: 9 x 6 pixels; expected 8 x 6"]),
+        (lambda scene: (scene / "results/frame000001.png").write_bytes(b""), ["not a readable picture"]),
+        (camera("{"), ["not valid JSON", "cam_params.json"]),
+        (camera("{}"), ['no "camera" entry']),
+        (camera({"fy": None}), ['"fy" is None']),
+        (camera({"fx": -1.0}), ['"fx" is -1.0; expected a positive number']),
+        (camera({"scale": float("nan")}), ['"scale" is nan']),
+        (camera({"w": "8"}), ["\"w\" is '8'; expected a number"]),
+        (camera({"h": 6.5}), ["whole number of pixels"]),
+        (line(3, " ".join(["0"] * 15)), ["line 3 has 15 values"]),
+        (line(3, " ".join(["x"] * 16)), ["line 3: could not convert"]),
+        (line(2, line_of(np.diag([1.1, 1.1, 1.1, 1]))), ["line 2 is not a rigid pose"]),
+        (line(2, line_of(np.diag([1, 1, -1, 1]))), ["line 2 mirrors the axes"]),
+        (line(1, line_of(COLUMN_BY_COLUMN)), ["line 1 ends in 1 2 3 1; expected 0 0 0 1"]),
+        (lambda scene: [edit_line(scene, i, " ".join(["nan"] * 16)) for i in (1, 2, 3, 4)], ["none of the 4 poses is"]),
+    ],
+)
+def test_what_is_missing_or_cannot_be_used_is_named_in_one_line(scene, spoil, words):
+    spoil(scene)
+    with pytest.raises(DataError) as caught:
+        load_replica(scene)
+    assert all(some in str(caught.value) for some in words) and "\n" not in str(caught.value), caught.value
+
+
+@pytest.mark.parametrize("lost", ["-inf " * 16, "nan " * 12 + "0 0 0 1", "1 0 0 -1e300 0 1 0 0 0 0 1 0 0 0 0 1",
+                                  "1 0 0 1e39 0 1 0 0 0 0 1 0 0 0 0 1"])  # fmt: skip
+def test_lost_poses_and_those_beyond_float32_are_dropped_and_their_lines_said(scene, caplog, lost):
+    edit_line(scene, 2, lost)
+    with caplog.at_level(logging.WARNING):
+        loaded = load_replica(scene)
+    assert loaded.numbers == (0, 2, 3) and np.isfinite(loaded.poses.astype(np.float32)).all()
+    assert "1 of 4 poses" in caplog.text and "line 2" in caplog.text
+
+
+def test_small_drift_is_removed(scene):
+    pose = np.eye(4)
+    pose[:3, :3] += 1e-3
+    edit_line(scene, 2, line_of(pose))
+    rotation = load_replica(scene).poses[1, :3, :3]
+    assert np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)  # float64 SVD
+
+
+def test_pictures_of_another_kind_and_broken_ones_are_refused(scene):
+    loaded = load_replica(scene)
+    Image.fromarray(np.full((6, 8), 300, np.uint16)).save(loaded.photos[1])  # 300 modulo 256 is nearly black
+    with pytest.raises(DataError, match="frame000001.png: pixels of mode I.*expected 8 bits a channel"):
+        read_photo(loaded.photos[1], loaded.params)
+    depth = loaded.depths[1]
+    Image.new("L", (8, 6)).save(depth)
+    with pytest.raises(DataError, match="expected a 16-bit grey"):
+        read_depth(depth, loaded.params)
+    noise = np.random.default_rng(0).integers(0, 65535, (6, 8)).astype(np.uint16)
+    Image.fromarray(noise).save(depth)
+    depth.write_bytes(depth.read_bytes()[:-40])
+    with pytest.raises(DataError, match="broken picture"):
+        read_depth(depth, loaded.params)
+
+
+def test_a_scene_without_depth_is_read_and_has_no_seed_points(tmp_path):
+    scene = load_replica(write_scene(tmp_path / "s", depth=False))
+    assert scene.depths is None
+    with pytest.raises(DataError, match="no depth images"):
+        fuse_depth(scene, 1000, scene.params.principal_point())
+
+
+def test_seed_points_avoid_outlines_and_unknown_pixels(tmp_path):
+    scene = load_replica(write_scene(tmp_path / "s", frames=1))
+    raw = np.full((6, 8), 1000, np.uint16)
+    raw[:, 4:], raw[0, 0] = 3000, 0
+    Image.fromarray(raw).save(scene.depths[0])
+    xyz, _ = fuse_depth(scene, 1000, scene.params.principal_point())
+    # Lost: the columns on both sides of the step, the unknown pixel and its two other neighbours.
+    assert len(xyz) == 6 * 6 - 3 and set(np.unique(xyz[:, 2])) == {1.0, 3.0}
+
+
+def test_thinning_is_even_bounded_and_keeps_means():
+    rng = np.random.default_rng(3)
+    # A plane whose left half was seen 20 times as often as its right half.
+    dense, sparse = rng.uniform((-1, -1), (0, 1), (40_000, 2)), rng.uniform((0, -1), (1, 1), (2_000, 2))
+    xyz = np.concatenate([dense, sparse])
+    xyz = np.concatenate([xyz, np.zeros((len(xyz), 1))], axis=1).astype(np.float32)
+    points, colors = voxel_thin(xyz, np.full((len(xyz), 3), 77, np.uint8), 400)
+    assert 350 < len(points) <= 400  # the voxel size is bisected to 1 %, one step of whole columns is 5 %
+    left = int((points[:, 0] < 0).sum())
+    assert abs(left - len(points) / 2) < 0.1 * len(points)
+    assert np.all(colors == 77) and np.all(points[:, 2] == 0)
