@@ -21,7 +21,7 @@ from pointsplat_ns.system.progress import Progress, tracked
 from pointsplat_ns.viewing.camera_path import FILM_SIDE, FPS, FilmSettings, camera_path
 from pointsplat_ns.viewing.film import FilmScenes, Split, render_frames
 from pointsplat_ns.viewing.video import check_output, write_frames
-from pointsplat_ns.views import RasterizeMode, Views
+from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
     from pointsplat_ns.viewing.viewer import Viewer
@@ -101,12 +101,9 @@ def render_path(
         settings = replace(settings, seconds=max(1, len(given)) / (fps or FPS))
     view_source = _source(scene, loaded[0], path if isinstance(path, Views) else given)
     chosen = camera_path(loaded[0], view_source, way, settings, kind == "picture", upward)
-    modes = [_mode(source, chosen.views.rasterize_mode) for source in sources]
     if labels is None:
         labels = [f"{_name(s, i)}, {len(g):,} Gaussians" for i, (s, g) in enumerate(zip(sources, loaded, strict=True))]
-    film = FilmScenes(
-        loaded[0], loaded[1] if other is not None else None, (modes[0], modes[-1]), split, labels if other else ()
-    )
+    film = FilmScenes(loaded[0], loaded[1] if other is not None else None, split, labels if other else ())
     logger.info("%d x %d pixels: %s", chosen.views.width, chosen.views.height, chosen.origin)
     frames = tracked(render_frames(film, chosen.views, chosen.fps), "rendering", len(chosen.views), progress)
     return write_frames(frames, output, chosen.fps, force)
@@ -153,30 +150,19 @@ def open_viewer(
 
     def read(path: Path, name: str) -> ViewedScene:
         loaded = load(path)
-        return ViewedScene(name, None, loaded, _source(loaded, loaded, None), "classic")
+        return ViewedScene(name, None, loaded, _source(loaded, loaded, None))
 
     scenes = []
     for index, source in enumerate(source for source in (scene, other) if source is not None):
         loaded = source if isinstance(source, Gaussians) else load(source)
         path = None if isinstance(source, Gaussians) else Path(source)
-        views, mode = _source(source, loaded, None), _mode(source, "classic")
-        scenes.append(ViewedScene(_name(source, index), path, loaded, views, mode))
+        scenes.append(ViewedScene(_name(source, index), path, loaded, _source(source, loaded, None)))
     return Viewer(scenes, host, port, upward, None if scenes else read)
 
 
 def _source(scene: Source, loaded: Gaussians, given: Views | None) -> ViewSource:
     run = None if isinstance(scene, Gaussians) else scene
     return ViewSource(loaded, given, run, dataset_views)
-
-
-def _mode(scene: Source, usual: RasterizeMode) -> RasterizeMode:
-    """The rasterize mode of a scene's training; ``usual`` if it is not known."""
-    if isinstance(scene, Gaussians) or not may_be_run(scene):
-        return usual
-    try:
-        return open_run(scene, need_data=False).rasterize_mode
-    except SceneError:
-        return usual
 
 
 def _name(scene: Source, index: int) -> str:

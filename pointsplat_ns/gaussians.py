@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
+from pointsplat_ns.geometry.harmonics import C0
 
-SH_C0 = 0.28209479177387814
+SH_C0 = C0
 """The constant band of the real spherical harmonics, 1 / (2 sqrt(pi))."""
 
 MAX_SH_DEGREE = 3
@@ -48,6 +49,7 @@ class Gaussians:
         opacities: (N, 1) logits; +Inf is opacity 1 and -Inf opacity 0.
         features_dc: (N, 3) constant SH coefficient of red, green and blue: colour = 0.5 + :data:`SH_C0` * features_dc.
         features_rest: (N, (d+1)^2 - 1, 3) the other coefficients of SH degree d, from 0 to 3.
+        antialiased: whether the scene was trained to be drawn antialiased (Mip-Splatting), and so is.
 
     Raises:
         SceneError: if a shape, device or dtype does not fit the others, or no SH degree has this number of
@@ -80,6 +82,7 @@ class Gaussians:
     opacities: Tensor  # [N, 1] logit; +-Inf are opacity 1 and 0
     features_dc: Tensor  # [N, 3] constant SH coefficient
     features_rest: Tensor  # [N, (d+1)^2 - 1, 3] the other SH coefficients
+    antialiased: bool = dataclasses.field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         tails = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (1,), "features_dc": (3,)}
@@ -109,12 +112,13 @@ class Gaussians:
 
     @classmethod
     def cat(cls, scenes: Sequence[Gaussians]) -> Gaussians:
-        """All Gaussians of several scenes of one SH degree, in order."""
-        return cls(*(torch.cat(parts) for parts in zip(*(s.tensors() for s in scenes), strict=True)))
+        """All Gaussians of several scenes of one SH degree, in order; antialiased if one of the scenes is."""
+        parts = zip(*(scene.tensors() for scene in scenes), strict=True)
+        return cls(*map(torch.cat, parts), antialiased=any(scene.antialiased for scene in scenes))
 
     def items(self) -> Iterator[tuple[str, Tensor]]:
         """``(name, tensor)`` of every parameter, in the order of the fields."""
-        return ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
+        return ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self)[:-1])
 
     def tensors(self) -> list[Tensor]:
         """The parameter tensors, in the order of the fields."""
@@ -122,17 +126,18 @@ class Gaussians:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """A scene whose every parameter is ``function(parameter)``."""
-        return Gaussians(*(function(value) for value in self.tensors()))
+        return Gaussians(*map(function, self.tensors()), antialiased=self.antialiased)
 
-    def replace(self, **changes: Tensor) -> Gaussians:
-        """A scene with some parameters replaced."""
+    def replace(self, **changes: Any) -> Gaussians:
+        """A scene with some attributes replaced."""
         return dataclasses.replace(self, **changes)
 
     def __len__(self) -> int:
         return self.means.shape[0]
 
     def __repr__(self) -> str:
-        return f"Gaussians({len(self):,}, SH degree {self.sh_degree}, {self.dtype}, {self.device})"
+        drawn = ", antialiased" if self.antialiased else ""
+        return f"Gaussians({len(self):,}, SH degree {self.sh_degree}, {self.dtype}, {self.device}{drawn})"
 
     def __getitem__(self, index: int | slice | list[int] | Tensor) -> Gaussians:
         """The scene of some Gaussians: by slice, boolean mask (N,), list or tensor of indices (K,), or one integer."""

@@ -99,7 +99,7 @@ def _print(found: SceneInfo) -> None:
     from pointsplat_ns.io.files import bytes_text, three_digits
 
     print(f"{found.file}: {found.format}, {bytes_text(found.bytes)}")
-    print(f"{found.gaussians:,} Gaussians of SH degree {found.sh_degree}")
+    print(f"{found.gaussians:,} Gaussians of SH degree {found.sh_degree}{', antialiased' if found.antialiased else ''}")
     print(f"up: {found.up_text}{'; --up names another axis' if found.up_is_guess else ''}")
     if found.fill is not None:
         print(f"fill: {found.fill:.1f} Gaussians drawn per pixel, in {found.views}")

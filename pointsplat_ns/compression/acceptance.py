@@ -159,7 +159,7 @@ def interpolate(before: Gaussians, after: Gaussians, strength: float) -> Gaussia
         return after
     mixed = (a.lerp(b, strength) for a, b in zip(before.tensors(), after.tensors(), strict=True))
     values = zip(before.items(), mixed, strict=True)
-    return Gaussians(**{name: torch.where(value.isfinite(), value, a) for (name, a), value in values})
+    return before.replace(**{name: torch.where(value.isfinite(), value, a) for (name, a), value in values})
 
 
 def parabola_minimum(at_zero: float, at_half: float, at_one: float) -> float:

@@ -240,13 +240,13 @@ def _text(level: Keep) -> str:
     return str(level) if isinstance(level, (Megabytes, WithinPsnr)) else repr(level)
 
 
-def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int) -> list[int]:
+def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int, antialiased: bool = False) -> list[int]:
     """The number of Gaussians of each level of a scene of ``n``, descending. Raises BudgetError if a level does not fit
     the scene, or two levels have the same number."""
     texts: dict[int, str] = {}
     for text, budget in levels:
         try:
-            count = resolve_keep(n, budget, sh_degree)
+            count = resolve_keep(n, budget, sh_degree, antialiased)
         except BudgetError as error:
             raise BudgetError(f"level {text}: {error}") from error
         if count in texts:
@@ -286,7 +286,7 @@ def make_levels(
     views = views or ViewSource(dense)
     progress("rendering the dense scene", 0.0)
     cut = prune_scene(dense, PruneRequest(1.0, sh=sh), views)
-    counts = level_counts(budgets, len(dense), cut.scene.sh_degree)
+    counts = level_counts(budgets, len(dense), cut.scene.sh_degree, dense.antialiased)
     notes, reference, distance = cut.notes, None, None
     afar: dict[int, Reference] = {}
     try:

@@ -94,7 +94,7 @@ class Adam:
     def moved(self, scene: Gaussians, share: float = 1.0, factors: Tensor | None = None) -> Gaussians:
         """A scene after a step; arguments as for :meth:`moves`."""
         moves = self.moves(share, factors)
-        return Gaussians(**{name: value + moves[name] for name, value in scene.items()})
+        return scene.replace(**{name: value + moves[name] for name, value in scene.items()})
 
     def _weight_sum(self, which: int) -> float:
         """The sum of the weights in an average, for bias correction; ``which`` indexes ``betas``."""

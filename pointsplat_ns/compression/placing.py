@@ -12,11 +12,10 @@ from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.transforms import quaternions_of
 from pointsplat_ns.io.runs import Run, may_be_run, open_run
+from pointsplat_ns.io.turning import turned
 from pointsplat_ns.looking.sampling import estimated_up
 from pointsplat_ns.looking.upright import axis_named
-from pointsplat_ns.refiner.augmentation import Transform
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +32,9 @@ class Similarity:
 
     def apply(self, scene: Gaussians) -> Gaussians:
         """The scene after the transform. Its SH are turned too; a mirrored scene has mirrored SH."""
-        mirrored = bool(torch.linalg.det(self.matrix) < 0)
-        quat = quaternions_of(-self.matrix if mirrored else self.matrix)
-        turn = Transform(quat, mirrored, torch.ones(3, dtype=torch.float64), torch.arange(3))
-        turned = turn.apply(scene.to(dtype=torch.float64))
-        return turned.replace(
-            means=turned.means * self.scale + self.offset.to(turned.means), scales=turned.scales + math.log(self.scale)
+        moved = turned(scene.to(dtype=torch.float64), self.matrix)
+        return moved.replace(
+            means=moved.means * self.scale + self.offset.to(moved.means), scales=moved.scales + math.log(self.scale)
         ).to(dtype=scene.dtype)
 
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.io.camera_files import read_views, transforms_beside
-from pointsplat_ns.io.runs import CONFIG_NAME, may_be_run, open_run
+from pointsplat_ns.io.runs import CONFIG_NAME
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.looking.poses import in_pictures
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
@@ -35,17 +33,12 @@ def views_for(scene: Gaussians | Path | str, poses: Path | str) -> Views:
     """Read the views of a scene from a file of cameras, of at most 1600 pixels on the longer side.
 
     A ``dataparser_transforms.json`` in the scene's run, beside the scene or beside the poses moves them into the
-    scene's frame. The views have the rasterize mode of the scene's run. Raises SceneError if a file is missing, or the
+    scene's frame. Raises SceneError if a file is missing, or the
     transforms are not usable, and DataError if the file has no usable cameras.
     """
     if isinstance(scene, Gaussians):
         return read_views(poses).resized(LONGEST_SIDE)
-    path = Path(scene)
-    views = read_views(poses, _transforms_of(path)).resized(LONGEST_SIDE)
-    if may_be_run(path):
-        with suppress(SceneError):  # a checkpoint outside a run, or not a scene: read_scene says which
-            views = replace(views, rasterize_mode=open_run(path, need_data=False).rasterize_mode)
-    return views
+    return read_views(poses, _transforms_of(Path(scene))).resized(LONGEST_SIDE)
 
 
 def check_views_show(scene: Gaussians, views: Views, poses: Path | str) -> None:

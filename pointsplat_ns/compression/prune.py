@@ -73,7 +73,7 @@ def prune_scene(
     notes: list[str] = []
     seen: list[Views] = []  # the views of each scene that was merged
     full = _with_sh(dense, request.sh, views, progress, notes)
-    count = request.count_of(len(full), full.sh_degree)
+    count = request.count_of(len(full), full.sh_degree, full.antialiased)
     start, cleaning, limit = full, None, None
     if request.clean:
         from pointsplat_ns.compression.cleaning import clean_scene

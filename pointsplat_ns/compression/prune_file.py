@@ -138,7 +138,7 @@ def prune_file(
         return known.spread(MERGED_FROM)
 
     def count_of(n: int) -> int:
-        count = request.count_of(n, rows.sh_degree)
+        count = request.count_of(n, rows.sh_degree, rows.antialiased)
         assert count is not None
         return count
 

@@ -47,6 +47,8 @@ class SceneInfo:
     bytes: int
     gaussians: int
     sh_degree: int
+    antialiased: bool
+    """Whether the scene was trained with antialiasing, as its file or run says."""
     up: list[float]
     """The direction that is up, of length 1; empty if nothing is visible."""
     up_is_guess: bool
@@ -128,6 +130,7 @@ def info(
         bytes=bytes_,
         gaussians=len(scene),
         sh_degree=scene.sh_degree,
+        antialiased=scene.antialiased,
         up=[] if up_found is None else up_found.direction.tolist(),
         up_is_guess=up_found is not None and not up_found.sure,
         fill=filled,
@@ -178,7 +181,7 @@ def _sizes(kind: Format, scene: Gaussians) -> dict[str, int]:
     """Bytes of a file by share of the Gaussians; empty for formats that are not written to one file."""
     counts = {f"{share:.0%}": int(share * len(scene) + 0.5) for share in (1.0, 0.5, 0.3, 0.1, 0.03)}
     if kind.bytes_of is not None:
-        return {text: kind.bytes_of(count, scene.sh_degree) for text, count in counts.items()}
+        return {text: kind.bytes_of(count, scene.sh_degree, scene.antialiased) for text, count in counts.items()}
     if kind.suffix not in (".spz", ".sog") or not len(scene):
         return {}
     try:

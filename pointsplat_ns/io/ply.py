@@ -19,7 +19,7 @@ import torch
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians, sh_degree_of
 from pointsplat_ns.io.files import keep_usable, logger, one_line, replacing, require_file, require_memory
-from pointsplat_ns.io.ply_header import Element, Header, read_header, warn_render_mode
+from pointsplat_ns.io.ply_header import ANTIALIASED, Element, Header, is_antialiased, read_header
 
 MAX_REST = (MAX_SH_DEGREE + 1) ** 2 - 1
 """Number of SH coefficients per channel beyond the constant one that are read."""
@@ -57,7 +57,7 @@ def read_ply(path: Path | str) -> Gaussians:
         with _GaussiansAlone(path, header) as stream:
             # Binary rows are mapped, not read: only the Gaussians below take memory.
             rows = PlyData.read(stream, mmap="r")["vertex"].data
-            scene = _scene(rows, k, in_file)
+            scene = _scene(rows, k, in_file, is_antialiased(header, path))
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
     except (PlyParseError, ValueError, OverflowError) as error:
@@ -75,6 +75,8 @@ class PlyRows:
     """Number of Gaussians in the file, those that cannot be drawn included."""
     rest: int
     """Number of SH coefficients per channel beyond the constant one that are read."""
+    antialiased: bool
+    """Whether the scene was trained with antialiasing."""
     _dtype: np.dtype
     """Properties of a row."""
     _start: int
@@ -94,7 +96,7 @@ class PlyRows:
             _report_unread(header, vertex, in_file, path)
         dtype = np.dtype([(name, header.order + np.dtype(kind).str[1:]) for name, kind in vertex.properties])
         start = header.size + sum(_least_bytes(element, header) for element in header.before("vertex"))
-        return cls(path, vertex.count, min(in_file, MAX_REST), dtype, start, in_file)
+        return cls(path, vertex.count, min(in_file, MAX_REST), is_antialiased(header, path), dtype, start, in_file)
 
     def __len__(self) -> int:
         return self.count
@@ -126,7 +128,7 @@ class PlyRows:
         data = b"".join(found) if len(found) > 1 else found[0]
         if len(data) < size * sum(count for _, count in parts):
             raise SceneError(f"{self.path}: truncated while it was read; expected {self.count} Gaussians")
-        return _scene(np.frombuffer(data, self._dtype), self.rest, self._in_file)
+        return _scene(np.frombuffer(data, self._dtype), self.rest, self._in_file, self.antialiased)
 
 
 def _checked(path: Path) -> tuple[Header, Element, int]:
@@ -155,8 +157,9 @@ def write_ply(scene: Gaussians, path: Path | str) -> None:
     scene = keep_usable(scene.detach().to("cpu", torch.float32), path)
     names = _column_names(3 * scene.features_rest.shape[1])
     rows = row_table(scene).view([(name, "<f4") for name in names]).reshape(len(scene))
-    with replacing(path, ply_bytes(len(scene), scene.sh_degree)) as part:
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(part))
+    comments = [ANTIALIASED] if scene.antialiased else []
+    with replacing(path, ply_bytes(len(scene), scene.sh_degree, scene.antialiased)) as part:
+        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=comments).write(str(part))
 
 
 def row_table(scene: Gaussians) -> np.ndarray:
@@ -167,17 +170,18 @@ def row_table(scene: Gaussians) -> np.ndarray:
     return np.ascontiguousarray(torch.cat(values, dim=1).numpy().astype("<f4", copy=False))
 
 
-def header_bytes(count: int, sh_degree: int) -> bytes:
+def header_bytes(count: int, sh_degree: int, antialiased: bool = False) -> bytes:
     """The header of a 3DGS PLY of ``count`` Gaussians, whose :func:`row_table` follows."""
     names = _column_names(3 * ((sh_degree + 1) ** 2 - 1))
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines = ["ply", "format binary_little_endian 1.0", *[f"comment {ANTIALIASED}"] * antialiased]
+    lines.append(f"element vertex {count}")
     return "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""]).encode("ascii")
 
 
-def ply_bytes(count: int, sh_degree: int) -> int:
+def ply_bytes(count: int, sh_degree: int, antialiased: bool = False) -> int:
     """Size of the 3DGS PLY of ``count`` Gaussians, bytes: an ASCII header, then 17 numbers a Gaussian (normals
     included) and three for each SH coefficient beyond the constant one, as float32."""
-    return len(header_bytes(count, sh_degree)) + 4 * (17 + 3 * ((sh_degree + 1) ** 2 - 1)) * count
+    return len(header_bytes(count, sh_degree, antialiased)) + 4 * (17 + 3 * ((sh_degree + 1) ** 2 - 1)) * count
 
 
 def _column_names(rest: int) -> list[str]:
@@ -233,7 +237,6 @@ def _report_unread(header: Header, vertex: Element, in_file: int, path: Path) ->
     """Warn of what a file holds beside the Gaussians that are read."""
     if in_file > MAX_REST:
         logger.warning("%s: SH degree 4, read up to degree %d", path, MAX_SH_DEGREE)
-    warn_render_mode(header, path)
     known = {name for names in _COLUMNS.values() for name in names}
     others = [name for name, _ in vertex.properties if name not in known and not name.startswith("f_rest_")]
     unread = [f"the vertex properties {', '.join(others[:4])}{'...' if len(others) > 4 else ''}"] if others else []
@@ -276,7 +279,7 @@ def _num_rest(vertex: Element, path: Path) -> int:
     return len(rest) // 3
 
 
-def _scene(rows: np.ndarray, k: int, in_file: int) -> Gaussians:
+def _scene(rows: np.ndarray, k: int, in_file: int, antialiased: bool) -> Gaussians:
     """The scene in structured rows (N,), with ``k`` coefficients per channel beyond the constant one, of ``in_file``
     that the file has."""
     from numpy.lib.recfunctions import structured_to_unstructured
@@ -300,4 +303,5 @@ def _scene(rows: np.ndarray, k: int, in_file: int) -> Gaussians:
     if flat:
         tables["scales"] = np.column_stack([tables["scales"], np.full(len(rows), -np.inf, np.float32)])
     tensors = {name: torch.from_numpy(table) for name, table in tables.items()}
-    return Gaussians(**{**tensors, "features_rest": tensors["features_rest"].reshape(len(rows), k, 3)})
+    tensors["features_rest"] = tensors["features_rest"].reshape(len(rows), k, 3)
+    return Gaussians(**tensors, antialiased=antialiased)

@@ -29,6 +29,10 @@ _TYPES = {
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
+ANTIALIASED = "SplatRenderMode: mip"
+"""The comment of a scene that was trained with antialiasing, as Brush and splat-transform write it."""
+
+
 @dataclass(frozen=True)
 class Element:
     """One element of a PLY file."""
@@ -113,22 +117,22 @@ def read_header(stream: BinaryIO, path: Path) -> Header:
     return Header(order, tuple(Element(name, count, tuple(props)) for name, count, props in elements), size, comments)
 
 
-def warn_render_mode(header: Header, path: Path) -> None:
-    """Say that a scene was trained to be drawn in another way than scenes are here, if a comment says so.
+def is_antialiased(header: Header, path: Path) -> bool:
+    """Whether the last comment on rendering says that a scene was trained with antialiasing. Other ways of rendering
+    are warned of.
 
-    Brush writes ``SplatRenderMode: mip`` or ``2dgs``, Postshot ``antialiased 1``.
+    Brush writes ``SplatRenderMode: default``, ``mip`` or ``2dgs``, Postshot ``antialiased 0`` or ``1``.
     """
+    found = False
     for comment in header.comments:
         words = comment.lower().replace(":", " ").split()
-        if words[:1] == ["splatrendermode"] and words[1:] not in (["default"], []):
-            logger.warning("%s: trained for %r rendering; drawn here as ordinary Gaussians", path, words[1])
-        elif words[:2] == ["antialiased", "1"]:
-            warn_antialiased(path)
-
-
-def warn_antialiased(path: Path) -> None:
-    """Say that a scene was trained with antialiasing, which a scene does not record here."""
-    logger.warning("%s: trained with antialiasing (Mip-Splatting); drawn here without", path)
+        if words[:1] == ["splatrendermode"] and len(words) > 1:
+            found = words[1] == "mip"
+            if words[1] not in ("default", "mip"):
+                logger.warning("%s: trained for %r rendering; drawn here as ordinary Gaussians", path, words[1])
+        elif words[:1] == ["antialiased"] and words[1:] in (["0"], ["1"]):
+            found = words[1] == "1"
+    return found
 
 
 def _header_text(stream: BinaryIO, path: Path) -> tuple[list[str], int]:

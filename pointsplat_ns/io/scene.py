@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import torch
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import keep_usable, require_file
+from pointsplat_ns.io.files import keep_usable, logger, require_file
 from pointsplat_ns.io.formats import READABLE, Format, format_named, format_to_read, format_to_write
-from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, open_run
+from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, Run, open_run
 from pointsplat_ns.io.splatfacto import read_checkpoint
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 
@@ -58,13 +59,16 @@ def read_scene(path: Path | str) -> Gaussians:
     """
     path = Path(path)
     if path.is_dir() and (path / CONFIG_NAME).is_file():
-        return read_checkpoint(open_run(path, need_data=False).checkpoint)
+        return _scene_of(open_run(path, need_data=False))
     if not path.is_dir():
         require_file(path, ACCEPTED)
     if path.suffix.lower() == ".ckpt":
-        return read_checkpoint(path)
+        scene = read_checkpoint(path)
+        with suppress(SceneError):  # a checkpoint outside a run
+            return scene.replace(antialiased=open_run(path, need_data=False).rasterize_mode == "antialiased")
+        return scene
     if path.suffix.lower() in RUN_SUFFIXES:
-        return read_checkpoint(open_run(path, need_data=False).checkpoint)
+        return _scene_of(open_run(path, need_data=False))
     kind = format_to_read(path)
     if kind is None or kind.read is None:
         what = (
@@ -72,6 +76,11 @@ def read_scene(path: Path | str) -> Gaussians:
         )
         raise SceneError(f"{path}: {what}; expected {ACCEPTED}")
     return kind.read(path)
+
+
+def _scene_of(run: Run) -> Gaussians:
+    """The scene of a run's checkpoint, antialiased if the run was trained so."""
+    return read_checkpoint(run.checkpoint).replace(antialiased=run.rasterize_mode == "antialiased")
 
 
 def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False) -> None:
@@ -107,4 +116,6 @@ def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False) 
 def save_as(kind: Format, scene: Gaussians, path: Path, progress: Progress = silent) -> None:
     """Write a scene in a format that is written, whatever the path's name; otherwise as :func:`save`."""
     assert kind.write is not None
+    if scene.antialiased and not kind.holds_antialiased:
+        logger.warning("%s: a %s does not say that the scene was trained with antialiasing", path, kind.suffix)
     kind.write(keep_usable(scene.detach().to("cpu", torch.float32), path), path, progress)

@@ -47,9 +47,9 @@ def read_checkpoint(path: Path | str) -> Gaussians:
     limit = path.stat().st_size
     held = (state.get(prefix + name) for name in NAMES)
     require_memory(path, min(limit, sum(4 * value.numel() for value in held if _is_dense(value))))
-    tensors = {name: _parameter(state, prefix + name, path, limit) for name in NAMES}
+    tensors = [_parameter(state, prefix + name, path, limit) for name in NAMES]
     try:
-        scene = Gaussians(**tensors)
+        scene = Gaussians(*tensors)
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error
     if scene.sh_degree == 0:

@@ -88,7 +88,7 @@ def views_in_units(views: Views, centre: Tensor, size: float) -> Views:
 def thinned(scene: Gaussians, max_count: int) -> Gaussians:
     """Every so many-th Gaussian, about ``max_count`` at most, enlarged so that they cover as much as all."""
     step = max(1, len(scene) // max_count)
-    return _enlarged(Gaussians(*(value[::step] for value in scene.tensors())), step)
+    return _enlarged(scene[::step], step)
 
 
 def every_nth(scene: Gaussians, members: Tensor, step: int) -> Gaussians:

@@ -17,7 +17,7 @@ from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
 from pointsplat_ns.looking.sizes import RESOLUTION, middle_sized, two_sizes
 from pointsplat_ns.looking.traces import PhotoPlaces, photo_places
 from pointsplat_ns.looking.upright import Up
-from pointsplat_ns.views import RasterizeMode, View, Views, spread_indices
+from pointsplat_ns.views import View, Views, spread_indices
 
 MERGED_FROM = 48
 """Maximum number of known views from which merging computes visibility weights."""
@@ -57,7 +57,6 @@ class ViewSource:
         """Text that says where views came from; empty until there are some."""
         self.missing = ""
         """Text in brackets that says why a run's dataset gives no poses; empty if it does, or was not looked for."""
-        self._rasterize_mode: RasterizeMode = "classic"
 
     @property
     def text(self) -> str:
@@ -74,18 +73,12 @@ class ViewSource:
         """The views that were given, if any."""
         return self._given if self._given is not None and len(self._given) else None
 
-    @property
-    def rasterize_mode(self) -> RasterizeMode:
-        """Rasterize mode of the run's training; "classic" for other scenes."""
-        self.known(1)  # reads the run
-        return self._rasterize_mode
-
     @cached_property
     def _of_dataset(self) -> Views | None:
         if self._run is None or self._dataset_views is None or not may_be_run(self._run):
             return None
         try:
-            self._rasterize_mode = open_run(self._run, need_data=False).rasterize_mode
+            open_run(self._run, need_data=False)
         except SceneError:
             return None  # a checkpoint outside a run
         try:
@@ -95,8 +88,7 @@ class ViewSource:
             return None
 
     def views(self, count: int) -> Views:
-        """At most ``count`` views: given ones, those of the dataset's training poses, or sampled ones, which get the
-        run's rasterize mode.
+        """At most ``count`` views: given ones, those of the dataset's training poses, or sampled ones.
 
         Raises:
             DataError: if the given views are empty, or none can be sampled.
@@ -115,13 +107,11 @@ class ViewSource:
         return views
 
     def _sampled(self, count: int, seed: int) -> Views:
-        """Sampled views, which get the run's rasterize mode."""
         width, height = self.resolution
-        views = views_about(
+        return views_about(
             self._scene, self._photos, count, width=width, height=height, seed=seed, up=self.up.direction,
             settings=self._settings,
         )  # fmt: skip
-        return dataclasses.replace(views, rasterize_mode=self._rasterize_mode)
 
     @cached_property
     def _photos(self) -> PhotoPlaces | None:

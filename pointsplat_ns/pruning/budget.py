@@ -37,7 +37,7 @@ class Megabytes:
             raise BudgetError(f"keep is the size of a {self.suffix} file; expected one of {WRITABLE}")
 
     @property
-    def bytes_of(self) -> Callable[[int, int], int] | None:
+    def bytes_of(self) -> Callable[[int, int, bool], int] | None:
         """Size of a file, bytes, by count and SH degree; None if only writing a scene tells it."""
         return format_to_write(self.suffix).bytes_of
 
@@ -64,7 +64,7 @@ class BareCount(int):
 Keep = float | int | Megabytes | WithinPsnr
 
 
-def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3) -> int:
+def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, antialiased: bool = False) -> int:
     """The number of Gaussians that a budget means for a scene of ``n``.
 
     The type decides: a float is a ratio and an int is a count, so ``1.0`` keeps everything and ``1`` keeps one
@@ -95,7 +95,7 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3) -> int:
     if isinstance(keep, WithinPsnr):
         raise BudgetError("keep is auto, which is found by rendering; expected a ratio, a count or a size here")
     if isinstance(keep, Megabytes):
-        return _count_that_fits(n, keep, sh_degree)
+        return _count_that_fits(n, keep, sh_degree, antialiased)
     if isinstance(keep, bool) or not isinstance(keep, Real):
         raise BudgetError(f"keep is {keep!r}; {WANTED}")
     if n < 1:
@@ -132,7 +132,7 @@ def check_size(keep: Megabytes, n: int) -> int:
     return math.floor(keep.value * 1e6)
 
 
-def _count_that_fits(n: int, keep: Megabytes, sh_degree: int) -> int:
+def _count_that_fits(n: int, keep: Megabytes, sh_degree: int, antialiased: bool) -> int:
     """Largest number of Gaussians, at most ``n``, whose file is no larger than the budget."""
     bytes_of, limit = keep.bytes_of, check_size(keep, n)
     if bytes_of is None:
@@ -140,9 +140,9 @@ def _count_that_fits(n: int, keep: Megabytes, sh_degree: int) -> int:
             f"keep is {keep}, which is found by writing; expected a ratio, a count or the size of a .ply here"
         )
     # The size never falls with the count, but grows unevenly: headers hold its digits, and chunks are padded.
-    count = bisect.bisect_right(range(1, n + 1), limit, key=lambda count: bytes_of(count, sh_degree))
+    count = bisect.bisect_right(range(1, n + 1), limit, key=lambda count: bytes_of(count, sh_degree, antialiased))
     if count < 1:
-        least = bytes_of(1, sh_degree)
+        least = bytes_of(1, sh_degree, antialiased)
         raise BudgetError(
             f"keep is {keep}, too small for one Gaussian of SH degree {sh_degree}; expected at least {least / 1e6:g}MB"
         )

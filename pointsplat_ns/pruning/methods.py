@@ -143,7 +143,7 @@ def prune(
     """
     method = method_named(by)
     check_opacity_weight(method, opacity_weight)
-    count = resolve_keep(len(scene), keep, scene.sh_degree)
+    count = resolve_keep(len(scene), keep, scene.sh_degree, scene.antialiased)
     need_usable(scene)
     if method.score is None:
         given = views if isinstance(views, Views) else None

@@ -195,7 +195,7 @@ def _project(means: Tensor, stds: Tensor, scene: Gaussians, views: Views, index:
         near_plane=views.near_plane,
         far_plane=math.inf,
         eps2d=views.eps2d,
-        antialiased=views.rasterize_mode == "antialiased",
+        antialiased=scene.antialiased or views.rasterize_mode == "antialiased",
     )
 
 

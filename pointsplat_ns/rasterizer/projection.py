@@ -94,7 +94,7 @@ def project_scene(scene: Gaussians, view: View) -> Projected:
     return project(
         scene.means, scene.quats, scene.stds, scene.alphas, viewmat, view.K.to(scene.means), view.width, view.height,
         near_plane=view.near_plane, far_plane=math.inf, eps2d=view.eps2d,
-        antialiased=view.rasterize_mode == "antialiased",
+        antialiased=scene.antialiased or view.rasterize_mode == "antialiased",
     )  # fmt: skip
 
 

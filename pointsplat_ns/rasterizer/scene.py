@@ -26,7 +26,8 @@ def render(
     quality: QualityName = "exact",
     backend: Literal["torch", "gsplat", "auto"] = "torch",
 ) -> Tensor:
-    """Render a scene from one view or several, over the views' background. Differentiable in the scene.
+    """Render a scene from one view or several, over the views' background. Differentiable in the scene. The picture is
+    antialiased if the scene or the view is.
 
     Args:
         scene: N Gaussians, on any device; the picture is rendered there.
@@ -85,7 +86,7 @@ def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tupl
         height=view.height,
         near_plane=view.near_plane,
         far_plane=math.inf,  # the unit of length may be small
-        rasterize_mode=view.rasterize_mode,
+        rasterize_mode="antialiased" if scene.antialiased else view.rasterize_mode,
         eps2d=view.eps2d,
         **options,
     )

@@ -6,49 +6,15 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pointsplat_ns.gaussians import SH_C0
+from pointsplat_ns.geometry.harmonics import C1, C2, C3, basis_rows
 from pointsplat_ns.geometry.transforms import SHORTEST
 from pointsplat_ns.rasterizer.precision import full_precision
-
-# Normalisation constants of the real spherical harmonics (Sloan, "Efficient Spherical Harmonic
-# Evaluation", 2013), with the signs that 3DGS files use. That of degree 0 is SH_C0.
-C1 = 0.4886025119029199
-C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
-C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
 
 
 def check_degree(degree: int) -> None:
     """Raise a ValueError unless the degree is 0 to 3."""
     if not 0 <= degree <= 3:
         raise ValueError(f"SH degree is {degree}; expected 0 to 3")
-
-
-def _basis_rows(unit: Tensor, degree: int) -> list[Tensor]:
-    x, y, z = unit
-    rows = [torch.full_like(x, SH_C0)]
-    if degree >= 1:
-        rows += [-C1 * y, C1 * z, -C1 * x]
-    if degree >= 2:
-        xx, yy, zz, xy = x * x, y * y, z * z, x * y
-        rows += [
-            C2[0] * xy,
-            -C2[0] * (y * z),
-            C2[1] * (2.0 * zz - xx - yy),
-            -C2[0] * (x * z),
-            C2[2] * (xx - yy),
-        ]
-    if degree >= 3:
-        around = 4.0 * zz - xx - yy
-        rows += [
-            -C3[0] * y * (3.0 * xx - yy),
-            C3[1] * xy * z,
-            -C3[2] * y * around,
-            C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
-            -C3[2] * x * around,
-            C3[4] * z * (xx - yy),
-            -C3[0] * x * (xx - 3.0 * yy),
-        ]
-    return rows
 
 
 def _basis_backward(unit: Tensor, grad: Tensor, degree: int) -> Tensor:
@@ -106,7 +72,7 @@ class Color(torch.autograd.Function):
     def forward(ctx, directions, coefficients, ids, degree):
         used = (degree + 1) ** 2
         unit, inverse_length = unit_rows(directions.T.contiguous())
-        basis = torch.stack(_basis_rows(unit, degree)).T.contiguous()
+        basis = torch.stack(basis_rows(unit, degree)).T.contiguous()
         color = directions.new_empty(directions.shape[0], 3)
         for part in _blocks(color.shape[0], color.device.type == "cpu"):
             chosen = coefficients.index_select(0, ids[part])[:, :used]
@@ -143,4 +109,4 @@ class Color(torch.autograd.Function):
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """Basis values (M, (degree + 1)^2) for unit directions (M, 3), world space, and a degree of 0 to 3."""
     check_degree(degree)
-    return torch.stack(_basis_rows(directions.movedim(-1, 0), degree), dim=-1)
+    return torch.stack(basis_rows(directions.movedim(-1, 0), degree), dim=-1)

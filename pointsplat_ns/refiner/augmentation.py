@@ -7,14 +7,14 @@ while the target images do not change.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import SH_C0, Gaussians
-from pointsplat_ns.geometry.transforms import rotation_matrices, zero_as_identity
-from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
+from pointsplat_ns.geometry.transforms import rotation_matrices
+from pointsplat_ns.io.turning import turned
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Transform:
     def apply(self, scene: Gaussians) -> Gaussians:
         """The transformed scene."""
         gains, middle = self._color(scene)
-        moved = self._moved(scene, self.matrix, self.quat)
+        moved = turned(scene, self.matrix, self.quat)
         return moved.replace(
             features_dc=(scene.features_dc * gains + middle)[:, self.channels],
             features_rest=(moved.features_rest * gains)[..., self.channels],
@@ -45,7 +45,7 @@ class Transform:
         """The inverse of :meth:`apply`."""
         gains, middle = self._color(scene)
         back = self.channels.argsort()
-        moved = self._moved(scene, self.matrix.T, self.quat * self.quat.new_tensor([1.0, -1.0, -1.0, -1.0]))
+        moved = turned(scene, self.matrix.T, self.quat * self.quat.new_tensor([1.0, -1.0, -1.0, -1.0]))
         return moved.replace(
             features_dc=(scene.features_dc[:, back] - middle) / gains,
             features_rest=moved.features_rest[..., back] / gains,
@@ -56,25 +56,6 @@ class Transform:
         colours changes the 0.5 too."""
         gains = self.gains.to(scene.means)
         return gains, 0.5 * (gains - 1.0) / SH_C0
-
-    def _moved(self, scene: Gaussians, matrix: Tensor, quat: Tensor) -> Gaussians:
-        """The scene with positions, rotations and SH bands rotated. A reflection through the origin leaves covariances,
-        and so the rotations of Gaussians, unchanged."""
-        from kornia.geometry.quaternion import Quaternion
-
-        like = scene.means
-        rest, first = [], 0
-        for degree in range(1, scene.sh_degree + 1):
-            size = 2 * degree + 1
-            band = scene.features_rest[:, first : first + size]
-            rest.append(torch.einsum("ij,njc->nic", sh_matrix(matrix, degree).to(like), band))
-            first += size
-        turn = Quaternion(quat.to(like).expand(len(scene), 4))
-        return scene.replace(
-            means=scene.means @ matrix.T.to(like),
-            quats=(turn * Quaternion(zero_as_identity(scene.quats))).data,
-            features_rest=torch.cat(rest, dim=1) if rest else scene.features_rest,
-        )
 
 
 def random_transform(generator: torch.Generator | None = None) -> Transform:
@@ -87,24 +68,3 @@ def random_transform(generator: torch.Generator | None = None) -> Transform:
     low, high = (0.7, 1.4)  # of the factors on colour channels
     gains = low * (high / low) ** torch.rand(3, generator=generator, dtype=torch.float64)
     return Transform(quat / quat.norm(), mirrored, gains, torch.randperm(3, generator=generator))
-
-
-@lru_cache(maxsize=1)
-def _directions() -> tuple[Tensor, Tensor]:
-    """Random unit directions (M, 3), and the SH basis of degree 3 in them (M, 16), float64."""
-    generator = torch.Generator().manual_seed(0)
-    directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1)
-    return directions, sh_basis(directions, 3)
-
-
-def sh_matrix(matrix: Tensor, degree: int) -> Tensor:
-    """The matrix (2 degree + 1, 2 degree + 1), float64, that rotates the coefficients of one SH band of degree 1 to 3,
-    for a rotation of directions by an orthogonal ``matrix`` (3, 3), float64.
-
-    The coefficients ``c'`` of the rotated function satisfy ``Y(d) c' = Y(matrix^T d) c`` for every direction ``d``.
-    They are found by least squares over fixed directions; the solution is exact, as rotations preserve bands.
-    """
-    directions, basis = _directions()
-    band = slice(degree**2, (degree + 1) ** 2)
-    turned = sh_basis(directions @ matrix.cpu(), degree)[:, band]
-    return torch.linalg.lstsq(basis[:, band], turned).solution.to(matrix.device)

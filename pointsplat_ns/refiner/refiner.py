@@ -121,7 +121,7 @@ class Refiner(nn.Module):
         if "features_rest" in residuals:
             wanted = residuals["features_rest"].view(len(scene), -1, 3)[:, : rest.shape[1]]
             rest = rest + wanted.to(scene.dtype)
-        return Gaussians(
+        return scene.replace(
             means=scene.means + moved,
             scales=scene.scales + residuals["scales"].to(scene.dtype),
             quats=zero_as_identity(scene.quats) + turned,
@@ -135,4 +135,4 @@ def _put_back(rows: Gaussians, mask: Tensor, scene: Gaussians) -> Gaussians:
     """``scene`` with the Gaussians of ``mask`` replaced by ``rows``, in order."""
     place = mask.nonzero()[:, 0]
     values = zip(scene.items(), rows.tensors(), strict=True)
-    return Gaussians(**{name: before.index_copy(0, place, after) for (name, before), after in values})
+    return scene.replace(**{name: before.index_copy(0, place, after) for (name, before), after in values})

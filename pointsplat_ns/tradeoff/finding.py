@@ -45,7 +45,9 @@ def find_scene(
         return measurer.measure(setting, lambda what, share: progress(f"scene {number}: {what or 'looking'}", share))
 
     kind = format_to_write(subject.suffix)
-    size = kind.bytes_of or _estimated(subject)
+    size, bytes_of = _estimated(subject), kind.bytes_of
+    if bytes_of is not None:
+        size = lambda count, degree: bytes_of(count, degree, dense.antialiased)  # noqa: E731
     plan = Plan(len(dense), dense.sh_degree, (by,), repairs)
     search = TargetSearch(
         targets, plan, measure, measurer.cut_psnr, measurer.judged_views.where, size, exact=kind.suffix == ".ply"

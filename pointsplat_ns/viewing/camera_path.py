@@ -135,7 +135,7 @@ def camera_path(
         return CameraPath(views, fps, f"along the {source.origin}{skipped}")
     if known is None:
         opening = opening_views(scene, 1 if one else STOPS, *_shape(settings, (960, 540)), up)
-        stops = dataclasses.replace(opening.views, rasterize_mode=source.rasterize_mode)
+        stops = opening.views
         up, origin = opening.up, f"views that show most, up is {opening.up}{source.missing}"
     else:
         stops, origin = _sized(known.spread(2 * STOPS), settings, _reduced(known)), source.origin

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -18,7 +18,7 @@ from pointsplat_ns.rasterizer.constants import TILE
 from pointsplat_ns.rasterizer.drawing import Drawing
 from pointsplat_ns.rasterizer.rendering import QualityName
 from pointsplat_ns.rasterizer.tiles import Region
-from pointsplat_ns.views import RasterizeMode, View, Views
+from pointsplat_ns.views import View, Views
 
 if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont
@@ -33,8 +33,6 @@ class FilmScenes:
 
     first: Gaussians
     second: Gaussians | None = None
-    modes: tuple[RasterizeMode, RasterizeMode] = ("classic", "classic")
-    """The rasterize modes of both scenes."""
     split: Split = "side-by-side"
     labels: Sequence[str] = ()
     """Labels of the first and the second scene; may be empty."""
@@ -53,11 +51,10 @@ def render_frame(film: FilmScenes, view: View, seconds: float = 0.0) -> np.ndarr
         # The line moves 0.4 of the width to one side of the middle, to the other side, and back within 6 s.
         at = 0.5 + 0.4 * math.sin(2 * math.pi * seconds / 6.0)
         column = round(at * view.width)
-        pictures = [Wipe(film.first, film.second, view, column, film.modes)]
+        pictures = [Wipe(film.first, film.second, view, column)]
     else:
         scenes = [film.first] if film.second is None else [film.first, film.second]
-        modes = zip(film.modes, film.modes, strict=True)
-        pictures = [Wipe(scene, None, view, modes=mode) for scene, mode in zip(scenes, modes, strict=False)]
+        pictures = [Wipe(scene, None, view) for scene in scenes]
         column = view.width
     pixels = np.concatenate([to_uint8(picture.draw(0, picture.rows)) for picture in pictures], axis=1)
     if film.second is not None:
@@ -67,8 +64,7 @@ def render_frame(film: FilmScenes, view: View, seconds: float = 0.0) -> np.ndarr
 
 class Wipe:
     """The picture of one or two scenes in one view: the first left of a column (in pixels, from 0 to the view's width),
-    the second, if there is one, from there on. Hidden parts of a scene are not drawn. Rasterize modes are by default
-    the view's."""
+    the second, if there is one, from there on. Hidden parts of a scene are not drawn."""
 
     def __init__(
         self,
@@ -76,16 +72,14 @@ class Wipe:
         second: Gaussians | None,
         view: View,
         column: int = 0,
-        modes: tuple[RasterizeMode, RasterizeMode] | None = None,
         quality: QualityName = "exact",
     ):
         self.column = view.width if second is None else min(max(column, 0), view.width)
         """First column of the second scene, pixels."""
-        left, right = modes or (view.rasterize_mode, view.rasterize_mode)
-        self._first = Drawing(first, replace(view, rasterize_mode=left), quality) if self.column > 0 else None
+        self._first = Drawing(first, view, quality) if self.column > 0 else None
         self._second = None
         if second is not None and self.column < view.width:
-            self._second = Drawing(second, replace(view, rasterize_mode=right), quality)
+            self._second = Drawing(second, view, quality)
         self.rows = -(-view.height // TILE)
         """Rows of tiles of 8 pixels."""
 

@@ -17,7 +17,7 @@ from pointsplat_ns.io.files import logger, one_line
 from pointsplat_ns.viewing.film import Wipe, to_uint8, with_line
 from pointsplat_ns.viewing.schedule import DrawingStep, Schedule
 from pointsplat_ns.viewing.selection import ReducedScene
-from pointsplat_ns.views import RasterizeMode, View
+from pointsplat_ns.views import View
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,6 @@ class PictureRequest:
     second: ReducedScene | None
     line: float
     """Share of the picture's width for the first scene, in [0, 1]."""
-    modes: tuple[RasterizeMode, RasterizeMode]
 
 
 def paint(step: DrawingStep[PictureRequest]) -> Iterator[np.ndarray | None]:
@@ -60,7 +59,7 @@ def paint(step: DrawingStep[PictureRequest]) -> Iterator[np.ndarray | None]:
     first = request.first.part(step.share)
     second = None if request.second is None or request.line >= 1 else request.second.part(step.share)
     column = round(request.line * view.width)
-    wipe = Wipe(first, second, view, column, request.modes, "fast" if step.moving else "exact")
+    wipe = Wipe(first, second, view, column, "fast" if step.moving else "exact")
     yield None
     # At least 32,768 pixels between two checks for a moved camera.
     bands, rows = [], max(32_768 // (8 * view.width), 1)

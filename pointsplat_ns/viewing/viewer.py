@@ -28,7 +28,6 @@ from pointsplat_ns.system.memory import share_freed_memory
 from pointsplat_ns.viewing.painter import PictureRequest, ViewerCamera, Watcher
 from pointsplat_ns.viewing.selection import Selection
 from pointsplat_ns.viewing.server import LARGEST, READABLE_NAMES, Answer, Request, Route, Server, received
-from pointsplat_ns.views import RasterizeMode
 
 
 @dataclass(frozen=True)
@@ -58,8 +57,6 @@ class ViewedScene:
     scene: Gaussians
     source: ViewSource
     """Source of views."""
-    mode: RasterizeMode
-    """Rasterize mode of its training."""
 
 
 class _Stage:
@@ -114,8 +111,7 @@ class _Stage:
         second = self.selections[1].current if two else first.whole
         wipe = min(max(float(wanted["wipe"]), 0.0), 1.0)
         line = wipe if two or first.percent < 100 else 1.0
-        modes = self.scenes[0].mode, self.scenes[-1].mode
-        return PictureRequest(drawn, first.current, second, line, modes), max(width, height)
+        return PictureRequest(drawn, first.current, second, line), max(width, height)
 
     def texts(self) -> list[dict[str, str]]:
         """Text on the current part of each scene, with the command that makes it."""

@@ -70,8 +70,8 @@ def test_poses_of_a_run_are_moved_and_drawn_as_the_run_was_trained(trained_walls
     original = nerfstudio(replace(known, viewmats=invert_rigid(back @ poses)))
     path = written(original, tmp_path / "transforms.json")
     for named in (run, run / "config.yml", next((run / "nerfstudio_models").glob("*.ckpt"))):
-        _, found = read_posed(named, path)
-        assert found.rasterize_mode == "antialiased"
+        dense, found = read_posed(named, path)
+        assert dense.antialiased
         torch.testing.assert_close(found.viewmats.float(), known.viewmats.float(), rtol=0, atol=1e-5)
 
 

@@ -75,6 +75,7 @@ SCENES = {
         lambda: ball(2000, 3, log_size=-4.5),
         ring_of_views(rasterize_mode="antialiased", background=torch.tensor([0.2, 0.5, 0.7])),
     ),
+    "antialiased by the scene": (lambda: ball(2000, 3, log_size=-4.5).replace(antialiased=True), ring_of_views()),
     "far from the origin and small": (lambda: moved(ball(400, 1), 300.0, 1e-3), None),
     "needles": (lambda: needles(cloud(400)), ring_of_views()),
 }

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from making import normal_scene
+from pointsplat_ns.geometry.harmonics import sh_matrix
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
-from pointsplat_ns.refiner.augmentation import Transform, random_transform, sh_matrix
+from pointsplat_ns.refiner.augmentation import Transform, random_transform
 
 
 def a_scene(n=40, sh_degree=3, dtype=torch.float64, seed=0):

@@ -33,7 +33,7 @@ def request(
     camera: ViewerCamera, scene: ps.Gaussians, second: ps.Gaussians | None = None, line: float = 1.0
 ) -> PictureRequest:
     other = None if second is None else ReducedScene(second, "all")
-    return PictureRequest(camera, ReducedScene(scene, "all"), other, line, ("classic", "classic"))
+    return PictureRequest(camera, ReducedScene(scene, "all"), other, line)
 
 
 def step(of: PictureRequest, side: int = 400, moving: bool = False) -> DrawingStep[PictureRequest]:

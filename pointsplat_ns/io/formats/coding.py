@@ -77,6 +77,9 @@ class Blocks:
     def __init__(self, data: bytes | memoryview, path: Path, start: int = 0):
         self._data, self._path, self.position = data, path, start
 
+    def __len__(self) -> int:
+        return len(self._data)
+
     def take(self, dtype: str | np.dtype, *shape: int) -> NDArray:
         """The next array, not copied; a SceneError if the bytes end before it does."""
         kind = np.dtype(dtype)

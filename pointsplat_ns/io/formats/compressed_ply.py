@@ -28,7 +28,7 @@ from pointsplat_ns.io.formats.coding import (
     smallest_three,
     unit_quats,
 )
-from pointsplat_ns.io.ply_header import Element, Header, read_header, warn_render_mode
+from pointsplat_ns.io.ply_header import ANTIALIASED, Element, Header, is_antialiased, read_header
 from pointsplat_ns.system.progress import Progress, silent
 
 CHUNK_GAUSSIANS = 256
@@ -63,18 +63,18 @@ def read_compressed_ply(path: Path | str) -> Gaussians:
             raise SceneError(f"{path}: lacks the element {'vertex' if chunk else 'chunk'!r}; expected a compressed PLY")
         rest = _check(header, chunk, vertex, sh, path)
         require_memory(path, path.stat().st_size + 4 * vertex.count * (14 + 3 * rest))
-        warn_render_mode(header, path)
         blocks = Blocks(load_bytes(path), path, header.size)
         data = {element.name: blocks.take(_dtype(element), element.count) for element in header.elements}
         scene = _decode(data["chunk"], data["vertex"], data.get("sh"), rest)
+        scene = scene.replace(antialiased=is_antialiased(header, path))
     return keep_usable(scene, path)
 
 
-def compressed_ply_bytes(count: int, sh_degree: int) -> int:
+def compressed_ply_bytes(count: int, sh_degree: int, antialiased: bool = False) -> int:
     """Size of a compressed PLY of ``count`` Gaussians, bytes."""
     rest = 3 * ((sh_degree + 1) ** 2 - 1)
     chunks = -(-count // CHUNK_GAUSSIANS)
-    return len(_header_text(count, rest)) + 4 * len(_BOUNDS) * chunks + (16 + rest) * count
+    return len(_header_text(count, rest, antialiased)) + 4 * len(_BOUNDS) * chunks + (16 + rest) * count
 
 
 def encode_compressed_ply(scene: Gaussians, progress: Progress = silent) -> bytes:
@@ -99,11 +99,13 @@ def encode_compressed_ply(scene: Gaussians, progress: Progress = silent) -> byte
     rest = scene.features_rest.transpose(1, 2).flatten(1).double().numpy()
     sh = np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)  # of [-4, 4]
     packed = np.stack(words, axis=1).astype("<u4")
-    return b"".join((_header_text(n, rest.shape[1]), chunks.tobytes(), packed.tobytes(), sh.tobytes()))
+    header = _header_text(n, rest.shape[1], scene.antialiased)
+    return b"".join((header, chunks.tobytes(), packed.tobytes(), sh.tobytes()))
 
 
-def _header_text(count: int, rest: int) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {-(-count // CHUNK_GAUSSIANS)}"]
+def _header_text(count: int, rest: int, antialiased: bool) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", *[f"comment {ANTIALIASED}"] * antialiased]
+    lines.append(f"element chunk {-(-count // CHUNK_GAUSSIANS)}")
     lines += [f"property float {name}" for name in _BOUNDS]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
     if rest:

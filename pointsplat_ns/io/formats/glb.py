@@ -147,7 +147,7 @@ def _entry(entries: Any, index: Any) -> dict[str, Any]:
     return entries[index]
 
 
-def glb_bytes(count: int, sh_degree: int) -> int:
+def glb_bytes(count: int, sh_degree: int, antialiased: bool = False) -> int:
     """Size of a ``.glb`` of ``count`` Gaussians, bytes."""
     floats = 3 + 4 + 3 + 1 + 3 * (sh_degree + 1) ** 2
     return 12 + 8 + JSON_BYTES + 8 + (4 * floats + 4) * count

@@ -45,12 +45,15 @@ class Format:
     write: Writer | None = None
     starts: tuple[bytes, ...] = ()
     """What its files begin with, if that tells."""
-    bytes_of: Callable[[int, int], int] | None = None
-    """Exact size of a file, bytes, by the number of Gaussians and their SH degree; None if it depends on the scene."""
+    bytes_of: Callable[[int, int, bool], int] | None = None
+    """Exact size of a file, bytes, by the number of Gaussians, their SH degree, and whether the scene is antialiased;
+    None if it depends on more."""
     encode: Callable[[Gaussians, Progress], bytes] | None = None
     """The bytes of a file of a scene, where only they tell its size."""
     rounded: Callable[[Gaussians, Rounding], Gaussians] | None = None
     """A scene whose numbers are rounded, so that a file of it is smaller."""
+    holds_antialiased: bool = True
+    """Whether a file says that a scene was trained with antialiasing."""
     order: Callable[[Gaussians], Tensor] | None = None
     """Indices (N,) of a scene's Gaussians in the order in which they are written, if that is another."""
 
@@ -105,8 +108,11 @@ FORMATS = (
         "SOG folder", META, read_sog, write_sog_folder, encode=encode_sog, rounded=rounded_for_sog, order=morton_order
     ),
     Format("ksplat", ".ksplat", read_ksplat),
-    Format("splat", ".splat", read_splat, _writer(encode_splat), bytes_of=splat_bytes, order=drawing_order),
-    Format("glTF", ".glb", read_glb, _writer(encode_glb), (b"glTF",), glb_bytes),
+    Format(
+        "splat", ".splat", read_splat, _writer(encode_splat), bytes_of=splat_bytes,
+        holds_antialiased=False, order=drawing_order,
+    ),
+    Format("glTF", ".glb", read_glb, _writer(encode_glb), (b"glTF",), glb_bytes, holds_antialiased=False),
     Format("LCC", ".lcc"), Format("LCC", ".lcc2"),
 )  # fmt: skip
 """All formats of files that hold nothing but a scene."""

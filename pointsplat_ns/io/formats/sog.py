@@ -38,7 +38,6 @@ from pointsplat_ns.io.formats.coding import (
 from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette, palette_size
 from pointsplat_ns.io.formats.rounding import Rounding, multiples, rounded_shapes, steps_of, weights
 from pointsplat_ns.io.formats.sog_images import META, Images, webp
-from pointsplat_ns.io.ply_header import warn_antialiased
 from pointsplat_ns.system.progress import Progress, silent
 
 MAX_SIDE = 16_383
@@ -124,8 +123,6 @@ def _decode(images: Images, meta: dict[str, Any], path: Path) -> Gaussians:
     if not isinstance(n, int) or not 0 <= n <= MAX_SIDE**2:
         raise SceneError(f"{path}: declares {n!r} Gaussians; expected a number up to {MAX_SIDE**2}")
     require_plausible(path, 16 * n, images.size, n, _rest_of(meta))  # four images that every scene has
-    if meta.get("model", "default") == "antialiased":
-        warn_antialiased(path)
     pixels = functools.partial(_pixels, images, n)
     low, high = pixels(meta["means"], 0), pixels(meta["means"], 1)
     mins, maxs = (_numbers(meta["means"][name], 3) for name in ("mins", "maxs"))
@@ -142,7 +139,7 @@ def _decode(images: Images, meta: dict[str, Any], path: Path) -> Gaussians:
         logits_of_bytes(colors[:, 3]) if version == 2 else dc[:, 3],
         dc[:, :3],
         _read_sh(images, n, meta),
-    )
+    ).replace(antialiased=meta.get("model") == "antialiased")
 
 
 def _pixels(images: Images, n: int, part: dict[str, Any], file: int = 0) -> Array:
@@ -241,6 +238,8 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
             "files": add("sh0.webp", [color_index.numpy(), bytes_of_logits(scene)]),
         },
     }
+    if scene.antialiased:
+        meta["model"] = "antialiased"
     if scene.sh_degree:
         meta["shN"] = _pack_sh(scene, images, (width, height), progress)
     files = {}

@@ -54,7 +54,7 @@ def read_splat(path: Path | str) -> Gaussians:
     return keep_usable(scene, path)
 
 
-def splat_bytes(count: int, sh_degree: int) -> int:
+def splat_bytes(count: int, sh_degree: int, antialiased: bool = False) -> int:
     """Size of a ``.splat`` file of ``count`` Gaussians, bytes."""
     return _ROW.itemsize * count
 

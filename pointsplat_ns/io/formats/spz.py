@@ -2,7 +2,8 @@
 
 Versions 2 and 3 are one gzip stream, with quaternions of three and four bytes. Version 4 has one zstd stream for each
 attribute. Positions are in fixed point of 24 bits. The format's documentation wants axes right, up, back (RUB);
-what is read and written here keeps the axes that it has, as most converters do.
+what is read and written here keeps the axes that it has, as most converters do. Where an extension of version 4 names
+other axes, the scene is turned to RUB.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
@@ -35,7 +37,7 @@ from pointsplat_ns.io.formats.coding import (
     unit_quats,
 )
 from pointsplat_ns.io.formats.rounding import Rounding, rounded
-from pointsplat_ns.io.ply_header import warn_antialiased
+from pointsplat_ns.io.turning import turned
 from pointsplat_ns.system.progress import Progress, silent
 
 Version = Literal[3, 4]
@@ -49,6 +51,12 @@ compress better. The format's own programs keep 5 and 4, in a file a seventh sma
 
 _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")  # magic, version, Gaussians, SH degree, bits after the point, flags, streams
+_FIRST_RECORD, _MAX_RECORDS = 32, 1 << 20  # bytes of version 4 before extensions, and up to their end
+_ANTIALIASED, _EXTENDED = 1, 2  # flags
+_AXES_EXTENSION = 0xADBE0003
+"""SPZ_ADOBE_coordinate_system: the axes of the numbers in the file."""
+_AXES = "LDB RDB LUB RUB LDF RDF LUF RUF LFD RFD LFU RFU LBD RBD LBU RBU".split()  # numbered from 1
+_DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "U": (0, 1, 0), "D": (0, -1, 0), "B": (0, 0, 1), "F": (0, 0, -1)}
 _COLOR_SCALE = 0.15
 _XYZW = np.array([1, 2, 3, 0])  # SPZ has w last
 
@@ -71,8 +79,8 @@ class _Head:
 
 def read_spz(path: Path | str) -> Gaussians:
     """Read an SPZ file of version 2, 3 or 4, as :func:`~pointsplat_ns.io.read_scene` does. The axes stay those of the
-    file. Of SH degree 4, the highest band is left out, which is logged. Raises SceneError if the file is of another
-    kind or version, is truncated, or declares more than it can hold."""
+    file, unless it names others than right, up, back. Of SH degree 4, the highest band is left out, which is logged.
+    Raises SceneError if the file is of another kind or version, is truncated, or declares more than it can hold."""
     path = require_file(path, "an SPZ file")
     with damage_named(path, "SPZ"):
         data = load_bytes(path)
@@ -82,14 +90,38 @@ def read_spz(path: Path | str) -> Gaussians:
             head, parts = _parts_of_zstd(data, path)
         else:
             raise SceneError(f"{path}: not an SPZ file (starts with {data[:4]!r}); expected gzip or {_MAGIC!r}")
-        if head.flags & 1:  # antialiased
-            warn_antialiased(path)
-        if head.flags & 2:  # extended
-            logger.warning("%s: not read: the extensions of the SPZ file", path)
+        axes = _named_axes(head, data, path) if head.flags & _EXTENDED else None
         if head.degree > MAX_SH_DEGREE:
             logger.warning("%s: SH degree %d, read up to degree %d", path, head.degree, MAX_SH_DEGREE)
-        scene = _decode(head, parts)
+        scene = _decode(head, parts).replace(antialiased=bool(head.flags & _ANTIALIASED))
+        if axes is not None:
+            scene = turned(scene, axes)
     return keep_usable(scene, path)
+
+
+def _named_axes(head: _Head, data: bytes, path: Path) -> Tensor | None:
+    """The matrix (3, 3) float64 from the axes that an extension of version 4 names to right, up, back; None if there is
+    no such extension. Others are not read, with a warning."""
+    found: Tensor | None = None
+    unread: dict[str, None] = {}
+    if head.version < 4:  # behind the compressed attributes
+        unread["all"] = None
+    else:
+        blocks = Blocks(data[: _table_of(data, path)], path, _FIRST_RECORD)
+        if len(blocks) > _MAX_RECORDS:
+            raise SceneError(f"{path}: {len(blocks)} bytes before the attributes; expected at most {_MAX_RECORDS}")
+        while blocks.position < len(blocks):
+            kind, size = blocks.take("<u4", 2).tolist()
+            content = blocks.take("u1", size)
+            number = int(content.view("<u4")[0]) if kind == _AXES_EXTENSION and size == 4 else 0
+            if 1 <= number <= len(_AXES):
+                columns = [_DIRECTIONS[letter] for letter in _AXES[number - 1]]
+                found = torch.tensor(columns, dtype=torch.float64).T
+            else:
+                unread[f"{kind:#x}"] = None
+    if unread:
+        logger.warning("%s: extensions of the SPZ file that are not read: %s", path, ", ".join([*unread][:4]))
+    return found
 
 
 def encode_spz(
@@ -117,7 +149,7 @@ def encode_spz(
         sh_bits = (8, 8) if torch.equal(levels, levels.round()) else SH_BITS
     if not all(1 <= bits <= 8 for bits in sh_bits):
         raise SceneError(f"SH of {sh_bits[0]} and {sh_bits[1]} bits; expected 1 to 8 bits in SPZ")
-    n, flags = len(scene), 0
+    n, flags = len(scene), _ANTIALIASED if scene.antialiased else 0
     bits = _fraction_bits(scene)
     parts = _encode(scene, bits, sh_bits)
     if version == 3:
@@ -136,7 +168,7 @@ def encode_spz(
         progress("compressing", index / len(parts))
         streams.append(ZstdCompressor(level=12).compress(part))
     head = _HEADER.pack(_MAGIC, 4, n, scene.sh_degree, bits, flags, len(parts))
-    head += struct.pack("<I12x", 32)  # where the table of sizes begins
+    head += struct.pack("<I12x", _FIRST_RECORD)  # where the table of sizes begins
     table = b"".join(struct.pack("<QQ", len(s), len(p)) for s, p in zip(streams, parts, strict=True))
     return b"".join([head, table, *streams])
 
@@ -202,11 +234,10 @@ def _parts_of_zstd(data: bytes, path: Path) -> tuple[_Head, list[bytes | memoryv
     if head.version != 4:
         raise SceneError(f"{path}: SPZ of version {head.version} outside gzip; expected version 4 there")
     require_plausible(path, sum(head.sizes), len(data), head.count, (head.degree + 1) ** 2 - 1)
-    sizes = [size for size in head.sizes if size]
-    table = int(Blocks(data, path, _HEADER.size).take("<u4", 1)[0])
-    if head.streams != len(sizes) or table < 32:
+    sizes, table = [size for size in head.sizes if size], _table_of(data, path)
+    if head.streams != len(sizes) or table < _FIRST_RECORD:
         raise SceneError(
-            f"{path}: {head.streams} streams listed at byte {table}; expected {len(sizes)} from byte 32 on"
+            f"{path}: {head.streams} streams listed at byte {table}; expected {len(sizes)} from byte {_FIRST_RECORD} on"
         )
     blocks = Blocks(data, path, table)
     lengths = blocks.take("<u8", len(sizes), 2).tolist()
@@ -224,6 +255,11 @@ def _parts_of_zstd(data: bytes, path: Path) -> tuple[_Head, list[bytes | memoryv
             raise SceneError(f"{path}: truncated; a stream ends after {len(part)} of {size} bytes")
         parts.append(part)
     return head, parts + [b""] * (len(head.sizes) - len(parts))
+
+
+def _table_of(data: bytes, path: Path) -> int:
+    """Where the table of streams of version 4 begins, bytes. Extensions are before it."""
+    return int(Blocks(data, path, _HEADER.size).take("<u4", 1)[0])
 
 
 def _decode(head: _Head, parts: list[bytes | memoryview]) -> Gaussians:

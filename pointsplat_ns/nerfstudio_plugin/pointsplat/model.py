@@ -226,7 +226,7 @@ class PointSplatModel(SplatfactoModel):
             eps2d=eps2d_of(camera),
             sh_degree=gaussians.sh_degree,
             render_mode="RGB" if self.training else "RGB+ED",
-            rasterize_mode=scene.rasterize_mode,
+            rasterize_mode="antialiased" if gaussians.antialiased else scene.rasterize_mode,
         )
         background = scene.background.to(image)
         outputs = {

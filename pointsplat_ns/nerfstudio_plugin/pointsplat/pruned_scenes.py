@@ -123,6 +123,7 @@ def stored_path(folder: Path, name: str, content: str, settings: PruneSettings) 
 def write_pruned(path: Path, pruned: Gaussians, dense_count: int, seconds: float) -> None:
     """Write a pruned scene, the number of Gaussians of the dense scene, and the seconds that pruning took."""
     header = {"format": FORMAT, "dense_count": str(dense_count), "seconds": repr(seconds)}
+    header["antialiased"] = str(pruned.antialiased)
     write_tensors(path, dict(pruned.items()), header)
 
 
@@ -136,7 +137,10 @@ def read_pruned(path: Path) -> tuple[Gaussians, int, float]:
             header = file.metadata() or {}
             if header.get("format") != FORMAT:
                 raise SceneError(f"{path}: format {header.get('format')!r}; expected {FORMAT!r}; remove the file")
-            pruned = Gaussians(**{name: file.get_tensor(name) for name in file.keys()})
+            pruned = Gaussians(
+                **{name: file.get_tensor(name) for name in file.keys()},
+                antialiased=header.get("antialiased") == "True",
+            )
             return pruned, int(header["dense_count"]), float(header["seconds"])
     except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
         raise SceneError(f"{path}: not a readable pruned scene ({one_line(error)}); remove the file") from error

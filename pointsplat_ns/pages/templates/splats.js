@@ -246,7 +246,7 @@ class Drawer {
   }
 
   // What is drawn of an unpacked scene. Its order is to be set before.
-  add({ count, degree, texels, words }) {
+  add({ count, degree, antialiased, texels, words }) {
     const { gl } = this, texture = gl.createTexture(), array = gl.createVertexArray(), indices = gl.createBuffer();
     const rows = words.length / (4 * TEXELS_WIDE);
     if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(`${count} Gaussians are more than the graphics driver takes.`);
@@ -264,7 +264,7 @@ class Drawer {
       gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
       scene.shown = order.length;
     };
-    const scene = { texture, array, texels, degree, shown: 0, setOrder };
+    const scene = { texture, array, texels, degree, antialiased, shown: 0, setOrder };
     return scene;
   }
 
@@ -300,11 +300,11 @@ class Drawer {
     gl.uniform2f(at.size, this.width, this.height);
     gl.uniform1f(at.focal, (0.5 * Math.max(this.width, this.height)) / Math.tan(0.5 * camera.fov));
     gl.uniform1f(at.near, style.near);
-    gl.uniform1i(at.antialiased, style.antialiased);
     for (const [scene, from, to] of parts) {
       const left = Math.round(from * this.width), width = Math.round(to * this.width) - left;
       if (!width || !scene.shown) continue;
       gl.scissor(left, 0, width, this.height);
+      gl.uniform1i(at.antialiased, style.antialiased || scene.antialiased);
       gl.uniform1i(at.texels, scene.texels);
       gl.uniform1i(at.degree, scene.degree);
       gl.bindTexture(gl.TEXTURE_2D, scene.texture);

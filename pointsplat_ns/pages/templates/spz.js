@@ -18,6 +18,7 @@ async function unpackSpz(base64) {
   const head = new DataView(buffer);
   if (head.getUint32(0, true) !== 0x5053474e || head.getUint32(4, true) !== 3) throw new Error("not SPZ of version 3");
   const count = head.getUint32(8, true), degree = head.getUint8(12), step = 2 ** -head.getUint8(13);
+  const antialiased = Boolean(head.getUint8(14) & 1);
   const coefficients = 3 * SH_COEFFICIENTS[degree];
   if (buffer.byteLength !== 16 + (20 + coefficients) * count) throw new Error(`SPZ of ${buffer.byteLength} bytes for ${count} Gaussians`);
 
@@ -41,5 +42,5 @@ async function unpackSpz(base64) {
     for (let part = 0; part < 4; part++) bytes[byte + 16 + part] = file[rotation + 4 * i + part];
     for (let k = 0; k < coefficients; k++) bytes[byte + 32 + k] = file[sh + coefficients * i + k];
   }
-  return { count, degree, texels, words, positions };
+  return { count, degree, antialiased, texels, words, positions };
 }

@@ -38,6 +38,7 @@ def scene_maker(participants: Participants, groups: Groups, settings: MergeSetti
             quats,
             torch.where(single, scene.opacities[groups.first], logits),
             *sh,
+            antialiased=scene.antialiased,
         )
 
     return make

@@ -87,11 +87,11 @@ def test_pruned_scenes_are_taken_from_the_folder(trained_walls, tmp_path, monkey
 def test_files_of_pruned_scenes_that_are_damaged_or_of_another_kind_say_so(tmp_path):
     from safetensors.torch import save_file
 
-    scene = Gaussians.empty(sh_degree=1)
+    scene = Gaussians.empty(sh_degree=1).replace(antialiased=True)
     path = stored_path(tmp_path, "room", "a5" * 32, PruneSettings(0.5, "paper"))
     write_pruned(path, scene, 7, 0.25)
     found, count, seconds = read_pruned(path)
-    assert (len(found), found.sh_degree, count, seconds) == (0, 1, 7, 0.25)
+    assert (len(found), found.sh_degree, found.antialiased, count, seconds) == (0, 1, True, 7, 0.25)
     path.write_bytes(path.read_bytes()[:-3] + b"x")
     with pytest.raises(SceneError, match="not a readable pruned scene"):
         read_pruned(path)

@@ -64,8 +64,9 @@ def test_exact_copies_and_faint_gaussians_do_not_change_the_count(tmp_path):
 
 
 def test_what_is_not_merged_stays_as_it_is_to_the_bit(tmp_path):
-    scene = cloud(900, seed=5, sh_degree=2)
+    scene = cloud(900, seed=5, sh_degree=2).replace(antialiased=True)
     kept = merged(rows_of(scene, tmp_path), 900, 300, tmp_path)
+    assert kept.antialiased
     order, wanted = (s.means[:, 0].argsort() for s in (kept, scene))
     assert same_bits(kept[order], scene[wanted])
 

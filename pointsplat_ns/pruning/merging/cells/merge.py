@@ -90,8 +90,8 @@ def merge_file(
 
     work = _Work(cells, Overview(**scratch.tensors("overview", look)), k, resolution, settings)
     rounds = work.merged(progress)
-    with replacing(output, ply_bytes(k, rows.sh_degree)) as part, part.open("wb") as stream:
-        stream.write(header_bytes(k, rows.sh_degree))
+    with replacing(output, ply_bytes(k, rows.sh_degree, rows.antialiased)) as part, part.open("wb") as stream:
+        stream.write(header_bytes(k, rows.sh_degree, rows.antialiased))
         for done, path in enumerate(work.finished(rounds)):
             progress("finishing", done / len(cells))
             with path.open("rb") as finished:

@@ -50,7 +50,7 @@ class Cells:
     def read(self, cell: int) -> Gaussians:
         """The Gaussians of a cell, in the order of the file."""
         path, width = self.scratch.folder / _name(cell), _width(self.sample)
-        scene = Gaussians.empty(self.sample.sh_degree).map(lambda v: v.new_empty(self.counts[cell], *v.shape[1:]))
+        scene = self.sample.map(lambda values: values.new_empty(self.counts[cell], *values.shape[1:]))
         with path.open("rb") as stream:
             for start in range(0, len(scene), PIECE):
                 count = min(PIECE, len(scene) - start)

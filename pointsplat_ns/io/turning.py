@@ -1,0 +1,38 @@
+"""Turns and mirrors scenes about the origin."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.harmonics import sh_matrix
+from pointsplat_ns.geometry.transforms import quaternions_of, zero_as_identity
+
+
+def turned(scene: Gaussians, matrix: Tensor, quat: Tensor | None = None) -> Gaussians:
+    """A scene whose positions, rotations and SH are turned about the origin.
+
+    Args:
+        scene: N Gaussians.
+        matrix: (3, 3) float64, orthogonal: the factor on positions. A determinant of -1 mirrors. A reflection through
+            the origin leaves covariances, and so the rotations of Gaussians, unchanged.
+        quat: (4,) wxyz, unit: the rotation in the matrix, by default computed. Its sign is that of the quaternions.
+    """
+    from kornia.geometry.quaternion import Quaternion
+
+    like = scene.means
+    rest, first = [], 0
+    for degree in range(1, scene.sh_degree + 1):
+        size = 2 * degree + 1
+        band = scene.features_rest[:, first : first + size]
+        rest.append(torch.einsum("ij,njc->nic", sh_matrix(matrix, degree).to(like), band))
+        first += size
+    if quat is None:
+        quat = quaternions_of(matrix * torch.linalg.det(matrix).sign())
+    turn = Quaternion(quat.to(like).expand(len(scene), 4))
+    return scene.replace(
+        means=scene.means @ matrix.T.to(like),
+        quats=(turn * Quaternion(zero_as_identity(scene.quats))).data,
+        features_rest=torch.cat(rest, dim=1) if rest else scene.features_rest,
+    )
