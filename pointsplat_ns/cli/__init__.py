@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import importlib
 import inspect
 import io
@@ -14,7 +16,7 @@ import threading
 import types
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, TextIO, cast
+from typing import Any, NoReturn, TextIO, cast
 
 from pointsplat_ns.errors import PointSplatError, printable
 
@@ -195,13 +197,23 @@ def _options_in_lines(text: str) -> str:
     return re.sub(r"\n {8,}", " ", text)
 
 
+def _leave() -> NoReturn:
+    """End the process with status 0, without unloading torch's libraries, which takes 0.4 CPU seconds."""
+    atexit._run_exitfuncs()
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        stream.flush()
+    os._exit(0)
+
+
 def main(args: list[str] | None = None) -> None:
-    """Run one subcommand.
+    """Run one subcommand; by default that of the program's own arguments, after which the process ends.
 
     Unusable input, files that cannot be read or written, a lack of memory and a missing package end it with one line
     and exit status 1; Ctrl-C ends it with 130, another signal with 128 plus its number
     (:data:`pointsplat_ns.cli.help.STATUSES`). With ``--json``, standard output has one JSON value and nothing else.
     """
+    if args is None:
+        gc.set_threshold(100_000)  # searching the objects of torch's modules for garbage takes 0.2 s by default
     with any_text_printable():
         try:
             _run(sys.argv[1:] if args is None else args)
@@ -217,6 +229,8 @@ def main(args: list[str] | None = None) -> None:
         except KeyboardInterrupt:
             text, status = "interrupted", 130
         else:
+            if args is None:
+                _leave()
             return
         print(text, file=sys.stderr)
         sys.exit(status)
