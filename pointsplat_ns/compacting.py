@@ -21,7 +21,7 @@ from pointsplat_ns.views import Views
 if TYPE_CHECKING:
     from pointsplat_ns.compression.compact import Compacted
     from pointsplat_ns.compression.photo_repair import Photos
-    from pointsplat_ns.compression.quality import FullSizePsnr
+    from pointsplat_ns.compression.quality import FullSizeQuality
     from pointsplat_ns.compression.requests import Effort
     from pointsplat_ns.tradeoff.targets import Targets
 
@@ -56,7 +56,7 @@ def prune_source(
     up: str | None = None,
     progress: bool | Progress = False,
     compared: bool = False,
-) -> tuple[Gaussians, Gaussians, float, FullSizePsnr | None]:
+) -> tuple[Gaussians, Gaussians, float, FullSizeQuality | None]:
     """Read a scene and prune it; notes are logged. Arguments as of :func:`pointsplat_ns.prune`.
 
     Returns:
@@ -86,7 +86,7 @@ def compact_source(
     up: str | None = None,
     progress: bool | Progress = False,
     compared: bool = False,
-) -> tuple[Gaussians, Compacted, FullSizePsnr | None]:
+) -> tuple[Gaussians, Compacted, FullSizeQuality | None]:
     """Read a scene and compact it, or search for a goal; verdicts and notes are logged. Arguments as of
     :func:`pointsplat_ns.compact`. A search uses only the method and the refiner of the request, and decides the rest.
 

@@ -15,7 +15,7 @@ from pointsplat_ns.cli.scene_options import file_bytes
 from pointsplat_ns.system.quantities import seconds_text
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.quality import FullSizePsnr
+    from pointsplat_ns.compression.quality import FullSizeQuality
     from pointsplat_ns.gaussians import Gaussians
     from pointsplat_ns.io.ply import PlyRows
 
@@ -74,7 +74,7 @@ def print_result(
     scene: Gaussians | PlyRows,
     seconds: float,
     where: Path | None,
-    quality: FullSizePsnr | str | None,
+    quality: FullSizeQuality | str | None,
 ) -> None:
     """Print what was done by a method and ``also`` after it (refined, repaired), counts, size of the file (that of a
     PLY in a dry run) and time, and how close the result is to the dense scene, or why that is not known."""

@@ -109,14 +109,25 @@ def _print_table(found: Tradeoff) -> None:
                 three_digits(point.bytes / 1e6),
                 f"{speed.median:.1f} ({speed.low:.1f}-{speed.high:.1f})",
                 three_digits(point.frame_ms),
+                "-" if point.fill is None else f"{point.fill:.1f}",
                 f"{point.against_dense.psnr:.2f}",
                 *([_psnr(point.against_photos)] if photos else []),
             )
         )
     print_table(
-        ("", "Gaussians", "MB", "times as fast", "ms a\nframe", "dB,\nrenders", *(["dB,\nphotos"] if photos else [])),
+        (
+            "",
+            "Gaussians",
+            "MB",
+            "times as fast",
+            "ms a\nframe",
+            "fill",
+            "dB,\nrenders",
+            *(["dB,\nphotos"] if photos else []),
+        ),
         rows,
-        "*: recommended; times as fast as the dense scene: median and quartiles over views; dB of PSNR",
+        "*: recommended; times as fast as the dense scene: median and quartiles over views; fill: Gaussians "
+        "drawn per pixel; dB of PSNR",
     )
 
 

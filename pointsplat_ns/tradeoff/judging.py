@@ -21,6 +21,7 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.looking.closeness import DenseReference, views_text
+from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.metrics import MOST_PSNR, SSIM_WINDOW, ImageError, finite_psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
@@ -76,6 +77,7 @@ class Judged:
 
     against_dense: ImageMetrics
     against_photos: ImageMetrics | None
+    fill: float
     frame_ms: float = math.nan
     frame_ms_low: float = math.nan
     frame_ms_high: float = math.nan
@@ -128,7 +130,9 @@ class Judge:
         close = self.reference.closeness_of(images)
         assert close.ssim is not None
         perceived = self._perceived(zip(images, self.reference.renders, strict=True))
-        return Judged(ImageMetrics(min(close.psnr, MOST_PSNR), close.ssim, perceived), photos, **times)
+        return Judged(
+            ImageMetrics(min(close.psnr, MOST_PSNR), close.ssim, perceived), photos, fill(scene, self.views), **times
+        )
 
     def _time(self, scene: Gaussians) -> dict[str, float]:
         """The times of :class:`Judged`: ``dense_ms`` times the measured ratio of frames."""

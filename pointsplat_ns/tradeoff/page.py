@@ -129,6 +129,7 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
         "bytes": "MB",
         "speed": "times as fast",
         "frame_ms": "ms a frame",
+        "fill": "fill",
         **{
             f"{reference}_{metric}": f"{title}, {reference}"
             for reference in get_args(Reference)
@@ -204,6 +205,7 @@ def _cells(point: Point, dense: Point) -> dict[str, tuple[float | None, str]]:
         "bytes": (point.bytes, three_digits(point.bytes / 1e6)),
         "speed": (speed.median, f"{speed.median:.2f} ({speed.low:.2f}–{speed.high:.2f})"),
         "frame_ms": (ms, f"{ms:,.0f}" if ms >= 100 else f"{ms:.1f}"),
+        "fill": (point.fill, "–" if point.fill is None else f"{point.fill:.1f}"),
         "seconds": (point.seconds, f"{point.seconds:.1f}"),
         "peak_bytes": (point.peak_bytes, "–" if point.peak_bytes is None else f"{point.peak_bytes / 1e9:.2f}"),
     }

@@ -54,6 +54,8 @@ class Point:
     """Peak memory of the making process; None if it was not measured."""
     others_cores: float | None = None
     """Cores that other programs used during the timing; None if they were not measured."""
+    fill: float | None = None
+    """Mean number of Gaussians that viewers draw on a pixel; None in points of older programs."""
     clock_ms: float | None = None
     """Median time of one frame over views by the clock, in milliseconds; None if it was not measured."""
 

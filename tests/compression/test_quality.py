@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from making import box_room
-from pointsplat_ns.compression.quality import FullSizePsnr, quality_of
+from pointsplat_ns.compression.quality import FullSizeQuality, quality_of
 from pointsplat_ns.looking.closeness import DenseReference
+from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.sampling import sample_views
 
 
@@ -25,9 +26,18 @@ def test_the_figure_is_that_of_whole_pictures_over_covered_pixels(dense):
 
 
 def test_the_quality_is_said_with_the_views_and_their_size(dense):
-    assert str(FullSizePsnr(31.249, 8, 1920, 1080)) == "31.2 dB PSNR against the dense scene (8 views, 1920 x 1080)"
+    close, drawn = str(FullSizeQuality(31.249, 8, 1920, 1080, 33.84, 12.06)).splitlines()
+    assert close == "31.2 dB PSNR against the dense scene (8 views, 1920 x 1080)"
+    assert drawn == "fill: 33.8 -> 12.1 Gaussians drawn per pixel"
     same = quality_of(dense, dense, sample_views(dense, 1, 64, 48))
-    assert str(same) == "no difference from the dense scene (1 view, 64 x 48)"
+    assert str(same).startswith("no difference from the dense scene (1 view, 64 x 48)\n")
+
+
+def test_fill_is_that_of_both_scenes_in_the_compared_views(dense):
+    views = sample_views(dense, 2, 64, 48)
+    found = quality_of(dense, dense[::3], views[1:])
+    assert (found.fill_before, found.fill) == (fill(dense, views[1:]), fill(dense[::3], views[1:]))
+    assert 0 < found.fill < found.fill_before
 
 
 def test_views_that_the_finish_of_merging_compared_are_left_out(dense):

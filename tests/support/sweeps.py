@@ -10,6 +10,7 @@ from PIL import Image
 from torch import Tensor
 
 import pointsplat_ns as ps
+from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.tradeoff.points import ImageMetrics, Point, Tradeoff, picture_path
@@ -97,6 +98,7 @@ def measured_room(
                 frame_ms_low=low,
                 frame_ms_high=high,
                 seconds=seconds,
+                fill=fill(small, views),
             )
         )
     return Tradeoff(
