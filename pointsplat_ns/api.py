@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pointsplat_ns.compacting import Source, compact_source, goal_of, log, prune_source, read_source
 from pointsplat_ns.compression.compact import Compacted
-from pointsplat_ns.compression.level_folder import check_folder
+from pointsplat_ns.compression.level_folder import check_level_folder
 from pointsplat_ns.compression.level_stream import Chunks, check_stream_folder
 from pointsplat_ns.compression.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
 from pointsplat_ns.compression.pictures import plot_views as draw_views
@@ -278,7 +278,7 @@ def lod(
     with ExitStack() as stack:
         if folder is not None:
             if stream is None:
-                check_folder(Path(folder), len(budgets), force)
+                check_level_folder(Path(folder), len(budgets), force)
             else:
                 check_stream_folder(Path(folder), force)
             stack.enter_context(claimed_folder(Path(folder)))

@@ -20,7 +20,7 @@ from pointsplat_ns.tables.cells import About, Cell
 from pointsplat_ns.tables.layout import Layout, Table, figure_medians, markdown_table
 from pointsplat_ns.tables.means import Group, SceneCells
 from pointsplat_ns.tables.outputs import medians, plot_figure
-from pointsplat_ns.tables.ways import OURS
+from pointsplat_ns.tables.ways import WAYS
 from pointsplat_ns.tradeoff.journal import restored_point
 
 ROOT = Path(__file__).parents[2]
@@ -60,7 +60,7 @@ def read(path: Path) -> list[Group]:
     Raises:
         SystemExit: if the file cannot be read or is none.
     """
-    left_out = {way.name for way in OURS}
+    left_out = {WAYS.merge.name, WAYS.compact.name}
     try:
         content = json.loads(path.read_text("utf-8"))
         cells = [_cell(values) for values in content["cells"] if values["way"] not in left_out]

@@ -31,7 +31,7 @@ def run_folder(
         PointSplatError: if a scene fails, after all the others.
     """
     import pointsplat_ns as ps
-    from pointsplat_ns.compression.scene_folder import TABLE_NAME
+    from pointsplat_ns.io.discovery import FOLDER_FILES
     from pointsplat_ns.system.processes import torchrun_rank
 
     for name, given in refused.items():
@@ -45,7 +45,7 @@ def run_folder(
         print_json({"output": output, "scenes": [asdict(result) for result in results]})
     else:
         _print_table(results)
-        print(f"{output}: {len(results) - failed} of {len(results)} scenes, and the table {TABLE_NAME}")
+        print(f"{output}: {len(results) - failed} of {len(results)} scenes, and the table {FOLDER_FILES.scenes_table}")
     if failed:
         raise ps.PointSplatError(f"{failed} of {len(results)} scenes failed; the same command tries them again")
 

@@ -72,7 +72,7 @@ def lod(
     """
     import pointsplat_ns as ps
     from pointsplat_ns.compression.level_stream import Chunks
-    from pointsplat_ns.io.discovery import LEVELS_NAME
+    from pointsplat_ns.io.discovery import FOLDER_FILES
     from pointsplat_ns.system.threads import fixed_threads
 
     need_one_scene(scene)
@@ -87,7 +87,7 @@ def lod(
     if json_output and stream:
         print_json({"output": folder, "levels": [level.facts(len(made.dense)) for level in made]})
     elif json_output:
-        print_json({"output": folder, **json.loads((folder / LEVELS_NAME).read_text("utf-8"))})
+        print_json({"output": folder, **json.loads((folder / FOLDER_FILES.levels).read_text("utf-8"))})
     else:
         _print_table(made, folder)
 

@@ -67,7 +67,7 @@ def tradeoff(
     import pointsplat_ns as ps
     from pointsplat_ns.system.threads import fixed_threads
     from pointsplat_ns.tradeoff.front import next_best
-    from pointsplat_ns.tradeoff.outputs import JSON
+    from pointsplat_ns.tradeoff.outputs import SWEEP_FILES
 
     check_poses(poses)
     folder = output or output_beside(scene, "tradeoff").with_suffix("")
@@ -78,7 +78,7 @@ def tradeoff(
             force=force, progress=True,
         )  # fmt: skip
     if json_output:
-        print_json({"output": folder, **json.loads((folder / JSON).read_text("utf-8"))})
+        print_json({"output": folder, **json.loads((folder / SWEEP_FILES.json).read_text("utf-8"))})
         return
     _print_table(found)
     for note in found.notes:

@@ -14,10 +14,8 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import content_hash, write_ply
-from pointsplat_ns.io.discovery import LEVELS_NAME
+from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.io.files import replacing, write_json
-
-PICTURE = "lod.png"
 
 
 def file_names(index: int) -> tuple[str, str]:
@@ -25,14 +23,18 @@ def file_names(index: int) -> tuple[str, str]:
     return f"level_{index}.ply", f"level_{index}_parents.npy"
 
 
-def check_folder(folder: Path, count: int, force: bool) -> None:
+def check_level_folder(folder: Path, count: int, force: bool) -> None:
     """Raise a SceneError, before the long computations, if ``count`` levels may not be written to a folder: it is a
     file or named like one, or holds a file that must not be overwritten."""
     if folder.suffix.lower() in (".ply", ".json", ".png"):
         raise SceneError(f"{folder}: levels are several files; expected the name of a folder")
     if folder.exists() and not folder.is_dir():
         raise SceneError(f"{folder}: is a file; expected the name of a folder")
-    for name in (LEVELS_NAME, PICTURE, *(name for index in range(count) for name in file_names(index))):
+    for name in (
+        FOLDER_FILES.levels,
+        FOLDER_FILES.levels_picture,
+        *(name for index in range(count) for name in file_names(index)),
+    ):
         if (folder / name).exists() and not force:
             raise SceneError(f"{folder / name}: exists already; name another folder, or overwrite it with --force")
 
@@ -59,17 +61,17 @@ def write_levels(
         force: whether existing files may be overwritten.
 
     Raises:
-        SceneError: if the folder cannot be used, see :func:`check_folder`, or a file cannot be written.
+        SceneError: if the folder cannot be used, see :func:`check_level_folder`, or a file cannot be written.
     """
     folder = Path(folder)
-    check_folder(folder, len(levels), force)
+    check_level_folder(folder, len(levels), force)
     rows = []
     with ExitStack() as stack:
 
         def part_of(name: str) -> Path:
             return stack.enter_context(replacing(folder / name))
 
-        manifest = part_of(LEVELS_NAME)  # entered first, left last
+        manifest = part_of(FOLDER_FILES.levels)  # entered first, left last
         for index, (scene, parents) in enumerate(levels):
             scene_name, parents_name = file_names(index)
             scene_part, parents_part = part_of(scene_name), part_of(parents_name)
@@ -79,9 +81,9 @@ def write_levels(
             parents_facts = _file_facts(parents_name, parents_part)
             rows.append({**_file_facts(scene_name, scene_part), "parents": parents_facts, **facts[index]})
         if images:
-            _draw(images, captions, part_of(PICTURE))
+            _draw(images, captions, part_of(FOLDER_FILES.levels_picture))
         write_json({"format": "pointsplat-lod", "version": 1, **about, "levels": rows}, manifest)
-        for name in (LEVELS_NAME, *(() if images else (PICTURE,))):
+        for name in (FOLDER_FILES.levels, *(() if images else (FOLDER_FILES.levels_picture,))):
             (folder / name).unlink(missing_ok=True)
 
 

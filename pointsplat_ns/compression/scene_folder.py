@@ -24,16 +24,14 @@ from pointsplat_ns.compression.scene_task import (
     remove_unfinished,
 )
 from pointsplat_ns.errors import DataError, SceneError
-from pointsplat_ns.io.discovery import RESULTS_NAME, find_scenes
+from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
 from pointsplat_ns.io.files import logger, read_text, replacing
 from pointsplat_ns.io.formats import format_like
 from pointsplat_ns.system.claims import claim
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.workers import in_processes, in_turn
 
-TABLE_NAME, LOCK_NAME = "scenes.csv", ".scenes.lock"
-
-FORMAT = "pointsplat-scenes"
+SCENES_FORMAT = "pointsplat-scenes"
 
 
 @dataclass(frozen=True)
@@ -88,7 +86,7 @@ class Command:
     @property
     def description(self) -> dict[str, object]:
         """The content of the file that describes the results of a folder."""
-        return {"format": FORMAT, "command": self.name, "options": dict(self.options)}
+        return {"format": SCENES_FORMAT, "command": self.name, "options": dict(self.options)}
 
 
 def run_on_folder(
@@ -184,11 +182,11 @@ def _clear(task: SceneTask) -> None:
 def _check_and_describe(output: Path, command: Command, force: bool) -> None:
     """Write the description of the results. Raises SceneError if the output is no folder, or holds results of another
     command or other options."""
-    path, description = output / RESULTS_NAME, command.description
+    path, description = output / FOLDER_FILES.scenes, command.description
     if output.exists() and not output.is_dir():
         raise SceneError(f"{output}: is a file; expected the name of a folder")
     try:
-        with claim(output / LOCK_NAME, wait=True):
+        with claim(output / FOLDER_FILES.scenes_lock, wait=True):
             known = _description(path)
             if known is not None and known != description and not force:
                 raise SceneError(
@@ -210,7 +208,11 @@ def _description(path: Path) -> dict | None:
         return None
     except (ValueError, RecursionError):
         known = None
-    if not isinstance(known, dict) or known.get("format") != FORMAT or not isinstance(known.get("options"), dict):
+    if (
+        not isinstance(known, dict)
+        or known.get("format") != SCENES_FORMAT
+        or not isinstance(known.get("options"), dict)
+    ):
         raise SceneError(f"{path}: damaged; remove it, or name another folder")
     return known
 
@@ -225,9 +227,12 @@ def _differences(known: Mapping, wanted: Mapping) -> str:
 
 def _write_table(output: Path, everything: Sequence[SceneTask], results: Mapping[str, SceneResult]) -> None:
     """Write the table of all scenes. Scenes of other shards are taken from their records."""
-    with claim(output / LOCK_NAME, wait=True):  # so the last process to write has read all records
+    with claim(output / FOLDER_FILES.scenes_lock, wait=True):  # so the last process to write has read all records
         rows = [results.get(task.name) or known_result(task) for task in everything]
-        with replacing(output / TABLE_NAME) as part, part.open("w", encoding="utf-8", newline="") as stream:
+        with (
+            replacing(output / FOLDER_FILES.scenes_table) as part,
+            part.open("w", encoding="utf-8", newline="") as stream,
+        ):
             writer = csv.DictWriter(stream, [field.name for field in dataclasses.fields(SceneResult)])
             writer.writeheader()
             writer.writerows(map(dataclasses.asdict, rows))

@@ -21,8 +21,23 @@ from pointsplat_ns.io.scene import is_folder_of_scenes, is_scene_file
 Supervision = Literal["auto", "photos", "dense"]
 """Training targets: a run's photos, or renders of the scene before it was pruned."""
 
-RESULTS_NAME, LEVELS_NAME, SWEEP_NAME = "pointsplat-scenes.json", "lod.json", "tradeoff.json"
-"""Files in folders that commands write: of results of many scenes, of levels, of a sweep."""
+
+@dataclass(frozen=True)
+class FolderFiles:
+    """Names of files in folders that commands write."""
+
+    scenes: str = "pointsplat-scenes.json"
+    """Command and options that all results in a folder of scenes have in common."""
+    scenes_table: str = "scenes.csv"
+    scenes_lock: str = ".scenes.lock"
+    levels: str = "lod.json"
+    """Manifest of levels of detail."""
+    levels_picture: str = "lod.png"
+    sweep: str = "tradeoff.json"
+    """Points of a sweep."""
+
+
+FOLDER_FILES = FolderFiles()
 
 
 @dataclass(frozen=True)
@@ -169,7 +184,7 @@ def _files_with_gaussians(root: Path, wanted: Callable[[str], bool]) -> list[Pat
     """
     paths = [root] if root.is_file() and wanted(root.name) else []
     for place, inner, files in os.walk(root):
-        results = {RESULTS_NAME, LEVELS_NAME, SWEEP_NAME}.intersection(files)
+        results = {FOLDER_FILES.scenes, FOLDER_FILES.levels, FOLDER_FILES.sweep}.intersection(files)
         if CONFIG_NAME in files or (results and Path(place) != root):
             inner.clear()
             continue

@@ -17,14 +17,14 @@ from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica
 from pointsplat_ns.system.progress import Progress, progress_bar
-from pointsplat_ns.tables.cells import CELLS
+from pointsplat_ns.tables.cells import TABLE_FILES
 from pointsplat_ns.tables.making import Refiners, Tools
 from pointsplat_ns.tables.means import Group
 from pointsplat_ns.tables.measuring import Measuring
-from pointsplat_ns.tables.outputs import OUTPUTS, write_tables
+from pointsplat_ns.tables.outputs import write_tables
 from pointsplat_ns.tables.scene import OpenedScene, TableOptions, TableScene
 from pointsplat_ns.tables.ways import PROTOCOL
-from pointsplat_ns.tradeoff.journal import check_folder
+from pointsplat_ns.tradeoff.journal import check_journal_folder
 from pointsplat_ns.tradeoff.judging import JudgedViews
 
 
@@ -98,14 +98,15 @@ def measure_tables(
         raise PointSplatError("no scene is named; expected Splatfacto runs, or files of scenes")
     opened = [_table_scene(Path(path)) for path in scenes]
     opened = _grouped(opened, groups)
-    check_folder(folder, f"*/{CELLS}", OUTPUTS, force, [folder / scene.name / CELLS for scene in opened])
+    journals = [folder / scene.name / TABLE_FILES.cells for scene in opened]
+    check_journal_folder(folder, f"*/{TABLE_FILES.cells}", TABLE_FILES.results, force, journals)
     tools = Tools(options, Refiners([Path(path) for path in refiners]), splat_transform)
     with progress_bar(progress) as report:
         measuring = Measuring(opened, folder, shares, tools, only, report)
         try:
             measuring.run()
         except (KeyboardInterrupt, SystemExit):
-            if any(folder.glob(f"*/{CELLS}")):
+            if any(folder.glob(f"*/{TABLE_FILES.cells}")):
                 write_tables(folder, shares, measuring.missing)
             raise
         return write_tables(folder, shares, measuring.missing)

@@ -19,9 +19,9 @@ from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
 from pointsplat_ns.system.progress import Progress, progress_bar
-from pointsplat_ns.tradeoff.journal import POINTS, check_folder
+from pointsplat_ns.tradeoff.journal import POINTS_NAME, check_journal_folder
 from pointsplat_ns.tradeoff.measuring import Subject
-from pointsplat_ns.tradeoff.outputs import OUTPUTS
+from pointsplat_ns.tradeoff.outputs import SWEEP_FILES
 from pointsplat_ns.tradeoff.points import Tradeoff
 from pointsplat_ns.tradeoff.sweep import Options, Sweep, removed_without_points
 from pointsplat_ns.tradeoff.targets import TargetSearch, targets_of
@@ -98,7 +98,8 @@ def measure_tradeoff(
     path, folder = Path(scene), Path(folder)
     with claimed_folder(folder), removed_without_points(folder), progress_bar(progress) as report:
         dense, given = (read_scene(path), None) if poses is None else read_posed(path, poses)
-        check_folder(folder, POINTS, OUTPUTS, force, [folder / name for name in (POINTS, *OUTPUTS)])
+        results = SWEEP_FILES.every
+        check_journal_folder(folder, POINTS_NAME, results, force, [folder / name for name in (POINTS_NAME, *results)])
         subject = subject_of(dense, path, given, resolution=size, up=upward)
         file = None if poses is None else Path(poses)
         subject = replace(subject, name=name_of(path), sha256=source_file(path).sha256, poses=file)

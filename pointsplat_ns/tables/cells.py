@@ -18,13 +18,31 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import one_line
 from pointsplat_ns.pruning.scores import log_volume
 from pointsplat_ns.tables.scene import TableOptions, TableScene
-from pointsplat_ns.tables.ways import FIGURE_4
+from pointsplat_ns.tables.ways import WAYS
 from pointsplat_ns.tradeoff.journal import Form, check_types, restored_point
 from pointsplat_ns.tradeoff.points import Point
 
-CELLS = "cells.json"
 
-FORM = Form("pointsplat-tables-cells", 2, "cells", "a scene's tables")
+@dataclass(frozen=True)
+class TableFiles:
+    """Names of files in the folder of all tables."""
+
+    cells: str = "cells.json"
+    """The journal of a scene, in a folder of the scene's own."""
+    markdown: str = "tables.md"
+    latex: str = "tables.tex"
+    json: str = "tables.json"
+    figure: str = "figure4.png"
+
+    @property
+    def results(self) -> tuple[str, ...]:
+        """All but the journals."""
+        return (self.markdown, self.latex, self.json, self.figure)
+
+
+TABLE_FILES = TableFiles()
+
+CELLS_FORM = Form("pointsplat-tables-cells", 2, "cells", "a scene's tables")
 
 
 @dataclass(frozen=True)
@@ -104,39 +122,39 @@ class CellJournal:
     SceneError if the scene's journal cannot be read."""
 
     def __init__(self, folder: Path, name: str):
-        self.path = folder / name / CELLS
+        self.path = folder / name / TABLE_FILES.cells
         self.about: About | None = None
         self.cells: dict[tuple[str, float], Cell] = {}
         """Cells by way and share."""
         self._of: dict[str, Any] = {}
         if self.path.exists():
-            self._of, cells = FORM.read(self.path, _cell)
+            self._of, cells = CELLS_FORM.read(self.path, _cell)
             self.about = _about(self._of, self.path)
             self.cells = {(cell.way, cell.point.share): cell for cell in cells}
 
     def check(self, wanted: Mapping[str, str | int]) -> None:
         """Raise a SceneError if existing cells are of another scene, other views or another machine than ``wanted``."""
         if self._of:
-            FORM.check(self.path, self._of, wanted)
+            CELLS_FORM.check(self.path, self._of, wanted)
 
     def add(self, cell: Cell, about: About, of: Mapping[str, str | int]) -> None:
         """Add a cell, or replace an older one, and write all cells, with facts on the scene for the reader and its
         identity."""
         self.about, self._of = about, {**of, **vars(about)}
         self.cells[(cell.way, cell.point.share)] = cell
-        FORM.write(self.path, self._of, list(self.cells.values()))
+        CELLS_FORM.write(self.path, self._of, list(self.cells.values()))
 
     def regroup(self, group: str) -> None:
         """Move a scene with cells to another group."""
         if self.about is not None and self.about.group != group:
             self.about = dataclasses.replace(self.about, group=group)
             self._of |= vars(self.about)
-            FORM.write(self.path, self._of, list(self.cells.values()))
+            CELLS_FORM.write(self.path, self._of, list(self.cells.values()))
 
 
 def distributions(scene: Gaussians, way: str, share: float) -> tuple[tuple[int, ...] | None, tuple[int, ...] | None]:
     """Numbers of Gaussians in the bins of opacity and of volume, for cells of Figure 4; else None twice."""
-    if (way, share) not in {(shown.name, kept) for shown, kept in FIGURE_4}:
+    if (way, share) not in {(shown.name, kept) for shown, kept in WAYS.figure_4}:
         return None, None
     usable = scene[scene.usable()]
     volumes = (log_volume(usable) / math.log(10)).clamp(*BINS.volume_span)

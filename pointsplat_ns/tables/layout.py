@@ -9,21 +9,7 @@ from dataclasses import dataclass
 
 from pointsplat_ns.io.files import three_digits
 from pointsplat_ns.tables.means import Group, Mean
-from pointsplat_ns.tables.ways import (
-    DENSE_WAY,
-    FIGURE_4,
-    IMAGE_DRIVEN,
-    OURS,
-    PEERS,
-    POINTSPLAT,
-    PROTOCOL,
-    TABLE_1,
-    TABLE_3,
-    TABLE_4,
-    Way,
-    cell_key,
-    published,
-)
+from pointsplat_ns.tables.ways import PROTOCOL, WAYS, Way, cell_key, published
 from pointsplat_ns.tradeoff.points import ImageMetrics
 
 NO_FIGURE = "-"
@@ -51,7 +37,7 @@ class Layout:
 
     def __init__(self, group: Group, shares: Sequence[float], missing: Mapping[str, str]):
         self.group, self.missing = group, missing
-        names = {way.name for way in TABLE_1} - {way.name for way in TABLE_4}  # Table 4 has other shares
+        names = {way.name for way in WAYS.table_1} - {way.name for way in WAYS.table_4}  # Table 4 has other shares
         measured = {share for scene in group.scenes for way, share in scene.cells if way in names}
         self.shares = sorted({*shares, *measured}, reverse=True)
 
@@ -60,14 +46,14 @@ class Layout:
         return [self._table_1(), self._table_2(), self._table_3(), self._table_4()]
 
     def _table_1(self) -> Table:
-        blocks = [[(DENSE_WAY, 1.0)], *([(way, share) for way in TABLE_1] for share in self.shares)]
+        blocks = [[(WAYS.dense, 1.0)], *([(way, share) for way in WAYS.table_1] for share in self.shares)]
         sections = [[((_percent(share), way.label), way, share) for way, share in block] for block in blocks]
         return self._of_quality(1, "What is left at a number of Gaussians", ("kept", "method"), sections)
 
     def _table_2(self) -> Table:
         header = ("kept", "method", "Gaussians", "frames a second", "MB", "scenes")
-        ways = (IMAGE_DRIVEN[1], IMAGE_DRIVEN[3], POINTSPLAT, *OURS, *PEERS)
-        blocks = [[(DENSE_WAY, 1.0)], *([(way, share) for way in ways] for share in self.shares)]
+        ways = WAYS.table_2
+        blocks = [[(WAYS.dense, 1.0)], *([(way, share) for way in ways] for share in self.shares)]
         sections = []
         for block in blocks:
             rows = []
@@ -87,7 +73,7 @@ class Layout:
         return Table(2, self._title("Efficiency"), header, tuple(sections), notes)
 
     def _table_3(self) -> Table:
-        rows = [((f"{weight:g}", way.label), way, PROTOCOL.ablation_share) for weight, way in TABLE_3]
+        rows = [((f"{weight:g}", way.label), way, PROTOCOL.ablation_share) for weight, way in WAYS.table_3]
         sections = [rows[i : i + 2] for i in range(0, len(rows), 2)]
         title = f"Lambda of the paper's score, {_percent(PROTOCOL.ablation_share)} kept"
         return self._of_quality(3, title, ("lambda", "method"), sections)
@@ -96,7 +82,7 @@ class Layout:
         branches = (("", "", ""), ("yes", "", ""), ("yes", "", "yes"), ("yes", "yes", ""), ("yes", "yes", "yes"))
         rows = [
             ((number, *used), way, PROTOCOL.ablation_share)
-            for number, used, way in zip(("I", "II", "III", "IV", "V"), branches, TABLE_4, strict=True)
+            for number, used, way in zip(("I", "II", "III", "IV", "V"), branches, WAYS.table_4, strict=True)
         ]
         first = ("model", "geometry", "appearance", "position")
         return self._of_quality(4, f"The dual-branch encoder, {_percent(PROTOCOL.ablation_share)} kept", first, [rows])
@@ -158,7 +144,7 @@ def figure_medians(group: Group, medians: Mapping[str, tuple[float, float]]) -> 
     """The medians of Figure 4, of opacity and of log10 of the volume by name of the way, as a table."""
     rows = tuple(
         (way.label, f"{medians[way.name][0]:.2f}", f"{medians[way.name][1]:.1f}")
-        for way, _ in FIGURE_4
+        for way, _ in WAYS.figure_4
         if way.name in medians
     )
     title = f"Medians of Figure 4: {group.name}, {_percent(PROTOCOL.figure_share)} kept"

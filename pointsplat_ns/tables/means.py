@@ -9,8 +9,8 @@ from pathlib import Path
 from statistics import fmean
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.tables.cells import CELLS, About, Cell, CellJournal
-from pointsplat_ns.tables.ways import DENSE_WAY, PROTOCOL
+from pointsplat_ns.tables.cells import TABLE_FILES, About, Cell, CellJournal
+from pointsplat_ns.tables.ways import PROTOCOL, WAYS
 from pointsplat_ns.tradeoff.machine import is_busy
 from pointsplat_ns.tradeoff.points import ImageMetrics, Point
 
@@ -25,7 +25,7 @@ class SceneCells:
 
     def loss(self, point: Point) -> float | None:
         """Loss of PSNR against photos from the dense scene to a point, dB; None where it is not known."""
-        dense = self.cells.get((DENSE_WAY.name, 1.0))
+        dense = self.cells.get((WAYS.dense.name, 1.0))
         if point.against_photos is None or dense is None or dense.point.against_photos is None:
             return None
         return dense.point.against_photos.psnr - point.against_photos.psnr
@@ -106,7 +106,7 @@ def read_groups(folder: Path) -> list[Group]:
     """All scenes below a folder of tables, in groups; the paper's datasets first, the others by name. Raises SceneError
     if a journal cannot be read, or there is none."""
     scenes: dict[str, list[SceneCells]] = {}
-    for path in sorted(folder.glob(f"*/{CELLS}")):
+    for path in sorted(folder.glob(f"*/{TABLE_FILES.cells}")):
         journal = CellJournal(folder, path.parent.name)
         if journal.about is None or journal.about.name != path.parent.name:
             raise SceneError(f"{path}: not the cells of {path.parent.name}; put its folder's name back, or remove it")

@@ -22,7 +22,7 @@ from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tables.cells import About, Cell, CellJournal, distributions, identity
 from pointsplat_ns.tables.making import Maker, Tools
 from pointsplat_ns.tables.scene import OpenedScene, TableScene
-from pointsplat_ns.tables.ways import PROTOCOL, Way, all_cells, cell_key
+from pointsplat_ns.tables.ways import PROTOCOL, WAYS, Way, cell_key
 from pointsplat_ns.tradeoff.judging import Judge, Judged
 from pointsplat_ns.tradeoff.machine import machine_text, one_at_a_time
 from pointsplat_ns.tradeoff.measuring import MadeScene, point_of
@@ -57,7 +57,7 @@ class Measuring:
         self._cells = [
             (work, way, share)
             for work in self._work
-            for way, share in all_cells(shares)
+            for way, share in WAYS.cells(shares)
             if not only or any(fnmatch.fnmatchcase(work.key(way, share), pattern) for pattern in only)
         ]
         if not self._cells:

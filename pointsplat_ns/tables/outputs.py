@@ -10,18 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pointsplat_ns.io.files import replacing, write_json
-from pointsplat_ns.tables.cells import BINS
+from pointsplat_ns.tables.cells import BINS, TABLE_FILES
 from pointsplat_ns.tables.layout import Layout, Table, figure_medians, latex_document, markdown_table, markdown_text
 from pointsplat_ns.tables.means import Group, read_groups
-from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_4, PROTOCOL, Way, published
+from pointsplat_ns.tables.ways import PROTOCOL, WAYS, Way, published
 from pointsplat_ns.tradeoff.machine import is_busy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-
-OUTPUTS = ("tables.md", "tables.tex", "tables.json", "figure4.png")
-"""Names of the written files."""
 
 READING = (
     "Figures are means over scenes. PSNR (dB), SSIM and LPIPS (AlexNet) are against held-out photos; those of "
@@ -42,13 +39,13 @@ def write_tables(folder: Path, shares: Sequence[float], missing: Mapping[str, st
     for group in groups:
         if found := medians(group):
             tables[group.name].append(figure_medians(group, found))
-    write_json(_content(groups, missing), folder / "tables.json")
-    with replacing(folder / "tables.md") as part:
+    write_json(_content(groups, missing), folder / TABLE_FILES.json)
+    with replacing(folder / TABLE_FILES.markdown) as part:
         part.write_text(_markdown(groups, tables), encoding="utf-8")
-    with replacing(folder / "tables.tex") as part:
+    with replacing(folder / TABLE_FILES.latex) as part:
         every = [table for members in tables.values() for table in members]
         part.write_text(latex_document(every, [READING.replace("\\", ""), *_notes(groups)]), encoding="utf-8")
-    plot_figure(groups, folder / "figure4.png")
+    plot_figure(groups, folder / TABLE_FILES.figure)
     return groups
 
 
@@ -58,7 +55,7 @@ def _markdown(groups: Sequence[Group], tables: Mapping[str, Sequence[Table]]) ->
         lines += [f"## {markdown_text(group.name)}", ""]
         lines += ["| scene | Gaussians | judged in | size |", "|---|---|---|---|"]
         for scene in group.scenes:
-            about, dense = scene.about, scene.cells.get((DENSE_WAY.name, 1.0))
+            about, dense = scene.about, scene.cells.get((WAYS.dense.name, 1.0))
             words = (
                 about.name,
                 "-" if dense is None else f"{dense.point.gaussians:,}",
@@ -67,7 +64,7 @@ def _markdown(groups: Sequence[Group], tables: Mapping[str, Sequence[Table]]) ->
             )
             lines.append("| " + " | ".join(map(markdown_text, words)) + " |")
         lines += ["", *(markdown_table(table) for table in tables[group.name])]
-    lines += ["![Figure 4](figure4.png)", "", "*Figure 4: opacity and volume of the Gaussians kept.*", ""]
+    lines += [f"![Figure 4]({TABLE_FILES.figure})", "", "*Figure 4: opacity and volume of the Gaussians kept.*", ""]
     return "\n".join(lines)
 
 
@@ -121,7 +118,7 @@ def medians(group: Group) -> dict[str, tuple[float, float]]:
     """Medians of opacity and of log10 of the volume (scene units cubed), by way, interpolated within bins. All scenes
     have the same weight. Ways without measurements are left out."""
     found = {}
-    for way, share in FIGURE_4:
+    for way, share in WAYS.figure_4:
         both = densities(group, way.name, share)
         if both is not None:
             found[way.name] = (_median(both[0], BINS.opacity_edges), _median(both[1], BINS.volume_edges))
@@ -145,7 +142,7 @@ def plot_figure(groups: Sequence[Group], path: Path) -> None:
 
     figure = Figure(figsize=(11, 3.6 * len(groups)), layout="constrained")
     for group, (left, right) in zip(groups, figure.subplots(len(groups), 2, squeeze=False), strict=True):
-        for way, share in FIGURE_4:
+        for way, share in WAYS.figure_4:
             both = densities(group, way.name, share)
             if both is not None:
                 _stairs(left, both[0], BINS.opacity_edges, way)
@@ -164,7 +161,7 @@ def plot_figure(groups: Sequence[Group], path: Path) -> None:
 
 def _extent(group: Group) -> tuple[float, float]:
     """Range of log10 of the volume over the bins with more than 0.1 % of the Gaussians."""
-    found = [both[1] for way, share in FIGURE_4 if (both := densities(group, way.name, share)) is not None]
+    found = [both[1] for way, share in WAYS.figure_4 if (both := densities(group, way.name, share)) is not None]
     filled: np.ndarray = np.flatnonzero(np.max(found, axis=0) > 1e-3) if found else np.empty(0, int)
     edges = BINS.volume_edges
     return (edges[filled[0]], edges[filled[-1] + 1]) if len(filled) else BINS.volume_span
@@ -172,7 +169,7 @@ def _extent(group: Group) -> tuple[float, float]:
 
 def _stairs(axis: Axes, shares: np.ndarray, edges: np.ndarray, way: Way) -> None:
     colors = {"lightgaussian": "tab:orange", "pup": "gray", "paper": "tab:blue", "merge": "tab:green", "dense": "black"}
-    style = "--" if way == DENSE_WAY else "-"
+    style = "--" if way == WAYS.dense else "-"
     axis.stairs(100 * shares, edges, color=colors[way.name], linestyle=style, label=way.label, linewidth=1.4)
 
 

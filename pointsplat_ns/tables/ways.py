@@ -78,97 +78,111 @@ class Way:
     """Index of splat-transform's mode; None for other ways."""
 
 
-DENSE_WAY = Way(DENSE, "3DGS (dense)")
+@dataclass(frozen=True)
+class Ways:
+    """All ways, and the rows that the tables have of them. A star in a label marks ways without fine-tuning."""
 
-IMAGE_DRIVEN = (
-    Way("lightgaussian", "LightGaussian*", "lightgaussian"),
-    Way("lightgaussian-tuned", "LightGaussian", "lightgaussian", fine_tuned=True),
-    Way("pup", "PUP-3DGS*", "pup"),
-    Way("pup-tuned", "PUP-3DGS", "pup", fine_tuned=True),
-)
-"""Methods that use images of the scene; a star marks methods without fine-tuning."""
+    dense: Way = Way(DENSE, "3DGS (dense)")
 
-PAPER = Way("paper", "PointSplat*", "paper")
-POINTSPLAT = Way("pointsplat", "PointSplat", "paper", network=Network())
+    # The paper's, by images of the scene.
+    lightgaussian: Way = Way("lightgaussian", "LightGaussian*", "lightgaussian")
+    lightgaussian_tuned: Way = Way("lightgaussian-tuned", "LightGaussian", "lightgaussian", fine_tuned=True)
+    pup: Way = Way("pup", "PUP-3DGS*", "pup")
+    pup_tuned: Way = Way("pup-tuned", "PUP-3DGS", "pup", fine_tuned=True)
 
-GEOMETRY_DRIVEN = (
-    # The paper does not say how the Gaussians of this row are selected; not by its own score, which "boosts" it.
-    Way("splatformer", "SplatFormer", "random", network=Network("concat", "random", None)),
-    PAPER,
-    Way("paper-splatformer", "PointSplat* + SplatFormer", "paper", network=Network("concat")),
-    POINTSPLAT,
-)
-"""Methods of the paper that use the Gaussians alone."""
+    # The paper's, by the Gaussians alone.
+    splatformer: Way = Way("splatformer", "SplatFormer", "random", network=Network("concat", "random", None))
+    """The paper does not say how the Gaussians of this row are selected; not by its own score, which "boosts" it."""
+    paper: Way = Way("paper", "PointSplat*", "paper")
+    paper_splatformer: Way = Way("paper-splatformer", "PointSplat* + SplatFormer", "paper", network=Network("concat"))
+    pointsplat: Way = Way("pointsplat", "PointSplat", "paper", network=Network())
 
-MERGE = Way("merge", "merge (our default)", "merge")
-OURS = (MERGE, Way("compact", "compact", "merge", repair="quick"))
-"""The defaults of ``pointsplat prune`` and ``pointsplat compact``."""
+    # The defaults of this package's commands.
+    merge: Way = Way("merge", "merge (our default)", "merge")
+    compact: Way = Way("compact", "compact", "merge", repair="quick")
 
-PEERS = (
-    Way("splat-transform", "splat-transform", mode=0),
-    Way("splat-transform-adaptive", "splat-transform, adaptive", mode=1),
-)
-"""The modes of another program."""
+    # The modes of another program.
+    splat_transform: Way = Way("splat-transform", "splat-transform", mode=0)
+    splat_transform_adaptive: Way = Way("splat-transform-adaptive", "splat-transform, adaptive", mode=1)
 
-TABLE_1 = (*IMAGE_DRIVEN, *GEOMETRY_DRIVEN, *OURS, *PEERS)
+    @property
+    def table_1(self) -> tuple[Way, ...]:
+        """The rows of Table 1 for each share; the dense scene stands above them."""
+        by_images = (self.lightgaussian, self.lightgaussian_tuned, self.pup, self.pup_tuned)
+        return (*by_images, *self._by_gaussians, *self._not_of_the_paper)
+
+    @property
+    def table_2(self) -> tuple[Way, ...]:
+        """The rows of Table 2 for each share."""
+        return (self.lightgaussian_tuned, self.pup_tuned, self.pointsplat, *self._not_of_the_paper)
+
+    @property
+    def table_3(self) -> tuple[tuple[float, Way], ...]:
+        """Lambda and way of each row of Table 3."""
+        weights = PROTOCOL.opacity_weights
+        return tuple((weight, way(weight)) for weight in weights for way in (self.selected, self.refined))
+
+    @property
+    def table_4(self) -> tuple[Way, ...]:
+        """Rows I to V of Table 4."""
+        parts = {"ii": (False, False), "iii": (False, True), "iv": (True, False)}
+        ablated = (
+            Way(f"pointsplat-{row}", row.upper(), "paper", network=Network(use_appearance=first, use_position=second))
+            for row, (first, second) in parts.items()
+        )
+        return (self.paper, *ablated, self.pointsplat)
+
+    @property
+    def figure_4(self) -> tuple[tuple[Way, float], ...]:
+        """Ways and shares in Figure 4: the dense scene, the paper's three, and the default of this package."""
+        smaller = (self.lightgaussian, self.pup, self.paper, self.merge)
+        return ((self.dense, 1.0), *((way, PROTOCOL.figure_share) for way in smaller))
+
+    def selected(self, weight: float) -> Way:
+        """The paper's selection at a lambda."""
+        if weight == DEFAULT_OPACITY_WEIGHT:
+            return self.paper
+        return Way(f"paper-{weight:g}", self.paper.label, "paper", weight)
+
+    def refined(self, weight: float) -> Way:
+        """The paper's selection at a lambda, refined."""
+        if weight == DEFAULT_OPACITY_WEIGHT:
+            return self.pointsplat
+        network = Network(opacity_weight=weight)
+        return Way(f"pointsplat-{weight:g}", self.pointsplat.label, "paper", weight, network=network)
+
+    def cells(self, shares: Sequence[float]) -> list[tuple[Way, float]]:
+        """Every way and share of all tables, those of Table 1 given, each once, in the order of measurement: quick ones
+        first."""
+        ablations = dict.fromkeys([*(way for _, way in self.table_3), *self.table_4])
+        cells = [(self.dense, 1.0), *((way, PROTOCOL.ablation_share) for way in ablations)]
+        quick = (*self._by_gaussians, self.merge, self.compact)
+        cells += [(way, share) for way in dict.fromkeys([*quick, *self.table_1]) for share in shares]
+        return list(dict.fromkeys(cells))
+
+    @property
+    def _by_gaussians(self) -> tuple[Way, ...]:
+        return (self.splatformer, self.paper, self.paper_splatformer, self.pointsplat)
+
+    @property
+    def _not_of_the_paper(self) -> tuple[Way, ...]:
+        return (self.merge, self.compact, self.splat_transform, self.splat_transform_adaptive)
 
 
-def selected(weight: float) -> Way:
-    """The paper's selection at a lambda."""
-    return PAPER if weight == DEFAULT_OPACITY_WEIGHT else Way(f"paper-{weight:g}", PAPER.label, "paper", weight)
-
-
-def refined(weight: float) -> Way:
-    """The paper's selection at a lambda, refined."""
-    if weight == DEFAULT_OPACITY_WEIGHT:
-        return POINTSPLAT
-    network = Network(opacity_weight=weight)
-    return Way(f"pointsplat-{weight:g}", POINTSPLAT.label, "paper", weight, network=network)
-
-
-TABLE_3 = tuple((weight, way(weight)) for weight in PROTOCOL.opacity_weights for way in (selected, refined))
-
-
-def _ablated(name: str, label: str, appearance: bool, position: bool) -> Way:
-    return Way(name, label, "paper", network=Network(use_appearance=appearance, use_position=position))
-
-
-TABLE_4 = (
-    PAPER,
-    _ablated("pointsplat-ii", "II", False, False),
-    _ablated("pointsplat-iii", "III", False, True),
-    _ablated("pointsplat-iv", "IV", True, False),
-    POINTSPLAT,
-)
-"""Rows I to V."""
-
-FIGURE_4 = (
-    (DENSE_WAY, 1.0),
-    *((way, PROTOCOL.figure_share) for way in (IMAGE_DRIVEN[0], IMAGE_DRIVEN[2], PAPER, MERGE)),
-)
-"""Ways and shares in Figure 4: the dense scene, the paper's three, and the default of this package."""
-
-
-def all_cells(shares: Sequence[float]) -> list[tuple[Way, float]]:
-    """Every way and share of all tables, those of Table 1 given, each once, in the order of measurement: quick ones
-    first."""
-    ablations = dict.fromkeys([*(way for _, way in TABLE_3), *TABLE_4])
-    cells = [(DENSE_WAY, 1.0), *((way, PROTOCOL.ablation_share) for way in ablations)]
-    cells += [(way, share) for way in (*GEOMETRY_DRIVEN, *OURS, *IMAGE_DRIVEN, *PEERS) for share in shares]
-    return list(dict.fromkeys(cells))
+WAYS = Ways()
 
 
 def cell_key(scene: str, way: Way, share: float) -> str:
     """The key of a cell.
 
     Example:
-        >>> cell_key("fox", MERGE, 0.1)
+        >>> cell_key("fox", WAYS.merge, 0.1)
         'fox/merge/10%'
     """
     return f"{scene}/{way.name}/{100 * share:g}%"
 
 
-_TABLES: dict[int, dict[tuple[str, float], tuple[float, ...]]] = {
+_PUBLISHED: dict[int, dict[tuple[str, float], tuple[float, ...]]] = {
     1: {
         ("dense", 1.0): (29.73, 0.925, 0.165, 39.40, 0.974, 0.122),
         ("lightgaussian", 0.5): (28.19, 0.913, 0.188, 32.33, 0.957, 0.143),
@@ -227,6 +241,6 @@ def published(table: int, dataset: str, way: str, share: float) -> ImageMetrics 
         >>> published(1, "Replica", "pointsplat", 0.1)
         ImageMetrics(psnr=29.81, ssim=0.902, lpips=0.276)
     """
-    figures = _TABLES[table].get((way, share), ())
+    figures = _PUBLISHED[table].get((way, share), ())
     found = {"ScanNet++": figures[:3], "Replica": figures[3:]}.get(dataset)
     return ImageMetrics(*found) if found else None

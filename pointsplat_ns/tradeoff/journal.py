@@ -26,9 +26,6 @@ Identity = Mapping[str, str | int]
 
 Record = TypeVar("Record")
 
-MOST_BYTES = 16_000_000
-"""Largest size of a journal, bytes; a thousand points take one megabyte."""
-
 
 @dataclass(frozen=True)
 class Form:
@@ -40,6 +37,8 @@ class Form:
     """Name of the list of records, in the plural."""
     of: str
     """Name of the whole, in the singular."""
+    most_bytes: int = 16_000_000
+    """Largest size of a file; a thousand points take one megabyte."""
 
     def write(self, path: Path, identity: Identity, records: Sequence[DataclassInstance]) -> None:
         """Write all records."""
@@ -52,7 +51,7 @@ class Form:
         result of :func:`dataclasses.asdict`; see :func:`check_types`. Raises SceneError if the file is not such a
         journal, or damaged."""
         try:
-            content = json.loads(read_text(path, MOST_BYTES))
+            content = json.loads(read_text(path, self.most_bytes))
             if content["format"] != self.name:
                 raise ValueError(f"of format {content['format']}")
             if content["version"] != self.version:
@@ -74,7 +73,9 @@ class Form:
                 )
 
 
-def check_folder(folder: Path, records: str, outputs: Sequence[str], force: bool, older: Sequence[Path]) -> None:
+def check_journal_folder(
+    folder: Path, records: str, outputs: Sequence[str], force: bool, older: Sequence[Path]
+) -> None:
     """Check, before the long computations, that results may be written to a folder.
 
     Args:
@@ -101,7 +102,7 @@ def check_folder(folder: Path, records: str, outputs: Sequence[str], force: bool
                 )
 
 
-POINTS = "points.json"
+POINTS_NAME = "points.json"
 
 POINTS_FORM = Form("pointsplat-tradeoff-points", 3, "points", "a sweep")
 """Points of version 1 were timed without the dense scene beside them, some of version 2 drawn in other qualities."""
@@ -112,7 +113,7 @@ class Journal:
     SceneError if the folder holds points of another identity, or a file of points that cannot be read."""
 
     def __init__(self, folder: Path, identity: Identity):
-        self.path, self._identity = folder / POINTS, dict(identity)
+        self.path, self._identity = folder / POINTS_NAME, dict(identity)
         self.dense: Point | None = None
         self.points: dict[Setting, Point] = {}
         if self.path.exists():

@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -14,11 +15,18 @@ import torch
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.system.threads import cores
 
-LOCK = "pointsplat-measuring.lock"
-"""Name of the lock's file, in the folder for temporary files."""
 
-LOCK_PAUSE = 0.2
-"""Pause after a measurement in seconds, so that waiting processes, which poll every 0.05 s, can take the lock."""
+@dataclass(frozen=True)
+class MeasuringLock:
+    """The lock that measurements on this machine take in turn."""
+
+    name: str = "pointsplat-measuring.lock"
+    """Name of its file in the folder for temporary files, or a path."""
+    pause: float = 0.2
+    """Pause after a measurement in seconds, so that waiting processes, which poll every 0.05 s, can take the lock."""
+
+
+LOCK = MeasuringLock()
 
 
 def machine_text(device: torch.device) -> str:
@@ -44,7 +52,7 @@ def one_at_a_time(progress: Progress) -> Iterator[bool]:
     ``progress`` is told. Yields whether the lock was taken: its file may belong to another user."""
     from filelock import FileLock, Timeout
 
-    lock = FileLock(Path(tempfile.gettempdir()) / LOCK, mode=0o666)
+    lock = FileLock(Path(tempfile.gettempdir()) / LOCK.name, mode=0o666)
     try:
         lock.acquire(timeout=0)
     except Timeout:
@@ -57,7 +65,7 @@ def one_at_a_time(progress: Progress) -> Iterator[bool]:
         yield True
     finally:
         lock.release()
-        time.sleep(LOCK_PAUSE)
+        time.sleep(LOCK.pause)
 
 
 class OtherPrograms:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pointsplat_ns.io.discovery import SWEEP_NAME
+from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.io.files import replacing, write_json
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.tradeoff.front import Cost, Reference, pareto_front, quality_of
@@ -17,15 +18,27 @@ from pointsplat_ns.tradeoff.settings import DENSE
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-TABLE, JSON, PAGE = "tradeoff.csv", SWEEP_NAME, "tradeoff.html"
-PLOTS: dict[Cost, str] = {
-    "frame_ms": "tradeoff_ms.png",
-    "bytes": "tradeoff_mb.png",
-    "gaussians": "tradeoff_count.png",
-}
-"""Names of the plots by cost, the horizontal axis."""
 
-OUTPUTS = (TABLE, JSON, PAGE, *PLOTS.values())
+@dataclass(frozen=True)
+class SweepFiles:
+    """Names of the results of a sweep in its folder, beside its journal and its pictures."""
+
+    table: str = "tradeoff.csv"
+    json: str = FOLDER_FILES.sweep
+    page: str = "tradeoff.html"
+
+    @property
+    def plots(self) -> dict[Cost, str]:
+        """The plots by cost, the horizontal axis."""
+        return {"frame_ms": "tradeoff_ms.png", "bytes": "tradeoff_mb.png", "gaussians": "tradeoff_count.png"}
+
+    @property
+    def every(self) -> tuple[str, ...]:
+        """All results, in the order of writing."""
+        return (self.table, self.json, self.page, *self.plots.values())
+
+
+SWEEP_FILES = SweepFiles()
 
 
 def write_outputs(sweep: Tradeoff, folder: Path, progress: Progress = silent) -> None:
@@ -35,15 +48,15 @@ def write_outputs(sweep: Tradeoff, folder: Path, progress: Progress = silent) ->
 
     dense = sweep.points[0]
     points = [{**dataclasses.asdict(point), "speed": speed_of(point, dense)._asdict()} for point in sweep.points]
-    write_json({**dataclasses.asdict(sweep), "points": points}, folder / JSON)
+    write_json({**dataclasses.asdict(sweep), "points": points}, folder / SWEEP_FILES.json)
     rows = [_row(point, dense) for point in sweep.points]
-    with replacing(folder / TABLE) as part, part.open("w", encoding="utf-8", newline="") as stream:
+    with replacing(folder / SWEEP_FILES.table) as part, part.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    for cost, name in PLOTS.items():
+    for cost, name in SWEEP_FILES.plots.items():
         plot(sweep, cost, folder / name)
-    write_page(sweep, folder, folder / PAGE, progress)
+    write_page(sweep, folder, folder / SWEEP_FILES.page, progress)
 
 
 def _row(point: Point, dense: Point) -> dict[str, object]:

@@ -20,10 +20,10 @@ from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pruning import method_named
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.front import recommend
-from pointsplat_ns.tradeoff.journal import POINTS, Journal
+from pointsplat_ns.tradeoff.journal import POINTS_NAME, Journal
 from pointsplat_ns.tradeoff.machine import busy_note, machine_text
 from pointsplat_ns.tradeoff.measuring import Measurer, Subject
-from pointsplat_ns.tradeoff.outputs import OUTPUTS, write_outputs
+from pointsplat_ns.tradeoff.outputs import SWEEP_FILES, write_outputs
 from pointsplat_ns.tradeoff.page import keep_flight
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, picture_path, speed_of
 from pointsplat_ns.tradeoff.settings import DENSE, REPAIRS, Setting, check_repairs
@@ -72,7 +72,7 @@ def removed_without_points(folder: Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        if not (folder / POINTS).exists():
+        if not (folder / POINTS_NAME).exists():
             for place in places:
                 for path in {*place.glob("*")} - before:
                     path.unlink()
@@ -142,7 +142,7 @@ class Sweep:
         if setting not in self.journal.points:
             point = self.measurer.measure(setting, self._shower(1 + len(self.journal.points), of))
             self._take(point, self.scene(setting))
-            if not (self.folder / OUTPUTS[0]).exists():  # the first useful results, early
+            if not (self.folder / SWEEP_FILES.table).exists():  # the first useful results, early
                 write_outputs(self.result(), self.folder)
         return self.journal.points[setting]
 

@@ -159,7 +159,7 @@ def hangs(number, frame):
 def quick(monkeypatch, tmp_path):
     """The viewer ends at once, and no other program on this machine is waited for."""
     monkeypatch.setattr(Viewer, "wait", lambda self: None)
-    monkeypatch.setattr(machine, "LOCK", str(tmp_path / "lock"))
+    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
     before = signal.signal(signal.SIGALRM, hangs)
     yield
     signal.signal(signal.SIGALRM, before)

@@ -10,7 +10,7 @@ from making import box_room
 from pointsplat_ns.cli import main
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.tables.cells import CELLS
+from pointsplat_ns.tables.cells import TABLE_FILES
 from pointsplat_ns.tradeoff import machine
 
 FEW = ("--only", "room/dense/*", "room/paper*/*", "--views", "2")
@@ -25,7 +25,7 @@ def views() -> ps.Views:
 def ply(tmp_path, views, no_lpips, monkeypatch) -> Path:
     """A room of 400 Gaussians, looked at from three views."""
     monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, **options: views[:count])
-    monkeypatch.setattr(machine, "LOCK", str(tmp_path / "lock"))
+    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
     ps.save(box_room(0, 400), tmp_path / "room.ply")
     return tmp_path / "room.ply"
 
@@ -55,7 +55,7 @@ def test_a_cells_command_measures_it_again(ply, tmp_path, capsys, monkeypatch):
 
 
 def test_damaged_cells_and_unknown_names_are_one_line(ply, tmp_path, capsys):
-    journal = tmp_path / "tables" / "room" / CELLS
+    journal = tmp_path / "tables" / "room" / TABLE_FILES.cells
     journal.parent.mkdir(parents=True)
     journal.write_text('{"format": "pointsplat-tables-cells", "version": 2, "cells": [{}]}')
     for words, expected in (

@@ -32,7 +32,7 @@ def ply(tmp_path, views, plain_page, no_lpips, monkeypatch) -> Path:
     monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, **options: views[:count])
     monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
     monkeypatch.setattr(judging, "_timed", lambda scene, view: 1e-5 * len(scene))
-    monkeypatch.setattr(machine, "LOCK", str(tmp_path / "lock"))
+    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     ps.save(box_room(0, 400), tmp_path / "room.ply")
     return tmp_path / "room.ply"

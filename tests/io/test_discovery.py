@@ -5,7 +5,7 @@ import pytest
 from making import cloud
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import find_runs, read_scene, write_ply
-from pointsplat_ns.io.discovery import RESULTS_NAME, find_scenes
+from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
 from pointsplat_ns.io.scene import is_folder_of_scenes, save
 
 POINTS = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
@@ -19,7 +19,7 @@ def test_files_and_the_newest_run_of_each_experiment_are_scenes_and_nothing_else
     write_ply(cloud(3), newest / "compact.ply")  # in the folder of a run
     for name in ("hall.ply", "deep/er/HALL.PLY", "kitchen.ply", ".hidden/x.ply", "made/y.ply"):
         write_ply(cloud(3), folder / name)
-    (folder / "made" / RESULTS_NAME).touch()
+    (folder / "made" / FOLDER_FILES.scenes).touch()
     (folder / "points.ply").write_bytes(POINTS)
     (folder / "notes.txt").touch()
     found = {scene.name: scene.path for scene in find_scenes(folder)}

@@ -44,7 +44,7 @@ def test_a_run_that_is_none_has_no_photos(tmp_path):
 
 
 def test_a_run_is_measured_against_its_held_out_photos(run, tmp_path, plain_page, no_lpips, monkeypatch):
-    monkeypatch.setattr(machine, "LOCK", str(tmp_path / "lock"))
+    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
     monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
     found = ps.measure_tradeoff(run, tmp_path / "trade", points=2, repairs=("none",))
     dense, small = found.points

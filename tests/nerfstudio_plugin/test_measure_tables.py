@@ -15,7 +15,7 @@ from pointsplat_ns.tradeoff import machine
 
 
 def test_a_run_is_judged_by_its_held_out_photos_and_tuned_on_the_others(trained_walls, tmp_path, no_lpips, monkeypatch):
-    monkeypatch.setattr(machine, "LOCK", str(tmp_path / "lock"))
+    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
     monkeypatch.setattr(outputs, "plot_figure", lambda groups, path: path.write_text("a figure"))
     (config,) = (trained_walls / "wall-b").rglob("config.yml")
     only = ["wall-b/dense/*", "wall-b/lightgaussian/50%", "wall-b/lightgaussian-tuned/50%"]

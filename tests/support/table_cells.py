@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 from pointsplat_ns.tables.cells import BINS, About, Cell, CellJournal
-from pointsplat_ns.tables.ways import DENSE_WAY, FIGURE_4, Way, all_cells, cell_key
+from pointsplat_ns.tables.ways import WAYS, Way, cell_key
 from pointsplat_ns.tradeoff.points import ImageMetrics, Point
 
 IDENTITY = {"file": "abc", "machine": "a machine", "most views": 3}
@@ -17,7 +17,7 @@ def about(name: str, group: str = "scenes", dataset: str = "") -> About:
 
 def cell(name: str, way: Way, share: float, psnr: float, photos: float | None) -> Cell:
     """A cell of a scene of 1,000 Gaussians, of a PSNR against renders and, if there are any, photos."""
-    shown = (way, share) in FIGURE_4
+    shown = (way, share) in WAYS.figure_4
     middle = (*(0 for _ in range(9)), 7)
     point = Point(
         key=cell_key(name, way, share),
@@ -61,8 +61,8 @@ def write_scene(
         without: names of ways that were not measured.
     """
     journal = CellJournal(folder, name)
-    for number, (way, share) in enumerate(all_cells((0.3, 0.1))):
-        dense = way == DENSE_WAY
+    for number, (way, share) in enumerate(WAYS.cells((0.3, 0.1))):
+        dense = way == WAYS.dense
         lost = 0.0 if dense else 1 + worse + 0.1 * number
         against = 30.0 - lost if photos else None
         if way.name not in without:

@@ -15,8 +15,8 @@ from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.refiner import Refiner, preset
 from pointsplat_ns.refiner.weights import save_refiner
-from pointsplat_ns.tables import measuring, outputs
-from pointsplat_ns.tables.ways import all_cells
+from pointsplat_ns.tables import outputs
+from pointsplat_ns.tables.ways import Ways
 from pointsplat_ns.tradeoff import machine
 
 
@@ -54,8 +54,7 @@ def room(tmp_path, room_views, no_lpips, monkeypatch) -> Path:
     """A closed box of 400 Gaussians as a file, looked at from three views; repairs take two steps, figures are
     none. Tests wait neither for one another nor for anything else on this machine."""
     monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, *_, **options: room_views[:count])
-    monkeypatch.setattr(machine, "LOCK", str(tmp_path / "lock"))
-    monkeypatch.setattr(machine, "LOCK_PAUSE", 0.0)
+    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
     monkeypatch.setattr(outputs, "plot_figure", lambda groups, path: path.write_text("a figure"))
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     ps.save(box_room(0, 400), tmp_path / "room.ply")
@@ -77,6 +76,5 @@ def measured(room, tmp_path) -> Callable[..., list]:
 def few_ways(monkeypatch) -> None:
     """Tables that have no more than the dense scene, the paper's selection at its lambda, and LightGaussian."""
     few = ("dense", "paper", "lightgaussian", "lightgaussian-tuned")
-    monkeypatch.setattr(
-        measuring, "all_cells", lambda shares: [cell for cell in all_cells(shares) if cell[0].name in few]
-    )
+    every = Ways.cells
+    monkeypatch.setattr(Ways, "cells", lambda ways, shares: [c for c in every(ways, shares) if c[0].name in few])

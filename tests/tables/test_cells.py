@@ -9,9 +9,9 @@ import torch
 
 from making import ball
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.tables.cells import BINS, CELLS, CellJournal, distributions
+from pointsplat_ns.tables.cells import BINS, TABLE_FILES, CellJournal, distributions
 from pointsplat_ns.tables.means import read_groups
-from pointsplat_ns.tables.ways import DENSE_WAY, MERGE
+from pointsplat_ns.tables.ways import WAYS
 from table_cells import IDENTITY, about, cell, write_scene
 
 
@@ -19,8 +19,8 @@ from table_cells import IDENTITY, about, cell, write_scene
 def written(tmp_path):
     """A folder with two cells of a fox."""
     journal = CellJournal(tmp_path, "fox")
-    journal.add(cell("fox", DENSE_WAY, 1.0, math.inf, 30.0), about("fox"), IDENTITY)
-    journal.add(cell("fox", MERGE, 0.1, 31.25, 27.5), about("fox"), IDENTITY)
+    journal.add(cell("fox", WAYS.dense, 1.0, math.inf, 30.0), about("fox"), IDENTITY)
+    journal.add(cell("fox", WAYS.merge, 0.1, 31.25, 27.5), about("fox"), IDENTITY)
     return tmp_path
 
 
@@ -28,20 +28,22 @@ def test_cells_are_read_back_as_they_were(written):
     again = CellJournal(written, "fox")
     assert again.about == about("fox")
     assert again.cells == {
-        ("dense", 1.0): cell("fox", DENSE_WAY, 1.0, math.inf, 30.0),
-        ("merge", 0.1): cell("fox", MERGE, 0.1, 31.25, 27.5),
+        ("dense", 1.0): cell("fox", WAYS.dense, 1.0, math.inf, 30.0),
+        ("merge", 0.1): cell("fox", WAYS.merge, 0.1, 31.25, 27.5),
     }
 
 
 def test_a_cell_measured_again_takes_the_place_of_the_older_one(written):
-    newer = cell("fox", MERGE, 0.1, 32.0, 28.0)
+    newer = cell("fox", WAYS.merge, 0.1, 32.0, 28.0)
     CellJournal(written, "fox").add(newer, about("fox"), IDENTITY)
     assert CellJournal(written, "fox").cells["merge", 0.1] == newer
 
 
 @pytest.mark.parametrize("name, value", [("file", "abd"), ("most views", 4), ("machine", "another")])
 def test_cells_of_something_else_are_refused(written, name, value):
-    with pytest.raises(SceneError, match=rf"fox.{CELLS}: its cells are of another scene's tables \({name}: .*--force"):
+    with pytest.raises(
+        SceneError, match=rf"fox.{TABLE_FILES.cells}: its cells are of another scene's tables \({name}: .*--force"
+    ):
         CellJournal(written, "fox").check({**IDENTITY, name: value})
 
 
@@ -87,12 +89,12 @@ def set_point(**changes):
     ],
 )
 def test_cells_that_are_none_are_refused(written, change):
-    path = written / "fox" / CELLS
+    path = written / "fox" / TABLE_FILES.cells
     content = json.loads(path.read_text())
     if not isinstance(change, str):
         change(content)
     path.write_text(change if isinstance(change, str) else json.dumps(content))
-    with pytest.raises(SceneError, match=f"{CELLS}: not the cells of a scene's tables .*--force"):
+    with pytest.raises(SceneError, match=f"{TABLE_FILES.cells}: not the cells of a scene's tables .*--force"):
         CellJournal(written, "fox")
 
 

@@ -9,8 +9,8 @@ import pointsplat_ns as ps
 from making import box_room
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.looking.closeness import DenseReference
-from pointsplat_ns.tables.cells import CELLS
-from pointsplat_ns.tables.ways import FIGURE_4, Network, all_cells
+from pointsplat_ns.tables.cells import TABLE_FILES
+from pointsplat_ns.tables.ways import WAYS, Network
 from pointsplat_ns.tradeoff.judging import Judge
 
 
@@ -27,7 +27,7 @@ def qualities(group) -> dict:
 @pytest.fixture()
 def all_weights(weights):
     """Weights for every row."""
-    wanted = {way.network for way, _ in all_cells((0.3,)) if way.network}
+    wanted = {way.network for way, _ in WAYS.cells((0.3,)) if way.network}
     return [
         weights(
             f"{network.encoder}-{network.by}-{network.opacity_weight}-{network.use_appearance:d}{network.use_position:d}",
@@ -43,14 +43,14 @@ def all_weights(weights):
 def test_every_cell_can_be_measured_and_says_by_what(measured, all_weights, peer, tmp_path):
     [group] = measured(refiners=all_weights, splat_transform=peer())
     cells = cells_of(group)
-    assert [*cells] == [(way.name, share) for way, share in all_cells((0.3,))]
+    assert [*cells] == [(way.name, share) for way, share in WAYS.cells((0.3,))]
     dense = cells["dense", 1.0].point
     for (way, share), cell in cells.items():
         assert cell.point.gaussians == round(400 * share) and cell.point.key == f"room/{way}/{100 * share:g}%"
         assert cell.point.command.startswith("pointsplat tables ") and f"--only {cell.point.key}" in cell.point.command
         assert cell.version == ps.__version__ and cell.seed == 0
         assert cell.point.against_photos is None and (cell.point.against_dense.psnr < 100 or cell.point == dense)
-        assert (cell.opacities is not None) == ((way, share) in {(shown.name, kept) for shown, kept in FIGURE_4})
+        assert (cell.opacities is not None) == ((way, share) in {(shown.name, kept) for shown, kept in WAYS.figure_4})
     psnr = {way: cell.point.against_dense.psnr for (way, share), cell in cells.items() if share == 0.3}
     assert psnr["lightgaussian-tuned"] != psnr["lightgaussian"] and psnr["pointsplat"] != psnr["paper"]
     assert psnr["splat-transform"] != psnr["splat-transform-adaptive"]
@@ -126,7 +126,7 @@ def test_an_interrupted_run_goes_on_and_loses_nothing(measured, few_ways, tmp_pa
         patch.setattr(Judge, "judge", interrupted)
         with pytest.raises(KeyboardInterrupt):
             measured()
-    journal = tmp_path / "tables" / "room" / CELLS
+    journal = tmp_path / "tables" / "room" / TABLE_FILES.cells
     before = json.loads(journal.read_text())["cells"]
     assert (
         [cell["point"]["key"] for cell in before]

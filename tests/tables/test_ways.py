@@ -6,20 +6,10 @@ import pytest
 
 from pointsplat_ns.pruning import METHODS
 from pointsplat_ns.tables import ways
-from pointsplat_ns.tables.ways import (
-    PROTOCOL,
-    TABLE_1,
-    TABLE_3,
-    TABLE_4,
-    Network,
-    all_cells,
-    cell_key,
-    published,
-    selected,
-)
+from pointsplat_ns.tables.ways import PROTOCOL, WAYS, Network, cell_key, published
 from pointsplat_ns.tradeoff.points import ImageMetrics
 
-CELLS = all_cells(PROTOCOL.shares)
+CELLS = WAYS.cells(PROTOCOL.shares)
 
 
 def test_no_two_cells_have_one_name_and_a_shell_reads_each_as_it_is():
@@ -30,8 +20,8 @@ def test_no_two_cells_have_one_name_and_a_shell_reads_each_as_it_is():
 
 def test_every_row_has_a_cell():
     cells = {(way.name, share) for way, share in CELLS}
-    assert {(way.name, share) for way in TABLE_1 for share in PROTOCOL.shares} <= cells
-    assert {(way.name, 0.1) for way in (*TABLE_4, *(way for _, way in TABLE_3))} <= cells
+    assert {(way.name, share) for way in WAYS.table_1 for share in PROTOCOL.shares} <= cells
+    assert {(way.name, 0.1) for way in (*WAYS.table_4, *(way for _, way in WAYS.table_3))} <= cells
 
 
 def test_every_row_is_made_in_exactly_one_way():
@@ -48,14 +38,14 @@ def test_networks_are_told_apart_by_all_that_tables_vary():
 
 
 def test_the_middle_lambda_is_the_row_of_table_1():
-    assert selected(0.3) in TABLE_1 and selected(0.5) not in TABLE_1
+    assert WAYS.selected(0.3) in WAYS.table_1 and WAYS.selected(0.5) not in WAYS.table_1
 
 
 def test_every_figure_of_the_paper_has_a_row():
     cells = {(way.name, share) for way, share in CELLS}
-    assert {*ways._TABLES[1]} <= cells and {*ways._TABLES[3]} <= cells
-    assert [way.name for way in TABLE_4] == [name for name, _ in ways._TABLES[4]]
-    assert len(ways._TABLES[1]) == 1 + 8 * 3 and len(ways._TABLES[3]) == 10
+    assert {*ways._PUBLISHED[1]} <= cells and {*ways._PUBLISHED[3]} <= cells
+    assert [way.name for way in WAYS.table_4] == [name for name, _ in ways._PUBLISHED[4]]
+    assert len(ways._PUBLISHED[1]) == 1 + 8 * 3 and len(ways._PUBLISHED[3]) == 10
 
 
 @pytest.mark.parametrize(

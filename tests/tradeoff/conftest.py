@@ -33,7 +33,7 @@ def room_views(room) -> Views:
 @pytest.fixture(autouse=True)
 def own_lock(tmp_path_factory, monkeypatch) -> None:
     """Tests wait neither for one another nor for anything else on this machine."""
-    monkeypatch.setattr(machine, "LOCK", str(tmp_path_factory.mktemp("lock") / "lock"))
+    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path_factory.mktemp("lock") / "lock"), 0.0))
 
 
 @pytest.fixture()

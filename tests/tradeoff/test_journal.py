@@ -1,5 +1,6 @@
 """points.json: what is put in comes out, and what is not ours is refused."""
 
+import dataclasses
 import json
 import math
 
@@ -7,7 +8,7 @@ import pytest
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.tradeoff import journal as journal_module
-from pointsplat_ns.tradeoff.journal import POINTS, Journal
+from pointsplat_ns.tradeoff.journal import POINTS_NAME, Journal
 from pointsplat_ns.tradeoff.settings import DENSE, Setting
 from trades import point
 
@@ -31,7 +32,7 @@ def test_points_are_read_back_as_they_were(written):
 
 
 def test_the_file_is_json_that_any_reader_takes(written):
-    content = json.loads((written / POINTS).read_text(), parse_constant=lambda name: pytest.fail(name))
+    content = json.loads((written / POINTS_NAME).read_text(), parse_constant=lambda name: pytest.fail(name))
     assert [values["key"] for values in content["points"]] == ["dense", "10pct_sh3_quick"]
 
 
@@ -42,7 +43,7 @@ def test_a_point_is_on_disk_as_soon_as_it_is_added(written):
 
 
 def test_a_point_that_cannot_be_written_leaves_those_that_were(written, monkeypatch):
-    before = (written / POINTS).read_bytes()
+    before = (written / POINTS_NAME).read_bytes()
 
     def no_room(*args):
         raise OSError(28, "No space left on device")
@@ -50,13 +51,13 @@ def test_a_point_that_cannot_be_written_leaves_those_that_were(written, monkeypa
     monkeypatch.setattr("os.replace", no_room)
     with pytest.raises(SceneError, match="No space left"):
         Journal(written, OF).add(point(Setting(5000, 3), 28.0))
-    assert (written / POINTS).read_bytes() == before
-    assert [path.name for path in written.iterdir()] == [POINTS]
+    assert (written / POINTS_NAME).read_bytes() == before
+    assert [path.name for path in written.iterdir()] == [POINTS_NAME]
 
 
 @pytest.mark.parametrize("name, value", [("scene", "abd"), ("views", 11), ("machine", "another")])
 def test_points_of_another_sweep_are_refused(written, name, value):
-    with pytest.raises(SceneError, match=rf"{POINTS}: its points are of another sweep \({name}: .*--force"):
+    with pytest.raises(SceneError, match=rf"{POINTS_NAME}: its points are of another sweep \({name}: .*--force"):
         Journal(written, {**OF, name: value})
 
 
@@ -81,22 +82,23 @@ def test_points_of_another_sweep_are_refused(written, name, value):
     ],
 )
 def test_points_that_are_none_are_refused(written, change):
-    content = json.loads((written / POINTS).read_text())
+    content = json.loads((written / POINTS_NAME).read_text())
     change(content)
-    (written / POINTS).write_text(json.dumps(content))
-    with pytest.raises(SceneError, match=f"{POINTS}: not the points of a sweep .*--force"):
+    (written / POINTS_NAME).write_text(json.dumps(content))
+    with pytest.raises(SceneError, match=f"{POINTS_NAME}: not the points of a sweep .*--force"):
         Journal(written, OF)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", "[" * 100_000, "\x00\xff"])
 def test_a_file_that_holds_something_else_is_refused(tmp_path, text):
-    (tmp_path / POINTS).write_text(text)
+    (tmp_path / POINTS_NAME).write_text(text)
     with pytest.raises(SceneError, match="not the points of a sweep"):
         Journal(tmp_path, OF)
 
 
 def test_a_file_too_large_is_refused_before_it_is_read(written, monkeypatch):
-    monkeypatch.setattr(journal_module, "MOST_BYTES", 100)
+    form = dataclasses.replace(journal_module.POINTS_FORM, most_bytes=100)
+    monkeypatch.setattr(journal_module, "POINTS_FORM", form)
     with pytest.raises(SceneError, match="larger than 100 bytes"):
         Journal(written, OF)
 
@@ -104,12 +106,12 @@ def test_a_file_too_large_is_refused_before_it_is_read(written, monkeypatch):
 @pytest.mark.parametrize("version", [1, 2, "two", None, "x" * 1000])
 def test_points_of_another_version_are_refused_in_one_line(written, version):
     """Those of version 1 were timed otherwise, and had other fields."""
-    content = json.loads((written / POINTS).read_text())
+    content = json.loads((written / POINTS_NAME).read_text())
     content["version"] = version
     content["points"][1].pop("frame_ms")
-    (written / POINTS).write_text(json.dumps(content))
+    (written / POINTS_NAME).write_text(json.dumps(content))
     with pytest.raises(
-        SceneError, match=f"{POINTS}: not the points of a sweep .of version .*, this program's are of 3.*--force"
+        SceneError, match=f"{POINTS_NAME}: not the points of a sweep .of version .*, this program's are of 3.*--force"
     ) as e:
         Journal(written, OF)
     assert len(str(e.value).splitlines()) == 1 and len(str(e.value)) < 400

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from matplotlib.image import imread
 
-from pointsplat_ns.tradeoff.outputs import PLOTS, plot
+from pointsplat_ns.tradeoff.outputs import SWEEP_FILES, plot
 from pointsplat_ns.tradeoff.points import Tradeoff
 from pointsplat_ns.tradeoff.settings import DENSE, REPAIRS, Setting
 from trades import point
@@ -20,7 +20,7 @@ def sweep(photos: float | None, repairs=REPAIRS) -> Tradeoff:
     return Tradeoff("room", "a machine", "given views", 64, 48, tuple(points), recommended=points[-1].key)
 
 
-@pytest.mark.parametrize("against", PLOTS)
+@pytest.mark.parametrize("against", SWEEP_FILES.plots)
 @pytest.mark.parametrize("photos, wide", [(28.0, True), (None, False)])
 def test_there_is_a_panel_for_renders_and_one_for_photos_where_there_are_any(against, photos, wide, tmp_path):
     plot(sweep(photos), against, tmp_path / "plot.png")

@@ -13,8 +13,8 @@ from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.tradeoff import judging, measuring, sweep
-from pointsplat_ns.tradeoff.journal import POINTS, check_folder
-from pointsplat_ns.tradeoff.outputs import OUTPUTS, PAGE, PLOTS, TABLE
+from pointsplat_ns.tradeoff.journal import POINTS_NAME, check_journal_folder
+from pointsplat_ns.tradeoff.outputs import SWEEP_FILES
 from pointsplat_ns.tradeoff.points import picture_path
 from pointsplat_ns.tradeoff.settings import Setting
 from pointsplat_ns.tradeoff.sweep import Options
@@ -27,19 +27,19 @@ def names(folder):
 def test_a_sweep_leaves_tables_plots_pictures_and_a_page(new_sweep, tmp_path, plain_page, monkeypatch):
     result = new_sweep(tmp_path, points=2).run()
     assert [point.key for point in result.points] == ["dense", "10pct_sh1"]
-    assert names(tmp_path) == sorted([*OUTPUTS, POINTS, "pictures", "scenes"])
-    with (tmp_path / TABLE).open(newline="") as stream:
+    assert names(tmp_path) == sorted([*SWEEP_FILES.every, POINTS_NAME, "pictures", "scenes"])
+    with (tmp_path / SWEEP_FILES.table).open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [row["key"] for row in rows] == [point.key for point in result.points]
     assert float(rows[1]["against_dense_psnr"]) == result.points[1].against_dense.psnr
     content = json.loads((tmp_path / "tradeoff.json").read_text())
     assert content["points"][0]["against_dense"]["psnr"] is None, "infinite"
     assert content["recommended"] == result.recommended
-    assert [(tmp_path / name).read_text() for name in PLOTS.values()] == [*PLOTS]
+    assert [(tmp_path / name).read_text() for name in SWEEP_FILES.plots.values()] == [*SWEEP_FILES.plots]
     for shown in result.points:
         assert all(picture_path(tmp_path, view, shown.key).is_file() for view in range(3))
     assert names(tmp_path / "scenes") == ["10pct_sh1.json", "dense.json"]
-    assert (tmp_path / PAGE).read_text().split() == [point.key for point in result.points]
+    assert (tmp_path / SWEEP_FILES.page).read_text().split() == [point.key for point in result.points]
 
 
 def test_the_first_useful_results_are_there_after_the_first_smaller_scene(new_sweep, tmp_path, plain_page):
@@ -47,7 +47,7 @@ def test_the_first_useful_results_are_there_after_the_first_smaller_scene(new_sw
     running.measure_dense()
     assert plain_page == []
     running.measure(Setting(40, 1))
-    assert plain_page == [tmp_path] and (tmp_path / PLOTS["gaussians"]).is_file()
+    assert plain_page == [tmp_path] and (tmp_path / SWEEP_FILES.plots["gaussians"]).is_file()
 
 
 def test_points_have_exact_counts_sizes_and_commands(new_sweep, tmp_path, room):
@@ -172,10 +172,10 @@ def test_points_of_another_scene_are_refused_before_anything_is_measured(new_swe
 
 
 def test_results_without_points_are_not_overwritten(tmp_path):
-    (tmp_path / TABLE).write_text("precious")
+    (tmp_path / SWEEP_FILES.table).write_text("precious")
     with pytest.raises(SceneError, match="exists already, without points.json"):
-        check_folder(tmp_path, POINTS, OUTPUTS, False, [tmp_path / TABLE])
-    check_folder(tmp_path, POINTS, OUTPUTS, True, [tmp_path / TABLE])
+        check_journal_folder(tmp_path, POINTS_NAME, SWEEP_FILES.every, False, [tmp_path / SWEEP_FILES.table])
+    check_journal_folder(tmp_path, POINTS_NAME, SWEEP_FILES.every, True, [tmp_path / SWEEP_FILES.table])
     assert names(tmp_path) == []
 
 
