@@ -18,7 +18,7 @@ from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.system.progress import Progress, tracked
-from pointsplat_ns.viewing.camera_path import FILM_SIDE, FPS, FilmSettings, camera_path
+from pointsplat_ns.viewing.camera_path import CAMERA_PATH, FilmSettings, camera_path
 from pointsplat_ns.viewing.film import FilmScenes, Split, render_frames
 from pointsplat_ns.viewing.video import check_output, write_frames
 from pointsplat_ns.views import Views
@@ -92,13 +92,13 @@ def render_path(
     upward = up_named(up)
     kind = check_output(output, force)
     sources = [scene] if other is None else [scene, other]
-    given = views_for(scene, views).resized(FILM_SIDE) if isinstance(views, (str, Path)) else views
+    given = views_for(scene, views).resized(CAMERA_PATH.photo_side) if isinstance(views, (str, Path)) else views
     loaded = [source if isinstance(source, Gaussians) else load(source) for source in sources]
     if given is not None and isinstance(views, (str, Path)):
         check_views_show(loaded[0], given, views)
     way: str | Path = path if not isinstance(path, Views) else "dataset"
     if given is not None and kind == "frames" and seconds is None and way in ("auto", "dataset"):
-        settings = replace(settings, seconds=max(1, len(given)) / (fps or FPS))
+        settings = replace(settings, seconds=max(1, len(given)) / (fps or CAMERA_PATH.fps))
     view_source = _source(scene, loaded[0], path if isinstance(path, Views) else given)
     chosen = camera_path(loaded[0], view_source, way, settings, kind == "picture", upward)
     if labels is None:

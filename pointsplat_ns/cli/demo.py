@@ -5,21 +5,28 @@ from __future__ import annotations
 import shlex
 import shutil
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 from pointsplat_ns.cli.printing import written_size
 from pointsplat_ns.cli.scene_options import Share, claim_folder, claim_outputs
 
-HELD_OUT = "room2"
-"""The room without a part in the refiner's training."""
 
-TIMESTAMP = "demo"
-"""Folder name of the runs, constant so that finished runs are found again."""
+@dataclass(frozen=True)
+class DemoSettings:
+    """Choices of the demo that have no option."""
 
-ROOMS = ("room0", "room1", HELD_OUT)
+    rooms: tuple[str, ...] = ("room0", "room1", "room2")
+    """Names of the synthetic rooms, each with its seed."""
+    held_out: str = "room2"
+    """The room without a part in the refiner's training."""
+    timestamp: str = "demo"
+    """Folder name of the runs, constant so that finished runs are found again."""
+    advice: str = "start over with --force, or name another --output"
+    """Advice if a training with another number of steps is finished."""
 
-ADVICE = "start over with --force, or name another --output"
-"""Advice if a training with another number of steps is finished."""
+
+DEMO = DemoSettings()
 
 
 def demo(
@@ -62,7 +69,7 @@ def demo(
             shutil.rmtree(output / folder)
     scenes, refiner = training_folders(output)
     for training, steps in [*((scene, scene_steps) for scene in scenes.values()), (refiner, refiner_steps)]:
-        finished(training, steps, ADVICE)  # refuses another number of steps before the work
+        finished(training, steps, DEMO.advice)  # refuses another number of steps before the work
     compact_example(output, keep)
     need("nerfstudio", "the rest of the demo, which trains,")
     print(
@@ -79,8 +86,8 @@ def training_folders(output: Path) -> tuple[dict[str, Path], Path]:
     from pointsplat_ns.io.runs import REFINER_METHOD
     from pointsplat_ns.nerfstudio_plugin.running import SCENE_METHOD, run_folder
 
-    scenes = {name: run_folder(output / "scenes", name, SCENE_METHOD, TIMESTAMP) for name in ROOMS}
-    return scenes, run_folder(output / "refiner", "rooms", REFINER_METHOD, TIMESTAMP)
+    scenes = {name: run_folder(output / "scenes", name, SCENE_METHOD, DEMO.timestamp) for name in DEMO.rooms}
+    return scenes, run_folder(output / "refiner", "rooms", REFINER_METHOD, DEMO.timestamp)
 
 
 def write_example(path: Path, force: bool) -> None:
@@ -127,28 +134,28 @@ def train_and_judge(
     start = time.perf_counter()
     rooms, scenes, refiners = output / "rooms", output / "scenes", output / "refiner"
     scene_runs, trained = training_folders(output)
-    for name in ROOMS:
+    for name in DEMO.rooms:
         if not (rooms / name).is_dir():
             print(write_room(rooms / name, int(name[4:]), *photos))
     for name, scene_run in scene_runs.items():
-        if not finished(scene_run, scene_steps, ADVICE):
+        if not finished(scene_run, scene_steps, DEMO.advice):
             remove_interrupted(scene_run)
-            run(train_scene_command(rooms / name, scenes, name, scene_steps, TIMESTAMP, seed_points=20_000))
-    if not finished(trained, refiner_steps, ADVICE):
+            run(train_scene_command(rooms / name, scenes, name, scene_steps, DEMO.timestamp, seed_points=20_000))
+    if not finished(trained, refiner_steps, DEMO.advice):
         remove_interrupted(trained)
         options = {"pipeline.model.keep": keep, "pipeline.model.size": "tiny"}
-        run(train_refiner_command(scenes, refiners, "rooms", refiner_steps, TIMESTAMP, (HELD_OUT,), options))
+        run(train_refiner_command(scenes, refiners, "rooms", refiner_steps, DEMO.timestamp, (DEMO.held_out,), options))
     evaluation, pictures = output / "evaluation.json", output / "pictures"
     run(evaluate_command(trained, evaluation, pictures))
-    refined, small = output / f"{HELD_OUT}_refined.ply", output / f"{HELD_OUT}_compact.ply"
+    refined, small = output / f"{DEMO.held_out}_refined.ply", output / f"{DEMO.held_out}_compact.ply"
     run(shlex.join(["pointsplat", "export", str(trained), "-o", str(refined), "--force"]))
-    dense, views = scene_runs[HELD_OUT], output / "compact.png"
+    dense, views = scene_runs[DEMO.held_out], output / "compact.png"
     words = ["pointsplat", "compact", str(dense), "--keep", f"{keep:g}", "-o", str(small), "--picture", str(views)]
     run(shlex.join([*words, "--force"]))
 
     results = read_evaluation(evaluation)
     picture = output / "before_after.png"
-    before_after(sorted(pictures.glob(f"{HELD_OUT}_*.png")), results["scenes"][HELD_OUT], picture)
+    before_after(sorted(pictures.glob(f"{DEMO.held_out}_*.png")), results["scenes"][DEMO.held_out], picture)
     show_report(results)
     config = shlex.quote(str(trained / "config.yml"))
     print(f"{refined}: open it in any 3DGS viewer, or run ns-viewer --load-config {config}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pointsplat_ns.compression.posed_scene import check_views_show, views_for
@@ -24,18 +24,25 @@ from pointsplat_ns.pruning.merging.settings import DEFAULTS
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.views import Views
 
-WHOLE_BYTES = 600
-"""Memory that merging takes for each Gaussian of a scene in memory, beside the scene itself, bytes."""
 
-CELL_BYTES = 400
-"""The same for each Gaussian of a cell: what follows from the whole scene is known before."""
+@dataclass(frozen=True)
+class MemorySettings:
+    """Memory that merging takes, and the sizes of cells that follow from it."""
 
-BASE_BYTES = 1_050_000_000
-"""Memory of the interpreter, torch and a thinned scene, bytes."""
+    whole: int = 600
+    """Bytes for each Gaussian of a scene in memory, beside the scene itself."""
+    cell: int = 400
+    """Bytes for each Gaussian of a cell: what follows from the whole scene is known before."""
+    base: int = 1_050_000_000
+    """Bytes of the interpreter, torch and a thinned scene."""
+    most: int = 4_000_000
+    """Largest number of Gaussians in a cell. More memory than it needs changes nothing, so that a result does not
+    depend on the memory that happens to be free."""
+    least: int = 100_000
+    """Smallest number of Gaussians in a cell."""
 
-MOST, LEAST = 4_000_000, 100_000
-"""Largest and smallest number of Gaussians in a cell. More memory than the first needs changes nothing: so a result
-does not depend on the memory that happens to be free."""
+
+MEMORY = MemorySettings()
 
 
 def rows_to_prune(scene: Path, request: PruneRequest, memory: float | None = None) -> PlyRows | None:
@@ -61,8 +68,8 @@ def rows_to_prune(scene: Path, request: PruneRequest, memory: float | None = Non
                 "`pointsplat convert` makes"
             )
         return None
-    size = rows.count * (_row_bytes(rows) + WHOLE_BYTES)
-    limit = psutil.virtual_memory().available if memory is None else memory - BASE_BYTES
+    size = rows.count * (_row_bytes(rows) + MEMORY.whole)
+    limit = psutil.virtual_memory().available if memory is None else memory - MEMORY.base
     if size <= limit:
         return None
     asked = {
@@ -169,13 +176,12 @@ def _row_bytes(rows: PlyRows) -> int:
 def _most_in_cell(rows: PlyRows, memory: float | None) -> int:
     """Largest number of Gaussians in a cell. Raises PointSplatError if the memory is too small."""
     if memory is None:
-        return MOST
-    each = _row_bytes(rows) + CELL_BYTES
-    if memory < BASE_BYTES + LEAST * each:
-        raise PointSplatError(
-            f"memory of {bytes_text(memory)} is too small; expected at least {bytes_text(BASE_BYTES + LEAST * each)}"
-        )
-    return min(MOST, int((memory - BASE_BYTES) / each))
+        return MEMORY.most
+    each = _row_bytes(rows) + MEMORY.cell
+    needed = MEMORY.base + MEMORY.least * each
+    if memory < needed:
+        raise PointSplatError(f"memory of {bytes_text(memory)} is too small; expected at least {bytes_text(needed)}")
+    return min(MEMORY.most, int((memory - MEMORY.base) / each))
 
 
 def _digest(views: Views | None) -> str:

@@ -11,9 +11,6 @@ from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstud
 if TYPE_CHECKING:
     from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 
-COLMAP_MODELS = ("colmap/sparse/0", "sparse/0", "sparse", "colmap/sparse", "colmap")
-"""Where the model of COLMAP lies in a capture, the first that is there."""
-
 
 def train_capture(capture: Path, keep: int | None, output: Path, steps: int, scale: float) -> tuple[Path, int]:
     """Train a scene by the method ``splatfacto-cpu``. nerfstudio's log goes to standard output.
@@ -69,10 +66,10 @@ def dataparser_for(capture: Path) -> DataParserConfig:
         return ReplicaDataParserConfig()
     if (capture / "transforms.json").is_file():
         return NerfstudioDataParserConfig(load_3D_points=True)
-    for model in COLMAP_MODELS:
+    for model in ("colmap/sparse/0", "sparse/0", "sparse", "colmap/sparse", "colmap"):
         if (capture / model / "cameras.bin").is_file() or (capture / model / "cameras.txt").is_file():
             return ColmapDataParserConfig(colmap_path=Path(model))
     raise DataError(
-        f"{capture}: no capture that is known; expected transforms.json, a COLMAP model ({COLMAP_MODELS[0]}), dslr "
+        f"{capture}: no capture that is known; expected transforms.json, a COLMAP model (colmap/sparse/0), dslr "
         "(ScanNet++) or traj.txt (Replica) in it; ns-process-data makes transforms.json from photos or a video"
     )

@@ -1,8 +1,8 @@
 """Warnings of nerfstudio and torch that every command would print and that the user can do nothing about.
 
 Each is identified by its text, its category and its module, so that no other warning is hidden. :data:`JIT_SCRIPT` is
-raised before nerfstudio loads any plugin, so nothing here can silence it in a ``ns-*`` command. :data:`PYTHONWARNINGS`
-in the command's environment can.
+raised before nerfstudio loads any plugin, so nothing here can silence it in a ``ns-*`` command. The environment
+variable PYTHONWARNINGS can (:attr:`KnownWarning.option`).
 """
 
 from __future__ import annotations
@@ -23,6 +23,11 @@ class KnownWarning:
     module: str
     """Full name of the module that it is reported for."""
 
+    @property
+    def option(self) -> str:
+        """Value of the environment variable PYTHONWARNINGS with which a command does not print this warning."""
+        return f"ignore:{self.text}:{self.category.__name__}:{self.module}"
+
     def ignore(self) -> None:
         """Ignore this warning and no other. Calling this again changes nothing."""
         warnings.filterwarnings("ignore", re.escape(self.text), self.category, re.escape(self.module) + r"\Z")
@@ -30,9 +35,6 @@ class KnownWarning:
 
 JIT_SCRIPT = KnownWarning("`torch.jit.script` is deprecated", FutureWarning, "torch.jit._script")
 """nerfstudio.cameras.camera_utils scripts a function when it is imported."""
-
-PYTHONWARNINGS = f"ignore:{JIT_SCRIPT.text}:{JIT_SCRIPT.category.__name__}:{JIT_SCRIPT.module}"
-"""Value of the environment variable of that name with which a ``ns-*`` command does not print :data:`JIT_SCRIPT`."""
 
 NERFSTUDIO = (
     # Decorators of nerfstudio's NeRF methods, at import.

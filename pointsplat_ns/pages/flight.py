@@ -27,15 +27,11 @@ from pointsplat_ns.views import Views
 
 logger = logging.getLogger("pointsplat_ns")
 
-SCRIPTS = ("spz.js", "splats.js", "camera.js", "flight.js")
+FLIGHT_SCRIPTS = ("spz.js", "splats.js", "camera.js", "flight.js")
 """Scripts of a flight, for :func:`~pointsplat_ns.pages.html.page` with ``with_workers``."""
 
 KNOWN_VIEWS = 24
 """Maximum number of known views from which those of a page are chosen."""
-
-MAX_COORDINATE = 2047.0
-"""Largest coordinate of a Gaussian in a page, in units of the content (10 to its diagonal); farther ones are left out.
-Positions in SPZ have steps of 1/4096 of a unit up to there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +61,8 @@ class FlightFrame:
     def packed(self, scene: Gaussians, name: str, progress: Progress = silent) -> dict[str, str]:
         """A scene for the page: its name, text on its size, and its data in units of the content as base64 of SPZ 3."""
         placed = in_units(scene.detach(), self.centre.to(scene.device), self.size).to("cpu", torch.float32)
-        near = placed.usable() & (placed.means.abs() <= MAX_COORDINATE).all(1)
+        # Positions in SPZ have steps of 1/4096 of a unit up to 2047 units; the content's diagonal is 10.
+        near = placed.usable() & (placed.means.abs() <= 2047.0).all(1)
         left_out = int((~near).sum())
         if left_out:
             logger.warning("%s: %d Gaussians, very far away or not finite, are not in the page", name, left_out)

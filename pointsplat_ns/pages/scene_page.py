@@ -10,7 +10,7 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger, replacing
 from pointsplat_ns.looking.upright import up_named
-from pointsplat_ns.pages.flight import SCRIPTS, FlightFrame
+from pointsplat_ns.pages.flight import FLIGHT_SCRIPTS, FlightFrame
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.system.progress import Progress, progress_bar
@@ -93,7 +93,7 @@ def write_page(
             flight = frame.data(included)
             values: dict[str, Any] = {"title": title, "rows": rows, "notes": notes, "missing": missing}
             values |= {"flight": flight, "data": {"flight": flight}}
-            text = page("scene.html", (*SCRIPTS, "scene.js"), with_workers=True, **values).encode("utf-8")
+            text = page("scene.html", (*FLIGHT_SCRIPTS, "scene.js"), with_workers=True, **values).encode("utf-8")
             if len(text) <= 1e6 * limit_mb:
                 break
             included, missing = _without_the_largest(included, path, len(text), limit_mb)

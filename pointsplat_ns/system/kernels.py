@@ -128,9 +128,6 @@ def _declared(statement: str, structs: dict[str, type[Struct]]) -> Iterator[tupl
         yield parts[2], kind
 
 
-CACHE_VARIABLE = "POINTSPLAT_CACHE"
-"""Environment variable with the folder for what is built; by default pointsplat_ns in the user's cache folder."""
-
 _FLAGS = ("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 
 _SHARED = Path(__file__).with_name("include")
@@ -211,8 +208,9 @@ def _run(arguments: list[str]) -> subprocess.CompletedProcess[bytes]:
 
 
 def _cache_folder() -> Path | None:
-    """A folder that is the user's alone; None if there is none."""
-    named = os.environ.get(CACHE_VARIABLE)
+    """The folder for built libraries, which is the user's alone: that of the environment variable POINTSPLAT_CACHE, by
+    default pointsplat_ns in the user's cache folder. None if there is none."""
+    named = os.environ.get("POINTSPLAT_CACHE")
     home = os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
     folder = Path(named) if named else Path(home) / "pointsplat_ns"
     try:

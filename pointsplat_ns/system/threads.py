@@ -28,7 +28,7 @@ logger = logging.getLogger("pointsplat_ns")
 
 Item = TypeVar("Item")
 
-ENVIRONMENT = "OMP_NUM_THREADS"
+THREADS_VARIABLE = "OMP_NUM_THREADS"
 """Environment variable with the number of torch's threads. Where it is set, no other number is chosen."""
 
 
@@ -102,17 +102,17 @@ def fixed_threads(count: int | None) -> Iterator[None]:
         return
     if not 1 <= count <= 1024:
         raise PointSplatError(f"{count} threads; expected 1 to 1024")
-    before, variable = torch.get_num_threads(), os.environ.get(ENVIRONMENT)
+    before, variable = torch.get_num_threads(), os.environ.get(THREADS_VARIABLE)
     torch.set_num_threads(count)
-    os.environ[ENVIRONMENT] = str(count)
+    os.environ[THREADS_VARIABLE] = str(count)
     try:
         yield
     finally:
         torch.set_num_threads(before)
         if variable is None:
-            os.environ.pop(ENVIRONMENT, None)
+            os.environ.pop(THREADS_VARIABLE, None)
         else:
-            os.environ[ENVIRONMENT] = variable
+            os.environ[THREADS_VARIABLE] = variable
 
 
 class Load:
@@ -145,7 +145,7 @@ class Load:
             self._told = True
             logger.warning(
                 "this machine is busy with other programs: torch's threads wait for one another, so one is used "
-                "instead of %d for now; --threads or %s overrules that", count, ENVIRONMENT,
+                "instead of %d for now; --threads or %s overrules that", count, THREADS_VARIABLE,
             )  # fmt: skip
         return any(self._looks)
 
@@ -189,7 +189,7 @@ def suitable_threads(device: torch.device | None = None) -> Iterator[None]:
     """
     before, outer = torch.get_num_threads(), chosen.most
     on_cpu = device is None or device.type == "cpu"
-    if not on_cpu or chosen.settled or most_threads() <= 1 or ENVIRONMENT in os.environ:
+    if not on_cpu or chosen.settled or most_threads() <= 1 or THREADS_VARIABLE in os.environ:
         yield
         return
     chosen.most = min(most_threads(), cores())

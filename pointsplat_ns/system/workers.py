@@ -24,12 +24,19 @@ from pointsplat_ns.system.threads import cores
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-LATER_SECONDS = 1.0
-"""Time until an item is tried again whose result was None."""
 
-MOST_DEATHS = 10
-"""Number of processes that may be killed at one item, as by a lack of memory, before it is given up. Where they are
-killed at random, so many are hardly ever killed at the same one."""
+@dataclass(frozen=True)
+class RetrySettings:
+    """When items are tried again."""
+
+    later_seconds: float = 1.0
+    """Time until an item is tried again whose result was None."""
+    most_deaths: int = 10
+    """Number of processes that may be killed at one item, as by a lack of memory, before it is given up. Where they are
+    killed at random, so many are hardly ever killed at the same one."""
+
+
+RETRIES = RetrySettings()
 
 
 def threads_for(jobs: int) -> int:
@@ -70,8 +77,8 @@ def in_processes(
         function: called with an item. It, the items and results are pickled.
         items: the items.
         jobs: number of processes.
-        on_death: called in this process with an item at which :data:`MOST_DEATHS` processes were killed, and with how
-            the last one ended; gives the item's result.
+        on_death: called in this process with an item at which ``RETRIES.most_deaths`` processes were killed, and with
+            how the last one ended; gives the item's result.
         on_stop: called in this process with every item at which a process was killed because the iteration was ended.
         preload: modules that take long to import; where processes can be forked, they are imported but once.
 
@@ -103,7 +110,7 @@ def in_processes(
                         raise RuntimeError(f"{idle_deaths} processes in a row ended at once; the last {how}") from None
                     if number is not None:
                         deaths[number] += 1
-                        if deaths[number] < MOST_DEATHS:
+                        if deaths[number] < RETRIES.most_deaths:
                             waiting.put_off(number)
                         else:
                             yield on_death(items[number], how)
@@ -137,7 +144,7 @@ class _Waiting:
 
     def put_off(self, number: int) -> None:
         """Let a number wait for some time, and for those that wait already."""
-        heapq.heappush(self._heap, (time.monotonic() + LATER_SECONDS, next(self._order), number))
+        heapq.heappush(self._heap, (time.monotonic() + RETRIES.later_seconds, next(self._order), number))
 
     def seconds(self) -> float:
         """Time until the next number's time has come."""

@@ -16,7 +16,7 @@ import numpy as np
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import read_text, replacing, three_digits, write_json
-from pointsplat_ns.pages.flight import SCRIPTS, FlightFrame
+from pointsplat_ns.pages.flight import FLIGHT_SCRIPTS, FlightFrame
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.pages.pictures import ERROR_GAIN, error_colors, error_map, fit, read_png
 from pointsplat_ns.pruning import ply_bytes
@@ -64,7 +64,7 @@ def write_page(
     dense, recommended = sweep.points[0].key, sweep.recommended
     flight = read_flight_beside(flight_path(folder, recommended), flight_path(folder, dense))
     values, data = _values(sweep, len(views)), {**_data(sweep), "flight": flight}
-    scripts = ("chart.js", *(SCRIPTS if flight else ()), "tradeoff.js")
+    scripts = ("chart.js", *(FLIGHT_SCRIPTS if flight else ()), "tradeoff.js")
 
     def filled(uris: list[str], compressed: str) -> str:
         left = iter(uris)

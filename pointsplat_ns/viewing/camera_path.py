@@ -29,9 +29,13 @@ from pointsplat_ns.views import Views
 
 
 @dataclass(frozen=True)
-class PathLimits:
-    """Limits of camera paths."""
+class PathSettings:
+    """Defaults and limits of camera paths and films."""
 
+    fps: float = 24.0
+    """Frames a second."""
+    photo_side: int = 960
+    """Largest longer side of pictures from the poses of photos, without a given size, pixels."""
     bytes: int = 64_000_000
     """Maximum size of a file: nerfstudio writes about 500 bytes a frame."""
     frames: int = 100_000
@@ -42,12 +46,7 @@ class PathLimits:
     """Largest coordinate of a camera, scene units: its square is finite in float32."""
 
 
-LIMITS = PathLimits()
-
-
-FPS = 24.0
-FILM_SIDE = 960
-"""Largest longer side of pictures from the poses of photos, without a given size, pixels."""
+CAMERA_PATH = PathSettings()
 
 
 @dataclass(frozen=True)
@@ -66,12 +65,12 @@ class FilmSettings:
     def __post_init__(self) -> None:
         for name in ("width", "height"):
             value = getattr(self, name)
-            if value is not None and not 2 <= value <= LIMITS.pixels:
-                raise PointSplatError(f"{name} is {value}; expected 2 to {LIMITS.pixels} pixels")
+            if value is not None and not 2 <= value <= CAMERA_PATH.pixels:
+                raise PointSplatError(f"{name} is {value}; expected 2 to {CAMERA_PATH.pixels} pixels")
         if self.fps is not None and not 0.1 <= self.fps <= 1000:  # NaN fails too
             raise PointSplatError(f"fps is {self.fps:g}; expected 0.1 to 1000 frames a second")
-        if self.seconds is not None and not 0 < self.seconds * (self.fps or FPS) <= LIMITS.frames:
-            raise PointSplatError(f"seconds are {self.seconds:g}; expected 1 to {LIMITS.frames} frames in all")
+        if self.seconds is not None and not 0 < self.seconds * (self.fps or CAMERA_PATH.fps) <= CAMERA_PATH.frames:
+            raise PointSplatError(f"seconds are {self.seconds:g}; expected 1 to {CAMERA_PATH.frames} frames in all")
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,17 +111,17 @@ def camera_path(
     """
     if str(path) not in ("auto", "dataset", "walk", "orbit"):
         saved = read_path(path)
-        fps = settings.fps or saved.fps or FPS
+        fps = settings.fps or saved.fps or CAMERA_PATH.fps
         frames = 1 if one else len(saved.views) if settings.seconds is None else _frames(settings.seconds, fps)
         known = source.known(1)
         views = _sized(saved.views, settings, (saved.views.width, saved.views.height))
         if known is not None:
             views = dataclasses.replace(views, background=known.background, rasterize_mode=known.rasterize_mode)
         return CameraPath(views if frames == len(views) else along(views, frames), fps, f"the path of {path}")
-    known = source.known(LIMITS.frames)
+    known = source.known(CAMERA_PATH.frames)
     if path == "dataset" and known is None:
         raise DataError(f"no poses of a dataset{source.missing}; expected a run whose photos are found, or views")
-    fps = settings.fps or FPS
+    fps = settings.fps or CAMERA_PATH.fps
     frames = 1 if one else _frames(10.0 if settings.seconds is None else settings.seconds, fps)
     if known is not None and path in ("auto", "dataset"):
         if settings.seconds is None and not one:
@@ -147,12 +146,12 @@ def camera_path(
 
 
 def _frames(seconds: float, fps: float) -> int:
-    return min(max(round(seconds * fps), 1), LIMITS.frames)
+    return min(max(round(seconds * fps), 1), CAMERA_PATH.frames)
 
 
 def _reduced(views: Views) -> tuple[int, int]:
     """Width and height of photos, their longer side at most 960 pixels."""
-    factor = min(1.0, FILM_SIDE / max(views.width, views.height))
+    factor = min(1.0, CAMERA_PATH.photo_side / max(views.width, views.height))
     return round(views.width * factor), round(views.height * factor)
 
 
@@ -187,15 +186,15 @@ def read_path(path: Path | str) -> SavedPath:
     saves it. Raises SceneError if there is no such file, and DataError if it is too large, is not such JSON, has
     another camera model, or has an invalid camera."""
     path = require_file(path, "a camera path saved by nerfstudio's viewer (JSON)")
-    if path.stat().st_size > LIMITS.bytes:
+    if path.stat().st_size > CAMERA_PATH.bytes:
         raise DataError(f"{path}: {path.stat().st_size / 1e6:.0f} MB; expected a camera path of at most 64 MB")
     try:
         content = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: cannot be read as JSON ({one_line(error, 80)})") from error
     cameras = content.get("camera_path") if isinstance(content, dict) else None
-    if not isinstance(cameras, list) or not 0 < len(cameras) <= LIMITS.frames:
-        raise DataError(f"{path}: no camera path; expected 'camera_path', a list of 1 to {LIMITS.frames} cameras")
+    if not isinstance(cameras, list) or not 0 < len(cameras) <= CAMERA_PATH.frames:
+        raise DataError(f"{path}: no camera path; expected 'camera_path', a list of 1 to {CAMERA_PATH.frames} cameras")
     kind = content.get("camera_type", "perspective")
     if kind != "perspective":
         raise DataError(f"{path}: cameras are {str(kind)[:40]!r}; expected perspective ones")
@@ -213,8 +212,8 @@ def read_path(path: Path | str) -> SavedPath:
 
 def _size(value: Any, name: str, path: Path) -> int:
     number = finite(value)
-    if number is None or number != int(number) or not 1 <= number <= LIMITS.pixels:
-        raise DataError(f"{path}: {name} is {str(value)[:40]}; expected 1 to {LIMITS.pixels} pixels")
+    if number is None or number != int(number) or not 1 <= number <= CAMERA_PATH.pixels:
+        raise DataError(f"{path}: {name} is {str(value)[:40]}; expected 1 to {CAMERA_PATH.pixels} pixels")
     return int(number)
 
 
@@ -231,9 +230,10 @@ def _camera(camera: Any, index: int, height: int, path: Path) -> tuple[Tensor, f
     rigid = (off <= 1e-3) & (last <= 1e-3) & (torch.linalg.det(turn) > 0)  # nerfstudio writes 16 digits
     if not bool(rigid):  # NaN fails too
         raise DataError(f"{path}: the pose of camera {index} is no rigid motion; expected a rotation and a position")
-    if float(pose[:3, 3].abs().max()) > LIMITS.coordinate:
+    if float(pose[:3, 3].abs().max()) > CAMERA_PATH.coordinate:
         raise DataError(
-            f"{path}: camera {index} is farther than {LIMITS.coordinate:g} units from the origin; expected it nearer"
+            f"{path}: camera {index} is farther than {CAMERA_PATH.coordinate:g} units from the origin; expected it "
+            "nearer"
         )
     fov = finite(camera.get("fov"))
     if fov is None or not 0.1 <= fov <= 179:

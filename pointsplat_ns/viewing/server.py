@@ -20,9 +20,6 @@ from urllib.parse import parse_qsl, urlsplit
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io.formats import FORMATS
 
-LARGEST = 4_000_000_000
-"""Largest file that may be dropped, bytes."""
-
 READABLE_NAMES = (*(kind.suffix for kind in FORMATS if kind.read and kind.suffix.startswith(".")), ".ckpt")
 """Ends of the names of files that may be dropped."""
 

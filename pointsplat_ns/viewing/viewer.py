@@ -27,7 +27,7 @@ from pointsplat_ns.pages.html import page
 from pointsplat_ns.system.memory import share_freed_memory
 from pointsplat_ns.viewing.painter import PictureRequest, ViewerCamera, Watcher
 from pointsplat_ns.viewing.selection import Selection
-from pointsplat_ns.viewing.server import LARGEST, READABLE_NAMES, Answer, Request, Route, Server, received
+from pointsplat_ns.viewing.server import READABLE_NAMES, Answer, Request, Route, Server, received
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,8 @@ class ViewerSettings:
     """Longest wait for each thing that is being drawn, merged or read when the viewer is closed."""
     largest_side: int = 4096
     """Largest longer side of a picture, pixels."""
+    largest_file: int = 4_000_000_000
+    """Largest file that may be dropped, bytes."""
 
 
 VIEWER = ViewerSettings()
@@ -164,7 +166,10 @@ class Viewer:
         }
         if read is not None:
             self._drop_page = page("drop.html", ("drop.js",), connects=True, suffixes=READABLE_NAMES).encode("utf-8")
-            routes |= {"/drop": Route(self._drop, LARGEST), "/other": Route(lambda _: _html(self._drop_page))}
+            routes |= {
+                "/drop": Route(self._drop, VIEWER.largest_file),
+                "/other": Route(lambda _: _html(self._drop_page)),
+            }
         if scenes:
             self._show(scenes)
         self._server = Server(host, port, routes)

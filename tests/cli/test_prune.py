@@ -286,8 +286,7 @@ def test_poses_in_another_frame_are_refused_before_the_work(posed, tmp_path, cap
 
 
 def test_a_scene_that_does_not_fit_is_merged_in_parts(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(prune_file, "BASE_BYTES", 0)
-    monkeypatch.setattr(prune_file, "LEAST", 100)
+    monkeypatch.setattr(prune_file, "MEMORY", prune_file.MemorySettings(base=0, least=100))
     scene, small = tmp_path / "scene.ply", tmp_path / "small.ply"
     write_ply(normal_scene(900, degree=1, seed=SEED), scene)
     run("prune", scene, "--keep", "10%", "--sh", "0", "--memory", "200kB", "-o", small, "--json")
@@ -309,15 +308,14 @@ def test_a_scene_that_does_not_fit_is_merged_in_parts(tmp_path, capsys, monkeypa
     ],
 )
 def test_what_needs_the_whole_scene_is_refused_under_a_limit_of_memory(options, named, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(prune_file, "BASE_BYTES", 0)
-    monkeypatch.setattr(prune_file, "LEAST", 100)
+    monkeypatch.setattr(prune_file, "MEMORY", prune_file.MemorySettings(base=0, least=100))
     write_ply(normal_scene(900, degree=1, seed=SEED), tmp_path / "scene.ply")
     error = refusal(capsys, tmp_path / "small.ply", "prune", tmp_path / "scene.ply", *options)
     assert re.search(named, error)
 
 
 def test_a_limit_of_memory_needs_a_binary_ply_and_writes_one(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(prune_file, "BASE_BYTES", 0)
+    monkeypatch.setattr(prune_file, "MEMORY", prune_file.MemorySettings(base=0))
     scene = normal_scene(900, degree=1, seed=SEED)
     ps.save(scene, tmp_path / "scene.spz")
     assert "expected a binary 3DGS PLY" in refusal(

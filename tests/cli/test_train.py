@@ -7,7 +7,7 @@ import pytest
 
 import pointsplat_ns as ps
 from pointsplat_ns.cli import main
-from pointsplat_ns.nerfstudio_plugin.captures import COLMAP_MODELS, dataparser_for
+from pointsplat_ns.nerfstudio_plugin.captures import dataparser_for
 
 
 @pytest.mark.parametrize(
@@ -16,7 +16,8 @@ from pointsplat_ns.nerfstudio_plugin.captures import COLMAP_MODELS, dataparser_f
         (["transforms.json"], "NerfstudioDataParserConfig"),
         (["traj.txt", "results/frame000000.png"], "ReplicaDataParserConfig"),
         (["dslr/nerfstudio/transforms.json", "transforms.json"], "SeededScanNetppDataParserConfig"),
-        *(([f"{model}/cameras.bin"], "ColmapDataParserConfig") for model in COLMAP_MODELS),
+        (["colmap/sparse/0/cameras.bin", "colmap/cameras.bin"], "ColmapDataParserConfig"),
+        (["sparse/cameras.bin"], "ColmapDataParserConfig"),
         (["sparse/0/cameras.txt"], "ColmapDataParserConfig"),
     ],
 )

@@ -31,7 +31,7 @@ def folder(tmp_path) -> Path:
 @pytest.fixture(autouse=True)
 def soon(monkeypatch) -> None:
     """What is put off waits for a moment only."""
-    monkeypatch.setattr(workers, "LATER_SECONDS", 0.05)
+    monkeypatch.setattr(workers, "RETRIES", workers.RetrySettings(later_seconds=0.05))
 
 
 def command_in(place: Path, keep: str = "50%") -> Command:
@@ -195,7 +195,7 @@ def test_an_interruption_ends_it_all_and_leaves_whole_files(folder):
 
 
 def test_processes_that_are_killed_lose_no_scene_and_make_none_twice(tmp_path, monkeypatch):
-    monkeypatch.setattr(workers, "MOST_DEATHS", 3)
+    monkeypatch.setattr(workers, "RETRIES", workers.RetrySettings(later_seconds=0.05, most_deaths=3))
     folder = tmp_path / "scenes"
     names = [f"fine{i}" for i in range(20)] + [f"killed{i}" for i in range(8)] + ["bad", "deadly"]
     for seed, name in enumerate(names):

@@ -12,7 +12,6 @@ from making import quick_start
 from pointsplat_ns.nerfstudio_plugin.third_party_warnings import (
     JIT_SCRIPT,
     NERFSTUDIO,
-    PYTHONWARNINGS,
     KnownWarning,
     quiet_nerfstudio,
 )
@@ -45,7 +44,7 @@ def test_a_known_warning_is_not_printed_and_one_that_differs_in_anything_is(know
 )
 def test_the_environment_variable_quiets_one_warning_and_no_other(known, shown):
     code = f"import warnings; warnings.warn_explicit({known.text!r}, FutureWarning, 'x', 1, module={known.module!r})"
-    environment = {**os.environ, "PYTHONWARNINGS": PYTHONWARNINGS}
+    environment = {**os.environ, "PYTHONWARNINGS": JIT_SCRIPT.option}
     result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     assert shown in result.stderr if shown else result.stderr == ""
 
@@ -60,7 +59,7 @@ def test_a_training_prints_no_warning(wall_scene, tmp_path):
     result = run_quietly(
         *("ns-train", "splatfacto-cpu", "--data", wall_scene, "--output-dir", tmp_path, "--machine.device-type", "cpu"),
         *("--max-num-iterations", "3", "replica-data", "--num-seed-points", "50"),
-        PYTHONWARNINGS=PYTHONWARNINGS,
+        PYTHONWARNINGS=JIT_SCRIPT.option,
     )
     assert (result.returncode, result.stderr) == (0, "")
 

@@ -16,7 +16,7 @@ from pointsplat_ns.io.formats.spz import read_spz
 from pointsplat_ns.looking.content import in_units
 from pointsplat_ns.looking.poses import in_pictures, look_at
 from pointsplat_ns.looking.upright import Up
-from pointsplat_ns.pages.flight import MAX_COORDINATE, FlightFrame
+from pointsplat_ns.pages.flight import FlightFrame
 from sweeps import room_views
 
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(1)>\"'&</title>"
@@ -120,7 +120,7 @@ def test_what_is_very_far_away_or_has_no_meaning_is_left_out_and_counted(tmp_pat
         path = ps.write_page(scene.replace(means=means), tmp_path / "page.html", ["the ball"])
     assert "the ball: 3 Gaussians, very far away or not finite, are not in the page" in caplog.text
     [shown] = scenes_in(path, tmp_path)
-    assert len(shown) == 197 and shown.means.abs().max() < MAX_COORDINATE
+    assert len(shown) == 197 and shown.means.abs().max() < 2047
 
 
 def ball_seen_from(eyes: list[list[float]], targets: list[list[float]]) -> ps.Views:

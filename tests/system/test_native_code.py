@@ -21,7 +21,7 @@ pytestmark = pytest.mark.skipif(
 def build(tmp_path, monkeypatch):
     """Builds and loads a text, without what this process remembers."""
     cache = tmp_path / "cache"
-    monkeypatch.setenv(kernels.CACHE_VARIABLE, str(cache))
+    monkeypatch.setenv("POINTSPLAT_CACHE", str(cache))
 
     def load(text: str) -> ctypes.CDLL:
         source = tmp_path / "some.cpp"
@@ -39,7 +39,7 @@ def test_what_was_built_is_loaded_and_a_changed_source_is_built_anew(build, monk
     monkeypatch.setattr(kernels, "_build", lambda *args: pytest.fail("built again"))
     assert build(TWO).answer() == 2
     monkeypatch.undo()
-    monkeypatch.setenv(kernels.CACHE_VARIABLE, str(build.cache))
+    monkeypatch.setenv("POINTSPLAT_CACHE", str(build.cache))
     assert build(TWO.replace("2", "3")).answer() == 3 and len(list(build.cache.iterdir())) == 2
 
 

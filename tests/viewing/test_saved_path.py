@@ -106,7 +106,7 @@ def test_anything_else_is_refused_in_one_line(content, message, tmp_path):
 def test_missing_and_huge_files_are_refused(tmp_path, monkeypatch):
     with pytest.raises(ps.SceneError, match="no such file; expected a camera path"):
         read_path(tmp_path / "nothing.json")
-    monkeypatch.setattr(camera_path, "LIMITS", camera_path.PathLimits(bytes=10))
+    monkeypatch.setattr(camera_path, "CAMERA_PATH", camera_path.PathSettings(bytes=10))
     with pytest.raises(ps.DataError, match="expected a camera path of at most"):
         read_path(written(saved(), tmp_path))
 

@@ -200,7 +200,7 @@ def test_hostile_files_are_one_line_and_nothing_stays(name, data, words, empty, 
 
 def test_too_large_and_cut_off_files_are_refused(empty, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    status, body, _ = post(empty, "/drop?name=a.ply", b"x", Content_Length=str(server.LARGEST + 1))
+    status, body, _ = post(empty, "/drop?name=a.ply", b"x", Content_Length=str(viewing.VIEWER.largest_file + 1))
     assert status == 413 and b"expected at most 4,000,000,000" in body
     host, port = empty.url.removeprefix("http://").split(":")
     with socket.create_connection((host, int(port)), timeout=30) as client:

@@ -21,7 +21,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainerConfig
 from pointsplat_ns.system.processes import connect_torchrun, gathered, local_rank, rank, torchrun_rank
 
-RATES = {
+REFINER_RATES = {
     "encoder": 1e-4,
     "backbone": 1e-4,
     "means": 1e-4,
@@ -94,16 +94,16 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
         config = copy.deepcopy(self)
         steps = config.first_step() + config.max_num_iterations
         rates = {
-            "fast": RATES,
-            "paper": dict.fromkeys(RATES, 1e-5),  # with schedule="step"
+            "fast": REFINER_RATES,
+            "paper": dict.fromkeys(REFINER_RATES, 1e-5),  # with schedule="step"
             "authors": {  # of the released code, with the cosine schedule
-                **dict.fromkeys(RATES, 3e-5),
+                **dict.fromkeys(REFINER_RATES, 3e-5),
                 **dict.fromkeys(("means", "scales", "quats"), 1e-5),
                 "features_rest": 1e-6,
             },
         }[self.rates]
         for name, group in config.optimizers.items():
-            if group["optimizer"].lr == RATES.get(name):
+            if group["optimizer"].lr == REFINER_RATES.get(name):
                 group["optimizer"].lr = rates[name]
             group["optimizer"].lr *= self.rate_factor
             schedule = group["scheduler"]
@@ -137,7 +137,7 @@ def pointsplat_config() -> TrainerConfig:
                 "optimizer": FusedAdamConfig(lr=rate, eps=1e-15, max_norm=2.0),
                 "scheduler": CosineDecaySchedulerConfig(warm_up_end=0, learning_rate_alpha=0.02, max_steps=0),
             }
-            for name, rate in RATES.items()
+            for name, rate in REFINER_RATES.items()
         },
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
         vis="tensorboard",

@@ -33,18 +33,22 @@ from pointsplat_ns.nerfstudio_plugin.running import (
 from pointsplat_ns.refiner import read_refiner, save_refiner
 from pointsplat_ns.rooms import write_room
 
-TIMESTAMP = "recipe"
-"""Folder name of the runs, the same in each call, so that finished ones are found again."""
+
+@dataclass(frozen=True)
+class RecipeSettings:
+    """Choices of the recipe that have no option."""
+
+    timestamp: str = "recipe"
+    """Folder name of the runs, the same in each call, so that finished ones are found again."""
+    train_seeds: tuple[int, ...] = tuple(range(100, 116))
+    """Seeds of the rooms that the refiner is trained on."""
+    unseen_seeds: tuple[int, ...] = (50, 51, 52, 53)
+    """Seeds of the rooms that the refiner is evaluated on."""
+    keep: float = 0.1
+    """Share of the Gaussians that scenes are merged to in training."""
 
 
-TRAIN_SEEDS = tuple(range(100, 116))
-"""Seeds of the rooms that the refiner is trained on."""
-
-UNSEEN_SEEDS = (50, 51, 52, 53)
-"""Seeds of the rooms that the refiner is evaluated on."""
-
-KEEP = 0.1
-"""Share of the Gaussians that scenes are merged to in training."""
+RECIPE = RecipeSettings()
 
 
 @dataclass(frozen=True)
@@ -96,21 +100,21 @@ def make_refiner(
         pointsplat_ns.errors.DataError: --steps 0: expected at least 1
     """
     output = Path(output)
-    if rooms is not None and not 1 <= rooms <= len(TRAIN_SEEDS):
-        raise DataError(f"--rooms {rooms}: expected 1 to {len(TRAIN_SEEDS)}")
+    if rooms is not None and not 1 <= rooms <= len(RECIPE.train_seeds):
+        raise DataError(f"--rooms {rooms}: expected 1 to {len(RECIPE.train_seeds)}")
     if steps < 1:
         raise DataError(f"--steps {steps}: expected at least 1")
     need("nerfstudio", "training")
-    train_seeds = TRAIN_SEEDS[:rooms]
-    _make_scenes(output, (*train_seeds, *UNSEEN_SEEDS), workers or os.cpu_count() or 1)
+    train_seeds = RECIPE.train_seeds[:rooms]
+    _make_scenes(output, (*train_seeds, *RECIPE.unseen_seeds), workers or os.cpu_count() or 1)
 
     name = f"{size}-{steps}-{len(train_seeds)}rooms-seed{seed}"
-    trained = run_folder(output / "refiners", name, REFINER_METHOD, TIMESTAMP)
+    trained = run_folder(output / "refiners", name, REFINER_METHOD, RECIPE.timestamp)
     evaluation, pictures = output / f"{name}.json", output / "pictures" / name
     if not finished(trained, steps):
         remove_interrupted(trained)
         evaluation.unlink(missing_ok=True)
-        run(refiner_command(output / "scenes", output / "refiners", name, TIMESTAMP, size, steps, seed))
+        run(refiner_command(output / "scenes", output / "refiners", name, RECIPE.timestamp, size, steps, seed))
     if not evaluation.is_file():
         run(evaluate_command(trained, evaluation, pictures))
     results = read_evaluation(evaluation)
@@ -119,7 +123,7 @@ def make_refiner(
     about = {
         "command": f"pointsplat make-refiner --size {size} --steps {steps} --seed {seed}{options}",
         "by": "merge",
-        "keep": KEEP,
+        "keep": RECIPE.keep,
         "steps": steps,
         "scenes": [f"room{seed}" for seed in train_seeds],
         "unseen": {variant: results["average_unseen"][variant] for variant in VARIANTS},
@@ -127,7 +131,7 @@ def make_refiner(
     target = Path(weights or output)
     refiner = read_refiner(trained / REFINER_NAME)
     save_refiner(refiner, target / REFINER_NAME, about)
-    command = refiner_command(Path("scenes"), Path("refiners"), name, TIMESTAMP, size, steps, seed)
+    command = refiner_command(Path("scenes"), Path("refiners"), name, RECIPE.timestamp, size, steps, seed)
     with replacing(target / "CARD.md") as part:
         parameters = sum(p.numel() for p in refiner.parameters())
         part.write_text(card_text(about, results, command, parameters), encoding="utf-8")
@@ -147,14 +151,14 @@ def _make_scenes(output: Path, seeds: tuple[int, ...], workers: int) -> None:
 
     def make(seed: int) -> None:
         settings = scene_settings(seed)
-        trained = run_folder(output / "scenes", settings.name, SCENE_METHOD, TIMESTAMP)
+        trained = run_folder(output / "scenes", settings.name, SCENE_METHOD, RECIPE.timestamp)
         if finished(trained, settings.steps):
             return
         remove_interrupted(trained)
         data = output / "rooms" / settings.name
         if not data.is_dir():
             write_room(data, seed, settings.frames, settings.width, settings.height, stop_or_go_on)
-        command = settings.train_command(data, output / "scenes", TIMESTAMP)
+        command = settings.train_command(data, output / "scenes", RECIPE.timestamp)
         run(command, output / "logs" / f"{settings.name}.txt", threads=1, stop=stop)
 
     with ThreadPoolExecutor(workers) as pool:
@@ -225,13 +229,13 @@ def refiner_command(scenes: Path, output: Path, name: str, timestamp: str, size:
         "pipeline.datamanager.supervision": "dense",
         "pipeline.datamanager.seed": seed,
         "pipeline.model.size": size,
-        "pipeline.model.keep": KEEP,
+        "pipeline.model.keep": RECIPE.keep,
         "pipeline.model.pixel-loss": "rmse",
         "pipeline.model.lpips-weight": 0.05,
         "rate-factor": 8,
         "pipeline.model.pruned-folder": scenes.parent / "pruned",
     }
-    unseen = tuple(f"room{seed}" for seed in UNSEEN_SEEDS)
+    unseen = tuple(f"room{seed}" for seed in RECIPE.unseen_seeds)
     return train_refiner_command(scenes, output, name, steps, timestamp, unseen, options)
 
 

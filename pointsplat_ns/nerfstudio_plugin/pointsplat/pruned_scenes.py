@@ -23,7 +23,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.pruning import PruneSettings
 from pointsplat_ns.refiner import Structure
 
-FORMAT = "pointsplat-pruned/1"
+PRUNED_FORMAT = "pointsplat-pruned/1"
 """Must change whenever the result of a pruning method changes, so that older files are not used."""
 
 
@@ -116,13 +116,13 @@ def tensors_in(value: Any) -> Iterator[Tensor]:
 def stored_path(folder: Path, name: str, content: str, settings: PruneSettings) -> Path:
     """The path of a pruned scene's file, by the SHA-256 of the file that the dense scene is read from and by how it is
     pruned: a scene that is trained again has another one. The name is for people who look into the folder."""
-    described = json.dumps([FORMAT, content, dataclasses.asdict(settings)], sort_keys=True)
+    described = json.dumps([PRUNED_FORMAT, content, dataclasses.asdict(settings)], sort_keys=True)
     return folder / f"{file_stem(name)}-{hashlib.sha256(described.encode()).hexdigest()[:16]}.safetensors"
 
 
 def write_pruned(path: Path, pruned: Gaussians, dense_count: int, seconds: float) -> None:
     """Write a pruned scene, the number of Gaussians of the dense scene, and the seconds that pruning took."""
-    header = {"format": FORMAT, "dense_count": str(dense_count), "seconds": repr(seconds)}
+    header = {"format": PRUNED_FORMAT, "dense_count": str(dense_count), "seconds": repr(seconds)}
     header["antialiased"] = str(pruned.antialiased)
     write_tensors(path, dict(pruned.items()), header)
 
@@ -135,8 +135,10 @@ def read_pruned(path: Path) -> tuple[Gaussians, int, float]:
     try:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
-            if header.get("format") != FORMAT:
-                raise SceneError(f"{path}: format {header.get('format')!r}; expected {FORMAT!r}; remove the file")
+            if header.get("format") != PRUNED_FORMAT:
+                raise SceneError(
+                    f"{path}: format {header.get('format')!r}; expected {PRUNED_FORMAT!r}; remove the file"
+                )
             pruned = Gaussians(
                 **{name: file.get_tensor(name) for name in file.keys()},
                 antialiased=header.get("antialiased") == "True",

@@ -24,7 +24,6 @@ COLUMNS = (("psnr", "PSNR dB", 2), ("ssim", "SSIM", 3), ("lpips", "LPIPS", 3), (
 """Columns of the table: a value of each variant, the title, digits to show."""
 
 
-PHOTOS = "photos"
 """The reference of evaluations that name none."""
 
 
@@ -143,8 +142,8 @@ def _parts(results: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _reference(part: dict[str, Any]) -> str:
     """Text that says what a part was compared with."""
-    reference = part.get("reference", PHOTOS)
-    return {PHOTOS: "held-out photos", "dense renders": "the dense scenes' own renders"}.get(reference, reference)
+    reference = part.get("reference", "photos")
+    return {"photos": "held-out photos", "dense renders": "the dense scenes' own renders"}.get(reference, reference)
 
 
 def _settings(results: dict[str, Any]) -> str:
@@ -160,11 +159,11 @@ def _note(results: dict[str, Any]) -> str:
 
 def _blocks(results: dict[str, Any], part: dict[str, Any]) -> list[ReportBlock]:
     """The scenes of a part, then the averages if there are several scenes."""
-    reference = part.get("reference", PHOTOS)
+    reference = part.get("reference", "photos")
     blocks = [
         ReportBlock(name, "yes" if scene["seen_in_training"] else "never", scene)
         for name, scene in results["scenes"].items()
-        if scene.get("reference", PHOTOS) == reference
+        if scene.get("reference", "photos") == reference
     ]
     if len(blocks) > 1:
         averages = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))

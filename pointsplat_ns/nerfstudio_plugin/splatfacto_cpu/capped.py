@@ -25,15 +25,6 @@ from torch.optim import Optimizer
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.system.threads import one_thread
 
-GROWTH = 1.05
-"""Least factor of the number of Gaussians in a densification, as in the paper."""
-
-NOISE_SLOPE, NOISE_OPACITY = 100.0, 0.005
-"""k and t of the paper's noise: half as much at opacity t as at 0, and next to none from 0.05 on."""
-
-LOGITS = (-80.0, 16.0)
-"""Least and largest logit of an opacity that is shared: beyond, an opacity is 0 or 1 in float32."""
-
 
 @dataclass
 class CappedStrategy(Strategy):
@@ -118,9 +109,9 @@ def shared_opacity(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[T
         copies: (M,) number of copies, at least 1.
 
     Returns:
-        (M,) logits and (M, 3) natural logarithms, of each copy. Opacities count as within :data:`LOGITS`.
+        (M,) logits and (M, 3) natural logarithms, of each copy. Logits below -80 and above 16 count as these.
     """
-    logits = opacities.double().clamp(*LOGITS)
+    logits = opacities.double().clamp(-80.0, 16.0)  # outside, an opacity is 0 or 1 in float32
     numbers = copies.double()
     passed = logsigmoid(-logits) / numbers  # log(1 - o')
     opacity = -torch.expm1(passed)
@@ -131,7 +122,9 @@ def shared_opacity(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[T
     return (opacity.log() - passed).to(opacities.dtype), (scales.double() + factor[:, None]).to(scales.dtype)
 
 
-def position_noise(scales: Tensor, quats: Tensor, opacities: Tensor) -> Tensor:
+def position_noise(
+    scales: Tensor, quats: Tensor, opacities: Tensor, slope: float = 100.0, least: float = 0.005
+) -> Tensor:
     """Random moves of N Gaussians, as long as they are wide, and the shorter the more opaque they are: covariance times
     normal numbers times the logistic function of k (t - o) (the paper's equation 8).
 
@@ -139,12 +132,14 @@ def position_noise(scales: Tensor, quats: Tensor, opacities: Tensor) -> Tensor:
         scales: (N, 3) natural logarithms.
         quats: (N, 4) wxyz.
         opacities: (N, 1) logits.
+        slope: k.
+        least: t, an opacity: there the share is a half; with these values it is next to none from 0.05 on.
 
     Returns:
         (N, 3), scene units.
     """
     normal = torch.randn(scales.shape[0], 3, 1, dtype=scales.dtype, device=scales.device)
-    share = torch.sigmoid(NOISE_SLOPE * (NOISE_OPACITY - torch.sigmoid(opacities)))
+    share = torch.sigmoid(slope * (least - torch.sigmoid(opacities)))
     turn = rotation_matrices(quats)
     return share * (turn @ ((2 * scales).exp()[:, :, None] * (turn.mT @ normal)))[..., 0]
 
@@ -159,12 +154,12 @@ def drawn(weights: Tensor, count: int) -> Tensor:
     return chosen.clamp(max=int(weights.nonzero()[-1]))  # where the product is rounded up to the last end
 
 
-def grown_number(num: int, most: int, later: int) -> int:
+def grown_number(num: int, most: int, later: int, least_factor: float = 1.05) -> int:
     """Number of Gaussians after a densification of ``num``, if ``later`` more follow until ``most`` has to be reached:
-    the same factor for each, and at least :data:`GROWTH`."""
+    the same factor for each, and at least the paper's."""
     if num >= most or later <= 0:
         return most
-    return min(most, math.ceil(num * max(GROWTH, (most / num) ** (1 / (later + 1)))))
+    return min(most, math.ceil(num * max(least_factor, (most / num) ** (1 / (later + 1)))))
 
 
 def replaced(

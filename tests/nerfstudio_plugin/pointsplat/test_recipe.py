@@ -6,18 +6,16 @@ import pytest
 
 from making import parsed_by_ns_train
 from pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner import (
-    KEEP,
-    TRAIN_SEEDS,
-    UNSEEN_SEEDS,
+    RECIPE,
     refiner_command,
     scene_settings,
 )
 
 
 def test_settings_follow_from_the_seed_and_differ_between_seeds():
-    assert not set(TRAIN_SEEDS) & set(UNSEEN_SEEDS)
-    every = [scene_settings(seed) for seed in (*TRAIN_SEEDS, *UNSEEN_SEEDS)]
-    assert every == [scene_settings(seed) for seed in (*TRAIN_SEEDS, *UNSEEN_SEEDS)]
+    assert not set(RECIPE.train_seeds) & set(RECIPE.unseen_seeds)
+    every = [scene_settings(seed) for seed in (*RECIPE.train_seeds, *RECIPE.unseen_seeds)]
+    assert every == [scene_settings(seed) for seed in (*RECIPE.train_seeds, *RECIPE.unseen_seeds)]
     for name in ("steps", "seed_points", "densify_grad_thresh"):
         assert len({getattr(s, name) for s in every}) > 0.9 * len(every), name
     for name in ("width", "cull_alpha_thresh", "antialiased", "scale_regularization"):
@@ -25,7 +23,7 @@ def test_settings_follow_from_the_seed_and_differ_between_seeds():
 
 
 def test_the_scene_command_says_what_the_settings_say():
-    settings = scene_settings(TRAIN_SEEDS[0])
+    settings = scene_settings(RECIPE.train_seeds[0])
     config = parsed_by_ns_train(settings.train_command(Path("rooms/a b"), Path("scenes"), "recipe"))
     model = config.pipeline.model
     assert config.method_name == "splatfacto-cpu" and config.experiment_name == settings.name
@@ -42,7 +40,7 @@ def test_the_refiner_command_holds_the_unseen_rooms_out():
     config = parsed_by_ns_train(refiner_command(Path("o/scenes"), Path("o/refiners"), "name", "recipe", "tiny", 70, 3))
     manager, model = config.pipeline.datamanager, config.pipeline.model
     assert config.method_name == "pointsplat" and config.max_num_iterations == 70
-    assert manager.eval_scenes == tuple(f"room{seed}" for seed in UNSEEN_SEEDS)
+    assert manager.eval_scenes == tuple(f"room{seed}" for seed in RECIPE.unseen_seeds)
     assert (manager.supervision, manager.seed) == ("dense", 3)
-    assert model.keep == KEEP and model.size == "tiny" and model.by == "merge"
+    assert model.keep == RECIPE.keep and model.size == "tiny" and model.by == "merge"
     assert model.pruned_folder == Path("o/pruned")

@@ -8,7 +8,7 @@ import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import fast_config, pipeline_of
-from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES
+from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.report import REFINER_NAME
 from pointsplat_ns.refiner import read_refiner
 from pointsplat_ns.refiner.weights import read_metadata
@@ -46,7 +46,7 @@ def test_the_checkpoint_holds_the_network_and_nothing_else(trained):
     assert all(torch.equal(state["pipeline"][f"_model.refiner.{n}"], v) for n, v in refiner.state_dict().items())
     parameters = sum(p.numel() for p in refiner.parameters())
     assert path.stat().st_size < 4 * 3 * parameters + 500_000, "three floats a parameter: itself and Adam's two"
-    assert set(state["optimizers"]) == set(RATES)
+    assert set(state["optimizers"]) == set(REFINER_RATES)
     trained_numbers = {p for g in trainer.optimizers.optimizers.values() for s in g.param_groups for p in s["params"]}
     assert trained_numbers == set(refiner.parameters()), "every parameter has a learning rate"
 

@@ -14,7 +14,7 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch loa
 from broken_steps import broken
 from making import dense_config, equal
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES, pointsplat_config
+from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES, pointsplat_config
 from pointsplat_ns.nerfstudio_plugin.pointsplat.training_state import TrainingState
 
 
@@ -163,9 +163,9 @@ def fitted_of(config):
 
 def test_published_rates_are_taken_but_for_what_was_set_by_hand():
     config = pointsplat_config()
-    assert {n: g["optimizer"].lr for n, g in fitted_of(config).items()} == RATES
+    assert {n: g["optimizer"].lr for n, g in fitted_of(config).items()} == REFINER_RATES
     config.optimizers["backbone"]["optimizer"].lr = 7e-4
-    expected = {"paper": dict.fromkeys(RATES, 1e-5), "authors": dict.fromkeys(RATES, 3e-5)}
+    expected = {"paper": dict.fromkeys(REFINER_RATES, 1e-5), "authors": dict.fromkeys(REFINER_RATES, 3e-5)}
     expected["authors"] |= {"means": 1e-5, "scales": 1e-5, "quats": 1e-5, "features_rest": 1e-6}
     for config.rates in ("paper", "authors"):
         fitted = fitted_of(config)

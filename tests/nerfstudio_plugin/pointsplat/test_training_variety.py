@@ -13,7 +13,7 @@ from making import equal, move_zero_layers, small_config
 from pointsplat_ns.compression.trained_refiner import load_refiner
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES
+from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PIXEL_LOSSES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes import PrunedKey, read_pruned, stored_path, write_pruned
 from pointsplat_ns.pruning import PruneSettings
@@ -139,8 +139,8 @@ def test_the_factor_multiplies_every_rate_and_is_a_positive_number(trained_walls
     config.rate_factor = 3.0
     trainer = config.setup(local_rank=0, world_size=1)
     for name, group in trainer.config.optimizers.items():
-        assert group["optimizer"].lr == pytest.approx(3 * RATES[name])
-    assert config.optimizers["encoder"]["optimizer"].lr == RATES["encoder"], "the config given is left as it is"
+        assert group["optimizer"].lr == pytest.approx(3 * REFINER_RATES[name])
+    assert config.optimizers["encoder"]["optimizer"].lr == REFINER_RATES["encoder"], "the config given is left as it is"
     for config.rate_factor in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(PointSplatError, match="--rate-factor"):
             config.setup(local_rank=0, world_size=1)

@@ -212,4 +212,4 @@ def test_memory_is_that_of_a_cell_and_not_of_the_scene(tmp_path):
     command = [sys.executable, "-c", MEMORY, str(tmp_path), str(most)]  # a process of its own: no other test's memory
     grown = int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     # Of a cell, 8 times as much, with what the C library and mapped files hold; of one cell for all, 215 MB.
-    assert grown < 14 * most * (prune_file.CELL_BYTES + sh_bytes)
+    assert grown < 14 * most * (prune_file.MEMORY.cell + sh_bytes)
