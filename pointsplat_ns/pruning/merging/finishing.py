@@ -1,8 +1,8 @@
 """How a scene is finished: one factor for the sizes of all merged Gaussians, chosen by renders.
 
 How large a merged Gaussian must be to look like its members depends on how these overlap and on what is behind them,
-and differs between scenes. The factor is chosen by the PSNR against the dense scene in pictures of several
-sizes (:mod:`~pointsplat_ns.looking.sizes`).
+and differs between scenes. The factor is chosen by the PSNR against the dense scene in pictures of the
+middle size (:func:`~pointsplat_ns.looking.sizes.sides_of`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Finish:
     size_change: float = 0.0
     """Added to the log-scales of merged Gaussians."""
     psnr: float | None = None
-    """Mean PSNR over pictures of all sizes against the dense scene's renders, dB; None if nothing was rendered."""
+    """PSNR against the dense scene's renders, dB; None if nothing was rendered."""
     psnr_before: float | None = None
     """The same with a size change of 0, dB."""
 

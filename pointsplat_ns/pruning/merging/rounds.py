@@ -19,7 +19,7 @@ from torch import Tensor
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
-from pointsplat_ns.looking.content import views_in_units
+from pointsplat_ns.looking.content import thinned, views_in_units
 from pointsplat_ns.looking.sampling import views_in_scene_units
 from pointsplat_ns.looking.sizes import RESOLUTION, RendersOfSizes, sides_of
 from pointsplat_ns.pruning.duplicates import Copies, Reduced
@@ -240,7 +240,8 @@ def looked_at(
     if views is not None:
         viewpoints = Viewpoints(views_in_units(views, participants.centre, participants.size))
     elif len(participants) >= settings.min_count_rendered:
-        viewpoints = sampled_viewpoints(participants.in_units(participants.scene), *resolution, settings)
+        few = thinned(participants.scene, settings.max_count_drawn)
+        viewpoints = sampled_viewpoints(participants.in_units(few), *resolution, settings)
     return viewpoints, visibility_weights(participants, viewpoints, settings)
 
 
@@ -309,10 +310,10 @@ def _reference(
     dense: Callable[[], Gaussians],
     settings: MergeSettings,
 ) -> RendersOfSizes | None:
-    """Renders of ``count`` Gaussians ``dense`` that results are compared with, in the smallest and largest pictures;
-    None if they are too many or there are no viewpoints."""
+    """Renders of ``count`` Gaussians ``dense`` that results are compared with, in every few pixels of pictures of
+    the middle size; None if they are too many or there are no viewpoints."""
     if viewpoints is None or count > settings.max_count_rendered or settings.finish_views < 1:
         return None
     views = viewpoints.views.spread(settings.finish_views)
     sides = sides_of(views.width, views.height)
-    return RendersOfSizes(participants.in_units(dense()), views, sorted({sides[0], sides[-1]}))
+    return RendersOfSizes(participants.in_units(dense()), views, [sides[len(sides) // 2]])
