@@ -15,12 +15,11 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.geometry.harmonics import C0
-
-SH_C0 = C0
-"""The constant band of the real spherical harmonics, 1 / (2 sqrt(pi))."""
 
 MAX_SH_DEGREE = 3
+
+PARAMETERS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
+"""Names of the parameters of Gaussians, also in checkpoints and in Splatfacto's optimisers."""
 
 
 def sh_degree_of(num_rest: int) -> int:
@@ -60,7 +59,7 @@ class Gaussians:
 
         >>> import torch
         >>> import pointsplat_ns as ps
-        >>> from pointsplat_ns.gaussians import SH_C0
+        >>> from pointsplat_ns.geometry.harmonics import SH_C0
         >>> scene = ps.Gaussians(
         ...     means=torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
         ...     scales=torch.tensor([[0.1, 0.1, 0.1], [0.2, 0.2, 0.001]]).log(),

@@ -19,6 +19,9 @@ WAYS: dict[Way, tuple[str, ...]] = {
 
 _PROGRAM = [sys.executable, "-c", "from pointsplat_ns.cli import main; main()"]
 
+PEER = "splat-transform"
+"""Name of the other program that is measured."""
+
 
 def programs_of(ways: tuple[Way, ...], splat_transform: tuple[str, ...]) -> list[Reducer]:
     """Our ways, by the interpreter in use, and every mode of each named program of splat-transform.
@@ -30,7 +33,7 @@ def programs_of(ways: tuple[Way, ...], splat_transform: tuple[str, ...]) -> list
     for path in splat_transform:
         found = SplatTransform(path)
         if found.missing:
-            raise SystemExit(f"{'splat-transform'}: {found.missing}")
+            raise SystemExit(f"{PEER}: {found.missing}")
         programs += [mode for mode in found.modes if mode.label not in [known.label for known in programs]]
     return programs
 

@@ -21,14 +21,14 @@ import tyro
 
 from lab.common.printing import console, save_figure, table
 from lab.common.results import Results, Row, grouped
-from lab.common.ways import Way, pointsplat_command
+from lab.common.ways import PEER, Way, pointsplat_command
 from lab.judge.record import OURS
 from lab.judge.scenes import JudgedScene, check, load, losses
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_scene
 from pointsplat_ns.system.programs import run_measured
 from pointsplat_ns.system.progress import tracked
-from pointsplat_ns.tables.making import PEER, SplatTransform
+from pointsplat_ns.tables.making import SplatTransform
 
 
 def files_of(

@@ -20,10 +20,10 @@ import tyro
 from lab.common.printing import markdown
 from lab.common.results import Row, grouped
 from lab.common.scenes import group_of
+from lab.common.ways import PEER
 from lab.judge.scenes import LPIPS_WIDTH, MEASURES, PHOTOS
 from lab.judge.tables import AHEAD, all_leads, at_order, means
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.tables.making import PEER
 
 ROOT = Path(__file__).parents[2]
 

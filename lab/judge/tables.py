@@ -12,10 +12,9 @@ from lab.common.compare import METRICS
 from lab.common.printing import megabytes, number, table
 from lab.common.results import Row, grouped
 from lab.common.scenes import JUDGED, TUNING, group_of
-from lab.common.ways import WAYS
+from lab.common.ways import PEER, WAYS
 from lab.judge.camera_paths import path_of
 from lab.judge.scenes import MEASURES, PHOTOS
-from pointsplat_ns.tables.making import PEER
 
 COSTS = ("seconds", "cpu_seconds", "peak_bytes")
 """What making a scene smaller took."""

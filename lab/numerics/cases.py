@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pointsplat_ns.gaussians import SH_C0, Gaussians
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.views import Views
 
 WIDTH, HEIGHT, FOCAL = 40, 32, 44.0

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.refiner.feedback import PARAMETERS
+from pointsplat_ns.gaussians import PARAMETERS, Gaussians
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.sizes import RESOLUTION, middle_sized, two_sizes
-from pointsplat_ns.looking.view_source import COMPARED_VIEWS
+from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, save_feedback_refiner
@@ -87,7 +87,7 @@ class TrainingScene:
         first = sampled[0]
         views = Views(viewmats, Ks, first.width, first.height, first.background, near_plane=first.near_plane)
         pruned = {budget: prune(dense, budget, "merge") for budget in keep}
-        reference = DenseReference(dense, middle_sized(views).spread(COMPARED_VIEWS))
+        reference = DenseReference(dense, middle_sized(views).spread(VIEW_COUNTS.compared))
         psnr = {budget: reference.psnr(scene)[0] for budget, scene in pruned.items()}
         return cls(name, dense, pruned, psnr, two_sizes(views))
 

@@ -16,7 +16,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text, replacing
 from pointsplat_ns.looking.closeness import Closeness
 from pointsplat_ns.looking.coverage import coverage
-from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
+from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.pruning.scores import log_volume
 from pointsplat_ns.rasterizer import render
@@ -92,7 +92,7 @@ def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
         DataError: if there are no views.
         SceneError: if the file cannot be written.
     """
-    views = source.views(MERGED_FROM)
+    views = source.views(VIEW_COUNTS.weighed)
     columns = 4
     pictures = [render(dense, view) for view in views.spread(columns**2).resized(320)]
     share = coverage(dense, views)

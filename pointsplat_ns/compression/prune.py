@@ -19,7 +19,7 @@ from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import rounding_for
 from pointsplat_ns.looking.closeness import DenseReference
-from pointsplat_ns.looking.view_source import MERGED_FROM, ViewSource
+from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning import (
     Megabytes,
     WithinPsnr,
@@ -38,9 +38,6 @@ from pointsplat_ns.views import Views
 if TYPE_CHECKING:
     from pointsplat_ns.compression.budget_search import FileLimit
     from pointsplat_ns.compression.cleaning import Cleaning
-
-SCORED_VIEWS = 40
-"""Maximum number of views for fine-tuning and for methods that score by views. Datasets may have thousands."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +94,7 @@ def prune_scene(
     if request.fine_tune:
         from pointsplat_ns.compression.fine_tune import fine_tune
 
-        tuned = views.scored(SCORED_VIEWS)
+        tuned = views.scored(VIEW_COUNTS.scored)
         scene = fine_tune(scene, tuned, dense, request.fine_tune, progress=functools.partial(progress, "fine-tuning"))
         notes.append(f"fine-tuned {request.fine_tune} steps against the dense scene's renders in {len(tuned)} views")
     if views.origin:
@@ -133,8 +130,8 @@ def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress, n
 def _views_of_method(request: PruneRequest, views: ViewSource) -> Views | Callable[[], Views] | None:
     """The views that a method needs. Merging gets known views only, because it samples its own."""
     if request.method.needs_views:
-        return functools.partial(views.scored, SCORED_VIEWS)
-    return views.known(MERGED_FROM) if request.method.score is None else None
+        return functools.partial(views.scored, VIEW_COUNTS.scored)
+    return views.known(VIEW_COUNTS.weighed) if request.method.score is None else None
 
 
 def _pruner(
@@ -148,7 +145,7 @@ def _pruner(
     are computed once. The views that merging looked from are added to ``seen``."""
     method = request.method
     if method.score is None:
-        merger = Merger(scene, views.known(MERGED_FROM), views.resolution)
+        merger = Merger(scene, views.known(VIEW_COUNTS.weighed), views.resolution)
 
         def made(count: int) -> Gaussians:
             merged = merger.merged(count)
@@ -157,7 +154,7 @@ def _pruner(
 
         return made
     progress(0.0)
-    scored = functools.partial(views.scored, SCORED_VIEWS)
+    scored = functools.partial(views.scored, VIEW_COUNTS.scored)
     scores = score_of(scene, method, scored, request.opacity_weight, progress)
     return lambda count: scene[select(scores, count)]
 

@@ -17,7 +17,7 @@ from pointsplat_ns.io.formats.compressed_ply import is_compressed
 from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.io.ply_header import read_header
 from pointsplat_ns.looking.sizes import RESOLUTION
-from pointsplat_ns.looking.view_source import MERGED_FROM
+from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pruning import found_by_trying
 from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
 from pointsplat_ns.pruning.merging.settings import DEFAULTS
@@ -142,7 +142,7 @@ def prune_file(
         if known is None:
             return None
         check_views_show(sample, known, str(poses))
-        return known.spread(MERGED_FROM)
+        return known.spread(VIEW_COUNTS.weighed)
 
     def count_of(n: int) -> int:
         count = request.count_of(n, rows.sh_degree, rows.antialiased)

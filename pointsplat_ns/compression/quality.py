@@ -14,7 +14,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import DenseReference, views_text
 from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.sizes import subsampled
-from pointsplat_ns.looking.view_source import COMPARED_VIEWS, MERGED_FROM, ViewSource
+from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning.merging.settings import DEFAULTS as MERGING
 from pointsplat_ns.views import Views, spread_indices
 
@@ -47,13 +47,13 @@ def quality_of(dense: Gaussians, scene: Gaussians, views: Views) -> FullSizeQual
     """Compare a scene with the dense scene in subsampled pictures (:mod:`~pointsplat_ns.looking.sizes`). On a statue, a
     bathroom and flowers the PSNR is within 0.03 dB of that of the whole pictures.
 
-    Of the views, which are at full size, at most :data:`~pointsplat_ns.looking.view_source.COMPARED_VIEWS` are used,
+    Of the views, which are at full size, at most ``VIEW_COUNTS.compared`` are used,
     and none that the finish of merging compared, unless there are no others.
     """
     finish = spread_indices(len(views), MERGING.finish_views)
     if others := sorted({*range(len(views))} - {*finish}):
         views = views[torch.tensor(others)]
-    views = views.spread(COMPARED_VIEWS)
+    views = views.spread(VIEW_COUNTS.compared)
     psnr, _ = DenseReference(dense, subsampled(views, max(views.width, views.height))).psnr(scene)
     fills = fill(dense, views), fill(scene, views)
     return FullSizeQuality(psnr, len(views), views.width, views.height, *fills)
@@ -70,4 +70,6 @@ def quality_if_seen(dense: Gaussians, scene: Gaussians, views: Callable[[], View
 def quality_of_pruned(dense: Gaussians, pruned: Pruned, source: ViewSource) -> FullSizeQuality | None:
     """:func:`quality_of` in known views, else in those that merging looked from; None if there is no place to look
     from."""
-    return quality_if_seen(dense, pruned.scene, lambda: source.known(MERGED_FROM) or pruned.views or source.whole())
+    return quality_if_seen(
+        dense, pruned.scene, lambda: source.known(VIEW_COUNTS.weighed) or pruned.views or source.whole()
+    )

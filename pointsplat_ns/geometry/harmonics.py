@@ -9,7 +9,8 @@ from torch import Tensor
 
 # Normalisation constants of the real spherical harmonics (Sloan, "Efficient Spherical Harmonic
 # Evaluation", 2013), with the signs that 3DGS files use.
-C0 = 0.28209479177387814
+SH_C0 = 0.28209479177387814
+"""The constant band of the real spherical harmonics, 1 / (2 sqrt(pi))."""
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
@@ -18,7 +19,7 @@ C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901
 def basis_rows(unit: Tensor, degree: int) -> list[Tensor]:
     """The (degree + 1)^2 basis functions, (M,) each, in directions (3, M) of length 1."""
     x, y, z = unit
-    rows = [torch.full_like(x, C0)]
+    rows = [torch.full_like(x, SH_C0)]
     if degree >= 1:
         rows += [-C1 * y, C1 * z, -C1 * x]
     if degree >= 2:

@@ -5,6 +5,7 @@ Both are exact, in float64. They may differ in the order of neighbours at equal 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -13,14 +14,20 @@ from torch import Tensor
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.threads import most_threads
 
-QUERIES_AT_ONCE = 1 << 17
-"""Number of points asked for at once, to save memory."""
 
-LANES = 8
-"""Points in a leaf of the compiled tree, and children of a node."""
+@dataclass(frozen=True)
+class TreeSettings:
+    """Sizes of the search for neighbours."""
 
-MOST_COMPILED = 32
-"""Largest number of neighbours that the compiled tree finds."""
+    queries_at_once: int = 1 << 17
+    """Number of points asked for at once, to save memory."""
+    lanes: int = 8
+    """Points in a leaf of the compiled tree, and children of a node."""
+    most_compiled: int = 32
+    """Largest number of neighbours that the compiled tree finds."""
+
+
+TREE = TreeSettings()
 
 
 def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
@@ -68,7 +75,7 @@ def other_neighbours(points: Tensor, k: int, compiled: bool | None = None) -> Te
     Returns:
         Indices (N, k) int32, the nearest first; a point's own index stands for none.
     """
-    if k <= MOST_COMPILED and len(points) and KERNELS.usable(compiled):
+    if k <= TREE.most_compiled and len(points) and KERNELS.usable(compiled):
         tree = PointTree(points)
         near, walk = tree.others(k), tree.order
     else:
@@ -90,7 +97,7 @@ def _others_by_scipy(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
     tree = cKDTree(array, balanced_tree=False)
     near = torch.full((n, k), -1, dtype=torch.int32)
     ranks = list(range(1, min(k + 1, n) + 1))
-    for these in torch.arange(n).split(QUERIES_AT_ONCE):
+    for these in torch.arange(n).split(TREE.queries_at_once):
         _, found = tree.query(array[these[0] : these[-1] + 1], k=ranks, workers=most_threads())
         indices = torch.from_numpy(found)
         # The point itself is the first, or, among coincident ones, anywhere or missing: the first takes its place.
@@ -113,13 +120,13 @@ def nearest_of(points: Tensor, queries: Tensor, near: Tensor, k: int, compiled: 
         Indices (m, min(k, N)) int32, the nearest first.
     """
     k = min(k, len(points))
-    if k <= MOST_COMPILED and KERNELS.usable(compiled):
+    if k <= TREE.most_compiled and KERNELS.usable(compiled):
         return PointTree(points).nearest(queries, near, k)
     from scipy.spatial import cKDTree
 
     tree = cKDTree(points.numpy(), balanced_tree=False)
     found = torch.empty(len(queries), k, dtype=torch.int32)
-    for rows in torch.arange(len(queries)).split(QUERIES_AT_ONCE):
+    for rows in torch.arange(len(queries)).split(TREE.queries_at_once):
         indices = tree.query(queries[rows].numpy(), k=list(range(1, k + 1)), workers=most_threads())[1]
         found[rows] = torch.from_numpy(indices).to(torch.int32)
     return found
@@ -136,15 +143,15 @@ class PointTree:
         count = len(points)
         self.order = torch.arange(count)
         """Indices (N,) int64 of the points as the leaves hold them."""
-        sizes = [-(-count // LANES)]  # leaves, then the nodes of each level
+        sizes = [-(-count // TREE.lanes)]  # leaves, then the nodes of each level
         while len(sizes) < 2 or sizes[-1] > 1:
-            sizes.append(-(-sizes[-1] // LANES))
+            sizes.append(-(-sizes[-1] // TREE.lanes))
         starts = [sum(sizes[1:level]) for level in range(1, len(sizes))]
         self._tree = KERNELS.structs["Tree"](
             points=points.contiguous(), order=self.order, count=count, levels=len(starts),
             starts=(*starts, *[0] * (16 - len(starts))),
-            leaves=torch.empty(sizes[0], 3, LANES, dtype=torch.float64),
-            boxes=torch.empty(sum(sizes[1:]), 6, LANES, dtype=torch.float64),
+            leaves=torch.empty(sizes[0], 3, TREE.lanes, dtype=torch.float64),
+            boxes=torch.empty(sum(sizes[1:]), 6, TREE.lanes, dtype=torch.float64),
         )  # fmt: skip
         KERNELS.library.pointsplat_order(self._tree)
         self._run(count, KERNELS.library.pointsplat_leaves, self._tree)
@@ -153,13 +160,13 @@ class PointTree:
 
     def others(self, k: int) -> Tensor:
         """The nearest other points (N, k) int32 of every point, the nearest first; -1 for none. ``k`` is at most
-        :data:`MOST_COMPILED`."""
+        ``TREE.most_compiled``."""
         return self._search(len(self.order), k)
 
     def nearest(self, queries: Tensor, near: Tensor, k: int) -> Tensor:
-        """As :func:`nearest_of`, for at most :data:`MOST_COMPILED` neighbours."""
+        """As :func:`nearest_of`, for at most ``TREE.most_compiled`` neighbours."""
         leaves = torch.empty_like(self.order)
-        leaves[self.order] = torch.arange(len(self.order)) // LANES
+        leaves[self.order] = torch.arange(len(self.order)) // TREE.lanes
         return self._search(len(queries), k, queries=queries.contiguous(), leaves=leaves[near])
 
     def _search(self, count: int, k: int, **where: Tensor) -> Tensor:

@@ -34,7 +34,9 @@ class FolderFiles:
     """Manifest of levels of detail."""
     levels_picture: str = "lod.png"
     sweep: str = "tradeoff.json"
-    """Points of a sweep."""
+    """Results of a sweep."""
+    sweep_points: str = "points.json"
+    """Journal of a sweep."""
 
 
 FOLDER_FILES = FolderFiles()

@@ -11,12 +11,10 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import SH_C0, Gaussians
+from pointsplat_ns.gaussians import PARAMETERS, Gaussians
+from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.files import keep_usable, one_line, require_file, require_memory
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
-
-NAMES = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
-"""Names of the parameters of Gaussians, in checkpoints and in Splatfacto's optimisers."""
 
 
 def read_checkpoint(path: Path | str) -> Gaussians:
@@ -45,9 +43,9 @@ def read_checkpoint(path: Path | str) -> Gaussians:
             f"expected {prefixes[0]}means, as Splatfacto saves"
         )
     limit = path.stat().st_size
-    held = (state.get(prefix + name) for name in NAMES)
+    held = (state.get(prefix + name) for name in PARAMETERS)
     require_memory(path, min(limit, sum(4 * value.numel() for value in held if _is_dense(value))))
-    tensors = [_parameter(state, prefix + name, path, limit) for name in NAMES]
+    tensors = [_parameter(state, prefix + name, path, limit) for name in PARAMETERS]
     try:
         scene = Gaussians(*tensors)
     except SceneError as error:

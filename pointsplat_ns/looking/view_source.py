@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import random
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import count as counted
 from pathlib import Path
@@ -19,11 +20,22 @@ from pointsplat_ns.looking.traces import PhotoPlaces, photo_places
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.views import View, Views, spread_indices
 
-MERGED_FROM = 48
-"""Maximum number of known views from which merging computes visibility weights."""
 
-COMPARED_VIEWS = 12
-"""Maximum number of views in which renders are compared."""
+@dataclass(frozen=True)
+class ViewCounts:
+    """Maximum numbers of views for what is decided by views. Datasets may have thousands."""
+
+    weighed: int = 48
+    """Known views from which merging computes visibility weights."""
+    compared: int = 12
+    """Views in which renders are compared."""
+    scored: int = 40
+    """Views for fine-tuning and for methods that score by views."""
+    opening: int = 24
+    """Known views from which those of a page are chosen."""
+
+
+VIEW_COUNTS = ViewCounts()
 
 
 class ViewSource:
@@ -138,12 +150,12 @@ class ViewSource:
         return views if self._resolution is None else views.resized(max(self._resolution))
 
     def whole(self) -> Views:
-        """The views in which renders are compared, at their full size: at most :data:`COMPARED_VIEWS`."""
+        """The views in which renders are compared, at their full size: at most ``VIEW_COUNTS.compared``."""
         return self._whole
 
     @cached_property
     def _whole(self) -> Views:
-        return self.views(COMPARED_VIEWS)
+        return self.views(VIEW_COUNTS.compared)
 
     def compared(self) -> Views:
         """The views in which renders are compared, at :func:`~pointsplat_ns.looking.sizes.middle_sized` size."""
@@ -169,7 +181,7 @@ class ViewSource:
         compared = self.compared()
         known = self.given if self.given is not None else self._of_dataset
         if known is not None and len(known) > 2 * len(compared):
-            left = sorted(set(range(len(known))) - set(spread_indices(len(known), COMPARED_VIEWS)))
+            left = sorted(set(range(len(known))) - set(spread_indices(len(known), VIEW_COUNTS.compared)))
             rest, generator = two_sizes(self._at_resolution(known), self._settings), random.Random(seed)
             for turn, index in enumerate(drawn for _ in counted() for drawn in generator.sample(left, len(left))):
                 yield rest[turn % 2][index]

@@ -18,7 +18,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.nerfstudio_plugin.frames import LOOK_AHEAD, Frame, Frames, MemoryCache, free_memory_share, to_device
+from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache, free_memory_share, to_device
 from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset], SpiralSourc
         if not self.train_unseen_cameras:
             self.train_unseen_cameras = self.sample_train_cameras()
         frame = self.train_frames[index]
-        self.train_frames.prefetch(self.train_unseen_cameras[:LOOK_AHEAD])
+        self.train_frames.prefetch(self.train_unseen_cameras[: self.train_frames.look_ahead])
         camera, data = to_device(frame, self.device)
         camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
         return camera, data

@@ -74,10 +74,6 @@ class MemoryCache:
         return len(self._entries)
 
 
-LOOK_AHEAD = 4
-"""Photos decoded ahead of the one in use: enough to hide decoding behind a training step, few enough to need little
-memory."""
-
 Frame = tuple[Cameras, dict[str, Any]]
 """A camera of shape (1,), and what nerfstudio calls its data: a dictionary with the photo, its mask and its index."""
 
@@ -100,6 +96,10 @@ class Frames:
     shared with the cache, which by default takes a quarter of the free memory: do not write to them. ``max_workers``
     threads decode ahead. A photo or mask that cannot be used is a DataError.
     """
+
+    look_ahead = 4
+    """Photos decoded ahead of the one in use: enough to hide decoding behind a training step, few enough to need little
+    memory."""
 
     def __init__(
         self,
@@ -134,7 +134,7 @@ class Frames:
 
     def __iter__(self) -> Iterator[Frame]:
         for index in range(len(self)):
-            self.prefetch(range(index + 1, min(index + 1 + LOOK_AHEAD, len(self))))
+            self.prefetch(range(index + 1, min(index + 1 + self.look_ahead, len(self))))
             yield self[index]
 
     def prefetch(self, indices: Iterable[int]) -> None:

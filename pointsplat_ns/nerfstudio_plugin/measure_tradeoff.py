@@ -10,16 +10,17 @@ from pointsplat_ns.compression.posed_scene import read_posed
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.runs import may_be_run, name_of
 from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named
-from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
+from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
 from pointsplat_ns.system.progress import Progress, progress_bar
-from pointsplat_ns.tradeoff.journal import POINTS_NAME, check_journal_folder
+from pointsplat_ns.tradeoff.journal import check_journal_folder
 from pointsplat_ns.tradeoff.measuring import Subject
 from pointsplat_ns.tradeoff.outputs import SWEEP_FILES
 from pointsplat_ns.tradeoff.points import Tradeoff
@@ -36,7 +37,7 @@ def measure_tradeoff(
     within: float = 0.5,
     by: tuple[str, ...] = ("merge",),
     repairs: tuple[str, ...] = ("none", "quick"),
-    views: int = COMPARED_VIEWS,
+    views: int = VIEW_COUNTS.compared,
     poses: str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
     up: str | None = None,
@@ -99,7 +100,13 @@ def measure_tradeoff(
     with claimed_folder(folder), removed_without_points(folder), progress_bar(progress) as report:
         dense, given = (read_scene(path), None) if poses is None else read_posed(path, poses)
         results = SWEEP_FILES.every
-        check_journal_folder(folder, POINTS_NAME, results, force, [folder / name for name in (POINTS_NAME, *results)])
+        check_journal_folder(
+            folder,
+            FOLDER_FILES.sweep_points,
+            results,
+            force,
+            [folder / name for name in (FOLDER_FILES.sweep_points, *results)],
+        )
         subject = subject_of(dense, path, given, resolution=size, up=upward)
         file = None if poses is None else Path(poses)
         subject = replace(subject, name=name_of(path), sha256=source_file(path).sha256, poses=file)

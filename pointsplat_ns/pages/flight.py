@@ -21,6 +21,7 @@ from pointsplat_ns.looking.content import content_size, in_units, views_in_units
 from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.sampling import estimated_up
 from pointsplat_ns.looking.upright import Up
+from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.views import Views
@@ -29,9 +30,6 @@ logger = logging.getLogger("pointsplat_ns")
 
 FLIGHT_SCRIPTS = ("spz.js", "splats.js", "camera.js", "flight.js")
 """Scripts of a flight, for :func:`~pointsplat_ns.pages.html.page` with ``with_workers``."""
-
-KNOWN_VIEWS = 24
-"""Maximum number of known views from which those of a page are chosen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +49,7 @@ class FlightFrame:
         most, see :func:`~pointsplat_ns.looking.opening.opening_views`; by default up is that of the views, or
         estimated. Raises SceneError if no Gaussian can be drawn, and DataError if none is visible."""
         need_usable(scene)
-        known = None if views is None or len(views) == 0 else views.spread(KNOWN_VIEWS)
+        known = None if views is None or len(views) == 0 else views.spread(VIEW_COUNTS.opening)
         if up is None and known is not None:
             up = _up_of(known, estimated_up(scene))
         opening = opening_views(scene.detach(), 6, up=up, known=known)

@@ -2,7 +2,6 @@
 
 from pointsplat_ns.io.ply import ply_bytes
 from pointsplat_ns.pruning.budget import (
-    AUTO_PSNR,
     Keep,
     Megabytes,
     WithinPsnr,
@@ -16,7 +15,6 @@ from pointsplat_ns.pruning.select import select
 from pointsplat_ns.pruning.sh_bands import band_energies, cut_sh, energy_lost
 
 __all__ = [
-    "AUTO_PSNR",
     "METHODS",
     "Keep",
     "Megabytes",

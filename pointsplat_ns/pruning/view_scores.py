@@ -19,11 +19,6 @@ from pointsplat_ns.rasterizer.pixel_walk import PixelBlock, sum_over_pixels
 from pointsplat_ns.rasterizer.projection import Projected, project
 from pointsplat_ns.views import Views
 
-MIN_EIGENVALUE = 1e-9
-"""Lower bound of the eigenvalues of a Hessian block of unit diagonal (PUP-3DGS). Parameters that no view determines
-have eigenvalues of 0, whose computed values and logarithms are rounding errors. With this bound the score depends on
-the other eigenvalues."""
-
 
 def lightgaussian_score(
     scene: Gaussians, views: Views, beta: float = 0.1, progress: Callable[[float], None] | None = None
@@ -87,7 +82,7 @@ def pup_score(scene: Gaussians, views: Views, progress: Callable[[float], None] 
     Returns:
         Scores (N,), float64: -Inf where the picture does not depend on one of the six parameters (as where no view sees
         the Gaussian), NaN where it cannot be drawn. Combinations of parameters that no view determines count
-        as slightly determined, see :data:`MIN_EIGENVALUE`.
+        as slightly determined, see :func:`log_determinant`.
 
     Raises:
         DataError: if there is no view.
@@ -120,19 +115,20 @@ def sensitivity(scene: Gaussians, views: Views, progress: Callable[[float], None
     return total
 
 
-def log_determinant(blocks: Tensor) -> Tensor:
+def log_determinant(blocks: Tensor, least: float = 1e-9) -> Tensor:
     """Logarithm of the determinants of symmetric positive semi-definite blocks, (N, D, D) to (N,); -Inf where the
     diagonal has a zero.
 
     Each block is first scaled to a unit diagonal, so that neither 1e-30 nor 1e30 under- or overflows. Its eigenvalues
-    are then bounded by :data:`MIN_EIGENVALUE`.
+    count as at least ``least``: parameters that no view determines have eigenvalues of 0, whose computed values and
+    logarithms are rounding errors. So the result depends on the other eigenvalues.
     """
     diagonal = blocks.diagonal(dim1=-2, dim2=-1)
     ok = (diagonal > 0).all(-1) & blocks.isfinite().all(-1).all(-1)
     root = torch.where(ok[:, None], diagonal, 1.0).sqrt()
     unit = torch.where(ok[:, None, None], blocks, torch.eye(blocks.shape[-1]).to(blocks))
     values = torch.linalg.eigvalsh(unit / root[:, :, None] / root[:, None, :])
-    result = values.clamp_min(MIN_EIGENVALUE).log().sum(-1) + 2 * root.log().sum(-1)
+    result = values.clamp_min(least).log().sum(-1) + 2 * root.log().sum(-1)
     return torch.where(ok, result, -math.inf)
 
 

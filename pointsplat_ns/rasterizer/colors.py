@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pointsplat_ns.gaussians import SH_C0
+from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.rasterizer.compiled import colors as compiled_colors
 from pointsplat_ns.rasterizer.spherical_harmonics import Color, check_degree, offset
 

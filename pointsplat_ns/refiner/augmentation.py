@@ -12,7 +12,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pointsplat_ns.gaussians import SH_C0, Gaussians
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.io.turning import turned
 

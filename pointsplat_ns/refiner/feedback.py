@@ -17,11 +17,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from pointsplat_ns.gaussians import PARAMETERS
 from pointsplat_ns.io.files import write_tensors
 from pointsplat_ns.refiner.weights import checked_tensors, opened_weights
-
-PARAMETERS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
-"""Parameters, each with a factor for each Gaussian."""
 
 FEATURES = 39
 """Number of features of a Gaussian, see :mod:`pointsplat_ns.compression.feedback`."""
@@ -56,8 +54,8 @@ class FeedbackRefiner(nn.Module):
         self.mlp = nn.Sequential(*layers, last)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Factors of the steps, (N, 6), above 0, in the order of :data:`PARAMETERS`, from features (N,
-        :data:`FEATURES`)."""
+        """Factors of the steps, (N, 6), above 0, in the order of :data:`~pointsplat_ns.gaussians.PARAMETERS`, from
+        features (N, :data:`FEATURES`)."""
         bound = self.MAX_LOG_FACTOR
         return (bound * torch.tanh(self.mlp(features) / bound)).exp()
 

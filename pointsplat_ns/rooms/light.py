@@ -17,10 +17,18 @@ from pointsplat_ns.rooms.raycast import Solids, chart_points, chart_size, dot, o
 from pointsplat_ns.rooms.textures import Canvas
 from pointsplat_ns.system.threads import one_thread
 
-TEXEL = 0.0075
-"""Metres between texels: a pixel of a 320 x 240 picture with 78 degrees covers that at 1.5 m."""
-LUMEL = 0.12
-"""Metres between points where light is computed."""
+
+@dataclass(frozen=True)
+class LightSettings:
+    """Resolutions of what is stored of surfaces, metres."""
+
+    texel: float = 0.0075
+    """Distance of texels: a pixel of a 320 x 240 picture with 78 degrees covers that at 1.5 m."""
+    lumel: float = 0.12
+    """Distance of points where light is computed."""
+
+
+LIGHT = LightSettings()
 
 
 @dataclass(frozen=True)
@@ -106,7 +114,7 @@ def _paint(solids: Solids, materials: tuple[Material, ...], seed: int) -> ChartG
     images, spacing = [], []
     for chart, material in enumerate(materials):
         width, height = chart_size(solids, chart)
-        columns, rows = max(math.ceil(width / TEXEL), 2), max(math.ceil(height / TEXEL), 2)
+        columns, rows = max(math.ceil(width / LIGHT.texel), 2), max(math.ceil(height / LIGHT.texel), 2)
         painted = material.paint(Canvas(width, height, columns, rows, seed * 1009 + chart))
         images.append(torch.from_numpy(painted).float().clamp(0, 1).permute(2, 0, 1))
         spacing.append(math.sqrt(width / columns * height / rows))
@@ -118,7 +126,7 @@ def _illuminate(solids: Solids, lights: tuple[Light, ...]) -> ChartGrids:
     shapes, placed = [], []
     for chart in range(6 * len(solids)):
         width, height = chart_size(solids, chart)
-        rows, columns = max(round(height / LUMEL), 2), max(round(width / LUMEL), 2)
+        rows, columns = max(round(height / LIGHT.lumel), 2), max(round(width / LIGHT.lumel), 2)
         v, u = torch.meshgrid((torch.arange(rows) + 0.5) / rows, (torch.arange(columns) + 0.5) / columns, indexing="ij")
         shapes.append((rows, columns))
         placed.append(chart_points(solids, chart, u.reshape(-1), v.reshape(-1)))
@@ -132,7 +140,7 @@ def _illuminate(solids: Solids, lights: tuple[Light, ...]) -> ChartGrids:
     values = torch.cat([total + ambient, torch.stack(visible, 1)], 1)
     parts = values.split([rows * columns for rows, columns in shapes])
     images = [part.T.reshape(-1, *shape) for part, shape in zip(parts, shapes, strict=True)]
-    return ChartGrids.of(images, [LUMEL] * len(images), levels=1)
+    return ChartGrids.of(images, [LIGHT.lumel] * len(images), levels=1)
 
 
 def _direct(solids: Solids, light: Light, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:

@@ -29,11 +29,9 @@ from pointsplat_ns.refiner import read_metadata
 from pointsplat_ns.system.programs import ProgramFailed, Usage, run_measured
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tables.scene import OpenedScene, TableOptions
-from pointsplat_ns.tables.ways import PROTOCOL, Network, Way
+from pointsplat_ns.tables.ways import PROTOCOL, WAYS, Network, Way
 from pointsplat_ns.tradeoff.measuring import MadeScene, make
 from pointsplat_ns.tradeoff.settings import DENSE, EFFORTS, Setting
-
-PEER = "splat-transform"
 
 
 class Tools:
@@ -246,7 +244,7 @@ class SplatTransform:
     """
 
     def __init__(self, program: str | None = None):
-        self.command = [program] if program else ["npx", "--no-install", PEER]
+        self.command = [program] if program else ["npx", "--no-install", WAYS.splat_transform.name]
         self.version = self.missing = ""
         self.modes: tuple[Reducer, ...] = ()
         try:
@@ -261,7 +259,7 @@ class SplatTransform:
             self.missing = f"{' '.join(self.command)} ended with {found.returncode}; is Node's package installed?"
             return
         self.version = version[1]
-        label = f"{PEER} {self.version}"
+        label = f"{WAYS.splat_transform.name} {self.version}"
         if int(version[2]) < 3:
             self.modes = (self._mode(label, "--decimate"),)
         else:

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from pointsplat_ns.compression.compact import Compacted, as_compacted
 from pointsplat_ns.io.formats import format_to_write
-from pointsplat_ns.looking.view_source import COMPARED_VIEWS
+from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pruning import cut_sh
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.machine import busy_note
@@ -38,7 +38,7 @@ def find_scene(
     """
     start = time.perf_counter()
     dense, timed = subject.dense, targets.ms is not None
-    measurer = Measurer(subject, COMPARED_VIEWS, progress, timed=timed)
+    measurer = Measurer(subject, VIEW_COUNTS.compared, progress, timed=timed)
 
     def measure(setting: Setting) -> Point:
         number = 1 + len(search.tried)

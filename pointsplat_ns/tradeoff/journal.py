@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.io.files import one_line, read_text, write_json
 from pointsplat_ns.tradeoff.points import ImageMetrics, Point
 from pointsplat_ns.tradeoff.settings import DENSE, Setting, setting_of
@@ -102,8 +103,6 @@ def check_journal_folder(
                 )
 
 
-POINTS_NAME = "points.json"
-
 POINTS_FORM = Form("pointsplat-tradeoff-points", 3, "points", "a sweep")
 """Points of version 1 were timed without the dense scene beside them, some of version 2 drawn in other qualities."""
 
@@ -113,7 +112,7 @@ class Journal:
     SceneError if the folder holds points of another identity, or a file of points that cannot be read."""
 
     def __init__(self, folder: Path, identity: Identity):
-        self.path, self._identity = folder / POINTS_NAME, dict(identity)
+        self.path, self._identity = folder / FOLDER_FILES.sweep_points, dict(identity)
         self.dense: Point | None = None
         self.points: dict[Setting, Point] = {}
         if self.path.exists():

@@ -22,7 +22,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.looking.closeness import DenseReference, views_text
 from pointsplat_ns.looking.fill import fill
-from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
+from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.metrics import MOST_PSNR, SSIM_WINDOW, ImageError, finite_psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.rasterizer import render
@@ -54,7 +54,7 @@ class JudgedViews:
     def compared(source: ViewSource, count: int) -> JudgedViews:
         """At most ``count`` views without photos: the views of comparisons in ``compact``, which no optimisation uses.
         Raises DataError if there are none."""
-        views = source.compared().spread(min(count, COMPARED_VIEWS))
+        views = source.compared().spread(min(count, VIEW_COUNTS.compared))
         return JudgedViews(views, None, source.origin)
 
     def resized(self, side: int) -> JudgedViews:

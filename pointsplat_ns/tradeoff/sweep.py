@@ -13,14 +13,15 @@ from pathlib import Path
 
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.looking.sizes import size_text
-from pointsplat_ns.looking.view_source import COMPARED_VIEWS
+from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pruning import method_named
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.front import recommend
-from pointsplat_ns.tradeoff.journal import POINTS_NAME, Journal
+from pointsplat_ns.tradeoff.journal import Journal
 from pointsplat_ns.tradeoff.machine import busy_note, machine_text
 from pointsplat_ns.tradeoff.measuring import Measurer, Subject
 from pointsplat_ns.tradeoff.outputs import SWEEP_FILES, write_outputs
@@ -42,7 +43,7 @@ class Options:
     """Largest loss of the recommended point, dB."""
     methods: tuple[str, ...] = ("merge",)
     repairs: tuple[str, ...] = ("none", "quick")
-    views: int = COMPARED_VIEWS
+    views: int = VIEW_COUNTS.compared
     """Largest number of views."""
 
     def __post_init__(self) -> None:
@@ -72,7 +73,7 @@ def removed_without_points(folder: Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        if not (folder / POINTS_NAME).exists():
+        if not (folder / FOLDER_FILES.sweep_points).exists():
             for place in places:
                 for path in {*place.glob("*")} - before:
                     path.unlink()

@@ -21,8 +21,8 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import one_line
 from pointsplat_ns.looking.content import UNITS
 from pointsplat_ns.looking.upright import Up
-from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.pages.flight import KNOWN_VIEWS, FlightFrame
+from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
+from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.system.memory import share_freed_memory
 from pointsplat_ns.viewing.painter import PictureRequest, ViewerCamera, Watcher
@@ -71,7 +71,7 @@ class _Stage:
         self.made = 0
         """Number of times that another part of a scene was chosen or made, which pages then ask to see."""
         first = scenes[0]
-        known = first.source.known(KNOWN_VIEWS)
+        known = first.source.known(VIEW_COUNTS.opening)
         self.frame = FlightFrame.of(first.scene, known, first.source.up if up is None and known is None else up)
         found = f"the view that shows most, up is {self.frame.up}{first.source.missing}"
         self.origin = found if known is None else first.source.origin

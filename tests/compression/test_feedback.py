@@ -7,9 +7,9 @@ import torch
 
 from pointsplat_ns.compression.feedback import REPAIR, Feedback
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings, nonzero_rms
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.gaussians import PARAMETERS, Gaussians
 from pointsplat_ns.pruning import prune
-from pointsplat_ns.refiner.feedback import FEATURES, PARAMETERS, FeedbackRefiner
+from pointsplat_ns.refiner.feedback import FEATURES, FeedbackRefiner
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
+from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
 
@@ -146,7 +146,7 @@ def test_views_to_optimise_on_are_none_of_those_compared(hollow_ball):
         [tuple(view.viewmat.flatten().tolist()) for view in itertools.islice(source.others(seed), 56)]
         for seed in (0, 1)
     )
-    assert len(compared) == COMPARED_VIEWS and not compared & set(first)
+    assert len(compared) == VIEW_COUNTS.compared and not compared & set(first)
     assert len(set(first[:28])) == 28 and set(first[:28]) == set(first[28:]), "each once before any is repeated"
     assert first != second
 

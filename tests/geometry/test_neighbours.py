@@ -55,7 +55,7 @@ def test_points_in_a_graph_are_taken():
 @compiled_or_not
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
 def test_other_neighbours_are_the_nearest_without_the_point_itself(monkeypatch, compiled, scale):
-    monkeypatch.setattr(neighbours, "QUERIES_AT_ONCE", 300)  # several pieces
+    monkeypatch.setattr(neighbours, "TREE", neighbours.TreeSettings(queries_at_once=300))  # several pieces
     where = scale * points(1000).double()
     assert torch.equal(other_neighbours(where, 8, compiled).long(), by_brute_force(where, 9)[1][:, 1:])
 

@@ -11,7 +11,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import SHARED_DATA, cloud, normal_scene, same_bits
-from pointsplat_ns.gaussians import SH_C0
+from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.transforms import zero_as_identity
 from pointsplat_ns.io.formats import FORMATS, format_to_read, format_to_write
 from pointsplat_ns.io.formats.registry import format_named

@@ -12,7 +12,7 @@ import torch
 
 from making import normal_scene, same_bits
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import SH_C0
+from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io import read_checkpoint
 
 

@@ -14,7 +14,7 @@ from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.sizes import sides_of
 from pointsplat_ns.looking.traces import PhotoPlaces
 from pointsplat_ns.looking.upright import Up
-from pointsplat_ns.looking.view_source import COMPARED_VIEWS, ViewSource
+from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.views import Views
 
@@ -82,7 +82,7 @@ def test_renders_are_compared_in_few_views_of_a_middle_size(scene):
     given = sample_views(scene, 2, 900, 600)
     many = given[[0, 1] * 20]
     compared = ViewSource(scene, given=many).compared()
-    assert len(compared) == COMPARED_VIEWS
+    assert len(compared) == VIEW_COUNTS.compared
     assert compared.width == sides_of(900, 600)[1] and ViewSource(scene, given=many).whole().width == 900
 
 

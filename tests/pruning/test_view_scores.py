@@ -8,7 +8,6 @@ import torch
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.view_scores import (
-    MIN_EIGENVALUE,
     lightgaussian_score,
     log_determinant,
     pup_score,
@@ -190,7 +189,7 @@ def test_what_is_undetermined_is_ranked_by_the_rest():
     singular = root @ root.mT  # rank 3: the other three eigenvalues are rounding errors
     diagonal = singular.diagonal(dim1=1, dim2=2)
     unit = singular / (diagonal[:, :, None] * diagonal[:, None]).sqrt()
-    wanted = torch.linalg.eigvalsh(unit)[:, 3:].log().sum(1) + 3 * math.log(MIN_EIGENVALUE) + diagonal.log().sum(1)
+    wanted = torch.linalg.eigvalsh(unit)[:, 3:].log().sum(1) + 3 * math.log(1e-9) + diagonal.log().sum(1)
     assert torch.allclose(log_determinant(singular), wanted, rtol=1e-9)
     # seen twice as brightly, worth more; with the rounding errors themselves that is a matter of luck
     assert torch.allclose(

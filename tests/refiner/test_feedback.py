@@ -4,10 +4,10 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from pointsplat_ns.gaussians import PARAMETERS
 from pointsplat_ns.refiner.feedback import (
     FEATURES,
     FORMAT,
-    PARAMETERS,
     PRETRAINED,
     FeedbackRefiner,
     read_feedback_refiner,

@@ -29,8 +29,7 @@ room_of = functools.cache(make_room)
 def coarser_light():
     """Light of a tenth of the numbers."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(light, "TEXEL", 4 * light.TEXEL)
-        patch.setattr(light, "LUMEL", 2 * light.LUMEL)
+        patch.setattr(light, "LIGHT", light.LightSettings(4 * light.LIGHT.texel, 2 * light.LIGHT.lumel))
         yield
 
 

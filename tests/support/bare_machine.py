@@ -62,6 +62,6 @@ if __name__ == "__main__":
     from pointsplat_ns.rooms import light
 
     view_source.RESOLUTION = (64, 48)
-    light.TEXEL, light.LUMEL = 0.1, 0.5
+    light.LIGHT = light.LightSettings(0.1, 0.5)
     commands, results = map(Path, sys.argv[1:])
     results.write_text(json.dumps([outcome(words) for words in json.loads(commands.read_text("utf-8"))]))

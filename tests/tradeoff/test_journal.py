@@ -7,8 +7,9 @@ import math
 import pytest
 
 from pointsplat_ns.errors import SceneError
+from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.tradeoff import journal as journal_module
-from pointsplat_ns.tradeoff.journal import POINTS_NAME, Journal
+from pointsplat_ns.tradeoff.journal import Journal
 from pointsplat_ns.tradeoff.settings import DENSE, Setting
 from trades import point
 
@@ -32,7 +33,9 @@ def test_points_are_read_back_as_they_were(written):
 
 
 def test_the_file_is_json_that_any_reader_takes(written):
-    content = json.loads((written / POINTS_NAME).read_text(), parse_constant=lambda name: pytest.fail(name))
+    content = json.loads(
+        (written / FOLDER_FILES.sweep_points).read_text(), parse_constant=lambda name: pytest.fail(name)
+    )
     assert [values["key"] for values in content["points"]] == ["dense", "10pct_sh3_quick"]
 
 
@@ -43,7 +46,7 @@ def test_a_point_is_on_disk_as_soon_as_it_is_added(written):
 
 
 def test_a_point_that_cannot_be_written_leaves_those_that_were(written, monkeypatch):
-    before = (written / POINTS_NAME).read_bytes()
+    before = (written / FOLDER_FILES.sweep_points).read_bytes()
 
     def no_room(*args):
         raise OSError(28, "No space left on device")
@@ -51,13 +54,15 @@ def test_a_point_that_cannot_be_written_leaves_those_that_were(written, monkeypa
     monkeypatch.setattr("os.replace", no_room)
     with pytest.raises(SceneError, match="No space left"):
         Journal(written, OF).add(point(Setting(5000, 3), 28.0))
-    assert (written / POINTS_NAME).read_bytes() == before
-    assert [path.name for path in written.iterdir()] == [POINTS_NAME]
+    assert (written / FOLDER_FILES.sweep_points).read_bytes() == before
+    assert [path.name for path in written.iterdir()] == [FOLDER_FILES.sweep_points]
 
 
 @pytest.mark.parametrize("name, value", [("scene", "abd"), ("views", 11), ("machine", "another")])
 def test_points_of_another_sweep_are_refused(written, name, value):
-    with pytest.raises(SceneError, match=rf"{POINTS_NAME}: its points are of another sweep \({name}: .*--force"):
+    with pytest.raises(
+        SceneError, match=rf"{FOLDER_FILES.sweep_points}: its points are of another sweep \({name}: .*--force"
+    ):
         Journal(written, {**OF, name: value})
 
 
@@ -82,16 +87,16 @@ def test_points_of_another_sweep_are_refused(written, name, value):
     ],
 )
 def test_points_that_are_none_are_refused(written, change):
-    content = json.loads((written / POINTS_NAME).read_text())
+    content = json.loads((written / FOLDER_FILES.sweep_points).read_text())
     change(content)
-    (written / POINTS_NAME).write_text(json.dumps(content))
-    with pytest.raises(SceneError, match=f"{POINTS_NAME}: not the points of a sweep .*--force"):
+    (written / FOLDER_FILES.sweep_points).write_text(json.dumps(content))
+    with pytest.raises(SceneError, match=f"{FOLDER_FILES.sweep_points}: not the points of a sweep .*--force"):
         Journal(written, OF)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", "[" * 100_000, "\x00\xff"])
 def test_a_file_that_holds_something_else_is_refused(tmp_path, text):
-    (tmp_path / POINTS_NAME).write_text(text)
+    (tmp_path / FOLDER_FILES.sweep_points).write_text(text)
     with pytest.raises(SceneError, match="not the points of a sweep"):
         Journal(tmp_path, OF)
 
@@ -106,12 +111,13 @@ def test_a_file_too_large_is_refused_before_it_is_read(written, monkeypatch):
 @pytest.mark.parametrize("version", [1, 2, "two", None, "x" * 1000])
 def test_points_of_another_version_are_refused_in_one_line(written, version):
     """Those of version 1 were timed otherwise, and had other fields."""
-    content = json.loads((written / POINTS_NAME).read_text())
+    content = json.loads((written / FOLDER_FILES.sweep_points).read_text())
     content["version"] = version
     content["points"][1].pop("frame_ms")
-    (written / POINTS_NAME).write_text(json.dumps(content))
+    (written / FOLDER_FILES.sweep_points).write_text(json.dumps(content))
     with pytest.raises(
-        SceneError, match=f"{POINTS_NAME}: not the points of a sweep .of version .*, this program's are of 3.*--force"
+        SceneError,
+        match="points.json: not the points of a sweep .of version .*, this program's are of 3.*--force",
     ) as e:
         Journal(written, OF)
     assert len(str(e.value).splitlines()) == 1 and len(str(e.value)) < 400

@@ -11,9 +11,10 @@ import pointsplat_ns as ps
 from making import same_bits
 from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
+from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.tradeoff import judging, measuring, sweep
-from pointsplat_ns.tradeoff.journal import POINTS_NAME, check_journal_folder
+from pointsplat_ns.tradeoff.journal import check_journal_folder
 from pointsplat_ns.tradeoff.outputs import SWEEP_FILES
 from pointsplat_ns.tradeoff.points import picture_path
 from pointsplat_ns.tradeoff.settings import Setting
@@ -27,7 +28,7 @@ def names(folder):
 def test_a_sweep_leaves_tables_plots_pictures_and_a_page(new_sweep, tmp_path, plain_page, monkeypatch):
     result = new_sweep(tmp_path, points=2).run()
     assert [point.key for point in result.points] == ["dense", "10pct_sh1"]
-    assert names(tmp_path) == sorted([*SWEEP_FILES.every, POINTS_NAME, "pictures", "scenes"])
+    assert names(tmp_path) == sorted([*SWEEP_FILES.every, FOLDER_FILES.sweep_points, "pictures", "scenes"])
     with (tmp_path / SWEEP_FILES.table).open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [row["key"] for row in rows] == [point.key for point in result.points]
@@ -174,8 +175,10 @@ def test_points_of_another_scene_are_refused_before_anything_is_measured(new_swe
 def test_results_without_points_are_not_overwritten(tmp_path):
     (tmp_path / SWEEP_FILES.table).write_text("precious")
     with pytest.raises(SceneError, match="exists already, without points.json"):
-        check_journal_folder(tmp_path, POINTS_NAME, SWEEP_FILES.every, False, [tmp_path / SWEEP_FILES.table])
-    check_journal_folder(tmp_path, POINTS_NAME, SWEEP_FILES.every, True, [tmp_path / SWEEP_FILES.table])
+        check_journal_folder(
+            tmp_path, FOLDER_FILES.sweep_points, SWEEP_FILES.every, False, [tmp_path / SWEEP_FILES.table]
+        )
+    check_journal_folder(tmp_path, FOLDER_FILES.sweep_points, SWEEP_FILES.every, True, [tmp_path / SWEEP_FILES.table])
     assert names(tmp_path) == []
 
 

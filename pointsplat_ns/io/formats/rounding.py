@@ -22,7 +22,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pointsplat_ns.gaussians import SH_C0, Gaussians
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.formats.coding import from_smallest_three, smallest_three, unit_quats
 
 

@@ -13,7 +13,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
-from pointsplat_ns.io.splatfacto import NAMES
+from pointsplat_ns.gaussians import PARAMETERS
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
 from pointsplat_ns.nerfstudio_plugin.optimizers import FallingRateConfig, FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig
@@ -74,7 +74,7 @@ def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainer
     own = _optimizers()
     for name, group in config.optimizers.items():
         schedule = group["scheduler"]
-        if haste > 1 and name in NAMES and group == own[name]:
+        if haste > 1 and name in PARAMETERS and group == own[name]:
             last = 1.0 if schedule is None else schedule.lr_final / group["optimizer"].lr
             group["scheduler"] = FallingRateConfig(first=haste, last=last, max_steps=length)
         elif isinstance(schedule, ExponentialDecaySchedulerConfig) and schedule.max_steps == SPLATFACTO_STEPS:

@@ -16,13 +16,10 @@ from pointsplat_ns.geometry.transforms import rotation_matrices
 MIN_DIVISOR = 1e-300
 """Lower bound of float64 denominators, which keeps quotients finite; the smallest normal float64 is 2e-308."""
 
-MAX_LOG_SCALE = 40.0
-"""Bound of the absolute value of log-scales: products of four standard deviations and their squares stay in float64."""
-
 
 def covariances(log_scales: Tensor, quats: Tensor) -> Tensor:
     """Covariances (N, 6) of Gaussians with log-scales (N, 3), +-Inf allowed, and quaternions (N, 4), float64."""
-    logs = log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
+    logs = log_scales.clamp(-40.0, 40.0)  # products of four standard deviations and their squares stay in float64
     # an axis is at least exp(-11.5), 1e-5, of the longest, which float64 still tells from zero
     logs = torch.maximum(logs, logs.amax(dim=1, keepdim=True) - 11.5)
     axes = rotation_matrices(quats) * logs.exp()[:, None]

@@ -190,7 +190,7 @@ from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.pruning.merging.cells import Scratch, merge_file, partition
 from pointsplat_ns.pruning.merging.settings import DEFAULTS
 from pointsplat_ns.system.memory import PeakMemory
-partition.PIECE, partition.SAMPLE = 1 << 13, 1 << 12
+partition.CELLS = partition.CellSettings(rows_at_once=1 << 13, overview=1 << 12)
 peaks = []
 for name, most in (("few", 1000), ("many", int(sys.argv[2]))):  # the first for imports and kernels
     folder, peak = Path(sys.argv[1]) / name, PeakMemory()

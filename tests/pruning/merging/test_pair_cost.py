@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from making import assert_same_on_any_threads, cloud
-from pointsplat_ns.gaussians import SH_C0, Gaussians
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.pruning.merging import DEFAULTS
 from pointsplat_ns.pruning.merging import covariance as algebra
 from pointsplat_ns.pruning.merging.pair_cost import KERNELS, costs_in_plane, pair_costs

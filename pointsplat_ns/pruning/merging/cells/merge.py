@@ -19,7 +19,7 @@ from pointsplat_ns.io.ply import PlyRows, header_bytes, ply_bytes, row_table
 from pointsplat_ns.looking.sizes import RESOLUTION
 from pointsplat_ns.pruning.duplicates import Copies
 from pointsplat_ns.pruning.merging.cells.overview import Overview, overview_of
-from pointsplat_ns.pruning.merging.cells.partition import Cells, divided
+from pointsplat_ns.pruning.merging.cells.partition import CELLS, Cells, divided
 from pointsplat_ns.pruning.merging.cells.scratch import Scratch
 from pointsplat_ns.pruning.merging.groups import Groups, first_members
 from pointsplat_ns.pruning.merging.matching import candidate_pairs
@@ -34,11 +34,6 @@ from pointsplat_ns.pruning.merging.state import State, initial_state
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import Views
-
-FINISHED_PARTS, FINISHED_PART = 4, 1 << 18
-"""Number of parts of the curve that are merged by themselves to find the finish of the whole, and Gaussians in each. In
-five scenes, an eighth of a scene at a time, their mean factor differs from that of the whole by 0.02 at most. A thinned
-scene needs smaller factors than the whole."""
 
 _OF_EACH = ("means", "cov", "alphas", "colours", "weights", "counts")
 """Tensors of a state that have a row for each Gaussian."""
@@ -187,11 +182,11 @@ class _Work:
     def _size_changes(self, cell: int, participants: Participants) -> dict[str, Tensor]:
         """The finish of the parts in this cell among those that are evenly spread over all."""
         changes = []
-        for number in range(FINISHED_PARTS):
-            found, place = divmod((number + 0.5) * len(self.cells) / FINISHED_PARTS, 1)
+        for number in range(CELLS.finished_parts):
+            found, place = divmod((number + 0.5) * len(self.cells) / CELLS.finished_parts, 1)
             if found == cell:
-                start = max(0, int(place * len(participants)) - FINISHED_PART // 2)
-                part = participants.scene[participants.members[start : start + FINISHED_PART]]
+                start = max(0, int(place * len(participants)) - CELLS.finished_part // 2)
+                part = participants.scene[participants.members[start : start + CELLS.finished_part]]
                 few = max(1, len(part) * self.k // self.cells.count)
                 merged = merge(part, few, resolution=self.resolution, settings=self.settings)
                 changes.append(merged.finish.size_change)
