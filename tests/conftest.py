@@ -15,7 +15,7 @@ from nerfstudio.configs import external_methods
 from making import SHARED_DATA
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.settings import DEFAULTS
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.views import Views
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
@@ -245,4 +245,4 @@ def ball_views(hollow_ball: Gaussians) -> Views:
 @pytest.fixture()
 def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """The search for views ends after one round without a view, not after four: each round takes seconds."""
-    monkeypatch.setitem(vars(DEFAULTS), "max_fruitless_rounds", 1)
+    monkeypatch.setitem(vars(LOOKING), "max_fruitless_rounds", 1)

@@ -107,8 +107,8 @@ class Table:
 
 
 TABLES = {
-    "merging": Table("Merging", merging.DEFAULTS, MERGING),
-    "looking": Table("Looking", looking.DEFAULTS, LOOKING),
+    "merging": Table("Merging", merging.MERGING, MERGING),
+    "looking": Table("Looking", looking.LOOKING, LOOKING),
 }
 """All variants. Names differ between tables."""
 
@@ -151,15 +151,15 @@ def applied(name: str) -> Iterator[merging.MergeSettings]:
     """Settings of merging for a variant or for :data:`BASELINE`. A variant of another table is in force while the
     context is open."""
     if name == BASELINE:
-        yield merging.DEFAULTS
+        yield merging.MERGING
         return
     key = table_of(name)
     changes = TABLES[key].variants[name]
     if key == "merging":
-        yield dataclasses.replace(merging.DEFAULTS, **changes)
+        yield dataclasses.replace(merging.MERGING, **changes)
         return
     with replaced(TABLES[key].defaults, changes):
-        yield merging.DEFAULTS
+        yield merging.MERGING
 
 
 @contextmanager

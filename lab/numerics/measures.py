@@ -17,7 +17,7 @@ from lab.numerics.cases import HEIGHT, WIDTH, Case, Sweep
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.content import content_size
-from pointsplat_ns.pruning.merging import DEFAULTS, merge
+from pointsplat_ns.pruning.merging import MERGING, merge
 from pointsplat_ns.pruning.merging.matching import cheapest_pairs
 from pointsplat_ns.pruning.merging.pair_cost import pair_costs
 from pointsplat_ns.pruning.merging.participants import Participants
@@ -196,8 +196,8 @@ def _scores(given: Case, scene: Gaussians, truth: Gaussians) -> Iterator[tuple[s
 def _merge(given: Case, scene: Gaussians, truth: Gaussians) -> dict[str, float]:
     centre, size = content_size(truth)  # of equal Gaussians it is a matter of ties, and only a unit
     everyone, equal = torch.arange(len(truth)), torch.ones(len(truth))
-    states = [initial_state(Participants(part, everyone, centre, size), equal, DEFAULTS) for part in (scene, truth)]
-    near = other_neighbours(states[1].means, DEFAULTS.neighbours)
+    states = [initial_state(Participants(part, everyone, centre, size), equal, MERGING) for part in (scene, truth)]
+    near = other_neighbours(states[1].means, MERGING.neighbours)
     costs, wanted = pair_costs(states[0], near), pair_costs(states[1], near, dtype=torch.float64)
     there = near != torch.arange(len(near))[:, None]
     most = max(1, len(truth) // 2)

@@ -26,7 +26,7 @@ from lab.common.ways import count_of
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.io import read_scene
-from pointsplat_ns.pruning.merging import DEFAULTS, merge
+from pointsplat_ns.pruning.merging import MERGING, merge
 from pointsplat_ns.pruning.merging.matching import cheapest_pairs
 from pointsplat_ns.pruning.merging.pair_cost import pair_costs
 from pointsplat_ns.pruning.merging.participants import Participants
@@ -42,23 +42,23 @@ Part = Callable[[bool], object]
 def parts_of(scene: Gaussians) -> dict[str, Part]:
     """The parts of merging, by name, as functions of whether they use compiled kernels."""
     participants = Participants.of(scene, scene.usable().nonzero()[:, 0])
-    state = initial_state(participants, torch.ones(len(participants)), DEFAULTS)
-    near = other_neighbours(state.means, DEFAULTS.neighbours)
+    state = initial_state(participants, torch.ones(len(participants)), MERGING)
+    near = other_neighbours(state.means, MERGING.neighbours)
     costs = pair_costs(state, near)
-    first, second = cheapest_pairs(near, costs, int(DEFAULTS.round_share * len(state)))
+    first, second = cheapest_pairs(near, costs, int(MERGING.round_share * len(state)))
     members, count = Members.of(scene, participants.members), count_of(KEEP, len(state))
     group = torch.arange(len(state)) * count // len(state)  # neighbours along the curve
     groups = moments(members, group, count)
     parts: dict[str, Part] = {
-        "neighbours": partial(other_neighbours, state.means, DEFAULTS.neighbours),
+        "neighbours": partial(other_neighbours, state.means, MERGING.neighbours),
         "costs of pairs": lambda compiled: pair_costs(state, near, compiled=compiled),
         "matching": lambda compiled: cheapest_pairs(near, costs, len(first), compiled=compiled),
-        "replacement": lambda compiled: replace_pairs(state, first, second, DEFAULTS, compiled),
+        "replacement": lambda compiled: replace_pairs(state, first, second, MERGING, compiled),
         "choice of groups": lambda compiled: best_groups(members, group, groups, compiled=compiled),
     }
     whole = participants.in_units(scene)
-    if viewpoints := sampled_viewpoints(whole, 1920, 1080, DEFAULTS):
-        view = viewpoints.views.resized(DEFAULTS.visibility_side)[0]
+    if viewpoints := sampled_viewpoints(whole, 1920, 1080, MERGING):
+        view = viewpoints.views.resized(MERGING.visibility_side)[0]
         parts["visible pixels, a view"] = lambda compiled: pixels_of(whole, view, compiled)
     return parts
 

@@ -45,11 +45,11 @@ def need_no_folder_options(scene: Path, jobs: int | None, shard: str | None) -> 
 def need_one_scene(path: Path) -> None:
     """Raise a SceneError if the path is a folder of scenes."""
     from pointsplat_ns.errors import SceneError
-    from pointsplat_ns.io.scene import ACCEPTED, is_folder_of_scenes
+    from pointsplat_ns.io.scene import SCENE_KINDS, is_folder_of_scenes
 
     if is_folder_of_scenes(path):
         raise SceneError(
-            f"{path}: a folder without config.yml, so no run; expected {ACCEPTED}; compact, prune, "
+            f"{path}: a folder without config.yml, so no run; expected {SCENE_KINDS}; compact, prune, "
             "convert and info take a folder of scenes"
         )
 
@@ -121,11 +121,11 @@ def check_poses(poses: Path | None) -> None:
     if poses is None:
         return
     from pointsplat_ns.errors import SceneError
-    from pointsplat_ns.io.camera_files import ACCEPTED, is_camera_file
+    from pointsplat_ns.io.camera_files import CAMERA_KINDS, is_camera_file
 
     if not is_camera_file(poses):
         raise SceneError(
-            f"{poses}: a run or a scene; expected {ACCEPTED}; the poses of a run's own dataset need no --poses"
+            f"{poses}: a run or a scene; expected {CAMERA_KINDS}; the poses of a run's own dataset need no --poses"
         )
 
 

@@ -20,7 +20,7 @@ from pointsplat_ns.looking.sizes import RESOLUTION
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pruning import found_by_trying
 from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
-from pointsplat_ns.pruning.merging.settings import DEFAULTS
+from pointsplat_ns.pruning.merging.settings import MERGING
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.views import Views
 
@@ -135,7 +135,7 @@ def prune_file(
     work = {
         "scene": str(rows.path.resolve()), "bytes": status.st_size, "changed": status.st_mtime_ns, "rest": rows.rest,
         "keep": str(request.keep), "most": most, "views": _digest(known), "resolution": list(resolution or RESOLUTION),
-        "settings": repr(DEFAULTS),
+        "settings": repr(MERGING),
     }  # fmt: skip
 
     def views(sample: Gaussians) -> Views | None:

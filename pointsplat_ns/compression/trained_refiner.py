@@ -21,7 +21,7 @@ from pointsplat_ns.io.runs import REFINER_METHOD, Run, open_run
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.pruning import PruneSettings, method_named
 from pointsplat_ns.refiner import Refiner, WeightsError, preset, read_metadata, read_refiner
-from pointsplat_ns.refiner.weights import PRETRAINED
+from pointsplat_ns.refiner.weights import SHIPPED_REFINER
 from pointsplat_ns.system.threads import suitable_threads
 
 
@@ -75,12 +75,12 @@ def load_refiner(path: Path | str | None = None, device: torch.device | str | No
         500
     """
     device = default_device() if device is None else device
-    if path is None and not PRETRAINED.is_file():
+    if path is None and not SHIPPED_REFINER.is_file():
         raise WeightsError(
-            f"{PRETRAINED}: the refiner that ships is not there; name another (--refiner RUN_OR_FILE), or make it with "
-            "pointsplat make-refiner"
+            f"{SHIPPED_REFINER}: the refiner that ships is not there; name another (--refiner RUN_OR_FILE), or make it "
+            "with pointsplat make-refiner"
         )
-    path = PRETRAINED if path is None else Path(path)
+    path = SHIPPED_REFINER if path is None else Path(path)
     kind = path.suffix.lower()
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise WeightsError(f"{path}: not a regular file; expected a trained pointsplat run or a .safetensors file")

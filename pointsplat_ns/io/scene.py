@@ -15,7 +15,7 @@ from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, Run, open_run
 from pointsplat_ns.io.splatfacto import read_checkpoint
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 
-ACCEPTED = f"a scene ({READABLE}), a Splatfacto .ckpt, or a Splatfacto run (its folder or config.yml)"
+SCENE_KINDS = f"a scene ({READABLE}), a Splatfacto .ckpt, or a Splatfacto run (its folder or config.yml)"
 
 
 def is_scene_file(path: Path | str) -> bool:
@@ -61,7 +61,7 @@ def read_scene(path: Path | str) -> Gaussians:
     if path.is_dir() and (path / CONFIG_NAME).is_file():
         return _scene_of(open_run(path, need_data=False))
     if not path.is_dir():
-        require_file(path, ACCEPTED)
+        require_file(path, SCENE_KINDS)
     if path.suffix.lower() == ".ckpt":
         scene = read_checkpoint(path)
         with suppress(SceneError):  # a checkpoint outside a run
@@ -74,7 +74,7 @@ def read_scene(path: Path | str) -> Gaussians:
         what = (
             f"a folder without {CONFIG_NAME} or meta.json" if path.is_dir() else f"a {path.suffix or 'nameless'} file"
         )
-        raise SceneError(f"{path}: {what}; expected {ACCEPTED}")
+        raise SceneError(f"{path}: {what}; expected {SCENE_KINDS}")
     return kind.read(path)
 
 

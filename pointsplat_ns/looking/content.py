@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.views import Views
 
 UNITS = 10.0
@@ -18,7 +18,7 @@ UNITS = 10.0
 against it."""
 
 
-def content_box(scene: Gaussians, settings: LookingSettings = DEFAULTS) -> tuple[Tensor, Tensor]:
+def content_box(scene: Gaussians, settings: LookingSettings = LOOKING) -> tuple[Tensor, Tensor]:
     """Corners (3,), (3,) of the box that holds 90 % of the scene's opacity along each axis, scene units, float64.
 
     Args:

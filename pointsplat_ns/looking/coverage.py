@@ -9,7 +9,7 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.views import Views
 
@@ -22,7 +22,7 @@ def coverage(
     side: int = 160,
     min_pixels: float = 0.05,
     samples: int = 96,
-    settings: LookingSettings = DEFAULTS,
+    settings: LookingSettings = LOOKING,
 ) -> float:
     """Share of the visible content that enough of the views show.
 

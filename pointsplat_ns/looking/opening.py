@@ -16,7 +16,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import UNITS, views_in_units
 from pointsplat_ns.looking.poses import in_pictures, look_at, views_of
 from pointsplat_ns.looking.sampling import content_surface, views_in_scene_units, which_way_up
-from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces, photo_places
 from pointsplat_ns.looking.upright import Up, UprightBox, level_directions
@@ -43,7 +43,7 @@ def opening_views(
     height: int = 600,
     up: Up | None = None,
     known: Views | None = None,
-    settings: LookingSettings = DEFAULTS,
+    settings: LookingSettings = LOOKING,
 ) -> Opening:
     """The views in which to show a scene first.
 

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.views import Views
 
 
@@ -40,7 +40,7 @@ def look_at(positions: Tensor, targets: Tensor, up: Tensor | None = None) -> Ten
     return viewmats
 
 
-def views_of(viewmats: Tensor, width: int, height: int, diagonal: float, settings: LookingSettings = DEFAULTS) -> Views:
+def views_of(viewmats: Tensor, width: int, height: int, diagonal: float, settings: LookingSettings = LOOKING) -> Views:
     """Views over black from world-to-camera matrices.
 
     Args:

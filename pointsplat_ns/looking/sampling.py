@@ -15,7 +15,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import UNITS, content_box, content_size, in_units, thinned
 from pointsplat_ns.looking.poses import views_of
 from pointsplat_ns.looking.search import ViewSearch
-from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces, log_widths, photo_places
 from pointsplat_ns.looking.upright import Up, UprightBox, pointing_up, upright_axis
@@ -31,7 +31,7 @@ def sample_views(
     height: int = 240,
     seed: int = 0,
     up: Tensor | None = None,
-    settings: LookingSettings = DEFAULTS,
+    settings: LookingSettings = LOOKING,
 ) -> Views:
     """Sample cameras that look at a scene as people would.
 
@@ -83,7 +83,7 @@ def views_about(
     seed: int = 0,
     up: Tensor | None = None,
     sharp: bool = True,
-    settings: LookingSettings = DEFAULTS,
+    settings: LookingSettings = LOOKING,
 ) -> Views:
     """Sample views as :func:`sample_views` does, near photo places that are known already.
 
@@ -140,7 +140,7 @@ def unit_direction(up: Tensor) -> Tensor:
 
 
 def views_in_scene_units(
-    viewmats: Tensor, width: int, height: int, centre: Tensor, diagonal: float, settings: LookingSettings = DEFAULTS
+    viewmats: Tensor, width: int, height: int, centre: Tensor, diagonal: float, settings: LookingSettings = LOOKING
 ) -> Views:
     """Views of a scene from world-to-camera matrices (C, 4, 4) in units of its content, which has this centre (3,) and
     diagonal, scene units."""
@@ -156,7 +156,7 @@ def _alternating(first: Tensor, second: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def estimated_up(scene: Gaussians, settings: LookingSettings = DEFAULTS) -> Up:
+def estimated_up(scene: Gaussians, settings: LookingSettings = LOOKING) -> Up:
     """The direction that is up in a scene, as :func:`sample_views` takes it.
 
     Raises:
@@ -166,7 +166,7 @@ def estimated_up(scene: Gaussians, settings: LookingSettings = DEFAULTS) -> Up:
 
 
 @torch.no_grad()
-def up_about(scene: Gaussians, photos: PhotoPlaces | None, settings: LookingSettings = DEFAULTS) -> Up:
+def up_about(scene: Gaussians, photos: PhotoPlaces | None, settings: LookingSettings = LOOKING) -> Up:
     """:func:`estimated_up` of a scene whose photo places are known already."""
     centre, diagonal, surface = content_surface(scene, settings)
     photos = None if photos is None else photos.in_units(centre, diagonal)

@@ -14,7 +14,7 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import UNITS
 from pointsplat_ns.looking.poses import look_at, views_of
-from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces, explained_energy
 from pointsplat_ns.looking.upright import UprightBox, level_directions
@@ -38,7 +38,7 @@ class ViewSearch:
     generator: torch.Generator
     photos: PhotoPlaces | None
     """Photo places that views stand near; None for views from anywhere."""
-    settings: LookingSettings = DEFAULTS
+    settings: LookingSettings = LOOKING
     max_blur: float = field(init=False)
     """Largest blur of a view, radians. It grows after each round that finds too few views."""
 

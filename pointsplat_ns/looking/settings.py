@@ -16,7 +16,7 @@ class LookingSettings:
 
     Example:
         >>> from dataclasses import replace
-        >>> replace(DEFAULTS, photo_share=0.0).places  # everything as by default, but no views near photo places
+        >>> replace(LOOKING, photo_share=0.0).places  # everything as by default, but no views near photo places
         48
     """
 
@@ -346,5 +346,5 @@ class LookingSettings:
     knows before which one the scene is shown; 0 turns the rule off. Odd, so that both sizes of pictures have both."""
 
 
-DEFAULTS = LookingSettings()
+LOOKING = LookingSettings()
 """The settings that scenes are looked at with by default."""

@@ -17,7 +17,7 @@ import torch
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import DenseReference
-from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.metrics import MOST_PSNR
 from pointsplat_ns.views import Views
 
@@ -48,7 +48,7 @@ def size_text(resolution: tuple[int, int]) -> str:
     return "x".join(map(str, resolution))
 
 
-def sides_of(width: int, height: int, settings: LookingSettings = DEFAULTS) -> tuple[int, ...]:
+def sides_of(width: int, height: int, settings: LookingSettings = LOOKING) -> tuple[int, ...]:
     """Longer sides of the pictures that renders are compared in, pixels: ``smallest_side`` of the settings, the whole
     size, and their geometric mean. The whole size alone if it is no larger than the smallest.
 
@@ -60,7 +60,7 @@ def sides_of(width: int, height: int, settings: LookingSettings = DEFAULTS) -> t
     return (longest,) if longest <= smallest else (smallest, round(math.sqrt(smallest * longest)), longest)
 
 
-def middle_sized(views: Views, settings: LookingSettings = DEFAULTS) -> Views:
+def middle_sized(views: Views, settings: LookingSettings = LOOKING) -> Views:
     """Views at the middle one of their :func:`sides_of`: nearly as large as people look at, and quick to draw."""
     sides = sides_of(views.width, views.height, settings)
     return views.resized(sides[len(sides) // 2])
@@ -76,11 +76,11 @@ def subsampled(views: Views, side: int, drawn_side: int | None = None) -> Views:
         drawn_side: longer side of what is drawn, pixels; at most that of ``views``. By default ``side``, and at most
             ``smallest_side`` of the settings.
     """
-    drawn = views.resized(min(side, DEFAULTS.smallest_side) if drawn_side is None else drawn_side)
+    drawn = views.resized(min(side, LOOKING.smallest_side) if drawn_side is None else drawn_side)
     return replace(drawn, eps2d=views.eps2d * (max(drawn.width, drawn.height) / side) ** 2)
 
 
-def two_sizes(views: Views, settings: LookingSettings = DEFAULTS) -> tuple[Views, Views]:
+def two_sizes(views: Views, settings: LookingSettings = LOOKING) -> tuple[Views, Views]:
     """Views :func:`middle_sized`, and views of as many pixels, subsampled from the whole size: to optimise on in
     turn."""
     middle = middle_sized(views, settings)

@@ -16,7 +16,7 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import curve_keys, rotation_matrices, unit_cells
 from pointsplat_ns.looking.content import UNITS, positions_in_units
-from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.traces import trace_factors, unit_sh
 
 
@@ -30,10 +30,10 @@ class Surface:
     widths: Tensor  # [M] float32, geometric mean of the two larger standard deviations of its Gaussian, units
     trace_factors: Tensor  # [M] float32, see :func:`~pointsplat_ns.looking.traces.trace_factors`
     sh: Tensor  # [M, K, 3] float32, SH coefficients of its Gaussian, degrees 1 and up, of length 1
-    settings: LookingSettings = DEFAULTS
+    settings: LookingSettings = LOOKING
 
     @staticmethod
-    def of(scene: Gaussians, centre: Tensor, size: float, settings: LookingSettings = DEFAULTS) -> Surface:
+    def of(scene: Gaussians, centre: Tensor, size: float, settings: LookingSettings = LOOKING) -> Surface:
         """The points of a scene. Deterministic.
 
         Args:

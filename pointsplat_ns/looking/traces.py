@@ -25,7 +25,7 @@ from torch.nn.functional import avg_pool1d
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import positions_in_units
-from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.system.pieces import in_pieces
 
@@ -41,7 +41,7 @@ class PhotoPlaces(NamedTuple):
         return PhotoPlaces(positions_in_units(self.places, centre, size), self.shares)
 
 
-def trace_factors(scene: Gaussians, members: Tensor, settings: LookingSettings = DEFAULTS) -> Tensor:
+def trace_factors(scene: Gaussians, members: Tensor, settings: LookingSettings = LOOKING) -> Tensor:
     """Trace factor of each member: large where photos showed its neighbourhood well, 1 for the median member.
 
     The mean energy of the SH and the exponential of the mean flatness, each to a power. The flatness is the logarithm
@@ -91,10 +91,10 @@ class PhotoEvidence:
     means: Tensor  # [n, 3] float64, scene units
     sh: Tensor  # [n, K, 3] float32, SH coefficients of degrees 1 and up, of length 1
     sizes: Tensor  # [n] float64, logarithms of the geometric means of width and length
-    settings: LookingSettings = DEFAULTS
+    settings: LookingSettings = LOOKING
 
     @staticmethod
-    def of(scene: Gaussians, generator: torch.Generator, settings: LookingSettings = DEFAULTS) -> PhotoEvidence:
+    def of(scene: Gaussians, generator: torch.Generator, settings: LookingSettings = LOOKING) -> PhotoEvidence:
         """Gaussians that are drawn from those with SH; if there are none, from all that are opaque enough."""
         count = settings.evidence_count
         drawn = torch.randperm(len(scene), generator=generator)[: settings.evidence_draws * count]
@@ -131,7 +131,7 @@ class PhotoEvidence:
         return torch.stack([correlation(log_norms(self.means - place), self.sizes) for place in places]).float()
 
 
-def photo_places(scene: Gaussians, settings: LookingSettings = DEFAULTS) -> PhotoPlaces | None:
+def photo_places(scene: Gaussians, settings: LookingSettings = LOOKING) -> PhotoPlaces | None:
     """Where the photos of a scene were taken, estimated from its Gaussians.
 
     Args:
@@ -161,7 +161,7 @@ def photo_places(scene: Gaussians, settings: LookingSettings = DEFAULTS) -> Phot
     return PhotoPlaces(places, shares / shares.sum())
 
 
-def unit_sh(sh: Tensor, settings: LookingSettings = DEFAULTS) -> Tensor:
+def unit_sh(sh: Tensor, settings: LookingSettings = LOOKING) -> Tensor:
     """SH coefficients (n, K, 3), scaled to a length of 1 for each Gaussian, float32; 0 if they are at most
     ``min_sh`` long."""
     sh = sh.double().clamp(-settings.max_sh, settings.max_sh)
@@ -185,7 +185,7 @@ def correlation(a: Tensor, b: Tensor) -> Tensor:
     return torch.corrcoef(torch.stack([a, b]))[0, 1].nan_to_num(0.0)
 
 
-def explained_energy(offsets: Tensor, sh: Tensor, settings: LookingSettings = DEFAULTS) -> Tensor:
+def explained_energy(offsets: Tensor, sh: Tensor, settings: LookingSettings = LOOKING) -> Tensor:
     """Share of the energy of SH that lies along the basis in one direction each, relative to its mean over SH of random
     directions.
 

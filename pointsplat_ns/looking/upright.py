@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces
 
@@ -101,7 +101,7 @@ class UprightBox:
         share = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
         return (middle + share * half) @ self.frame
 
-    def places_at_eyes(self, generator: torch.Generator, settings: LookingSettings = DEFAULTS) -> Tensor:
+    def places_at_eyes(self, generator: torch.Generator, settings: LookingSettings = LOOKING) -> Tensor:
         """Positions (P, 3), units, at the height of eyes."""
         low, high = settings.eye_heights
         places = self.places(settings.box_draws * settings.places, generator)

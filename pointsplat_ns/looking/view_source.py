@@ -14,7 +14,7 @@ from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run
 from pointsplat_ns.looking.sampling import up_about, views_about
-from pointsplat_ns.looking.settings import DEFAULTS, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.sizes import RESOLUTION, middle_sized, two_sizes
 from pointsplat_ns.looking.traces import PhotoPlaces, photo_places
 from pointsplat_ns.looking.upright import Up
@@ -60,7 +60,7 @@ class ViewSource:
         run: Path | str | None = None,
         dataset_views: Callable[[Path | str], Views] | None = None,
         resolution: tuple[int, int] | None = None,
-        settings: LookingSettings = DEFAULTS,
+        settings: LookingSettings = LOOKING,
         up: Up | None = None,
     ):
         self._resolution, self._settings, self._up = resolution, settings, up

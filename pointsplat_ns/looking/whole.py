@@ -13,7 +13,7 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import UNITS, in_units, thinned
 from pointsplat_ns.looking.poses import look_at, views_of
-from pointsplat_ns.looking.settings import DEFAULTS
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.rasterizer import pixels_of
@@ -67,7 +67,7 @@ def shown(few: Gaussians, views: Views, side: int) -> Tensor:
         views: C views of them.
         side: longer side of the pictures, pixels.
     """
-    rows = [pixels_of(few, view) > DEFAULTS.min_shown_pixels for view in views.resized(side)]
+    rows = [pixels_of(few, view) > LOOKING.min_shown_pixels for view in views.resized(side)]
     return torch.stack(rows) if rows else torch.zeros(0, len(few), dtype=torch.bool)
 
 

@@ -24,9 +24,9 @@ from pointsplat_ns.refiner.weights import checked_tensors, opened_weights
 FEATURES = 39
 """Number of features of a Gaussian, see :mod:`pointsplat_ns.compression.feedback`."""
 
-FORMAT = "pointsplat-feedback/2"
+FEEDBACK_FORMAT = "pointsplat-feedback/2"
 
-PRETRAINED = Path(__file__).parent / "pretrained" / "feedback.safetensors"
+SHIPPED_FEEDBACK = Path(__file__).parent / "pretrained" / "feedback.safetensors"
 """The shipped network; ``CARD.md`` beside it describes its training and results."""
 
 
@@ -62,13 +62,13 @@ class FeedbackRefiner(nn.Module):
 
 def save_feedback_refiner(network: FeedbackRefiner, path: Path | str, metadata: dict[str, Any] | None = None) -> None:
     """Write a network, with metadata, which may be anything that JSON can hold: data, command, steps, results."""
-    write_tensors(path, network.state_dict(), {"format": FORMAT, "metadata": json.dumps(metadata or {})})
+    write_tensors(path, network.state_dict(), {"format": FEEDBACK_FORMAT, "metadata": json.dumps(metadata or {})})
 
 
-def read_feedback_refiner(path: Path | str = PRETRAINED, device: torch.device | str = "cpu") -> FeedbackRefiner:
+def read_feedback_refiner(path: Path | str = SHIPPED_FEEDBACK, device: torch.device | str = "cpu") -> FeedbackRefiner:
     """Read a network, in evaluation mode; by default the shipped one. Raises WeightsError if the file is none."""
     path, network = Path(path), FeedbackRefiner()
-    with opened_weights(path, FORMAT, "a feedback refiner") as (file, _):
+    with opened_weights(path, FEEDBACK_FORMAT, "a feedback refiner") as (file, _):
         state = checked_tensors(file, network.state_dict(), path)
     network.load_state_dict(state)
     return network.to(device).eval().requires_grad_(requires_grad=False)

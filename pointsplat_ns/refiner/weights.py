@@ -15,9 +15,9 @@ from pointsplat_ns.io.files import one_line, require_memory, write_tensors
 from pointsplat_ns.refiner.config import RefinerConfig, RefinerConfigError
 from pointsplat_ns.refiner.refiner import Refiner
 
-FORMAT = "pointsplat-refiner/1"
+REFINER_FORMAT = "pointsplat-refiner/1"
 
-PRETRAINED = Path(__file__).parent / "pretrained" / "refiner.safetensors"
+SHIPPED_REFINER = Path(__file__).parent / "pretrained" / "refiner.safetensors"
 """The shipped refiner; ``CARD.md`` beside it describes its training and results."""
 
 
@@ -29,7 +29,7 @@ def save_refiner(refiner: Refiner, path: str | Path, metadata: dict[str, Any] | 
     """Write a refiner's configuration, parameters and running statistics, with metadata, which may be anything that
     JSON can hold: data, command, steps, results."""
     header = {
-        "format": FORMAT,
+        "format": REFINER_FORMAT,
         "config": json.dumps(refiner.config.to_dict()),
         "metadata": json.dumps(metadata or {}),
     }
@@ -43,7 +43,7 @@ def read_refiner(path: str | Path, device: torch.device | str = "cpu") -> Refine
     is allocated. Raises WeightsError if the file is missing, damaged, of another kind, or its tensors do not fit.
     """
     path = Path(path)
-    with opened_weights(path, FORMAT, "refiner weights") as (file, header):
+    with opened_weights(path, REFINER_FORMAT, "refiner weights") as (file, header):
         refiner = _hollow(header, len(file.keys()), path)
         state = checked_tensors(file, refiner.state_dict(), path)
     refiner.to_empty(device="cpu").load_state_dict(state)
@@ -75,7 +75,7 @@ def checked_tensors(file: Any, expected: dict[str, torch.Tensor], path: Path) ->
 def read_metadata(path: str | Path) -> dict[str, Any]:
     """The metadata of a file written by :func:`save_refiner`. Errors are those of :func:`read_refiner`."""
     path = Path(path)
-    with opened_weights(path, FORMAT, "refiner weights") as (_, header):
+    with opened_weights(path, REFINER_FORMAT, "refiner weights") as (_, header):
         return _json(header, "metadata", path)
 
 

@@ -119,7 +119,7 @@ def test_a_run_is_compared_from_the_poses_of_its_dataset_and_as_it_was_drawn(hel
 
 def test_the_refiner_that_ships_is_used_if_it_is_asked_for(ply, tmp_path, capsys, monkeypatch):
     (tmp_path / "empty").mkdir()
-    monkeypatch.setattr(trained_refiner, "PRETRAINED", tmp_path / "refiner.safetensors")
+    monkeypatch.setattr(trained_refiner, "SHIPPED_REFINER", tmp_path / "refiner.safetensors")
     said = refusal(capsys, tmp_path / "empty" / "small.ply", ply, "--refiner", "shipped")
     assert "--refiner RUN_OR_FILE" in said and "pointsplat make-refiner" in said
     weights(tmp_path / "refiner.safetensors", "scales", 0.15, keep=0.2)

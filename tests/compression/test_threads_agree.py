@@ -20,10 +20,10 @@ import pointsplat_ns as ps
 from pointsplat_ns.compression.optimiser import gradients_of
 from pointsplat_ns.compression.repair import RepairBudget, repair
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.pruning.merging import DEFAULTS, merge
+from pointsplat_ns.pruning.merging import MERGING, merge
 from pointsplat_ns.system.threads import fixed_threads
 
-quick = dataclasses.replace(DEFAULTS, finish_views=1)
+quick = dataclasses.replace(MERGING, finish_views=1)
 
 room = ps.example_room()
 both = torch.cat([torch.arange(len(room)), torch.arange(5001)])  # more than torch shares between threads, and odd

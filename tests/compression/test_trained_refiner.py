@@ -18,7 +18,7 @@ from pointsplat_ns.errors import BudgetError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import PruneSettings, prune
 from pointsplat_ns.refiner import Refiner, WeightsError, preset, save_refiner
-from pointsplat_ns.refiner.weights import PRETRAINED
+from pointsplat_ns.refiner.weights import SHIPPED_REFINER
 
 
 def random_scene(n: int = 60, degree: int = 3) -> Gaussians:
@@ -113,7 +113,7 @@ def test_anything_else_is_no_refiner(tmp_path):
 
 
 def test_where_the_refiner_that_ships_is_missing_it_is_said_what_to_do(tmp_path, monkeypatch):
-    monkeypatch.setattr(trained_refiner, "PRETRAINED", tmp_path / "refiner.safetensors")
+    monkeypatch.setattr(trained_refiner, "SHIPPED_REFINER", tmp_path / "refiner.safetensors")
     with pytest.raises(
         WeightsError, match="not there; .*--refiner RUN_OR_FILE.*, or .*pointsplat make-refiner"
     ) as caught:
@@ -125,8 +125,8 @@ def test_where_the_refiner_that_ships_is_missing_it_is_said_what_to_do(tmp_path,
 
 def test_the_installed_package_holds_the_refiner_that_ships_and_its_card():
     folder = importlib.resources.files("pointsplat_ns") / "refiner" / "pretrained"
-    assert PRETRAINED.samefile(str(folder / "refiner.safetensors"))
-    assert PRETRAINED.stat().st_size <= 10e6 and (folder / "CARD.md").is_file()
+    assert SHIPPED_REFINER.samefile(str(folder / "refiner.safetensors"))
+    assert SHIPPED_REFINER.stat().st_size <= 10e6 and (folder / "CARD.md").is_file()
     scene = ball(60, degree=3)
     refined = load_refiner()(scene)
     assert len(refined) == 60 and bool(refined.usable().all())

@@ -11,7 +11,7 @@ from lab.judge import ablation, camera_paths, scenes, variants
 from lab.judge import ablation_record as record
 from making import box_room
 from pointsplat_ns.io import read_scene, write_ply
-from pointsplat_ns.pruning.merging import DEFAULTS, MergeSettings, merge
+from pointsplat_ns.pruning.merging import MERGING, MergeSettings, merge
 
 PATH = {
     "scene": "small",
@@ -71,7 +71,7 @@ def test_a_variant_of_another_table_is_in_force_while_merging_runs(monkeypatch):
     other = variants.Table("Others", Others(), {"a_2": {"a": 2}})
     monkeypatch.setitem(variants.TABLES, "others", other)
     with variants.applied("a_2") as settings:
-        assert settings is DEFAULTS and other.defaults.a == 2
+        assert settings is MERGING and other.defaults.a == 2
     assert other.defaults.a == 1
     assert variants.default_values()["others.a"] == 1 and variants.changes_of("a_2") == {"a": 2}
 
@@ -83,7 +83,7 @@ def test_every_variant_has_the_psnr_of_what_merging_makes_with_its_settings(smal
     assert [row["method"] for row in rows] == ["default", *TWO]
     scene = scenes.load(small, (64,), 2)
     for row, changes in zip(rows, ({}, {"regrouping_rounds": 0}, {"growth_exponent": 0.0}), strict=True):
-        merged = merge(read_scene(small), 180, settings=dataclasses.replace(DEFAULTS, **changes)).scene
+        merged = merge(read_scene(small), 180, settings=dataclasses.replace(MERGING, **changes)).scene
         [(_, _, expected)] = scenes.losses(scene, [merged], None)
         assert row["covered_psnr"] == expected["covered_psnr"]
         assert (row["at"], row["keep"], row["gaussians"], row["changes"]) == (64, 0.2, 900, changes)
@@ -112,9 +112,9 @@ def test_resume_measures_what_is_not_there_or_was_measured_with_other_values(sma
     assert fresh(*TWO) == ["growth_0", "growth_1"]
     monkeypatch.delitem(variants.MERGING, "growth_1")
     assert len(rows_of(results)) == 4 and fresh("growth_0") == ["growth_0", "growth_1"]
-    changed = dataclasses.replace(variants.TABLES["merging"], defaults=dataclasses.replace(DEFAULTS, neighbours=99))
+    changed = dataclasses.replace(variants.TABLES["merging"], defaults=dataclasses.replace(MERGING, neighbours=99))
     monkeypatch.setitem(variants.TABLES, "merging", changed)
-    said = f"was written with merging.neighbours {DEFAULTS.neighbours}, now 99; expected the same"
+    said = f"was written with merging.neighbours {MERGING.neighbours}, now 99; expected the same"
     with pytest.raises(SystemExit, match=re.escape(said)):
         fresh(*TWO)
 
@@ -164,7 +164,7 @@ def test_the_page_has_changes_over_scenes_and_poses_at_each_budget_the_largest_l
     assert ["rock", "1,000", "camera path", "judged", "30.00", "40.00"] in lines
     table = lines[lines.index(["variant", "change", "10 %", "50 %", "CPU", "scenes and poses"]) + 2 :]
     first, second = table[:2]
-    move = f"`regrouping_rounds` {DEFAULTS.regrouping_rounds} to 0"
+    move = f"`regrouping_rounds` {MERGING.regrouping_rounds} to 0"
     assert first == ["`no_regrouping`", move, "-1.00 (-1.00…-1.00)", "-", "0.50", "1"]
     assert second[2:6] == ["+0.03 (-0.30…+0.50)", "-0.04 (-0.04…-0.04)", "1.20", "1 to 3"]
     assert len(table) == 2

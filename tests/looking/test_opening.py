@@ -12,7 +12,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.poses import in_pictures, look_at, views_of
 from pointsplat_ns.looking.sampling import estimated_up
-from pointsplat_ns.looking.settings import DEFAULTS
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.upright import Up
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -60,7 +60,7 @@ def test_up_is_the_side_from_which_more_is_seen(axis):
     turn, _ = Rotation.align_vectors([axis], [[0, 0, 1]])
     scene = turned(corner(), turn)
     assert estimated_up(scene).direction.tolist() == list(map(float, axis))
-    without = replace(DEFAULTS, min_seen_from_above=math.inf)
+    without = replace(LOOKING, min_seen_from_above=math.inf)
     if axis == (0, 1, 0):
         assert estimated_up(scene, without).direction.tolist() == [0.0, -1.0, 0.0]
 

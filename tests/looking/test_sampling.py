@@ -13,7 +13,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.sampling import sample_views, views_about
-from pointsplat_ns.looking.settings import DEFAULTS
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.rasterizer import pixels_of, render, render_depth
 
 
@@ -184,6 +184,6 @@ def test_a_scene_of_few_large_gaussians_has_views_as_well(make_hollow_ball):
 def test_views_near_photo_places_can_be_turned_off(off):
     """Not the estimate of up, which uses photo places as well: it is given."""
     scene, up = photographed(), torch.tensor([0.0, 0.0, 1.0])
-    without = sample_views(scene, 3, 64, 48, up=up, settings=dataclasses.replace(DEFAULTS, **off))
+    without = sample_views(scene, 3, 64, 48, up=up, settings=dataclasses.replace(LOOKING, **off))
     assert torch.equal(without.viewmats, views_about(scene, None, 3, 64, 48, up=up).viewmats)
     assert not torch.equal(without.viewmats, sample_views(scene, 3, 64, 48, up=up).viewmats)

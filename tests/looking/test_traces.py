@@ -10,7 +10,7 @@ from making import EYES, ball, normal_scene, photographed
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.settings import DEFAULTS
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.traces import correlation, log_norms, photo_places, trace_factors
 from pointsplat_ns.pruning.merging import merge
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
@@ -155,7 +155,7 @@ def without_sh(scene: Gaussians) -> Gaussians:
     ],
 )
 def test_trace_factors_grow_with(scene, options, ratio, tolerance):
-    factors = trace_factors(scene, torch.arange(2000), replace(DEFAULTS, **options))
+    factors = trace_factors(scene, torch.arange(2000), replace(LOOKING, **options))
     # tolerances: the SH of both halves are random
     apart = factors[:900].double().log().mean() - factors[1100:].double().log().mean()
     assert float(apart.exp()) == pytest.approx(ratio, rel=tolerance)
@@ -180,7 +180,7 @@ def test_extremes_stay_within_bounds(dtype):
         scales[500:800, 0], scales[800:900, 2] = -math.inf, 0.5 * largest
         factors = trace_factors(scene.replace(features_rest=rest, scales=scales), torch.arange(2000))
         assert bool(factors.isfinite().all())
-        assert float(factors.log().abs().max()) <= DEFAULTS.max_log_factor + 1e-5
+        assert float(factors.log().abs().max()) <= LOOKING.max_log_factor + 1e-5
 
 
 def test_merging_keeps_more_where_trace_factors_are_large():

@@ -7,8 +7,8 @@ from safetensors.torch import save_file
 from pointsplat_ns.gaussians import PARAMETERS
 from pointsplat_ns.refiner.feedback import (
     FEATURES,
-    FORMAT,
-    PRETRAINED,
+    FEEDBACK_FORMAT,
+    SHIPPED_FEEDBACK,
     FeedbackRefiner,
     read_feedback_refiner,
     save_feedback_refiner,
@@ -42,15 +42,15 @@ def test_a_file_gives_back_the_network(tmp_path):
 
 def test_the_network_that_ships_is_there_and_trained():
     network = read_feedback_refiner()
-    assert PRETRAINED.is_file() and bool(network.mlp[-1].weight.any())
+    assert SHIPPED_FEEDBACK.is_file() and bool(network.mlp[-1].weight.any())
 
 
 @pytest.mark.parametrize(
     ("bias", "form", "message"),
     [
         (torch.zeros(0), "another", "not a feedback refiner"),
-        (None, FORMAT, "expected"),
-        (torch.nan, FORMAT, "NaN or Inf"),
+        (None, FEEDBACK_FORMAT, "expected"),
+        (torch.nan, FEEDBACK_FORMAT, "NaN or Inf"),
     ],
     ids=["format", "missing", "nan"],
 )

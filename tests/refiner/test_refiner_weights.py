@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 from making import move_zero_layers, normal_scene
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.refiner import Refiner, WeightsError, preset, read_metadata, read_refiner, save_refiner
-from pointsplat_ns.refiner.weights import FORMAT
+from pointsplat_ns.refiner.weights import REFINER_FORMAT
 
 
 def trained(**changes) -> Refiner:
@@ -57,7 +57,7 @@ def test_missing_foreign_and_truncated_files_are_named(tmp_path):
     save_file({"x": torch.zeros(2)}, path)
     with pytest.raises(WeightsError, match="format None; expected 'pointsplat-refiner/1'"):
         read_refiner(path)
-    save_file({"x": torch.zeros(2)}, path, metadata={"format": FORMAT})
+    save_file({"x": torch.zeros(2)}, path, metadata={"format": REFINER_FORMAT})
     with pytest.raises(WeightsError, match="lacks the entry 'config'"):
         read_refiner(path)
     save_refiner(trained(), path)
@@ -159,7 +159,7 @@ def test_settings_of_a_wrong_type_are_one_error(name, tmp_path):
 def test_a_header_that_is_no_json_object_is_one_error(key, text, tmp_path):
     path = tmp_path / "refiner.safetensors"
     save_refiner(trained(), path)
-    header = {"format": FORMAT, "config": json.dumps(trained().config.to_dict()), "metadata": "{}"}
+    header = {"format": REFINER_FORMAT, "config": json.dumps(trained().config.to_dict()), "metadata": "{}"}
     save_file(load_file(path), path, metadata={**header, key: text.encode("utf-8", "replace").decode()})
     with pytest.raises(WeightsError, match=f"refiner.safetensors: {key} is "):
         (read_refiner if key == "config" else read_metadata)(path)

@@ -19,8 +19,8 @@ from pointsplat_ns.views import Views
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Limits of files of cameras."""
+class CameraLimits:
+    """CameraLimits of files of cameras."""
 
     file_bytes: int = 64_000_000
     """Maximum size of JSON: 100,000 frames have about as much."""
@@ -33,7 +33,7 @@ class Limits:
     """Largest deviation of a rotation; text of four digits has less."""
 
 
-LIMITS = Limits()
+CAMERA_LIMITS = CameraLimits()
 
 
 class Camera(NamedTuple):
@@ -118,9 +118,11 @@ def rigid(values: Tensor, whose: str, names: Sequence[str] = ()) -> Tensor:
     """
     turn = values[:, :3, :3]
     off = (turn @ turn.transpose(1, 2) - torch.eye(3, dtype=values.dtype)).abs().amax((1, 2))
-    good = values.isfinite().all(2).all(1) & (off <= LIMITS.deviation) & (torch.linalg.det(turn) > 0)  # NaN fails too
+    good = (
+        values.isfinite().all(2).all(1) & (off <= CAMERA_LIMITS.deviation) & (torch.linalg.det(turn) > 0)
+    )  # NaN fails too
     if values.shape[1] == 4:
-        good &= ((values[:, 3] - values.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() <= LIMITS.deviation).all(1)
+        good &= ((values[:, 3] - values.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() <= CAMERA_LIMITS.deviation).all(1)
     if not bool(good.all()):
         camera = f" of camera {_first_bad(good, names)}" if names else ""
         raise DataError(
@@ -159,13 +161,13 @@ def views_of(path: Path, cameras: Sequence[Camera], motion: Motion | None = None
     sizes, focals, centres = (
         torch.tensor([camera[field] for camera in cameras], dtype=torch.float64).view(-1, 2) for field in (2, 3, 4)
     )
-    reached = poses[:, :3, 3].abs().amax(1) <= LIMITS.coordinate
-    whole = ((sizes == sizes.floor()) & (sizes >= 1) & (sizes <= LIMITS.pixels)).all(1)
+    reached = poses[:, :3, 3].abs().amax(1) <= CAMERA_LIMITS.coordinate
+    whole = ((sizes == sizes.floor()) & (sizes >= 1) & (sizes <= CAMERA_LIMITS.pixels)).all(1)
     long = ((focals >= 1e-3 * sizes) & (focals <= 1e5 * sizes)).all(1)  # fields of view of 179.9 and 0.0006 degrees
     near = (centres.abs() <= 100.0 * sizes).all(1)  # at most 100 sides of the picture away from its corner
     for good, what, expected in (
-        (reached, "is too far away", f"at most {LIMITS.coordinate:g} units"),
-        (whole, "has a picture of no usable size", f"1 to {LIMITS.pixels} pixels a side"),
+        (reached, "is too far away", f"at most {CAMERA_LIMITS.coordinate:g} units"),
+        (whole, "has a picture of no usable size", f"1 to {CAMERA_LIMITS.pixels} pixels a side"),
         (long, "has no usable focal length", "a positive number of pixels"),
         (near, "has its principal point far outside of the picture", "one in or near it"),
     ):
@@ -185,8 +187,8 @@ def views_of(path: Path, cameras: Sequence[Camera], motion: Motion | None = None
 
 def need_count(path: Path, count: int) -> None:
     """Raise a DataError for a file of no camera, or of too many."""
-    if not 0 < count <= LIMITS.cameras:
-        raise DataError(f"{path}: {count} cameras; expected 1 to {LIMITS.cameras}")
+    if not 0 < count <= CAMERA_LIMITS.cameras:
+        raise DataError(f"{path}: {count} cameras; expected 1 to {CAMERA_LIMITS.cameras}")
 
 
 def _first_bad(good: Tensor, names: Sequence[str]) -> str:

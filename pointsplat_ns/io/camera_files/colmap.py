@@ -18,7 +18,7 @@ import torch
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices
-from pointsplat_ns.io.camera_files.cameras import LIMITS, Camera, CameraFile, Motion, need_count
+from pointsplat_ns.io.camera_files.cameras import CAMERA_LIMITS, Camera, CameraFile, Motion, need_count
 from pointsplat_ns.io.files import logger, one_line
 
 MODELS = {
@@ -197,10 +197,10 @@ def _count(stream: BinaryIO, path: Path, least: int) -> int:
     """The count that a binary file begins with, checked against its size; ``least`` bytes follow for each."""
     (count,) = struct.unpack("<Q", _exactly(stream, 8, path))
     room = (os.fstat(stream.fileno()).st_size - 8) // least
-    if not 0 < count <= min(room, LIMITS.cameras):
+    if not 0 < count <= min(room, CAMERA_LIMITS.cameras):
         raise DataError(
-            f"{path}: says that it has {count} entries and has room for {room}; expected 1 to {LIMITS.cameras}, as "
-            "COLMAP writes them"
+            f"{path}: says that it has {count} entries and has room for {room}; expected 1 to {CAMERA_LIMITS.cameras}, "
+            "as COLMAP writes them"
         )
     return count
 

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.camera_files.cameras import LIMITS, CameraFile, Motion, rigid, views_of
+from pointsplat_ns.io.camera_files.cameras import CAMERA_LIMITS, CameraFile, Motion, rigid, views_of
 from pointsplat_ns.io.camera_files.colmap import colmap_cameras, is_model
 from pointsplat_ns.io.camera_files.inria import inria_cameras
 from pointsplat_ns.io.camera_files.nerfstudio import nerfstudio_cameras
@@ -15,7 +15,7 @@ from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_named
 from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, TRANSFORMS_NAME, read_transforms
 from pointsplat_ns.views import Views
 
-ACCEPTED = "cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model"
+CAMERA_KINDS = "cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model"
 
 
 def is_camera_file(path: Path | str) -> bool:
@@ -77,20 +77,22 @@ def read_views(path: Path | str, transforms: Path | None = None) -> Views:
 def _json_cameras(path: Path) -> CameraFile:
     """The cameras of a JSON file: a list is INRIA's, an object with frames nerfstudio's."""
     if path.is_dir():
-        raise DataError(f"{path}: a folder without cameras.bin or cameras.txt; expected {ACCEPTED}")
-    path = require_file(path, ACCEPTED)
+        raise DataError(f"{path}: a folder without cameras.bin or cameras.txt; expected {CAMERA_KINDS}")
+    path = require_file(path, CAMERA_KINDS)
     size = path.stat().st_size
-    if size > LIMITS.file_bytes:
-        raise DataError(f"{path}: {size / 1e6:.0f} MB; expected cameras of at most {LIMITS.file_bytes / 1e6:.0f} MB")
+    if size > CAMERA_LIMITS.file_bytes:
+        raise DataError(
+            f"{path}: {size / 1e6:.0f} MB; expected cameras of at most {CAMERA_LIMITS.file_bytes / 1e6:.0f} MB"
+        )
     require_memory(path, 24 * size)  # most memory that a byte of JSON takes: empty lists are the worst
     try:
         content = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: cannot be read as JSON ({one_line(error, 80)}); expected {ACCEPTED}") from error
+        raise DataError(f"{path}: cannot be read as JSON ({one_line(error, 80)}); expected {CAMERA_KINDS}") from error
     if isinstance(content, list):
         return inria_cameras(content, path)
     if isinstance(content, dict) and isinstance(content.get("frames"), list):
         return nerfstudio_cameras(content, path)
     if isinstance(content, dict) and "camera_path" in content:
-        raise DataError(f"{path}: a camera path of nerfstudio's viewer, for `render --path`; expected {ACCEPTED}")
-    raise DataError(f"{path}: JSON without a list of cameras; expected {ACCEPTED}")
+        raise DataError(f"{path}: a camera path of nerfstudio's viewer, for `render --path`; expected {CAMERA_KINDS}")
+    raise DataError(f"{path}: JSON without a list of cameras; expected {CAMERA_KINDS}")

@@ -6,6 +6,6 @@ in the order of :mod:`~pointsplat_ns.pruning.merging.rounds`.
 
 from pointsplat_ns.pruning.merging.finishing import Finish
 from pointsplat_ns.pruning.merging.rounds import Merged, Merger, merge, merge_levels
-from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
+from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 
-__all__ = ["DEFAULTS", "Finish", "MergeSettings", "Merged", "Merger", "merge", "merge_levels"]
+__all__ = ["MERGING", "Finish", "MergeSettings", "Merged", "Merger", "merge", "merge_levels"]

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
+from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Finish:
         return f"{factor}, chosen by renders: {self.psnr_before:.2f} -> {self.psnr:.2f} dB"
 
 
-def best_finish(psnr_of: Callable[[float], float], settings: MergeSettings = DEFAULTS) -> Finish:
+def best_finish(psnr_of: Callable[[float], float], settings: MergeSettings = MERGING) -> Finish:
     """The best size change of those tried: three, and the top of the parabola through them.
 
     Args:

@@ -9,14 +9,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pointsplat_ns.pruning.merging.settings import DEFAULTS
+from pointsplat_ns.pruning.merging.settings import MERGING
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import CHUNK
 from pointsplat_ns.system.threads import in_threads, most_threads
 
 
 def cheapest_pairs(
-    near: Tensor, costs: Tensor, most: int, passes: int = DEFAULTS.matching_passes, compiled: bool | None = None
+    near: Tensor, costs: Tensor, most: int, passes: int = MERGING.matching_passes, compiled: bool | None = None
 ) -> tuple[Tensor, Tensor]:
     """Disjoint pairs of neighbours.
 
@@ -40,7 +40,7 @@ def cheapest_pairs(
 
 
 def candidate_pairs(
-    near: Tensor, costs: Tensor, passes: int = DEFAULTS.matching_passes, compiled: bool | None = None
+    near: Tensor, costs: Tensor, passes: int = MERGING.matching_passes, compiled: bool | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The pairs of all passes, of which :func:`cheapest_pairs` takes the cheapest: first and second members, (E,) int64
     each, and costs, (E,) float32. Arguments as there."""

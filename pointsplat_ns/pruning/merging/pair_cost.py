@@ -37,9 +37,9 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.pruning.merging import projections as planes
-from pointsplat_ns.pruning.merging.projections import DIRECTIONS, LIMITS, Projections, area_of, directions_of
+from pointsplat_ns.pruning.merging.projections import DIRECTIONS, PROJECTION_LIMITS, Projections, area_of, directions_of
 from pointsplat_ns.pruning.merging.replacement import growth
-from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
+from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import State
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
 from pointsplat_ns.system.threads import in_threads, most_threads
@@ -51,7 +51,7 @@ GAUSSIANS_AT_ONCE = 1 << 14
 def pair_costs(
     state: State,
     near: Tensor,
-    settings: MergeSettings = DEFAULTS,
+    settings: MergeSettings = MERGING,
     dtype: torch.dtype = torch.float32,
     compiled: bool | None = None,
 ) -> Tensor:
@@ -157,7 +157,7 @@ def overlap_of_sum(uu: Tensor, uv: Tensor, vv: Tensor, areas: Tensor, u: Tensor,
         areas: product of both areas.
         u, v: from one centre to the other.
     """
-    inverse = (uu * vv).addcmul_(uv, uv, value=-1).clamp_min_(LIMITS.min_divisor).reciprocal_()
+    inverse = (uu * vv).addcmul_(uv, uv, value=-1).clamp_min_(PROJECTION_LIMITS.min_divisor).reciprocal_()
     distance = (vv * u).addcmul_(uv, v, value=-2).mul_(u).addcmul_(uu * v, v).mul_(inverse).clamp_min_(0)
     return distance.mul_(-0.5).exp_().mul_(inverse.sqrt_()).mul_(areas)
 
@@ -167,13 +167,13 @@ def _surroundings(first: Flat, second: Flat, oij: Tensor, ci: Tensor, cj: Tensor
     on_first = second.alpha * oij / first.area
     cover = first.alpha / 2 + on_first.sum(1, keepdim=True)
     colour = torch.baddbmm((first.alpha / 2 * ci)[:, None], on_first[:, None], cj)[:, 0]
-    return cover, colour / cover.clamp_min(LIMITS.min_divisor)
+    return cover, colour / cover.clamp_min(PROJECTION_LIMITS.min_divisor)
 
 
 def _replacement(first: Flat, second: Flat, u: Tensor, v: Tensor, both: Tensor, settings: MergeSettings) -> Replacement:
     """The replacement of each pair, whose centres are (u, v) apart and which covers ``both`` twice."""
     mi, mj = first.alpha * first.area, second.alpha * second.area
-    wi = mi / (mi + mj).clamp_min_(LIMITS.min_divisor)
+    wi = mi / (mi + mj).clamp_min_(PROJECTION_LIMITS.min_divisor)
     wj = 1 - wi
     wu, wv = wi * wj * u, wi * wj * v
     uu = (wu * u).addcmul_(wi, first.uu).addcmul_(wj, second.uu)
@@ -228,7 +228,7 @@ def _by_kernels(state: State, near: Tensor, settings: MergeSettings) -> Tensor:
     """As :func:`pair_costs`, float32."""
     count, library = len(state), KERNELS.library
     costs = torch.empty(near.shape, dtype=torch.float32)
-    limits = KERNELS.structs["Limits"](**vars(LIMITS))
+    limits = KERNELS.structs["Limits"](**vars(PROJECTION_LIMITS))
     task = KERNELS.structs["Costs"](
         planes=_planes(), limits=limits, contrasts=_contrasts(settings), centre=tuple(state.centre.tolist()),
         size=state.size, means=state.means, cov=state.cov, alphas=state.alphas, colours=state.colours.contiguous(),
@@ -267,7 +267,7 @@ def _as_torch() -> bool:
         centre=torch.full((3,), 0.5, dtype=torch.float64), size=1.3,
     )  # fmt: skip
     near = torch.randint(count, (count, 9), generator=generator, dtype=torch.int32)
-    ours, torchs = _by_kernels(state, near, DEFAULTS), pair_costs(state, near, compiled=False)
+    ours, torchs = _by_kernels(state, near, MERGING), pair_costs(state, near, compiled=False)
     return agreement([ours], [torchs], off=1e-4, share=1e-2)
 
 

@@ -26,7 +26,7 @@ DIRECTIONS = torch.nn.functional.normalize(
 
 
 @dataclass(frozen=True)
-class Limits:
+class ProjectionLimits:
     """Bounds of projections, in units of the content's size."""
 
     max_coordinate: float = 1e3
@@ -42,7 +42,7 @@ class Limits:
     """Lower bound of float32 denominators, which keeps quotients finite; the smallest normal float32 is 1e-38."""
 
 
-LIMITS = Limits()
+PROJECTION_LIMITS = ProjectionLimits()
 
 
 def _projection_matrices() -> tuple[Tensor, Tensor]:
@@ -77,10 +77,12 @@ TRIPLES = _perpendicular_triples()
 def in_content_units(state: State, rows: Tensor) -> tuple[Tensor, Tensor]:
     """Means (m, 3) and covariances (m, 6) of some Gaussians in units of the content's size, around its centre, within
     the bounds."""
-    means = ((state.means[rows] - state.centre) / state.size).clamp_(-LIMITS.max_coordinate, LIMITS.max_coordinate)
+    means = ((state.means[rows] - state.centre) / state.size).clamp_(
+        -PROJECTION_LIMITS.max_coordinate, PROJECTION_LIMITS.max_coordinate
+    )
     cov = state.cov[rows] / state.size**2
     total = cov[:, 0] + cov[:, 3] + cov[:, 5]
-    cov *= (LIMITS.max_width**2 / total.clamp_min(LIMITS.max_width**2))[:, None]
+    cov *= (PROJECTION_LIMITS.max_width**2 / total.clamp_min(PROJECTION_LIMITS.max_width**2))[:, None]
     return means, cov
 
 
@@ -112,7 +114,7 @@ class Projections:
         means, cov = in_content_units(state, rows)
         centres = (means @ PLANE_AXES[direction]).to(self.table)
         flat = (cov @ TO_PLANE[direction]).to(self.table)
-        added = LIMITS.roundness * (flat[:, 0] + flat[:, 2]) + LIMITS.min_width**2
+        added = PROJECTION_LIMITS.roundness * (flat[:, 0] + flat[:, 2]) + PROJECTION_LIMITS.min_width**2
         flat[:, 0] += added
         flat[:, 2] += added
         self.table[rows, :6] = torch.cat([centres, flat, area_of(*flat.unbind(1))[:, None]], dim=1)
@@ -120,4 +122,4 @@ class Projections:
 
 def area_of(uu: Tensor, uv: Tensor, vv: Tensor) -> Tensor:
     """Areas of projections with these covariances, in units of 2 pi: root of the determinant."""
-    return (uu * vv).addcmul_(uv, uv, value=-1).clamp_min_(LIMITS.min_divisor).sqrt_()
+    return (uu * vv).addcmul_(uv, uv, value=-1).clamp_min_(PROJECTION_LIMITS.min_divisor).sqrt_()

@@ -26,7 +26,7 @@ from pointsplat_ns.pruning.merging.covariance import MIN_DIVISOR, covariances_of
 from pointsplat_ns.pruning.merging.groups import Groups, first_members
 from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.replacement import enlarged
-from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
+from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import bounded_colours
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import CHUNK, in_pieces
@@ -43,7 +43,7 @@ class Members:
     colours: Tensor  # [n, 3] float32 of SH degree 0, colour units
 
     @classmethod
-    def of(cls, scene: Gaussians, rows: Tensor, settings: MergeSettings = DEFAULTS) -> Members:
+    def of(cls, scene: Gaussians, rows: Tensor, settings: MergeSettings = MERGING) -> Members:
         """The Gaussians ``rows`` (n,) of a scene on the CPU."""
         cov = in_pieces(lambda these: covariances_of(scene, these), rows, 6)
 
@@ -139,7 +139,7 @@ def best_groups(
     members: Members,
     group: Tensor,
     groups: Moments,
-    settings: MergeSettings = DEFAULTS,
+    settings: MergeSettings = MERGING,
     compiled: bool | None = None,
 ) -> Tensor:
     """The group (n,) that each member fits best, of its own and the nearest. The heaviest member of each group stays,

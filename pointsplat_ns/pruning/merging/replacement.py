@@ -32,7 +32,7 @@ from pointsplat_ns.pruning.merging.covariance import (
     rms_area,
     thinnest_axes,
 )
-from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
+from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import State
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import CHUNK
@@ -144,7 +144,7 @@ def _as_torch() -> bool:
         torch.ones(90, dtype=torch.int32), torch.zeros(3), 1.0,
     )  # fmt: skip
     first, second = torch.randperm(90, generator=generator)[:60].view(2, 30)
-    found = [_by_kernels(state, first, second, DEFAULTS), replace_pairs(state, first, second, DEFAULTS, False)]
+    found = [_by_kernels(state, first, second, MERGING), replace_pairs(state, first, second, MERGING, False)]
     ours, torchs = ([after.means, after.cov, after.alphas, after.colours, shares] for after, shares in found)
     return all(torch.allclose(a, b, rtol=1e-6, atol=1e-9) for a, b in zip(ours, torchs, strict=True))
 

@@ -31,7 +31,7 @@ from pointsplat_ns.pruning.merging.pair_cost import pair_costs
 from pointsplat_ns.pruning.merging.participants import Participants, drawable
 from pointsplat_ns.pruning.merging.regrouping import regrouped
 from pointsplat_ns.pruning.merging.replacement import replace_pairs
-from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
+from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import State, initial_state
 from pointsplat_ns.pruning.merging.tree import Tree
 from pointsplat_ns.pruning.merging.visibility import Viewpoints, sampled_viewpoints, visibility_weights
@@ -58,7 +58,7 @@ def merge(
     progress: Callable[[float], None] | None = None,
     views: Views | None = None,
     resolution: tuple[int, int] = RESOLUTION,
-    settings: MergeSettings = DEFAULTS,
+    settings: MergeSettings = MERGING,
 ) -> Merged:
     """Replace a scene by ``k`` Gaussians that look the same.
 
@@ -91,7 +91,7 @@ def merge_levels(
     progress: Callable[[float], None] | None = None,
     views: Views | None = None,
     resolution: tuple[int, int] = RESOLUTION,
-    settings: MergeSettings = DEFAULTS,
+    settings: MergeSettings = MERGING,
 ) -> Iterator[Merged]:
     """Replace a scene by fewer and fewer Gaussians in one pass.
 
@@ -134,7 +134,7 @@ class Merger:
         scene: Gaussians,
         views: Views | None = None,
         resolution: tuple[int, int] = RESOLUTION,
-        settings: MergeSettings = DEFAULTS,
+        settings: MergeSettings = MERGING,
     ):
         self._scene, self._options = scene, (views, resolution, settings)
         self._steps: list[Step] = []  # after rounds that merge as many pairs as they may

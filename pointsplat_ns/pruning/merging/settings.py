@@ -16,7 +16,7 @@ class MergeSettings:
 
     Example:
         >>> from dataclasses import replace
-        >>> replace(DEFAULTS, regrouping_rounds=0).neighbours  # everything as by default, but no regrouping
+        >>> replace(MERGING, regrouping_rounds=0).neighbours  # everything as by default, but no regrouping
         6
     """
 
@@ -137,5 +137,5 @@ class MergeSettings:
     """How far outside of ``size_changes`` the chosen one may lie. Flowers gain 0.4 dB where ``depth_exponent`` is 0."""
 
 
-DEFAULTS = MergeSettings()
+MERGING = MergeSettings()
 """The settings that scenes are merged with by default."""

@@ -26,7 +26,7 @@ from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.looking.sampling import views_about
 from pointsplat_ns.looking.traces import photo_places, trace_factors
 from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
+from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.views import Views
 
@@ -45,7 +45,7 @@ def visibility_weights(participants: Participants, viewpoints: Viewpoints | None
     return weights * trace_factors(scene, members) if viewpoints.photos_found else weights
 
 
-def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: MergeSettings = DEFAULTS) -> Tensor:
+def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: MergeSettings = MERGING) -> Tensor:
     """Covered pixels of some Gaussians over opacity times area, relative to one that is seen well.
 
     Args:

@@ -17,7 +17,7 @@ from pointsplat_ns.io import read_ply, write_ply
 from pointsplat_ns.io.ply import PlyRows, header_bytes, row_table
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.pruning.merging import DEFAULTS, MergeSettings, merge
+from pointsplat_ns.pruning.merging import MERGING, MergeSettings, merge
 from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
 from pointsplat_ns.pruning.merging.cells.partition import divided
 from pointsplat_ns.system.memory import PeakMemory
@@ -31,7 +31,7 @@ def rows_of(scene: Gaussians, folder: Path) -> PlyRows:
     return rows
 
 
-BLIND = replace(DEFAULTS, min_count_rendered=10**9)
+BLIND = replace(MERGING, min_count_rendered=10**9)
 """Settings without sampled views, to be quick."""
 
 
@@ -84,7 +84,7 @@ def test_cells_hold_equally_many_gaussians_even_at_one_position(tmp_path):
 def test_cells_lose_no_more_than_the_whole_and_leave_no_seam(tmp_path):
     scene = box_room(seed=3, count=12_000, size=0.08)
     rows, k = rows_of(scene, tmp_path), 1200
-    whole, parts = merge(scene, k).scene, merged(rows, k, 3000, tmp_path, DEFAULTS)
+    whole, parts = merge(scene, k).scene, merged(rows, k, 3000, tmp_path, MERGING)
     reference = DenseReference(scene, sample_views(scene, 6, width=160, height=120, seed=9))
     assert reference.psnr(parts)[0] > reference.psnr(whole)[0] - 0.3  # other sampled views differ by as much
     # Density beside borders: share of the dense Gaussians near a border, and of those that remain.
@@ -116,7 +116,7 @@ KILLED = """
 import os, signal, sys
 from dataclasses import replace
 from pathlib import Path
-from pointsplat_ns.pruning.merging import DEFAULTS
+from pointsplat_ns.pruning.merging import MERGING
 from pointsplat_ns.io.ply import PlyRows, header_bytes, row_table
 from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
 here, at = Path(sys.argv[1]), int(sys.argv[2])
@@ -128,7 +128,7 @@ def heard(event, args):
             os.kill(os.getpid(), signal.SIGKILL)
 sys.addaudithook(heard)
 rows = PlyRows.open(here / "scene.ply")
-blind = replace(DEFAULTS, min_count_rendered=10**9)
+blind = replace(MERGING, min_count_rendered=10**9)
 merge_file(rows, lambda n: 300, here / "small.ply", 1000, Scratch(here / "cells", {"a": 1}), settings=blind)
 """
 
@@ -188,7 +188,7 @@ from dataclasses import replace
 from pathlib import Path
 from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.pruning.merging.cells import Scratch, merge_file, partition
-from pointsplat_ns.pruning.merging.settings import DEFAULTS
+from pointsplat_ns.pruning.merging.settings import MERGING
 from pointsplat_ns.system.memory import PeakMemory
 partition.CELLS = partition.CellSettings(rows_at_once=1 << 13, overview=1 << 12)
 peaks = []
@@ -196,7 +196,7 @@ for name, most in (("few", 1000), ("many", int(sys.argv[2]))):  # the first for 
     folder, peak = Path(sys.argv[1]) / name, PeakMemory()
     peaks.append(peak.bytes())
     rows = PlyRows.open(folder / "scene.ply")
-    blind = replace(DEFAULTS, min_count_rendered=10**9)
+    blind = replace(MERGING, min_count_rendered=10**9)
     merge_file(rows, lambda n: n // 10, folder / "small.ply", most, Scratch(folder / "cells", {}), settings=blind)
     peaks.append(peak.bytes())
 print(peaks[3] - peaks[2])

@@ -8,7 +8,7 @@ from making import ball
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.pruning.merging.finishing import Finish, best_finish, top_of_parabola
-from pointsplat_ns.pruning.merging.settings import DEFAULTS
+from pointsplat_ns.pruning.merging.settings import MERGING
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_the_top_of_the_trials_is_tried_too():
 
     found = best_finish(psnr_of)
     assert found.size_change == pytest.approx(-0.06) and found.psnr == pytest.approx(30)
-    assert tried == [*DEFAULTS.size_changes, pytest.approx(-0.06)]
+    assert tried == [*MERGING.size_changes, pytest.approx(-0.06)]
 
 
 def test_the_note_is_one_line():

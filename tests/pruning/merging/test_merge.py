@@ -10,7 +10,7 @@ import torch
 from making import ball, cloud, same
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.merging import DEFAULTS, Finish, Merged, Merger, merge, merge_levels
+from pointsplat_ns.pruning.merging import MERGING, Finish, Merged, Merger, merge, merge_levels
 from pointsplat_ns.pruning.merging import covariance as algebra
 from pointsplat_ns.pruning.merging.merged_scene import deepened
 from pointsplat_ns.rasterizer import rasterization
@@ -18,7 +18,7 @@ from pointsplat_ns.rasterizer.constants import ALPHA_MAX
 from pointsplat_ns.system.kernels import Kernels
 from pointsplat_ns.views import Views
 
-RENDERED = replace(DEFAULTS, min_count_rendered=0)
+RENDERED = replace(MERGING, min_count_rendered=0)
 """Settings with which the smallest scenes are rendered."""
 
 
@@ -113,7 +113,7 @@ def test_two_coincident_halves_become_one_of_their_common_mass():
     result = merge(pair, 1)
     merged, finish = result.scene, result.finish
     # Mass 0.5 + 0.5 less the integral of what is covered twice, 0.25 G^2: half of 0.25; then deepened for two members.
-    want = 1 - 0.125 ** (2**DEFAULTS.depth_exponent)
+    want = 1 - 0.125 ** (2**MERGING.depth_exponent)
     assert float(merged.alphas) == pytest.approx(want, rel=1e-5)  # float32, 7 digits
     torch.testing.assert_close(merged.means, one.means)
     want_scales = one.scales.sort().values + finish.size_change

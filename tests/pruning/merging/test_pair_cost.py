@@ -9,14 +9,14 @@ import torch
 from making import assert_same_on_any_threads, cloud
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.pruning.merging import DEFAULTS
+from pointsplat_ns.pruning.merging import MERGING
 from pointsplat_ns.pruning.merging import covariance as algebra
 from pointsplat_ns.pruning.merging.pair_cost import KERNELS, costs_in_plane, pair_costs
 from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.projections import (
     DIRECTIONS,
-    LIMITS,
     PLANE_AXES,
+    PROJECTION_LIMITS,
     TO_PLANE,
     Projections,
     in_content_units,
@@ -31,7 +31,7 @@ def state_of(scene: Gaussians, size: float = 1.0) -> State:
     """The state before the first round, of all Gaussians, around the origin."""
     n = len(scene)
     participants = Participants(scene, torch.arange(n), torch.zeros(3, dtype=torch.float64), size)
-    return initial_state(participants, torch.ones(n), DEFAULTS)
+    return initial_state(participants, torch.ones(n), MERGING)
 
 
 def disks(seed: int = 1, logits: tuple[float, float] = (0.3, -0.6)) -> Gaussians:
@@ -53,7 +53,7 @@ def costs_along(
     """Costs (m, k) in one direction, float64."""
     projections = Projections.empty(state, dtype)
     projections.fill(state, torch.arange(len(state)), direction)
-    return costs_in_plane(projections, i, j, DEFAULTS).double()
+    return costs_in_plane(projections, i, j, MERGING).double()
 
 
 def cost_along_z(scene: Gaussians) -> float:
@@ -88,23 +88,23 @@ def test_the_cost_is_the_integral_that_it_claims_to_be(logits, grows):
     merged_cov = (w[:, None, None] * (cov + apart[:, :, None] * apart[:, None])).sum(0)
     alpha = (alphas * areas).sum() - alphas[0] * alphas[1] * both
     alpha = alpha / torch.linalg.det(merged_cov).sqrt()
-    assert (float(alpha) > DEFAULTS.max_opacity) == grows
+    assert (float(alpha) > MERGING.max_opacity) == grows
     merged_cov = (
-        merged_cov * (alpha / DEFAULTS.max_opacity).clamp(1, DEFAULTS.max_growth_ratio) ** DEFAULTS.growth_exponent
+        merged_cov * (alpha / MERGING.max_opacity).clamp(1, MERGING.max_growth_ratio) ** MERGING.growth_exponent
     )
-    alpha = alpha.clamp_max(DEFAULTS.max_opacity)
+    alpha = alpha.clamp_max(MERGING.max_opacity)
     merged = splat(mean, merged_cov)
     on = alphas[1] * both / areas[0]
     cover = alphas[0] / 2 + on
     colours = scene.features_dc.double() * SH_C0
     around = (alphas[0] / 2 * colours[0] + on * colours[1]) / cover
     f = colours - around
-    assumed = 3 * DEFAULTS.min_contrast**2
+    assumed = 3 * MERGING.min_contrast**2
     parts = torch.stack([alphas[0] * first, alphas[1] * second, -alpha * merged])
     change = torch.einsum("cij,cd->ijd", parts, torch.cat([f, (w[:, None] * f).sum(0)[None]]))
     shape = parts.sum(0).square().sum() * pixel
     blend = float(change.square().sum() * pixel + assumed * shape)
-    through = 3 * DEFAULTS.background_contrast**2 * math.exp(-4 * float(cover))
+    through = 3 * MERGING.background_contrast**2 * math.exp(-4 * float(cover))
     want = blend / max(float(cover), 0.5) ** 2 + through * float(shape)
     assert got == pytest.approx(want, rel=2e-3)  # float32, where six terms nearly cancel
 
@@ -128,7 +128,7 @@ def test_sizes_are_in_units_of_the_scene_and_bounded_where_they_are_wide_beyond_
         features_rest=torch.zeros(4, 0, 3),
     )
     _, cov = in_content_units(state_of(scene, size=2.0), torch.arange(4))
-    expected = torch.tensor([0.25, 10.0, 250.0, LIMITS.max_width], dtype=torch.float64)
+    expected = torch.tensor([0.25, 10.0, 250.0, PROJECTION_LIMITS.max_width], dtype=torch.float64)
     torch.testing.assert_close(cov[:, 0].sqrt(), expected, rtol=1e-6, atol=0.0)  # sizes are given in float32
 
 
@@ -169,7 +169,7 @@ def test_kernels_are_as_near_to_float64_as_torch_is(k, axes):
         features_dc=torch.randn(n, 3, generator=g),
         features_rest=torch.randn(n, 3, 3, generator=g),
     )
-    n_axes = replace(DEFAULTS, colour_axes=axes)
+    n_axes = replace(MERGING, colour_axes=axes)
     participants = Participants(scene, torch.arange(n), torch.full((3,), 0.5, dtype=torch.float64), 1.7)
     state = initial_state(participants, torch.rand(n, generator=g), n_axes)
     near = torch.randint(0, n, (n, k), generator=g, dtype=torch.int32)

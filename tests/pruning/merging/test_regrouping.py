@@ -5,7 +5,7 @@ import torch
 
 from making import cloud
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.merging import DEFAULTS
+from pointsplat_ns.pruning.merging import MERGING
 from pointsplat_ns.pruning.merging.covariance import covariances, unpack
 from pointsplat_ns.pruning.merging.regrouping import Members, Moments, best_groups, moments
 
@@ -93,7 +93,7 @@ def test_the_unit_of_length_does_not_matter(unit):
     assert torch.equal(found, expected) and not torch.equal(found, group)
 
 
-@pytest.mark.parametrize("count", [1, 2, DEFAULTS.regrouping_candidates - 1])
+@pytest.mark.parametrize("count", [1, 2, MERGING.regrouping_candidates - 1])
 def test_there_may_be_fewer_groups_than_candidates(count):
     scene, group = cloud(200), random_groups(cloud(200), count)
     assert torch.equal(after(scene, group, count).unique(), torch.arange(count))

@@ -8,7 +8,7 @@ import torch
 
 from making import assert_same_on_any_threads, cloud
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.merging import DEFAULTS
+from pointsplat_ns.pruning.merging import MERGING
 from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.replacement import KERNELS, replace_pairs
 from pointsplat_ns.pruning.merging.state import State, initial_state
@@ -20,7 +20,7 @@ def state_of(scene: Gaussians) -> State:
     """The state before the first round, each Gaussian with another visibility weight."""
     n = len(scene)
     participants = Participants(scene, torch.arange(n), torch.zeros(3, dtype=torch.float64), 1.0)
-    return initial_state(participants, torch.linspace(0.1, 1, n), DEFAULTS)
+    return initial_state(participants, torch.linspace(0.1, 1, n), MERGING)
 
 
 def extremes(n: int, unit: float) -> Gaussians:
@@ -41,7 +41,7 @@ def extremes(n: int, unit: float) -> Gaussians:
 def test_the_kernel_gives_what_torch_gives(scene):
     state = state_of(scene)
     first, second = torch.randperm(2000, generator=torch.Generator().manual_seed(1))[:1400].view(2, 700)
-    (ours, our_shares), (torchs, shares) = (replace_pairs(state, first, second, DEFAULTS, on) for on in (True, False))
+    (ours, our_shares), (torchs, shares) = (replace_pairs(state, first, second, MERGING, on) for on in (True, False))
     assert torch.equal(ours.counts, torchs.counts) and int(ours.counts.sum()) == 2000
     torch.testing.assert_close(ours.means, torchs.means, rtol=1e-9, atol=1e-9 * float(torchs.means.abs().max()))
     for got, wanted in ((ours.colours, torchs.colours), (ours.weights, torchs.weights), (our_shares, shares)):
@@ -58,9 +58,9 @@ def test_any_number_of_threads_gives_the_same_and_others_stay_as_they_are():
     state, pairs = state_of(cloud(9000)), torch.arange(6000).view(2, 3000)
 
     def replaced() -> list[torch.Tensor]:
-        after, shares = replace_pairs(state, *pairs, DEFAULTS)
+        after, shares = replace_pairs(state, *pairs, MERGING)
         return [*(value for value in dataclasses.astuple(after) if isinstance(value, torch.Tensor)), shares]
 
     assert_same_on_any_threads(replaced)
-    after, _ = replace_pairs(state, *pairs, DEFAULTS)
+    after, _ = replace_pairs(state, *pairs, MERGING)
     assert torch.equal(after.cov[3000:], state.cov[6000:]) and torch.equal(after.colours[3000:], state.colours[6000:])

@@ -10,7 +10,7 @@ from making import ball, cloud, normal_scene, photographed
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import content_size, in_units, views_in_units
 from pointsplat_ns.looking.poses import look_at
-from pointsplat_ns.pruning.merging import DEFAULTS, merge, visibility
+from pointsplat_ns.pruning.merging import MERGING, merge, visibility
 from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.visibility import (
     Viewpoints,
@@ -79,7 +79,7 @@ def test_an_occluded_gaussian_has_a_small_weight():
 def test_a_gaussian_outside_of_all_pictures_has_the_smallest_weight():
     scene = joined(wall(0.0), wall(0.0).replace(means=wall(0.0).means + torch.tensor([0, 0, -20.0])))
     _, behind = weights_of(scene, of_origin((0, 0, -4))).chunk(2)
-    assert behind.tolist() == pytest.approx([DEFAULTS.min_visibility] * len(behind))
+    assert behind.tolist() == pytest.approx([MERGING.min_visibility] * len(behind))
 
 
 def test_merging_keeps_visible_gaussians_rather_than_occluded_ones():
@@ -93,7 +93,7 @@ def test_in_a_large_scene_some_gaussians_are_drawn_for_all(max_count):
     scene = two_walls()
     participants = Participants.of(scene, torch.arange(len(scene)))
     viewpoints = Viewpoints(views_in_units(of_origin((0, 0, -4)), participants.centre, participants.size))
-    found = visibility_weights(participants, viewpoints, replace(DEFAULTS, max_count_drawn=max_count))
+    found = visibility_weights(participants, viewpoints, replace(MERGING, max_count_drawn=max_count))
     assert found.shape == (len(scene),)
     front = scene.means[participants.members, 2] < 0
     if max_count > 3:
@@ -112,7 +112,7 @@ def test_weights_are_bounded_whatever_the_scene(dtype, case):
         scene = scene.replace(opacities=torch.full_like(scene.opacities, -math.inf))
     views = of_origin((0, -6, 1))[[]] if case == "no view" else of_origin((0, -6, 1))
     found = weights_of(scene, views)
-    least = DEFAULTS.min_visibility
+    least = MERGING.min_visibility
     assert found.shape == (400,) and bool(((found >= 0.999 * least) & (found <= 1.001 / least)).all())
     if case in ("transparent", "no view"):  # nothing is known
         assert found.tolist() == [1.0] * 400
@@ -123,23 +123,23 @@ def test_traces_count_where_the_scene_tells_of_its_photos(monkeypatch, found_pho
     monkeypatch.setattr(visibility, "covered_per_area", lambda scene, rows, views, settings: torch.full((30,), 0.5))
     monkeypatch.setattr(visibility, "trace_factors", lambda scene, members: torch.full((30,), 16.0))
     viewpoints = Viewpoints(of_origin((0, -6, 1)), photos_found=found_photos)
-    found = visibility_weights(Participants.of(cloud(30), torch.arange(30)), viewpoints, DEFAULTS)
+    found = visibility_weights(Participants.of(cloud(30), torch.arange(30)), viewpoints, MERGING)
     assert found.tolist() == [8.0 if found_photos else 0.5] * 30
 
 
 def test_without_viewpoints_all_weights_are_equal():
-    assert visibility_weights(Participants.of(cloud(30), torch.arange(30)), None, DEFAULTS).tolist() == [1.0] * 30
+    assert visibility_weights(Participants.of(cloud(30), torch.arange(30)), None, MERGING).tolist() == [1.0] * 30
 
 
 def test_without_a_free_place_there_are_no_viewpoints():
     fog = ball(200)
     fog = fog.replace(opacities=torch.full((200, 1), -math.inf))
-    assert sampled_viewpoints(fog, 32, 24, DEFAULTS) is None
+    assert sampled_viewpoints(fog, 32, 24, MERGING) is None
 
 
 def test_photo_places_are_found_unless_that_is_turned_off():
     content = photographed()
     content = in_units(content, *content_size(content))
-    settings = replace(DEFAULTS, sampled_views=2)
+    settings = replace(MERGING, sampled_views=2)
     assert sampled_viewpoints(content, 32, 24, settings).photos_found
     assert not sampled_viewpoints(content, 32, 24, replace(settings, find_photo_places=False)).photos_found

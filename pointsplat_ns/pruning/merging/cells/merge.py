@@ -29,7 +29,7 @@ from pointsplat_ns.pruning.merging.participants import Participants, drawable
 from pointsplat_ns.pruning.merging.regrouping import regrouped
 from pointsplat_ns.pruning.merging.replacement import replace_pairs
 from pointsplat_ns.pruning.merging.rounds import merge
-from pointsplat_ns.pruning.merging.settings import DEFAULTS, MergeSettings
+from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import State, initial_state
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.threads import one_thread_each
@@ -49,7 +49,7 @@ def merge_file(
     views: Callable[[Gaussians], Views | None] = lambda sample: None,
     resolution: tuple[int, int] = RESOLUTION,
     progress: Progress = silent,
-    settings: MergeSettings = DEFAULTS,
+    settings: MergeSettings = MERGING,
 ) -> tuple[int, int]:
     """Merge the Gaussians of a file, and write those that remain, cell by cell.
 
