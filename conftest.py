@@ -30,8 +30,7 @@ def no_repair_by_default() -> Iterator[None]:
 @pytest.fixture()
 def coarse_rooms(monkeypatch: pytest.MonkeyPatch) -> None:
     """Built-in rooms whose textures and light have few points: made in a second, for tests that do not look at them."""
-    monkeypatch.setattr(light, "TEXEL", 0.1)
-    monkeypatch.setattr(light, "LUMEL", 0.5)
+    monkeypatch.setattr(light, "LIGHT", light.LightSettings(texel=0.1, lumel=0.5))
 
 
 @pytest.fixture(autouse=True)
