@@ -33,7 +33,7 @@ Source = Gaussians | str | Path
 ViewsInput = Views | str | Path | None
 """Views, the run whose dataset has the poses, a file of cameras, or None for those of the scene's run."""
 
-Resolution = tuple[int, int] | str | None
+ResolutionInput = tuple[int, int] | str | None
 """Width and height of pictures, pixels."""
 
 
@@ -52,7 +52,7 @@ def prune_source(
     scene: Source,
     request: PruneRequest,
     views: ViewsInput = None,
-    resolution: Resolution = None,
+    resolution: ResolutionInput = None,
     up: str | None = None,
     progress: bool | Progress = False,
     compared: bool = False,
@@ -82,7 +82,7 @@ def compact_source(
     request: CompactRequest,
     goal: Goal | None = None,
     views: ViewsInput = None,
-    resolution: Resolution = None,
+    resolution: ResolutionInput = None,
     up: str | None = None,
     progress: bool | Progress = False,
     compared: bool = False,
@@ -139,7 +139,7 @@ def goal_of(
 
 
 def read_source(
-    scene: Source, views: ViewsInput, resolution: Resolution, up: str | None = None
+    scene: Source, views: ViewsInput, resolution: ResolutionInput, up: str | None = None
 ) -> tuple[Gaussians, ViewSource]:
     """Read the dense scene, and make its source of views. Arguments as of :func:`pointsplat_ns.prune`. Raises
     SceneError if a file is missing or damaged, or the scene is a ``pointsplat`` run, which is pruned already; DataError

@@ -19,7 +19,7 @@ from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.system.progress import Progress, tracked
 from pointsplat_ns.viewing.camera_path import CAMERA_PATH, FilmSettings, camera_path
-from pointsplat_ns.viewing.film import FilmScenes, Split, render_frames
+from pointsplat_ns.viewing.film import FilmScenes, SplitScreen, render_frames
 from pointsplat_ns.viewing.video import check_output, write_frames
 from pointsplat_ns.views import Views
 
@@ -36,7 +36,7 @@ def render_path(
     *,
     path: str | Path | Views = "auto",
     views: Views | str | Path | None = None,
-    split: Split = "side-by-side",
+    split: SplitScreen = "side-by-side",
     labels: Sequence[str] | None = None,
     up: str | None = None,
     width: int | None = None,

@@ -12,7 +12,7 @@ from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.quality import quality_of_pruned
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
 from pointsplat_ns.compression.scene_folder import Command, Shard, output_folder, run_on_folder
-from pointsplat_ns.compression.scene_task import Options, SceneResult, SmallerScene
+from pointsplat_ns.compression.scene_task import CommandOptions, SceneResult, SmallerScene
 from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -107,7 +107,7 @@ def compact_folder(
     size = parse_resolution(resolution)
     request = CompactRequest.of(trained, keep, by, sh, clean, RepairBudget(effort, seconds))
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
-    options: Options = {
+    options: CommandOptions = {
         "keep": str(request.prune.budget),
         "refiner": None if trained is None else source_file(trained.source).sha256,
         "by": request.prune.by,
@@ -143,7 +143,7 @@ def prune_folder(
 ) -> list[SceneResult]:
     """Prune every scene of a folder by :func:`prune`; folders, sizes and results as of :func:`compact_folder`."""
     request, size = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune), parse_resolution(resolution)
-    options: Options = {
+    options: CommandOptions = {
         "keep": str(request.budget),
         "by": by,
         "sh": sh,
@@ -174,7 +174,7 @@ def convert_folder(
     :func:`compact_folder`. Raises SceneError if the format is not written as one file."""
     if not suffix.startswith(".") or format_to_write(suffix).suffix != suffix:
         raise SceneError(f"{suffix}: no suffix of scene files that are written; expected one such as .spz")
-    options: Options = {"format": suffix, "sh": sh, "up": up, "scale": scale, "original_frame": original_frame}
+    options: CommandOptions = {"format": suffix, "sh": sh, "up": up, "scale": scale, "original_frame": original_frame}
     command = Command("convert", functools.partial(_converted, sh, up, scale, original_frame), options, suffix)
     return _run(folder, output, command, jobs, shard, force, progress)
 

@@ -155,12 +155,12 @@ def plain_page(monkeypatch) -> list[Path]:
     for."""
     asked: list[Path] = []
 
-    def write_page(sweep, folder: Path, output: Path, progress=None) -> Path:
+    def write_sweep_page(sweep, folder: Path, output: Path, progress=None) -> Path:
         asked.append(folder)
         output.write_text(" ".join(point.key for point in sweep.points))
         return output
 
-    monkeypatch.setattr("pointsplat_ns.tradeoff.page.write_page", write_page)
+    monkeypatch.setattr("pointsplat_ns.tradeoff.page.write_sweep_page", write_sweep_page)
     return asked
 
 

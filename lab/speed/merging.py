@@ -30,7 +30,7 @@ from pointsplat_ns.pruning.merging import MERGING, merge
 from pointsplat_ns.pruning.merging.matching import cheapest_pairs
 from pointsplat_ns.pruning.merging.pair_cost import pair_costs
 from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.regrouping import Members, best_groups, moments
+from pointsplat_ns.pruning.merging.regrouping import Members, best_groups, group_moments
 from pointsplat_ns.pruning.merging.replacement import replace_pairs
 from pointsplat_ns.pruning.merging.state import initial_state
 from pointsplat_ns.pruning.merging.visibility import sampled_viewpoints
@@ -48,7 +48,7 @@ def parts_of(scene: Gaussians) -> dict[str, Part]:
     first, second = cheapest_pairs(near, costs, int(MERGING.round_share * len(state)))
     members, count = Members.of(scene, participants.members), count_of(KEEP, len(state))
     group = torch.arange(len(state)) * count // len(state)  # neighbours along the curve
-    groups = moments(members, group, count)
+    groups = group_moments(members, group, count)
     parts: dict[str, Part] = {
         "neighbours": partial(other_neighbours, state.means, MERGING.neighbours),
         "costs of pairs": lambda compiled: pair_costs(state, near, compiled=compiled),

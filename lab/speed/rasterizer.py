@@ -131,7 +131,7 @@ class Case:
     def footprints_of(self, seen: Projected) -> Footprints:
         geometry = [t.detach() for t in (seen.means2d, seen.cov2d, seen.det, seen.opacities)]
         camera, engine = torch.zeros_like(seen.ids), binning.engine_of(None, *geometry)
-        return Footprints(*geometry, seen.beyond, camera, 1, self.width, self.height, engine=engine)
+        return Footprints(*geometry, seen.depth_keys, camera, 1, self.width, self.height, engine=engine)
 
     def time_stages(self) -> dict[str, float]:
         """Stage by stage, forward as in training and backward: what `rasterization` does for one camera, compiled

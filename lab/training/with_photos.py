@@ -31,7 +31,7 @@ from lab.common.ways import count_of
 from lab.judge.scenes import PHOTOS
 from pointsplat_ns.io import read_scene
 from pointsplat_ns.metrics.lpips import Lpips
-from pointsplat_ns.nerfstudio_plugin.running import SCENE_METHOD, run_folder
+from pointsplat_ns.nerfstudio_plugin.running import SCENE_METHOD, folder_of_run
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.programs import run_measured
 
@@ -75,11 +75,11 @@ class Capture:
     @property
     def dense(self) -> Path:
         """The run of the dense training."""
-        return run_folder(self.folder, self.name, SCENE_METHOD, "dense")
+        return folder_of_run(self.folder, self.name, SCENE_METHOD, "dense")
 
     def train(self, label: str, steps: int, cap: int | None = None) -> tuple[Path, float]:
         """A new training, with a cap or without: its run and its CPU seconds."""
-        run = run_folder(self.folder, self.name, SCENE_METHOD, label)
+        run = folder_of_run(self.folder, self.name, SCENE_METHOD, label)
         shutil.rmtree(run, ignore_errors=True)
         words = [*_TRAIN, self.arguments[0], "--output-dir", str(self.folder), "--experiment-name", self.name]
         words += ["--timestamp", label, "--max-num-iterations", str(steps), "--vis", "tensorboard"]
@@ -96,7 +96,7 @@ class Capture:
         """CPU seconds of a step of a training with a cap, on average over its schedule, and of the start."""
         few, many = 1, max(20, self.steps // 10)
         costs = [self.train("trial", steps, count)[1] for steps in (few, many)]
-        shutil.rmtree(run_folder(self.folder, self.name, SCENE_METHOD, "trial"), ignore_errors=True)
+        shutil.rmtree(folder_of_run(self.folder, self.name, SCENE_METHOD, "trial"), ignore_errors=True)
         return max(1e-3, (costs[1] - costs[0]) / (many - few)), costs[0]
 
     def reduced(self, words: list[str], count: int) -> tuple[Path, float]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from pointsplat_ns.cli.folders import run_folder
+from pointsplat_ns.cli.folders import run_on_folder
 from pointsplat_ns.cli.printing import (
     Json,
     end_if_interrupted,
@@ -129,17 +128,14 @@ def compact(
     if is_folder_of_scenes(scene):
         from pointsplat_ns.compression.scene_folder import output_folder
 
-        run = functools.partial(
-            ps.compact_folder, keep=keep, refiner=refiner, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds,
-            target_db=target_db, target_ms=target_ms, target_mb=target_mb, resolution=resolution,
-            jobs=1 if jobs is None else jobs, shard=shard, force=force,
-        )  # fmt: skip
         one = {"--poses": poses, "--up": up, "--picture": picture, "--html": html, "--photos": photos}
-        with fixed_threads(threads):
-            run_folder(
-                scene, output or output_folder(scene, "compact"), run, {**one, "--dry-run": dry_run}, json_output
-            )
-        return
+        one |= {"--dry-run": dry_run}
+        return run_on_folder(
+            ps.compact_folder, scene, output or output_folder(scene, "compact"), one, json_output, jobs, threads,
+            keep=keep, refiner=refiner, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds,
+            target_db=target_db, target_ms=target_ms, target_mb=target_mb, resolution=resolution, shard=shard,
+            force=force,
+        )  # fmt: skip
     need_no_folder_options(scene, jobs, shard)
     from pointsplat_ns.compacting import compact_source, goal_of
     from pointsplat_ns.compression.requests import CompactRequest, RepairBudget

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import time
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from pointsplat_ns.cli.folders import run_folder
+from pointsplat_ns.cli.folders import run_on_folder
 from pointsplat_ns.cli.printing import Json, print_json, scene_result, written_size
 from pointsplat_ns.cli.scene_options import Scene, claim_outputs, need_no_folder_options
 from pointsplat_ns.system.quantities import seconds_text
@@ -63,13 +62,11 @@ def convert(
 
         if to is None:
             raise ps.SceneError(f"{scene}: a folder of scenes; expected their new format, such as --to .spz")
-        run = functools.partial(
-            convert_folder, suffix=to, sh=sh, up=up, scale=scale, original_frame=original_frame,
-            jobs=1 if jobs is None else jobs, shard=shard, force=force,
-        )  # fmt: skip
         one = {"--spz-version": None if spz_version == 3 else spz_version, "--spz-sh-bits": spz_sh_bits}
-        run_folder(scene, output, run, one, json_output)
-        return
+        return run_on_folder(
+            convert_folder, scene, output, one, json_output, jobs,
+            suffix=to, sh=sh, up=up, scale=scale, original_frame=original_frame, shard=shard, force=force,
+        )  # fmt: skip
     need_no_folder_options(scene, jobs, shard)
     if to is not None:
         raise ps.SceneError(f"{scene}: one scene; --to is for a folder of scenes, the name of {output} says its format")

@@ -58,7 +58,7 @@ def demo(
         force: start over: first remove rooms, trainings and pictures of an earlier demo in the folder.
     """
     from pointsplat_ns.errors import need
-    from pointsplat_ns.nerfstudio_plugin.running import finished
+    from pointsplat_ns.nerfstudio_plugin.running import has_finished
 
     if scene_only:
         write_example(Path("room.ply"), force)
@@ -69,7 +69,7 @@ def demo(
             shutil.rmtree(output / folder)
     scenes, refiner = training_folders(output)
     for training, steps in [*((scene, scene_steps) for scene in scenes.values()), (refiner, refiner_steps)]:
-        finished(training, steps, DEMO.advice)  # refuses another number of steps before the work
+        has_finished(training, steps, DEMO.advice)  # refuses another number of steps before the work
     compact_example(output, keep)
     need("nerfstudio", "the rest of the demo, which trains,")
     print(
@@ -84,10 +84,10 @@ def demo(
 def training_folders(output: Path) -> tuple[dict[str, Path], Path]:
     """Folders of the trained scenes by room, and the folder of the trained refiner."""
     from pointsplat_ns.io.runs import REFINER_METHOD
-    from pointsplat_ns.nerfstudio_plugin.running import SCENE_METHOD, run_folder
+    from pointsplat_ns.nerfstudio_plugin.running import SCENE_METHOD, folder_of_run
 
-    scenes = {name: run_folder(output / "scenes", name, SCENE_METHOD, DEMO.timestamp) for name in DEMO.rooms}
-    return scenes, run_folder(output / "refiner", "rooms", REFINER_METHOD, DEMO.timestamp)
+    scenes = {name: folder_of_run(output / "scenes", name, SCENE_METHOD, DEMO.timestamp) for name in DEMO.rooms}
+    return scenes, folder_of_run(output / "refiner", "rooms", REFINER_METHOD, DEMO.timestamp)
 
 
 def write_example(path: Path, force: bool) -> None:
@@ -123,7 +123,7 @@ def train_and_judge(
     from pointsplat_ns.nerfstudio_plugin.pointsplat.report import read_evaluation, show_report
     from pointsplat_ns.nerfstudio_plugin.running import (
         evaluate_command,
-        finished,
+        has_finished,
         remove_interrupted,
         run,
         train_refiner_command,
@@ -138,10 +138,10 @@ def train_and_judge(
         if not (rooms / name).is_dir():
             print(write_room(rooms / name, int(name[4:]), *photos))
     for name, scene_run in scene_runs.items():
-        if not finished(scene_run, scene_steps, DEMO.advice):
+        if not has_finished(scene_run, scene_steps, DEMO.advice):
             remove_interrupted(scene_run)
             run(train_scene_command(rooms / name, scenes, name, scene_steps, DEMO.timestamp, seed_points=20_000))
-    if not finished(trained, refiner_steps, DEMO.advice):
+    if not has_finished(trained, refiner_steps, DEMO.advice):
         remove_interrupted(trained)
         options = {"pipeline.model.keep": keep, "pipeline.model.size": "tiny"}
         run(train_refiner_command(scenes, refiners, "rooms", refiner_steps, DEMO.timestamp, (DEMO.held_out,), options))

@@ -14,17 +14,27 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_task import SceneResult
 
 
-def run_folder(
-    folder: Path, output: Path, run: Callable[..., list[SceneResult]], refused: Mapping[str, object], json_output: bool
+def run_on_folder(
+    run: Callable[..., list[SceneResult]],
+    folder: Path,
+    output: Path,
+    refused: Mapping[str, object],
+    json_output: bool,
+    jobs: int | None,
+    threads: int | None = None,
+    **options: object,
 ) -> None:
     """Run a command on a folder, and print a table of its scenes, or JSON.
 
     Args:
+        run: from both folders and options to the results: a function of :mod:`pointsplat_ns.folders`.
         folder: of scenes.
         output: folder of the results.
-        run: from both folders and ``progress`` to the results.
         refused: options that are for one scene only, by name; False and None stand for options not given.
         json_output: whether to print JSON.
+        jobs: number of processes; by default 1.
+        threads: number of threads of each; by default it adapts.
+        options: all others of ``run``.
 
     Raises:
         SceneError: if an option is given that is for one scene only.
@@ -33,11 +43,13 @@ def run_folder(
     import pointsplat_ns as ps
     from pointsplat_ns.io.discovery import FOLDER_FILES
     from pointsplat_ns.system.processes import torchrun_rank
+    from pointsplat_ns.system.threads import fixed_threads
 
     for name, given in refused.items():
         if given is not None and given is not False:
             raise ps.SceneError(f"{name} is for one scene; {folder} is a folder of scenes")
-    results = run(folder, output, progress=True)
+    with fixed_threads(threads):
+        results = run(folder, output, jobs=1 if jobs is None else jobs, progress=True, **options)
     if torchrun_rank()[0] > 0:
         return  # the first process speaks for all
     failed = sum(result.status == "failed" for result in results)

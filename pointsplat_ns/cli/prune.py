@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pointsplat_ns.cli.folders import run_folder
+from pointsplat_ns.cli.folders import run_on_folder
 from pointsplat_ns.cli.printing import (
     Json,
     print_distributions,
@@ -109,14 +108,12 @@ def prune(
         from pointsplat_ns.compression.scene_folder import output_folder
         from pointsplat_ns.folders import prune_folder
 
-        run = functools.partial(
-            prune_folder, keep=keep, by=by, sh=sh, opacity_weight=opacity_weight, clean=clean, fine_tune=fine_tune,
-            resolution=resolution, jobs=1 if jobs is None else jobs, shard=shard, force=force,
-        )  # fmt: skip
         one = {"--poses": poses, "--up": up, "--plot": plot, "--dry-run": dry_run, "--memory": memory}
-        with fixed_threads(threads):
-            run_folder(scene, output or output_folder(scene, "pruned"), run, one, json_output)
-        return
+        return run_on_folder(
+            prune_folder, scene, output or output_folder(scene, "pruned"), one, json_output, jobs, threads,
+            keep=keep, by=by, sh=sh, opacity_weight=opacity_weight, clean=clean, fine_tune=fine_tune,
+            resolution=resolution, shard=shard, force=force,
+        )  # fmt: skip
     need_no_folder_options(scene, jobs, shard)
     check_poses(poses)
     output = output or output_beside(scene, "pruned")

@@ -16,7 +16,7 @@ from itertools import count as counted
 import torch
 
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings, Example, optimised
-from pointsplat_ns.compression.repair import Steps, rate_factor
+from pointsplat_ns.compression.repair import OptimisationRun, rate_factor
 from pointsplat_ns.compression.requests import PhotoBudget
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
@@ -100,7 +100,7 @@ def photo_repair(
     """
     if len(photos) < 2:
         raise DataError(f"{len(photos)} photos to train on; expected at least two, one of them to compare with")
-    run, checked = Steps(budget), 0
+    run, checked = OptimisationRun(budget), 0
     unseen = list(range(0, len(photos), PHOTO_REPAIR.unseen_every))[: PHOTO_REPAIR.most_unseen]
     used = sorted({*range(len(photos))} - {*unseen})
     best, before = scene, _psnr(scene, photos, unseen)

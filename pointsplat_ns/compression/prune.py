@@ -48,7 +48,7 @@ class Pruned:
     notes: tuple[str, ...]
     """Lines of text: SH bands dropped, PSNR reached, origin of the views."""
     views: Views | None = None
-    """The views that merging looked from; None if it did not, or for another method."""
+    """The views that merging rendered; None if it rendered none, or for another method."""
     limit: FileLimit | None = None
     """The limit of a compressed file, and the rounding that meets it; None for another budget."""
 
@@ -68,7 +68,7 @@ def prune_scene(
     need_usable(dense)
     views = views or ViewSource(dense)
     notes: list[str] = []
-    seen: list[Views] = []  # the views of each scene that was merged
+    rendered: list[Views] = []  # the views of each scene that was merged
     full = _with_sh(dense, request.sh, views, progress, notes)
     count = request.count_of(len(full), full.sh_degree, full.antialiased)
     start, cleaning, limit = full, None, None
@@ -81,9 +81,9 @@ def prune_scene(
     report = functools.partial(progress, f"by {request.by}")
     if count is not None:
         method_views, weight = _views_of_method(request, views), request.opacity_weight
-        scene = prune(start, count, request.by, method_views, weight, report, seen.append, views.resolution)
+        scene = prune(start, count, request.by, method_views, weight, report, rendered.append, views.resolution)
     else:
-        make = _pruner(start, request, views, report, seen)
+        make = _pruner(start, request, views, report, rendered)
         if cleaning is not None:
             make = _refilling(make, cleaning, full, len(start))
         searching = functools.partial(progress, "trying counts")
@@ -101,7 +101,7 @@ def prune_scene(
         notes.insert(0, views.text)
     if limit is not None and rounding:
         scene = limit.rounded(scene)
-    return Pruned(scene, tuple(notes), seen[-1] if seen else None, limit)
+    return Pruned(scene, tuple(notes), rendered[-1] if rendered else None, limit)
 
 
 def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress, notes: list[str]) -> Gaussians:
@@ -139,17 +139,17 @@ def _pruner(
     request: PruneRequest,
     views: ViewSource,
     progress: Callable[[float], None],
-    seen: list[Views],
+    rendered: list[Views],
 ) -> Callable[[int], Gaussians]:
     """A function from a count to a scene of that many Gaussians. Scores, and the rounds of merging that counts share,
-    are computed once. The views that merging looked from are added to ``seen``."""
+    are computed once. The views that merging rendered are added to ``rendered``."""
     method = request.method
     if method.score is None:
         merger = Merger(scene, views.known(VIEW_COUNTS.weighed), views.resolution)
 
         def made(count: int) -> Gaussians:
             merged = merger.merged(count)
-            seen.extend([] if merged.views is None else [merged.views])
+            rendered.extend([] if merged.views is None else [merged.views])
             return merged.scene
 
         return made

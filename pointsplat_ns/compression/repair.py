@@ -63,7 +63,7 @@ def repair(
     Raises:
         DataError: if there is no free space for a camera.
     """
-    run = Steps(budget)
+    run = OptimisationRun(budget)
     if network == "shipped":
         network = shipped_feedback_refiner(scene.device)
     feedback, first_factor = Feedback(scene, len(dense)), initial_rate_factor(psnr)
@@ -85,7 +85,7 @@ def repair(
 
 
 @dataclass
-class Steps:
+class OptimisationRun:
     """The steps of an optimisation within a budget, counted and timed."""
 
     budget: RepairBudget

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pointsplat_ns.compression.scene_task import (
-    Options,
+    CommandOptions,
     SceneResult,
     SceneTask,
     SmallerScene,
@@ -78,7 +78,7 @@ class Command:
 
     name: str
     make: Callable[[Path], SmallerScene]
-    options: Options
+    options: CommandOptions
     """All options that ``make`` depends on."""
     suffix: str | None = None
     """Suffix of the results; None for the format of each scene."""

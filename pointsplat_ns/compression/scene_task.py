@@ -30,7 +30,7 @@ from pointsplat_ns.system.claims import claim
 
 Status = Literal["done", "done before", "failed", "open"]
 
-Options = Mapping[str, str | float | bool | None]
+CommandOptions = Mapping[str, str | float | bool | None]
 """The options that a result depends on."""
 
 
@@ -111,7 +111,7 @@ class SceneTask:
 
 
 def make_result(
-    task: SceneTask, make: Callable[[Path], SmallerScene], options: Options, force: bool = False
+    task: SceneTask, make: Callable[[Path], SmallerScene], options: CommandOptions, force: bool = False
 ) -> SceneResult | None:
     """Make the result of a scene, unless it is finished; None if another process works on it.
 
@@ -168,7 +168,7 @@ def known_result(task: SceneTask) -> SceneResult:
     return task.result(status, **facts)
 
 
-def _key(task: SceneTask, options: Options) -> str:
+def _key(task: SceneTask, options: CommandOptions) -> str:
     """Hash of the input file and the options."""
     text = json.dumps([source_file(task.source).sha256, dict(options)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
@@ -199,7 +199,7 @@ def _check_overwriting(task: SceneTask, force: bool) -> None:
         )
 
 
-def _write(task: SceneTask, made: SmallerScene, key: str, options: Options, start: float) -> SceneResult:
+def _write(task: SceneTask, made: SmallerScene, key: str, options: CommandOptions, start: float) -> SceneResult:
     """Write a result and its record. A process killed in between leaves the record alone: the scene is unfinished."""
     with replacing(task.output) as part:
         kind = format_to_write(task.output)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -20,10 +20,8 @@ from pointsplat_ns.views import Views, spread_indices
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.frames import Frames
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import Split
     from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
-
-Split = Literal["train", "test"]
-"""The training photos of a dataset, or its held-out ones."""
 
 
 def dataset_views(path: Path | str, split: Split = "train") -> Views:

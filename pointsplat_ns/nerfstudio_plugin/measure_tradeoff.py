@@ -24,7 +24,7 @@ from pointsplat_ns.tradeoff.journal import check_journal_folder
 from pointsplat_ns.tradeoff.measuring import Subject
 from pointsplat_ns.tradeoff.outputs import SWEEP_FILES
 from pointsplat_ns.tradeoff.points import Tradeoff
-from pointsplat_ns.tradeoff.sweep import Options, Sweep, removed_without_points
+from pointsplat_ns.tradeoff.sweep import Sweep, SweepOptions, removed_without_points
 from pointsplat_ns.tradeoff.targets import TargetSearch, targets_of
 from pointsplat_ns.views import Views
 
@@ -93,7 +93,7 @@ def measure_tradeoff(
         >>> found.point(found.recommended).bytes <= 10_000
         True
     """
-    options = Options(points, within, tuple(by), tuple(repairs), views)
+    options = SweepOptions(points, within, tuple(by), tuple(repairs), views)
     targets, size = targets_of(target_db, target_ms, target_mb), parse_resolution(resolution)
     upward = up_named(up)
     path, folder = Path(scene), Path(folder)

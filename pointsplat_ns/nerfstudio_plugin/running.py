@@ -22,7 +22,7 @@ from pointsplat_ns.nerfstudio_plugin.third_party_warnings import JIT_SCRIPT
 SCENE_METHOD = "splatfacto-cpu"
 """nerfstudio's name of the method that trains scenes."""
 
-Options = Mapping[str, Any]
+TrainOptions = Mapping[str, Any]
 """Option name without its dashes -> value. A tuple or list becomes several words."""
 
 
@@ -30,7 +30,7 @@ class StoppedError(Exception):
     """Work in a thread that was stopped because the whole program is."""
 
 
-def finished(run: Path, steps: int, instead: str = "name another --output") -> bool:
+def has_finished(run: Path, steps: int, instead: str = "name another --output") -> bool:
     """Whether the training in a run's folder, which need not exist, has finished. A SceneError, with the advice
     ``instead``, if a training of another number of steps has finished there."""
     done = _steps_if_finished(run)
@@ -112,11 +112,17 @@ def _status(
 
 
 def train_scene_command(
-    data: Path, output: Path, name: str, steps: int, timestamp: str, seed_points: int, options: Options | None = None
+    data: Path,
+    output: Path,
+    name: str,
+    steps: int,
+    timestamp: str,
+    seed_points: int,
+    options: TrainOptions | None = None,
 ) -> str:
     """The command that trains a Splatfacto scene from a folder in the Replica layout. The run goes to
-    :func:`run_folder`. The scene starts from ``seed_points`` points of the depth images; ``options`` are further ones
-    of the method."""
+    :func:`folder_of_run`. The scene starts from ``seed_points`` points of the depth images; ``options`` are more
+    options of the method."""
     words = _train_words(SCENE_METHOD, output, name, steps, timestamp, options)
     return shlex.join([*words, "--data", str(data), "replica-data", "--num-seed-points", str(seed_points)])
 
@@ -128,10 +134,10 @@ def train_refiner_command(
     steps: int,
     timestamp: str,
     eval_scenes: tuple[str, ...] = (),
-    options: Options | None = None,
+    options: TrainOptions | None = None,
 ) -> str:
     """The command that trains a refiner on all scenes below the folder ``scenes``, but for those named in
-    ``eval_scenes``. The run goes to :func:`run_folder`; ``options`` are further ones of the method."""
+    ``eval_scenes``. The run goes to :func:`folder_of_run`; ``options`` are further ones of the method."""
     held_out = {"pipeline.datamanager.eval-scenes": eval_scenes} if eval_scenes else {}
     options = {"data": scenes, **held_out, **(options or {})}
     return shlex.join(_train_words(REFINER_METHOD, output, name, steps, timestamp, options))
@@ -144,13 +150,13 @@ def evaluate_command(run: Path, evaluation: Path, pictures: Path) -> str:
     return shlex.join([*words, "--render-output-path", str(pictures)])
 
 
-def run_folder(output: Path, name: str, method: str, timestamp: str) -> Path:
+def folder_of_run(output: Path, name: str, method: str, timestamp: str) -> Path:
     """The folder in which nerfstudio saves a run."""
     return output / name / method / timestamp
 
 
 def _train_words(
-    method: str, output: Path, name: str, steps: int, timestamp: str, options: Options | None
+    method: str, output: Path, name: str, steps: int, timestamp: str, options: TrainOptions | None
 ) -> list[str]:
     words = ["ns-train", method, "--vis", "tensorboard", "--timestamp", timestamp, "--output-dir", str(output)]
     words += ["--experiment-name", name, "--max-num-iterations", str(steps)]

@@ -116,7 +116,7 @@ def prune(
     views: Views | Callable[[], Views] | None = None,
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
-    looked: Callable[[Views], None] | None = None,
+    views_used: Callable[[Views], None] | None = None,
     resolution: tuple[int, int] = RESOLUTION,
 ) -> Gaussians:
     """Prune a scene to a number of Gaussians.
@@ -129,7 +129,7 @@ def prune(
             such; for a function or None it samples views of its own.
         opacity_weight: lambda of the methods that weigh opacity; by default the paper's.
         progress: called with the share done, in [0, 1].
-        looked: called with the views that merging sampled or was given, if it rendered.
+        views_used: called with the views that merging rendered, given or sampled; not called if it rendered none.
         resolution: width and height of the views that merging samples, pixels.
 
     Returns:
@@ -149,8 +149,8 @@ def prune(
         given = views if isinstance(views, Views) else None
         merged = merge(scene, count, progress=progress, views=given, resolution=resolution)
         logger.debug("%s", merged.finish.note)
-        if looked is not None and merged.views is not None:
-            looked(merged.views)
+        if views_used is not None and merged.views is not None:
+            views_used(merged.views)
         return merged.scene
     return scene[select(score_of(scene, method, views, opacity_weight, progress), count)]
 

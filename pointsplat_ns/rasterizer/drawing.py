@@ -43,7 +43,7 @@ class Drawing:
         level = QUALITIES[quality]
         self._seen, self._options = seen, BlendOptions(level)
         self._footprints = Footprints(
-            seen.means2d, seen.cov2d, seen.det, seen.opacities, seen.beyond, torch.zeros_like(seen.ids), 1,
+            seen.means2d, seen.cov2d, seen.det, seen.opacities, seen.depth_keys, torch.zeros_like(seen.ids), 1,
             view.width, view.height, level.alpha_min,
             binning.engine_of(None, seen.means2d, seen.cov2d, seen.det, seen.opacities),
         )  # fmt: skip

@@ -185,15 +185,15 @@ class Project(torch.autograd.Function):
         rows = torch.stack([mx, my, points[2], xx, xy, yy, det, alphas, radii]).index_select(1, kept)
         directions = directions.index_select(0, kept).to(means.dtype)
         exact_depths = exact[2].index_select(0, kept)
-        beyond = (exact_depths - exact_depths.amin() if len(kept) else exact_depths).to(means.dtype)
+        depth_keys = (exact_depths - exact_depths.amin() if len(kept) else exact_depths).to(means.dtype)
         ctx.lens, ctx.count = lens, means.shape[0]
         if any(ctx.needs_input_grad):
             state = torch.cat([slopes, rz[None], unit, inverse_length[None], std, ratio[None]])
             ctx.save_for_backward(ids, state.index_select(1, kept), directions, view, opacities)
         radii = rows[8].ceil().clamp_max_(2**30).to(torch.int32)
-        ctx.mark_non_differentiable(ids, radii, beyond)
+        ctx.mark_non_differentiable(ids, radii, depth_keys)
         cov2d = rows[3:6].T.contiguous()
-        return ids, rows[:2].T.contiguous(), rows[2], cov2d, rows[6], rows[7], directions, radii, beyond
+        return ids, rows[:2].T.contiguous(), rows[2], cov2d, rows[6], rows[7], directions, radii, depth_keys
 
     @staticmethod
     @once_differentiable

@@ -55,7 +55,9 @@ def sum_over_pixels(
     total = means2d.new_zeros(len(seen.ids), columns)
     camera = torch.zeros_like(seen.ids)
     engine = binning.engine_of(None, means2d, cov2d, det, seen.opacities)
-    footprints = Footprints(means2d, cov2d, det, seen.opacities, seen.beyond, camera, 1, width, height, engine=engine)
+    footprints = Footprints(
+        means2d, cov2d, det, seen.opacities, seen.depth_keys, camera, 1, width, height, engine=engine
+    )
     lists = footprints.tiles(footprints.whole)
     gaussians, starts, across = lists.gaussians, lists.offsets, footprints.columns
     xx, xy, yy = cov2d.unbind(-1)

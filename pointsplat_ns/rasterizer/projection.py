@@ -27,7 +27,7 @@ class Projected:
     opacities: Tensor  # [M] in (0, 1], compensation included
     directions: Tensor  # [M, 3] from the camera centre, world space
     radii: Tensor  # [M] int32, pixels, 3 standard deviations of the longest axis
-    beyond: Tensor  # [M] depth minus that of the nearest; the key of the drawing order
+    depth_keys: Tensor  # [M] depth minus that of the nearest; the key of the drawing order
 
     @property
     def conics(self) -> Tensor:

@@ -213,7 +213,7 @@ def rasterization(
 
     level = quality if isinstance(quality, Quality) else QUALITIES[quality]
     footprints = Footprints(
-        means2d, cov2d, det, alphas, packed_of("beyond"), camera_ids, cameras, width, height, level.alpha_min,
+        means2d, cov2d, det, alphas, packed_of("depth_keys"), camera_ids, cameras, width, height, level.alpha_min,
         binning.engine_of(compiled, means2d, cov2d, det, alphas),
     )  # fmt: skip
 

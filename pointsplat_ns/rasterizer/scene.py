@@ -124,7 +124,7 @@ def _weighed(scene: Gaussians, view: View) -> Tensor:
     seen = project_scene(scene, view)
     shape = seen.means2d, seen.cov2d, seen.det, seen.opacities
     footprints = Footprints(
-        *shape, seen.beyond, torch.zeros_like(seen.ids), 1, view.width, view.height, ALPHA_MIN,
+        *shape, seen.depth_keys, torch.zeros_like(seen.ids), 1, view.width, view.height, ALPHA_MIN,
         binning.engine_of(None, *shape),
     )  # fmt: skip
     inputs = kernels.inputs_of(*shape, seen.means2d[:, :0], Quality())

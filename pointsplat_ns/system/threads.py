@@ -37,7 +37,7 @@ class Chosen(threading.local):
 
     most: int | None = None
     """Number of threads that torch had before; None where nothing is chosen."""
-    settled: bool = False
+    fixed: bool = False
     """Whether no other number may be chosen: within a step, or where work is in pieces."""
 
 
@@ -66,14 +66,14 @@ def one_thread() -> Iterator[None]:
 def one_thread_each() -> Iterator[None]:
     """Let torch use one thread while the context is open, and :func:`in_threads` as many as torch had: for long work
     whose result must not depend on the number of threads. Nothing is chosen in it."""
-    before, outer = torch.get_num_threads(), (chosen.most, chosen.settled)
-    chosen.most, chosen.settled = most_threads(), True
+    before, outer = torch.get_num_threads(), (chosen.most, chosen.fixed)
+    chosen.most, chosen.fixed = most_threads(), True
     torch.set_num_threads(1)
     try:
         yield
     finally:
         torch.set_num_threads(before)
-        chosen.most, chosen.settled = outer
+        chosen.most, chosen.fixed = outer
 
 
 def in_threads(function: Callable[[Item], object], items: Sequence[Item]) -> None:
@@ -189,17 +189,17 @@ def suitable_threads(device: torch.device | None = None) -> Iterator[None]:
     """
     before, outer = torch.get_num_threads(), chosen.most
     on_cpu = device is None or device.type == "cpu"
-    if not on_cpu or chosen.settled or most_threads() <= 1 or THREADS_VARIABLE in os.environ:
+    if not on_cpu or chosen.fixed or most_threads() <= 1 or THREADS_VARIABLE in os.environ:
         yield
         return
     chosen.most = min(most_threads(), cores())
-    chosen.settled = True
+    chosen.fixed = True
     try:
         torch.set_num_threads(1 if chosen.most > 1 and machine.stalls(chosen.most) else chosen.most)
         yield
     finally:
         torch.set_num_threads(before)
-        chosen.most, chosen.settled = outer, False
+        chosen.most, chosen.fixed = outer, False
 
 
 def cores() -> int:

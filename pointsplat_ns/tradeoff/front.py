@@ -22,7 +22,7 @@ PHOTO_PSNR = 27.0
 """Assumed PSNR in dB of a trained scene against held-out photos: about that of 3DGS on the captures of papers."""
 
 
-def quality_of(point: Point, reference: Reference, metric: Metric) -> float | None:
+def metric_of(point: Point, reference: Reference, metric: Metric) -> float | None:
     """A metric of a point; None where it was not measured. A PSNR may be infinite."""
     quality: ImageMetrics | None = point.against_dense if reference == "renders" else point.against_photos
     value = None if quality is None else getattr(quality, metric)
@@ -33,7 +33,7 @@ def pareto_front(points: Sequence[Point], cost: Cost, reference: Reference, metr
     """The points that no other point beats in both cost and quality, cheapest first. Of points with equal cost and
     quality, the first is taken. Points without the metric are left out."""
     sign = -1 if metric == "lpips" else 1  # LPIPS is a distance: less is better
-    judged = [(point, sign * value) for point in points if (value := quality_of(point, reference, metric)) is not None]
+    judged = [(point, sign * value) for point in points if (value := metric_of(point, reference, metric)) is not None]
     front: list[Point] = []
     best = -math.inf
     for point, quality in sorted(judged, key=lambda pair: (getattr(pair[0], cost), -pair[1])):
@@ -52,7 +52,7 @@ def fastest_first(points: Sequence[Point], trusted: bool = True) -> list[Point]:
 def fastest_within(points: Sequence[Point], db: float, trusted: bool = True) -> Point | None:
     """The fastest point whose PSNR against photos is at most ``db`` below that of the first point, the dense scene;
     None where there are no photos. ``trusted`` as for :func:`fastest_first`."""
-    dense = quality_of(points[0], "photos", "psnr")
+    dense = metric_of(points[0], "photos", "psnr")
     return None if dense is None else _fastest(points, "photos", dense - db, trusted)
 
 
@@ -65,7 +65,7 @@ def fastest_above(points: Sequence[Point], db: float, trusted: bool = True) -> P
 def _fastest(points: Sequence[Point], reference: Reference, least: float, trusted: bool) -> Point | None:
     # 1e-9, because differences of decimal numbers are not exact: 30.1 - 0.5 is not 29.6.
     for point in fastest_first(points, trusted):
-        quality = quality_of(point, reference, "psnr")
+        quality = metric_of(point, reference, "psnr")
         if quality is not None and quality >= least - 1e-9:
             return point
     return None

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.io.files import replacing, write_json
 from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.tradeoff.front import Cost, Reference, pareto_front, quality_of
+from pointsplat_ns.tradeoff.front import Cost, Reference, metric_of, pareto_front
 from pointsplat_ns.tradeoff.points import ImageMetrics, Point, Tradeoff, speed_of
 from pointsplat_ns.tradeoff.settings import DENSE
 
@@ -44,7 +44,7 @@ SWEEP_FILES = SweepFiles()
 def write_outputs(sweep: Tradeoff, folder: Path, progress: Progress = silent) -> None:
     """Write the table, the JSON, the plots and the page of a sweep to its folder, which has the pictures. Raises
     SceneError if a file cannot be written."""
-    from pointsplat_ns.tradeoff.page import write_page
+    from pointsplat_ns.tradeoff.page import write_sweep_page
 
     dense = sweep.points[0]
     points = [{**dataclasses.asdict(point), "speed": speed_of(point, dense)._asdict()} for point in sweep.points]
@@ -56,7 +56,7 @@ def write_outputs(sweep: Tradeoff, folder: Path, progress: Progress = silent) ->
         writer.writerows(rows)
     for cost, name in SWEEP_FILES.plots.items():
         plot(sweep, cost, folder / name)
-    write_page(sweep, folder, folder / SWEEP_FILES.page, progress)
+    write_sweep_page(sweep, folder, folder / SWEEP_FILES.page, progress)
 
 
 def _row(point: Point, dense: Point) -> dict[str, object]:
@@ -93,11 +93,11 @@ def plot(sweep: Tradeoff, cost: Cost, path: Path) -> None:
 def _draw(axis: Axes, sweep: Tradeoff, cost: Cost, reference: Reference) -> None:
     """One panel: a marker for each point, a line along the front, the dense scene, and the recommended point."""
     dense, *others = sweep.points
-    others = [point for point in others if quality_of(point, reference, "psnr") is not None]
+    others = [point for point in others if metric_of(point, reference, "psnr") is not None]
 
     def at(points: list[Point]) -> tuple[list[float], list[float]]:
         costs = [getattr(point, cost) / (1e6 if cost == "bytes" else 1) for point in points]
-        return costs, [quality_of(point, reference, "psnr") or 0.0 for point in points]
+        return costs, [metric_of(point, reference, "psnr") or 0.0 for point in points]
 
     front = pareto_front(others, cost, reference, "psnr")
     axis.plot(*at(front), color="0.6", linewidth=1, zorder=1)

@@ -28,9 +28,9 @@ from pointsplat_ns.tradeoff.front import (
     fastest_above,
     fastest_first,
     fastest_within,
+    metric_of,
     pareto_front,
     psnr_within,
-    quality_of,
 )
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, picture_path, speed_of
 
@@ -41,7 +41,7 @@ FLIGHT_BYTES = 4_000_000
 Picture = Callable[[], np.ndarray]
 
 
-def write_page(
+def write_sweep_page(
     sweep: Tradeoff, folder: Path, output: Path, progress: bool | Progress = False, max_bytes: int = 10_000_000
 ) -> Path:
     """Write one self-contained HTML file with the points of a sweep, which needs no other file; returns its path.
@@ -119,8 +119,8 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
     """Values for the template itself, without scripts."""
     within_db = 0.5  # initial loss of PSNR against photos
     above_db = round(psnr_within(within_db), 1)  # the same against renders, where there are no photos
-    has_photos = quality_of(sweep.points[0], "photos", "psnr") is not None
-    has_lpips = any(quality_of(point, "renders", "lpips") is not None for point in sweep.points)
+    has_photos = metric_of(sweep.points[0], "photos", "psnr") is not None
+    has_lpips = any(metric_of(point, "renders", "lpips") is not None for point in sweep.points)
     rows = [{"key": point.key, "label": point.label, "cells": _cells(point, sweep.points[0])} for point in sweep.points]
     titles = {
         "share": "kept",
@@ -163,7 +163,7 @@ def _data(sweep: Tradeoff) -> dict[str, Any]:
     """Data for the scripts, except pictures. An infinite number is the text "Infinity"."""
 
     def qualities(point: Point, reference: Any) -> dict[str, float | str | None]:
-        values = {metric: quality_of(point, reference, metric) for metric in get_args(Metric)}
+        values = {metric: metric_of(point, reference, metric) for metric in get_args(Metric)}
         return {metric: "Infinity" if value == math.inf else value for metric, value in values.items()}
 
     def fronts(reference: Any, metric: Any) -> dict[str, list[str]]:
@@ -211,7 +211,7 @@ def _cells(point: Point, dense: Point) -> dict[str, tuple[float | None, str]]:
     }
     for reference in get_args(Reference):
         for metric, digits in zip(get_args(Metric), (2, 3, 3), strict=True):
-            value = quality_of(point, reference, metric)
+            value = metric_of(point, reference, metric)
             text = "–" if value is None else "identical" if value == math.inf else f"{value:.{digits}f}"
             cells[f"{reference}_{metric}"] = (value, text)
     return cells

@@ -34,7 +34,7 @@ logger = logging.getLogger("pointsplat_ns")
 
 
 @dataclass(frozen=True)
-class Options:
+class SweepOptions:
     """Options of a sweep. Raises PointSplatError if an option is invalid."""
 
     points: int = 12
@@ -86,7 +86,7 @@ class Sweep:
     """Measures settings of a scene, and writes points, pictures and results to a folder. Raises SceneError if no
     Gaussian can be drawn, or the folder holds points of another sweep, and DataError if there is no view."""
 
-    def __init__(self, subject: Subject, folder: Path, options: Options, progress: Progress):
+    def __init__(self, subject: Subject, folder: Path, options: SweepOptions, progress: Progress):
         self.subject, self.folder, self.options, self.progress = subject, folder, options, progress
         self.measurer = Measurer(subject, options.views, progress, folder)
         self.plan = options.plan(subject.dense)

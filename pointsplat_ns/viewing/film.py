@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont
 
 
-Split = Literal["side-by-side", "wipe"]
+SplitScreen = Literal["side-by-side", "wipe"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class FilmScenes:
 
     first: Gaussians
     second: Gaussians | None = None
-    split: Split = "side-by-side"
+    split: SplitScreen = "side-by-side"
     labels: Sequence[str] = ()
     """Labels of the first and the second scene; may be empty."""
 

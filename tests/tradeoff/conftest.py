@@ -12,7 +12,7 @@ from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.tradeoff import machine, outputs
 from pointsplat_ns.tradeoff.measuring import Subject
-from pointsplat_ns.tradeoff.sweep import Options, Sweep
+from pointsplat_ns.tradeoff.sweep import Sweep, SweepOptions
 from pointsplat_ns.views import Views
 
 
@@ -50,6 +50,6 @@ def new_sweep(room, room_views, plain_page, plain_plots, no_lpips, monkeypatch) 
     def begin(folder: Path, held_out=None, progress=lambda what, share: None, **options) -> Sweep:
         dense = ps.load(room)
         subject = Subject(dense, room, "room", "sum", lambda: ViewSource(dense, given=room_views), held_out)
-        return Sweep(subject, folder, Options(**options), progress)
+        return Sweep(subject, folder, SweepOptions(**options), progress)
 
     return begin

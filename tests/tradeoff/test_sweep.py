@@ -18,7 +18,7 @@ from pointsplat_ns.tradeoff.journal import check_journal_folder
 from pointsplat_ns.tradeoff.outputs import SWEEP_FILES
 from pointsplat_ns.tradeoff.points import picture_path
 from pointsplat_ns.tradeoff.settings import Setting
-from pointsplat_ns.tradeoff.sweep import Options
+from pointsplat_ns.tradeoff.sweep import SweepOptions
 
 
 def names(folder):
@@ -169,7 +169,7 @@ def test_points_of_another_scene_are_refused_before_anything_is_measured(new_swe
     dense = ps.load(room)
     other = measuring.Subject(dense, room, "room", "another sum", lambda: ViewSource(dense, given=room_views))
     with pytest.raises(SceneError, match="its points are of another sweep"):
-        sweep.Sweep(other, tmp_path, Options(), lambda what, share: None)
+        sweep.Sweep(other, tmp_path, SweepOptions(), lambda what, share: None)
 
 
 def test_results_without_points_are_not_overwritten(tmp_path):
@@ -196,4 +196,4 @@ def test_results_without_points_are_not_overwritten(tmp_path):
 )
 def test_options_that_mean_nothing_are_refused(options, said):
     with pytest.raises(PointSplatError, match=said):
-        Options(**options)
+        SweepOptions(**options)

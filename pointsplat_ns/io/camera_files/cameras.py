@@ -135,7 +135,7 @@ def rigid(values: Tensor, whose: str, names: Sequence[str] = ()) -> Tensor:
     return exact
 
 
-def views_of(path: Path, cameras: Sequence[Camera], motion: Motion | None = None) -> Views:
+def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None = None) -> Views:
     """Cameras as views over black, sorted by the names of their photos, r_2 before r_10.
 
     Views have one size. Cameras of another size than the most common one see the same field of view at that size: their

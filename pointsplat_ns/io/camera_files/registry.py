@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.camera_files.cameras import CAMERA_LIMITS, CameraFile, Motion, rigid, views_of
+from pointsplat_ns.io.camera_files.cameras import CAMERA_LIMITS, CameraFile, Motion, checked_views, rigid
 from pointsplat_ns.io.camera_files.colmap import colmap_cameras, is_model
 from pointsplat_ns.io.camera_files.inria import inria_cameras
 from pointsplat_ns.io.camera_files.nerfstudio import nerfstudio_cameras
@@ -67,11 +67,11 @@ def read_views(path: Path | str, transforms: Path | None = None) -> Views:
     found = colmap_cameras(path) if is_model(path) else _json_cameras(path)
     transforms = transforms or transforms_beside(path)
     if found.saved is None or transforms is None:
-        return views_of(path, found.cameras)
+        return checked_views(path, found.cameras)
     transform, scale = read_transforms(transforms)
     exact = rigid(transform.double()[None], f"{transforms}: its transform")[0]
     logger.info("%s: poses are moved into the frame of the scene, as %s says", path, transforms)
-    return views_of(path, found.cameras, found.saved.undone_before(Motion(exact, scale)))
+    return checked_views(path, found.cameras, found.saved.undone_before(Motion(exact, scale)))
 
 
 def _json_cameras(path: Path) -> CameraFile:

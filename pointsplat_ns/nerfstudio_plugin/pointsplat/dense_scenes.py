@@ -31,6 +31,7 @@ from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import RasterizeMode
 
 Split = Literal["train", "test"]
+"""The training photos of a dataset, or its held-out ones."""
 
 
 @dataclass(frozen=True)

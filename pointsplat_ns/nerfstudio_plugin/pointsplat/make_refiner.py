@@ -23,10 +23,10 @@ from pointsplat_ns.nerfstudio_plugin.running import (
     SCENE_METHOD,
     StoppedError,
     evaluate_command,
-    finished,
+    folder_of_run,
+    has_finished,
     remove_interrupted,
     run,
-    run_folder,
     train_refiner_command,
     train_scene_command,
 )
@@ -109,9 +109,9 @@ def make_refiner(
     _make_scenes(output, (*train_seeds, *RECIPE.unseen_seeds), workers or os.cpu_count() or 1)
 
     name = f"{size}-{steps}-{len(train_seeds)}rooms-seed{seed}"
-    trained = run_folder(output / "refiners", name, REFINER_METHOD, RECIPE.timestamp)
+    trained = folder_of_run(output / "refiners", name, REFINER_METHOD, RECIPE.timestamp)
     evaluation, pictures = output / f"{name}.json", output / "pictures" / name
-    if not finished(trained, steps):
+    if not has_finished(trained, steps):
         remove_interrupted(trained)
         evaluation.unlink(missing_ok=True)
         run(refiner_command(output / "scenes", output / "refiners", name, RECIPE.timestamp, size, steps, seed))
@@ -151,8 +151,8 @@ def _make_scenes(output: Path, seeds: tuple[int, ...], workers: int) -> None:
 
     def make(seed: int) -> None:
         settings = scene_settings(seed)
-        trained = run_folder(output / "scenes", settings.name, SCENE_METHOD, RECIPE.timestamp)
-        if finished(trained, settings.steps):
+        trained = folder_of_run(output / "scenes", settings.name, SCENE_METHOD, RECIPE.timestamp)
+        if has_finished(trained, settings.steps):
             return
         remove_interrupted(trained)
         data = output / "rooms" / settings.name

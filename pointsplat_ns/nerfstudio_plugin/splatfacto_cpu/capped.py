@@ -78,10 +78,10 @@ class CappedStrategy(Strategy):
         dead = opacities <= self.least_opacity
         if dead.all():
             return
-        grown = grown_number(num, self.most, (self.grown_by - 1 - step) // self.every)
-        places = torch.cat([dead.nonzero()[:, 0], torch.arange(num, grown, device=dead.device)])
+        count = grown_number(num, self.most, (self.grown_by - 1 - step) // self.every)
+        places = torch.cat([dead.nonzero()[:, 0], torch.arange(num, count, device=dead.device)])
         sources = drawn(opacities.masked_fill(dead, 0.0), len(places))
-        rows = torch.arange(grown, device=dead.device)
+        rows = torch.arange(count, device=dead.device)
         rows[places] = sources
         changed = torch.cat([sources.unique(), places])
         copies = 1 + torch.bincount(sources, minlength=num)[rows[changed]]

@@ -85,11 +85,11 @@ def regrouped(participants: Participants, groups: Groups, settings: MergeSetting
     """
     members = Members.of(participants.scene, participants.members, settings)
     group, count = groups.group, len(groups)
-    common = moments(members, group, count)
+    common = group_moments(members, group, count)
     ratios = groups.alphas * rms_area(groups.cov) / common.mass.clamp_min(MIN_DIVISOR)
     for _ in range(settings.regrouping_rounds):
         group = best_groups(members, group, common, settings)
-        common = moments(members, group, count)
+        common = group_moments(members, group, count)
     alphas = torch.where(
         common.mass > MIN_DIVISOR,
         ratios * common.mass / rms_area(common.cov).clamp_min(MIN_DIVISOR),
@@ -106,7 +106,7 @@ def regrouped(participants: Participants, groups: Groups, settings: MergeSetting
     )
 
 
-def moments(members: Members, group: Tensor, count: int) -> Moments:
+def group_moments(members: Members, group: Tensor, count: int) -> Moments:
     """Moments of groups.
 
     Args:

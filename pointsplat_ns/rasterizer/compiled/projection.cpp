@@ -40,7 +40,7 @@ struct Projection {
     double* nearest;         // [ranges] least depth
     const int64_t* offsets;  // [ranges] where they begin in what follows, [M, ...] each
     int64_t* ids;
-    float *means2d, *depths, *cov2d, *dets, *opacities, *directions, *beyond;
+    float *means2d, *depths, *cov2d, *dets, *opacities, *directions, *depth_keys;
     int32_t* radii;
 };
 
@@ -321,7 +321,7 @@ void pointsplat_unpack(const Projection* task, int64_t* next) {
             const Seen& seen = t.seen[first + i];
             const int64_t to = t.offsets[range] + i;
             t.ids[to] = seen.id, t.radii[to] = seen.radius;
-            t.depths[to] = seen.z, t.beyond[to] = static_cast<float>(seen.depth - nearest);
+            t.depths[to] = seen.z, t.depth_keys[to] = static_cast<float>(seen.depth - nearest);
             t.dets[to] = seen.det, t.opacities[to] = seen.opacity;
             std::copy_n(seen.mean2d, 2, t.means2d + 2 * to);
             std::copy_n(seen.cov2d, 3, t.cov2d + 3 * to);

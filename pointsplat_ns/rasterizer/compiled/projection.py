@@ -68,11 +68,11 @@ class CompiledProject(torch.autograd.Function):
         kept = int(offsets[-1])
         ids = torch.empty(kept, dtype=torch.int64)
         means2d, cov2d, directions = (means.new_empty(kept, columns) for columns in (2, 3, 3))
-        depths, det, alphas, beyond = (means.new_empty(kept) for _ in range(4))
+        depths, det, alphas, depth_keys = (means.new_empty(kept) for _ in range(4))
         radii = torch.empty(kept, dtype=torch.int32)
         task.fill(
             offsets=offsets, ids=ids, radii=radii, means2d=means2d, depths=depths, cov2d=cov2d, dets=det,
-            opacities=alphas, directions=directions, beyond=beyond,
+            opacities=alphas, directions=directions, depth_keys=depth_keys,
         )  # fmt: skip
         if kept:
             on_threads(count >= SEVERAL, library.pointsplat_unpack, task)
@@ -80,8 +80,8 @@ class CompiledProject(torch.autograd.Function):
             ctx.camera = camera
             ctx.save_for_backward(ids, *scene)
             ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(ids, radii, beyond)
-        return ids, means2d, depths, cov2d, det, alphas, directions, radii, beyond
+        ctx.mark_non_differentiable(ids, radii, depth_keys)
+        return ids, means2d, depths, cov2d, det, alphas, directions, radii, depth_keys
 
     @staticmethod
     @once_differentiable
@@ -123,10 +123,10 @@ def _as_torch() -> bool:
     for function in (ewa.Project, CompiledProject):
         with torch.enable_grad():
             leaves = [value.clone().requires_grad_() for value in (*scene, view * view[2, 2].sign(), centre)]
-            ids, *values, radii, beyond = function.apply(*leaves, lens)
+            ids, *values, radii, depth_keys = function.apply(*leaves, lens)
             total = sum((value / (1.0 + value.detach().abs())).sum() for value in values)
         grads = torch.autograd.grad(total, leaves)
-        projected.append((ids, [*(value.detach() for value in values), radii.float(), beyond, *grads]))
+        projected.append((ids, [*(value.detach() for value in values), radii.float(), depth_keys, *grads]))
     (torchs_ids, torchs), (our_ids, ours) = projected
     spoilt = [value.clone() for value in scene]
     for row, (value, wrong) in enumerate(zip(spoilt, (math.nan, math.inf, -1.0, -1.0), strict=True)):

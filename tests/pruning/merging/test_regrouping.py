@@ -7,7 +7,7 @@ from making import cloud
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.merging import MERGING
 from pointsplat_ns.pruning.merging.covariance import covariances, unpack
-from pointsplat_ns.pruning.merging.regrouping import Members, Moments, best_groups, moments
+from pointsplat_ns.pruning.merging.regrouping import Members, Moments, best_groups, group_moments
 
 ALL = torch.arange(200)
 
@@ -21,7 +21,7 @@ def random_groups(scene: Gaussians, count: int) -> torch.Tensor:
 
 def moments_of(scene: Gaussians, group: torch.Tensor, count: int) -> Moments:
     """Moments of groups of all."""
-    return moments(Members.of(scene, ALL), group, count)
+    return group_moments(Members.of(scene, ALL), group, count)
 
 
 def after(scene: Gaussians, group: torch.Tensor, count: int) -> torch.Tensor:

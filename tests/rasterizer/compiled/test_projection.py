@@ -195,7 +195,7 @@ def test_what_is_seen_and_its_gradients_are_those_of_torch_and_as_near_to_float6
             assert bounded_otherwise or error <= 2 * torchs_error + 1e-6, (what, error, torchs_error)
     one, other = (seen.select(torch.searchsorted(seen.ids, common)) for _, seen in (ours, torchs))
     assert ((one.radii - other.radii).abs() <= 1 + 1e-6 * other.radii).all()  # rounded up
-    assert off(one.beyond, other.beyond)[0] <= 1e-6
+    assert off(one.depth_keys, other.depth_keys)[0] <= 1e-6
     dropped = torch.ones(len(scene[0]), dtype=torch.bool).index_fill_(0, common, False)
     assert not any(grad[dropped].any() for grad in results[0][1][:4])
 
@@ -219,7 +219,7 @@ def test_where_no_gaussian_is_seen_gradients_are_zero(count):
     assert [tuple(t.shape) for t in vars(seen).values()] == [
         (0,), (0, 2), (0,), (0, 3), (0,), (0,), (0, 3), (0,), (0,)
     ]  # fmt: skip
-    assert (seen.ids.dtype, seen.radii.dtype, seen.beyond.dtype) == (torch.int64, torch.int32, F32)
+    assert (seen.ids.dtype, seen.radii.dtype, seen.depth_keys.dtype) == (torch.int64, torch.int32, F32)
     grads = torch.autograd.grad(seen.means2d.sum() + seen.det.sum(), leaves)
     assert [g.shape for g in grads] == [leaf.shape for leaf in leaves] and not any(g.any() for g in grads)
 
@@ -246,7 +246,7 @@ def test_any_number_of_threads_projects_the_same_bits():
     def results():
         leaves, seen = projected(scene, {"antialiased": True}, F32, True)
         values, grads = values_and_gradients(leaves, seen, seen.ids)
-        return [seen.ids, seen.beyond, seen.radii, *values, *grads]
+        return [seen.ids, seen.depth_keys, seen.radii, *values, *grads]
 
     assert_same_on_any_threads(results)
 

@@ -8,7 +8,7 @@ import pytest
 
 import pointsplat_ns as ps
 from pointsplat_ns.pages.flight import FlightFrame
-from pointsplat_ns.tradeoff.page import keep_flight, write_page
+from pointsplat_ns.tradeoff.page import keep_flight, write_sweep_page
 from pointsplat_ns.tradeoff.points import Tradeoff, flight_path
 from sweeps import measured_room, room_views
 
@@ -38,6 +38,6 @@ def make_page(sweep, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., 
 
     def make(**replaced) -> Path:
         measured, folder = sweep
-        return write_page(replace(measured, **replaced), folder, tmp_path_factory.mktemp("page") / "trade.html")
+        return write_sweep_page(replace(measured, **replaced), folder, tmp_path_factory.mktemp("page") / "trade.html")
 
     return make

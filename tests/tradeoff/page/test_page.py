@@ -20,7 +20,7 @@ from pointsplat_ns.pages import pictures
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.tradeoff import page
 from pointsplat_ns.tradeoff import page as page_module
-from pointsplat_ns.tradeoff.page import write_page
+from pointsplat_ns.tradeoff.page import write_sweep_page
 from pointsplat_ns.tradeoff.points import ImageMetrics, flight_path, picture_path
 from sweeps import room_views
 
@@ -84,7 +84,7 @@ def decoded(uri: str) -> Image.Image:
 def test_error_maps_are_those_of_the_lossless_pictures(sweep, tmp_path, monkeypatch):
     measured, folder = sweep
     monkeypatch.setattr(page_module, "fit", lambda sources, *_: ([str(int(s().sum())) for s in sources], "sums"))
-    [shown, *_] = parts_of(write_page(measured, folder, tmp_path / "sums.html")).data["pictures"]
+    [shown, *_] = parts_of(write_sweep_page(measured, folder, tmp_path / "sums.html")).data["pictures"]
     for point in measured.points[1:]:
         for reference, other in (("renders", "dense"), ("photos", "photo")):
             a, b = (pictures.read_png(picture_path(folder, 0, key), 64, 48) for key in (point.key, other))
@@ -107,7 +107,7 @@ def test_page_without_photos_and_with_lpips(sweep, tmp_path):
         replace(p, against_photos=None, against_dense=replace(p.against_dense, lpips=1 - p.share))
         for p in measured.points
     ]
-    parts = parts_of(write_page(replace(measured, points=tuple(points)), bare, tmp_path / "bare.html"))
+    parts = parts_of(write_sweep_page(replace(measured, points=tuple(points)), bare, tmp_path / "bare.html"))
     radios = {(a["name"], a["value"]) for tag, a in parts.elements if tag == "input" and a.get("type") == "radio"}
     assert ("metric", "lpips") in radios and not [name for name, _ in radios if name == "reference"]
     assert not [name for view in parts.data["pictures"] for name in view if "photo" in name]
@@ -132,8 +132,8 @@ def test_table_says_what_is_infinite_and_what_is_unknown(make_page, sweep):
 
 def test_page_takes_no_more_bytes_than_it_may(sweep, tmp_path):
     measured, folder = sweep
-    whole = write_page(measured, folder, tmp_path / "whole.html").stat().st_size
-    less = write_page(measured, folder, tmp_path / "less.html", max_bytes=whole - 5_000)
+    whole = write_sweep_page(measured, folder, tmp_path / "whole.html").stat().st_size
+    less = write_sweep_page(measured, folder, tmp_path / "less.html", max_bytes=whole - 5_000)
     assert less.stat().st_size <= whole - 5_000 and parts_of(less).data["pictures"][1]["photo"].startswith("data:")
 
 
@@ -158,7 +158,7 @@ def test_the_dense_scene_is_beside_the_recommended_one_if_both_fit(sweep, tmp_pa
     page.keep_flight(FlightFrame.of(room, room_views()), room[::5], "dense", flight_path(tmp_path / "copy", "dense"))
 
     def names(recommended: str) -> list[str]:
-        page = write_page(replace(measured, recommended=recommended), tmp_path / "copy", tmp_path / "page.html")
+        page = write_sweep_page(replace(measured, recommended=recommended), tmp_path / "copy", tmp_path / "page.html")
         return [scene["name"] for scene in parts_of(page).data["flight"]["scenes"]]
 
     assert names("0.1_coverage") == ["dense", "a tenth"] and names("dense") == ["dense"]
@@ -172,7 +172,7 @@ def test_what_is_no_scene_to_fly_through_is_left_out(sweep, tmp_path, content):
     measured, folder = sweep
     shutil.copytree(folder, tmp_path / "copy")
     flight_path(tmp_path / "copy", "dense").write_bytes(content)
-    page = write_page(replace(measured, recommended="dense"), tmp_path / "copy", tmp_path / "page.html")
+    page = write_sweep_page(replace(measured, recommended="dense"), tmp_path / "copy", tmp_path / "page.html")
     assert parts_of(page).data["flight"] is None
 
 
@@ -196,15 +196,15 @@ def test_a_missing_picture_is_one_line_with_its_path(sweep, tmp_path):
     missing = picture_path(broken, 1, measured.points[2].key)
     missing.unlink()
     with pytest.raises(DataError, match=re.escape(f"{missing}: cannot be read (No such file or directory)")):
-        write_page(measured, broken, tmp_path / "page.html")
+        write_sweep_page(measured, broken, tmp_path / "page.html")
     with pytest.raises(DataError, match="no such file; expected pictures of at least one view"):
-        write_page(measured, tmp_path / "nowhere", tmp_path / "page.html")
+        write_sweep_page(measured, tmp_path / "nowhere", tmp_path / "page.html")
     with pytest.raises(DataError, match="nothing was measured"):
-        write_page(replace(measured, points=()), folder, tmp_path / "page.html")
+        write_sweep_page(replace(measured, points=()), folder, tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
 
 
 def test_a_page_that_cannot_be_written_is_an_error_of_the_scene(sweep, tmp_path):
     (tmp_path / "folder.html").mkdir()
     with pytest.raises(SceneError, match="is a folder"):
-        write_page(*sweep, tmp_path / "folder.html")
+        write_sweep_page(*sweep, tmp_path / "folder.html")
