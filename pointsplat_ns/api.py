@@ -27,7 +27,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.outputs import claimed_folder
-from pointsplat_ns.io.runs import REFINER_METHOD, may_be_run, open_run
+from pointsplat_ns.io.runs import METHOD_NAMES, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.pruning import Keep
@@ -332,6 +332,6 @@ def plot_views(
 
 def _is_refiner_run(path: str | Path) -> bool:
     try:
-        return may_be_run(path) and open_run(path, need_data=False).method_name == REFINER_METHOD
+        return may_be_run(path) and open_run(path, need_data=False).method_name == METHOD_NAMES.refiner
     except SceneError:
         return False  # a single scene, or not readable: read_scene raises the error

@@ -30,8 +30,9 @@ from lab.common.results import Results, Row
 from lab.common.ways import count_of
 from lab.judge.scenes import PHOTOS
 from pointsplat_ns.io import read_scene
+from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.metrics.lpips import Lpips
-from pointsplat_ns.nerfstudio_plugin.running import SCENE_METHOD, folder_of_run
+from pointsplat_ns.nerfstudio_plugin.running import folder_of_run
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.programs import run_measured
 
@@ -75,11 +76,11 @@ class Capture:
     @property
     def dense(self) -> Path:
         """The run of the dense training."""
-        return folder_of_run(self.folder, self.name, SCENE_METHOD, "dense")
+        return folder_of_run(self.folder, self.name, METHOD_NAMES.scene, "dense")
 
     def train(self, label: str, steps: int, cap: int | None = None) -> tuple[Path, float]:
         """A new training, with a cap or without: its run and its CPU seconds."""
-        run = folder_of_run(self.folder, self.name, SCENE_METHOD, label)
+        run = folder_of_run(self.folder, self.name, METHOD_NAMES.scene, label)
         shutil.rmtree(run, ignore_errors=True)
         words = [*_TRAIN, self.arguments[0], "--output-dir", str(self.folder), "--experiment-name", self.name]
         words += ["--timestamp", label, "--max-num-iterations", str(steps), "--vis", "tensorboard"]
@@ -96,7 +97,7 @@ class Capture:
         """CPU seconds of a step of a training with a cap, on average over its schedule, and of the start."""
         few, many = 1, max(20, self.steps // 10)
         costs = [self.train("trial", steps, count)[1] for steps in (few, many)]
-        shutil.rmtree(folder_of_run(self.folder, self.name, SCENE_METHOD, "trial"), ignore_errors=True)
+        shutil.rmtree(folder_of_run(self.folder, self.name, METHOD_NAMES.scene, "trial"), ignore_errors=True)
         return max(1e-3, (costs[1] - costs[0]) / (many - few)), costs[0]
 
     def reduced(self, words: list[str], count: int) -> tuple[Path, float]:
@@ -178,8 +179,8 @@ def main(
     results = Results(json_path, {"lpips": lpips is not None}, json_path is not None)
     folder.mkdir(parents=True, exist_ok=True)
     arguments = shlex.split(train)
-    if arguments[:1] != [SCENE_METHOD]:
-        raise SystemExit(f"--train {train}; expected it to begin with {SCENE_METHOD}")
+    if arguments[:1] != [METHOD_NAMES.scene]:
+        raise SystemExit(f"--train {train}; expected it to begin with {METHOD_NAMES.scene}")
     capture = Capture(name, arguments, steps, folder.resolve(), lpips)
     if results.of(name) and not capture.dense.is_dir():
         raise SystemExit(f"{json_path} has rows of {name}, but {capture.dense} is missing; expected the same --folder")

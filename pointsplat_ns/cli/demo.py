@@ -83,11 +83,11 @@ def demo(
 
 def training_folders(output: Path) -> tuple[dict[str, Path], Path]:
     """Folders of the trained scenes by room, and the folder of the trained refiner."""
-    from pointsplat_ns.io.runs import REFINER_METHOD
-    from pointsplat_ns.nerfstudio_plugin.running import SCENE_METHOD, folder_of_run
+    from pointsplat_ns.io.runs import METHOD_NAMES
+    from pointsplat_ns.nerfstudio_plugin.running import folder_of_run
 
-    scenes = {name: folder_of_run(output / "scenes", name, SCENE_METHOD, DEMO.timestamp) for name in DEMO.rooms}
-    return scenes, folder_of_run(output / "refiner", "rooms", REFINER_METHOD, DEMO.timestamp)
+    scenes = {name: folder_of_run(output / "scenes", name, METHOD_NAMES.scene, DEMO.timestamp) for name in DEMO.rooms}
+    return scenes, folder_of_run(output / "refiner", "rooms", METHOD_NAMES.refiner, DEMO.timestamp)
 
 
 def write_example(path: Path, force: bool) -> None:

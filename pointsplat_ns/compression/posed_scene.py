@@ -10,14 +10,11 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.io.camera_files import read_views, transforms_beside
-from pointsplat_ns.io.runs import CONFIG_NAME
+from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.looking.poses import in_pictures
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.views import Views
-
-LONGEST_SIDE = 1600
-"""Largest longer side of pictures, pixels, as in 3DGS training."""
 
 
 def read_posed(scene: Gaussians | Path | str, poses: Path | str) -> tuple[Gaussians, Views]:
@@ -30,15 +27,14 @@ def read_posed(scene: Gaussians | Path | str, poses: Path | str) -> tuple[Gaussi
 
 
 def views_for(scene: Gaussians | Path | str, poses: Path | str) -> Views:
-    """Read the views of a scene from a file of cameras, of at most 1600 pixels on the longer side.
+    """Read the views of a scene from a file of cameras, of at most 1600 pixels on the longer side, as in 3DGS training.
 
     A ``dataparser_transforms.json`` in the scene's run, beside the scene or beside the poses moves them into the
     scene's frame. Raises SceneError if a file is missing, or the
     transforms are not usable, and DataError if the file has no usable cameras.
     """
-    if isinstance(scene, Gaussians):
-        return read_views(poses).resized(LONGEST_SIDE)
-    return read_views(poses, _transforms_of(Path(scene))).resized(LONGEST_SIDE)
+    transforms = None if isinstance(scene, Gaussians) else _transforms_of(Path(scene))
+    return read_views(poses, transforms).resized(1600)
 
 
 def check_views_show(scene: Gaussians, views: Views, poses: Path | str) -> None:
@@ -71,6 +67,6 @@ def check_views_show(scene: Gaussians, views: Views, poses: Path | str) -> None:
 def _transforms_of(scene: Path) -> Path | None:
     """The ``dataparser_transforms.json`` of the scene's run, or beside its file."""
     folder = scene if scene.is_dir() else scene.parent
-    if scene.suffix == ".ckpt" and not (folder / CONFIG_NAME).is_file():
+    if scene.suffix == ".ckpt" and not (folder / RUN_FILES.config).is_file():
         folder = folder.parent
-    return transforms_beside(folder / CONFIG_NAME)
+    return transforms_beside(folder / RUN_FILES.config)

@@ -17,7 +17,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.discovery import find_runs_and_plys, shown_scene
 from pointsplat_ns.io.files import one_line
-from pointsplat_ns.io.runs import REFINER_METHOD, Run, open_run
+from pointsplat_ns.io.runs import METHOD_NAMES, Run, open_run
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.pruning import PruneSettings, method_named
 from pointsplat_ns.refiner import Refiner, WeightsError, preset, read_metadata, read_refiner
@@ -135,8 +135,10 @@ def refiner_at(path: Path | str | None, device: torch.device | str | None = None
 def open_refiner_run(path: Path | str, need_data: bool) -> Run:
     """The ``pointsplat`` run at a path. Raises SceneError if there is none, or it is damaged or of another kind."""
     run = open_run(path, need_data)
-    if run.method_name != REFINER_METHOD:
-        raise SceneError(f"{path}: a run of the method {run.method_name or 'unknown'}; expected a {REFINER_METHOD} run")
+    if run.method_name != METHOD_NAMES.refiner:
+        raise SceneError(
+            f"{path}: a run of the method {run.method_name or 'unknown'}; expected a {METHOD_NAMES.refiner} run"
+        )
     return run
 
 
@@ -175,13 +177,13 @@ def _read_run(run: Run) -> tuple[Refiner, PruneSettings]:
         network.load_state_dict({k[len(prefix) :]: v for k, v in state.items() if k.startswith(prefix)})
     except KeyError as error:
         raise SceneError(
-            f"{run.config_path}: lacks {error}; expected a {REFINER_METHOD} run of this version"
+            f"{run.config_path}: lacks {error}; expected a {METHOD_NAMES.refiner} run of this version"
         ) from error
     except PointSplatError as error:
         raise SceneError(f"{run.config_path}: {error}") from error
     except Exception as error:  # a damaged archive can raise nearly anything
         text = " ".join(str(error).split())[:160]
-        raise SceneError(f"{run.checkpoint}: not a usable {REFINER_METHOD} checkpoint ({text})") from error
+        raise SceneError(f"{run.checkpoint}: not a usable {METHOD_NAMES.refiner} checkpoint ({text})") from error
     return network, settings
 
 

@@ -15,7 +15,7 @@ from pointsplat_ns.io.files import file_stem, logger
 from pointsplat_ns.io.formats import READABLE, format_named
 from pointsplat_ns.io.formats.compressed_ply import is_compressed
 from pointsplat_ns.io.ply_header import read_header
-from pointsplat_ns.io.runs import CONFIG_NAME, Run, open_run, scene_name
+from pointsplat_ns.io.runs import RUN_FILES, Run, open_run, scene_name
 from pointsplat_ns.io.scene import is_folder_of_scenes, is_scene_file
 
 Supervision = Literal["auto", "photos", "dense"]
@@ -121,7 +121,7 @@ def find_runs(folder: Path | str, need_data: bool = True) -> list[Run]:
     folder = Path(folder)
     if not folder.exists():
         raise SceneError(f"{folder}: no such folder; expected one with trained nerfstudio runs in it")
-    if not folder.is_dir() or (folder / CONFIG_NAME).is_file():
+    if not folder.is_dir() or (folder / RUN_FILES.config).is_file():
         run = open_run(folder, need_data)
         if not run.is_gaussian_scene:
             raise SceneError(
@@ -146,7 +146,7 @@ def find_runs(folder: Path | str, need_data: bool = True) -> list[Run]:
     if not newest:
         seen = f"; passed over {len(passed)}, such as {passed[0]}" if passed else ""
         raise SceneError(
-            f"{folder}: no trained Splatfacto run below it; expected EXPERIMENT/METHOD/TIME/{CONFIG_NAME}{seen}"
+            f"{folder}: no trained Splatfacto run below it; expected EXPERIMENT/METHOD/TIME/{RUN_FILES.config}{seen}"
         )
     runs = sorted(newest.values(), key=lambda run: (scene_name(run), str(run.folder)))
     return [open_run(run.folder, need_data) for run in runs] if need_data else runs
@@ -187,7 +187,7 @@ def _files_with_gaussians(root: Path, wanted: Callable[[str], bool]) -> list[Pat
     paths = [root] if root.is_file() and wanted(root.name) else []
     for place, inner, files in os.walk(root):
         results = {FOLDER_FILES.scenes, FOLDER_FILES.levels, FOLDER_FILES.sweep}.intersection(files)
-        if CONFIG_NAME in files or (results and Path(place) != root):
+        if RUN_FILES.config in files or (results and Path(place) != root):
             inner.clear()
             continue
         inner[:] = sorted(name for name in inner if not name.startswith("."))
@@ -228,7 +228,7 @@ def _run_folders(folder: Path) -> list[Path]:
     """Folders below ``folder`` that hold a ``config.yml``, sorted; folders inside these are not searched."""
     folders = []
     for place, inner, files in os.walk(folder):
-        if CONFIG_NAME in files:
+        if RUN_FILES.config in files:
             folders.append(Path(place))
             inner.clear()
         inner[:] = sorted(name for name in inner if not name.startswith("."))

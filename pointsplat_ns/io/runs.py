@@ -23,13 +23,34 @@ from pointsplat_ns.io.files import file_stem, logger, one_line, read_text
 from pointsplat_ns.io.inert_yaml import Tagged, read_config
 from pointsplat_ns.io.splatfacto import is_complete
 
-CONFIG_NAME = "config.yml"
-TRANSFORMS_NAME = "dataparser_transforms.json"
-RUN_SUFFIXES = (".ckpt", ".yml", ".yaml")
-"""Of the files that lead to a run."""
 
-REFINER_METHOD = "pointsplat"
-"""nerfstudio's name of the method that trains refiners."""
+@dataclass(frozen=True)
+class RunFiles:
+    """Names of files in the folder of a run."""
+
+    config: str = "config.yml"
+    transforms: str = "dataparser_transforms.json"
+    """The transform of the dataset from the frame of its poses to that of the scene."""
+    refiner: str = "refiner.safetensors"
+    """Weights of the refiner that the run trained."""
+    suffixes: tuple[str, ...] = (".ckpt", ".yml", ".yaml")
+    """Ends of the names of files that stand for a run."""
+
+
+RUN_FILES = RunFiles()
+
+
+@dataclass(frozen=True)
+class MethodNames:
+    """nerfstudio's names of the methods of this package."""
+
+    scene: str = "splatfacto-cpu"
+    """Trains scenes."""
+    refiner: str = "pointsplat"
+    """Trains refiners."""
+
+
+METHOD_NAMES = MethodNames()
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +86,7 @@ class Run:
     @property
     def is_gaussian_scene(self) -> bool:
         """Whether the checkpoint holds one Gaussian scene: Splatfacto or a method derived from it."""
-        if self.method_name == REFINER_METHOD:  # a refiner for many scenes
+        if self.method_name == METHOD_NAMES.refiner:  # a refiner for many scenes
             return False
         # Methods derived from Splatfacto have these settings, too.
         needed = {"sh_degree", "densify_grad_thresh", "rasterize_mode"}
@@ -87,7 +108,7 @@ class Run:
 def may_be_run(path: Path | str) -> bool:
     """Whether a path is one that runs have: a folder, a checkpoint or YAML. Other files hold nothing but a scene."""
     path = Path(path)
-    return path.is_dir() or path.suffix.lower() in RUN_SUFFIXES
+    return path.is_dir() or path.suffix.lower() in RUN_FILES.suffixes
 
 
 def open_run(path: Path | str, need_data: bool = True) -> Run:
@@ -106,11 +127,11 @@ def open_run(path: Path | str, need_data: bool = True) -> Run:
         raise SceneError(f"{path}: no such file or folder; expected a nerfstudio run")
     chosen = path if path.suffix == ".ckpt" else None
     folder = path if path.is_dir() else path.parent
-    if chosen is not None and not (folder / CONFIG_NAME).is_file():
+    if chosen is not None and not (folder / RUN_FILES.config).is_file():
         folder = folder.parent
-    config_path = path if path.is_file() and chosen is None else folder / CONFIG_NAME
+    config_path = path if path.is_file() and chosen is None else folder / RUN_FILES.config
     if not config_path.is_file():
-        raise SceneError(f"{path}: not a nerfstudio run; expected a folder with {CONFIG_NAME} (no {config_path})")
+        raise SceneError(f"{path}: not a nerfstudio run; expected a folder with {RUN_FILES.config} (no {config_path})")
     root = read_config(config_path)
     pipeline = _tagged(root, "pipeline", config_path)
     datamanager = _tagged(pipeline, "datamanager", config_path)
@@ -125,7 +146,7 @@ def open_run(path: Path | str, need_data: bool = True) -> Run:
         if need_data:
             raise SceneError(f"{config_path}: names no data folder; expected the photos that the run was trained on")
         data = Path()
-    transform, scale = read_transforms(folder / TRANSFORMS_NAME)
+    transform, scale = read_transforms(folder / RUN_FILES.transforms)
     planned = root.fields.get("max_num_iterations")
     return Run(
         folder=folder,

@@ -11,7 +11,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable, logger, require_file
 from pointsplat_ns.io.formats import READABLE, Format, format_named, format_to_read, format_to_write
-from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, Run, open_run
+from pointsplat_ns.io.runs import RUN_FILES, Run, open_run
 from pointsplat_ns.io.splatfacto import read_checkpoint
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 
@@ -20,7 +20,7 @@ SCENE_KINDS = f"a scene ({READABLE}), a Splatfacto .ckpt, or a Splatfacto run (i
 
 def is_scene_file(path: Path | str) -> bool:
     """Whether :func:`read_scene` takes a file for a whole scene, by its suffix. Runs and SOG folders, streamed or not,
-    are told by what lies in them instead."""
+    are recognised by their content instead."""
     path = Path(path)
     kind = format_named(path.name)
     return path.suffix.lower() == ".ckpt" or (
@@ -31,13 +31,13 @@ def is_scene_file(path: Path | str) -> bool:
 def is_folder_of_scenes(path: Path | str) -> bool:
     """Whether a path is a folder that is no scene itself, as those of runs and SOG folders are."""
     path = Path(path)
-    return path.is_dir() and not (path / CONFIG_NAME).is_file() and format_to_read(path) is None
+    return path.is_dir() and not (path / RUN_FILES.config).is_file() and format_to_read(path) is None
 
 
 def read_scene(path: Path | str) -> Gaussians:
     """Read a scene: a file of any format, a Splatfacto checkpoint, or the newest checkpoint of a Splatfacto run.
 
-    What a file begins with tells its format, else its name.
+    The first bytes of a file decide its format, else its name.
 
     Args:
         path: a 3DGS or compressed ``.ply``, ``.spz``, ``.sog`` (or its folder, or the ``meta.json`` in it), a streamed
@@ -58,7 +58,7 @@ def read_scene(path: Path | str) -> Gaussians:
         2
     """
     path = Path(path)
-    if path.is_dir() and (path / CONFIG_NAME).is_file():
+    if path.is_dir() and (path / RUN_FILES.config).is_file():
         return _scene_of(open_run(path, need_data=False))
     if not path.is_dir():
         require_file(path, SCENE_KINDS)
@@ -67,12 +67,14 @@ def read_scene(path: Path | str) -> Gaussians:
         with suppress(SceneError):  # a checkpoint outside a run
             return scene.replace(antialiased=open_run(path, need_data=False).rasterize_mode == "antialiased")
         return scene
-    if path.suffix.lower() in RUN_SUFFIXES:
+    if path.suffix.lower() in RUN_FILES.suffixes:
         return _scene_of(open_run(path, need_data=False))
     kind = format_to_read(path)
     if kind is None or kind.read is None:
         what = (
-            f"a folder without {CONFIG_NAME} or meta.json" if path.is_dir() else f"a {path.suffix or 'nameless'} file"
+            f"a folder without {RUN_FILES.config} or meta.json"
+            if path.is_dir()
+            else f"a {path.suffix or 'nameless'} file"
         )
         raise SceneError(f"{path}: {what}; expected {SCENE_KINDS}")
     return kind.read(path)

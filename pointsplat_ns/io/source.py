@@ -10,7 +10,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import content_hash, one_line
 from pointsplat_ns.io.formats import SOG_META, STREAM_META
 from pointsplat_ns.io.formats.sog_stream import stream_parts
-from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, open_run
+from pointsplat_ns.io.runs import RUN_FILES, open_run
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def source_parts(path: Path | str) -> list[Path]:
     parts = _sog_parts(path)
     if parts:
         return parts
-    if path.is_dir() or path.suffix.lower() in RUN_SUFFIXES:
+    if path.is_dir() or path.suffix.lower() in RUN_FILES.suffixes:
         return [open_run(path, need_data=False).checkpoint]
     return [path]
 
@@ -58,7 +58,7 @@ def _sog_parts(path: Path) -> list[Path]:
     folder."""
     folder = _folder_of(path)
     streamed = path.name != SOG_META and (folder / STREAM_META).is_file()
-    if not (streamed or (folder / SOG_META).is_file()) or (folder / CONFIG_NAME).is_file():
+    if not (streamed or (folder / SOG_META).is_file()) or (folder / RUN_FILES.config).is_file():
         return []
     try:
         if streamed:

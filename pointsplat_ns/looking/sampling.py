@@ -41,8 +41,8 @@ def sample_views(
     the picture rather than at its edge. Views complete each
     other, so ask for all of them at once.
 
-    If the Gaussians tell where photos were taken (:mod:`pointsplat_ns.looking.traces`), half of the cameras stand near
-    these places and look at the parts that photos showed.
+    If the Gaussians have traces of where photos were taken (:mod:`pointsplat_ns.looking.traces`), half of the cameras
+    stand near these places and look at the parts that photos showed.
 
     Args:
         scene: N Gaussians.

@@ -271,7 +271,7 @@ class LookingSettings:
     # Views near photo places (search.py)
 
     photo_share: float = 0.5
-    """Share of the views that stand near photo places, if the scene tells them; 0 turns the rule off."""
+    """Share of the views that stand near photo places, if traces show them; 0 turns the rule off."""
 
     photo_place_deviation: float = 0.4
     """Standard deviation of candidates from photo places along each axis, units: the distance between these."""
@@ -347,4 +347,4 @@ class LookingSettings:
 
 
 LOOKING = LookingSettings()
-"""The settings that scenes are looked at with by default."""
+"""Default settings of sampling and choosing views."""

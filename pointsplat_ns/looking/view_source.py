@@ -33,6 +33,8 @@ class ViewCounts:
     """Views for fine-tuning and for methods that score by views."""
     opening: int = 24
     """Known views from which those of a page are chosen."""
+    walked: int = 12
+    """Views that a walk passes."""
 
 
 VIEW_COUNTS = ViewCounts()

@@ -48,6 +48,6 @@ class FallingRate(Scheduler):
 def all_finite(tensors: Iterable[Tensor]) -> bool:
     """Whether all numbers are finite.
 
-    A sum is not finite if a number is not, and is a fifth of the work; where it overflows, numbers are looked at.
+    A sum is not finite if a number is not, and is a fifth of the work; where it overflows, each number is checked.
     """
     return all(bool(tensor.sum().isfinite()) or bool(tensor.isfinite().all()) for tensor in tensors)

@@ -16,11 +16,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.io.runs import REFINER_METHOD, open_run
+from pointsplat_ns.io.runs import METHOD_NAMES, open_run
 from pointsplat_ns.nerfstudio_plugin.third_party_warnings import JIT_SCRIPT
-
-SCENE_METHOD = "splatfacto-cpu"
-"""nerfstudio's name of the method that trains scenes."""
 
 TrainOptions = Mapping[str, Any]
 """Option name without its dashes -> value. A tuple or list becomes several words."""
@@ -105,7 +102,7 @@ def _status(
         except BaseException:
             process.terminate()
             try:
-                process.wait(5.0)  # s to end after it was told to; then it is killed
+                process.wait(5.0)  # s to end after the signal; then it is killed
             except subprocess.TimeoutExpired:
                 process.kill()
             raise
@@ -123,7 +120,7 @@ def train_scene_command(
     """The command that trains a Splatfacto scene from a folder in the Replica layout. The run goes to
     :func:`folder_of_run`. The scene starts from ``seed_points`` points of the depth images; ``options`` are more
     options of the method."""
-    words = _train_words(SCENE_METHOD, output, name, steps, timestamp, options)
+    words = _train_words(METHOD_NAMES.scene, output, name, steps, timestamp, options)
     return shlex.join([*words, "--data", str(data), "replica-data", "--num-seed-points", str(seed_points)])
 
 
@@ -140,7 +137,7 @@ def train_refiner_command(
     ``eval_scenes``. The run goes to :func:`folder_of_run`; ``options`` are further ones of the method."""
     held_out = {"pipeline.datamanager.eval-scenes": eval_scenes} if eval_scenes else {}
     options = {"data": scenes, **held_out, **(options or {})}
-    return shlex.join(_train_words(REFINER_METHOD, output, name, steps, timestamp, options))
+    return shlex.join(_train_words(METHOD_NAMES.refiner, output, name, steps, timestamp, options))
 
 
 def evaluate_command(run: Path, evaluation: Path, pictures: Path) -> str:

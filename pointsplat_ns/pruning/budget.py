@@ -34,7 +34,7 @@ class Megabytes:
 
     @property
     def bytes_of(self) -> Callable[[int, int, bool], int] | None:
-        """Size of a file, bytes, by count and SH degree; None if only writing a scene tells it."""
+        """Size of a file, bytes, by count and SH degree; None if it is known only after writing."""
         return format_to_write(self.suffix).bytes_of
 
     def __str__(self) -> str:
@@ -111,7 +111,7 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, antialiased: bool
 
 
 def found_by_trying(keep: Keep) -> bool:
-    """Whether only trials tell the count of a budget: of a PSNR, or of the size of a compressed file."""
+    """Whether the count of a budget is found only by trials: of a PSNR, or of the size of a compressed file."""
     return isinstance(keep, WithinPsnr) or isinstance(keep, Megabytes) and keep.bytes_of is None
 
 

@@ -21,9 +21,6 @@ from pointsplat_ns.gaussians import PARAMETERS
 from pointsplat_ns.io.files import write_tensors
 from pointsplat_ns.refiner.weights import checked_tensors, opened_weights
 
-FEATURES = 39
-"""Number of features of a Gaussian, see :mod:`pointsplat_ns.compression.feedback`."""
-
 FEEDBACK_FORMAT = "pointsplat-feedback/2"
 
 SHIPPED_FEEDBACK = Path(__file__).parent / "pretrained" / "feedback.safetensors"
@@ -34,9 +31,12 @@ class FeedbackRefiner(nn.Module):
     """An MLP on the features of each Gaussian.
 
     Example:
-        >>> FeedbackRefiner()(torch.zeros(5, FEATURES)).unique().tolist()
+        >>> FeedbackRefiner()(torch.zeros(5, FeedbackRefiner.FEATURES)).unique().tolist()
         [1.0]
     """
+
+    FEATURES = 39
+    """Number of features of a Gaussian, see :mod:`pointsplat_ns.compression.feedback`."""
 
     MAX_LOG_FACTOR = 2.0
     """Bound of the factors' logarithms: factors are from 1/7 to 7."""
@@ -44,7 +44,7 @@ class FeedbackRefiner(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         layers: list[nn.Module] = []
-        width = FEATURES
+        width = self.FEATURES
         for _ in range(2):
             layers += [nn.Linear(width, 64), nn.SiLU()]
             width = 64
@@ -55,7 +55,7 @@ class FeedbackRefiner(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Factors of the steps, (N, 6), above 0, in the order of :data:`~pointsplat_ns.gaussians.PARAMETERS`, from
-        features (N, :data:`FEATURES`)."""
+        features (N, :attr:`FEATURES`)."""
         bound = self.MAX_LOG_FACTOR
         return (bound * torch.tanh(self.mlp(features) / bound)).exp()
 

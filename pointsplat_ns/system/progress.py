@@ -62,7 +62,7 @@ def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
 @contextmanager
 def _lines(stream: IO[str]) -> Iterator[Progress]:
     """Write what is being done to ``stream``, every :data:`LINE_SECONDS` seconds until the context is left. A thread
-    writes, so that steps that report nothing for minutes are told from a program that hangs."""
+    writes, so that a step that reports nothing for minutes does not look like a program that hangs."""
     start, ended, current = time.monotonic(), threading.Event(), ["starting"]
     begun: dict[str, tuple[float, float]] = {}  # when each task was first heard of, and what was done of it by then
 

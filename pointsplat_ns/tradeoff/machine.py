@@ -49,7 +49,7 @@ def _processor() -> str:
 @contextmanager
 def one_at_a_time(progress: Progress) -> Iterator[bool]:
     """Hold the lock of measurements on this machine while the context is open; wait for others that hold it, which
-    ``progress`` is told. Yields whether the lock was taken: its file may belong to another user."""
+    is reported to ``progress``. Yields whether the lock was taken: its file may belong to another user."""
     from filelock import FileLock, Timeout
 
     lock = FileLock(Path(tempfile.gettempdir()) / LOCK.name, mode=0o666)

@@ -23,8 +23,8 @@ from pointsplat_ns.io.files import logger, one_line, require_file
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.upright import Up
-from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.viewing.trajectories import STOPS, along, fitted, orbit, walk
+from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
+from pointsplat_ns.viewing.trajectories import along, fitted, orbit, walk
 from pointsplat_ns.views import Views
 
 
@@ -128,16 +128,16 @@ def camera_path(
             frames = max(frames, len(known))
         usual = (known.width, known.height) if source.given is not None else _reduced(known)
         if one and path == "auto":
-            known = opening_views(scene, up=up, known=known.spread(4 * STOPS)).views
+            known = opening_views(scene, up=up, known=known.spread(4 * VIEW_COUNTS.walked)).views
         views = along(_sized(known, settings, usual), frames)
         skipped = f", {len(known) - frames} of {len(known)} left out" if frames < len(known) and not one else ""
         return CameraPath(views, fps, f"along the {source.origin}{skipped}")
     if known is None:
-        opening = opening_views(scene, 1 if one else STOPS, *_shape(settings, (960, 540)), up)
+        opening = opening_views(scene, 1 if one else VIEW_COUNTS.walked, *_shape(settings, (960, 540)), up)
         stops = opening.views
         up, origin = opening.up, f"views that show most, up is {opening.up}{source.missing}"
     else:
-        stops, origin = _sized(known.spread(2 * STOPS), settings, _reduced(known)), source.origin
+        stops, origin = _sized(known.spread(2 * VIEW_COUNTS.walked), settings, _reduced(known)), source.origin
     upward = None if up is None else up.direction
     if path == "orbit":
         low, high = content_box(scene)

@@ -14,10 +14,8 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.upright import level_directions
+from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.views import Views
-
-STOPS = 12
-"""Maximum number of views in a walk."""
 
 
 def along(views: Views, frames: int) -> Views:
@@ -48,7 +46,7 @@ def walk(views: Views, frames: int, up: Tensor | None = None, from_first: bool =
     ``up`` (3,) has length 1; by default it is that of the views. With ``from_first`` it begins at the first of the
     views, not where the walk is shortest. Raises DataError if there is no view, or ``frames`` is not positive.
     """
-    views = _spread(views.spread(STOPS), frames)
+    views = _spread(views.spread(VIEW_COUNTS.walked), frames)
     places, turns = _poses(views)
     order = _tour(_distances(places, turns), [0] if from_first else range(len(views)))
     views, places, turns = views[order], places[order], turns[order]

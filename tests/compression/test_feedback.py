@@ -9,7 +9,7 @@ from pointsplat_ns.compression.feedback import REPAIR, Feedback
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings, nonzero_rms
 from pointsplat_ns.gaussians import PARAMETERS, Gaussians
 from pointsplat_ns.pruning import prune
-from pointsplat_ns.refiner.feedback import FEATURES, FeedbackRefiner
+from pointsplat_ns.refiner.feedback import FeedbackRefiner
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +165,7 @@ def test_features_and_steps_are_right_at_the_extremes(scene, size, degree):
             feedback.observe(gradients(wild.to(dtype), seed, size))
         features = feedback.features(wild.to(dtype), 1.0, 10**6)
         moves = feedback.moves(1.0)
-        assert features.shape == (len(scene), FEATURES) and features.dtype == torch.float32
+        assert features.shape == (len(scene), FeedbackRefiner.FEATURES) and features.dtype == torch.float32
         assert bool(features.isfinite().all()) and float(features.abs().max()) <= 8
         assert all(bool(value.isfinite().all()) for value in moves.values())
         found.append((features, moves))

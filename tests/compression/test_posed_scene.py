@@ -9,7 +9,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, run_of
-from pointsplat_ns.compression.posed_scene import LONGEST_SIDE, check_views_show, read_posed
+from pointsplat_ns.compression.posed_scene import check_views_show, read_posed
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid
 from posing import inria, nerfstudio, written
@@ -78,7 +78,7 @@ def test_poses_of_a_run_are_moved_and_drawn_as_the_run_was_trained(trained_walls
 def test_large_pictures_are_reduced(scene, views, tmp_path):
     large = replace(views, Ks=views.Ks * torch.tensor([[50.0], [50.0], [1.0]]), width=3200, height=2400)
     _, found = read_posed(scene, written(inria(large), tmp_path / "cameras.json"))
-    assert (found.width, found.height) == (LONGEST_SIDE, 1200)
+    assert (found.width, found.height) == (1600, 1200)
 
 
 def test_half_of_the_cameras_may_see_nothing(scene, views):

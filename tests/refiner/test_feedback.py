@@ -6,7 +6,6 @@ from safetensors.torch import save_file
 
 from pointsplat_ns.gaussians import PARAMETERS
 from pointsplat_ns.refiner.feedback import (
-    FEATURES,
     FEEDBACK_FORMAT,
     SHIPPED_FEEDBACK,
     FeedbackRefiner,
@@ -25,14 +24,14 @@ def trained() -> FeedbackRefiner:
 
 
 def test_factors_are_bounded_whatever_comes_in():
-    factors = trained()(100 * torch.randn(50, FEATURES))
+    factors = trained()(100 * torch.randn(50, FeedbackRefiner.FEATURES))
     assert factors.shape == (50, len(PARAMETERS))
     assert float(factors.log().abs().max()) <= FeedbackRefiner.MAX_LOG_FACTOR + 1e-5
     assert float(factors.log().abs().max()) > 0.5 * FeedbackRefiner.MAX_LOG_FACTOR, "weights of this size use the range"
 
 
 def test_a_file_gives_back_the_network(tmp_path):
-    network, features = trained(), torch.randn(7, FEATURES)
+    network, features = trained(), torch.randn(7, FeedbackRefiner.FEATURES)
     save_feedback_refiner(network, tmp_path / "a.safetensors", {"steps": 3})
     again = read_feedback_refiner(tmp_path / "a.safetensors")
     assert not again.training and not any(value.requires_grad for value in again.parameters())

@@ -21,7 +21,7 @@ from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices
 from pointsplat_ns.io.camera_files.cameras import CAMERA_LIMITS, Camera, CameraFile, Motion, need_count
 from pointsplat_ns.io.files import logger, one_line
 
-MODELS = {
+COLMAP_CAMERAS = {
     "SIMPLE_PINHOLE": (0, 1, 3), "PINHOLE": (1, 2, 4), "SIMPLE_RADIAL": (2, 1, 4), "RADIAL": (3, 1, 5),
     "OPENCV": (4, 2, 8), "OPENCV_FISHEYE": (5, 2, 8), "FULL_OPENCV": (6, 2, 12), "FOV": (7, 2, 5),
     "SIMPLE_RADIAL_FISHEYE": (8, 1, 4), "RADIAL_FISHEYE": (9, 1, 5), "THIN_PRISM_FISHEYE": (10, 2, 12),
@@ -101,7 +101,7 @@ def colmap_cameras(path: Path) -> CameraFile:
 
 
 def _lens(name: str, size: tuple[float, float], params: tuple[float, ...]) -> _Lens:
-    _, focals, _ = MODELS[name]
+    _, focals, _ = COLMAP_CAMERAS[name]
     bent = "FISHEYE" in name or any(params[focals + 2 :])
     return _Lens(size, (params[0], params[focals - 1]), (params[focals], params[focals + 1]), bent)
 
@@ -113,10 +113,10 @@ def _text_lenses(stream: BinaryIO, path: Path) -> dict[int, _Lens]:
         words = line.split()
         try:
             name, size = words[1], (float(words[2]), float(words[3]))
-            if name not in MODELS:
+            if name not in COLMAP_CAMERAS:
                 raise _no_model(path, name)
             params = tuple(float(word) for word in words[4:])
-            if len(params) != MODELS[name][2]:
+            if len(params) != COLMAP_CAMERAS[name][2]:
                 raise ValueError
             lenses[int(words[0])] = _lens(name, size, params)
         except (ValueError, IndexError) as error:
@@ -160,14 +160,14 @@ def _lines(stream: BinaryIO, path: Path) -> Iterator[str]:
 
 def _binary_lenses(stream: BinaryIO, path: Path) -> dict[int, _Lens]:
     """A count, and for each camera its number, model, width, height and parameters."""
-    names = {number: name for name, (number, _, _) in MODELS.items()}
+    names = {number: name for name, (number, _, _) in COLMAP_CAMERAS.items()}
     lenses = {}
     for _ in range(_count(stream, path, 24)):
         number, model, width, height = struct.unpack("<IiQQ", _exactly(stream, 24, path))
         if model not in names:
             raise _no_model(path, str(model))
         name = names[model]
-        params = struct.unpack(f"<{MODELS[name][2]}d", _exactly(stream, 8 * MODELS[name][2], path))
+        params = struct.unpack(f"<{COLMAP_CAMERAS[name][2]}d", _exactly(stream, 8 * COLMAP_CAMERAS[name][2], path))
         lenses[number] = _lens(name, (float(width), float(height)), params)
     return lenses
 
@@ -213,4 +213,4 @@ def _exactly(stream: BinaryIO, size: int, path: Path) -> bytes:
 
 
 def _no_model(path: Path, name: str) -> DataError:
-    return DataError(f"{path}: a camera of model {name[:40]}; expected one of {', '.join(MODELS)}")
+    return DataError(f"{path}: a camera of model {name[:40]}; expected one of {', '.join(COLMAP_CAMERAS)}")

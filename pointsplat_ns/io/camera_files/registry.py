@@ -12,24 +12,24 @@ from pointsplat_ns.io.camera_files.inria import inria_cameras
 from pointsplat_ns.io.camera_files.nerfstudio import nerfstudio_cameras
 from pointsplat_ns.io.files import logger, one_line, require_file, require_memory
 from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_named
-from pointsplat_ns.io.runs import CONFIG_NAME, RUN_SUFFIXES, TRANSFORMS_NAME, read_transforms
+from pointsplat_ns.io.runs import RUN_FILES, read_transforms
 from pointsplat_ns.views import Views
 
 CAMERA_KINDS = "cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model"
 
 
 def is_camera_file(path: Path | str) -> bool:
-    """Whether a path is no run and no scene, so that it can only hold cameras. What is in a file is not looked at."""
+    """Whether a path is no run and no scene, so that it can only hold cameras. The content of a file is not read."""
     path = Path(path)
     if path.is_dir():
-        return is_model(path) or not any((path / name).is_file() for name in (CONFIG_NAME, SOG_META, STREAM_META))
-    return path.suffix.lower() not in RUN_SUFFIXES and format_named(path.name) is None
+        return is_model(path) or not any((path / name).is_file() for name in (RUN_FILES.config, SOG_META, STREAM_META))
+    return path.suffix.lower() not in RUN_FILES.suffixes and format_named(path.name) is None
 
 
 def transforms_beside(path: Path | str) -> Path | None:
     """The ``dataparser_transforms.json`` in a folder, or beside a file or folder; None if there is none."""
     path = Path(path)
-    places = (path / TRANSFORMS_NAME, path.parent / TRANSFORMS_NAME)
+    places = (path / RUN_FILES.transforms, path.parent / RUN_FILES.transforms)
     return next((place for place in places if place.is_file()), None)
 
 

@@ -14,7 +14,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.io.runs import REFINER_METHOD
+from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
@@ -123,7 +123,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
 def pointsplat_config() -> TrainerConfig:
     """The ``pointsplat`` method: 2,000 steps, which take two CPU cores less than an hour on small scenes."""
     return PointSplatTrainerConfig(
-        method_name=REFINER_METHOD,
+        method_name=METHOD_NAMES.refiner,
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         max_num_iterations=2000,
         steps_per_save=500,

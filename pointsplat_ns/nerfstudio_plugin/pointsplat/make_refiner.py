@@ -17,10 +17,9 @@ import numpy as np
 
 from pointsplat_ns.errors import DataError, need
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.io.runs import REFINER_METHOD
-from pointsplat_ns.nerfstudio_plugin.pointsplat.report import REFINER_NAME, VARIANTS, read_evaluation
+from pointsplat_ns.io.runs import METHOD_NAMES, RUN_FILES
+from pointsplat_ns.nerfstudio_plugin.pointsplat.report import VARIANTS, read_evaluation
 from pointsplat_ns.nerfstudio_plugin.running import (
-    SCENE_METHOD,
     StoppedError,
     evaluate_command,
     folder_of_run,
@@ -109,7 +108,7 @@ def make_refiner(
     _make_scenes(output, (*train_seeds, *RECIPE.unseen_seeds), workers or os.cpu_count() or 1)
 
     name = f"{size}-{steps}-{len(train_seeds)}rooms-seed{seed}"
-    trained = folder_of_run(output / "refiners", name, REFINER_METHOD, RECIPE.timestamp)
+    trained = folder_of_run(output / "refiners", name, METHOD_NAMES.refiner, RECIPE.timestamp)
     evaluation, pictures = output / f"{name}.json", output / "pictures" / name
     if not has_finished(trained, steps):
         remove_interrupted(trained)
@@ -129,13 +128,13 @@ def make_refiner(
         "unseen": {variant: results["average_unseen"][variant] for variant in VARIANTS},
     }
     target = Path(weights or output)
-    refiner = read_refiner(trained / REFINER_NAME)
-    save_refiner(refiner, target / REFINER_NAME, about)
+    refiner = read_refiner(trained / RUN_FILES.refiner)
+    save_refiner(refiner, target / RUN_FILES.refiner, about)
     command = refiner_command(Path("scenes"), Path("refiners"), name, RECIPE.timestamp, size, steps, seed)
     with replacing(target / "CARD.md") as part:
         parameters = sum(p.numel() for p in refiner.parameters())
         part.write_text(card_text(about, results, command, parameters), encoding="utf-8")
-    return MadeRefiner(target / REFINER_NAME, target / "CARD.md", pictures, results)
+    return MadeRefiner(target / RUN_FILES.refiner, target / "CARD.md", pictures, results)
 
 
 def _make_scenes(output: Path, seeds: tuple[int, ...], workers: int) -> None:
@@ -151,7 +150,7 @@ def _make_scenes(output: Path, seeds: tuple[int, ...], workers: int) -> None:
 
     def make(seed: int) -> None:
         settings = scene_settings(seed)
-        trained = folder_of_run(output / "scenes", settings.name, SCENE_METHOD, RECIPE.timestamp)
+        trained = folder_of_run(output / "scenes", settings.name, METHOD_NAMES.scene, RECIPE.timestamp)
         if has_finished(trained, settings.steps):
             return
         remove_interrupted(trained)

@@ -15,6 +15,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from pointsplat_ns.errors import SceneError
+from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat import distributed
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager, ScenesDataManagerConfig
@@ -26,7 +27,6 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
 )
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PIXEL_LOSSES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
-from pointsplat_ns.nerfstudio_plugin.pointsplat.report import REFINER_NAME
 from pointsplat_ns.nerfstudio_plugin.pointsplat.training_state import TrainingState
 from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system import processes
@@ -203,7 +203,7 @@ class PointSplatPipeline(VanillaPipeline):
                 names = [self.datamanager.scenes[i].name for i in self.datamanager.train_indices]
                 save_refiner(
                     self.model.refiner,
-                    trainer.base_dir / REFINER_NAME,
+                    trainer.base_dir / RUN_FILES.refiner,
                     {
                         "step": str(step),
                         "scenes": ", ".join(names),

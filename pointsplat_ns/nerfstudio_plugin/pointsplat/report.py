@@ -12,9 +12,6 @@ from pointsplat_ns.io.files import read_text
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.system.terminal import print_table
 
-REFINER_NAME = "refiner.safetensors"
-"""File of the trained network in the run's folder, for ``pointsplat compact --refiner``."""
-
 VARIANTS = ("dense", "pruned", "refined")
 """The variants of each scene that an evaluation compares."""
 

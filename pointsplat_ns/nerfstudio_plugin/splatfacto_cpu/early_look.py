@@ -28,7 +28,7 @@ class EarlyLook:
     view into a folder, as ``step-000000109.jpg``: the photo, and its render beside it.
 
     An estimate is logged after some seconds, and again whenever the resolution of training has risen. How much slower
-    later steps are is told by rendering a view at full resolution; that Gaussians become more is not foreseen.
+    later steps are is measured by rendering a view at full resolution; that Gaussians become more is not foreseen.
     """
 
     def __init__(self, pipeline: VanillaPipeline, folder: Path, first: int, count: int):

@@ -88,7 +88,7 @@ class SplatfactoCpuPipeline(VanillaPipeline):
 
 class CheckingOptimizers(Optimizers):
     """nerfstudio's optimisers, which leave out an update that would not be finite. Before each update, ``skips`` is
-    told of the groups with a gradient that is not finite, and says whether to leave it out."""
+    called with the groups that have a gradient that is not finite; it returns whether to leave the update out."""
 
     def __init__(
         self,

@@ -1,13 +1,13 @@
 """Visibility weight of each Gaussian: the pixels that it covers per unit of its own area. Errors count by it.
 
 The error that counts is per solid angle, not per squared metre, and only where something is seen. So both distance and
-occlusion matter, and a render tells both: a Gaussian covers the sum over pixels of its blend weight, alpha times
+occlusion matter, and a render measures both: a Gaussian covers the sum over pixels of its blend weight, alpha times
 transmittance. Divided by its opacity and area, that is large near the cameras, small far away, and 0 behind a wall.
 
 Pictures are small. 3DGS rasterizers widen every projected Gaussian by 0.3 pixels, which would make Gaussians below the
 size of a pixel seem large. The antialiased rasterizer lowers their opacity by as much, so it counts right.
 
-Where the scene tells where its photos were taken, the weight is multiplied by the trace factor
+Where traces in the scene show where its photos were taken, the weight is multiplied by the trace factor
 (:mod:`~pointsplat_ns.looking.traces`).
 """
 
@@ -73,15 +73,15 @@ def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: Mer
 
 @dataclass(frozen=True, eq=False)
 class Viewpoints:
-    """From where a scene is looked at."""
+    """Views that visibility is computed in."""
 
     views: Views  # in units of the content, see :func:`~pointsplat_ns.looking.content.in_units`
     photos_found: bool = False
-    """Whether views were sampled about where photos were taken, because the scene tells."""
+    """Whether views were sampled about where photos were taken, which traces in the scene show."""
 
 
 def sampled_viewpoints(scene: Gaussians, width: int, height: int, settings: MergeSettings) -> Viewpoints | None:
-    """Views from where photos were taken if the scene tells, and from free places in it.
+    """Views from where photos were taken, if traces in the scene show that, and from free places in it.
 
     Args:
         scene: N Gaussians in units of the content.

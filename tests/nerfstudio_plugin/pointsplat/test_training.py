@@ -8,8 +8,8 @@ import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import fast_config, pipeline_of
+from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
-from pointsplat_ns.nerfstudio_plugin.pointsplat.report import REFINER_NAME
 from pointsplat_ns.refiner import read_refiner
 from pointsplat_ns.refiner.weights import read_metadata
 
@@ -53,7 +53,7 @@ def test_the_checkpoint_holds_the_network_and_nothing_else(trained):
 
 def test_the_network_is_saved_by_itself_at_the_end(trained):
     config, trainer, _ = trained
-    path = config.get_base_dir() / REFINER_NAME
+    path = config.get_base_dir() / RUN_FILES.refiner
     loaded = read_refiner(path).state_dict()
     expected = trainer.pipeline.model.refiner.state_dict()
     assert loaded.keys() == expected.keys() and all(torch.equal(loaded[n], v) for n, v in expected.items())
